@@ -70,20 +70,20 @@ def main() -> None:
 def _case(key: Key) -> tuple[AutofocusCase, SpaceVariance]:
     scene, flight, pair, size_cm, snr_db, seed = key
     one = case(scene, flight, pair, float(size_cm) / 100, float(snr_db), int(seed))
-    sighting = one.sightings[0]
-    wavelength_m = SPEED_OF_LIGHT_M_S / sighting.profiles.centre_frequency_hz
+    record = one.records[0]
+    wavelength_m = SPEED_OF_LIGHT_M_S / record.profiles.centre_frequency_hz
     paths = PointPaths.of(
-        sighting.profiles.aperture, sighting.time_s, point_m=MIDDLE_M, axes=np.eye(3), wavelength_m=wavelength_m
+        record.profiles.aperture, record.time_s, point_m=MIDDLE_M, axes=np.eye(3), wavelength_m=wavelength_m
     )
-    return one, space_variance(paths, CORNERS_M, [one.errors[node] for node in dict.fromkeys(sighting.nodes)])
+    return one, space_variance(paths, CORNERS_M, [one.errors[node] for node in dict.fromkeys(record.nodes)])
 
 
 def _outcomes(one: AutofocusCase) -> Iterator[tuple[str, Outcome]]:
-    image_s = image_seconds(one.sightings[0])
+    image_s = image_seconds(one.records[0])
     true, before = (peaks(one.probes, tracks, PROBES_M, one.reach_m) for tracks in (one.truth, UNCORRECTED))
     for method in (*METHODS, "tracks"):
         begun = process_time()
-        found = _found(one, method)
+        found = _refined(one, method)
         seconds = process_time() - begun
         yield (
             method,
@@ -93,12 +93,12 @@ def _outcomes(one: AutofocusCase) -> Iterator[tuple[str, Outcome]]:
         )
 
 
-def _found(one: AutofocusCase, method: str) -> Refinement:
+def _refined(one: AutofocusCase, method: str) -> Refinement:
     """Return what a method makes of a case, from its search for points on."""
     if method == "tracks":
-        return refine(one.sightings, GRID, FlatGround(0.0), one.errors)
-    found = Candidates.of(one.sightings, GRID, FlatGround(0.0), one.errors)
-    return refine_one_phase(one.sightings, found, one.errors, method=method)
+        return refine(one.records, GRID, FlatGround(0.0), one.errors)
+    found = Candidates.of(one.records, GRID, FlatGround(0.0), one.errors)
+    return refine_one_phase(one.records, found, one.errors, method=method)
 
 
 def _outcome(found: Refinement, true: PointPeaks, before: PointPeaks, after: PointPeaks, images: float) -> Outcome:

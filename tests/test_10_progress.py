@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from apertura.common import progress as told
-from apertura.common.progress import progress, telling, told_at
+from apertura.common.progress import progress, progress_path, reporting_to
 
 
 @pytest.fixture
@@ -23,8 +23,8 @@ def counted(path):
 
 
 def test_a_step_tells_at_most_once_a_second_and_in_the_end(tmp_path, clock):
-    path = tmp_path.joinpath(*told_at(["image", "f01", "uav1-uav2"]))
-    with telling(path):
+    path = tmp_path.joinpath(*progress_path(["image", "f01", "uav1-uav2"]))
+    with reporting_to(path):
         with progress("tiles", 10) as done:
             assert counted(path) == (0, 10)
             done(3)
@@ -47,13 +47,13 @@ def test_work_outside_a_step_tells_nothing_and_writes_nothing(tmp_path, monkeypa
 
 def test_a_folder_that_takes_no_file_does_not_end_the_step(tmp_path):
     (tmp_path / ".run").write_text("a file where a folder should be")
-    with telling(tmp_path.joinpath(*told_at(["cube"]))), progress("images", 2) as done:
+    with reporting_to(tmp_path.joinpath(*progress_path(["cube"]))), progress("images", 2) as done:
         done(2)
 
 
 def test_a_failing_step_leaves_no_progress_behind(tmp_path):
-    path = tmp_path.joinpath(*told_at(["echo", "f01", "a-a"]))
-    with pytest.raises(ZeroDivisionError), telling(path), progress("pulses", 0) as done:
+    path = tmp_path.joinpath(*progress_path(["echo", "f01", "a-a"]))
+    with pytest.raises(ZeroDivisionError), reporting_to(path), progress("pulses", 0) as done:
         done(1 // 0)
     assert not path.exists()
 
@@ -73,7 +73,7 @@ def test_tiles_under_way_tell_how_many_of_their_parts_are_done(tmp_path, monkeyp
             target[window] = block
 
     windows = [(slice(0, 2), slice(0, 2)), (slice(2, 4), slice(2, 4)), (slice(0, 2), slice(4, 6))]
-    with telling(path):
+    with reporting_to(path):
         compute_tiles(ones((4, 6), chunks=2), windows, Watched(), threads=1)
     assert {one["total"] for one in seen} == {6}  # each is formed and written
     assert 0 < seen[-1]["done"] < 6

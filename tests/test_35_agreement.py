@@ -13,9 +13,9 @@ from apertura.core.geometry.phase_centres import TrackCorrection
 from apertura.core.imaging.range_profiles import range_compress
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import FlatGround
-from apertura.methods.autofocus.inputs import NodePrior, Prior, Sighting, TrackErrors
+from apertura.methods.autofocus.inputs import NodePrior, PairRecord, Prior, TrackErrors
 from apertura.methods.autofocus.objective import Blocks
-from apertura.methods.autofocus.solve import Gauge, minimal
+from apertura.methods.autofocus.solve import Gauge, minimise
 from apertura.methods.autofocus.speckle import SpeckleTiles, refined_by_speckle, tiles
 from apertura.simulation.scene import Scatterers
 from apertura.simulation.transfer import transfer
@@ -45,27 +45,27 @@ def seen(seed, ahead_m=4.7):
     of_tracks, of_scene = np.random.default_rng(seed).spawn(2)
     unknowns = of_tracks.standard_normal(PRIOR.size)
     truth, ground = TrackCorrection(KNOTS_S, PRIOR.tracks(unknowns)), speckle(of_scene)
-    sightings = []
+    records = []
     for pair in ("a-a", "a-b"):
         logged = Aperture(flown(0.0), flown(ahead_m if pair == "a-b" else 0.0))
         between_m = logged.tx_m - logged.rx_m if pair == "a-b" else None
         longer_m = -truth.longer_m(pair, TIME_S, between_m)
         echo = transfer(ground, truth.aperture(logged, pair, TIME_S), FREQUENCY_HZ, longer_m=longer_m, gridded=True)
         history = PhaseHistory(echo, FREQUENCY_HZ, window_weights("hann", 128), np.zeros(600), logged)
-        sightings.append(Sighting(pair, range_compress(history, GRID, GROUND), TIME_S, between_m))
-    return sightings, unknowns
+        records.append(PairRecord(pair, range_compress(history, GRID, GROUND), TIME_S, between_m))
+    return records, unknowns
 
 
-def ground_of(sightings):
+def ground_of(records):
     return SpeckleTiles.of(
-        [Blocks.of(one, KNOTS_S) for one in sightings], tiles(sightings, GRID, GROUND, lasting_s=1.0)
+        [Blocks.of(one, KNOTS_S) for one in records], tiles(records, GRID, GROUND, correlation_s=1.0)
     )
 
 
 @pytest.mark.slow
 def test_tiles_share_out_the_scene():
-    sightings, _ = seen(1)
-    found = tiles(sightings, GRID, GROUND, lasting_s=1.0)
+    records, _ = seen(1)
+    found = tiles(records, GRID, GROUND, correlation_s=1.0)
     area = sum(np.linalg.norm(np.cross(*tile.sides_m)) for tile in found)
     assert area == pytest.approx(360.0)
     pixels = np.concatenate([tile.patch.pixels_m for tile in found])
@@ -75,8 +75,8 @@ def test_tiles_share_out_the_scene():
 
 @pytest.mark.slow
 def test_speckle_of_two_pairs_agrees_from_the_true_tracks_only():
-    sightings, unknowns = seen(1)
-    ground = ground_of(sightings)
+    records, unknowns = seen(1)
+    ground = ground_of(records)
     coherence = [
         np.abs(ground.agreements(tracks)[0].coherence(tracks)).mean()
         for tracks in (PRIOR.tracks(0 * unknowns), PRIOR.tracks(unknowns))
@@ -86,9 +86,9 @@ def test_speckle_of_two_pairs_agrees_from_the_true_tracks_only():
 
 
 def test_the_gradient_is_that_of_the_value():
-    sightings, unknowns = seen(1)
+    records, unknowns = seen(1)
     tracks = PRIOR.tracks(0.3 * unknowns)
-    [agreement] = ground_of(sightings).agreements(PRIOR.tracks(0 * unknowns))
+    [agreement] = ground_of(records).agreements(PRIOR.tracks(0 * unknowns))
     _, gradient = agreement(tracks)
     generator = np.random.default_rng(3)
     for way in (PRIOR.tracks(unknowns), PRIOR.tracks(generator.standard_normal(PRIOR.size))):
@@ -102,11 +102,11 @@ def test_agreement_mends_what_blurs_speckle():
     """Path errors of the pair that sends and receives, less what only moves the image, fall as eq. 23 says."""
     left = []
     for seed in (1, 2):
-        sightings, unknowns = seen(seed)
-        ground, found = ground_of(sightings), np.zeros(PRIOR.size)
+        records, unknowns = seen(seed)
+        ground, found = ground_of(records), np.zeros(PRIOR.size)
         for _ in range(2):
             [agreement] = ground.agreements(PRIOR.tracks(found))
-            found = minimal(agreement, PRIOR, Gauge.none(PRIOR.size), found, iterations=15)
+            found = minimise(agreement, PRIOR, Gauge.none(PRIOR.size), found, iterations=15)
         left.append(blur_m(PRIOR.tracks(found - unknowns)["a"]) / blur_m(PRIOR.tracks(unknowns)["a"]))
     assert max(left) < 0.75, left
 
@@ -122,8 +122,8 @@ def blur_m(moved_m):
 
 
 def test_one_pair_has_nothing_to_agree_with():
-    sightings, unknowns = seen(1)
-    ground = ground_of(sightings[:1])
+    records, unknowns = seen(1)
+    ground = ground_of(records[:1])
     assert ground.agreements(PRIOR.tracks(unknowns)) == []
     found = refined_by_speckle(ground, PRIOR, KNOTS_S)
     assert not found.accepted
@@ -132,11 +132,11 @@ def test_one_pair_has_nothing_to_agree_with():
 
 @pytest.mark.slow
 def test_speckle_is_believed_by_the_coherence_of_tiles_that_were_not_fitted():
-    sightings, _ = seen(1)
-    found = refined_by_speckle(ground_of(sightings), PRIOR, KNOTS_S)
+    records, _ = seen(1)
+    found = refined_by_speckle(ground_of(records), PRIOR, KNOTS_S)
     assert found.accepted, found.why
-    unlike = [sightings[0], replace(sightings[1], profiles=seen(2)[0][1].profiles)]
-    refused = refined_by_speckle(ground_of(unlike), PRIOR, KNOTS_S)
-    assert not refused.accepted
-    assert not np.any(refused.correction.moved_m["a"])
-    assert "not fitted" in refused.flags["refinement_rejected"]
+    unlike = [records[0], replace(records[1], profiles=seen(2)[0][1].profiles)]
+    rejected = refined_by_speckle(ground_of(unlike), PRIOR, KNOTS_S)
+    assert not rejected.accepted
+    assert not np.any(rejected.correction.moved_m["a"])
+    assert "not fitted" in rejected.flags["refinement_rejected"]

@@ -8,7 +8,7 @@ from apertura.core.geometry.aperture import Aperture
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import FlatGround
 from apertura.methods.autofocus.motion import Logged, Recorded, plausible_offsets
-from apertura.methods.synchronisation.clock_alignment import align_on_point, with_drift
+from apertura.methods.synchronisation.clock_alignment import align_on_point, estimate_drift
 from apertura.methods.synchronisation.scene_alignment import align_on_scene
 
 BEHIND_S, PATH_M = 3.217, 1.43
@@ -88,7 +88,7 @@ def test_a_clock_that_runs_slow_is_told_on_a_long_recording():
     echo = Recorded(transfer, FREQUENCY, np.zeros(len(pulse_s)), clock_s)
     log = Logged(lambda at_s: Aperture(flown(to_and_fro(at_s)), flown(to_and_fro(at_s))), 0.0, 610.0)
     without = align_on_point(echo, log, POINTS[0], within_s=(2.9, 3.5), search_m=2.0)
-    found = with_drift(without, echo, log, POINTS[0])
+    found = estimate_drift(without, echo, log, POINTS[0])
     assert found.drift_ppm == pytest.approx(slow_ppm, abs=0.5)
     assert found.offset_s == pytest.approx(BEHIND_S, abs=1e-3)
     assert abs(without.offset_s - BEHIND_S) > 5e-3
@@ -97,9 +97,9 @@ def test_a_clock_that_runs_slow_is_told_on_a_long_recording():
 def test_on_a_short_recording_no_drift_is_told():
     echo, log = given(start_and_stop)
     found = align_on_point(echo, log, POINTS[0], within_s=(-10.0, 15.0), search_m=5.0)
-    kept = with_drift(found, echo, log, POINTS[0])
+    kept = estimate_drift(found, echo, log, POINTS[0])
     assert kept.drift_ppm == 0.0
-    assert "cannot be told" in kept.report["drift"]
+    assert "not observable" in kept.report["drift"]
 
 
 def test_a_point_that_is_not_there_is_told_of():

@@ -13,7 +13,7 @@ from apertura.core.imaging.range_profiles import range_compress
 from apertura.core.quality.path_errors import PointPaths
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import FlatGround
-from apertura.methods.autofocus.inputs import Sighting, TrackErrors
+from apertura.methods.autofocus.inputs import PairRecord, TrackErrors
 from apertura.methods.autofocus.one_phase import METHODS, entropy, space_variance
 from apertura.methods.autofocus.patches import Candidates, Patch
 from apertura.methods.autofocus.path_offsets import refine_one_phase
@@ -111,7 +111,7 @@ def seen(flight, points_m, *, pair="a-a", seed=1, snr_db=None):
     history = PhaseHistory(echo.astype(np.complex64), FREQUENCY_HZ, WEIGHT, np.zeros(len(path)), logged)
     profiles = range_compress(history, SceneGrid("local", -21.0, 21.0, 1.0, (42, 42)), FlatGround(0.0))
     sidelink_m = None if pair == "a-a" else logged.tx_m - logged.rx_m
-    return Sighting(pair, profiles, time_s, sidelink_m), profiles.moved(true, between)
+    return PairRecord(pair, profiles, time_s, sidelink_m), profiles.moved(true, between)
 
 
 def about(place_m, east_m, north_m, count=13):
@@ -140,10 +140,10 @@ def lost(profiles, true, points_m, cell_m):
     return loss_db, np.array([here - there for (_, here), (_, there) in both])
 
 
-def shifts_by(sighting, true, points_m):
+def shifts_by(record, true, points_m):
     """Return (point, 2) metres east and north by which the errors of the logs alone shift points of a far scene."""
-    logged = sighting.profiles.aperture
-    longer = true.aperture.path(points_m) - logged.path(points_m) - (true.start_m - sighting.profiles.start_m)[:, None]
+    logged = record.profiles.aperture
+    longer = true.aperture.path(points_m) - logged.path(points_m) - (true.start_m - record.profiles.start_m)[:, None]
     east, north = (logged.path_gradient(points_m.mean(axis=0))[:, axis] for axis in (0, 1))
     known = np.stack([east, np.full_like(north, north.mean())], -1)
     return (np.linalg.pinv(known) @ longer).T
@@ -160,21 +160,21 @@ FAR_ERRORS = {"a": SIGMA, "b": SIGMA}
 @pytest.mark.parametrize("pair", ["a-a", "a-b"])
 @pytest.mark.parametrize("method", METHODS)
 def test_one_phase_mends_a_far_scene_and_leaves_it_in_place(method, pair):
-    sighting, true = seen(FAR, np.vstack([FAR_POINTS_M, PROBES_M]), pair=pair, snr_db=10)
-    found = refine_one_phase([sighting], patches_at(FAR_POINTS_M, 5.0, 0.8), FAR_ERRORS, method=method)
-    before_db, _ = lost(sighting.profiles, true, PROBES_M, 1.0)
-    after_db, off_m = lost(sighting.moved(found.correction), true, PROBES_M, 1.0)
+    record, true = seen(FAR, np.vstack([FAR_POINTS_M, PROBES_M]), pair=pair, snr_db=10)
+    found = refine_one_phase([record], patches_at(FAR_POINTS_M, 5.0, 0.8), FAR_ERRORS, method=method)
+    before_db, _ = lost(record.profiles, true, PROBES_M, 1.0)
+    after_db, off_m = lost(record.moved(found.correction), true, PROBES_M, 1.0)
     assert found.accepted, found.why
     assert before_db.mean() < -2
     assert after_db.min() > -0.2
-    np.testing.assert_allclose(off_m[:, :2], shifts_by(sighting, true, PROBES_M), atol=0.01)
+    np.testing.assert_allclose(off_m[:, :2], shifts_by(record, true, PROBES_M), atol=0.01)
 
 
 def test_offsets_hold_neither_a_constant_nor_a_shift_along_the_track():
-    sighting, _ = seen(FAR, FAR_POINTS_M)
-    found = refine_one_phase([sighting], patches_at(FAR_POINTS_M, 5.0, 0.8), FAR_ERRORS, method="minimum_entropy")
+    record, _ = seen(FAR, FAR_POINTS_M)
+    found = refine_one_phase([record], patches_at(FAR_POINTS_M, 5.0, 0.8), FAR_ERRORS, method="minimum_entropy")
     further_m = found.correction.further_m["a-a"]
-    along = np.interp(found.correction.time_s, FAR[0], sighting.profiles.aperture.path_gradient(np.zeros(3))[:, 0])
+    along = np.interp(found.correction.time_s, FAR[0], record.profiles.aperture.path_gradient(np.zeros(3))[:, 0])
     assert np.std(further_m) > 0.01
     assert abs(further_m.mean()) < 1e-9
     assert abs(np.corrcoef(along, further_m)[0, 1]) < 1e-3
@@ -183,10 +183,10 @@ def test_offsets_hold_neither_a_constant_nor_a_shift_along_the_track():
 def test_one_phase_does_not_mend_a_near_scene():
     points = np.array([(0, -8, 0), (-4, -4, 0), (0, 0, 0), (4, 4, 0), (0, 8, 0)], float)
     corners = CORNERS_M * [9, 10, 0]
-    sighting, true = seen(NEAR, np.vstack([points, corners]))
-    found = refine_one_phase([sighting], patches_at(points, 0.6, 0.8), FAR_ERRORS, method="phase_gradient")
-    before_db, _ = lost(sighting.profiles, true, corners, 0.1)
-    after_db, _ = lost(sighting.moved(found.correction), true, corners, 0.1)
+    record, true = seen(NEAR, np.vstack([points, corners]))
+    found = refine_one_phase([record], patches_at(points, 0.6, 0.8), FAR_ERRORS, method="phase_gradient")
+    before_db, _ = lost(record.profiles, true, corners, 0.1)
+    after_db, _ = lost(record.moved(found.correction), true, corners, 0.1)
     assert before_db.mean() < after_db.mean() < -0.5
 
 
@@ -197,8 +197,8 @@ def test_phases_of_noise_are_not_believed(method):
     points = np.array([(east, north, 0.0) for north in (-12, -4, 4, 12) for east in (-12, 0, 12)])
     gains_db = []
     for seed in (0, 2):
-        sighting, _ = seen(FAR, points, seed=seed, snr_db=-10)
-        found = refine_one_phase([sighting], patches_at(points, 5.0, 0.8), FAR_ERRORS, method=method)
+        record, _ = seen(FAR, points, seed=seed, snr_db=-10)
+        found = refine_one_phase([record], patches_at(points, 5.0, 0.8), FAR_ERRORS, method=method)
         assert found.flags["refinement_rejected"] == found.why
         gains_db.append(found.report["gain_held_out_db"])
     assert max(gains_db) < 0
@@ -206,14 +206,14 @@ def test_phases_of_noise_are_not_believed(method):
 
 def test_patches_of_one_range_do_not_speak_for_each_other():
     beside = np.array([(east, 0, 0) for east in (-15, -9, -3, 3, 9, 15)], float)
-    sighting, _ = seen(FAR, beside)
-    found = refine_one_phase([sighting], patches_at(beside, 2.0, 0.8), FAR_ERRORS, method="phase_gradient")
+    record, _ = seen(FAR, beside)
+    found = refine_one_phase([record], patches_at(beside, 2.0, 0.8), FAR_ERRORS, method="phase_gradient")
     assert found.report["gain_held_out_db"] == 0
     assert not found.accepted
 
 
 def test_three_patches_are_too_few():
-    sighting, _ = seen(FAR, FAR_POINTS_M[:3])
-    found = refine_one_phase([sighting], patches_at(FAR_POINTS_M[:3], 5.0, 0.8), FAR_ERRORS, method="phase_gradient")
+    record, _ = seen(FAR, FAR_POINTS_M[:3])
+    found = refine_one_phase([record], patches_at(FAR_POINTS_M[:3], 5.0, 0.8), FAR_ERRORS, method="phase_gradient")
     assert list(found.flags) == ["refinement_too_few_patches"]
     assert not found.correction.further_m

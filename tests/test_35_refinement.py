@@ -54,8 +54,8 @@ def test_a_corrected_track_focuses_as_the_true_one(pair, ahead_m):
     assert abs(reference.form(history, TARGET_M)[0]) / 300 < 0.8
     between = logged.tx_m - logged.rx_m
     further = correction.longer_m(pair, TIME_S, between if pair == "a-b" else None)
-    mended = history.moved(true, further)
-    assert abs(reference.form(mended, TARGET_M)[0] / 300 - 1) < 1e-5
+    corrected = history.moved(true, further)
+    assert abs(reference.form(corrected, TARGET_M)[0] / 300 - 1) < 1e-5
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +64,7 @@ def two_centimetres():
 
 
 def searched(one):
-    return TrackSearch.begin(one.sightings, GRID, FlatGround(0.0), one.errors)
+    return TrackSearch.begin(one.records, GRID, FlatGround(0.0), one.errors)
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +74,7 @@ def search(two_centimetres):
 
 def test_points_are_found_where_they_are_whatever_blurs_them():
     one = case("five", "straight", "joint", 0.03, 10.0, 2)
-    places, ratio = bright_places(one.sightings, GRID, FlatGround(0.0), lasting_s=1.0)
+    places, ratio = bright_places(one.records, GRID, FlatGround(0.0), correlation_s=1.0)
     found = places[ratio > LEAST_RATIO]
     apart = np.linalg.norm(found[:, None] - one.targets_m, axis=2)
     assert apart.shape == (5, 5)
@@ -85,7 +85,7 @@ def test_blocks_add_what_their_pulses_do(search):
     blocks, echo = search.problem.pairs[1], search.problem.echoes[1][0]
     still = blocks.moves({node: np.zeros((len(search.problem.knots_s), 3)) for node in ("uav1", "uav2")})
     summed = blocks.contribution(echo, still).values
-    whole = block_contributions(blocks.sighting.profiles, echo.patch.pixels_m, edges=blocks.edges)
+    whole = block_contributions(blocks.record.profiles, echo.patch.pixels_m, edges=blocks.edges)
     # Blocks keep each pulse's carrier at the patch's middle, and that of their mean place beside it.
     phase = np.exp(1j * np.angle((summed.conj() * whole).sum(axis=0)))
     error = np.linalg.norm(summed * phase - whole) / np.linalg.norm(whole)
@@ -128,8 +128,10 @@ def test_the_adjoint_of_the_prior_is_its_transpose(drift_m):
 
 
 def test_the_gradient_of_sharpness_is_its_finite_difference(search):
-    problem, begun = search.problem, search.begun
-    sharpness = Sharpness(problem.pairs, begun.cached, begun.tracks, begun.seen, np.ones(len(problem.patches), bool))
+    problem, begun = search.problem, search.initial
+    sharpness = Sharpness(
+        problem.pairs, begun.cached, begun.tracks, begun.statistics, np.ones(len(problem.patches), bool)
+    )
     generator = np.random.default_rng(5)
     at = 0.3 * generator.standard_normal(problem.prior.size)
     gradient = problem.prior.adjoint(sharpness(problem.prior.tracks(at))[1])
@@ -142,8 +144,8 @@ def test_a_shift_of_all_tracks_moves_points_and_blurs_none(search):
     problem = search.problem
     for axis in np.eye(3):
         tracks = {node: np.ones((1, len(problem.knots_s), 3)) * axis for node in problem.prior.nodes}
-        for blocks, patches in zip(problem.pairs, search.begun.cached, strict=True):
-            moved = {node: blocks.average_of(tracks[node]) for node in blocks.sighting.nodes}
+        for blocks, patches in zip(problem.pairs, search.initial.cached, strict=True):
+            moved = {node: blocks.average_of(tracks[node]) for node in blocks.record.nodes}
             for patch in patches:
                 blur_rad, shift_m = effects(patch, moved, np.eye(3))
                 assert np.sqrt((blur_rad**2).sum()) < 0.01 * patch.wavenumber
@@ -152,7 +154,7 @@ def test_a_shift_of_all_tracks_moves_points_and_blurs_none(search):
 
 @pytest.fixture(scope="module")
 def refined(two_centimetres):
-    return refine(two_centimetres.sightings, GRID, FlatGround(0.0), two_centimetres.errors)
+    return refine(two_centimetres.records, GRID, FlatGround(0.0), two_centimetres.errors)
 
 
 @pytest.mark.slow
@@ -181,7 +183,7 @@ def test_refinement_does_not_move_the_image(two_centimetres, refined, search):
 @pytest.mark.slow
 def test_reference_points_put_the_image_where_it_belongs(two_centimetres, refined):
     known = [ReferencePoint(f"corner {number}", tuple(two_centimetres.targets_m[number]), 0.005) for number in range(4)]
-    tied = refine(two_centimetres.sightings, GRID, FlatGround(0.0), two_centimetres.errors, reference_points=known)
+    tied = refine(two_centimetres.records, GRID, FlatGround(0.0), two_centimetres.errors, reference_points=known)
     before, after = (judge(two_centimetres, one.correction) for one in (refined, tied))
     assert after.target_shift_cm < 0.5 * before.target_shift_cm
     assert after.target_shift_cm < 1.5
@@ -192,7 +194,7 @@ def test_reference_points_put_the_image_where_it_belongs(two_centimetres, refine
 @pytest.mark.slow
 def test_a_log_that_states_four_times_its_errors_is_flagged(two_centimetres, refined):
     stated = {node: TrackErrors((0.08,) * 3) for node in two_centimetres.errors}
-    found = refine(two_centimetres.sightings, GRID, FlatGround(0.0), stated)
+    found = refine(two_centimetres.records, GRID, FlatGround(0.0), stated)
     assert "prior_inconsistent" in found.flags
     assert "prior_inconsistent" not in refined.flags
     assert judge(two_centimetres, found.correction).probe_loss_db > -0.5  # and yet focused
@@ -216,11 +218,11 @@ def test_a_wavelength_of_path_over_a_part_of_the_aperture_is_told(two_centimetre
 def test_speckle_is_refused(two_centimetres):
     generator = np.random.default_rng(6)
     noisy = []
-    for one in two_centimetres.sightings:
+    for one in two_centimetres.records:
         shape = one.profiles.samples.shape
         noise = generator.standard_normal((*shape, 2)).astype(np.float32).view(np.complex64)[..., 0]
         noisy.append(replace(one, profiles=replace(one.profiles, samples=noise)))
-    refused = refine(noisy, GRID, FlatGround(0.0), two_centimetres.errors)
-    assert not refused.accepted
-    assert "refinement_too_few_patches" in refused.flags
-    assert not any(moved.any() for moved in refused.correction.moved_m.values())
+    rejected = refine(noisy, GRID, FlatGround(0.0), two_centimetres.errors)
+    assert not rejected.accepted
+    assert "refinement_too_few_patches" in rejected.flags
+    assert not any(moved.any() for moved in rejected.correction.moved_m.values())

@@ -63,7 +63,7 @@ def test_the_true_tracks_lose_nothing_and_the_logs_what_the_theory_says(pairs):
 def test_a_seed_keeps_its_tracks_and_noise_when_pairs_or_scene_change():
     joint, mono = (case("five", "straight", pairs, 0.01, 10, 1) for pairs in ("joint", "mono"))
     other = case("forty", "straight", "mono", 0.02, 10, 1)
-    assert np.array_equal(joint.sightings[0].profiles.samples, mono.sightings[0].profiles.samples)
+    assert np.array_equal(joint.records[0].profiles.samples, mono.records[0].profiles.samples)
     assert np.allclose(other.truth.moved_m["uav1"], 2 * joint.truth.moved_m["uav1"])
     assert not np.array_equal(
         case("five", "straight", "mono", 0.01, 10, 2).truth.moved_m["uav1"], mono.truth.moved_m["uav1"]

@@ -11,15 +11,15 @@ import apertura as ap
 from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
 from apertura.core.scene.looks import Looks
 from apertura.core.scene.terrain import FlatGround
-from apertura.methods.interferometry.comparison import AssumedGround, compared, raised
+from apertura.methods.interferometry.comparison import AssumedGround, form_interferogram, interferogram_flags
 from apertura.methods.interferometry.heights import (
-    Known,
+    KnownHeight,
     Level,
     Unwrapped,
-    contradictions,
+    count_residues,
     level,
-    levelled,
-    placed,
+    place_heights,
+    remove_level,
     unwrap,
 )
 from apertura.methods.interferometry.sensitivity import Sensitivity, sensitivity
@@ -114,7 +114,7 @@ def heights_shown(told):
 
 def parts(rise_m, **changes):
     first, second, told = two_tracks(rise_m, **changes)
-    return compared(first, second, ground_of(told), GRID.tiles(64), window=WINDOW), told
+    return form_interferogram(first, second, ground_of(told), GRID.tiles(64), window=WINDOW), told
 
 
 def independent(count):
@@ -177,8 +177,8 @@ def test_heights_of_a_ramp_lie_within_their_deviation(rise_m):
         place = np.array([east, north]) - told.shift[row, column] * height
         row, column = np.round(GRID.pixel_of(*place)).astype(int)
         phase = told.slope[row, column] * height + told.bend[row, column] * height**2
-        known.append(Known(f"mark {east}", int(row), int(column), float(phase)))
-    found = compared(first, second, ground_of(told, known), GRID.tiles(64), window=WINDOW)
+        known.append(KnownHeight(f"mark {east}", int(row), int(column), float(phase)))
+    found = form_interferogram(first, second, ground_of(told, known), GRID.tiles(64), window=WINDOW)
     wrong = (found.panels["height"] - ramp_m(*np.meshgrid(GRID.x_m, GRID.y_m)))[INSIDE]
     std = found.panels["height_std"][INSIDE]
     there = np.isfinite(wrong)
@@ -188,7 +188,7 @@ def test_heights_of_a_ramp_lie_within_their_deviation(rise_m):
     assert abs(wrong[there].mean()) < 3 * np.median(std[there]) / np.sqrt(independent(there.sum())) + by_level
     assert 0.5 < np.sqrt(np.mean((wrong[there] / std[there]) ** 2)) < 1.2
     assert found.level.points == ("mark -4.0", "mark 4.5")
-    assert raised(found.measured) == {}
+    assert interferogram_flags(found.measured) == {}
 
 
 @pytest.mark.slow
@@ -199,12 +199,12 @@ def test_what_has_changed_between_the_flights_lowers_coherence_and_widens_the_de
     wrong = (changed.panels["height"] - ramp_m(*np.meshgrid(GRID.x_m, GRID.y_m)))[INSIDE]
     wrong -= np.nanmedian(wrong)  # no point of known height
     assert np.sqrt(np.nanmean((wrong / changed.panels["height_std"][INSIDE]) ** 2)) < 1.2
-    assert list(raised(changed.measured)) == ["height_relative"]
+    assert list(interferogram_flags(changed.measured)) == ["height_relative"]
 
 
 def test_another_scene_is_decorrelated_and_tells_no_height():
     found, _ = parts(1.0, common=0.0)
-    assert "interferogram_decorrelated" in raised(found.measured)
+    assert "interferogram_decorrelated" in interferogram_flags(found.measured)
     assert found.measured.coherence == pytest.approx(found.measured.chance, abs=0.05)
     assert np.isfinite(found.panels["height"]).mean() < 0.01
 
@@ -214,7 +214,7 @@ def test_another_scene_is_decorrelated_and_tells_no_height():
 def test_tracks_too_far_apart_are_flagged_and_tell_no_height(rise_m, along_m):
     found, _ = parts(rise_m, along_m=along_m)
     assert found.measured.overlap < 0.05
-    assert "interferogram_decorrelated" in raised(found.measured)
+    assert "interferogram_decorrelated" in interferogram_flags(found.measured)
     assert np.isfinite(found.panels["height"]).mean() < 0.03
 
 
@@ -231,13 +231,13 @@ def test_tracks_too_close_together_tell_no_height():
     found, _ = parts(0.05)
     assert found.measured.coherent == found.measured.common
     assert found.measured.sensitive == 0
-    assert "height_insensitive" in raised(found.measured)
+    assert "height_insensitive" in interferogram_flags(found.measured)
     assert np.isnan(found.panels["height"]).all()
 
 
 def test_a_bright_point_tells_no_height_beside_itself():
     first, second, told = two_tracks(1.0, marked=True)
-    found = compared(first, second, ground_of(told), GRID.tiles(64), window=WINDOW)
+    found = form_interferogram(first, second, ground_of(told), GRID.tiles(64), window=WINDOW)
     wrong = found.panels["height"] - ramp_m(*np.meshgrid(GRID.x_m, GRID.y_m))
     wrong -= np.nanmedian(wrong)
     for east, north in MARKS:
@@ -249,9 +249,9 @@ def test_a_bright_point_tells_no_height_beside_itself():
 
 def test_shadow_and_layover_of_either_image_tell_nothing():
     first, second, told = two_tracks(1.0)
-    plain = np.ones((SIDE, SIDE), bool)
-    plain[:, 60:] = False
-    found = compared(first, second, replace(ground_of(told), plain=plain), GRID.tiles(64), window=WINDOW)
+    visible = np.ones((SIDE, SIDE), bool)
+    visible[:, 60:] = False
+    found = form_interferogram(first, second, replace(ground_of(told), visible=visible), GRID.tiles(64), window=WINDOW)
     assert all(np.isnan(found.panels[name][:, 60:]).all() for name in ("phase", "coherence", "unwrapped"))
     assert found.measured.common == 60 * SIDE
 
@@ -286,25 +286,25 @@ def test_without_the_library_the_phase_stays_within_a_turn_and_says_so(monkeypat
     _, wrapped = ramp_of_phase(0.5)
     told = unwrap(wrapped.astype(np.float32), np.full(wrapped.shape, 0.9, np.float32), looks=9.0)
     np.testing.assert_array_equal(told.phase, wrapped.astype(np.float32))
-    alone = levelled(told, level(told, []))
+    alone = remove_level(told, level(told, []))
     assert np.abs(alone).max() <= np.pi + 1e-6
     found, _ = parts(1.0)
-    flags = raised(replace(found.measured, by="", jumps=told.jumps))
+    flags = interferogram_flags(replace(found.measured, by="", jumps=told.jumps))
     assert "snaphu is not installed" in flags["height_ambiguous"]
-    assert "height_ambiguous" not in raised(replace(found.measured, by="", jumps=0))
+    assert "height_ambiguous" not in interferogram_flags(replace(found.measured, by="", jumps=0))
 
 
 def test_residues_are_where_the_phase_contradicts_itself():
     _, smooth = ramp_of_phase(0.5)
-    assert contradictions(smooth)[0] == 0
+    assert count_residues(smooth)[0] == 0
     row, column = np.mgrid[-30:30, -40:40] + 0.5
     vortex = np.arctan2(row, column)
-    assert contradictions(vortex)[0] == 1
+    assert count_residues(vortex)[0] == 1
     noise = np.random.default_rng(1).uniform(-np.pi, np.pi, (200, 200))
-    residues, loops, _ = contradictions(noise)
+    residues, loops, _ = count_residues(noise)
     assert residues / loops == pytest.approx(1 / 3, abs=0.02)  # of phase that is noise alone
     found, _ = parts(1.0)
-    assert "unwrapping_inconsistent" in raised(replace(found.measured, residues=residues, loops=loops))
+    assert "unwrapping_inconsistent" in interferogram_flags(replace(found.measured, residues=residues, loops=loops))
 
 
 # Section 7: level and place
@@ -314,19 +314,19 @@ def test_heights_of_a_part_apart_are_left_out():
     phase = np.array([[0.1, 0.2, np.nan, 6.0, 6.1, 6.2]], np.float32)
     told = Unwrapped(phase, np.array([[1, 1, 0, 2, 2, 2]], np.uint32), "snaphu", 0, 0, 1)
     assert level(told, []) == Level(6.1, 2)
-    known = [Known("mast", 0, 1, 0.5, measured_rad=0.2), Known("unseen", 0, 2, 0.0)]
+    known = [KnownHeight("mast", 0, 1, 0.5, measured_rad=0.2), KnownHeight("unseen", 0, 2, 0.0)]
     mast = level(told, known)
     assert (mast.part, mast.points, mast.spread_rad) == (1, ("mast",), None)
     assert mast.phase_rad == pytest.approx(-0.3)
-    np.testing.assert_allclose(levelled(told, mast)[0, :2], [0.4, 0.5], atol=1e-6)
-    assert np.isnan(levelled(told, mast)[0, 2:]).all()
+    np.testing.assert_allclose(remove_level(told, mast)[0, :2], [0.4, 0.5], atol=1e-6)
+    assert np.isnan(remove_level(told, mast)[0, 2:]).all()
     assert level(Unwrapped(phase * np.nan, np.zeros((1, 6), np.uint32), "", 0, 0, 0), known) is None
 
 
 def test_a_known_point_takes_the_turns_of_its_neighbours():
     phase = np.full((1, 4), 13.0, np.float32)
     told = Unwrapped(phase, np.ones((1, 4), np.uint32), "snaphu", 0, 0, 1)
-    one = level(told, [Known("mast", 0, 2, 1.0, measured_rad=13.1 - 4 * np.pi)])
+    one = level(told, [KnownHeight("mast", 0, 2, 1.0, measured_rad=13.1 - 4 * np.pi)])
     assert one.phase_rad == pytest.approx(12.1)
 
 
@@ -336,7 +336,7 @@ def test_heights_stand_at_their_own_places():
     shift = np.full((60, 80, 2), [-3.0, 2.0])
     shown = truth / (1 - (0.05 * 2.0 - 0.02 * -3.0))  # h(p) = truth(p + s h(p))
     shown[20:25, 30:35] = np.nan
-    told = placed(np.full((60, 80), 100.0), shown, np.full((60, 80), 0.1), shift)
+    told = place_heights(np.full((60, 80), 100.0), shown, np.full((60, 80), 0.1), shift)
     there = np.isfinite(told.height)
     np.testing.assert_allclose((told.height - 100)[there], truth[there], atol=2e-3)
     assert np.abs(shown - truth)[20, 60] > 0.3  # what would stand there by the pixel
@@ -347,7 +347,7 @@ def test_heights_stand_at_their_own_places():
 
 def test_ground_that_folds_over_is_left_out_and_counted():
     column = np.arange(80.0) + np.zeros((40, 1))
-    told = placed(
+    told = place_heights(
         np.zeros((40, 80)), np.where(column > 40, -1.0, 1.0), np.ones((40, 80)), np.full((40, 80, 2), [0, 10.0])
     )
     assert told.folded > 0

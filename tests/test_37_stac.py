@@ -20,7 +20,7 @@ from apertura.formats.catalog.stac import (
     instant,
     item_of,
     projection,
-    told_by,
+    read_facts,
 )
 from apertura.formats.catalog.validation import document_problem, stac_problems
 from apertura.formats.export.cog import write_slc
@@ -34,7 +34,7 @@ DIGEST = "ab" * 32
 HOSTILE = '<script>alert("x")</script> ../../etc \u202e\n"}'
 
 
-def told():
+def facts():
     return {
         **projection(WKT, (4, 6), PLACE[:6]),
         "sar:instrument_mode": "bistatic",
@@ -54,11 +54,11 @@ def slc(tmp_path_factory):
 
 
 def image(slc, name="a-b", **changes):
-    asset = asset_of(slc, f"../../../f01/{name}/slc.tif", sha256=DIGEST, told=told_by(slc))
+    asset = asset_of(slc, f"../../../f01/{name}/slc.tif", sha256=DIGEST, facts=read_facts(slc))
     inputs = {"raw/codes.npy": DIGEST}
     return Image(**{
         "flight": "f01", "name": name, "title": "a scene", "geometry": SQUARE, "acquisition": FLOWN,
-        "properties": told(), "assets": {"slc": asset}, "inputs": inputs, **changes,
+        "properties": facts(), "assets": {"slc": asset}, "inputs": inputs, **changes,
     })  # fmt: skip
 
 
@@ -67,7 +67,7 @@ def item(slc, **changes):
 
 
 def test_a_raster_says_its_bands_and_inputs(slc):
-    found = told_by(slc)
+    found = read_facts(slc)
     assert found.bands == [
         {"data_type": "cfloat32", "sampling": "area", "spatial_resolution": 0.5, "nodata": "nan", "unit": "1"}
     ]
@@ -78,7 +78,7 @@ def test_a_file_that_is_no_geotiff_is_one_message(tmp_path):
     path = tmp_path / "db.tif"
     path.write_text("no raster")
     with pytest.raises(CampaignError, match=r"db\.tif: cannot be read as GeoTIFF; expected a GeoTIFF of the workflow"):
-        told_by(path)
+        read_facts(path)
 
 
 def test_an_item_declares_and_keeps_every_extension(slc):
@@ -168,7 +168,7 @@ def test_a_link_out_of_the_catalog_is_not_followed(slc, tmp_path):
 
 def test_a_campaign_without_a_place_has_items_without_geometry_and_no_collection(slc, tmp_path):
     local = CRS.from_wkt('LOCAL_CS["yard",UNIT["metre",1],AXIS["Easting",EAST],AXIS["Northing",NORTH]]').to_wkt()
-    properties = {**told(), **projection(local, (4, 6), PLACE[:6])}
+    properties = {**facts(), **projection(local, (4, 6), PLACE[:6])}
     folder = written(tmp_path, [image(slc, geometry=None, properties=properties)])
     assert stac_problems(folder) == []
     (found,) = pystac.Catalog.from_file(folder / CATALOG).get_items(recursive=True)

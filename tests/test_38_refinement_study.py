@@ -72,7 +72,7 @@ def test_a_refused_refinement_leaves_the_loss_of_the_logs_and_an_accepted_one_it
 def test_logs_without_error_are_refined_as_if_they_had_some_and_lose_nothing(monkeypatch):
     stated = []
 
-    def looked_at(sightings, grid, terrain, errors):
+    def looked_at(records, grid, terrain, errors):
         stated.extend(known.std_m for known in errors.values())
         return answer(False, "refinement_rejected")
 
@@ -150,7 +150,7 @@ def test_a_scene_that_is_not_tried_is_answered_with_those_that_are(command):
 
 def linear_path_error(one, place_m):
     """Of the bistatic pair, docs/theory/autofocus.md, eq. 2: the errors of both nodes along u_t - s and u_r + s."""
-    bistatic = one.sightings[1]
+    bistatic = one.records[1]
     to_tx, to_rx, sidelink = (
         leg / np.linalg.norm(leg, axis=1)[:, None]
         for leg in (*(phase - place_m for phase in bistatic.profiles.aperture.legs), bistatic.sidelink_m)

@@ -20,7 +20,7 @@ from apertura.pipeline.config.processing import Processing
 from apertura.pipeline.opening.autofocus import ONE_PHASE, autofocus_of, clock_s, decide_method, open_refined
 from apertura.pipeline.opening.pair import open_pair
 from apertura.pipeline.opening.scene import open_scene
-from apertura.pipeline.opening.sightings import seen
+from apertura.pipeline.opening.sightings import refinement_inputs
 from apertura.pipeline.steps import refine
 from apertura.pipeline.store import open_stage
 from apertura.simulation import ImageGrid, PointTarget, SimulatedFlight, Straight, preset, simulate
@@ -53,13 +53,13 @@ def campaigns(tmp_path_factory):
     """The far campaign: as it was flown, and with logs that err by 2 cm, refined as `auto` does."""
     folder = tmp_path_factory.mktemp("far")
     right = simulate(folder / "right", far_away(), seed=7)
-    mended = copy_writable(right, folder / "mended")
-    for path in sorted((mended / "raw" / "f01").glob("*.track.*")):
+    corrected = copy_writable(right, folder / "mended")
+    for path in sorted((corrected / "raw" / "f01").glob("*.track.*")):
         log = noisy(0.02, seed=3)(read_log(path))
         write_log(path, log if log.attitude_deg is not None else saying(0.02)(log))
-    edit_config(mended, lambda document: [node.update(position_std_m=0.02) for node in document["nodes"].values()])
+    edit_config(corrected, lambda document: [node.update(position_std_m=0.02) for node in document["nodes"].values()])
     state(right, "processing", autofocus="off")
-    return {root.name: run_steps(root, exports=root is mended) for root in (right, mended)}
+    return {root.name: run_steps(root, exports=root is corrected) for root in (right, corrected)}
 
 
 def opened(campaign):
@@ -74,17 +74,17 @@ def opened(campaign):
 @pytest.mark.slow
 @pytest.mark.parametrize("pair", PAIRS)
 def test_images_of_a_far_scene_are_mended_by_one_phase_per_pulse(campaigns, pair):
-    right, mended = (np.abs(image_of(one, pair)).max() for one in campaigns.values())
+    right, corrected = (np.abs(image_of(one, pair)).max() for one in campaigns.values())
     quality = quality_of(campaigns["mended"], pair)
     assert quality["autofocus"]["gain_held_out_db"] > 3
-    assert 20 * np.log10(mended / right) > -0.2
+    assert 20 * np.log10(corrected / right) > -0.2
     assert quality["autofocus"]["accepted"]
     assert quality["autofocus"]["method"].startswith("minimum_entropy: auto: in uav1-uav1 one phase per pulse leaves")
     assert quality["models"]["autofocus_method"] == quality["autofocus"]["method"]
     assert 1 < quality["autofocus"]["further_rms_cm"] < 5
     assert "rms_cm" not in quality["autofocus"]
     assert quality["focus"]["verdict"] == "focused"
-    assert quality["focus"]["expected_db"] == pytest.approx(20 * np.log10(mended / right), abs=0.2)
+    assert quality["focus"]["expected_db"] == pytest.approx(20 * np.log10(corrected / right), abs=0.2)
 
 
 @pytest.mark.slow
@@ -99,9 +99,9 @@ def test_one_phase_leaves_the_image_where_the_logs_have_it(campaigns):
 def test_what_was_found_is_what_images_use(campaigns):
     campaign = campaigns["mended"]
     pairs, scene = opened(campaign)
-    given, track = seen(campaign, pairs, scene), open_refined(campaign, "f01")
-    candidates = Candidates.of(given.sightings, scene.grid, scene.terrain, given.errors)
-    found = refine_one_phase(given.sightings, candidates, given.errors, method=ONE_PHASE)
+    given, track = refinement_inputs(campaign, pairs, scene), open_refined(campaign, "f01")
+    candidates = Candidates.of(given.records, scene.grid, scene.terrain, given.errors)
+    found = refine_one_phase(given.records, candidates, given.errors, method=ONE_PHASE)
     assert track.stage.attrs["pairs"] == list(PAIRS)
     assert not track.stage.correction.values.any()
     for pair, profiles in pairs.items():

@@ -16,13 +16,13 @@ from apertura.core.geometry.phase_centres import TrackCorrection
 from apertura.core.imaging.range_profiles import profiles_of
 from apertura.core.planning.decisions import BORNE_DB, decide_autofocus
 from apertura.core.planning.plan import Decision
-from apertura.methods.autofocus.inputs import Refinement, Sighting
+from apertura.methods.autofocus.inputs import PairRecord, Refinement
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.check import as_line, problems
 from apertura.pipeline.check.stale import stale_results
 from apertura.pipeline.opening.acquisition import open_acquisition
 from apertura.pipeline.opening.autofocus import RefinedTrack, clock_s, open_refined
-from apertura.pipeline.opening.diagnosis import evidence_of, seen_from
+from apertura.pipeline.opening.diagnosis import evidence_of, moved_evidence
 from apertura.pipeline.opening.pair import open_pair
 from apertura.pipeline.opening.results import open_campaign
 from apertura.pipeline.opening.scene import open_scene
@@ -106,15 +106,15 @@ def spoilt(finished_tiny, tmp_path_factory):
 def write_track(campaign, began, correction, *, accepted=True, flags=None):
     """Write the stage that a refinement would, which has found this."""
     opened = open_scene(campaign)
-    sightings = []
+    records = []
     for name in PAIRS:
         pair = open_pair(campaign, "f01", name)
         profiles = profiles_of(open_stage(campaign.stage("profile", "f01", name), "profile"))
-        sightings.append(Sighting(name, profiles, clock_s(pair, began), pair.sidelink_m))
+        records.append(PairRecord(name, profiles, clock_s(pair, began), pair.sidelink_m))
     std_m = {node: np.full_like(moved, 1e-3) for node, moved in correction.moved_m.items()}
     report = {"gain_held_out_db": 3.0, "left_db": -0.05, "left_rad": 0.1, "gauge_shift_m": 0.01}
     found = Refinement(correction, std_m, accepted, "as told", report, flags or {})
-    given = RefinementInputs(tuple(sightings), {}, (), began)
+    given = RefinementInputs(tuple(records), {}, (), began)
     stage = refine.refined_stage(found, FOUND, given, opened)
     save_stage(stamped(stage, "refined_track", modules=[refine.__name__]), campaign.stage("refined_track", "f01"))
 
@@ -159,7 +159,7 @@ def test_hypotheses_begin_where_the_images_do(spoilt):
     for name in PAIRS:
         pair = open_pair(campaign, "f01", name)
         told = evidence_of(logged, name, open_stage(campaign.stage("echo", "f01", name), "echo"), "hann")
-        (moved,) = seen_from(nodes, [told])
+        (moved,) = moved_evidence(nodes, [told])
         imaged = track.pair(pair).history
         assert np.abs(imaged.aperture.tx_m - pair.aperture.tx_m).max() > 0.02
         np.testing.assert_allclose(moved.history.aperture.tx_m, imaged.aperture.tx_m, atol=1e-3)

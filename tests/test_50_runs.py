@@ -14,7 +14,7 @@ from rich.console import Console
 
 from apertura.common.errors import CampaignError
 from apertura.common.processes import hold, holder
-from apertura.common.progress import told_at
+from apertura.common.progress import progress_path
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.resources import Resources
 from apertura.pipeline.runs.journal import JobRecord, JournalReader, RunRecord, failures, note
@@ -165,7 +165,7 @@ def test_a_benchmark_that_makes_no_sense_is_none(finished_tiny, tmp_path, text):
 
 
 def tell(campaign, step, **report):
-    path = campaign.result(*told_at(step))
+    path = campaign.result(*progress_path(step))
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(report))
 
@@ -196,7 +196,7 @@ def test_a_step_that_tells_how_far_it_is_is_believed_over_what_was_expected(tmp_
 def test_a_report_that_makes_no_sense_is_none(tmp_path, finished_tiny, report):
     campaign = Campaign.load(copy_writable(finished_tiny.root, tmp_path / "campaign"))
     job = JobRecord("image", ("image", "f01", "uav1-uav1"), "", 1e9)
-    path = campaign.result(*told_at(job.step))
+    path = campaign.result(*progress_path(job.step))
     path.parent.mkdir(parents=True)
     path.write_text(json.dumps(report))
     assert StepProgress.of(campaign, job) is None

@@ -46,7 +46,7 @@ def test_a_reader_that_has_gone_is_one_message(finished_tiny):
         command = [APERTURA, "summary", finished_tiny.root]
         done = subprocess.run(command, stdout=closed, stderr=subprocess.PIPE, text=True, check=False)
     assert done.returncode == 2
-    assert done.stderr == "error: output: Broken pipe (EPIPE). Whoever read the output has gone.\n"
+    assert done.stderr == "error: output: Broken pipe (EPIPE). The reader of the output has gone.\n"
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")

@@ -11,7 +11,7 @@ from folders import complaint, run_steps
 from apertura.formats.tracks.optitrack import body_position
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.check import problems
-from apertura.pipeline.steps.align import align, keep
+from apertura.pipeline.steps.align import align, write_clock
 from apertura.pipeline.store import open_stage
 from apertura.views.score import score
 
@@ -69,7 +69,7 @@ def test_a_path_that_was_frozen_leaves_only_the_clock_to_be_found(rail_pass):
     (rail_pass / "config/clocks.tsv").unlink()
     campaign = Campaign.load(rail_pass)
     found, stated = align(campaign, "passA", "radar", point=tuple(reflector(rail_pass)), search_m=0.0)
-    keep(campaign, "passA", "radar", offset_s=stated["offset_s"], std_s=found.offset_width_s)
+    write_clock(campaign, "passA", "radar", offset_s=stated["offset_s"], std_s=found.offset_width_s)
     kept, stated_before = Campaign.load(rail_pass).clock("passA", "radar"), 1563913933.0905
     assert kept.offset_ns * 1e-9 == pytest.approx(stated_before, abs=2e-3)
     assert kept.std_s == pytest.approx(found.offset_width_s, abs=1e-6)
@@ -97,7 +97,7 @@ def test_the_rail_pass_is_aligned_by_its_sharpness_alone_within_ten_centimetres(
     (rail_pass / "config/clocks.tsv").unlink()
     campaign = Campaign.load(rail_pass)
     found, stated = align(campaign, "passA", "radar", search_m=6.0)
-    keep(campaign, "passA", "radar", offset_s=stated["offset_s"], std_s=found.offset_width_s)
+    write_clock(campaign, "passA", "radar", offset_s=stated["offset_s"], std_s=found.offset_width_s)
     config = rail_pass / "config/config.yaml"
     config.write_text(config.read_text().replace("radar: 3.8225", f"radar: {stated['path_offset_m']:.4f}"))
     run_steps(rail_pass, exports=False)

@@ -31,17 +31,17 @@ NAMED = ("scene", "geometry", "pairs", "sigma_cm", "snr_db", "seed")
 
 def refined(one: AutofocusCase) -> Refinement:
     """Return what the product makes of a case."""
-    return refine(one.sightings, GRID, FlatGround(0.0), one.errors)
+    return refine(one.records, GRID, FlatGround(0.0), one.errors)
 
 
 def by_speckle(one: AutofocusCase) -> Refinement:
     """Return what ground without points tells."""
-    lasting_s = min(errors.correlation_s for errors in one.errors.values())
-    time_s = one.sightings[0].time_s
-    knots_s = np.arange(time_s[0] + lasting_s / 20, time_s[-1], lasting_s / 10)
+    correlation_s = min(errors.correlation_s for errors in one.errors.values())
+    time_s = one.records[0].time_s
+    knots_s = np.arange(time_s[0] + correlation_s / 20, time_s[-1], correlation_s / 10)
     prior = Prior({node: NodePrior.of(errors, knots_s, np.eye(3)) for node, errors in one.errors.items()})
-    pairs = [Blocks.of(sighting, knots_s) for sighting in one.sightings]
-    found = tiles(one.sightings, GRID, FlatGround(0.0), lasting_s=lasting_s)
+    pairs = [Blocks.of(record, knots_s) for record in one.records]
+    found = tiles(one.records, GRID, FlatGround(0.0), correlation_s=correlation_s)
     return refined_by_speckle(SpeckleTiles.of(pairs, found), prior, knots_s)
 
 
@@ -86,7 +86,7 @@ def row(key: Key, attempt: Callable[[AutofocusCase], Refinement], *, drift_m: fl
         for when, judged in (("before", before), ("after", after))
         for name, value in asdict(judged).items()
     }
-    image_s = image_seconds(one.sightings[0])
+    image_s = image_seconds(one.records[0])
     cost = {"cpu_s": round(seconds, 2), "image_s": round(image_s, 4), "images": round(seconds / image_s, 1)}
     told = {"flags": " ".join(found.flags), "why": found.why, "report": json.dumps(dict(found.report))}
     return {**dict(zip(NAMED, key, strict=True)), **measures, "accepted": found.accepted, **cost, **told}

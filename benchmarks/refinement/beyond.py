@@ -17,7 +17,7 @@ from apertura_research.autofocus.cases import (
     AutofocusCase,
     TargetScene,
     drawn_errors,
-    sighting,
+    record,
 )
 from apertura_research.autofocus.outcomes import judge
 
@@ -54,15 +54,11 @@ def spoilt(flight_name: str, arm_m: float, height_m: float, drift_m: float, seed
     noises = of_noise.spawn(2)
     return AutofocusCase(
         ("forty", flight_name, "joint", SIGMA_M, 10.0, seed),
-        tuple(
-            sighting(pair, flight, truth, lifted, 10.0, one) for pair, one in zip(PAIRS["joint"], noises, strict=True)
-        ),
+        tuple(record(pair, flight, truth, lifted, 10.0, one) for pair, one in zip(PAIRS["joint"], noises, strict=True)),
         dict.fromkeys(NODES, TrackErrors((SIGMA_M,) * 3, drift_std_m=drift_m)),
         truth,
         lifted.position_m[lifted.targets] * [1, 1, 0],
-        tuple(
-            sighting(pair, flight, truth, probes, None, one) for pair, one in zip(PAIRS["joint"], noises, strict=True)
-        ),
+        tuple(record(pair, flight, truth, probes, None, one) for pair, one in zip(PAIRS["joint"], noises, strict=True)),
         flight.reach_m,
     )
 
@@ -73,7 +69,7 @@ def main() -> None:
             rows = []
             for seed in range(300, 302 if flight_name == "circle" else 305):
                 one = spoilt(flight_name, arm_m, height_m, drift_m, seed)
-                found = refine(one.sightings, GRID, FlatGround(0.0), one.errors)
+                found = refine(one.records, GRID, FlatGround(0.0), one.errors)
                 before, after = judge(one), judge(one, found.correction)
                 rows.append(
                     (

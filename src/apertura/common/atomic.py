@@ -16,7 +16,8 @@ def replacement(path: Path) -> Iterator[Path]:
     """Yield where to write a file or folder; it becomes `path` when the body ends without an error.
 
     The work folder, ``.<name>.wip``, may hold whatever else the body needs on disk. A second writer of the same path
-    waits: a kernel lock, which dies with its process, keeps it out. What a killed writer left is cleared by the next.
+    waits: a kernel lock, which dies with its process, keeps it out. Leftovers of a killed writer are removed by the
+    next.
 
     Parameters
     ----------
@@ -116,7 +117,7 @@ def date(paths: Iterable[Path], *, earliest_ns: int, latest_ns: int) -> None:
 
 
 def remove(path: Path) -> None:
-    """Remove a file, or a folder with all that is in it, if there is one; what a link points to stays."""
+    """Remove a file, or a folder with its contents, if there is one; targets of links stay."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path)
     else:
@@ -125,7 +126,7 @@ def remove(path: Path) -> None:
 
 @contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Let an `OSError` of the body say which file it is about: that of a write does not know.
+    """Add the path to an `OSError` of the body: that of a write lacks it.
 
     Examples
     --------
@@ -143,7 +144,7 @@ def naming(path: Path) -> Iterator[None]:
 
 
 def _synchronise(path: Path) -> None:
-    if path.is_symlink():  # none of ours, nor what it leads to
+    if path.is_symlink():  # not written by us, nor is its target
         return
     descriptor = os.open(path, os.O_RDONLY)
     with naming(path):

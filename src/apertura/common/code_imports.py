@@ -1,4 +1,4 @@
-"""Which code a module can run: the modules that it imports, however deep, and what of their text is run.
+"""Code that a module can run: its import closure, and the source of these modules without descriptions.
 
 An import counts wherever it stands, also inside a function. What only describes code, comments and docstrings, does not
 count, nor do modules that decide no value of a result (`WITHOUT_EFFECT`).
@@ -14,7 +14,7 @@ from pathlib import Path
 PACKAGE = Path(__file__).parents[1]
 
 WITHOUT_EFFECT = (
-    "apertura.common.errors",  # what a message says: a step that raised one has no result
+    "apertura.common.errors",  # texts of messages: a step that raised one has no result
     "apertura.common.flag_table",  # what pages say of a flag
     "apertura.common.progress",  # lines of a log
     "apertura.common.processes",  # where a process may look for code, and how it ends
@@ -23,7 +23,7 @@ WITHOUT_EFFECT = (
     "apertura.pipeline.rule_inputs",
     "apertura.pipeline.digests",  # their hashes
 )
-"""Modules, and those below them, that no result's code hash holds: nothing that they compute is in a result."""
+"""Modules, with those below them, excluded from code hashes: nothing that they compute is in a result."""
 
 _IMPORT = re.compile(r"^[ \t]*(?:from[ \t]+([\w.]+)[ \t]+import[ \t]+(\([^)]*\)|.*)|import[ \t]+(.*))$", re.MULTILINE)
 _NAME = re.compile(r"[\w.]+")

@@ -1,4 +1,4 @@
-"""What each stage holds: dimensions, dtype and unit of every variable, and what is written beside it."""
+"""Contracts of the stages: dimensions, dtype and unit of every variable, and required attributes."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
 
-# ---- What stage `cube` holds, a row each: name → dimensions, dtype, unit, meaning; see `contracts` -----------------
+# ---- Variables of stage `cube`: name → dimensions, dtype, unit, meaning ---------------------------------------------
 
 _RASTERS, _SUMS, _IMAGES = ("flight", "pair", "y", "x"), ("flight", "y", "x"), ("flight", "pair")
 
@@ -68,7 +68,7 @@ QUOTED: dict[str, Row] = {
     "verdict": (_IMAGES, "T", "", "focus: focused, defocused or cannot tell; empty: not flown"),
     "flags": (_IMAGES, "T", "", "names of the image's flags, with commas between"),
 }
-"""What each image says of itself; NaN where it does not."""
+"""Quality of each image; NaN where not measured."""
 
 COORDINATES: dict[str, Row] = {
     "flight": (("flight",), "T", "", "name of the flight"),
@@ -79,7 +79,7 @@ COORDINATES: dict[str, Row] = {
 }
 
 
-# ---- What each stage holds: dimensions, dtype and unit of every variable, and what is written beside it ------------
+# ---- Contracts of all stages ----------------------------------------------------------------------------------------
 #
 # Stages are nouns and data flows one way: raw → echo → profile → image → cube → files; `track` joins at echo. `check`
 # refuses a dataset that breaks its contract.
@@ -100,7 +100,7 @@ class Variable:
 
 @dataclass(frozen=True)
 class Stage:
-    """One station of the road: its arrays, the attributes that must stand beside them, and arrays that may."""
+    """Contract of a stage: its arrays, required attributes, and optional arrays."""
 
     variables: Mapping[str, Variable]
     attributes: Mapping[str, str]

@@ -1,4 +1,4 @@
-"""From a file of others to text, a document or a validated value, or to the one message that says what is wrong."""
+"""Untrusted files read as text, as a document, or as a validated value; any error is one message."""
 
 import difflib
 import json
@@ -14,7 +14,7 @@ from pydantic_core import ArgsKwargs
 
 from apertura.common.errors import CampaignError, quoted
 
-# ---- From a stranger's file to text or to a document, or to the one message that says what is wrong ----------------
+# ---- Text, YAML and JSON of untrusted files -------------------------------------------------------------------------
 #
 # Nothing that a file holds is trusted: sizes, depths and aliases are counted before anything is built of them.
 
@@ -47,7 +47,7 @@ def read_text(path: Path, *, expected: str, remedy: str, largest: int) -> str:
     path
         The file.
     expected, remedy
-        What the message says where there is no such file.
+        Remedy of the message where there is no such file.
     largest
         Bytes that it may have.
 
@@ -79,7 +79,7 @@ def read_yaml(path: Path, *, expected: str, remedy: str) -> object:
     path
         The file.
     expected, remedy
-        What the message says where there is no such file.
+        Remedy of the message where there is no such file.
 
     Raises
     ------
@@ -140,7 +140,7 @@ def _count_nodes(text: str) -> None:
 
 
 def _check_nodes(root: yaml.Node) -> None:
-    """Raise YAMLError where a key stands twice, a tag asks for more than plain values, or a number is endless."""
+    """Raise YAMLError at a repeated key, a tag beyond plain values, or an infinite number."""
     seen, waiting = set[int](), [root]
     while waiting:
         node = waiting.pop()
@@ -172,7 +172,7 @@ def read_json(path: Path, *, expected: str, remedy: str, largest: int = LARGEST_
     path
         The file.
     expected, remedy
-        What the message says where there is no such file.
+        Remedy of the message where there is no such file.
     largest
         Bytes that it may have.
 
@@ -251,7 +251,7 @@ def other_codec(metadata: object) -> str | None:
     return None
 
 
-# ---- From a document to a validated value, or to the one message that says all that is wrong with it ---------------
+# ---- Validation of documents by models ------------------------------------------------------------------------------
 
 T = TypeVar("T")
 
@@ -261,7 +261,7 @@ _TYPE = r"(constrained-\w+|literal\[.*|function-.*|tuple\[.*|bool|int|float|str)
 _MOST_COMPLAINTS = 12
 
 LARGEST_NUMBER = 1e15
-"""No length, time, frequency or count of ours is larger; beyond, sums lose what is added to them."""
+"""Largest length, time, frequency or count accepted: beyond, sums in float64 lose their addends."""
 
 
 def validated(model: type[T], document: object, *, where: object, expected: str) -> T:
@@ -321,7 +321,7 @@ def _complaints(error: ValidationError, schema: dict[str, Any]) -> str:
 
 
 def _complaint(item: dict[str, Any], schema: dict[str, Any]) -> tuple[str, str]:
-    """Return the key and what is wrong with it; the names of alternative types are no keys."""
+    """Return a key and its error; names of alternative types are no keys."""
     tags = _collected(schema, lambda part: part.get("discriminator", {}).get("mapping", {}))
     location = [str(part) for part in item["loc"] if not (re.match(_TYPE, str(part)) or part in tags)]
     key = ".".join(location) or "the whole file"

@@ -1,4 +1,4 @@
-"""The errors a user can cause, and what each must say; and those of a machine that is full, closed or broken."""
+"""Errors that a user can cause, and those of a full, read-only or broken machine."""
 
 import errno
 import os
@@ -22,12 +22,12 @@ _REMEDIES = {
     errno.EISDIR: "Move away the folder that stands where a file should be",
     errno.ENOTEMPTY: "Move away what stands there",
     errno.ENAMETOOLONG: "Give flights and nodes shorter names",
-    errno.EPIPE: "Whoever read the output has gone",
+    errno.EPIPE: "The reader of the output has gone",
 }
-"""Error number of the system → what a person can do about it."""
+"""Error number of the system → remedy."""
 
 _LONGEST = {"where": 400, "found": 1000, "expected": 1000, "remedy": 400}
-"""Characters of each part of a message; what a stranger's file holds may be of any length."""
+"""Characters of each part of a message; text of untrusted files may be of any length."""
 
 
 def shown(text: object, longest: int = 80) -> str:
@@ -71,7 +71,7 @@ def quoted(value: object, longest: int = 80) -> str:
 class CampaignError(ValueError):
     """Something in the campaign folder is wrong and a person has to change it.
 
-    What it says may quote a stranger's file: it is one line without control characters, and of bounded length.
+    It may quote an untrusted file: it is one line without control characters, of bounded length.
 
     Parameters
     ----------
@@ -122,7 +122,7 @@ def explained(error: BaseException) -> str | None:
     Returns
     -------
     str or None
-        What it was, where, how much is free there and what to do; None for any other error, a defect of the product.
+        Message with path, free space and remedy; None for any other error, a defect of the product.
 
     Examples
     --------
@@ -154,8 +154,8 @@ def _error_number(error: BaseException) -> int | None:
     if isinstance(error, OSError) and error.errno is not None:
         return error.errno if error.errno in _REMEDIES else None
     if isinstance(error, OSError) or type(error).__module__.startswith("rasterio"):
-        told = f"{error} {error.__cause__ or error.__context__ or ''}"
-        return next((number for number in _REMEDIES if os.strerror(number) in told), None)
+        text = f"{error} {error.__cause__ or error.__context__ or ''}"
+        return next((number for number in _REMEDIES if os.strerror(number) in text), None)
     return None
 
 

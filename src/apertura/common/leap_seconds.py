@@ -1,4 +1,4 @@
-"""Leap seconds: by how much GPS time is ahead of UTC, and UTC of what a GPS receiver counts."""
+"""Leap seconds: offset of GPS time against UTC, and conversions between both."""
 
 import logging
 
@@ -30,7 +30,7 @@ _LOG = logging.getLogger(__name__)
 
 
 def gps_ahead_s(time_utc: Times | np.datetime64) -> NDArray[np.int64]:
-    """Return by how many seconds GPS time is ahead of UTC.
+    """Return the seconds by which GPS time is ahead of UTC.
 
     Parameters
     ----------
@@ -40,7 +40,7 @@ def gps_ahead_s(time_utc: Times | np.datetime64) -> NDArray[np.int64]:
     Returns
     -------
     ndarray
-        Of the same shape, int64, s. After `KNOWN_UNTIL` it is what it was then; a notice says so.
+        Of the same shape, int64, s. After `KNOWN_UNTIL` it stays constant, with a notice.
 
     Raises
     ------
@@ -92,7 +92,7 @@ def utc_from_gps(time_gps: Times) -> Times:
     Returns
     -------
     ndarray
-        Of the same shape, datetime64[ns]. After `KNOWN_UNTIL` no further leap second is assumed; a notice says so.
+        Of the same shape, datetime64[ns]. After `KNOWN_UNTIL` no further leap second is assumed; with a notice.
 
     Raises
     ------
@@ -127,7 +127,7 @@ def gps_from_weeks(week: NDArray[np.int64], milliseconds: NDArray[np.int64]) -> 
 
 
 def _check(time: Times | np.datetime64) -> None:
-    """Raise ValueError of a time before GPS time began; tell of one that the table may not hold for."""
+    """Raise ValueError of a time before GPS time began; warn of one after the table's end."""
     if np.any(~(time >= GPS_EPOCH)):
         raise ValueError("a time before 1980-01-06, where GPS time begins")
     if np.any(time >= KNOWN_UNTIL):

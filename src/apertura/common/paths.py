@@ -1,4 +1,4 @@
-"""Where a name that a stranger's file gives may lead: to a file inside the folder, through no link."""
+"""Untrusted names of files: resolved inside the folder only, through no link."""
 
 from pathlib import Path
 

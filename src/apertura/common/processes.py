@@ -16,7 +16,7 @@ from typing import IO
 
 from apertura.common.errors import CampaignError, shown
 
-# ---- How a command ends: signals that close what is open, and a status that the run around it hears of -------------
+# ---- End of a command: signals, and the exit status for the run around it -------------------------------------------
 
 INTERRUPTED = 130
 STATUS_FILE = "APERTURA_STATUS_FILE"
@@ -26,14 +26,14 @@ _ENDING = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 
 
 class Interrupted(SystemExit):
-    """A signal asked this process to end."""
+    """The process was ended by a signal."""
 
 
 def leave_status(status: int) -> None:
-    """Tell the run that this step belongs to, if any, how the step ended."""
+    """Write the exit status of a step for the run that it belongs to, if any."""
     if STATUS_FILE in os.environ and status:
-        with suppress(OSError), Path(os.environ[STATUS_FILE]).open("a", encoding="utf-8") as said:  # on another node
-            said.write(f"{status}\n")
+        with suppress(OSError), Path(os.environ[STATUS_FILE]).open("a", encoding="utf-8") as file:  # on another node
+            file.write(f"{status}\n")
 
 
 @contextmanager
@@ -53,8 +53,7 @@ def ended_by_signals() -> Iterator[None]:
             signal.signal(number, handler)
 
 
-# ---- What a process does before it works for a stranger's folder: it leaves that folder, and so do all that it
-# starts
+# ---- Isolation from an untrusted working folder ---------------------------------------------------------------------
 #
 # Python and libraries take modules and settings from the working folder (``yaml.py``, numba's ``.numba_config.yaml``
 # with its cache of pickled code, ``matplotlibrc``). Commands are typed in campaign folders, and Snakemake starts
@@ -68,7 +67,7 @@ _left: list[Path] = []
 
 
 def leave_working_folder() -> None:
-    """Make the package's own folder the working folder, and `isolate`; what was typed is then found by `given`.
+    """Make the package's own folder the working folder, and `isolate`; typed paths are then resolved by `given`.
 
     Raises
     ------
@@ -81,7 +80,7 @@ def leave_working_folder() -> None:
 
 
 def isolate() -> None:
-    """See to it that nothing is imported or started from a working folder: not here, not by any process started here.
+    """Prevent imports and commands from the working folder, in this process and in those that it starts.
 
     Empty and relative entries of PATH, PYTHONPATH and ``sys.path`` mean whatever folder is the working one: Snakemake
     adds ``.snakemake/pip-deployments`` itself.
@@ -131,14 +130,14 @@ def as_typed(text: object) -> str:
     return str(text) if folder == os.sep else re.sub(rf"(?<![\w./-]){re.escape(folder)}{os.sep}", "", str(text))
 
 
-# ---- One run of a campaign at a time: a kernel lock that dies with its process, and says who holds it --------------
+# ---- Lock of a campaign: one run at a time, released with its process -----------------------------------------------
 
 _LOCK = Path("results/.run.lock")
 _TRIES, _BETWEEN_S = 20, 0.02
 
 
 def hold(root: Path) -> IO[str]:
-    """Hold a campaign folder until the file returned is closed, or its process ends.
+    """Lock a campaign folder until the returned file is closed, or its process ends.
 
     Raises
     ------
@@ -160,10 +159,10 @@ def hold(root: Path) -> IO[str]:
     try:
         _take(lock)
     except BlockingIOError:
-        held = _said(lock)
+        holder = _read_holder(lock)
         lock.close()
         raise CampaignError(
-            f"another run holds this campaign: {held}",
+            f"another run holds this campaign: {holder}",
             where=root,
             expected="one run at a time",
             remedy="Wait until it ends, or end it.",
@@ -175,7 +174,7 @@ def hold(root: Path) -> IO[str]:
 
 
 def holder(root: Path) -> str | None:
-    """Return who holds a campaign folder: process, machine, since when; None if nobody does.
+    """Return the holder of a campaign's lock: process, machine, start; None if it is free.
 
     Examples
     --------
@@ -189,14 +188,14 @@ def holder(root: Path) -> str | None:
             try:
                 fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
             except BlockingIOError:
-                return _said(lock)
+                return _read_holder(lock)
     except FileNotFoundError:
         pass
     return None
 
 
 def _take(lock: IO[str]) -> None:
-    """Take the lock; whoever only asks who holds it has it for an instant, and is waited for."""
+    """Take the lock; wait for `holder`, which has it for an instant."""
     for attempt in range(_TRIES):
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -207,6 +206,6 @@ def _take(lock: IO[str]) -> None:
             time.sleep(_BETWEEN_S)
 
 
-def _said(lock: IO[str]) -> str:
+def _read_holder(lock: IO[str]) -> str:
     lock.seek(0)
     return shown(lock.read(200).strip() or "one that has just begun", 200)

@@ -1,4 +1,4 @@
-"""How far a step is: a small file in the campaign folder that the run around it, and `apertura status`, look at."""
+"""Progress of a step: a small file in the campaign folder, read by the run and by `apertura status`."""
 
 import json
 import threading
@@ -8,15 +8,15 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 RUN = ".run"
-"""Folder of the results: what a run keeps of itself, its journal and a file for each step under way."""
+"""Folder of the results: journal of a run, and a progress file for each running step."""
 
 _BETWEEN_S = 1.0
-_told_in: list[Path] = []
-"""Where this process tells; empty where it is no step of a campaign."""
+_files: list[Path] = []
+"""Progress file of this process; empty outside a step of a campaign."""
 
 
-def told_at(step: Sequence[str]) -> tuple[str, ...]:
-    """Return where below the results a step tells how far it is.
+def progress_path(step: Sequence[str]) -> tuple[str, ...]:
+    """Return the progress file of a step, as parts of a path below the results.
 
     Parameters
     ----------
@@ -25,7 +25,7 @@ def told_at(step: Sequence[str]) -> tuple[str, ...]:
 
     Examples
     --------
-    >>> print(*told_at(["image", "f01", "uav1-uav2"]), sep="/")
+    >>> print(*progress_path(["image", "f01", "uav1-uav2"]), sep="/")
     .run/steps/image/f01/uav1-uav2.json
     """
     *folders, name = step
@@ -33,25 +33,25 @@ def told_at(step: Sequence[str]) -> tuple[str, ...]:
 
 
 @contextmanager
-def telling(file: Path) -> Iterator[None]:
-    """Tell in `file` what `progress` reports meanwhile; it goes when the step ends."""
-    _told_in.append(file)
+def reporting_to(file: Path) -> Iterator[None]:
+    """Write the progress reported in the body to `file`; remove it at the end."""
+    _files.append(file)
     try:
         yield
     finally:
-        _told_in.remove(file)
+        _files.remove(file)
         with suppress(OSError):
             file.unlink(missing_ok=True)
 
 
 @contextmanager
 def progress(what: str, total: int) -> Iterator[Callable[[int], None]]:
-    """Tell how much of a step's work is done, at most once a second; nothing where nobody asked (`telling`).
+    """Report how much of a step's work is done, at most once a second; nothing outside `reporting_to`.
 
     Parameters
     ----------
     what
-        Of which work is counted: ``tiles``, ``pulses``.
+        Unit of work: ``tiles``, ``pulses``.
     total
         How many there are.
 
@@ -63,30 +63,30 @@ def progress(what: str, total: int) -> Iterator[Callable[[int], None]]:
     Examples
     --------
     >>> from tempfile import TemporaryDirectory
-    >>> with TemporaryDirectory() as folder, telling(Path(folder, "image.json")), progress("tiles", 8) as done:
+    >>> with TemporaryDirectory() as folder, reporting_to(Path(folder, "image.json")), progress("tiles", 8) as done:
     ...     done(2)
     ...     print(Path(folder, "image.json").read_text())
     {"what": "tiles", "done": 0, "total": 8, "since": ..., "at": ...}
     """
-    lock, finished, told_s, since_s = threading.Lock(), 0, time.monotonic(), round(time.time(), 1)
+    lock, finished, written_s, since_s = threading.Lock(), 0, time.monotonic(), round(time.time(), 1)
 
     def done(more: int) -> None:
-        nonlocal finished, told_s
+        nonlocal finished, written_s
         with lock:
             finished += more
-            if (now := time.monotonic()) - told_s >= _BETWEEN_S:
-                told_s = now
-                _tell(what, finished, total, since_s)
+            if (now := time.monotonic()) - written_s >= _BETWEEN_S:
+                written_s = now
+                _write(what, finished, total, since_s)
 
-    _tell(what, 0, total, since_s)
+    _write(what, 0, total, since_s)
     yield done
-    _tell(what, finished, total, since_s)
+    _write(what, finished, total, since_s)
 
 
-def _tell(what: str, done: int, total: int, since_s: float) -> None:
-    """Write the file anew, whole at any instant; what only shows how far a step is never ends it."""
+def _write(what: str, done: int, total: int, since_s: float) -> None:
+    """Replace the file atomically; a failure to report never ends a step."""
     report = {"what": what, "done": done, "total": total, "since": since_s, "at": round(time.time(), 1)}
-    for file in _told_in[-1:]:
+    for file in _files[-1:]:
         beside = file.with_suffix(".partial")
         with suppress(OSError):
             file.parent.mkdir(parents=True, exist_ok=True)

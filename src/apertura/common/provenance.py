@@ -1,4 +1,4 @@
-"""Where a product comes from: settings, inputs, code, and the versions it was made with, of all stages before it."""
+"""Provenance of a product: settings, inputs, code and versions of software, of all stages before it."""
 
 import hashlib
 import json
@@ -15,7 +15,7 @@ from apertura import __version__
 from apertura.common.code_imports import PACKAGE, built_from, import_closure, without_description
 from apertura.common.paths import shipped
 
-# ---- What results are made with: versions of what apertura stands on, and the lock they may have come from ---------
+# ---- Versions of the software and its lock file ---------------------------------------------------------------------
 
 _NAME = re.compile(r"[\w.-]+")
 
@@ -75,13 +75,13 @@ def lock_sha256() -> str:
     return sha256_file(shipped() / "requirements" / "all.txt")
 
 
-# ---- Where a product comes from: settings, inputs and code, its own and those of the stages before it --------------
+# ---- Settings, inputs and code of a result and of the stages before it ----------------------------------------------
 
 _READ_BYTES = 1 << 20
 
 
 class StampedStage(Protocol):
-    """What `apertura.pipeline.steps.stamping.stamp` has stamped: its attributes say where it comes from."""
+    """A dataset stamped by `apertura.pipeline.steps.stamping.stamp`: its attributes state its provenance."""
 
     @property
     def attrs(self) -> Mapping[str, Any]: ...  # noqa: D102
@@ -89,7 +89,7 @@ class StampedStage(Protocol):
 
 @dataclass(frozen=True)
 class Provenance:
-    """Where a stage or a file comes from.
+    """Provenance of a stage or a file.
 
     Attributes
     ----------
@@ -118,7 +118,7 @@ class Provenance:
         inputs: Mapping[str, str] | None = None,
         software: Mapping[str, str] | None = None,
     ) -> "Provenance":
-        """Return what is inherited from `parents`, with what comes new.
+        """Return the provenance of `parents` joined with the new one.
 
         Parameters
         ----------
@@ -128,7 +128,7 @@ class Provenance:
             Stages of one line, whose settings agree; or name → stage of several lines, such as the pairs of a flight,
             whose settings are kept apart under their names.
         settings, inputs
-            What of the config mattered, and role → sha256 of files read, now.
+            Settings used, and role → sha256 of files read, of this stage alone.
         software
             Name → version of what runs now.
 
@@ -248,7 +248,7 @@ def code_sha256(*modules: str, package: Path = PACKAGE) -> str:
 
 
 def chained_sha256(own: str, parents: Iterable[str]) -> str:
-    """Return one hash for a stage's own code and the chains of the stages it stands on."""
+    """Return one hash for a stage's own code and the chains of the stages before it."""
     return hashlib.sha256("\n".join([own, *sorted(parents)]).encode()).hexdigest()
 
 

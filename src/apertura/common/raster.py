@@ -1,4 +1,4 @@
-"""The one place where rasters of strangers are opened: as GeoTIFF and nothing else, without the files beside it.
+"""Untrusted rasters, opened as GeoTIFF and nothing else, without sidecar files.
 
 GDAL would otherwise choose a driver by content: a VRT or WMS document named .tif reads other files and the network, and
 a file beside a raster changes its heights or its place.
@@ -21,7 +21,7 @@ ISOLATED = {
     "GDAL_HTTP_MAX_RETRY": "0",
     "PROJ_NETWORK": "OFF",
 }
-"""Settings of GDAL under which a stranger's raster is opened and read."""
+"""Settings of GDAL under which an untrusted raster is opened and read."""
 
 LARGEST_BLOCK = 100_000_000
 """Values of one block or strip of a raster: GDAL allocates it whole before it is decompressed."""

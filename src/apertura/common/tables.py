@@ -26,7 +26,7 @@ def write_table(path: Path, rows: Iterable[Any], *, digits: int | None = None) -
     rows
         At least one dataclass instance or mapping, all with the columns of the first.
     digits
-        Significant digits of floats; None: as many as tell them apart.
+        Significant digits of floats; None: as many as distinguish them.
     """
     records = [_record(row, digits) for row in rows]
     with replacement(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as stream:

@@ -78,7 +78,7 @@ def write_recording(
     stem
         raw/<flight>/<node>; the file name is the node's name.
     blocks
-        (sample, channel, 2), I and Q of a dtype of `DATATYPES`, in order; never held all at once.
+        (sample, channel, 2), I and Q of a dtype of `DATATYPES`, in order; never all in memory at once.
     captures
         Of each trigger the first sample, the node's own UTC tag (datetime64, written to its unit) and the frame
         number sent, if any.

@@ -49,7 +49,7 @@ class UnreadableError(ValueError):
 def read_isolated(
     function: str, paths: Sequence[Path], *, seconds: float | None = None, memory_bytes: int | None = None
 ) -> list[dict[str, NDArray[Any]]]:
-    """Return what a reader makes of each file, in one process for all.
+    """Return the result of a reader for each file, in one process for all.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ def read_isolated(
     Raises
     ------
     UnreadableError
-        If the function refuses a file, or the process dies, takes too long or asks for too much memory.
+        If the function rejects a file, or the process dies, takes too long or needs too much memory.
     """
     sizes = [path.stat().st_size for path in paths]
     seconds = SECONDS + SECONDS_PER_BYTE * sum(sizes) if seconds is None else seconds
@@ -96,11 +96,11 @@ def read_isolated(
         return [_read(folder, number) for number in range(len(paths))]
 
 
-def _ended(status: int, said: bytes) -> str:
+def _ended(status: int, stderr: bytes) -> str:
     """Return what became of the process; empty if all is well."""
     if status < 0:
         return f"its reader died of {signal.Signals(-status).name}"
-    lines = said.decode("utf-8", errors="replace").strip().splitlines()
+    lines = stderr.decode("utf-8", errors="replace").strip().splitlines()
     return "" if status == 0 else shown(lines[-1] if lines else f"its reader ended with status {status}", 300)
 
 

@@ -1,6 +1,6 @@
 """Names of recorders, flight logs and phase histories: which file is of which format, and which function reads it.
 
-Rows name their readers and import none: who asks what a file is called pays for no format, and the code hash of a
+Rows name their readers and import none: looking up a file's name loads no format, and the code hash of a
 result (`apertura.pipeline.lineage`) holds the readers of its own campaign alone. To add a format: one file with
 its reader, one row here.
 """
@@ -63,7 +63,7 @@ class HistoryFormat(NamedTuple):
     described: bool = False
     """Whether the reader also takes described=, the section `waveform` of the config."""
     frame: str = ""
-    """Of its positions, local or ecef; empty: the files say, or a flight log."""
+    """Of its positions, local or ecef; empty: stated by the files or a flight log."""
     waveform: str = "phase_history"
     """waveform.kind that it belongs to."""
     beside: str = ""
@@ -119,7 +119,7 @@ def recording_files(folder: Path, node: str) -> tuple[Path, ...]:
 
 
 def log_format(path: Path, options: LogOptions = AS_IT_SAYS) -> str:
-    """Return which row of `TRACKS` reads a log: the one asked for, else by suffix and heading.
+    """Return which row of `TRACKS` reads a log: the requested one, else by suffix and heading.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Arrays in .npy files that a stranger wrote: the header is checked before anything is allocated."""
+"""Arrays in untrusted .npy files: the header is checked before anything is allocated."""
 
 from pathlib import Path
 from typing import Any

@@ -59,7 +59,7 @@ def read_phase_history(
     pair
         Transmitter-receiver.
     described
-        What the config says of the waveform, for formats that do not say it.
+        The waveform of the config, for formats that do not state it.
     """
     row = PHASE_HISTORIES[kind]
     further = {"described": described} if row.described else {}

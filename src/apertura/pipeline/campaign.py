@@ -1,4 +1,4 @@
-"""A campaign folder as one value: its settings, its flights, and where everything in it lies."""
+"""A campaign folder as one value: settings, flights and paths."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -63,7 +63,7 @@ class Campaign(RawFolder):
 
     @cached_property
     def values(self) -> dict[str, Any]:
-        """The settings as JSON values, but for those that say where to compute and change no result."""
+        """The settings as JSON values, without those that only state where to compute."""
         return self.settings.model_dump(mode="json", exclude={"processing": {"scheduler"}})
 
     @property
@@ -95,7 +95,7 @@ class Campaign(RawFolder):
 
     @property
     def sent_file(self) -> Path:
-        """The file of what was transmitted: code symbols, or the samples of a pulse."""
+        """The file of the transmitted signal: code symbols, or the samples of a pulse."""
         key = getattr(self.settings.waveform, "file_key", "")
         return self.file(getattr(self.settings.waveform, key, ""), f"waveform.{key}")
 
@@ -136,11 +136,11 @@ class Campaign(RawFolder):
         return own
 
     def clock(self, flight: str, node: str) -> ClockRow:
-        """Return how a node's recorder stands to its log in a flight."""
+        """Return the clock of a node's recorder against its log in a flight."""
         return self._clocks.get((flight, node), ClockRow(flight, node))
 
     def node(self, flight: str, node: str) -> Node:
-        """Return the settings of a node as they hold in a flight: what clocks.tsv says of its tags goes first."""
+        """Return the settings of a node in a flight; clocks.tsv overrides its stated time tags."""
         stated, std_s = self.settings.nodes[node], self.clock(flight, node).std_s
         return stated if std_s is None else stated.model_copy(update={"time_tag_std_s": std_s})
 

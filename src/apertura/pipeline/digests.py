@@ -1,4 +1,4 @@
-"""What results are made from: hashes of a campaign's files, taken once per state of a file, and compared later.
+"""Hashes of the source files of results, computed once per state of a file.
 
 A file's state is its size, inode, and times of content and of inode: `cp -p` and `rsync -a` set the former time back,
 none sets the latter. A hash is kept under that state in ``results/.hashes``, so that nothing large is read twice.
@@ -67,7 +67,7 @@ def digest_of(
 
 @dataclass(frozen=True)
 class Sources:
-    """Files of a campaign as a step finds them.
+    """Source files of a step with their hashes and states.
 
     Attributes
     ----------
@@ -140,16 +140,16 @@ def _code_sha256(modules: tuple[str, ...]) -> str:
 
 @dataclass(frozen=True)
 class Result:
-    """What one rule writes.
+    """Result of one rule.
 
     Attributes
     ----------
     manifest
         Its manifest, relative to the campaign folder.
     sources
-        What it is made from: files, and manifests of other results, relative to the campaign folder.
+        Its sources: files, and manifests of other results, relative to the campaign folder.
     settings
-        What of the config matters to it.
+        Settings of the config that affect it.
     modules
         Modules whose import closure is the code that makes it, as `apertura.pipeline.lineage.result_of` returns them.
     """
@@ -170,13 +170,13 @@ class Result:
         return _code_sha256(self.modules)
 
     def begin(self, root: Path, *, further: Sequence[str] = ()) -> "Lineage":
-        """Hash what it is made from, and `further` files that reading it names."""
+        """Hash its sources, and `further` files that these name."""
         return Lineage(self, Sources.of(root, (*self.sources, *further)))
 
 
 @dataclass(frozen=True)
 class Lineage:
-    """A result that is being made, and its sources as they were found."""
+    """A result in the making, and its sources with their hashes at the start."""
 
     result: Result
     sources: Sources
@@ -187,7 +187,7 @@ class Lineage:
         return self.result.modules
 
     def record(self) -> dict[str, Any]:
-        """Return what the manifest says of where the result comes from.
+        """Return the provenance of the result for its manifest.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""raw/ of a campaign folder: which file holds what, by the names of flights and nodes."""
+"""Files of raw/ in a campaign folder, by the names of flights and nodes."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +11,7 @@ from apertura.pipeline.config import FLIGHTS, SampledWaveform, Settings
 
 @dataclass(frozen=True)
 class RawFolder:
-    """What lies in raw/ of a campaign.
+    """The folder raw/ of a campaign.
 
     Attributes
     ----------
@@ -35,7 +35,7 @@ class RawFolder:
         return {**history, **({"track": self.track_file(flight, node)} if self.logged(flight, node) else {})}
 
     def recording_files(self, flight: str, node: str) -> tuple[Path, ...]:
-        """Return the files of what `node` recorded in `flight`, in the order of their row of `RECORDERS`."""
+        """Return the files of the recording of `node` in `flight`, in the order of their row of `RECORDERS`."""
         files = recording_files(self.flight_folder(flight), node)
         return tuple(self._raw_file(flight, node, path.name) for path in files)
 
@@ -96,6 +96,6 @@ def _is_log(path: Path, node: str) -> bool:
 
 
 def _files(path: Path) -> list[Path]:
-    """Return a file itself, or those of a folder; links are among them, to be refused."""
+    """Return a file itself, or those of a folder, including links, which are rejected later."""
     inside_it = sorted(path.rglob("*")) if path.is_dir() and not path.is_symlink() else [path]
     return [file for file in inside_it if file.is_symlink() or not file.is_dir()]

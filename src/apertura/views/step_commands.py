@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from apertura.common.processes import as_typed, given
-from apertura.common.progress import telling, told_at
+from apertura.common.progress import progress_path, reporting_to
 from apertura.pipeline.rules import RULES, Rule
 
 app = typer.Typer(no_args_is_help=True, help="One step of the pipeline, as the workflow runs it.")
@@ -32,7 +32,7 @@ def _command_of(rule: Rule) -> Callable[..., None]:
         from apertura.pipeline.campaign import Campaign
 
         opened, words = Campaign.load(given(campaign)), [stated.pop(name) for name in rule.arguments]
-        with telling(opened.result(*told_at([rule.command, *words]))):
+        with reporting_to(opened.result(*progress_path([rule.command, *words]))):
             written = pkgutil.resolve_name(rule.step)(opened, *words, **stated)
         for path in [written] if isinstance(written, Path) else written:
             print(as_typed(path))

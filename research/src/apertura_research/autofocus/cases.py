@@ -15,7 +15,7 @@ from apertura.core.geometry.phase_centres import TrackCorrection
 from apertura.core.imaging.range_profiles import range_compress
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import FlatGround
-from apertura.methods.autofocus.inputs import Sighting, TrackErrors
+from apertura.methods.autofocus.inputs import PairRecord, TrackErrors
 from apertura.simulation.scene import Scatterers
 from apertura.simulation.transfer import transfer
 
@@ -217,7 +217,7 @@ class AutofocusCase:
     ----------
     name
         scene, geometry, pairs, sigma (m), SNR (dB) and seed.
-    sightings
+    records
         Of all pairs, as the logs have them.
     errors
         Node → what is known of the errors of its log.
@@ -232,11 +232,11 @@ class AutofocusCase:
     """
 
     name: tuple[str, str, str, float, float | None, int]
-    sightings: tuple[Sighting, ...]
+    records: tuple[PairRecord, ...]
     errors: Mapping[str, TrackErrors]
     truth: TrackCorrection
     targets_m: NDArray[np.float64]
-    probes: tuple[Sighting, ...]
+    probes: tuple[PairRecord, ...]
     reach_m: tuple[float, float]
 
 
@@ -266,11 +266,11 @@ def case(
     noises = dict(zip(PAIRS["joint"], of_noise.spawn(2), strict=True))
     return AutofocusCase(
         (scene, geometry, pairs, sigma_m, snr_db, seed),
-        tuple(sighting(pair, flight, truth, scatterers, snr_db, noises[pair]) for pair in PAIRS[pairs]),
+        tuple(record(pair, flight, truth, scatterers, snr_db, noises[pair]) for pair in PAIRS[pairs]),
         dict.fromkeys(sorted({node for pair in PAIRS[pairs] for node in pair.split("-")}), errors),
         truth,
         scatterers.position_m[scatterers.targets],
-        tuple(sighting(pair, flight, truth, probes, None, noises[pair]) for pair in PAIRS[pairs]),
+        tuple(record(pair, flight, truth, probes, None, noises[pair]) for pair in PAIRS[pairs]),
         flight.reach_m,
     )
 
@@ -280,14 +280,14 @@ def _probes(generator: np.random.Generator) -> TargetScene:
     return TargetScene(PROBES_M, phases * (np.hypot(PROBES_M[:, 1], 10) / 18) ** 2, np.arange(len(PROBES_M)))
 
 
-def sighting(
+def record(
     pair: str,
     flight: LoggedFlight,
     truth: TrackCorrection,
     scatterers: TargetScene,
     snr_db: float | None,
     generator: np.random.Generator,
-) -> Sighting:
+) -> PairRecord:
     """Return what a pair receives of some scatterers, with the length of the sidelink that the logs have restored.
 
     Parameters
@@ -317,7 +317,7 @@ def sighting(
         echo += np.float32(std) * parts.view(np.complex64)[..., 0]
     weights = window_weights("hann", SUBCARRIERS)
     history = PhaseHistory(echo, FREQUENCY_HZ, weights, np.zeros(len(echo)), logged)
-    return Sighting(pair, range_compress(history, GRID, FlatGround(0.0)), flight.time_s, between_m)
+    return PairRecord(pair, range_compress(history, GRID, FlatGround(0.0)), flight.time_s, between_m)
 
 
 def _signal_power(echo: NDArray[np.complex64], scatterers: TargetScene, flown: Aperture) -> float:

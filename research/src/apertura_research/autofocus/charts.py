@@ -14,7 +14,7 @@ from apertura.common.arrays import Floats
 from apertura.core.focus.engines import native
 from apertura.core.geometry.phase_centres import TrackCorrection
 from apertura.core.scene.grid import SceneGrid
-from apertura.methods.autofocus.inputs import Refinement, Sighting
+from apertura.methods.autofocus.inputs import PairRecord, Refinement
 from apertura.views.chart.png import save_png
 from apertura_research.autofocus.cases import GRID, NODES, AutofocusCase
 from apertura_research.autofocus.outcomes import (
@@ -190,7 +190,7 @@ def _draw_images(
 
 def image(one: AutofocusCase, correction: TrackCorrection, grid: SceneGrid) -> Floats:
     """Return (row, column), magnitude: the first pair's image from corrected tracks."""
-    return np.asarray(np.abs(native.form(native.prepare(one.sightings[0].moved(correction)), grid.positions(0.0))))
+    return np.asarray(np.abs(native.form(native.prepare(one.records[0].moved(correction)), grid.positions(0.0))))
 
 
 def _brightest(magnitude: Floats) -> Floats:
@@ -222,20 +222,20 @@ def _draw_errors(axes: Axes, one: AutofocusCase, used: TrackCorrection, number: 
 
 def _draw_paths(axes: Axes, one: AutofocusCase, used: TrackCorrection, place_m: Floats) -> None:
     """Draw by how much paths to a place are wrong, but for their mean: this is what blurs it."""
-    for sighting, colour in zip(one.sightings, _COLOURS, strict=False):
-        true, logged, now = (_path(sighting, tracks, place_m) for tracks in (one.truth, UNCORRECTED, used))
+    for record, colour in zip(one.records, _COLOURS, strict=False):
+        true, logged, now = (_path(record, tracks, place_m) for tracks in (one.truth, UNCORRECTED, used))
         errors = tuple(error - error.mean() for error in (true - logged, true - now))
-        _draw_pair(axes, sighting.time_s, errors, (sighting.pair, colour))
+        _draw_pair(axes, record.time_s, errors, (record.pair, colour))
     axes.set_title(
         f"path to the place looked at closely, {place_m[0]:.1f} m east, {place_m[1]:.1f} m north", fontsize=10
     )
     axes.set_ylabel("Error less its mean, cm")
 
 
-def _path(sighting: Sighting, tracks: TrackCorrection, place_m: Floats) -> Floats:
+def _path(record: PairRecord, tracks: TrackCorrection, place_m: Floats) -> Floats:
     """Return (pulse,) metres: the path that tracks expect of a place's echo (docs/theory/autofocus.md, eq. 1)."""
-    aperture = tracks.aperture(sighting.profiles.aperture, sighting.pair, sighting.time_s)
-    longer_m = tracks.longer_m(sighting.pair, sighting.time_s, sighting.sidelink_m)
+    aperture = tracks.aperture(record.profiles.aperture, record.pair, record.time_s)
+    longer_m = tracks.longer_m(record.pair, record.time_s, record.sidelink_m)
     return np.asarray(aperture.path(place_m[None])[:, 0] - longer_m)
 
 

@@ -11,7 +11,7 @@ from apertura.core.focus.engines import native
 from apertura.core.focus.engines.native_tables import Tables
 from apertura.core.geometry.phase_centres import TrackCorrection
 from apertura.core.scene.terrain import FlatGround
-from apertura.methods.autofocus.inputs import Refinement, Sighting, TrackErrors
+from apertura.methods.autofocus.inputs import PairRecord, Refinement, TrackErrors
 from apertura.methods.autofocus.refine import refine
 from apertura_research.autofocus.cases import GRID, PROBES_M, AutofocusCase, case
 
@@ -36,14 +36,14 @@ class PointPeaks:
 
 
 def peaks(
-    sightings: Sequence[Sighting], correction: TrackCorrection, points_m: Floats, reach_m: tuple[float, float]
+    records: Sequence[PairRecord], correction: TrackCorrection, points_m: Floats, reach_m: tuple[float, float]
 ) -> PointPeaks:
     """Return the highest peaks within reach of points (point, 3) as imaged from corrected tracks."""
     by_pair = []
-    for one in sightings:
+    for one in records:
         tables = native.prepare(one.moved(correction))
         by_pair.append([_peak(tables, point, reach_m) for point in points_m])
-    height = np.array([[peak for peak, _ in row] for row in by_pair]).reshape(len(sightings), len(points_m))
+    height = np.array([[peak for peak, _ in row] for row in by_pair]).reshape(len(records), len(points_m))
     place = np.array([[place for _, place in row] for row in by_pair]).reshape(*height.shape, 3)
     return PointPeaks(height, place)
 
@@ -84,17 +84,17 @@ def judge(one: AutofocusCase, correction: TrackCorrection = UNCORRECTED) -> Judg
     The probes are the honest ones: a fit to noise can lift a target's peak, not theirs.
     """
     probe_loss, probe_shift = _against_truth(one, one.probes, PROBES_M, correction)
-    target_loss, target_shift = _against_truth(one, one.sightings, one.targets_m, correction)
+    target_loss, target_shift = _against_truth(one, one.records, one.targets_m, correction)
     return Judgement(
         _mean(probe_loss), float(probe_loss.min()), _median(probe_shift), _mean(target_loss), _median(target_shift)
     )
 
 
 def _against_truth(
-    one: AutofocusCase, sightings: Sequence[Sighting], points_m: Floats, correction: TrackCorrection
+    one: AutofocusCase, records: Sequence[PairRecord], points_m: Floats, correction: TrackCorrection
 ) -> tuple[Floats, Floats]:
     """Return loss (dB) and shift (cm) of points, (pair, point) float64 each."""
-    true, now = (peaks(sightings, tracks, points_m, one.reach_m) for tracks in (one.truth, correction))
+    true, now = (peaks(records, tracks, points_m, one.reach_m) for tracks in (one.truth, correction))
     loss = 20 * np.log10(now.height / true.height)
     return loss, 100 * np.linalg.norm(now.place_m - true.place_m, axis=-1)
 
@@ -107,7 +107,7 @@ def _median(values: Floats) -> float:
     return float(np.median(values)) if values.size else np.nan
 
 
-def image_seconds(one: Sighting, *, thinning: int = 5) -> float:
+def image_seconds(one: PairRecord, *, thinning: int = 5) -> float:
     """Return the processor time of an image of the whole scene of every fifth pulse, by the native engine."""
     begun = process_time()
     native.form(native.prepare(one.profiles[::thinning]), GRID.positions(0.0))
@@ -180,7 +180,7 @@ def case_of(scene: str, sigma_cm: float, seed: int) -> AutofocusCase:
 
 def refine_case(one: AutofocusCase) -> Refinement:
     """Return what the product makes of a case whose errors are stated as they are."""
-    return refine(one.sightings, GRID, FlatGround(0.0), {node: _stated(known) for node, known in one.errors.items()})
+    return refine(one.records, GRID, FlatGround(0.0), {node: _stated(known) for node, known in one.errors.items()})
 
 
 def _stated(known: TrackErrors) -> TrackErrors:

@@ -1,4 +1,4 @@
-"""What a campaign has made, described for other programs: STAC for those who search, RO-Crate for those who check."""
+"""Results of a campaign described for other programs: STAC to search them, RO-Crate to check their provenance."""
 
 CATALOG = "catalog.json"
 """Where the STAC catalog begins, in its folder."""

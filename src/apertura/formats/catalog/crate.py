@@ -11,7 +11,7 @@ from rocrate.rocrate import ROCrate
 from apertura.common.provenance import canonical_json, sha256_text
 from apertura.formats.catalog.stac import media_type
 
-# ---- What a crate tells of a run: its jobs, their files, and what they ran on --------------------------------------
+# ---- Content of a crate: jobs, files, software ----------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -46,11 +46,11 @@ class CrateJob:
     code_sha256
         Of the code that ran.
     settings
-        What of the config mattered to it.
+        Settings that affect it.
     sources
-        Names of what it was made from: results by their manifests (``results/…``), and inputs.
+        Names of its sources: results by their manifests (``results/…``), and inputs.
     files
-        What it made, manifests last.
+        Files that it made, manifests last.
     doubts
         Why it would not be made so today, a line each.
     """
@@ -72,7 +72,7 @@ class CrateJob:
 
 @dataclass(frozen=True)
 class CrateRun:
-    """What a crate tells.
+    """Content of a crate: a run with its jobs and files.
 
     Attributes
     ----------
@@ -85,7 +85,7 @@ class CrateRun:
     jobs
         In the order in which they can run.
     inputs
-        What the campaign consists of, beside its results.
+        Files of the campaign beside its results.
     workflow
         Files of the workflow, as they lie beside the crate.
     """
@@ -99,8 +99,7 @@ class CrateRun:
     workflow: Sequence[Listed]
 
 
-# ---- A whole run as an RO-Crate, profile Provenance Run Crate 0.5: what was run, by which code, on what, and what
-# it made
+# ---- RO-Crate document, profile Provenance Run Crate 0.5 ------------------------------------------------------------
 #
 # The crate's root is the folder of results. What lies outside, recordings and config, stands in it by name and hash
 # as contextual entities: a crate may not point above its root, and results are passed on without their recordings.
@@ -132,8 +131,8 @@ def crate_document(run: CrateRun) -> dict[str, Any]:
     >>> rules = [Listed(WORKFLOW, "2" * 64, 10)]
     >>> versions = {"apertura": "1", "snakemake": "9"}
     >>> run = CrateRun("tandem", "2025-05-14T09:30:00Z", versions, "3" * 64, [job], [], rules)
-    >>> told = {entity["@id"]: entity for entity in crate_document(run)["@graph"]}
-    >>> told["#job/export/f01/a-b"]["result"], told["f01/a-b/db.tif"]["sha256"][:4]
+    >>> entities = {entity["@id"]: entity for entity in crate_document(run)["@graph"]}
+    >>> entities["#job/export/f01/a-b"]["result"], entities["f01/a-b/db.tif"]["sha256"][:4]
     ({'@id': 'f01/a-b/db.tif'}, '0000')
     """
     crate = ROCrate(version="1.1")
@@ -305,12 +304,12 @@ def _bytes(file: Listed) -> dict[str, Any]:
 
 
 def _parameter(name: str, value: object) -> dict[str, Any]:
-    told = value if isinstance(value, str) else canonical_json(value)
+    text = value if isinstance(value, str) else canonical_json(value)
     return {
-        "@id": f"#setting/{quote(name)}/{sha256_text(told)[:16]}",
+        "@id": f"#setting/{quote(name)}/{sha256_text(text)[:16]}",
         "@type": "PropertyValue",
         "name": name,
-        "value": told,
+        "value": text,
     }
 
 

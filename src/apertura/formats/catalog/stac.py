@@ -15,7 +15,7 @@ from apertura.common.errors import CampaignError
 from apertura.common.raster import opened_raster
 from apertura.formats.catalog import CATALOG
 
-# ---- Fields of STAC's extensions, and where their schemas are known by ---------------------------------------------
+# ---- Fields and schemas of STAC extensions --------------------------------------------------------------------------
 
 _BASE = "https://stac-extensions.github.io"
 
@@ -129,7 +129,7 @@ def projection(wkt: str, shape: tuple[int, int], transform: Sequence[float]) -> 
     }
 
 
-# ---- A file of an image as STAC describes it: type, role, size, checksum, and what the pixels of a raster are ------
+# ---- Assets: type, role, size, checksum and bands of a file ---------------------------------------------------------
 
 COG = "image/tiff; application=geotiff; profile=cloud-optimized"
 
@@ -165,16 +165,16 @@ _ROLES_OF_TYPE: Mapping[str, tuple[str, ...]] = {".tif": ("data",), ".qml": ("st
 
 @dataclass(frozen=True)
 class FileFacts:
-    """What a file says of itself.
+    """Metadata read from a file.
 
     Attributes
     ----------
     title
-        What a person would call it.
+        Title for people.
     bands
         Of a raster: fields of the raster extension, one mapping a band.
     inputs
-        File → sha256 of what a raster was made from.
+        Source file of a raster → sha256.
     """
 
     title: str
@@ -204,8 +204,8 @@ def media_type(name: str) -> str:
     return MEDIA_TYPES.get(Path(name).suffix, UNKNOWN_TYPE)
 
 
-def told_by(path: Path) -> FileFacts:
-    """Return what a file says of itself; of a GeoTIFF its bands and what it was made from.
+def read_facts(path: Path) -> FileFacts:
+    """Return the metadata of a file; of a GeoTIFF its bands and the sources stated in its tags.
 
     Raises
     ------
@@ -218,8 +218,8 @@ def told_by(path: Path) -> FileFacts:
     try:
         with opened_raster(path, expected=expected, remedy=remedy) as raster:
             bands = [_band(raster, number) for number in range(raster.count)]
-            told = json.loads(raster.tags().get("APERTURA_INPUTS", "{}"))
-            inputs = {str(name): str(digest) for name, digest in told.items()}
+            facts = json.loads(raster.tags().get("APERTURA_INPUTS", "{}"))
+            inputs = {str(name): str(digest) for name, digest in facts.items()}
             return FileFacts(raster.descriptions[0] or path.name, bands, inputs)
     except (ValueError, AttributeError) as error:
         raise CampaignError("cannot be read as GeoTIFF", path, expected, remedy) from error
@@ -239,7 +239,7 @@ def _band(raster: Any, number: int) -> dict[str, Any]:
     return band
 
 
-def asset_of(path: Path, href: str, *, sha256: str, told: FileFacts) -> pystac.Asset:
+def asset_of(path: Path, href: str, *, sha256: str, facts: FileFacts) -> pystac.Asset:
     """Return the asset of a file.
 
     Parameters
@@ -247,21 +247,21 @@ def asset_of(path: Path, href: str, *, sha256: str, told: FileFacts) -> pystac.A
     path
         The file; only its size is looked up.
     href
-        Where it lies, seen from the item, percent-encoded.
+        Path relative to the item, percent-encoded.
     sha256
         Of its bytes, hex.
-    told
-        What it says of itself.
+    facts
+        Its metadata, from `read_facts`.
     """
     name = path.name
     roles = _ROLES.get(name) or _ROLES_OF_TYPE.get(path.suffix) or ("metadata",)
     extra = {"file:checksum": multihash(sha256), "file:size": path.stat().st_size}
-    if told.bands:
-        extra["raster:bands"] = told.bands
-    return pystac.Asset(href, told.title, media_type=media_type(name), roles=list(roles), extra_fields=extra)
+    if facts.bands:
+        extra["raster:bands"] = facts.bands
+    return pystac.Asset(href, facts.title, media_type=media_type(name), roles=list(roles), extra_fields=extra)
 
 
-# ---- Images as a static STAC catalog: one item for each, with footprint, time, radar, processing, files and inputs
+# ---- Static catalog: one item per image -----------------------------------------------------------------------------
 
 RECORDED = "apertura:recorded"
 """Field of the catalog: the first and the last pulse of all images, UTC."""
@@ -271,20 +271,20 @@ _NO_PLACE = "Local axes without a place on Earth: items have no geometry, and th
 
 @dataclass(frozen=True)
 class Image:
-    """What an item says: one image of a flight.
+    """One image of a flight, the content of an item.
 
     Attributes
     ----------
     flight, name
         Which: a pair, 'coherent' or 'noncoherent'.
     title
-        What a person would call it.
+        Title for people.
     geometry
-        GeoJSON, longitude and latitude of WGS 84; None where there is no place on Earth, or nothing was seen.
+        GeoJSON, longitude and latitude of WGS 84; None in a local frame, or where nothing was illuminated.
     acquisition
         When and on which frequencies.
     properties
-        Fields of the extensions, and what the image says of itself.
+        Fields of the extensions, and measures of the image.
     assets
         Key → file.
     inputs
@@ -315,9 +315,9 @@ def item_of(image: Image, root: str) -> pystac.Item:
     Parameters
     ----------
     image
-        What it says.
+        Its content.
     root
-        The campaign folder, seen from the item.
+        The campaign folder, relative to the item.
 
     Examples
     --------
@@ -331,16 +331,16 @@ def item_of(image: Image, root: str) -> pystac.Item:
     """
     flown = image.acquisition
     named = {"title": image.title, "apertura:flight": image.flight, "apertura:image": image.name}
-    told = {**named, **flown.fields, **image.properties}
+    facts = {**named, **flown.fields, **image.properties}
     item = pystac.Item(
         image.id,
         None if image.geometry is None else dict(image.geometry),
         None if image.geometry is None else bounds([image.geometry]),
         flown.middle,
-        told,
+        facts,
         flown.start,
         flown.end,
-        [uri for prefix, uri in EXTENSIONS.items() if prefix != "sar" or "sar:frequency_band" in told],
+        [uri for prefix, uri in EXTENSIONS.items() if prefix != "sar" or "sar:frequency_band" in facts],
     )
     for key, asset in image.assets.items():
         item.add_asset(key, asset)
@@ -389,8 +389,8 @@ def catalog_files(campaign: str, images: Sequence[Image]) -> dict[str, dict[str,
     """
     ordered = sorted(images, key=lambda image: (image.flight, image.name))
     times = min(image.acquisition.start for image in ordered), max(image.acquisition.end for image in ordered)
-    told = {RECORDED: [pystac.utils.datetime_to_str(time) for time in times]}
-    catalog = pystac.Catalog("apertura", f"Images of the campaign {campaign}.", title=campaign, extra_fields=told)
+    facts = {RECORDED: [pystac.utils.datetime_to_str(time) for time in times]}
+    catalog = pystac.Catalog("apertura", f"Images of the campaign {campaign}.", title=campaign, extra_fields=facts)
     parent = _parent(campaign, ordered, times)
     catalog.add_child(parent)
     for image in ordered:

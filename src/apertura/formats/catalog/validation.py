@@ -1,4 +1,4 @@
-"""A static STAC catalog held against the schemas of pystac and of this package; nothing is fetched."""
+"""A static STAC catalog validated against the schemas of pystac and of this package; nothing is downloaded."""
 
 import json
 from collections.abc import Iterator
@@ -22,7 +22,7 @@ _DOWN = frozenset({"child", "item"})
 
 
 def stac_problems(folder: Path) -> list[str]:
-    """Return what is wrong with a catalog: a line for each file that is not what its schemas say, or is not there.
+    """Return the errors of a catalog: a line for each file that violates its schemas or is missing.
 
     Parameters
     ----------

@@ -1,6 +1,6 @@
 """Files for other programs: one module per format, one row per file.
 
-A row says the file's name, which raster it is written from and what writes it. Rows drive the rules of the workflow,
+A row states the file's name, its source raster and the function that writes it. Rows drive the rules of the workflow,
 the steps and the tests; nothing else names a product. To add one, write a function such as
 `apertura.formats.export.cog.write_power` and add its row to `EXPORTS`; or, from another package, register an `Export`
 as entry point of group ``apertura.exports``. Importing this module imports no format.
@@ -59,15 +59,15 @@ class Export:
         Whether the workflow's report shows it.
     opened
         What the summary says beside its name, how to open it; empty: the summary does not name it.
-    laid
-        Whether the rasters of all flights are laid upon one another in a mosaic: GDAL cannot of complex ones.
+    mosaicked
+        Whether the rasters of all flights are mosaicked: GDAL cannot mosaic complex ones.
     """
 
     file: str
     source: str
     function: str
     pictured: bool = False
-    laid: bool = True
+    mosaicked: bool = True
     opened: str = ""
 
     @property
@@ -77,7 +77,7 @@ class Export:
 
     @property
     def style(self) -> bool:
-        """Whether it says how QGIS shows the raster of its name."""
+        """Whether it is the style in which QGIS shows the raster of its name."""
         return self.module == "apertura.formats.export.style"
 
     @property
@@ -88,13 +88,13 @@ class Export:
 
 
 EXPORTS: tuple[Export, ...] = (
-    Export("slc.tif", "image", "apertura.formats.export.cog:write_slc", laid=False),
+    Export("slc.tif", "image", "apertura.formats.export.cog:write_slc", mosaicked=False),
     Export("power.tif", "image", "apertura.formats.export.cog:write_power"),
     Export("power.qml", "image", "apertura.formats.export.style:write_linear_style"),
     Export("db.tif", "image", "apertura.formats.export.db:write_db"),
     Export("db.qml", "image", "apertura.formats.export.style:write_db_style"),
     Export("quicklook.png", "image", "apertura.formats.export.quicklook:write_quicklook", pictured=True),
-    Export("coherent_slc.tif", "coherent", "apertura.formats.export.cog:write_slc", laid=False),
+    Export("coherent_slc.tif", "coherent", "apertura.formats.export.cog:write_slc", mosaicked=False),
     Export("coherent_power.tif", "coherent", "apertura.formats.export.cog:write_power"),
     Export("coherent_power.qml", "coherent", "apertura.formats.export.style:write_linear_style"),
     Export("coherent_db.tif", "coherent", "apertura.formats.export.db:write_db", opened="in a GIS"),
@@ -212,7 +212,7 @@ def mosaics(pairs: Mapping[str, Sequence[str]]) -> dict[str, list[str]]:
     for flight, names in pairs.items():
         for folder, kinds in _folders(names):
             for row in (row for kind in kinds for row in exports_in(kind)):
-                if row.laid and row.file.endswith(".tif"):
+                if row.mosaicked and row.file.endswith(".tif"):
                     name = f"{folder}/{row.file.removesuffix('.tif')}.vrt"
                     found.setdefault(name, []).append(f"{flight}/{folder}/{row.file}")
     return found
@@ -273,7 +273,7 @@ def write_exports(
     folder
         Where they go.
     rasters, titles
-        Source → (y, x) raster on the campaign's grid, and what a person would call it.
+        Source → (y, x) raster on the campaign's grid, and its title.
     tags
         Of every file, name → text.
     radiometry

@@ -20,7 +20,7 @@ from rasterio.errors import CRSError, NotGeoreferencedWarning
 from rasterio.windows import Window
 
 from apertura.common.errors import CampaignError, ContractError
-from apertura.formats.export.radiometry import told
+from apertura.formats.export.radiometry import with_radiometry
 from apertura.formats.export.writing import IN_MEMORY_BYTES, Block, added, blocks_of, check_written, gdal_replacement
 
 BLOCK = 512  # pixels along a side of a COG tile; overviews halve the raster until it fits into one tile
@@ -39,14 +39,14 @@ class NorthUpRaster(Protocol):
 
 @dataclass(frozen=True)
 class Band:
-    """What a raster file holds.
+    """Band of a raster file.
 
     Attributes
     ----------
     dtype, nodata
         Type on disk, and the value of a pixel that holds nothing.
     unit, meaning
-        Written beside the band and as a tag; see `apertura.formats.export.radiometry.told`.
+        Written beside the band and as a tag; see `apertura.formats.export.radiometry.with_radiometry`.
     overviews
         How the COG driver shrinks it: its OVERVIEW_RESAMPLING.
     colours
@@ -87,7 +87,7 @@ def write_slc(
     tags
         Provenance, name → text.
     title
-        What a person would call it; becomes the TIFF's ImageDescription.
+        Title for people, the TIFF's ImageDescription.
 
     Raises
     ------
@@ -147,7 +147,7 @@ def write_cog(
     image
         (y, x), north-up.
     band
-        What the file will hold.
+        Dtype, no data, unit and description.
     value
         Block of `image` → block of the file, in the dtype of `band`.
 
@@ -157,7 +157,7 @@ def write_cog(
         As `write_slc`.
     """
     place = placed(image, transform, crs)
-    band, tags = told(band, tags)
+    band, tags = with_radiometry(band, tags)
     words = described(tags, title)
     with gdal_replacement(path, size=(size := size_of(image, band))) as temporary:
         source = temporary.with_name("source.tif")

@@ -1,4 +1,4 @@
-"""What the flights of a campaign cover: a picture of looks, pairs, footprints and tracks, and the same for a GIS."""
+"""Coverage of a campaign: looks, pairs, footprints and tracks as a picture and for a GIS."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -50,7 +50,7 @@ class Covered:
 def footprint(looks: NDArray[np.float32], transform: Affine) -> list[list[Ring]]:
     """Return polygons about the places that pulses make: rings (vertex, 2) of map metres, the outer one first.
 
-    Outer rings turn left, holes right, each ends where it begins, as GeoJSON asks.
+    Outer rings turn left, holes right, each ends where it begins, as GeoJSON requires.
 
     Examples
     --------
@@ -70,7 +70,7 @@ def _turned(ring: Ring, *, left: bool) -> Ring:
     x, y = (ring - ring[0]).T
     turns_left = float((x[:-1] * y[1:] - x[1:] * y[:-1]).sum()) > 0
     ring = ring if turns_left == left else ring[::-1]
-    lowest = int(np.lexsort((ring[:-1, 0], ring[:-1, 1]))[0])  # the same vertex first, whoever traced it
+    lowest = int(np.lexsort((ring[:-1, 0], ring[:-1, 1]))[0])  # the same vertex first, however it was traced
     return np.concatenate([ring[lowest:-1], ring[: lowest + 1]])
 
 
@@ -110,7 +110,7 @@ def feature_collection(
                 for rings in footprint(one.looks, transform)
             ]
             area = {"type": "MultiPolygon", "coordinates": at}
-        features.append(_feature(area, {"kind": "footprint", **named, **_told(one.looks, transform)}))
+        features.append(_feature(area, {"kind": "footprint", **named, **_statistics(one.looks, transform)}))
     return {"type": "FeatureCollection", "features": features}
 
 
@@ -118,16 +118,16 @@ def _feature(geometry: Mapping[str, Any] | None, properties: Mapping[str, Any]) 
     return {"type": "Feature", "geometry": geometry, "properties": properties}
 
 
-def _told(looks: NDArray[np.float32], transform: Affine) -> dict[str, Any]:
-    seen = looks[looks > 0]
+def _statistics(looks: NDArray[np.float32], transform: Affine) -> dict[str, Any]:
+    covered_looks = looks[looks > 0]
     pixel_m2 = abs(transform.a * transform.e)
-    if not seen.size:
+    if not covered_looks.size:
         return {"covered_share": 0.0, "area_m2": 0.0}
     return {
-        "covered_share": round(seen.size / looks.size, 4),
-        "area_m2": float(f"{seen.size * pixel_m2:.4g}"),
-        "looks_median": round(float(np.median(seen)), 1),
-        "looks_most": round(float(seen.max()), 1),
+        "covered_share": round(covered_looks.size / looks.size, 4),
+        "area_m2": float(f"{covered_looks.size * pixel_m2:.4g}"),
+        "looks_median": round(float(np.median(covered_looks)), 1),
+        "looks_most": round(float(covered_looks.max()), 1),
     }
 
 
@@ -139,7 +139,7 @@ def _rounded(places: NDArray[np.float64], *, heights: bool = False) -> list[list
 def write_coverage(
     path: Path, covered: Sequence[Covered], transform: Affine, *, crs_name: str, title: str, tags: Mapping[str, str]
 ) -> None:
-    """Draw two maps as a PNG: pulses of all pairs that make each place, and how many pairs see it.
+    """Draw two maps as a PNG: pulses of all pairs at each place, and how many pairs illuminate it.
 
     Parameters
     ----------
@@ -170,8 +170,10 @@ def write_coverage(
         second.draw_frame("")
         first.draw_scale_and_north()
         second.axes.legend(*_legend(flights), loc="upper left", fontsize=7, framealpha=0.85)
-        seen = f"{100 * float((pairs > 0).mean()):.1f} % of the scene is seen by {len(covered)} pairs of {len(flights)}"
-        subtitle = f"{seen} flight{'s' if len(flights) > 1 else ''}; lines: tracks (dashed: receiver) and footprints"
+        share = (
+            f"{100 * float((pairs > 0).mean()):.1f} % of the scene is seen by {len(covered)} pairs of {len(flights)}"
+        )
+        subtitle = f"{share} flight{'s' if len(flights) > 1 else ''}; lines: tracks (dashed: receiver) and footprints"
         first.write_words(title, subtitle, f"apertura {tags['APERTURA_VERSION']}")
         with replacement(path) as temporary:
             first.figure.savefig(temporary, dpi=DPI, metadata={"Title": title, **dict(sorted(tags.items()))})

@@ -14,15 +14,14 @@ from apertura.common.atomic import replacement
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.geometry.geodesy import geodetic_from_ecef
 
-# ---- What a CPHD file says of a pair besides its samples: where and when, of which scene, and each pulse's
-# parameters
+# ---- Metadata of a CPHD file, and parameters of each pulse ----------------------------------------------------------
 
 
 PATH_LIMIT = "APERTURA_PATH_LIMIT"
 """Parameter of each pulse beside those of the standard: total path beyond which an echo leaves the prefix, m."""
 
 _OVERSAMPLED = 1.25
-"""Of the frequencies over what the swath needs; the standard wants 1.2."""
+"""Oversampling of the frequencies against the swath; the standard requires 1.2."""
 
 _RECORD = (
     *(("TxTime", 1), ("TxPos", 3), ("TxVel", 3), ("RcvTime", 1), ("RcvPos", 3), ("RcvVel", 3), ("SRPPos", 3)),
@@ -33,7 +32,7 @@ _RECORD = (
 
 @dataclass(frozen=True, eq=False)
 class CphdCollection:
-    """What a pair recorded, without its samples.
+    """Recording of a pair without its samples.
 
     Attributes
     ----------
@@ -110,7 +109,7 @@ class CphdCollection:
         return np.asarray((self.time - self.start) / np.timedelta64(1, "s"), np.float64)
 
     @property
-    def seen_s(self) -> Floats:
+    def exposed_s(self) -> Floats:
         """When each pulse is at the reference point: (pulse,) float64, seconds from `start`."""
         return np.asarray(self.sent_s + np.linalg.norm(self.tx_m - self.point_m, axis=1) / SPEED_OF_LIGHT_M_S)
 
@@ -141,8 +140,7 @@ class CphdCollection:
         return table
 
 
-# ---- Compensated phase history (CPHD 1.1.0, NGA.STND.0068-1) of one pair, for other processors and for `apertura`
-# itself
+# ---- Compensated phase history of one pair (CPHD 1.1.0, NGA.STND.0068-1) --------------------------------------------
 #
 # Signals are Σ a·exp(-j2πf(τ-τ_ref)), SGN -1, where τ_ref is the delay of the reference point of the scene, one for
 # all pulses (docs/formats/phase_history.md, "CPHD"). Metadata and pulse parameters are written by sarkit, samples in
@@ -303,8 +301,8 @@ def _layout(pulses: NDArray[Any]) -> dict[str, Any]:
 
 
 def _dwell(collection: CphdCollection) -> dict[str, Any]:
-    """Return when and how long a place of the scene is seen: by all pulses."""
-    seen = collection.seen_s
+    """Return centre and length of the exposure of the scene: all pulses illuminate all places."""
+    seen = collection.exposed_s
     return {
         "NumCODTimes": 1,
         "CODTime": [{"Identifier": _CHANNEL, "CODTimePoly": np.array([[(seen[0] + seen[-1]) / 2]])}],

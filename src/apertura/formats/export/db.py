@@ -23,7 +23,7 @@ from apertura.formats.export.cog import (
     power,
     size_of,
 )
-from apertura.formats.export.radiometry import told
+from apertura.formats.export.radiometry import with_radiometry
 from apertura.formats.export.writing import IN_MEMORY_BYTES, Block, check_written, gdal_replacement
 
 DB = Band("float32", np.nan, "dB", "{power}, 10 log10", "AVERAGE")
@@ -52,7 +52,7 @@ def write_db(
     array([[20., nan]], dtype=float32)
     """
     place = placed(image, transform, crs)
-    band, tags = told(DB, tags)
+    band, tags = with_radiometry(DB, tags)
     words, size = described(tags, title), size_of(image, POWER)
     with gdal_replacement(path, size=size) as temporary:
         linear = temporary.with_name("power.tif")

@@ -1,4 +1,4 @@
-"""What the phase between two images tells, as GeoTIFFs and one picture: phase, coherence, height and its deviation."""
+"""Products of an interferogram, GeoTIFFs and one picture: phase, coherence, height and its deviation."""
 
 import json
 from collections.abc import Mapping
@@ -53,7 +53,7 @@ def write_unwrapped(
 def write_height(
     path: Path, height_m: NorthUpRaster, /, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
 ) -> None:
-    """Write heights, (y, x) float32 metres, NaN where none is told. Else as `apertura.formats.export.cog.write_slc`.
+    """Write heights, (y, x) float32 metres, NaN where none is valid. Else as `apertura.formats.export.cog.write_slc`.
 
     Examples
     --------
@@ -119,7 +119,7 @@ def write_panels(
             layout.draw_frame(crs_name(crs))
             layout.draw_colour_bar(picture, words, beyond="neither" if ends else "both")
             if not np.isfinite(thin).any():
-                layout.axes.text(0.5, 0.5, "not told by any pixel", transform=layout.axes.transAxes, ha="center")
+                layout.axes.text(0.5, 0.5, "no valid pixel", transform=layout.axes.transAxes, ha="center")
         whole.draw_scale_and_north()
         whole.write_words(title, tags.get("APERTURA_LEVEL", ""), footer(tags))
         whole.write_flags(list(json.loads(tags.get("APERTURA_FLAGS", "{}"))))

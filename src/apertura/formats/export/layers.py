@@ -1,4 +1,4 @@
-"""Layers that explain an image: angles of view, where it saw nothing or too much, and how many pulses made it."""
+"""Layers of an image: angles of view, mask of shadow and layover, and number of pulses."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -10,7 +10,7 @@ from apertura.common.errors import ContractError
 from apertura.formats.export.cog import Band, NorthUpRaster, Pixels, write_cog
 
 SHADOW, LAYOVER, OUTSIDE = 1, 2, 255
-"""Bits of the mask, and its value where no pulse makes the pixel; 0 is seen once and plainly."""
+"""Bits of the mask, and its value where no pulse makes the pixel; 0 is visible once."""
 
 CLASSES = {
     0: ("valid", (255, 255, 255)),
@@ -19,7 +19,7 @@ CLASSES = {
     SHADOW | LAYOVER: ("shadow and layover", (150, 20, 60)),
     OUTSIDE: ("outside, no data", (0, 0, 0)),
 }
-"""Value of the mask → what it means, and its colour."""
+"""Value of the mask → meaning and colour."""
 
 INCIDENCE = Band("float32", np.nan, "deg", "incidence at closest approach, from the terrain's normal", "AVERAGE")
 BISTATIC_ANGLE = Band("float32", np.nan, "deg", "angle between transmitter and receiver at closest approach", "AVERAGE")

@@ -128,7 +128,7 @@ class MapLayout:
             )
 
     def write_words(self, title: str, subtitle: str, footer: str) -> None:
-        """Write what the picture shows above it, and where it comes from below."""
+        """Write title and subtitle above the picture, and its provenance below."""
         width, height = self.figure.get_size_inches()
         room = (width - LEFT - 0.1) * 72 / 0.68  # points, over the width of a bold letter in units of its size
         self._write(LEFT, height - 0.4, title, size=min(13, room / max(1, len(title))), weight="bold")
@@ -195,7 +195,7 @@ def round_length(most_m: float) -> float:
 
 
 def from_origin(origin: float, value: float, _position: int | None) -> str:
-    """Return the label of a tick that counts from an origin, as matplotlib asks for it."""
+    """Return the label of a tick that counts from an origin, as a formatter of matplotlib."""
     return number(value - origin)
 
 

@@ -19,7 +19,7 @@ _TYPES = {"uint8": "Byte", "float32": "Float32"}
 
 
 def write_mosaic(path: Path, rasters: Sequence[Path], *, title: str = "") -> None:
-    """Write a VRT of rasters of one grid; where several hold data, the last of them is seen.
+    """Write a VRT of rasters of one grid; where several hold data, the last of them is shown.
 
     Parameters
     ----------
@@ -28,7 +28,7 @@ def write_mosaic(path: Path, rasters: Sequence[Path], *, title: str = "") -> Non
     rasters
         Files of one band, real, all on one grid, the lowest first.
     title
-        What a person would call it.
+        Title for people.
 
     Raises
     ------
@@ -59,9 +59,9 @@ def write_mosaic(path: Path, rasters: Sequence[Path], *, title: str = "") -> Non
     root = ET.Element("VRTDataset", rasterXSize=str(first["width"]), rasterYSize=str(first["height"]))
     ET.SubElement(root, "SRS").text = first["crs"]
     ET.SubElement(root, "GeoTransform").text = ", ".join(map(repr, first["transform"]))
-    said = {"TIFFTAG_IMAGEDESCRIPTION": title, TAG: canonical_json(_common([json.loads(one) for one in tags]))}
+    tags_written = {"TIFFTAG_IMAGEDESCRIPTION": title, TAG: canonical_json(_common([json.loads(one) for one in tags]))}
     metadata = ET.SubElement(root, "Metadata")
-    for name, value in said.items():
+    for name, value in tags_written.items():
         ET.SubElement(metadata, "MDI", key=name).text = value
     band = ET.SubElement(root, "VRTRasterBand", dataType=kind["type"], band="1")
     for name in ("Description", "UnitType", "NoDataValue"):
@@ -77,8 +77,8 @@ def write_mosaic(path: Path, rasters: Sequence[Path], *, title: str = "") -> Non
 
 
 def _opened(rasters: Sequence[Path]) -> tuple[dict[str, Any], dict[str, Any], list[str]]:
-    """Return the grid and the kind that all rasters share, and what each says of its radiometry."""
-    seen: list[tuple[dict[str, Any], dict[str, Any], dict[str, str]]] = []
+    """Return the grid and the kind that all rasters share, and the radiometry of each."""
+    layouts: list[tuple[dict[str, Any], dict[str, Any], dict[str, str]]] = []
     tags = []
     for path in rasters:
         with opened_raster(path, expected="what the workflow wrote", remedy="Run it again.") as raster:
@@ -88,13 +88,13 @@ def _opened(rasters: Sequence[Path]) -> tuple[dict[str, Any], dict[str, Any], li
             words = {"Description": raster.descriptions[0] or "", "UnitType": raster.units[0] or ""}
             coloured = raster.colorinterp[0] == ColorInterp.palette
             colours = [colour for _, colour in sorted(raster.colormap(1).items())] if coloured else []
-            seen.append((grid | {"crs": raster.crs.to_wkt()}, kind | {"colours": colours}, words))
+            layouts.append((grid | {"crs": raster.crs.to_wkt()}, kind | {"colours": colours}, words))
             tags.append(raster.tags().get(TAG, "{}"))
-    grid, kind, _ = seen[0]
-    for path, (other, its, _) in zip(rasters, seen, strict=True):
+    grid, kind, _ = layouts[0]
+    for path, (other, its, _) in zip(rasters, layouts, strict=True):
         if other != grid or its != kind or kind["type"] is None:
             raise ContractError(f"{path}: no real raster on the grid of {rasters[0]}")
-    return grid, kind | seen[-1][2], tags
+    return grid, kind | layouts[-1][2], tags
 
 
 def _source(name: str, grid: Mapping[str, Any], kind: Mapping[str, Any]) -> ET.Element:
@@ -108,11 +108,13 @@ def _source(name: str, grid: Mapping[str, Any], kind: Mapping[str, Any]) -> ET.E
     return source
 
 
-def _common(told: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return what the rasters agree on of what their values mean, and levels that span them all."""
-    common = {name: value for name, value in told[-1].items() if all(one.get(name) == value for one in told)}
-    if all({"peak_db", "noise_floor_re_peak_db"} <= one.keys() for one in told):
-        top = max(one["peak_db"] for one in told)
-        floor = min(one["peak_db"] + one["noise_floor_re_peak_db"] for one in told)
+def _common(radiometries: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the radiometry that all rasters share, and levels that span them all."""
+    common = {
+        name: value for name, value in radiometries[-1].items() if all(one.get(name) == value for one in radiometries)
+    }
+    if all({"peak_db", "noise_floor_re_peak_db"} <= one.keys() for one in radiometries):
+        top = max(one["peak_db"] for one in radiometries)
+        floor = min(one["peak_db"] + one["noise_floor_re_peak_db"] for one in radiometries)
         common |= {"peak_db": top, "noise_floor_re_peak_db": round(floor - top, 2)}
     return common

@@ -114,7 +114,7 @@ def crs_name(crs: str) -> str:
 
 
 def footer(tags: Mapping[str, str]) -> str:
-    """Return the line below a picture: version, focus, numerical error and code, as far as its tags say them.
+    """Return the line below a picture: version, focus, numerical error and code, as far as its tags state them.
 
     Examples
     --------
@@ -126,8 +126,8 @@ def footer(tags: Mapping[str, str]) -> str:
         ("APERTURA_ERROR_DB", "numerical error below {} dB"),
         ("APERTURA_CODE_SHA256", "code {:.12}"),
     )
-    told = [words.format(tags[tag].replace("-", "−")) for tag, words in known if tag in tags]
-    return " · ".join([*told[:1], *_focus_words(tags), *told[1:]])
+    lines = [words.format(tags[tag].replace("-", "−")) for tag, words in known if tag in tags]
+    return " · ".join([*lines[:1], *_focus_words(tags), *lines[1:]])
 
 
 def _focus_words(tags: Mapping[str, str]) -> list[str]:
@@ -164,7 +164,7 @@ def shrink(image: NorthUpRaster, most: int) -> tuple[NDArray[np.float64], int]:
     height, width = image.shape
     factor = ceil(max(height, width) / most)
     mean = np.full((ceil(height / factor), ceil(width / factor)), np.nan)
-    step = max(1, READ // factor)  # groups along a side of what is held in memory
+    step = max(1, READ // factor)  # groups along a side of a block in memory
     for row in range(0, mean.shape[0], step):
         for column in range(0, mean.shape[1], step):
             groups = slice(row, row + step), slice(column, column + step)

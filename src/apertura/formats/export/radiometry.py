@@ -1,4 +1,4 @@
-"""What a pixel's value means, in words for the band and as values for the tag."""
+"""Radiometry of a raster: meaning of its values, in words for the band and as JSON for the tag."""
 
 import json
 from collections.abc import Mapping
@@ -16,7 +16,7 @@ TAG = "APERTURA_RADIOMETRY"
 
 @dataclass(frozen=True)
 class Radiometry:
-    """What the values of a raster mean, whichever file shows them.
+    """Meaning of the values of a raster, in any of its files.
 
     Attributes
     ----------
@@ -29,7 +29,7 @@ class Radiometry:
     phases_taken_off_rad
         Pair → constant phase taken off before it was added; pairs that a coherent sum leaves out are missing.
     peak_db, noise_floor_re_peak_db
-        Power of the brightest target, dB re 1; median power against the peak, dB; None where nobody measured.
+        Power of the brightest target, dB re 1; median power against the peak, dB; None where not measured.
     """
 
     amplitude: str
@@ -63,7 +63,7 @@ ECHO = Radiometry("echo amplitude", "echo power", "the echo of a target that eve
 
 
 def of_sums(peaks: Mapping[str, float], phases_rad: Mapping[str, float]) -> dict[str, Radiometry]:
-    """Return what the sums of a flight's pairs mean, by their source in `apertura.formats.export.SOURCES`.
+    """Return the radiometry of the sums of a flight's pairs, by their source in `apertura.formats.export.SOURCES`.
 
     Parameters
     ----------
@@ -88,8 +88,8 @@ def of_sums(peaks: Mapping[str, float], phases_rad: Mapping[str, float]) -> dict
     }
 
 
-def told(band: "Band", tags: Mapping[str, str]) -> tuple["Band", dict[str, str]]:
-    """Return a band and tags that say what its values mean, from what `TAG` says of the raster it is made from.
+def with_radiometry(band: "Band", tags: Mapping[str, str]) -> tuple["Band", dict[str, str]]:
+    """Return a band and tags that state the meaning of its values, from `TAG` of its source raster.
 
     Parameters
     ----------
@@ -101,12 +101,14 @@ def told(band: "Band", tags: Mapping[str, str]) -> tuple["Band", dict[str, str]]
     Examples
     --------
     >>> from apertura.formats.export.cog import POWER
-    >>> told(POWER, {TAG: canonical_json(ECHO.report)})[0].meaning
+    >>> with_radiometry(POWER, {TAG: canonical_json(ECHO.report)})[0].meaning
     'echo power, linear'
     """
     raster = {"amplitude": "amplitude of the focused scene", "power": "power of the focused scene"}
     raster |= json.loads(tags.get(TAG, "{}"))
     meaning = band.meaning.format(**raster)
-    said = {name: value for name, value in raster.items() if name not in {"amplitude", "power"} and value is not None}
-    words = canonical_json({**said, "quantity": meaning, "unit": band.unit})
+    meanings = {
+        name: value for name, value in raster.items() if name not in {"amplitude", "power"} and value is not None
+    }
+    words = canonical_json({**meanings, "quantity": meaning, "unit": band.unit})
     return replace(band, meaning=meaning), {**tags, TAG: words}

@@ -34,7 +34,7 @@ def write_db_style(path: Path, *_: object, **__: object) -> None:
     Parameters
     ----------
     path
-        ``….qml``; complete or absent. A raster of that name lies beside it: its tag `radiometry.TAG` tells
+        ``….qml``; complete or absent. A raster of that name lies beside it: its tag `radiometry.TAG` states
         peak and noise floor.
     *_, **__
         What other products are written from.
@@ -42,7 +42,7 @@ def write_db_style(path: Path, *_: object, **__: object) -> None:
     Raises
     ------
     ContractError
-        If nobody measured them.
+        If they were not measured.
 
     Examples
     --------
@@ -99,8 +99,8 @@ def write_layer_style(path: Path, *_: object, **__: object) -> None:
     with rasterio.Env(**ISOLATED), rasterio.open(_beside(path)) as raster:
         values, unit = _few(raster), raster.units[0]
     low, high = _round_ends(values[np.isfinite(values)])
-    told = {"classificationMin": f"{low:g}", "classificationMax": f"{high:g}"}
-    renderer = _renderer("singlebandpseudocolor", band="1", **told)
+    options = {"classificationMin": f"{low:g}", "classificationMax": f"{high:g}"}
+    renderer = _renderer("singlebandpseudocolor", band="1", **options)
     ends = {"minimumValue": f"{low:g}", "maximumValue": f"{high:g}"}
     shader = ET.SubElement(ET.SubElement(renderer, "rastershader"), "colorrampshader", ends)
     shader.attrib |= {"colorRampType": "INTERPOLATED", "classificationMode": "1", "clip": "0"}

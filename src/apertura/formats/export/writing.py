@@ -1,4 +1,4 @@
-"""GDAL's files held to the promise of all others: complete or absent, and an error is one that says what it was."""
+"""Files written by GDAL: complete or absent, with errors that state their cause."""
 
 import errno
 import os
@@ -19,7 +19,7 @@ from rasterio.windows import Window
 
 from apertura.common.atomic import replacement
 
-READ = 2048  # pixels along a side of what is held in memory at once: four tiles of a COG
+READ = 2048  # pixels along a side of a block in memory: four tiles of a COG
 GDAL = {"GDAL_CACHEMAX": 128, "GDAL_PAM_ENABLED": False}  # MB; no .aux.xml beside the file
 
 IN_MEMORY_BYTES = 1 << 27
@@ -47,7 +47,7 @@ def gdal_replacement(path: Path, *, size: int) -> Iterator[Path]:
     Raises
     ------
     OSError
-        With a number and `path`: `ENOSPC` where the disk is full, `EIO` where GDAL does not say what it was.
+        With a number and `path`: `ENOSPC` where the disk is full, `EIO` where GDAL does not state the cause.
     """
     with replacement(path) as temporary, rasterio.Env(**GDAL):
         if size <= IN_MEMORY_BYTES:
@@ -58,8 +58,8 @@ def gdal_replacement(path: Path, *, size: int) -> Iterator[Path]:
         try:
             yield temporary
         except Exception as error:
-            told = isinstance(error, OSError) and error.errno
-            if told or not type(error).__module__.startswith("rasterio"):
+            number = isinstance(error, OSError) and error.errno
+            if number or not type(error).__module__.startswith("rasterio"):
                 raise
             number = errno.ENOSPC if shutil.disk_usage(temporary.parent).free < _FULL_BYTES else errno.EIO
             raise OSError(number, f"{os.strerror(number)}: GDAL says: {error}", str(path)) from error
@@ -93,16 +93,16 @@ def check_written(path: Path, checksum: int, tags: Mapping[str, str]) -> None:
     """
     with rasterio.open(path) as raster:
         levels = len(raster.overviews(1))
-        found, told = _checksum(raster), raster.tags()
+        read, tags_read = _checksum(raster), raster.tags()
     for level in range(levels):
         with rasterio.open(path, OVERVIEW_LEVEL=level) as overview:
             _checksum(overview)  # its tiles carry sums of their own, which GDAL compares
-    if found != checksum or not tags.items() <= told.items():
+    if read != checksum or not tags.items() <= tags_read.items():
         raise OSError(errno.EIO, "what was written does not read back", str(path))
 
 
 def _checksum(raster: Any) -> int:
-    found = 0
+    checksum = 0
     for block in blocks_of(raster.shape):
-        found = added(found, raster.read(1, window=Window.from_slices(*block)))
-    return found
+        checksum = added(checksum, raster.read(1, window=Window.from_slices(*block)))
+    return checksum

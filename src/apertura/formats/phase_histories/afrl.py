@@ -20,7 +20,7 @@ from apertura.formats.phase_histories.phase_history import LARGEST, History, lar
 _EXPECTED = "a Gotcha .mat file with data.fp (frequency, pulse), freq, x, y, z, r0, all finite"
 
 _LARGEST = {"fp": LARGEST, "freq": 1e12, "x": 1e7, "y": 1e7, "z": 1e7, "r0": 1e7}
-"""What a field may hold: as a sample may, Hz, m."""
+"""Largest values of fields: samples, Hz, m."""
 
 _EPOCH = np.datetime64("1970-01-01", "ns")
 

@@ -22,7 +22,7 @@ from apertura.formats.phase_histories.phase_history import LARGEST, History, joi
 
 _EXPECTED = "a CPHD file, version 1.0.1 or 1.1.0, of samples over frequency (DomainType FX), not compressed"
 _FORMATS = {"CF8": ">c8", "CI4": ">i2", "CI2": "i1"}
-"""SignalArrayFormat → what a sample is made of: one complex number, or two whole ones."""
+"""SignalArrayFormat → dtype of a sample: one complex number, or two integers."""
 
 _LARGEST = {
     "TxTime": 1e7,
@@ -34,7 +34,7 @@ _LARGEST = {
     "TOA1": 1.0,
     "TOA2": 1.0,
 }
-"""What a parameter of a pulse may be, s and Hz; 1e8 m for positions."""
+"""Largest parameters of a pulse, s and Hz; 1e8 m for positions."""
 
 _CYCLES = 1e-5
 """By which a pulse's frequencies may turn an echo at the edge of its swath against those of another: -84 dB."""
@@ -43,7 +43,7 @@ _NORMAL = 1
 """SIGNAL of a pulse with an echo; 0: none, 2: noise, 3: noise of normal level."""
 
 _ATMOSPHERE_S = 1e-7
-"""More than what troposphere and ionosphere add to any path, where a file does not say it: 30 m."""
+"""Seconds, 30 m of path: more than troposphere and ionosphere add to any path, where a file does not state it."""
 
 _REACH = 1e-3  # of a step: FX1 and FX2 are rounded
 
@@ -76,17 +76,17 @@ def read_cphd(paths: Sequence[Path], *, pair: str, described: Mapping[str, Any])
     return joined(histories, pair=pair, expected=_EXPECTED)
 
 
-def of_channel(path: Path, fields: dict[str, NDArray[Any]], asked: str | None) -> dict[str, NDArray[Any]]:
-    """Return what `cphd_fields` has read of one channel: the one asked for, or the only one."""
+def of_channel(path: Path, fields: dict[str, NDArray[Any]], requested: str | None) -> dict[str, NDArray[Any]]:
+    """Return the fields of one channel: the requested one, or the only one."""
     names = list(map(str, fields["channels"]))
-    if names.count(asked or "") != 1 and (asked is not None or len(names) != 1):
+    if names.count(requested or "") != 1 and (requested is not None or len(names) != 1):
         raise CampaignError(
             f"{len(names)} channels, {', '.join(map(quoted, names[:9]))}",
             where=path,
-            expected="the one that waveform.channel names" if asked is None else f"one called {quoted(asked)}",
+            expected="the one that waveform.channel names" if requested is None else f"one called {quoted(requested)}",
             remedy="Set waveform.channel to one of them.",
         )
-    own = f"{0 if asked is None else names.index(asked)}/"
+    own = f"{0 if requested is None else names.index(requested)}/"
     return {name.removeprefix(own): array for name, array in fields.items() if "/" not in name or name.startswith(own)}
 
 
@@ -141,7 +141,7 @@ def history(path: Path, fields: dict[str, NDArray[Any]], *, pair: str) -> Histor
 
 
 class _Vectors:
-    """Samples of a file as transfer functions, converted as they are asked for: (pulse, subcarrier) complex64."""
+    """Samples of a file as transfer functions, converted lazily: (pulse, subcarrier) complex64."""
 
     dtype = np.dtype(np.complex64)
     ndim = 2
@@ -233,7 +233,7 @@ def _flags(fields: dict[str, NDArray[Any]], delay_s: NDArray[np.float64], normal
 
 
 def _in_frame(fields: dict[str, NDArray[Any]], path: Path, position: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return ECEF positions as they are, or in the local frame that the file says it was made from."""
+    """Return ECEF positions unchanged, or in the local frame stated by the file."""
     frame, axes = str(fields["frame"]), fields["axes"]
     if frame == "ecef":
         return position

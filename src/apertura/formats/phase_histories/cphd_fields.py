@@ -1,4 +1,4 @@
-"""What a CPHD file says of its pulses, through sarkit; run by `read_isolated`. Samples stay in the file."""
+"""Parameters of the pulses of a CPHD file, through sarkit; run by `read_isolated`. Samples stay in the file."""
 
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ FRAME = "APERTURA_FRAME"
 """Parameter of the collection that our own files add: frame of stage echo."""
 
 OPTIONAL_FIELDS = ("AmpSF", "SIGNAL", "TDTropoSRP", "TDIonoSRP", PATH_LIMIT)
-"""Of each pulse, what not every file says."""
+"""Optional parameters of each pulse."""
 
 
 def read_fields(path: Path) -> dict[str, NDArray[Any]]:

@@ -16,14 +16,14 @@ from apertura.formats.isolated import UnreadableError, read_isolated
 from apertura.formats.npy import read_npy
 from apertura.formats.times import utc_times
 
-# ---- Beat signals of FMCW radars as arrays (.npy, .mat): they enter at `echo`, placed by flight logs ---------------
+# ---- Beat signals of FMCW radars as arrays (.npy, .mat) -------------------------------------------------------------
 #
-# What was swept is what the config says of it: section `waveform` of kind fmcw.
+# The sweep is stated by the config: section `waveform` of kind fmcw.
 
 _TIMES = ".time.npy"
 _MOST_VALUES = 1 << 34
 _LARGEST = 1e15
-"""What a sample may be: its square is a float32."""
+"""Largest sample: its square is a float32."""
 
 _FARTHEST_S = 2.0**33
 """Since 1970, what nanoseconds can count."""
@@ -46,7 +46,7 @@ class Sweeps:
     beat
         (sweep, sample) from the beginning of each sweep.
     time
-        (sweep,) datetime64[ns], when each began; None: the file does not say.
+        (sweep,) datetime64[ns], start of each; None: not stated by the file.
     late_s
         (sweep,) seconds by which the first sample is later than that; None: by nothing.
     dropped
@@ -63,7 +63,7 @@ class Sweeps:
 def read_beat_npy(paths: Sequence[Path], *, pair: str, described: Mapping[str, Any]) -> xr.Dataset:
     """Return the `echo` stage of <node>.npy or <node>.<part>.npy, (sweep, sample), without positions.
 
-    Beside <stem>.npy, <stem>.time.npy may say when each sweep began: datetime64, or float64 seconds since 1970.
+    Beside <stem>.npy, <stem>.time.npy may state the start of each sweep: datetime64, or float64 seconds since 1970.
 
     Raises
     ------
@@ -75,12 +75,12 @@ def read_beat_npy(paths: Sequence[Path], *, pair: str, described: Mapping[str, A
     alone = [path for path in paths if path.name.endswith(_TIMES) and path.name[: -len(_TIMES)] + ".npy" not in by_name]
     if alone or not files:
         raise _error("times without beat signals", (alone or list(paths))[0])
-    asked: dict[str, Any] = {"most": _MOST_VALUES, "expected": _EXPECTED, "remedy": _REMEDY}
+    limits: dict[str, Any] = {"most": _MOST_VALUES, "expected": _EXPECTED, "remedy": _REMEDY}
     read = []
     for path in files:
         beside = by_name.get(path.name.removesuffix(".npy") + _TIMES)
-        time = None if beside is None else _times(read_npy(beside, kinds="Mf", **asked), beside)
-        read.append(Sweeps(path, read_npy(path, kinds="fiuc", **asked), time))
+        time = None if beside is None else _times(read_npy(beside, kinds="Mf", **limits), beside)
+        read.append(Sweeps(path, read_npy(path, kinds="fiuc", **limits), time))
     return joined_sweeps(read, pair=pair, described=described)
 
 
@@ -117,7 +117,7 @@ def sweeps_of(path: Path, found: Mapping[str, NDArray[Any]]) -> Sweeps:
 
 
 def sweep_of(described: Mapping[str, Any]) -> FrequencySweep:
-    """Return what section `waveform` says of the sweep."""
+    """Return the sweep of section `waveform`."""
     return FrequencySweep(**{field.name: described[field.name] for field in fields(FrequencySweep)})
 
 
@@ -235,8 +235,7 @@ def _error(found: str, path: Path, expected: str = _EXPECTED) -> CampaignError:
     return CampaignError(found, where=path, expected=expected, remedy=_REMEDY)
 
 
-# ---- Beat signals that a sound card recorded (.wav): a channel of triggers, one of beats, as of MIT's coffee-can
-# radar
+# ---- Beat signals of a sound card (.wav): channels of triggers and beats --------------------------------------------
 
 _EXTREMES = 0.1, 99.9
 """Percentiles that are the levels of the sync channel: clicks of a sound card are beyond."""

@@ -41,7 +41,7 @@ def read_wav(path: Path) -> dict[str, NDArray[Any]]:
     Raises
     ------
     ValueError
-        If it ends before its own header says so, or is otherwise none.
+        If it ends before the length in its header, or is otherwise no such file.
     """
     from scipy.io import wavfile
 

@@ -29,7 +29,7 @@ class Field(NamedTuple):
     kinds: str
     """Of numpy's dtypes."""
     largest: float
-    """What it may hold."""
+    """Range of its values."""
     optional: bool = False
 
 
@@ -42,14 +42,14 @@ LAYOUT: Mapping[str, Field] = {
     "reference_delay": Field(("pulse",), "fiu", 1.0),
     "path_limit": Field(("pulse",), "fiu", 1e12, optional=True),
 }
-"""Name → what it is; Hz, metres, seconds."""
+"""Name → array of the layout; Hz, metres, seconds."""
 
 POSITIONS = ("tx_position", "rx_position")
 """Left out where flight logs hold them."""
 
 
 def check_array(name: str, shape: Sequence[int], dtype: np.dtype[Any]) -> None:
-    """Raise ValueError if an array of a file, not read yet, is not what the layout says.
+    """Raise ValueError if an array of a file, not read yet, violates the layout.
 
     Examples
     --------
@@ -86,14 +86,14 @@ def check_attributes(frame: object, units: object, *, placed: bool) -> None:
 
 
 def history(path: Path, fields: Mapping[str, NDArray[Any]]) -> History:
-    """Return what a file of this layout holds.
+    """Return the arrays of a file of this layout.
 
     Parameters
     ----------
     path
         The file or folder, for messages.
     fields
-        Arrays of `LAYOUT`, each with the dimensions that `check_array` asks for, and ``frame`` as text, which counts
+        Arrays of `LAYOUT`, each with the dimensions that `check_array` requires, and ``frame`` as text, which counts
         where there are positions.
 
     Raises

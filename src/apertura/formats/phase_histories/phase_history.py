@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
 LARGEST = 1e30
-"""What a sample may hold: its square is a number that float32 still adds."""
+"""Largest sample: its square still adds up in float32."""
 
 _BLOCK_BYTES = 8 << 20
 _EARTH_M = (6.3e6, 1e8)
@@ -25,7 +25,7 @@ _EARTH_M = (6.3e6, 1e8)
 
 
 class Samples(Protocol):
-    """Transfer functions, (pulse, subcarrier), read as they are asked for: an array, or what behaves so."""
+    """Transfer functions, (pulse, subcarrier), read lazily: an array, or an array-like."""
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -33,7 +33,7 @@ class Samples(Protocol):
 
     @property
     def dtype(self) -> np.dtype[Any]:
-        """What it gives."""
+        """Type of its values."""
 
     def __getitem__(self, index: Any) -> NDArray[Any]: ...
 
@@ -57,7 +57,7 @@ class History:
     reference_delay
         (pulse,) float64, seconds: τ_ref.
     path_limit
-        (pulse,) float64, metres of total path beyond which there are no echoes; infinite where nothing says.
+        (pulse,) float64, metres of total path beyond which there are no echoes; infinite where not stated.
     used
         (pulse,) bool, those that hold echoes.
     frame
@@ -85,12 +85,12 @@ class History:
 def largest_by_row(
     name: str, values: Samples, largest: float, refuse: Callable[[str], CampaignError]
 ) -> NDArray[np.float64]:
-    """Return the largest magnitude along the first axis of what a file holds, read in blocks.
+    """Return the largest magnitude of an array along its first axis, read in blocks.
 
     Parameters
     ----------
     name
-        What the file calls it.
+        Its name in the file.
     values
         (row, …) numbers.
     largest
@@ -123,7 +123,7 @@ def largest_by_row(
 
 
 def joined(histories: Sequence[History], *, pair: str, expected: str) -> "xr.Dataset":
-    """Return the `echo` stage of files that follow each other; samples are read as they are asked for.
+    """Return the `echo` stage of files that follow each other; samples are read lazily.
 
     Parameters
     ----------

@@ -19,7 +19,7 @@ SAMPLE_RATE_HZ = 16.384e9
 """Of a scan: 32 of the radar's bins of 1.907 ps."""
 
 BAND_HZ = 3.1e9, 5.3e9
-"""What the radar occupies by its data sheet."""
+"""Band of the radar by its data sheet."""
 
 _CONFIG_BYTES = 32  # of the radar's configuration, which a file begins with
 _SAMPLES = 350  # of each message

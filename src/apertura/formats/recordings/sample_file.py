@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from apertura.common.atomic import naming
 from apertura.common.errors import CampaignError
 
-# ---- Real samples at an intermediate frequency become complex baseband: analytic signal, then mixing, at the same
-# rate
+# ---- Real samples at an intermediate frequency to complex baseband --------------------------------------------------
 
 SETTLING = 63
 """Samples on either side that the filter reaches: where it runs over the end of a capture, they are wrong."""
@@ -125,7 +124,7 @@ def _hilbert() -> NDArray[np.float64]:
     return np.asarray(taps * np.kaiser(k.size, _KAISER))
 
 
-# ---- How the samples of a recording lie in its file: which numbers, what stands between them, real ones at which IF
+# ---- Layout of the samples in a file --------------------------------------------------------------------------------
 
 Samples = NDArray[np.int16 | np.float32]
 """(…, 2), I and Q: counts of up to 16 bits as int16, all others as float32."""
@@ -225,7 +224,7 @@ class SampleLayout:
         return cls(raw.attrs["datatype"], raw.attrs["trailing_bytes"], start, skipped, mixing)
 
 
-# ---- Samples in a recorder's file, read where they are wanted, a bounded number at a time --------------------------
+# ---- Samples of a file, read in bounded blocks ----------------------------------------------------------------------
 #
 # They are read and not mapped: pages of a mapped file count as memory of the process, and a file that is cut short
 # meanwhile ends the process instead of raising an error.

@@ -22,7 +22,7 @@ from apertura.formats.recordings.recording import Captures, Recording
 from apertura.formats.recordings.sample_file import DATATYPES, SETTLING, Mixing, SampleFile, SampleLayout
 from apertura.formats.times import utc_times
 
-# ---- Metadata of SigMF recordings as values: global object and captures, read as a stream --------------------------
+# ---- Metadata: global object and captures, read as a stream ---------------------------------------------------------
 #
 # Only what is read is checked: the schema of the sigmf package takes jsonschema, which costs more to import than a
 # recording to open.
@@ -90,7 +90,7 @@ _SOME_CAPTURES = TypeAdapter(list[Capture])
 
 
 class StatedCaptures(NamedTuple):
-    """What the metadata say of the captures, (capture,) each."""
+    """Fields of the captures, (capture,) each."""
 
     start: NDArray[np.int64]
     time: NDArray[np.datetime64]
@@ -102,7 +102,7 @@ class StatedCaptures(NamedTuple):
 def read_meta(path: Path) -> tuple[Global, StatedCaptures]:
     """Return the metadata of a recording.
 
-    A long flight has some hundred thousand captures: no more than a few thousand of their objects are held at a time.
+    A long flight has some hundred thousand captures: at most a few thousand of their objects are in memory at a time.
 
     Raises
     ------
@@ -181,7 +181,7 @@ def of_sigmf(adapter: TypeAdapter[Model], document: object, path: Path, name: st
         raise CampaignError(f"not valid SigMF: {key}: {wrong['msg']}{given}", path, _EXPECTED, _REMEDY) from error
 
 
-# ---- Which files of a flight's folder are a node's SigMF recording: by its name, by a collection, by core:dataset
+# ---- Files of a node's recording: by name, collection or core:dataset -----------------------------------------------
 
 _SUFFIX = ".sigmf-collection"
 _A_COLLECTION = "a SigMF collection: core:version, core:streams (name, hash) and, where names differ, apertura:nodes"
@@ -205,7 +205,7 @@ def find_sigmf(folder: Path, node: str) -> tuple[Path, Path]:
     """Return metadata and samples of a node's recording, which need not be there.
 
     The metadata are <node>.sigmf-meta, or where that is missing those of the stream that `apertura:nodes` of a
-    collection in the folder gives the node. The samples have their name, or the one that `core:dataset` says.
+    collection in the folder gives the node. The samples have their name, or the one of `core:dataset`.
 
     Raises
     ------
@@ -255,7 +255,7 @@ def _collections(folder: Path) -> Iterator[tuple[Path, SigmfCollection]]:
         yield path, collection
 
 
-# ---- SigMF recordings: one capture segment per trigger, channels interleaved per sample ----------------------------
+# ---- Recordings: one capture segment per trigger, interleaved channels ----------------------------------------------
 
 
 def open_sigmf(meta_path: Path, data_path: Path) -> Recording:
@@ -323,7 +323,7 @@ def _layout(header: Global, captures: StatedCaptures, path: Path) -> SampleLayou
 
 
 def _frequency_hz(captures: StatedCaptures, path: Path) -> float:
-    """Return the RF frequency at baseband zero, which all captures share; 0 where none says."""
+    """Return the RF frequency at baseband zero, which all captures share; 0 where none is stated."""
     stated = np.flatnonzero(~np.isnan(captures.frequency_hz))
     if not stated.size:
         return 0.0

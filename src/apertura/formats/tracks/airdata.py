@@ -12,7 +12,7 @@ from apertura.common.errors import CampaignError
 from apertura.formats.times import utc_times
 from apertura.formats.tracks.csv_track import cut_off, numbers, read_table
 from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions
-from apertura.formats.tracks.track import contradicted, make_track, remarked, unsaid
+from apertura.formats.tracks.track import contradicted, make_track, remarked, unstated
 
 _CLOCK, _UTC = "time(millisecond)", "datetime(utc)"
 _PLACE = ["latitude", "longitude"]
@@ -24,8 +24,8 @@ _FEWEST = 4  # without them a position is dead reckoning
 _APART_S = 1.5
 """By what seconds and clock step apart where the clock stood still: a whole second is late by 1 s at most."""
 
-_SURE_S = 0.1
-"""How well the seconds of a part must tell its clock's zero, and how far an epoch may lie outside its second: AirData's
+_TOLERANCE_S = 0.1
+"""Seconds, accuracy of a part's clock zero, and how far an epoch may lie outside its second: AirData's
 interval."""
 
 _ROUNDING_S = 1e-6
@@ -37,7 +37,7 @@ class _Clock(NamedTuple):
     """UTC of epochs, and what is known of it."""
 
     time: NDArray[np.datetime64]
-    sure: NDArray[np.bool_]
+    resolved: NDArray[np.bool_]
     misfit_s: float
     parts: int
 
@@ -47,13 +47,13 @@ def read_airdata(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -> 
 
     datetime(utc) holds whole seconds, which are taken as cut off: UTC is the clock time(millisecond) plus the offset
     with which no epoch leaves its second. The clock stands still while motors are off, so every part between has an
-    offset of its own; parts too short to tell it are left out. What does not fit is told (remarks). Heights are above
-    mean sea level: options.height_offset_m is needed. The log does not say how a position was solved (RTK or not).
+    offset of its own; parts too short to determine it are left out. Misfits are reported (remarks). Heights are above
+    mean sea level: options.height_offset_m is needed. The log does not state how a position was solved (RTK or not).
 
     Raises
     ------
     CampaignError
-        If a column is missing, a cell is no number, nobody says what heights are above, or the two clocks do not agree.
+        If a column is missing, a cell is no number, the datum of heights is not stated, or the two clocks do not agree.
 
     Notes
     -----
@@ -62,7 +62,7 @@ def read_airdata(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -> 
     if options.time_system == "gpst":
         raise contradicted("time_system", f"{_UTC} is UTC", node=node, where=path)
     if options.height_offset_m is None:
-        raise unsaid("height_offset_m", "heights above mean sea level", node=node, where=path)
+        raise unstated("height_offset_m", "heights above mean sea level", node=node, where=path)
     try:
         table = read_table(path, (_CLOCK, _UTC, *_PLACE), optional=(*_ATTITUDE, *_HEIGHTS, _SATELLITES), texts=(_UTC,))
         height = next((name for name in _HEIGHTS if name in table), None)
@@ -72,15 +72,15 @@ def read_airdata(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -> 
         table, dropped = _measured(table.iloc[: len(table) - cut])
         clock = _utc(numbers(table[[_CLOCK]])[:, 0] / 1000, utc_times(table[_UTC].fillna("").str.strip().tolist()))
         logged = numbers(table[[*_PLACE, height]])
-        attitude = numbers(table[_ATTITUDE])[clock.sure] if set(_ATTITUDE) <= set(table) else None
+        attitude = numbers(table[_ATTITUDE])[clock.resolved] if set(_ATTITUDE) <= set(table) else None
     except (ValueError, ArithmeticError) as error:
         found = str(error).partition("\n")[0]
         raise CampaignError(found, path, _EXPECTED, "Export the flight from AirData again.") from error
     position = logged * [1.0, 1.0, _HEIGHTS[height]] + [0.0, 0.0, options.height_offset_m]
-    dropped |= {"line cut off": int(cut), "in a part too short to tell its time": int((~clock.sure).sum())}
+    dropped |= {"line cut off": int(cut), "in a part too short to tell its time": int((~clock.resolved).sum())}
     track = make_track(
-        clock.time[clock.sure],
-        position[clock.sure],
+        clock.time[clock.resolved],
+        position[clock.resolved],
         attitude_deg=attitude,
         dropped={why: count for why, count in dropped.items() if count},
         node=node,
@@ -107,18 +107,20 @@ def _utc(clock_s: NDArray[np.float64], second: NDArray[np.datetime64]) -> _Clock
     if not len(clock_s):
         raise ValueError("no epochs")
     zero = second[0]
-    told = (second - zero) / np.timedelta64(1, "s")
-    apart = np.abs(np.diff(told) - np.diff(clock_s)) > _APART_S
+    second_s = (second - zero) / np.timedelta64(1, "s")
+    apart = np.abs(np.diff(second_s) - np.diff(clock_s)) > _APART_S
     part = np.concatenate([[0], np.cumsum(apart)])
-    offset, sure, misfit = np.zeros(len(told)), np.zeros(len(told), bool), 0.0
+    offset, resolved, misfit = np.zeros(len(second_s)), np.zeros(len(second_s), bool), 0.0
     for number in range(part[-1] + 1):
         rows = part == number
-        low, high = (told - clock_s)[rows].max(), (told - clock_s)[rows].min() + 1
+        low, high = (second_s - clock_s)[rows].max(), (second_s - clock_s)[rows].min() + 1
         offset[rows] = (low + high) / 2
-        sure[rows] = high - low <= 2 * _SURE_S + _ROUNDING_S
-        misfit = max(misfit, (low - high) / 2 if sure[rows].any() else 0.0)
-    if misfit > _SURE_S or not sure.any():
-        found = f"{misfit:.2f} s apart" if misfit > _SURE_S else "one a second, so that no second is seen to change"
+        resolved[rows] = high - low <= 2 * _TOLERANCE_S + _ROUNDING_S
+        misfit = max(misfit, (low - high) / 2 if resolved[rows].any() else 0.0)
+    if misfit > _TOLERANCE_S or not resolved.any():
+        found = (
+            f"{misfit:.2f} s apart" if misfit > _TOLERANCE_S else "one a second, so that no second is seen to change"
+        )
         raise ValueError(f"columns {_CLOCK} and {_UTC}: {found}")
     elapsed = np.round((clock_s + offset) * 1e9).astype("timedelta64[ns]")
-    return _Clock(zero + elapsed, sure, misfit, int(part[-1]) + 1)
+    return _Clock(zero + elapsed, resolved, misfit, int(part[-1]) + 1)

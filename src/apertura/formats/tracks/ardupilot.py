@@ -32,7 +32,7 @@ _EXPECTED = f"an ArduPilot DataFlash log whose GPS messages hold {', '.join(NEED
 
 
 def read_ardupilot(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -> xr.Dataset:
-    """Return the `track` stage of a DataFlash log; its attribute `source` says which receiver was taken of how many.
+    """Return the `track` stage of a DataFlash log; its attribute `source` names the receiver used, of how many.
 
     Taken is receiver 0, or the one whose number ``options.body`` is. GPS week and milliseconds become UTC by the table
     of leap seconds. Heights are GPA.AEl, above the ellipsoid; logs without it have GPS.Alt only, above sea level, and
@@ -45,7 +45,7 @@ def read_ardupilot(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -
     node
         Its node.
     options
-        start_utc: UTC at the autopilot's start, where its receiver told no week.
+        start_utc: UTC at the autopilot's start, where its receiver gave no week.
 
     Raises
     ------
@@ -117,8 +117,8 @@ def _receiver(fields: Fields, options: LogOptions, node: str, where: Path) -> tu
     known = sorted({int(number) for number in numbers[np.isfinite(numbers)]})
     if not known:
         raise _error("no GPS message", where)
-    asked = options.body is None or options.body in map(str, known)
-    if not asked:
+    requested = options.body is None or options.body in map(str, known)
+    if not requested:
         raise CampaignError(
             f"no receiver {quoted(options.body)}",
             where,
@@ -144,7 +144,7 @@ def _accuracy(fields: Fields, receiver: int, time_us: Floats) -> dict[str, Float
 def _height(
     fields: Fields, sea_level: Floats, ellipsoidal: Floats, receiver: int, options: LogOptions
 ) -> Floats | None:
-    """Return heights above the ellipsoid, NaN where unknown; None if the log does not tell them."""
+    """Return heights above the ellipsoid, NaN where unknown; None if the log lacks them."""
     known = ellipsoidal > _LOWEST_M
     if known.any() and _parameter(fields, _TYPES, receiver, 0) != _NOVATEL:
         return np.where(known, ellipsoidal, np.nan)

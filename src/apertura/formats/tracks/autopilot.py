@@ -14,7 +14,7 @@ from apertura.formats.times import utc_times
 from apertura.formats.tracks.log_options import LogOptions
 from apertura.formats.tracks.track import make_track
 
-# ---- An autopilot's clock, which counts from its start, against UTC: the line through what its receiver tells ------
+# ---- Autopilot's clock against UTC: a line through its receiver's times ---------------------------------------------
 
 
 _AGREES_S = 0.25  # receivers' messages are late by about 0.1 s, and now and then by some tens of milliseconds more
@@ -61,14 +61,14 @@ class BootClock:
 def clock_of(
     boot_s: Floats, time_utc: NDArray[np.datetime64], *, delay_s: float, where: Path
 ) -> tuple[BootClock, NDArray[np.bool_]]:
-    """Return the autopilot's clock against UTC, and which epochs agree with it: a line through what most say.
+    """Return the autopilot's clock against UTC as a robust line, and which epochs agree with it.
 
     Parameters
     ----------
     boot_s, time_utc
         (epoch,): the autopilot's clock when it heard of epochs, and their times.
     delay_s
-        By how much it hears of them late.
+        Latency of the receiver's messages, s.
     where
         The log, for messages.
 
@@ -89,7 +89,7 @@ def clock_of(
     ahead, beside = since - boot_s, boot_s - zero
     line = np.array([0.0, float(np.median(ahead))])
     reach = _AGREES_S + _FASTEST * float(np.ptp(boot_s)) / 2
-    for _ in range(2):  # what is off by seconds goes before a line is laid through the rest
+    for _ in range(2):  # outliers of seconds are removed before the rest is fitted
         near = np.abs(ahead - np.polyval(line, beside)) <= reach
         if near.sum() >= 8 and np.ptp(beside[near]) * _FASTEST > 0.01:
             line = np.polyfit(beside[near], ahead[near], 1)
@@ -111,7 +111,7 @@ def clock_of(
     return BootClock(origin, middle - slope * zero, 1 + slope, delay_s), agree
 
 
-# ---- A receiver's positions against its own velocities, which come of Doppler shifts: two words on the same motion
+# ---- A receiver's positions against its own Doppler velocities ------------------------------------------------------
 
 _NEAR_M, _CURVED_M_S2 = 0.5, 2.5  # noise of both; an eighth of the 20 m/s² by which velocity may bend between epochs
 _MOST, _FEW = 0.5, 10
@@ -166,12 +166,11 @@ def contradicted(time_utc: NDArray[np.datetime64], geodetic: Floats, velocity: F
     return np.asarray(np.concatenate([[True], far]) & np.concatenate([far, [True]]))
 
 
-# ---- What autopilots log: a receiver's epochs in UTC, and attitude by a clock that counts from the autopilot's
-# start
+# ---- Logs of autopilots: receiver's epochs in UTC, attitude by its clock --------------------------------------------
 
 _WORST_STD_M = 1e4
 _UNIT = 1e-2
-_HELD_S, _LONGEST_S = 0.5, 1.0
+_EXTRAPOLATED_S, _LONGEST_S = 0.5, 1.0
 _TURN_RAD = np.radians(10)
 
 
@@ -244,7 +243,7 @@ def autopilot_track(
     attitude
         None: not logged.
     delay_s
-        By how much the autopilot hears of an epoch late, s.
+        Latency of an epoch in the autopilot, s.
     options
         start_utc: time zero of the autopilot's clock, where no epoch has a time.
     node, where
@@ -289,7 +288,7 @@ def autopilot_track(
 
 
 def _counted(boot_s: Floats, options: LogOptions, node: str, where: Path) -> NDArray[np.datetime64]:
-    """Return UTC of a log in which only the autopilot's clock tells time."""
+    """Return UTC of a log that has no clock but the autopilot's."""
     key = f"nodes.{node}.log.start_utc"
     try:
         start = utc_times([options.start_utc or ""])[0]
@@ -325,8 +324,8 @@ def _angles_deg(attitude: Attitude, boot_s: Floats) -> Floats | None:
     alone = np.zeros(time.size, bool)
     alone[1:-1] = np.minimum(before[:-1], after[1:]) > across + _TURN_RAD
     time, turns = time[~alone], turns[~alone]
-    held = np.clip(boot_s, time[0], time[-1])
-    angles = Slerp(time, turns)(held).as_euler("ZYX", degrees=True)[:, ::-1]
-    following = np.clip(np.searchsorted(time, held), 1, time.size - 1)
-    unknown = (np.abs(boot_s - held) > _HELD_S) | (time[following] - time[following - 1] > _LONGEST_S)
+    clipped = np.clip(boot_s, time[0], time[-1])
+    angles = Slerp(time, turns)(clipped).as_euler("ZYX", degrees=True)[:, ::-1]
+    following = np.clip(np.searchsorted(time, clipped), 1, time.size - 1)
+    unknown = (np.abs(boot_s - clipped) > _EXTRAPOLATED_S) | (time[following] - time[following - 1] > _LONGEST_S)
     return np.where(unknown[:, None], np.nan, angles)

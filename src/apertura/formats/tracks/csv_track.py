@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from apertura.common.errors import CampaignError, quoted
 from apertura.common.leap_seconds import GPS_EPOCH, utc_from_gps
 from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions
-from apertura.formats.tracks.track import FIXES, contradicted, make_track, start_time, unsaid
+from apertura.formats.tracks.track import FIXES, contradicted, make_track, start_time, unstated
 
-# ---- Tables of comma-separated values that strangers wrote: columns by name, each once, numbers and nothing else
+# ---- Untrusted tables of comma-separated numbers, columns by name ---------------------------------------------------
 
 LARGEST_LOG = 500_000_000
 """Bytes of a flight log or a table: a day at 50 Hz."""
@@ -130,7 +130,7 @@ def numbers(columns: pd.DataFrame) -> NDArray[np.float64]:
     return columns.to_numpy(np.float64, na_value=np.nan)
 
 
-# ---- Flight logs as CSV: a time, a position in one of three frames, maybe attitude, under names of ours or mapped
+# ---- Flight logs as CSV: time, position in one of three frames, attitude --------------------------------------------
 
 _TIMES = ("time_utc", "time", "time_s")
 _POSITIONS: dict[Literal["geodetic", "ecef", "local"], list[str]] = {
@@ -158,17 +158,17 @@ def read_csv_track(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -
 
     Its columns, or those that options.columns maps onto them, are
 
-    - one of time_utc (ISO 8601), time (the same, whose zone each cell or options.time_system says) and time_s (seconds
-      since options.start_utc, or with time_system gpst since 1980-01-06, GPS time);
+    - one of time_utc (ISO 8601), time (the same, whose zone each cell or options.time_system states) and time_s
+      (seconds since options.start_utc, or with time_system gpst since 1980-01-06, GPS time);
     - the first that is whole of latitude_deg, longitude_deg, height_m (WGS 84, ellipsoidal, after height_offset_m);
       x_m, y_m, z_m (ECEF); east_m, north_m, up_m (axes of the campaign's own);
     - where known roll_deg, pitch_deg, yaw_deg; std_north_m, std_east_m, std_up_m (standard deviations); quality (kind
-      of solution: a name or number of `FIXES`). Empty cells of these are epochs of which the log says nothing.
+      of solution: a name or number of `FIXES`). Empty cells of these are epochs without such a value.
 
     Raises
     ------
     CampaignError
-        If a column is missing or a cell is not a number or a time, or nobody says what times count from.
+        If a column is missing or a cell is not a number or a time, or the epoch of times is not stated.
     """
     log = _Log(path, node, options)
     try:
@@ -201,7 +201,7 @@ def read_csv_track(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -
 
 
 def _table(log: _Log) -> pd.DataFrame:
-    """Return the table under names of ours; ValueError where names are not in it, or not told apart."""
+    """Return the table under names of ours; ValueError where names are missing or ambiguous."""
     mapped = dict(log.options.columns)
     unknown = [name for name in mapped if name not in _OURS]
     if unknown:
@@ -249,7 +249,7 @@ def _frame(table: pd.DataFrame, log: _Log) -> Literal["geodetic", "ecef", "local
 
 
 def _time(table: pd.DataFrame, log: _Log) -> NDArray[np.datetime64]:
-    """Return UTC; what a name says is not overruled by the config."""
+    """Return UTC; a zone stated by the column's name is not overruled by the config."""
     stated = [name for name in _TIMES if name in table]
     if not stated:
         raise _lacking("time_utc", table, log)
@@ -262,7 +262,7 @@ def _time(table: pd.DataFrame, log: _Log) -> NDArray[np.datetime64]:
     if name == "time" and not zoned.all():
         if system is None or zoned.any():
             found = "times in column time that do not say whether they are UTC or GPST"
-            raise unsaid("time_system", found, node=log.node, where=log.path)
+            raise unstated("time_system", found, node=log.node, where=log.path)
         time = _iso(table[name])
         return utc_from_gps(time) if system == "gpst" else time
     if system == "gpst":

@@ -27,12 +27,12 @@ def read_fields(path: Path) -> dict[str, NDArray[Any]]:
     Parameters
     ----------
     path
-        A log; what it begins with says whether it is binary.
+        A log, binary or text by its first bytes.
 
     Raises
     ------
     ValueError
-        If it is neither kind, or its GPS messages are of a version that does not tell time by week.
+        If it is neither kind, or its GPS messages are of a version without time by week.
     """
     from pymavlink.DFReader import DFReader_binary, DFReader_text
 

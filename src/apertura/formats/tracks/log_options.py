@@ -1,4 +1,4 @@
-"""What a flight log cannot say of itself, and the config says for it."""
+"""Options of a flight log: values that the log lacks and the config states."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -9,17 +9,17 @@ TimeSystem = Literal["utc", "gpst"]
 
 @dataclass(frozen=True)
 class LogOptions:
-    """How a log is to be read where it leaves that open; what it says itself is never overruled.
+    """Values for what a log leaves open; those that it states are never overruled.
 
     Attributes
     ----------
     format
         A key of `TRACKS`; None: by suffix and heading.
     time_system
-        Of its times; None: the log says, or is refused.
+        Of its times; None: stated by the log, else the log is rejected.
     start_utc
         Time zero of a log that counts from its own beginning, or the day of one that writes times of day only:
-        ISO 8601, UTC; None: the log says, or is refused.
+        ISO 8601, UTC; None: stated by the log, else the log is rejected.
     columns
         Name of a column of ours → name in the log, for CSV.
     base
@@ -41,4 +41,4 @@ class LogOptions:
 
 
 AS_IT_SAYS = LogOptions()
-"""Of a log that says everything itself."""
+"""Of a log that states everything itself."""

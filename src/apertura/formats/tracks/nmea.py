@@ -15,7 +15,7 @@ from apertura.common.errors import CampaignError, quoted
 from apertura.formats.times import utc_times
 from apertura.formats.tracks.csv_track import LARGEST_LOG, number
 from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions
-from apertura.formats.tracks.track import FIXES, contradicted, make_track, remarked, start_time, unsaid
+from apertura.formats.tracks.track import FIXES, contradicted, make_track, remarked, start_time, unstated
 
 _BODY = re.compile(rb"([A-Z]{2}[A-Z0-9]{3},[^*]{1,250})(?:\*([0-9A-Fa-f]{2}))?")
 _STAMP = re.compile(rb"[\s\[(\"']*\d[-\d\s:.,;/TZ+\])\"']*")
@@ -39,7 +39,7 @@ class _Fix(NamedTuple):
 
 @dataclass
 class _Log:
-    """What the sentences of a log say, on its way to a track."""
+    """Values of the sentences of a log, from which the track is made."""
 
     path: Path
     node: str
@@ -63,8 +63,8 @@ def read_nmea(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -> xr.
     Raises
     ------
     CampaignError
-        If no sentence has a date, none a geoid separation and the config does not say what they leave open, or the
-        config says another day than they do, or times do not increase.
+        If no sentence has a date, none a geoid separation and the config does not state it, or the
+        config states another day than they do, or times do not increase.
 
     Notes
     -----
@@ -128,7 +128,7 @@ def _time_of_day(text: str) -> int | None:
 
 
 def _dated(sentence: Any) -> int | None:
-    """Return nanoseconds since 1970 that a sentence with a date says, None where it says none or is not sure."""
+    """Return nanoseconds since 1970 of a sentence with a date; None where it has none or is not valid."""
     data = [*sentence.data, *[""] * 9]
     if sentence.sentence_type == "RMC":
         day, month, year = (data[8][place : place + 2] for place in (0, 2, 4))
@@ -145,7 +145,7 @@ def _dated(sentence: Any) -> int | None:
 
 
 def _take(sentence: Any, log: _Log) -> None:
-    """Add what a sentence says to the log."""
+    """Add the values of a sentence to the log."""
     kind = sentence.sentence_type
     if kind in _DATED:
         log.now_ns = _dated(sentence) or log.now_ns
@@ -180,7 +180,7 @@ def _nearest(of_day: int, log: _Log) -> int:
 
 
 def _fix(sentence: Any, log: _Log) -> _Fix | None:
-    """Return what a GGA says, or None and count it where it is no measured position."""
+    """Return the position of a GGA, or None and count it where it is no measured position."""
     data = sentence.data
     quality = data[5]
     reason = _NOT_MEASURED.get(quality)
@@ -197,7 +197,7 @@ def _fix(sentence: Any, log: _Log) -> _Fix | None:
 
 
 def _keep(now: int, fix: _Fix, log: _Log) -> None:
-    """Add an epoch; of several that talkers have at one time GN's, of the same said twice one."""
+    """Add an epoch; of several talkers at one time GN's, of repeated ones one."""
     other = log.fixes.get(now)
     if other is None:
         log.fixes[now] = fix
@@ -224,7 +224,7 @@ def _track(log: _Log) -> xr.Dataset:
     if not separation[stated].any():  # a receiver without a model of the geoid writes 0 throughout
         if fixes and log.options.height_offset_m is None:
             found = "altitudes above mean sea level, without geoid separation"
-            raise unsaid("height_offset_m", found, node=log.node, where=log.path)
+            raise unstated("height_offset_m", found, node=log.node, where=log.path)
         stated, separation = np.ones(len(fixes), bool), np.full(len(fixes), log.options.height_offset_m or 0.0)
     elif log.options.height_offset_m is not None:
         raise contradicted("height_offset_m", "GGA states the geoid separation", node=log.node, where=log.path)

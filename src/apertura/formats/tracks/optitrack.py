@@ -12,7 +12,7 @@ from apertura.common.documents import read_text
 from apertura.common.errors import CampaignError, quoted
 from apertura.formats.tracks.csv_track import LARGEST_LOG, number
 from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions
-from apertura.formats.tracks.track import make_track, start_time, unsaid
+from apertura.formats.tracks.track import make_track, start_time, unstated
 
 _METRES = {"meters": 1.0, "centimeters": 0.01, "millimeters": 0.001}
 _NEEDED = [("Rotation", axis) for axis in "XYZW"] + [("Position", axis) for axis in "XYZ"]
@@ -43,7 +43,7 @@ def read_optitrack(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -
 
     Frame 'local': east is Motive's x, north its −z, up its y. Attitude is that of axes forward, right, down that were
     −z, x and −y when the body was defined. Times are options.start_utc plus the take's seconds: its own Capture Start
-    Time is a wall clock without zone. Frames in which the body was not seen are left out and counted.
+    Time is a wall clock without zone. Frames in which the body was not tracked are left out and counted.
 
     Raises
     ------
@@ -104,23 +104,23 @@ def _read(path: Path, body: str | None, *, node: str) -> _Take:
     columns = _columns(heading[: first + 1], body, node=node, where=path)
     cut = text[-1] not in "\r\n" and len(lines) > first + 1
     time_s, values = _numbers(lines[first + 1 : len(lines) - cut], len(heading[first]), columns, first + 2, path)
-    seen = np.isfinite(values).all(axis=1)
-    if (np.isfinite(values).any(axis=1) & ~seen).any():
-        row = int(np.flatnonzero(np.isfinite(values).any(axis=1) & ~seen)[0])
+    tracked = np.isfinite(values).all(axis=1)
+    if (np.isfinite(values).any(axis=1) & ~tracked).any():
+        row = int(np.flatnonzero(np.isfinite(values).any(axis=1) & ~tracked)[0])
         raise _error(f"half a pose at {time_s[row]:g} s", path)
-    quaternion, position = values[seen, :4], values[seen, 4:] * scale
+    quaternion, position = values[tracked, :4], values[tracked, 4:] * scale
     if (np.abs(np.linalg.norm(quaternion, axis=1) - 1) > _UNIT).any():
         raise _error("a rotation that is no quaternion of length 1", path)
-    return _Take(time_s[seen], position @ _ENU_FROM_MOTIVE.T, quaternion, int((~seen).sum()), int(cut))
+    return _Take(time_s[tracked], position @ _ENU_FROM_MOTIVE.T, quaternion, int((~tracked).sum()), int(cut))
 
 
 def _metres(cells: list[str], path: Path) -> float:
-    """Return metres of the take's unit, after a look at what else its first line says."""
-    said = dict(zip(cells[::2], cells[1::2], strict=False))
+    """Return metres of the take's unit; check the other fields of its first line."""
+    fields = dict(zip(cells[::2], cells[1::2], strict=False))
     for key, wanted in (("Rotation Type", ["quaternion"]), ("Coordinate Space", ["global"]), ("Length Units", _METRES)):
-        if said.get(key, "").lower() not in wanted:
-            raise _error(f"{key} {quoted(said.get(key, ''))}, not {' or '.join(wanted)}", path)
-    return _METRES[said["Length Units"].lower()]
+        if fields.get(key, "").lower() not in wanted:
+            raise _error(f"{key} {quoted(fields.get(key, ''))}, not {' or '.join(wanted)}", path)
+    return _METRES[fields["Length Units"].lower()]
 
 
 def _columns(heading: list[list[str]], body: str | None, *, node: str, where: Path) -> list[int]:
@@ -139,7 +139,7 @@ def _columns(heading: list[list[str]], body: str | None, *, node: str, where: Pa
     bodies = list(dict.fromkeys(name for name, _, _ in place))
     listed = ", ".join(quoted(name, 40) for name in bodies)
     if body is None and len(bodies) != 1:
-        raise unsaid("body", f"rigid bodies {listed}" if bodies else "no rigid body", node=node, where=where)
+        raise unstated("body", f"rigid bodies {listed}" if bodies else "no rigid body", node=node, where=where)
     chosen = body if body is not None else bodies[0]
     if chosen not in bodies:
         raise _error(f"no rigid body {quoted(chosen, 40)} among {listed}", where)

@@ -38,9 +38,9 @@ _EXPECTED = f"a PX4 ULog with positions in {', '.join((*RECEIVERS, FUSED))}"
 
 
 def read_px4_ulog(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -> xr.Dataset:
-    """Return the `track` stage of a PX4 ULog; its attribute `source` says which topic and instance was taken.
+    """Return the `track` stage of a PX4 ULog; its attribute `source` names the topic and instance used.
 
-    Taken is the first there is of vehicle_gps_position, sensor_gps: what the receiver says, at its own time in UTC and
+    Taken is the first there is of vehicle_gps_position, sensor_gps: the receiver's solution, at its own time in UTC and
     of its own antenna; else vehicle_global_position, whose height follows a barometer and whose time is found through
     the receiver's. ``options.body`` chooses: a topic, or one of several receivers as ``sensor_gps:1``. Attitude comes
     from vehicle_attitude. Heights are ellipsoidal; where the driver copies those above sea level, or has none,
@@ -53,7 +53,7 @@ def read_px4_ulog(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) ->
     node
         Its node.
     options
-        start_utc: UTC at the autopilot's start, where its receiver told none.
+        start_utc: UTC at the autopilot's start, where its receiver gave none.
 
     Raises
     ------
@@ -92,9 +92,9 @@ def track_of(fields: Fields, *, node: str, options: LogOptions, where: Path) -> 
     epochs = _epochs(fields, source, options, node, where)
     if source.startswith(FUSED):
         receiver = next((name for name in _sources(fields) if not name.startswith(FUSED)), None)
-        told = None if receiver is None else _of_receiver(fields, receiver)
-        if told is not None and told[0].size:
-            clock = clock_of(*told, delay_s=delay_s, where=where)[0]
+        receiver_time = None if receiver is None else _of_receiver(fields, receiver)
+        if receiver_time is not None and receiver_time[0].size:
+            clock = clock_of(*receiver_time, delay_s=delay_s, where=where)[0]
             epochs = replace(epochs, time_utc=clock.utc(epochs.boot_s))
         delay_s = 0.0  # the estimator's positions are of the moment that it writes
     track = autopilot_track(epochs, _attitude(fields), delay_s=delay_s, options=options, node=node, where=where)
@@ -110,17 +110,17 @@ def _sources(fields: Fields) -> list[str]:
 
 def _source(fields: Fields, options: LogOptions, node: str, where: Path) -> str:
     known = _sources(fields)
-    asked = [name for name in known if options.body in (None, name, name.partition(":")[0])]
+    bodies = [name for name in known if options.body in (None, name, name.partition(":")[0])]
     if not known:
         raise _error("no message of any of them", where)
-    if not asked:
+    if not bodies:
         raise CampaignError(
             f"no positions of {quoted(options.body)}",
             where,
             f"one of {', '.join(known)}",
             f"Correct nodes.{node}.log.body, or leave it out.",
         )
-    return asked[0]
+    return bodies[0]
 
 
 def _epochs(fields: Fields, source: str, options: LogOptions, node: str, where: Path) -> Epochs:
@@ -193,18 +193,18 @@ def _first(fields: Fields, source: str, names: tuple[str, ...]) -> NDArray[np.fl
 
 
 def _arrived(fields: Fields, source: str) -> NDArray[np.float64]:
-    """Return the autopilot's clock at which it had the time that a message tells."""
+    """Return the autopilot's clock at the UTC time of each message."""
     later = fields.get(f"{source}/timestamp_time_relative", np.zeros(1))
     return np.asarray((fields[f"{source}/timestamp"].astype(np.float64) + later) * 1e-6)
 
 
 def _utc(fields: Fields, source: str) -> NDArray[np.datetime64]:
-    told = fields.get(f"{source}/time_utc_usec")
+    receiver_time = fields.get(f"{source}/time_utc_usec")
     size = fields[f"{source}/timestamp"].size
-    told = np.zeros(size, np.uint64) if told is None else told
-    known = (told > _FIRST_US) & (told < _LAST_US)
+    receiver_time = np.zeros(size, np.uint64) if receiver_time is None else receiver_time
+    known = (receiver_time > _FIRST_US) & (receiver_time < _LAST_US)
     utc = np.full(size, np.datetime64("NaT", "ns"), "datetime64[ns]")
-    utc[known] = told[known].astype("datetime64[us]")
+    utc[known] = receiver_time[known].astype("datetime64[us]")
     return utc
 
 

@@ -16,7 +16,7 @@ from apertura.core.geometry.geodesy import ecef_from_geodetic, ned_axes
 from apertura.formats.times import utc_times
 from apertura.formats.tracks.csv_track import LARGEST_LOG, number
 from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions
-from apertura.formats.tracks.track import contradicted, make_track, unsaid
+from apertura.formats.tracks.track import contradicted, make_track, unstated
 
 _POSITIONS = {
     "geodetic": ("latitude(deg)", "longitude(deg)", "height(m)"),
@@ -37,7 +37,7 @@ _REMEDY = "Export the solution with these output settings."
 
 
 class _Header(NamedTuple):
-    """What the lines before the first solution say."""
+    """Fields of the lines before the first solution."""
 
     system: str
     position: str
@@ -50,7 +50,7 @@ class _Header(NamedTuple):
 def read_rtklib_pos(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -> xr.Dataset:
     """Return the `track` stage of an RTKLIB solution.
 
-    Its header says whether times are GPST, UTC or JST (as calendar dates or week and seconds), and whether positions
+    Its header states whether times are GPST, UTC or JST (as calendar dates or week and seconds), and whether positions
     are latitude, longitude (decimal degrees, or degrees, minutes and seconds) and height, ECEF, or a baseline to east,
     north and up of ``ref pos`` or options.base. Columns Q and standard deviations, where named, are kept; those of ECEF
     are turned to north, east and up with their covariances. Lines with Q = 0 hold no solution and are counted.
@@ -58,7 +58,7 @@ def read_rtklib_pos(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) 
     Raises
     ------
     CampaignError
-        If the header does not say what the columns are, heights are above a geoid and options.height_offset_m is not
+        If the header does not name the columns, heights are above a geoid and options.height_offset_m is not
         given, a baseline has no base, or a line cannot be read.
 
     Notes
@@ -68,7 +68,7 @@ def read_rtklib_pos(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) 
     text = read_text(path, expected=_EXPECTED, remedy=_REMEDY, largest=LARGEST_LOG // 2)
     lines = text.splitlines()
     header = _header([line for line in lines if line.startswith("%")], path)
-    _check_said(header, options, node=node, where=path)
+    _check_stated(header, options, node=node, where=path)
     cut = bool(lines) and text[-1] not in "\r\n" and lines[-1][:1] not in {"", "%"}
     times, values, stated = _rows(lines[: len(lines) - cut], header, path)
     quality = stated[:, 0] if "Q" in header.cell_of else np.full(len(times), np.nan)
@@ -112,14 +112,14 @@ def _header(lines: list[str], path: Path) -> _Header:
     return _Header(names[0], kind, cell_of, ends[-1], heights, _CELLS.split(base.strip()) if base.strip() else [])
 
 
-def _check_said(header: _Header, options: LogOptions, *, node: str, where: Path) -> None:
-    """Raise CampaignError where log and config say different things, or neither says what heights are above."""
+def _check_stated(header: _Header, options: LogOptions, *, node: str, where: Path) -> None:
+    """Raise CampaignError where log and config contradict, or neither states the datum of heights."""
     if options.time_system is not None and options.time_system.upper() != header.system:
         raise contradicted("time_system", f"times are {header.system}", node=node, where=where)
     if header.position not in {"geodetic", "sexagesimal"}:
         return
     if header.geodetic_height == "geodetic" and options.height_offset_m is None:
-        raise unsaid(
+        raise unstated(
             "height_offset_m",
             "heights are geodetic (above a geoid)",
             node=node,
@@ -169,7 +169,7 @@ def _angle(cells: list[str]) -> float:
 
 
 def _time(first: str, second: str) -> str | np.datetime64:
-    """Return a calendar date as text, which costs less to read all at once, or what week and seconds say."""
+    """Return a calendar date as text, which costs less to parse all at once, or the time of week and seconds."""
     if "/" in first:
         return f"{first.replace('/', '-')}T{second}"
     week, seconds = number(first), number(second)
@@ -221,13 +221,13 @@ def _base(header: _Header, options: LogOptions, *, node: str, where: Path) -> ND
         angles = whole if len(cells) == 3 else [_angle(cells[:3]), _angle(cells[3:6]), *whole[6:]] if whole else []
     except ValueError as error:
         raise _error(f"ref pos {quoted(' '.join(cells), 60)}", where) from error
-    said = angles or options.base
-    if not said:
+    stated = angles or options.base
+    if not stated:
         found = "baselines without the point that they begin at (ref pos)"
-        raise unsaid("base", found, node=node, where=where)
-    if len(said) != 3 or not (abs(said[0]) <= 90 and abs(said[1]) <= 360 and abs(said[2]) < 1e5):
+        raise unstated("base", found, node=node, where=where)
+    if len(stated) != 3 or not (abs(stated[0]) <= 90 and abs(stated[1]) <= 360 and abs(stated[2]) < 1e5):
         raise _error(f"ref pos {quoted(' '.join(cells), 60)}", where)
-    base = ecef_from_geodetic(*np.array(said, np.float64))
+    base = ecef_from_geodetic(*np.array(stated, np.float64))
     if options.base and np.linalg.norm(base - ecef_from_geodetic(*np.array(options.base))) > _SAME_BASE_M:
         raise contradicted("base", f"ref pos {' '.join(cells)}", node=node, where=where)
     return base
@@ -239,15 +239,15 @@ def _std(stated: NDArray[np.float64], ecef: NDArray[np.float64]) -> NDArray[np.f
         return None
     if stated.shape[1] == len(_STD):
         return stated
-    held = stated.clip(-_WORST_M, _WORST_M)  # whose squares are numbers; a track refuses what is as large
-    xx, yy, zz, xy, yz, zx = (np.sign(held) * held**2).T
+    clipped = stated.clip(-_WORST_M, _WORST_M)  # whose squares are numbers; a track refuses what is as large
+    xx, yy, zz, xy, yz, zx = (np.sign(clipped) * clipped**2).T
     covariance = np.stack([xx, xy, zx, xy, yy, yz, zx, yz, zz], -1).reshape(-1, 3, 3)
     axes = ned_axes(ecef)
     return np.asarray(np.sqrt(np.einsum("nia,nij,nja->na", axes, covariance, axes).clip(0)))
 
 
 def _fix(quality: NDArray[np.float64], path: Path) -> NDArray[np.int8]:
-    """Return kinds of solution, 0 where the log says none."""
+    """Return kinds of solution, 0 where the log states none."""
     stated = np.nan_to_num(quality, nan=0.0)
     wrong = np.flatnonzero(~np.isin(stated, range(10)))
     if wrong.size:

@@ -26,7 +26,7 @@ FARTHEST_M = 1e5
 
 _LOG = logging.getLogger(__name__)
 _EARTH_M = 6.37e6
-_NOWHERE_DEG = 1e-7  # a receiver without a fix logs 0, 0; within a centimetre of there nobody flies
+_NOWHERE_DEG = 1e-7  # a receiver without a fix logs 0, 0; no flight passes within a centimetre of it
 _WIDEST_DEG = 1080.0
 _WORST_STD_M = 1e7
 
@@ -98,7 +98,7 @@ def make_track(
         "position": (("epoch", "axis"), ecef_from_geodetic(*position.T) if frame == "geodetic" else position),
         "attitude": (("epoch", "axis"), attitude),
     }
-    # Arrays that need no look into: xarray would import dask and scipy to see whether they are theirs.
+    # Plain arrays: xarray would import dask and scipy to check whether they are theirs.
     return xr.Dataset(
         {name: xr.Variable(dims, values, fastpath=True) for name, (dims, values) in variables.items()},
         attrs={"node": node, "frame": "local" if frame == "local" else "ecef", "dropped": left_out},
@@ -106,7 +106,7 @@ def make_track(
 
 
 def remarked(track: xr.Dataset, remark: str, where: Path) -> xr.Dataset:
-    """Return a track with what a person should know of how its log was read, in its `remarks`; it is told, too.
+    """Return a track with remarks on how its log was read, in its `remarks`; they are also printed.
 
     Parameters
     ----------
@@ -150,7 +150,7 @@ def _check_stated(
     fix: NDArray[np.int8] | None,
     where: Path,
 ) -> None:
-    """Raise CampaignError where a stated value is none that the log of a flight has; NaN says nothing."""
+    """Raise CampaignError where a stated value is outside the range of a flight's log; NaN is ignored."""
     std, kinds = "a standard deviation", sorted(FIXES.values())
     for name, values, low, high in (
         ("an angle of attitude", attitude_deg, -_WIDEST_DEG, _WIDEST_DEG),
@@ -187,20 +187,20 @@ def _check_times(time_utc: NDArray[np.datetime64], where: Path) -> None:
         )
 
 
-# ---- What a flight log leaves open and the config must say, and what both say otherwise: one message each ----------
+# ---- Values that only the config states, and contradictions with the log --------------------------------------------
 
 _UNIX = re.compile(r"1970-01-01(?:[T ]00:00(?::00(?:\.0+)?)?)?", re.ASCII)
 
 
-def unsaid(key: str, found: str, *, node: str, where: Path, remedy: str = "") -> CampaignError:
-    """Return the error of a log that leaves open what only a person can say.
+def unstated(key: str, found: str, *, node: str, where: Path, remedy: str = "") -> CampaignError:
+    """Return the error of a log that lacks a value, which the config must state.
 
     Parameters
     ----------
     key
         Field of `LogOptions`.
     found
-        What the log leaves open.
+        Value that the log lacks.
     node, where
         Whose log, and its file.
     remedy
@@ -208,14 +208,14 @@ def unsaid(key: str, found: str, *, node: str, where: Path, remedy: str = "") ->
 
     Examples
     --------
-    >>> print(unsaid("start_utc", "times of day only", node="uav1", where=Path("a.nmea")))
+    >>> print(unstated("start_utc", "times of day only", node="uav1", where=Path("a.nmea")))
     a.nmea: times of day only; expected key nodes.uav1.log.start_utc in config.yaml. Add it.
     """
     return CampaignError(found, where, f"key nodes.{node}.log.{key} in config.yaml", f"Add it{remedy}.")
 
 
 def contradicted(key: str, found: str, *, node: str, where: Path) -> CampaignError:
-    """Return the error of a log that says otherwise than the config; parameters as `unsaid`.
+    """Return the error of a log that contradicts the config; parameters as `unstated`.
 
     Examples
     --------
@@ -227,14 +227,14 @@ def contradicted(key: str, found: str, *, node: str, where: Path) -> CampaignErr
 
 
 def start_time(options: LogOptions, found: str, *, node: str, where: Path) -> np.datetime64:
-    """Return time zero of a log, or its day, as the config says it: datetime64[ns], UTC.
+    """Return time zero of a log, or its day, stated by the config: datetime64[ns], UTC.
 
     Parameters
     ----------
     options
         With or without start_utc.
     found, node, where
-        As of `unsaid`.
+        As of `unstated`.
 
     Raises
     ------
@@ -247,7 +247,7 @@ def start_time(options: LogOptions, found: str, *, node: str, where: Path) -> np
     '2025-05-14T09:30:00.000000000'
     """
     if options.start_utc is None:
-        raise unsaid("start_utc", found, node=node, where=where)
+        raise unstated("start_utc", found, node=node, where=where)
     text = options.start_utc.strip().removesuffix("Z").removesuffix("+00:00")
     if _UNIX.fullmatch(text):  # no recording is that old, but seconds are counted from there
         return np.datetime64(0, "ns")

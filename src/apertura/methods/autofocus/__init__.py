@@ -1,1 +1,1 @@
-"""Tracks refined by the image itself: what spoils focus, how it is estimated, and whether it may be believed."""
+"""Autofocus: tracks refined by the image itself, with acceptance by patches that were not fitted."""

@@ -1,4 +1,4 @@
-"""Whether refined tracks are to be believed, measured without truth, and what remains unknown of them."""
+"""Acceptance of refined tracks, measured without truth, and the errors that remain."""
 
 import warnings
 from collections.abc import Mapping, Sequence
@@ -16,11 +16,11 @@ from apertura.methods.autofocus.objective import Blocks, PatchEcho, PatchImage, 
 from apertura.methods.autofocus.patches import Patch, bandwidth_hz
 from apertura.methods.autofocus.solve import Problem, State
 
-# ---- What a refinement leaves unknown of the tracks ----------------------------------------------------------------
+# ---- Errors that remain after a refinement --------------------------------------------------------------------------
 
 
 MOST_RATIO = 1e3
-"""A point's neighbours, not its noise, bound what its phase tells."""
+"""Peak to surroundings, power: above, a point's neighbours and not its noise bound the accuracy of its phase."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +52,7 @@ class Remaining:
 
 
 def remaining(problem: Problem, state: State) -> Remaining:
-    """Return what is left unknown: per knot the log's errors and all phases seen while they last, together.
+    """Return the errors that remain: per knot, the log's prior combined with all phases measured while errors last.
 
     Notes
     -----
@@ -65,8 +65,8 @@ def remaining(problem: Problem, state: State) -> Remaining:
         known[:, column[node], column[node]] += prior.axes.T @ np.diag(1 / prior.std_m**2) @ prior.axes
     rows: list[tuple[slice, Floats]] = []
     smooth = max(prior.smooth for prior in nodes.values())
-    for patches, seen in zip(state.cached, state.seen, strict=True):
-        for patch, now in zip(patches, seen, strict=True):
+    for patches, statistics in zip(state.cached, state.statistics, strict=True):
+        for patch, now in zip(patches, statistics, strict=True):
             ratio = min(now.ratio, MOST_RATIO)
             row = np.zeros((patch.blocks.stop - patch.blocks.start, 3 * len(nodes)))
             for node, slope in patch.slopes.items():
@@ -84,24 +84,24 @@ def remaining(problem: Problem, state: State) -> Remaining:
     return Remaining(std_m, float(np.sqrt(np.mean(phases))) if phases else float("nan"), problem.gauge.std_m)
 
 
-# ---- Whether refined tracks are to be believed, told without truth -------------------------------------------------
+# ---- Acceptance of refined tracks -----------------------------------------------------------------------------------
 
 LEAST_GAIN_DB, LEAST_BETTER = 0.3, 0.75
-"""Contrast that patches gain which were not fitted, and the share of them that gains: less is not believed."""
+"""Least contrast (dB) gained by patches that were not fitted, and least share of them that gains, to be accepted."""
 
-MOST_APART = 4.0
-"""Standard deviations of their places that pairs may show points apart: more are tracks that have slipped."""
+MOST_APART_SIGMA = 4.0
+"""Standard deviations of their places by which pairs may disagree on points: more means slipped tracks."""
 
 PARTS = 8
-"""Of the aperture, whose images of a point are compared in range."""
+"""Of the aperture, whose images of a point are compared in range, to detect cycle slips."""
 
-_BY_CHANCE = 1e-3  # how often errors as the log states them would be called inconsistent
-_SLACK = 1.5  # what the image settles is not settled wholly
-_REACH_CELLS, _STEPS = 3.0, 37
-_SLIP_SURE = 4.0
-_LEAST_POINTS = 3  # that must agree on where a part of the aperture sees them
+_BY_CHANCE = 1e-3  # false alarm rate of the test against the log's stated errors
+_SLACK = 1.5  # factor on the variance: the image determines its modes not wholly
+_REACH_CELLS, _STEPS = 3.0, 37  # of the line in range on which a point is searched: cells on either side, samples
+_SLIP_SIGMA = 4.0  # standard deviations from which a shift in range is a slip
+_LEAST_POINTS = 3  # that must agree on the shift of a part of the aperture
 _DOMINATES = 4.0  # peak power of a part's image of a point against the median of a line through it
-_LEAST_SLOPE = 0.05  # of the path over ground: a point seen from all around has no direction of range
+_LEAST_SLOPE = 0.05  # of the path over ground: a point illuminated from all sides has no direction of range
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,10 +113,10 @@ class Evidence:
     fitted_db, held_out_db
         (pair, patch) float64, contrast gained by the patches that were fitted and by those that were not.
     settled
-        (mode,) float64, unknowns that the image settles whatever the log says: of unit variance if the log states its
-        errors rightly.
+        (mode,) float64, unknowns that the image alone determines: of unit variance if the log states its errors
+        rightly.
     before, after
-        Where parts of the aperture see points in range.
+        Shifts of points in range between parts of the aperture.
     wavelength_m
         Of the band's middle.
     apart_sigma
@@ -144,7 +144,7 @@ class Evidence:
 
     @property
     def accepted(self) -> bool:
-        """Whether the tracks are believed."""
+        """Whether the tracks are used."""
         return self.gain_db >= LEAST_GAIN_DB and self.better >= LEAST_BETTER and not self.slip
 
     @property
@@ -156,14 +156,14 @@ class Evidence:
         )
         if self.accepted:
             return line
-        return f"{line}; {LEAST_GAIN_DB:g} dB and {LEAST_BETTER:.0%} are asked for" + (
+        return f"{line}; {LEAST_GAIN_DB:g} dB and {LEAST_BETTER:.0%} are required" + (
             ", and no slip" if self.slip else ""
         )
 
     @cached_property
     def slip(self) -> str:
-        """Which parts of the aperture see the points where a wavelength of path puts them; nothing if none does."""
-        if self.apart_sigma > MOST_APART:
+        """Line on parts of the aperture whose images are shifted by a wavelength of path; empty if none is."""
+        if self.apart_sigma > MOST_APART_SIGMA:
             return (
                 f"pairs show the same points {self.apart_sigma:.1f} standard deviations of their places apart: tracks "
                 "are wrong by more than their logs' errors"
@@ -233,15 +233,15 @@ def gains_db(before: Sequence[Sequence[PatchImage]], after: Sequence[Sequence[Pa
 
 @dataclass(frozen=True, eq=False)
 class RangeShifts:
-    """Where parts of the aperture see points in range, against the whole.
+    """Shifts of points in range between images of parts of the aperture and of the whole.
 
     Attributes
     ----------
     shift_m, std_m
         (pair, part) float64, metres of total path: median over points and its standard deviation; NaN where no
-        point was seen.
+        point was measured.
     points
-        (pair, part) int64, how many were seen.
+        (pair, part) int64, how many were measured.
     """
 
     shift_m: Floats
@@ -250,19 +250,19 @@ class RangeShifts:
 
     @property
     def rms_m(self) -> float | None:
-        """RMS of the shifts, metres; None where no point was seen."""
+        """RMS of the shifts, metres; None where no point was measured."""
         known = self.shift_m[np.isfinite(self.shift_m)]
         return round(float(np.sqrt((known**2).mean())), 5) if known.size else None
 
     def slipped(self, wavelength_m: float) -> NDArray[np.bool_]:
-        """Return (pair, part) bool: parts that are nearer to a whole turn off than to none, for sure."""
+        """Return (pair, part) bool: parts whose shift is significantly nearer to a whole turn than to none."""
         off = np.abs(self.shift_m)
         agreed = (self.points >= _LEAST_POINTS) & (self.std_m < wavelength_m / 3 / np.sqrt(np.maximum(self.points, 1)))
-        return np.asarray(agreed & (off > 0.6 * wavelength_m) & (off > _SLIP_SURE * self.std_m))
+        return np.asarray(agreed & (off > 0.6 * wavelength_m) & (off > _SLIP_SIGMA * self.std_m))
 
 
 def range_shifts(problem: Problem, state: State, axes: Floats) -> RangeShifts:
-    """Return where parts of the aperture see the brightest point of every patch in range.
+    """Return shifts in range of the brightest point of every patch, by part of the aperture.
 
     Parameters
     ----------
@@ -277,13 +277,13 @@ def range_shifts(problem: Problem, state: State, axes: Floats) -> RangeShifts:
     phase, but not its delay.
     """
     pairs = zip(problem.pairs, problem.echoes, state.images, strict=True)
-    found = [
+    by_part = [
         [_by_part(blocks, echo, image, state.tracks, axes) for echo, image in zip(echoes, images, strict=True)]
         for blocks, echoes, images in pairs
     ]
-    shifts = np.array(found).reshape(len(problem.pairs), -1, PARTS)
+    shifts = np.array(by_part).reshape(len(problem.pairs), -1, PARTS)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # a part in which no point was seen is NaN
+        warnings.simplefilter("ignore", RuntimeWarning)  # a part without a measured point is NaN
         middle = np.nanmedian(shifts, axis=1)
         spread = 1.4826 * np.nanmedian(np.abs(shifts - middle[:, None]), axis=1)
     count = np.isfinite(shifts).sum(axis=1)
@@ -291,7 +291,7 @@ def range_shifts(problem: Problem, state: State, axes: Floats) -> RangeShifts:
 
 
 def _by_part(blocks: Blocks, echo: PatchEcho, image: NDArray[np.complex64], tracks: Tracks, axes: Floats) -> Floats:
-    """Return (part,) float64, metres of total path by which each part sees a point farther; NaN where it does not."""
+    """Return (part,) float64, metres of total path by which each part's image shows a point farther; NaN if not."""
     nothing = np.full(PARTS, np.nan)
     place = echo.patch.pixels_m[int(np.abs(image).argmax())]
     slope = blocks.aperture.path_gradient(place).mean(axis=0)
@@ -307,6 +307,6 @@ def _by_part(blocks: Blocks, echo: PatchEcho, image: NDArray[np.complex64], trac
     peak = np.clip(power.argmax(axis=0), 1, _STEPS - 2)
     left, middle, right = (np.take_along_axis(power, (peak + step)[None], 0)[0] for step in (-1, 0, 1))
     curve = np.minimum(left - 2 * middle + right, -1e-300)
-    found = further[peak] + 0.5 * (left - right) / curve * (further[1] - further[0])
+    shift = further[peak] + 0.5 * (left - right) / curve * (further[1] - further[0])
     inside = (power.argmax(axis=0) == peak) & (middle > _DOMINATES * np.median(power, axis=0))
-    return np.where(inside, found, nothing)
+    return np.where(inside, shift, nothing)

@@ -1,4 +1,4 @@
-"""What a refinement is given and what it returns: data of each pair, the prior of track errors, the outcome."""
+"""Inputs and outcome of a refinement of tracks: data of each pair, prior of track errors, corrections."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -13,26 +13,26 @@ from apertura.core.antenna.beam import Beams
 from apertura.core.focus.inputs import Profiles
 from apertura.core.geometry.phase_centres import TrackCorrection
 
-# ---- What a refinement is given: what each pair saw, and what is known of the errors of the tracks -----------------
+# ---- Inputs: data of each pair, errors of the logs, reference points ------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
-class Sighting:
-    """What a pair saw from where its nodes' logs have it.
+class PairRecord:
+    """Range profiles of one pair along its logged tracks.
 
     Attributes
     ----------
     pair
         Its name, transmitter-receiver.
     profiles
-        Range profiles; their samples may be read as they are asked for.
+        Range profiles; their samples may be read lazily.
     time_s
         (pulse,) float64, seconds of the flight's clock, which all its pairs share.
     sidelink_m
         (pulse, 3) float64, metres: from the receiver's sidelink point to the transmitter's, as the logs have them;
-        None where echoes were not given back a sidelink's length.
+        None where echoes do not count from a sidelink.
     beams
-        What weighs pulses in the image; None where all count alike.
+        Antenna weights of pulses in the image; None where all count alike.
     """
 
     pair: str
@@ -48,14 +48,14 @@ class Sighting:
         return tx, rx
 
     def moved(self, correction: TrackCorrection) -> Profiles:
-        """Return the profiles as seen from corrected tracks (docs/theory/autofocus.md, eq. 3)."""
+        """Return the profiles over corrected tracks (docs/theory/autofocus.md, eq. 3)."""
         aperture = correction.aperture(self.profiles.aperture, self.pair, self.time_s)
         return self.profiles.moved(aperture, correction.longer_m(self.pair, self.time_s, self.sidelink_m))
 
 
 @dataclass(frozen=True)
 class TrackErrors:
-    """What is known of the errors of a node's logged positions.
+    """Statistics of the errors of a node's logged positions.
 
     Attributes
     ----------
@@ -101,7 +101,7 @@ class ReferencePoint:
     std_m: float
 
 
-# ---- What is known of the errors of tracks before the image is asked: white noise that is smoothed, and slow modes
+# ---- Prior of track errors: smoothed white noise and slow modes -----------------------------------------------------
 
 
 SLOW_MODES = 4
@@ -207,27 +207,27 @@ class Prior:
         return list(zip(self.nodes.items(), parts, strict=True))
 
 
-# ---- What a refinement found, whether it is believed, and why ------------------------------------------------------
+# ---- Outcome: corrections, and whether they are accepted ------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
 class Refinement:
-    """Corrections of a flight's tracks as its images ask for them.
+    """Corrections of a flight's tracks estimated from its images.
 
     Attributes
     ----------
     correction
-        What was found, accepted or not.
+        Estimated, accepted or not.
     std_m
-        Node → (knot, 3) float64, metres: how well, along the axes of the frame.
+        Node → (knot, 3) float64, metres: errors expected to remain, along the axes of the frame.
     accepted
-        Whether images are formed with it: as a whole or not at all.
+        Whether images are formed with the correction: as a whole or not at all.
     why
-        One line.
+        Reason of acceptance or rejection, one line.
     report
         As JSON values: what was measured.
     flags
-        Edge crossed → what was found, in one line.
+        Flag → what was measured, in one line.
     """
 
     correction: TrackCorrection

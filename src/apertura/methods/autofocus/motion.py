@@ -1,4 +1,4 @@
-"""When a node moved: by its log, and by echoes that change from pulse to pulse."""
+"""Motion of a node by its log and by echoes that change from pulse to pulse: plausible clock offsets."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -11,14 +11,14 @@ from apertura.common.arrays import Complexes, Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.geometry.aperture import Aperture
 
-Placed = Callable[[Floats], Aperture]
+PhaseCentres = Callable[[Floats], Aperture]
 """Seconds of the log's clock (time,), inside the log → phase centres."""
 
 LEAST_COVERED = 0.5
 """Share of the pulses that must lie inside the log."""
 
-_MARGIN = 8  # pulses
-_BELIEVED = 3.0  # standard deviations of a correlation by which offsets are ruled out
+_MARGIN = 8  # pulses added on both sides of the plausible offsets
+_SIGMA = 3.0  # standard deviations below the best correlation at which offsets are ruled out
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +55,7 @@ class Recorded:
         return SPEED_OF_LIGHT_M_S / float(self.frequency_hz[-1])
 
     def moving(self) -> "Recorded":
-        """Return the echoes less what all pulses have in common: coupling, and what a standing node sees."""
+        """Return the echoes less what all pulses have in common: coupling, and echoes of a node at rest."""
         return replace(self, transfer=self.transfer - self.transfer.mean(axis=0))
 
 
@@ -65,13 +65,13 @@ class Logged:
 
     Attributes
     ----------
-    placed
+    phase_centres
         Times inside the log → phase centres.
     first_s, last_s
         Times of its first and last epoch.
     """
 
-    placed: Placed
+    phase_centres: PhaseCentres
     first_s: float
     last_s: float
 
@@ -84,26 +84,26 @@ class Logged:
         speed = np.zeros(len(at_s))
         kept = self.inside(at_s)
         if kept.sum() > 1:
-            centres = self.placed(at_s[kept]).tx_m
+            centres = self.phase_centres(at_s[kept]).tx_m
             speed[kept] = 2 * np.linalg.norm(np.gradient(centres, at_s[kept], axis=0), axis=1)
         return speed
 
 
 def plausible_offsets(echo: Recorded, log: Logged, within_s: tuple[float, float]) -> tuple[float, float]:
-    """Return the least and the largest offset that let the node move when echoes change, seconds.
+    """Return the least and the largest offset at which the node moves when its echoes change, seconds.
 
     Parameters
     ----------
     echo, log
         What was recorded, and flown.
     within_s
-        Offsets that are thought possible.
+        Least and largest offset to consider, seconds.
 
     Notes
     -----
     Source: docs/theory/tracks.md, "Clock of the recorder". Compared are how much a pulse differs from the one before,
-    and how far the node went meanwhile, up to half a wavelength, from where on they differ as they will. Where the
-    node always moves alike nothing is ruled out.
+    and how far the node went meanwhile, up to half a wavelength, beyond which pulses are uncorrelated. Where the
+    node moves uniformly nothing is ruled out.
     """
     change = np.linalg.norm(np.diff(echo.transfer, axis=0), axis=1) / np.linalg.norm(echo.transfer[1:], axis=1)
     middle_s, interval_s = (echo.time_s[1:] + echo.time_s[:-1]) / 2, np.diff(echo.time_s)
@@ -127,6 +127,6 @@ def plausible_offsets(echo: Recorded, log: Logged, within_s: tuple[float, float]
     best = float(alike.max())
     independent = max(4.0, len(change) * float(np.median(interval_s)) * 4)  # motion lasts a quarter of a second or more
     std = (1 - max(best, 0.0) ** 2) / np.sqrt(independent)
-    kept = offsets_s[covered & (alike >= best - _BELIEVED * std)] if best > _BELIEVED * std else offsets_s[covered]
+    kept = offsets_s[covered & (alike >= best - _SIGMA * std)] if best > _SIGMA * std else offsets_s[covered]
     apart_s = _MARGIN * step_s
     return max(within_s[0], float(kept[0]) - apart_s), min(within_s[1], float(kept[-1]) + apart_s)

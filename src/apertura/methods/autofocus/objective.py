@@ -1,4 +1,4 @@
-"""How sharp the patches are as a function of the tracks: blocks of pulses, their contributions, value and gradient."""
+"""Sharpness of the patches as a function of the tracks: blocks of pulses, contributions, value and gradient."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -12,14 +12,14 @@ from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.focus.contributions import block_contributions
 from apertura.core.focus.inputs import Profiles
 from apertura.core.geometry.aperture import Aperture
-from apertura.methods.autofocus.inputs import Sighting
+from apertura.methods.autofocus.inputs import PairRecord
 from apertura.methods.autofocus.patches import Patch, bandwidth_hz
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
 
-# ---- Blocks of pulses: what tracks are corrected by, and what each block of a pair adds to the patches -------------
+# ---- Blocks of pulses and their contributions to the patches --------------------------------------------------------
 
 Tracks = Mapping[str, Floats]
 
@@ -29,7 +29,7 @@ _MARGIN = 10  # samples beyond a patch, for the interpolation and for tracks tha
 
 @dataclass(frozen=True, eq=False)
 class PatchEcho:
-    """What the blocks of a pair that see a patch recorded of it, summed towards its middle.
+    """Echoes of a patch in the blocks of a pair that illuminate it, summed towards its middle.
 
     Attributes
     ----------
@@ -48,7 +48,7 @@ class PatchEcho:
 
     @property
     def values(self) -> int:
-        """How many values tell what its blocks add to its pixels."""
+        """Number of complex values of its contributions."""
         return len(self.patch.pixels_m) * len(self.profiles)
 
 
@@ -58,7 +58,7 @@ class Blocks:
 
     Attributes
     ----------
-    sighting
+    record
         The pair.
     edges
         (knot + 1,) int64, first pulse of each block, and the number of pulses.
@@ -67,36 +67,36 @@ class Blocks:
     aperture
         Mean phase centres of each block's pulses, as the logs have them.
     sidelink_m
-        (block, 3) float64, mean of the sighting's; None where it has none.
+        (block, 3) float64, mean of the pair's; None where it has none.
     """
 
-    sighting: Sighting
+    record: PairRecord
     edges: NDArray[np.int64]
     average: "csr_array"
     aperture: Aperture
     sidelink_m: Floats | None
 
     @classmethod
-    def of(cls, sighting: Sighting, knots_s: Floats) -> "Blocks":
+    def of(cls, record: PairRecord, knots_s: Floats) -> "Blocks":
         """Return the blocks of a pair about equally spaced knots."""
         from scipy.sparse import csr_array  # slow to import
 
-        count, step_s, pulses = len(knots_s), float(knots_s[1] - knots_s[0]), len(sighting.time_s)
-        edges = np.searchsorted(sighting.time_s, np.append(knots_s - step_s / 2, np.inf))
+        count, step_s, pulses = len(knots_s), float(knots_s[1] - knots_s[0]), len(record.time_s)
+        edges = np.searchsorted(record.time_s, np.append(knots_s - step_s / 2, np.inf))
         edges[0] = 0
         block = np.repeat(np.arange(count), np.diff(edges))
         share = 1 / np.diff(edges)[block]
         mean = csr_array((share, (block, np.arange(pulses))), shape=(count, pulses))
-        place = np.clip((sighting.time_s - knots_s[0]) / step_s, 0, count - 1)
+        place = np.clip((record.time_s - knots_s[0]) / step_s, 0, count - 1)
         left = np.minimum(place.astype(np.int64), count - 2)
         rows = np.tile(np.arange(pulses), 2)
         between = csr_array(
             (np.concatenate([1 - (place - left), place - left]), (rows, np.concatenate([left, left + 1]))),
             shape=(pulses, count),
         )
-        aperture = Aperture(*(mean @ leg for leg in sighting.profiles.aperture.legs))
-        sidelink_m = None if sighting.sidelink_m is None else mean @ sighting.sidelink_m
-        return cls(sighting, edges, mean @ between, aperture, sidelink_m)
+        aperture = Aperture(*(mean @ leg for leg in record.profiles.aperture.legs))
+        sidelink_m = None if record.sidelink_m is None else mean @ record.sidelink_m
+        return cls(record, edges, mean @ between, aperture, sidelink_m)
 
     def average_of(self, tracks: Floats) -> Floats:
         """Return (mode, block, 3) float64, the mean of (mode, knot, 3) tracks over the pulses of each block."""
@@ -106,17 +106,17 @@ class Blocks:
 
     def moves(self, tracks: Tracks) -> Tracks:
         """Return node → (block, 3) float64, metres, of the nodes of the pair."""
-        return {node: np.asarray(self.average @ tracks[node]) for node in dict.fromkeys(self.sighting.nodes)}
+        return {node: np.asarray(self.average @ tracks[node]) for node in dict.fromkeys(self.record.nodes)}
 
     def echoes(self, patches: Sequence[Patch]) -> list[PatchEcho]:
-        """Return what the pair recorded of each patch; every pulse is read once.
+        """Return the summed echoes of each patch; every pulse is read once.
 
         Notes
         -----
         Source: docs/theory/autofocus.md, eq. 9: about the middle of a patch paths of a block differ by what they do at
         the middle.
         """
-        profiles, beams, edges = self.sighting.profiles, self.sighting.beams, self.edges
+        profiles, beams, edges = self.record.profiles, self.record.beams, self.edges
         starts = [self._offsets(patch) for patch in patches]
         sums = [np.zeros((len(offsets), len(edges) - 1), np.complex64) for offsets in starts]
         first = 0
@@ -138,8 +138,8 @@ class Blocks:
 
     def _offsets(self, patch: Patch) -> Floats:
         """Return (sample,) float64, metres of total path about a patch's middle."""
-        some = self.sighting.profiles.aperture.sample(64)
-        aperture, step_m = self.sighting.profiles.aperture[some], self.sighting.profiles.step_m
+        some = self.record.profiles.aperture.sample(64)
+        aperture, step_m = self.record.profiles.aperture[some], self.record.profiles.step_m
         corners = patch.pixels_m[:: max(1, len(patch.pixels_m) - 1)]
         corners = np.concatenate(
             [corners, 2 * patch.place_m - corners, patch.pixels_m[:: max(1, len(patch.pixels_m) // 8)]]
@@ -149,9 +149,9 @@ class Blocks:
         return np.asarray(np.arange(-half, half + 1) * step_m, np.float64)
 
     def _echo(self, patch: Patch, offsets: Floats, sums: NDArray[np.complex64]) -> PatchEcho:
-        seen = np.flatnonzero(np.abs(sums).any(axis=0))
-        blocks = slice(int(seen[0]), int(seen[-1]) + 1) if seen.size else slice(0, 1)
-        whole, aperture = self.sighting.profiles, self.aperture[blocks]
+        statistics = np.flatnonzero(np.abs(sums).any(axis=0))
+        blocks = slice(int(statistics[0]), int(statistics[-1]) + 1) if statistics.size else slice(0, 1)
+        whole, aperture = self.record.profiles, self.aperture[blocks]
         middle = aperture.path(patch.place_m)
         wavenumber = 2 * np.pi * whole.centre_frequency_hz / SPEED_OF_LIGHT_M_S
         turned = sums[:, blocks].T * np.exp(-1j * wavenumber * (middle[:, None] + offsets))
@@ -163,7 +163,7 @@ class Blocks:
 
     def contribution(self, echo: PatchEcho, moved: Tracks) -> "Contribution":
         """Return what each block adds to the pixels of a patch where its nodes have moved by so much."""
-        tx, rx = self.sighting.nodes
+        tx, rx = self.record.nodes
         moves = [moved[node][echo.blocks] for node in (tx, rx)]
         logged = echo.profiles.aperture
         aperture = Aperture(logged.tx_m + moves[0], logged.rx_m + moves[1])
@@ -189,7 +189,7 @@ class Blocks:
 
 @dataclass(frozen=True, eq=False)
 class Contribution:
-    """What the blocks of a pair that see a patch add to it.
+    """What the blocks of a pair that illuminate a patch add to it.
 
     Attributes
     ----------
@@ -217,7 +217,7 @@ def _towards(
 ) -> NDArray[np.complex64]:
     """Return Σ s(R + δ)·exp(jk(R + δ)) over the pulses of each block, (offset, block), R the path of a place.
 
-    Antennas on a line at -R/2 see places at δ/2 on it over the path R + δ.
+    The path from antennas on a line at -R/2 to places at δ/2 on it is R + δ.
     """
     on_line = np.zeros((len(profiles), 3))
     on_line[:, 0] = -profiles.aperture.path(place_m) / 2
@@ -227,17 +227,17 @@ def _towards(
     return block_contributions(at, places, edges=edges, weights=weights)
 
 
-# ---- How sharp the patches are, as a function of the tracks: value and gradient from cached contributions ----------
+# ---- Sharpness as a function of the tracks, from cached contributions -----------------------------------------------
 
-MOST_WEIGHT = 1e4
-_WEIGHT_OF_RATIO = 3.0
+MOST_WEIGHT = 1e4  # of a patch: bounds the influence of one bright point (eq. 11)
+_WEIGHT_OF_RATIO = 3.0  # weight of a patch over its ratio of peak power to surroundings (eq. 11)
 _SIDELOBES = 1e-3
 """Power of a point's sidelobes beyond its own patch, of an aperture without weights, whatever its tracks."""
 
 
 @dataclass(frozen=True, eq=False)
 class PatchImage:
-    """A patch as one pair sees it now.
+    """Statistics of one pair's image of a patch.
 
     Attributes
     ----------
@@ -255,7 +255,7 @@ class PatchImage:
 
     @classmethod
     def of(cls, image: NDArray[np.complex64], brightest: float = 0.0) -> "PatchImage":
-        """Return what the image of a patch, (pixel,), shows beside others whose brightest pixel has so much power."""
+        """Return those of an image (pixel,); `brightest` is the power of the brightest pixel of all patches."""
         power = np.abs(image).astype(np.float64) ** 2
         energy = max(float(power.sum()), 1e-300)
         about = max(float(np.median(power)) / np.log(2), _SIDELOBES * brightest, 1e-300)
@@ -279,7 +279,7 @@ class Sharpness:
         Pair → patch → what its blocks add.
     reference
         Node → (knot, 3) float64, metres: corrections that the contributions were cached at.
-    seen
+    statistics
         Pair → patch → what it showed then.
     used
         (patch,) bool, patches that count.
@@ -292,17 +292,17 @@ class Sharpness:
     pairs: Sequence[Blocks]
     cached: Sequence[Sequence[Contribution]]
     reference: Tracks
-    seen: Sequence[Sequence[PatchImage]]
+    statistics: Sequence[Sequence[PatchImage]]
     used: NDArray[np.bool_]
 
     def __call__(self, tracks: Tracks) -> tuple[float, dict[str, Floats]]:
         """Return the value and its derivatives by the corrections, node → (knot, 3)."""
         total = 0.0
         gradient = {node: np.zeros_like(track) for node, track in tracks.items()}
-        for blocks, patches, seen in zip(self.pairs, self.cached, self.seen, strict=True):
-            moved = blocks.moves({node: tracks[node] - self.reference[node] for node in blocks.sighting.nodes})
+        for blocks, patches, statistics in zip(self.pairs, self.cached, self.statistics, strict=True):
+            moved = blocks.moves({node: tracks[node] - self.reference[node] for node in blocks.record.nodes})
             slopes = {node: np.zeros_like(move) for node, move in moved.items()}
-            for patch, now, counts in zip(patches, seen, self.used, strict=True):
+            for patch, now, counts in zip(patches, statistics, self.used, strict=True):
                 if counts:
                     value, by_phase = _patch(patch, now, moved)
                     total += value

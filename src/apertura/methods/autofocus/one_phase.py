@@ -1,4 +1,4 @@
-"""One phase per block of pulses for the whole scene: phase gradient, minimum entropy, and where one phase cannot do."""
+"""One phase per block of pulses for the whole scene: phase gradient, minimum entropy, and when it suffices."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -12,17 +12,16 @@ from apertura.common.arrays import Floats
 from apertura.core.quality.path_errors import PointPaths
 from apertura.methods.autofocus.inputs import NodePrior, TrackErrors
 
-# ---- Whether one phase per pulse mends a scene: how much the path errors of its edges differ from those of its
-# middle
+# ---- Space variance: path errors of the scene's edges against its middle --------------------------------------------
 
 
 MOST_LOSS_DB = 0.1
-"""Of peak that one phase per pulse may leave at the scene's edges where it is enough."""
+"""Loss of peak power at the scene's edges up to which one phase per pulse suffices."""
 
 
 @dataclass(frozen=True)
 class SpaceVariance:
-    """What path errors leave at places of a scene once those of its middle are taken out.
+    """Path errors at places of a scene after correction by those of its middle.
 
     Attributes
     ----------
@@ -37,20 +36,20 @@ class SpaceVariance:
 
     @property
     def method(self) -> Literal["one_phase", "tracks"]:
-        """What the scene needs, and no more."""
+        """The simplest method that suffices."""
         return "one_phase" if self.loss_db >= -MOST_LOSS_DB else "tracks"
 
     @property
     def reason(self) -> str:
-        """In one line."""
+        """Of the choice, in one line."""
         return (
             f"one phase per pulse leaves {self.residual_rad:.2g} rad rms and {-self.loss_db:.2g} dB at the scene's "
-            f"edges, {MOST_LOSS_DB:g} dB are borne"
+            f"edges, {MOST_LOSS_DB:g} dB are accepted"
         )
 
 
 def space_variance(middle: PointPaths, points_m: Floats, errors: Sequence[TrackErrors]) -> SpaceVariance:
-    """Return what one phase per pulse, that of the scene's middle, leaves at other places.
+    """Return the errors at other places after correction by one phase per pulse, that of the scene's middle.
 
     Parameters
     ----------
@@ -76,9 +75,9 @@ def space_variance(middle: PointPaths, points_m: Floats, errors: Sequence[TrackE
     >>> far.method, round(far.residual_rad, 3)
     ('one_phase', 0.013)
     """
-    found = [_at(middle, point, errors) for point in points_m]
-    residual_rad = float(np.sqrt(np.mean([power for power, _ in found])))
-    return SpaceVariance(residual_rad, float(np.mean([loss_db for _, loss_db in found])))
+    effects = [_at(middle, point, errors) for point in points_m]
+    residual_rad = float(np.sqrt(np.mean([power for power, _ in effects])))
+    return SpaceVariance(residual_rad, float(np.mean([loss_db for _, loss_db in effects])))
 
 
 def _at(middle: PointPaths, point_m: Floats, errors: Sequence[TrackErrors]) -> tuple[float, float]:
@@ -95,23 +94,22 @@ def _at(middle: PointPaths, point_m: Floats, errors: Sequence[TrackErrors]) -> t
     return power * (2 * np.pi / middle.wavelength_m) ** 2, place.of_noise(*parts).loss_db
 
 
-# ---- Phases of blocks of pulses that make patches sharp, the same for the whole scene: phase gradient, minimum
-# entropy
+# ---- Estimators of one phase per block: phase gradient and minimum entropy ------------------------------------------
 
 Patches = Sequence[NDArray[np.complex64]]
-"""What blocks add to the pixels of each patch, (pixel, block)."""
+"""Contributions of blocks to the pixels of each patch, (pixel, block)."""
 
 _SHRINK = 0.7  # of the window, from one pass to the next
 _EDGE_DB, _WIDER = 10.0, 1.5  # the window holds what is brighter below the peak, and half as much again
-_LEAST_UNREST = 0.02  # of a line's power: no point is quieter
-_SETTLED_RAD = 0.05
-_MOST_PASSES = 30
+_LEAST_VARIANCE = 0.02  # floor of a line's amplitude variance, over its mean squared
+_SETTLED_RAD = 0.05  # rms change of the phases below which passes end
+_MOST_PASSES = 30  # of phase gradient
 _CHOICES = 2  # of the brightest pixels, before and after they have been sharpened
-_MOST_STEPS = 100
+_MOST_STEPS = 100  # of L-BFGS-B in minimum entropy
 
 
 def phase_gradient(patches: Patches) -> Floats:
-    """Return the phases by which blocks have to be turned, from how the brightest pixels' phases go on.
+    """Return the phases that correct the blocks, from phase steps of the brightest pixels.
 
     Parameters
     ----------
@@ -131,8 +129,8 @@ def phase_gradient(patches: Patches) -> Floats:
     Examples
     --------
     >>> wrong = np.exp(2j * np.sin(np.arange(64) / 5))
-    >>> mended = wrong * np.exp(1j * phase_gradient([wrong[None].astype(np.complex64)]))
-    >>> [round(float(np.abs(np.fft.fft(one, 1024)).max()) / 64, 1) for one in (wrong, mended)]
+    >>> corrected = wrong * np.exp(1j * phase_gradient([wrong[None].astype(np.complex64)]))
+    >>> [round(float(np.abs(np.fft.fft(one, 1024)).max()) / 64, 1) for one in (wrong, corrected)]
     [0.6, 1.0]
     """
     count = patches[0].shape[1]
@@ -144,7 +142,7 @@ def phase_gradient(patches: Patches) -> Floats:
         narrow = window <= least
         window = min(window, least) if narrow else max(window * _SHRINK, least)
         windowed = np.fft.ifft(np.where(cycles <= window / 2, spectrum, 0), axis=1)[:, :count]
-        steps = (windowed[:, 1:] * windowed[:, :-1].conj() / _unrest(windowed)).sum(axis=0)
+        steps = (windowed[:, 1:] * windowed[:, :-1].conj() / _amplitude_variance(windowed)).sum(axis=0)
         wrong = _level(np.append(0.0, np.cumsum(np.angle(steps))))
         phase = phase - wrong
         if narrow and wrong.std() < _SETTLED_RAD:
@@ -164,8 +162,8 @@ def minimum_entropy(patches: Patches) -> Floats:
     Examples
     --------
     >>> wrong = np.exp(2j * np.sin(np.arange(64) / 5))
-    >>> mended = wrong * np.exp(1j * minimum_entropy([wrong[None].astype(np.complex64)]))
-    >>> [round(float(np.abs(np.fft.fft(one, 1024)).max()) / 64, 1) for one in (wrong, mended)]
+    >>> corrected = wrong * np.exp(1j * minimum_entropy([wrong[None].astype(np.complex64)]))
+    >>> [round(float(np.abs(np.fft.fft(one, 1024)).max()) / 64, 1) for one in (wrong, corrected)]
     [0.6, 1.0]
     """
     from scipy.optimize import minimize  # slow to import
@@ -220,22 +218,22 @@ def entropy(lines: NDArray[np.complex128], phase: Floats) -> tuple[float, Floats
 
 
 def _lines(patches: Patches, phase: Floats) -> NDArray[np.complex128]:
-    """Return (patch, block), what blocks as turned add to the brightest pixel of each patch."""
+    """Return (patch, block), contributions of turned blocks to the brightest pixel of each patch."""
     turn = np.exp(1j * phase)
     brightest = (int(np.abs(patch @ turn.astype(np.complex64)).argmax()) for patch in patches)
     return np.stack([patch[pixel] * turn for patch, pixel in zip(patches, brightest, strict=True)])
 
 
 def _spread(spectrum: NDArray[np.complex128], cycles: Floats) -> float:
-    """Return the width of the window that holds the blurred points, cycles over the aperture."""
+    """Return the width of the window that contains the blurred points, cycles over the aperture."""
     power = (np.abs(spectrum) ** 2).sum(axis=0)
     return 2 * _WIDER * max(float(cycles[power > power.max() * 10 ** (-_EDGE_DB / 10)].max(initial=0.0)), 1.0)
 
 
-def _unrest(windowed: NDArray[np.complex128]) -> Floats:
-    """Return (line, 1) what beside its point a line holds: the variance of its magnitude."""
+def _amplitude_variance(windowed: NDArray[np.complex128]) -> Floats:
+    """Return (line, 1), amplitude variance of each line: clutter and noise beside its point."""
     level = np.abs(windowed)
-    return np.asarray(level.var(axis=1) + _LEAST_UNREST * level.mean(axis=1) ** 2)[:, None] + 1e-300
+    return np.asarray(level.var(axis=1) + _LEAST_VARIANCE * level.mean(axis=1) ** 2)[:, None] + 1e-300
 
 
 def _level(phase: Floats) -> Floats:
@@ -248,4 +246,4 @@ METHODS: Mapping[str, Callable[[Patches], Floats]] = {
     "phase_gradient": phase_gradient,
     "minimum_entropy": minimum_entropy,
 }
-"""What `processing.autofocus_method` may name where one phase per pulse suffices."""
+"""Value of `processing.autofocus_method` → estimator, where one phase per pulse suffices."""

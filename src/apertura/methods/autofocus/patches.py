@@ -1,4 +1,4 @@
-"""Patches of the scene about bright places: where points may stand, and the pixels that their images are asked at."""
+"""Patches of the scene about bright places: which places may be points, and the pixels about each."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -15,27 +15,27 @@ from apertura.core.geometry.geodesy import ned_axes
 from apertura.core.geometry.phase_centres import TrackCorrection
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import Terrain
-from apertura.methods.autofocus.inputs import Refinement, Sighting, TrackErrors
+from apertura.methods.autofocus.inputs import PairRecord, Refinement, TrackErrors
 
-# ---- Patches of the scene about bright places, and the pixels that their images are asked at -----------------------
+# ---- Patches about bright places and their pixels -------------------------------------------------------------------
 
 
 MOST_PATCHES, CLEAR = 32, 20.0
-"""Patches are taken until they tell as much as a dozen whose points stand out so many times."""
+"""Most patches; and peak to surroundings, power: patches are taken until their sum is that of a dozen such points."""
 
 LEAST_PATCHES = 4
-"""With fewer, none would be left to judge by."""
+"""With fewer, none would be left for validation."""
 
 MOST_VALUES = 2**27
-"""Complex values, a gigabyte, of what blocks add to patches: with more, fewer patches are looked at."""
+"""Complex values, a gigabyte, of what blocks add to patches: with more, fewer patches are used."""
 
-_ENOUGH = 12 * CLEAR
-_SAMPLING = 0.7  # of Nyquist of the image: at 0.5 no better, at 0.85 places are worse held
+_ENOUGH = 12 * CLEAR  # sum of the ratios at which no more patches are taken
+_SAMPLING = 0.7  # of Nyquist of the image: at 0.5 no better, at 0.85 places are less accurate
 _RANGE_CELLS = 1.5  # half of a patch along the line of sight
 _LEAST_CELLS, _MOST_CELLS = 6.0, 24.0  # half of a patch across it
 _BANDWIDTH = 0.66  # of an error that lasts τ, in 1/τ: its sidelobes should stay in the patch
-_MOST_PIXELS = 1000
-_PULSES = 256
+_MOST_PIXELS = 1000  # of a patch
+_PULSES = 256  # sampled for the directions and cells of a patch
 _SHARE = 0.4  # of all patches, at most, in one ninth of the scene
 
 
@@ -55,8 +55,8 @@ class Patch:
     pixels_m: Floats
 
 
-def spread_out(places_m: Floats, ratio: Floats, axes: Floats, *, apart_m: float) -> Floats:
-    """Return the first of some places that stand apart and do not crowd one part of the scene, as many as are needed.
+def separated(places_m: Floats, ratio: Floats, axes: Floats, *, apart_m: float) -> Floats:
+    """Return as many places as are needed, clearest first, apart from each other and spread over the scene.
 
     Parameters
     ----------
@@ -77,7 +77,7 @@ def spread_out(places_m: Floats, ratio: Floats, axes: Floats, *, apart_m: float)
     Examples
     --------
     >>> places = np.array([[0.0, 0, 0], [0.1, 0, 0], [5, 0, 0], [0, 5, 0]])
-    >>> len(spread_out(places, np.full(4, 10.0), np.eye(3), apart_m=1.0))
+    >>> len(separated(places, np.full(4, 10.0), np.eye(3), apart_m=1.0))
     3
     """
     level = (places_m - places_m.mean(axis=0)) @ axes[:2].T
@@ -85,8 +85,8 @@ def spread_out(places_m: Floats, ratio: Floats, axes: Floats, *, apart_m: float)
     ninth = np.minimum((level - low) / extent * 3, 2.999).astype(int) @ np.array([3, 1])
     taken: list[int] = []
     for number in range(len(places_m)):
-        told = float(np.minimum(ratio[taken], CLEAR).sum())
-        if len(taken) == MOST_PATCHES or told >= _ENOUGH:
+        information = float(np.minimum(ratio[taken], CLEAR).sum())
+        if len(taken) == MOST_PATCHES or information >= _ENOUGH:
             break
         most = max(2, int(np.ceil(_SHARE * min(MOST_PATCHES, _ENOUGH / min(CLEAR, ratio[number])))))
         near = any(np.linalg.norm(level[number] - level[other]) < apart_m for other in taken)
@@ -95,15 +95,15 @@ def spread_out(places_m: Floats, ratio: Floats, axes: Floats, *, apart_m: float)
     return places_m[taken]
 
 
-def patch_at(place_m: Floats, sightings: Sequence[Sighting], axes: Floats, *, correlation_s: float) -> Patch:
-    """Return the pixels about a place: as fine as the sharpest pair needs, as wide as errors throw its energy.
+def patch_at(place_m: Floats, records: Sequence[PairRecord], axes: Floats, *, correlation_s: float) -> Patch:
+    """Return the pixels about a place: as fine as the sharpest pair needs, as wide as errors spread its energy.
 
     Parameters
     ----------
     place_m
         (3,) float64, metres in the frame.
-    sightings
-        All pairs that see it.
+    records
+        Of all pairs.
     axes
         (3, 3) float64, rows are east, north, up.
     correlation_s
@@ -113,7 +113,7 @@ def patch_at(place_m: Floats, sightings: Sequence[Sighting], axes: Floats, *, co
     -----
     Source: docs/theory/autofocus.md, "Patches".
     """
-    spans = [_spans(place_m, sighting, axes, correlation_s) for sighting in sightings]
+    spans = [_spans(place_m, record, axes, correlation_s) for record in records]
     across = max(spans, key=lambda one: one[1][1])[0]
     cell = np.min([one[1] for one in spans], axis=0)
     half = np.max([one[2] for one in spans], axis=0)
@@ -128,12 +128,12 @@ def patch_at(place_m: Floats, sightings: Sequence[Sighting], axes: Floats, *, co
     return Patch(place_m, place_m + level.reshape(-1, 2) @ axes[:2])
 
 
-def affordable(values: Sequence[int]) -> int:
-    """Return how many patches may be kept in memory, of which each has so many complex values: long flights have many.
+def count_in_memory(values: Sequence[int]) -> int:
+    """Return how many patches fit in memory, given the number of complex values of each.
 
     Examples
     --------
-    >>> affordable([2**24] * 32)
+    >>> count_in_memory([2**24] * 32)
     8
     """
     return max(int((np.cumsum(values) <= MOST_VALUES).sum()), min(LEAST_PATCHES, len(values)))
@@ -144,14 +144,14 @@ def bandwidth_hz(profiles: Profiles) -> float:
     return SPEED_OF_LIGHT_M_S / (profiles.step_m * profiles.oversampling)
 
 
-def _spans(place_m: Floats, sighting: Sighting, axes: Floats, correlation_s: float) -> tuple[Floats, Floats, Floats]:
+def _spans(place_m: Floats, record: PairRecord, axes: Floats, correlation_s: float) -> tuple[Floats, Floats, Floats]:
     """Return the directions along and across the line of sight, the cells along both, half a patch in cells."""
-    profiles = sighting.profiles
+    profiles = record.profiles
     some = profiles.aperture.sample(_PULSES)
-    slope, time_s = profiles.aperture[some].path_gradient(place_m) @ axes[:2].T, sighting.time_s[some]
-    if sighting.beams is not None:
-        seen = sighting.beams[some].weight(profiles.aperture[some], place_m[None])[:, 0] > 0
-        slope, time_s = (slope[seen], time_s[seen]) if seen.sum() > 2 else (slope, time_s)
+    slope, time_s = profiles.aperture[some].path_gradient(place_m) @ axes[:2].T, record.time_s[some]
+    if record.beams is not None:
+        illuminated = record.beams[some].weight(profiles.aperture[some], place_m[None])[:, 0] > 0
+        slope, time_s = (slope[illuminated], time_s[illuminated]) if illuminated.sum() > 2 else (slope, time_s)
     ahead = slope.mean(axis=0)
     ahead = ahead / np.linalg.norm(ahead) if np.linalg.norm(ahead) > 1e-3 else np.array([0.0, 1.0])
     turned = np.stack([ahead, [-ahead[1], ahead[0]]])
@@ -159,37 +159,36 @@ def _spans(place_m: Floats, sighting: Sighting, axes: Floats, correlation_s: flo
     band = profiles.centre_frequency_hz + np.array([-0.5, 0.5]) * bandwidth_hz(profiles)
     cycles = np.concatenate([by_time * frequency / SPEED_OF_LIGHT_M_S for frequency in band])
     cell = 1 / np.maximum(np.ptp(cycles, axis=0), 1e-9)
-    thrown = np.clip(_BANDWIDTH * float(np.ptp(time_s)) / correlation_s, _LEAST_CELLS, _MOST_CELLS)
+    spread = np.clip(_BANDWIDTH * float(np.ptp(time_s)) / correlation_s, _LEAST_CELLS, _MOST_CELLS)
     turning = np.ptp(by_time, axis=0)
-    half = np.array([max(_RANGE_CELLS, thrown * min(1.0, turning[0] / max(turning[1], 1e-9)) ** 2), thrown])
+    half = np.array([max(_RANGE_CELLS, spread * min(1.0, turning[0] / max(turning[1], 1e-9)) ** 2), spread])
     return turned, cell, half
 
 
-# ---- Where points may stand: bright places of images of short parts of the aperture, which errors of tracks blur
-# least
+# ---- Bright places in images of short parts of the aperture ---------------------------------------------------------
 
 LEAST_RATIO = 5.0
-"""Power of a place against what lies about it, summed over parts of the aperture: less is no point."""
+"""Peak power over its surroundings, summed over parts of the aperture: less is no point."""
 
 HELPFUL_RATIO = 3.5
-"""Where there are points, places that stand out less help too."""
+"""The same of weaker places that are used as well where there are points."""
 
-_LEAST_TOLD = 40.0  # by all points together, as patches are counted: a few faint ones may be speckle
+_LEAST_RATIO_SUM = 40.0  # sum over all points, each up to CLEAR: a few faint ones may be speckle
 _SHARE_OF_CLEAREST = 0.05  # beside clear points faint places are their sidelobes
-_APART = 0.6  # of half a patch, at least, lie patches apart
+_APART = 0.6  # least distance of patches, in halves of a patch
 
 MOST_LOOKS = 24
 """Parts of the aperture: each as long as an error lasts, or longer."""
 
-_SIDE_PX = 512
-_ABOUT_CELLS = 12  # of range: how far a place is compared with what lies about it
-_SIDELOBES = 1e-3  # of the brightest: what stands out of nothing may be its sidelobe
-_MOST_PLACES = 500
+_SIDE_PX = 512  # of parts of the image formed at once
+_ABOUT_CELLS = 12  # of range: radius of the surroundings
+_SIDELOBES = 1e-3  # of the brightest: fainter places may be its sidelobes
+_MOST_PLACES = 500  # of candidates kept
 
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
-    """What a scene has to refine by.
+    """Places of a scene by which tracks can be refined.
 
     Attributes
     ----------
@@ -207,23 +206,23 @@ class Candidates:
 
     @classmethod
     def of(
-        cls, sightings: Sequence[Sighting], grid: SceneGrid, terrain: Terrain, errors: Mapping[str, TrackErrors]
+        cls, records: Sequence[PairRecord], grid: SceneGrid, terrain: Terrain, errors: Mapping[str, TrackErrors]
     ) -> "Candidates":
-        """Return those of a scene as its pairs saw it, with what is known of each node's log."""
-        lasting_s = min(one.correlation_s for one in errors.values())
-        places_m, ratio = bright_places(sightings, grid, terrain, lasting_s=lasting_s)
+        """Return those of a scene, from all pairs and the error statistics of each node's log."""
+        correlation_s = min(one.correlation_s for one in errors.values())
+        places_m, ratio = bright_places(records, grid, terrain, correlation_s=correlation_s)
         axes, points = east_north_up(grid, places_m), int((ratio > LEAST_RATIO).sum())
-        told = float(np.minimum(ratio[ratio > LEAST_RATIO], CLEAR).sum())
-        if points < LEAST_PATCHES or told < _LEAST_TOLD:
+        information = float(np.minimum(ratio[ratio > LEAST_RATIO], CLEAR).sum())
+        if points < LEAST_PATCHES or information < _LEAST_RATIO_SUM:
             return cls([], points, axes)
-        typical = patch_at(places_m[0], sightings, axes, correlation_s=lasting_s)
+        typical = patch_at(places_m[0], records, axes, correlation_s=correlation_s)
         apart_m = _APART * float(np.abs((typical.pixels_m - typical.place_m) @ axes[:2].T).max())
         helpful = ratio > max(HELPFUL_RATIO, _SHARE_OF_CLEAREST * float(ratio.max()))
-        chosen = spread_out(places_m[helpful], ratio[helpful], axes, apart_m=apart_m)
-        return cls([patch_at(place, sightings, axes, correlation_s=lasting_s) for place in chosen], points, axes)
+        chosen = separated(places_m[helpful], ratio[helpful], axes, apart_m=apart_m)
+        return cls([patch_at(place, records, axes, correlation_s=correlation_s) for place in chosen], points, axes)
 
-    def refused(self, errors: Mapping[str, TrackErrors], by_speckle: Refinement | None = None) -> Refinement:
-        """Return that too few points stand out, and what else was tried in vain: no node is moved."""
+    def rejected(self, errors: Mapping[str, TrackErrors], by_speckle: Refinement | None = None) -> Refinement:
+        """Return a rejected refinement: too few points, and why speckle does not do; no node is moved."""
         line = (
             f"{self.points} places of the scene stand {10 * np.log10(LEAST_RATIO):.0f} dB out of what lies about them; "
             f"{LEAST_PATCHES} are needed, twice as many where none stands out more"
@@ -237,17 +236,17 @@ class Candidates:
 
 
 def bright_places(
-    sightings: Sequence[Sighting], grid: SceneGrid, terrain: Terrain, *, lasting_s: float
+    records: Sequence[PairRecord], grid: SceneGrid, terrain: Terrain, *, correlation_s: float
 ) -> tuple[Floats, Floats]:
-    """Return places that stand out of what lies about them in the images of all pairs, and by how much.
+    """Return places brighter than their surroundings in the images of all pairs, and by how much.
 
     Parameters
     ----------
-    sightings
-        What every pair saw.
+    records
+        Of every pair.
     grid, terrain
         The scene.
-    lasting_s
+    correlation_s
         How long an error of the tracks lasts.
 
     Returns
@@ -255,7 +254,7 @@ def bright_places(
     places_m : ndarray
         (place, 3) float64, metres in the frame, those that stand out most first.
     ratio : ndarray
-        (place,) float64, power there against what lies about it, summed over parts of the aperture.
+        (place,) float64, power over that of the surroundings, summed over parts of the aperture.
 
     Notes
     -----
@@ -264,16 +263,16 @@ def bright_places(
     """
     from scipy.ndimage import maximum_filter, median_filter  # slow to import
 
-    cell_m = min(SPEED_OF_LIGHT_M_S / bandwidth_hz(one.profiles) for one in sightings) / 2
+    cell_m = min(SPEED_OF_LIGHT_M_S / bandwidth_hz(one.profiles) for one in records) / 2
     step = max(1, int(cell_m / 2 / grid.spacing_m))
     rows, columns = (np.arange(step // 2, size, step) for size in grid.shape)
     power = np.zeros((len(rows), len(columns)))
-    for one in sightings:
+    for one in records:
         image = np.zeros_like(power)
         for part in _parts(len(rows), len(columns)):
             row, column = np.meshgrid(rows[part[0]], columns[part[1]], indexing="ij")
             places = terrain.positions_at(grid, row, column)
-            image[part] = sum(np.abs(look).astype(np.float64) ** 2 for look in _looks(one, places, lasting_s))
+            image[part] = sum(np.abs(look).astype(np.float64) ** 2 for look in _looks(one, places, correlation_s))
         power += image / max(float(np.nanmean(image)), 1e-300)
     power = np.nan_to_num(power)
     reach = max(3, round(_ABOUT_CELLS * cell_m / (step * grid.spacing_m)))
@@ -302,13 +301,13 @@ def _parts(rows: int, columns: int) -> Iterator[tuple[slice, slice]]:
             yield slice(row, row + _SIDE_PX), slice(column, column + _SIDE_PX)
 
 
-def _looks(one: Sighting, places: Floats, lasting_s: float) -> Iterator[NDArray[np.complex64]]:
+def _looks(one: PairRecord, places: Floats, correlation_s: float) -> Iterator[NDArray[np.complex64]]:
     """Yield the image of each part of the aperture."""
     engine = load_engine("native")
     if not engine.available():
         engine = load_engine("numba")
     spans_s = float(one.time_s[-1] - one.time_s[0])
-    count = int(np.clip(spans_s / max(lasting_s, 1e-9), 1, MOST_LOOKS))
+    count = int(np.clip(spans_s / max(correlation_s, 1e-9), 1, MOST_LOOKS))
     for pulses in one.profiles.aperture.blocks(count):
         beams = None if one.beams is None else one.beams[pulses]
         yield engine.form(engine.prepare(one.profiles[pulses]), places, beams=beams)

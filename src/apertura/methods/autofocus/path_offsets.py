@@ -1,4 +1,4 @@
-"""One path offset per pulse of each pair, as bright patches ask for it, and whether it is to be believed."""
+"""One path offset per pulse of each pair, estimated from bright patches, and whether it is accepted."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -13,14 +13,14 @@ from apertura.core.geometry.phase_centres import TrackCorrection
 from apertura.core.quality.budget import NodePositions, position_lines
 from apertura.core.quality.path_errors import Effect, PointPaths
 from apertura.methods.autofocus.evidence import LEAST_BETTER, LEAST_GAIN_DB, MOST_RATIO, gains_db
-from apertura.methods.autofocus.inputs import Refinement, Sighting, TrackErrors
+from apertura.methods.autofocus.inputs import PairRecord, Refinement, TrackErrors
 from apertura.methods.autofocus.objective import PatchImage
 from apertura.methods.autofocus.one_phase import METHODS, Patches
-from apertura.methods.autofocus.patches import LEAST_PATCHES, Candidates, Patch, affordable, bandwidth_hz
+from apertura.methods.autofocus.patches import LEAST_PATCHES, Candidates, Patch, bandwidth_hz, count_in_memory
 
-_FOLDS = 4  # each of so many parts of the patches is held out once
-_APART_CELLS = 2.0  # of range, c/B of total path
-_BLOCKS_A_LASTING = 10  # at least, to an error's correlation time
+_FOLDS = 4  # of cross-validation: each part of the patches is left out of one fit
+_APART_CELLS = 2.0  # of range, c/B of total path: patches nearer than that share noise
+_BLOCKS_PER_CORRELATION_TIME = 10  # at least
 _BETWEEN_BLOCKS_RAD2 = 0.1  # by which an error grows from block to block: linear between them, an eighth is left
 _LINEAR = 1 / 8  # of that growth is left by offsets that are linear between blocks
 _PULSES = 4096  # read at a time
@@ -28,30 +28,31 @@ _SHIFTS = 0.5  # of the largest variation of the path's slope: a move in such a 
 
 
 def refine_one_phase(
-    sightings: Sequence[Sighting], found: Candidates, errors: Mapping[str, TrackErrors], *, method: str
+    records: Sequence[PairRecord], found: Candidates, errors: Mapping[str, TrackErrors], *, method: str
 ) -> Refinement:
-    """Return path offsets of pairs that make patches sharp, and whether patches that were not fitted believe them.
+    """Return path offsets of pairs that make patches sharp, accepted by the gain of patches that were not fitted.
 
     Parameters
     ----------
-    sightings
-        What every pair saw.
+    records
+        Of every pair.
     found
-        What the scene has to refine by.
+        Places of the scene to refine by.
     errors
-        Node → what is known of its log's errors.
+        Node → error statistics of its log.
     method
         A row of `METHODS`.
 
     Notes
     -----
-    Source: docs/theory/autofocus.md, "One phase per pulse". Each quarter of the patches is judged by offsets fitted to
-    those of the others that share no range with it. Of these offsets and those fitted to all the sharpest are returned.
-    No node is moved: what is known of its place is what its log knows.
+    Source: docs/theory/autofocus.md, "One phase per pulse". Each quarter of the patches is validated with offsets
+    fitted to those of the others that share no range with it. Of these offsets and those fitted to all, the sharpest
+    are returned.
+    No node is moved: its position errors remain those of its log.
     """
     if len(found.patches) < LEAST_PATCHES:
-        return found.refused(errors)
-    fits = [_Pair.of(sighting, found.patches, errors).fitted(method) for sighting in sightings]
+        return found.rejected(errors)
+    fits = [_Pair.of(record, found.patches, errors).fitted(method) for record in records]
     gain_db = np.concatenate([fit.gain_db for fit in fits])
     better = float((gain_db > 0).mean())
     accepted = bool(gain_db.mean() >= LEAST_GAIN_DB and better >= LEAST_BETTER)
@@ -71,14 +72,14 @@ def refine_one_phase(
         "patches": len(found.patches),
         "gain_held_out_db": round(float(gain_db.mean()), 3),
         "held_out_better": round(better, 3),
-        **_left(fits, [_of_logs(sighting, found, errors) for sighting in sightings]),
+        **_left(fits, [_of_logs(record, found, errors) for record in records]),
     }
     return Refinement(correction, std_m, accepted, why, report, {} if accepted else {"refinement_rejected": why})
 
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """By how much the echoes of a pair lie further, in total path, than its logs say.
+    """Path offsets of a pair's echoes against its logs, in total path.
 
     Attributes
     ----------
@@ -101,7 +102,7 @@ class _Fit:
 
 @dataclass(frozen=True, eq=False)
 class _Pair:
-    """What blocks of a pair add to the patches."""
+    """Contributions of a pair's blocks to the patches."""
 
     name: str
     time_s: Floats
@@ -113,36 +114,36 @@ class _Pair:
     wavenumber: float
 
     @classmethod
-    def of(cls, sighting: Sighting, patches: Sequence[Patch], errors: Mapping[str, TrackErrors]) -> "_Pair":
-        profiles = sighting.profiles
+    def of(cls, record: PairRecord, patches: Sequence[Patch], errors: Mapping[str, TrackErrors]) -> "_Pair":
+        profiles = record.profiles
         wavenumber = 2 * np.pi * profiles.centre_frequency_hz / SPEED_OF_LIGHT_M_S
-        of_nodes = [errors[node] for node in sighting.nodes]
-        lasting_s = min(error.correlation_s for error in of_nodes)
+        of_nodes = [errors[node] for node in record.nodes]
+        correlation_s = min(error.correlation_s for error in of_nodes)
         turned = 2 * wavenumber * max(max(error.std_m) for error in of_nodes)
-        lasts = min(1 / _BLOCKS_A_LASTING, _BETWEEN_BLOCKS_RAD2 / max(2 * turned**2, 1e-12))
-        edges = _edges(sighting.time_s, lasting_s * lasts)
+        lasts = min(1 / _BLOCKS_PER_CORRELATION_TIME, _BETWEEN_BLOCKS_RAD2 / max(2 * turned**2, 1e-12))
+        edges = _edges(record.time_s, correlation_s * lasts)
         middle = (edges[:-1] + edges[1:] - 1) // 2
-        time_s = np.add.reduceat(sighting.time_s, edges[:-1]) / np.diff(edges)
-        patches = patches[: affordable([len(patch.pixels_m) * len(time_s) for patch in patches])]
-        cached = _contributions(sighting, patches, edges)
+        time_s = np.add.reduceat(record.time_s, edges[:-1]) / np.diff(edges)
+        patches = patches[: count_in_memory([len(patch.pixels_m) * len(time_s) for patch in patches])]
+        cached = _contributions(record, patches, edges)
         places = np.array([patch.place_m for patch in patches])
         path_m = profiles.aperture[middle].path(places).mean(axis=0)
         slope = profiles.aperture[middle].path_gradient(places.mean(axis=0))
         cell_m = SPEED_OF_LIGHT_M_S / bandwidth_hz(profiles)
-        return cls(sighting.pair, time_s, 2 * turned**2 * lasts, cached, path_m, cell_m, slope, wavenumber)
+        return cls(record.pair, time_s, 2 * turned**2 * lasts, cached, path_m, cell_m, slope, wavenumber)
 
     def fitted(self, method: str) -> _Fit:
-        """Return the offsets found, and what each patch gains by those that it has no part in.
+        """Return the offsets, and what each patch gains by offsets that were not fitted to it.
 
         Of offsets fitted to all patches and to parts of them those are taken that all patches gain most by.
         """
-        folds, before = np.arange(len(self.cached)) % _FOLDS, self.seen()
+        folds, before = np.arange(len(self.cached)) % _FOLDS, self.statistics()
         parts = [self.apart(folds == fold) for fold in range(_FOLDS)]
         phases = [self.phases(method, fitted) for fitted in (*parts, np.ones_like(parts[0]))]
-        gain_db = np.array([gains_db([before], [self.seen(phase)])[0] for phase in phases])
+        gain_db = np.array([gains_db([before], [self.statistics(phase)])[0] for phase in phases])
         phase = phases[int(gain_db.mean(axis=1).argmax())]
-        told = 2 * sum(min(seen.ratio, MOST_RATIO) for seen in self.seen(phase)) / len(phase)
-        left_rad2 = _LINEAR * self.grows_rad2 + 1 / told
+        information = 2 * sum(min(statistics.ratio, MOST_RATIO) for statistics in self.statistics(phase)) / len(phase)
+        left_rad2 = _LINEAR * self.grows_rad2 + 1 / information
         # An echo over ∆ turns by -k∆.
         return _Fit(self.name, self.time_s, -phase / self.wavenumber, gain_db[folds, np.arange(len(folds))], left_rad2)
 
@@ -161,21 +162,21 @@ class _Pair:
         centred = phase - phase.mean()
         return np.asarray(centred - moves @ (moves.T @ centred))
 
-    def seen(self, phase: Floats | None = None) -> list[PatchImage]:
-        """Return what the patches show with blocks turned; as the logs have them by default."""
+    def statistics(self, phase: Floats | None = None) -> list[PatchImage]:
+        """Return the statistics of the patches with blocks turned by `phase`; by default along the logs."""
         turn = np.exp(1j * (np.zeros(len(self.time_s)) if phase is None else phase)).astype(np.complex64)
         return [PatchImage.of(patch @ turn) for patch in self.cached]
 
 
 def _edges(time_s: Floats, block_s: float) -> NDArray[np.int64]:
-    """Return (block + 1,) int64 first pulses of blocks of equal time; blocks without pulses are left out."""
+    """Return (block + 1,) int64, first pulse of each block of equal time; empty blocks are left out."""
     count = max(2, min(len(time_s), int(np.ceil((time_s[-1] - time_s[0]) / block_s))))
     ends = np.linspace(time_s[0], time_s[-1], count + 1)[:-1]
     return np.append(np.unique(np.searchsorted(time_s, ends)), len(time_s))
 
 
 def _contributions(
-    sighting: Sighting, patches: Sequence[Patch], edges: NDArray[np.int64]
+    record: PairRecord, patches: Sequence[Patch], edges: NDArray[np.int64]
 ) -> list[NDArray[np.complex64]]:
     """Return (pixel, block), what blocks add to each patch; every pulse is read once."""
     blocks = len(edges) - 1
@@ -185,27 +186,27 @@ def _contributions(
         some = slice(first, min(first + at_once, blocks))
         pulses = slice(int(edges[some.start]), int(edges[some.stop]))
         inside = edges[some.start : some.stop + 1] - pulses.start
-        part = sighting.profiles[pulses]
+        part = record.profiles[pulses]
         part = replace(part, samples=np.asarray(part.samples))
-        beams = None if sighting.beams is None else sighting.beams[pulses]
+        beams = None if record.beams is None else record.beams[pulses]
         for patch, target in zip(patches, cached, strict=True):
             weights = None if beams is None else beams.weight(part.aperture, patch.place_m[None])[:, 0]
             target[:, some] = block_contributions(part, patch.pixels_m, edges=inside, weights=weights)
     return cached
 
 
-def _of_logs(sighting: Sighting, found: Candidates, errors: Mapping[str, TrackErrors]) -> Effect:
-    """Return what errors of the logs do to a pair's image."""
-    profiles = sighting.profiles
+def _of_logs(record: PairRecord, found: Candidates, errors: Mapping[str, TrackErrors]) -> Effect:
+    """Return the effect of the logs' errors on a pair's image."""
+    profiles = record.profiles
     paths = PointPaths.of(
         profiles.aperture,
-        sighting.time_s,
+        record.time_s,
         point_m=np.mean([patch.place_m for patch in found.patches], axis=0),
         axes=found.axes,
         wavelength_m=SPEED_OF_LIGHT_M_S / profiles.centre_frequency_hz,
     )
-    nodes = [NodePositions(errors[node].std_m, errors[node].correlation_s) for node in dict.fromkeys(sighting.nodes)]
-    (line,) = position_lines(paths, nodes, sidelink=sighting.sidelink_m is not None)
+    nodes = [NodePositions(errors[node].std_m, errors[node].correlation_s) for node in dict.fromkeys(record.nodes)]
+    (line,) = position_lines(paths, nodes, sidelink=record.sidelink_m is not None)
     return line.effect
 
 

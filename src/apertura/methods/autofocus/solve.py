@@ -1,4 +1,4 @@
-"""Tracks that make the patches sharpest: what sharpness leaves free is fixed by the log; two starts of the search."""
+"""Tracks that make the patches sharpest: search, its two starts, and the gauge that only the log determines."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -13,19 +13,19 @@ from apertura.methods.autofocus.inputs import Prior
 from apertura.methods.autofocus.objective import Blocks, Contribution, PatchEcho, PatchImage, Sharpness, Tracks, phases
 from apertura.methods.autofocus.patches import Patch
 
-# ---- What sharpness does not see of the tracks and yet moves the image: held where the log has it ------------------
+# ---- Gauge: track modes that shift the image without blurring it ----------------------------------------------------
 
 
-SEEN_RAD = 0.03
-"""A mode that turns phases by less, rms over the aperture per standard deviation of the log, is not seen."""
+LEAST_PHASE_RAD = 0.03
+"""Radians rms over the aperture, per standard deviation of the log: a mode below leaves focus as it is."""
 
 LEAST_SHIFT_M = 3e-4
-"""Modes that move patches by less are left to the solver."""
+"""Metres per standard deviation of the log: modes that move patches by less are left to the solver."""
 
-SURE = 10.0
-"""A mode of which the image tells so many times as much as the log is settled by it."""
+LEAST_INFORMATION = 10.0
+"""Information of the image over that of the log, 1, from which the image alone determines a mode."""
 
-_PIECES = 5  # of the time for which a patch is seen, to a cubic piece of a smooth mode
+_PIECES = 5  # cubic pieces of a smooth mode in the time for which a patch is illuminated
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +51,7 @@ class Gauge:
     blurs_rad2: Floats
     blurring: Floats
 
-    def held(self, unknowns: Floats) -> Floats:
+    def project_out(self, unknowns: Floats) -> Floats:
         """Return unknowns, or a gradient, without their part along the modes."""
         return np.asarray(unknowns - self.modes.T @ (self.modes @ unknowns))
 
@@ -62,21 +62,21 @@ class Gauge:
 
     @classmethod
     def none(cls, unknowns: int) -> "Gauge":
-        """Return the gauge that holds nothing."""
+        """Return the gauge without modes."""
         return cls(np.zeros((0, unknowns)), np.zeros((0, 1, 2)), np.zeros(0), np.zeros((0, unknowns)))
 
     def settled(self, unknowns: Floats, *, known: float) -> Floats:
-        """Return (mode,) float64, the unknowns that an image settles whatever the log says.
+        """Return (mode,) float64, the unknowns that the image alone determines.
 
         Parameters
         ----------
         unknowns
             As solved.
         known
-            What the phases tell of a mode that turns them by a radian: 2·power of points against their surroundings,
+            Information of the phases on a mode that turns them by a radian: 2·power of points over their surroundings,
             summed over pairs and patches.
         """
-        return np.asarray(self.blurring[self.blurs_rad2 * known > SURE] @ unknowns)
+        return np.asarray(self.blurring[self.blurs_rad2 * known > LEAST_INFORMATION] @ unknowns)
 
 
 def find_gauge(
@@ -86,12 +86,12 @@ def find_gauge(
     knots_s: Floats,
     axes: Floats,
 ) -> Gauge:
-    """Return the gauge of some patches as some pairs see them; axes are rows east, north, up."""
+    """Return the gauge of patches over pairs; rows of `axes` are east, north, up."""
     unknowns = _smooth_unknowns(pairs, cached, prior, knots_s)
     blurs, shifts = [], []
     tracks = prior.tracks(unknowns)
     for blocks, patches in zip(pairs, cached, strict=True):
-        moved = {node: blocks.average_of(tracks[node]) for node in dict.fromkeys(blocks.sighting.nodes)}
+        moved = {node: blocks.average_of(tracks[node]) for node in dict.fromkeys(blocks.record.nodes)}
         for patch in patches:
             blur, shift = effects(patch, moved, axes)
             blurs.append(blur)
@@ -99,9 +99,9 @@ def find_gauge(
     count = len(blurs)
     focus = np.sum([blur.T @ blur for blur in blurs], axis=0) / count
     shift = np.concatenate(shifts) / np.sqrt(count)
-    spread = np.linalg.solve(focus + SEEN_RAD**2 * np.eye(len(focus)), shift.T)
+    spread = np.linalg.solve(focus + LEAST_PHASE_RAD**2 * np.eye(len(focus)), shift.T)
     power, turn = np.linalg.eigh(shift @ spread)
-    keep = power * SEEN_RAD**2 > LEAST_SHIFT_M**2
+    keep = power * LEAST_PHASE_RAD**2 > LEAST_SHIFT_M**2
     inside, _ = np.linalg.qr(spread @ turn[:, keep])
     moves = np.stack([one @ inside for one in shifts])
     blurred, shapes = np.linalg.eigh(focus)
@@ -114,15 +114,15 @@ def _smooth_unknowns(
     """Return (mode, unknown) float64, orthonormal: smooth tracks, and those that turn and stretch each node's own."""
     from scipy.interpolate import BSpline
 
-    seen = [patch.blocks.stop - patch.blocks.start for patches in cached for patch in patches]
-    length = max(4, int(np.median([one for one in seen if one] or [len(knots_s)])) // _PIECES)
+    lengths = [patch.blocks.stop - patch.blocks.start for patches in cached for patch in patches]
+    length = max(4, int(np.median([one for one in lengths if one] or [len(knots_s)])) // _PIECES)
     number = max(1, round(len(knots_s) / length))
     grid = np.linspace(knots_s[0], knots_s[-1], number + 1)
     step = grid[1] - grid[0]
     ends = np.concatenate([grid[0] - step * np.arange(3, 0, -1), grid, grid[-1] + step * np.arange(1, 4)])
     inside = np.clip(knots_s, grid[0], np.nextafter(grid[-1], grid[0]))
     splines = BSpline.design_matrix(inside, ends, 3).toarray()
-    flown = _flown(pairs)
+    flown = _logged_places(pairs)
     fields = []
     for node in prior.nodes:
         shape = flown[node] - flown[node].mean(axis=0)
@@ -135,13 +135,13 @@ def _smooth_unknowns(
     return np.asarray(left[:, size > 1e-6 * size[0]].T)
 
 
-def _flown(pairs: Sequence[Blocks]) -> Mapping[str, Floats]:
+def _logged_places(pairs: Sequence[Blocks]) -> Mapping[str, Floats]:
     """Return node → (knot, 3) float64, where its log has it."""
     places: dict[str, Floats] = {}
     for blocks in pairs:
-        sighting = blocks.sighting
-        middle = np.minimum((blocks.edges[:-1] + blocks.edges[1:]) // 2, len(sighting.time_s) - 1)
-        for node, leg in zip(sighting.nodes, sighting.profiles.aperture.legs, strict=True):
+        record = blocks.record
+        middle = np.minimum((blocks.edges[:-1] + blocks.edges[1:]) // 2, len(record.time_s) - 1)
+        for node, leg in zip(record.nodes, record.profiles.aperture.legs, strict=True):
             places.setdefault(node, leg[middle])
     return places
 
@@ -159,39 +159,39 @@ def effects(patch: Contribution, moved: Mapping[str, Floats], axes: Floats) -> t
     weight = np.linalg.norm(patch.values, axis=0).astype(np.float64)
     weight = (weight / max(weight.sum(), 1e-300))[:, None]
 
-    def told(paths: Floats) -> Floats:
+    def weighted(paths: Floats) -> Floats:
         centred = paths - (weight * paths).sum(axis=0)
         parts = [np.sqrt(weight) * one for one in (patch.wavenumber * centred, patch.band * paths)]
         return np.asarray(np.concatenate(parts), np.float64)
 
-    known, errors = (told(np.asarray(one)) for one in (ground, path))
+    known, errors = (weighted(np.asarray(one)) for one in (ground, path))
     shift = np.linalg.pinv(known) @ errors
     return errors - known @ shift, shift
 
 
-# ---- Tracks that make the patches sharpest without leaving what the log allows -------------------------------------
+# ---- Search for the sharpest tracks within the errors of the logs ---------------------------------------------------
 
 
 ITERATIONS = 20
-"""Steps towards the sharpest tracks before contributions are cached anew."""
+"""Steps of L-BFGS-B before contributions are computed anew."""
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """What is to be focused.
+    """Pairs, patches and prior of one refinement.
 
     Attributes
     ----------
     pairs
         Blocks of each pair.
     echoes
-        Pair → patch → what it recorded of it.
+        Pair → patch → its summed echoes.
     knots_s
         (knot,) float64, times of the corrections.
     prior
         Of the nodes.
     gauge
-        What is held at the log's value.
+        Modes that stay at the log's value.
     """
 
     pairs: Sequence[Blocks]
@@ -205,11 +205,11 @@ class Problem:
         return TrackCorrection(self.knots_s, self.prior.tracks(unknowns))
 
     def state(self, unknowns: Floats) -> "State":
-        """Return what blocks add to the patches from tracks as corrected."""
+        """Return contributions of the blocks to the patches from corrected tracks."""
         return replace(self.at(self.prior.tracks(unknowns)), unknowns=unknowns)
 
     def at(self, tracks: Tracks) -> "State":
-        """Return the same of tracks whose unknowns nobody asks for."""
+        """Return the same of tracks that have no unknowns."""
         cached = []
         for blocks, echoes in zip(self.pairs, self.echoes, strict=True):
             moved = blocks.moves(tracks)
@@ -226,21 +226,21 @@ class Problem:
         return replace(self, echoes=[[echoes[number] for number in patches] for echoes in self.echoes])
 
     def sharper(self, state: "State", used: Bools, *, stages: int = 1) -> "State":
-        """Return the tracks at which the patches used are sharpest, from a state on."""
+        """Return the tracks at which the patches used are sharpest, searched from `state`."""
         for _ in range(stages):
-            sharpness = Sharpness(self.pairs, state.cached, state.tracks, state.seen, used)
-            state = self.state(minimal(sharpness, self.prior, self.gauge, state.unknowns))
+            sharpness = Sharpness(self.pairs, state.cached, state.tracks, state.statistics, used)
+            state = self.state(minimise(sharpness, self.prior, self.gauge, state.unknowns))
         return state
 
     def value(self, state: "State", used: Bools, weights: Sequence[Sequence[PatchImage]]) -> float:
-        """Return what is to be small, with the weights and energies of another state."""
+        """Return the objective, with the weights and energies of another state."""
         value, _ = Sharpness(self.pairs, state.cached, state.tracks, weights, used)(state.tracks)
         return value + 0.5 * float(state.unknowns @ state.unknowns)
 
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """Tracks, and the patches as seen from them.
+    """Tracks, and the patches imaged from them.
 
     Attributes
     ----------
@@ -262,20 +262,20 @@ class State:
         return [[patch.values.sum(axis=1) for patch in patches] for patches in self.cached]
 
     @cached_property
-    def seen(self) -> list[list[PatchImage]]:
-        """Pair → patch → what it shows."""
-        seen = []
+    def statistics(self) -> list[list[PatchImage]]:
+        """Pair → patch → energy, contrast and peak ratio."""
+        statistics = []
         for images in self.images:
             brightest = max((float(np.abs(image).max()) ** 2 for image in images), default=0.0)
-            seen.append([PatchImage.of(image, brightest) for image in images])
-        return seen
+            statistics.append([PatchImage.of(image, brightest) for image in images])
+        return statistics
 
     def of(self, patches: Sequence[int]) -> "State":
         """Return the state of some patches."""
         return replace(self, cached=[[cached[number] for number in patches] for cached in self.cached])
 
 
-def minimal(
+def minimise(
     value: Callable[[Tracks], tuple[float, dict[str, Floats]]],
     prior: Prior,
     gauge: Gauge,
@@ -283,28 +283,28 @@ def minimal(
     *,
     iterations: int = ITERATIONS,
 ) -> Floats:
-    """Return the unknowns that make a function of the tracks and half their own square smallest, gauge held."""
+    """Return the unknowns that minimise a function of the tracks plus half their own square; the gauge is fixed."""
     from scipy.optimize import minimize  # slow to import
 
-    held = gauge.modes.T @ (gauge.modes @ start)
+    fixed = gauge.modes.T @ (gauge.modes @ start)
 
-    def whole(unknowns: Floats) -> tuple[float, Floats]:
-        free = gauge.held(unknowns) + held
+    def objective(unknowns: Floats) -> tuple[float, Floats]:
+        free = gauge.project_out(unknowns) + fixed
         some, by_tracks = value(prior.tracks(free))
-        return some + 0.5 * float(unknowns @ unknowns), gauge.held(prior.adjoint(by_tracks)) + unknowns
+        return some + 0.5 * float(unknowns @ unknowns), gauge.project_out(prior.adjoint(by_tracks)) + unknowns
 
     options = {"maxiter": iterations, "maxfun": 2 * iterations, "maxcor": 20}
-    found = minimize(whole, gauge.held(start), jac=True, method="L-BFGS-B", options=options)
-    return np.asarray(gauge.held(found.x) + held)
+    found = minimize(objective, gauge.project_out(start), jac=True, method="L-BFGS-B", options=options)
+    return np.asarray(gauge.project_out(found.x) + fixed)
 
 
-# ---- Tracks from the unwrapped phases of the patches' brightest points: another start of the search than the log
+# ---- Second start of the search: unwrapped phases of the brightest points -------------------------------------------
 
 SMOOTHED = (2.0, 1.5, 1.0)
-"""Standard deviation, in blocks, of what smooths phases before they are unwrapped: one per round."""
+"""Standard deviation, in blocks, of the filter before phases are unwrapped, one per round."""
 
 
-def prominent(problem: Problem, start: State, used: NDArray[np.bool_], axes: Floats) -> State:
+def prominent_point_start(problem: Problem, start: State, used: NDArray[np.bool_], axes: Floats) -> State:
     """Return the tracks that explain the phases of the patches' brightest pixels, least squares with the prior.
 
     Notes
@@ -315,7 +315,7 @@ def prominent(problem: Problem, start: State, used: NDArray[np.bool_], axes: Flo
     for smoothed in SMOOTHED:
         histories = [[_History.of(patch, smoothed, axes) for patch in patches] for patches in state.cached]
         fit = _PhaseFit(problem.pairs, histories, state.tracks, used)
-        state = problem.state(minimal(fit, problem.prior, problem.gauge, state.unknowns, iterations=40))
+        state = problem.state(minimise(fit, problem.prior, problem.gauge, state.unknowns, iterations=40))
     return state
 
 
@@ -353,7 +353,7 @@ class _PhaseFit:
     def __call__(self, tracks: Tracks) -> tuple[float, dict[str, Floats]]:
         total, gradient = 0.0, {node: np.zeros_like(track) for node, track in tracks.items()}
         for blocks, histories in zip(self.pairs, self.histories, strict=True):
-            moved = blocks.moves({node: tracks[node] - self.reference[node] for node in blocks.sighting.nodes})
+            moved = blocks.moves({node: tracks[node] - self.reference[node] for node in blocks.record.nodes})
             for one, counts in zip(histories, self.used, strict=True):
                 if not counts:
                     continue

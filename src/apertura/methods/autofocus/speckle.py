@@ -1,4 +1,4 @@
-"""Tracks refined where no point stands out: by the speckle that two pairs share at equal spatial frequencies."""
+"""Tracks refined where no point stands out: by speckle that two pairs share at equal spatial frequencies."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -13,22 +13,22 @@ from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.geometry.phase_centres import TrackCorrection
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import Terrain
-from apertura.methods.autofocus.inputs import Prior, Refinement, Sighting
+from apertura.methods.autofocus.inputs import PairRecord, Prior, Refinement
 from apertura.methods.autofocus.objective import Blocks, Contribution, PatchEcho, Tracks, phases
 from apertura.methods.autofocus.patches import Patch, bandwidth_hz
-from apertura.methods.autofocus.solve import Gauge, minimal
+from apertura.methods.autofocus.solve import Gauge, minimise
 
-# ---- The scene in squares that share it out: what two pairs are compared on ----------------------------------------
+# ---- Tiles of the scene on which two pairs are compared -------------------------------------------------------------
 
 
 MOST_TILES = 64
-"""Of a larger scene so many tiles about its middle are taken."""
+"""Of a larger scene, tiles about its middle."""
 
 SAMPLING = 0.85
-"""Of Nyquist of the image: products of two images are only summed."""
+"""Pixels over Nyquist of the image: products of two images are only summed."""
 
 _CELLS_WIDE = 2.5  # of a tile, in cells of an aperture that is flown while an error lasts
-_STEPS = 64
+_STEPS = 64  # pulses sampled for the size and pixels of a tile
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,16 +47,18 @@ class SpeckleTile:
     sides_m: Floats
 
 
-def tiles(sightings: Sequence[Sighting], grid: SceneGrid, terrain: Terrain, *, lasting_s: float) -> list[SpeckleTile]:
-    """Return squares that share out the scene without gaps, their pixels as fine as the sharpest pair needs.
+def tiles(
+    records: Sequence[PairRecord], grid: SceneGrid, terrain: Terrain, *, correlation_s: float
+) -> list[SpeckleTile]:
+    """Return squares that cover the scene without gaps, their pixels as fine as the sharpest pair needs.
 
     Parameters
     ----------
-    sightings
+    records
         All pairs.
     grid, terrain
         The scene.
-    lasting_s
+    correlation_s
         How long an error of the tracks lasts.
 
     Notes
@@ -73,30 +75,30 @@ def tiles(sightings: Sequence[Sighting], grid: SceneGrid, terrain: Terrain, *, l
     >>> silent = np.zeros((200, 100), np.complex64)
     >>> profiles = Profiles(silent, np.full(200, 20.0), 0.366, 1.4e9, 2.0, Aperture(track, track))
     >>> grid = SceneGrid("local", -9.0, 24.0, 0.5, (36, 36))
-    >>> found = tiles([Sighting("a-a", profiles, time_s)], grid, FlatGround(0.0), lasting_s=1.0)
+    >>> found = tiles([PairRecord("a-a", profiles, time_s)], grid, FlatGround(0.0), correlation_s=1.0)
     >>> len(found), found[0].sides_m.round(1).tolist()
     (9, [[0.0, -6.0, 0.0], [6.0, 0.0, 0.0]])
     """
     middle = terrain.positions_at(grid, (grid.shape[0] - 1) / 2, (grid.shape[1] - 1) / 2)
-    side_m = tile_side_m(middle, sightings, lasting_s=lasting_s)
+    side_m = tile_side_m(middle, records, correlation_s=correlation_s)
     counts = np.maximum(1, np.round(np.array(grid.shape) * grid.spacing_m / side_m)).astype(int)
     share = min(1.0, float(np.sqrt(MOST_TILES / counts.prod())))
     size, taken = np.array(grid.shape) / counts, np.maximum(1, counts * share).astype(int)
     first = (counts - taken) // 2
     corners = [size * (first + place) for place in np.ndindex(*taken)]
-    return [_tile(corner, size, sightings, grid, terrain) for corner in corners]
+    return [_tile(corner, size, records, grid, terrain) for corner in corners]
 
 
-def tile_side_m(place_m: Floats, sightings: Sequence[Sighting], *, lasting_s: float) -> float:
-    """Return how wide tiles must be so that errors of the tracks are told apart while they last.
+def tile_side_m(place_m: Floats, records: Sequence[PairRecord], *, correlation_s: float) -> float:
+    """Return the width of tiles that resolves the errors of the tracks within their correlation time, metres.
 
     Parameters
     ----------
     place_m
         (3,) float64, metres in the frame: the middle of the scene.
-    sightings
+    records
         All pairs.
-    lasting_s
+    correlation_s
         How long an error of the tracks lasts.
 
     Notes
@@ -104,9 +106,11 @@ def tile_side_m(place_m: Floats, sightings: Sequence[Sighting], *, lasting_s: fl
     Source: docs/theory/autofocus.md, eq. 22.
     """
     sides = []
-    for one in sightings:
-        begun = np.linspace(one.time_s[0], one.time_s[-1] - lasting_s, _STEPS)
-        pulses = [np.searchsorted(one.time_s, at).clip(max=len(one.time_s) - 1) for at in (begun, begun + lasting_s)]
+    for one in records:
+        first_s = np.linspace(one.time_s[0], one.time_s[-1] - correlation_s, _STEPS)
+        pulses = [
+            np.searchsorted(one.time_s, at).clip(max=len(one.time_s) - 1) for at in (first_s, first_s + correlation_s)
+        ]
         before, after = (one.profiles.aperture[some].path_gradient(place_m) for some in pulses)
         turned = float(np.median(np.linalg.norm(after - before, axis=-1)))
         sides.append(_CELLS_WIDE * SPEED_OF_LIGHT_M_S / (one.profiles.centre_frequency_hz * max(turned, 1e-9)))
@@ -114,7 +118,7 @@ def tile_side_m(place_m: Floats, sightings: Sequence[Sighting], *, lasting_s: fl
 
 
 def _tile(
-    corner: Floats, size: Floats, sightings: Sequence[Sighting], grid: SceneGrid, terrain: Terrain
+    corner: Floats, size: Floats, records: Sequence[PairRecord], grid: SceneGrid, terrain: Terrain
 ) -> SpeckleTile:
     """Return a tile of the grid from its corner and size, both in pixels (row, column)."""
     place, below, right = (
@@ -122,7 +126,7 @@ def _tile(
     )
     sides_m = 2 * np.stack([below - place, right - place])
     cycles = []
-    for one in sightings:
+    for one in records:
         aperture, band_hz = one.profiles.aperture, np.array([-0.5, 0.5]) * bandwidth_hz(one.profiles)
         slope = aperture[aperture.sample(_STEPS)].path_gradient(place) @ sides_m.T
         wavenumbers = (one.profiles.centre_frequency_hz + band_hz) / SPEED_OF_LIGHT_M_S
@@ -136,38 +140,38 @@ def _tile(
     return SpeckleTile(Patch(place, pixels.reshape(-1, 3)), sides_m)
 
 
-# ---- What two pairs see alike: the same spatial frequencies of the ground, at different times, speckle or not ------
+# ---- Coherence of two pairs at equal spatial frequencies of the ground ----------------------------------------------
 
 WEIGHT = 0.2
-"""Of a resolution cell that two pairs see alike; docs/theory/autofocus.md, "Speckle"."""
+"""Of a resolution cell that two pairs share; docs/theory/autofocus.md, "Speckle"."""
 
 
 @dataclass(frozen=True, eq=False)
-class Alike:
-    """A tile as two pairs see it.
+class TileCoherence:
+    """A tile in the images of two pairs.
 
     Attributes
     ----------
     product
         (block of the first, block of the second) complex64: Σ conj(B)·B' over the tile, by its two images' energies and
-        weighed by how far both blocks see the same spatial frequencies.
+        weighed by the spatial frequencies that both blocks share.
     cells
         Resolution cells that count: all of a tile of speckle; few where a point stands out, whose spatial frequencies
         are not independent.
     brightness
         Mean power of both images.
-    seen
-        What blocks of each pair see it and how they turn; without what they add.
+    contributions
+        Blocks of each pair that illuminate it and their path slopes, without values.
     """
 
     product: NDArray[np.complex64]
     cells: float
     brightness: float
-    seen: tuple[Contribution, Contribution]
+    contributions: tuple[Contribution, Contribution]
 
     @classmethod
-    def of(cls, tile: SpeckleTile, first: Contribution, second: Contribution) -> "Alike":
-        """Return what a tile's contributions to two pairs have in common, from the tracks that they were cached at."""
+    def of(cls, tile: SpeckleTile, first: Contribution, second: Contribution) -> "TileCoherence":
+        """Return the product of a tile's contributions in two pairs, along the tracks that they were cached at."""
         powers = np.stack([np.abs(one.values.sum(axis=1)).astype(np.float64) ** 2 for one in (first, second)])
         energy = np.maximum(powers.sum(axis=1), 1e-300)
         even = 2 * energy**2 / np.maximum((powers**2).sum(axis=1), 1e-300)
@@ -183,15 +187,15 @@ class Alike:
         Where the nodes of each pair's blocks have moved, node → (block, 3), metres.
         """
         first, second = (
-            np.exp(sign * 1j * phases(seen, one)).astype(np.complex64)
-            for sign, seen, one in zip((-1, 1), self.seen, moved, strict=True)
+            np.exp(sign * 1j * phases(contribution, one)).astype(np.complex64)
+            for sign, contribution, one in zip((-1, 1), self.contributions, moved, strict=True)
         )
         by_first = first * (self.product @ second)
         return complex(by_first.sum()), [by_first, second * (first @ self.product)]
 
 
 def _overlap(tile: SpeckleTile, first: Contribution, second: Contribution) -> NDArray[np.float32]:
-    """Return (block, block) float32: 1 where both look at a tile along one line, 0 from a resolvable angle on."""
+    """Return (block, block) float32: 1 where both blocks look along one line, 0 from a resolvable angle on."""
     cycles = [one.wavenumber / (2 * np.pi) * sum(one.slopes.values()) @ tile.sides_m.T for one in (first, second)]
     across = cycles[0][:, ::-1] * [-1, 1] / np.linalg.norm(cycles[0], axis=1, keepdims=True)
     apart = np.sum(across * cycles[0], axis=1)[:, None] - across @ cycles[1].T
@@ -200,14 +204,14 @@ def _overlap(tile: SpeckleTile, first: Contribution, second: Contribution) -> ND
 
 @dataclass(frozen=True, eq=False)
 class SpeckleAgreement:
-    """-w |Σ n·γ|: how far the images of two pairs agree on all tiles, but for one phase.
+    """-w |Σ n·γ|: coherence of the images of two pairs over all tiles, up to one phase.
 
     Attributes
     ----------
     pairs
         Blocks of both.
     tiles
-        What they see alike.
+        Of both.
     reference
         Node → (knot, 3) float64, metres: corrections that the tiles' contributions were cached at.
     weight
@@ -219,21 +223,21 @@ class SpeckleAgreement:
     """
 
     pairs: tuple[Blocks, Blocks]
-    tiles: Sequence[Alike]
+    tiles: Sequence[TileCoherence]
     reference: Tracks
     weight: float = WEIGHT
 
     def __call__(self, tracks: Tracks) -> tuple[float, dict[str, Floats]]:
         """Return the value and its derivatives by the corrections, node → (knot, 3)."""
-        moved, found = self._found(tracks)
+        moved, found = self._evaluate(tracks)
         total = sum(tile.cells * coherence for tile, (coherence, _) in zip(self.tiles, found, strict=True))
         turn = np.exp(-1j * np.angle(total))
         slopes = [{node: np.zeros_like(move) for node, move in one.items()} for one in moved]
         for tile, (_, parts) in zip(self.tiles, found, strict=True):
-            for seen, slope, part, sign in zip(tile.seen, slopes, parts, (-1, 1), strict=True):
-                by_path = sign * self.weight * tile.cells * seen.wavenumber * (turn * part).imag
-                for node, path in seen.slopes.items():
-                    slope[node][seen.blocks] += by_path[:, None] * path
+            for contribution, slope, part, sign in zip(tile.contributions, slopes, parts, (-1, 1), strict=True):
+                by_path = sign * self.weight * tile.cells * contribution.wavenumber * (turn * part).imag
+                for node, path in contribution.slopes.items():
+                    slope[node][contribution.blocks] += by_path[:, None] * path
         gradient = {node: np.zeros_like(track) for node, track in tracks.items()}
         for blocks, slope in zip(self.pairs, slopes, strict=True):
             for node, by_block in slope.items():
@@ -241,12 +245,12 @@ class SpeckleAgreement:
         return -self.weight * abs(total), gradient
 
     def coherence(self, tracks: Tracks) -> NDArray[np.complex128]:
-        """Return (tile,) complex128, at most 1: how far two images of each agree, and the phase between them."""
-        return np.array([value for value, _ in self._found(tracks)[1]])
+        """Return (tile,) complex128, coherence of the two images of each tile and the phase between them."""
+        return np.array([value for value, _ in self._evaluate(tracks)[1]])
 
-    def _found(self, tracks: Tracks) -> tuple[list[Tracks], list[tuple[complex, list[NDArray[np.complex64]]]]]:
+    def _evaluate(self, tracks: Tracks) -> tuple[list[Tracks], list[tuple[complex, list[NDArray[np.complex64]]]]]:
         moved = [
-            blocks.moves({node: tracks[node] - self.reference[node] for node in blocks.sighting.nodes})
+            blocks.moves({node: tracks[node] - self.reference[node] for node in blocks.record.nodes})
             for blocks in self.pairs
         ]
         return moved, [tile.coherence(moved) for tile in self.tiles]
@@ -254,7 +258,7 @@ class SpeckleAgreement:
 
 @dataclass(frozen=True, eq=False)
 class SpeckleTiles:
-    """The scene in tiles, as all pairs of a flight see it.
+    """The scene in tiles, with the echoes of all pairs of a flight.
 
     Attributes
     ----------
@@ -263,7 +267,7 @@ class SpeckleTiles:
     tiles
         Of the scene.
     echoes
-        Pair → tile → what it recorded of it.
+        Pair → tile → its summed echoes.
     """
 
     pairs: Sequence[Blocks]
@@ -272,29 +276,33 @@ class SpeckleTiles:
 
     @classmethod
     def of(cls, pairs: Sequence[Blocks], tiles: Sequence[SpeckleTile]) -> "SpeckleTiles":
-        """Return the ground as it was recorded."""
+        """Return the tiles with their echoes."""
         return cls(pairs, tiles, [blocks.echoes([tile.patch for tile in tiles]) for blocks in pairs])
 
     def agreements(self, tracks: Tracks, used: NDArray[np.bool_] | None = None) -> list[SpeckleAgreement]:
-        """Return what every two pairs see alike of the tiles used, from corrected tracks: node → (knot, 3), metres."""
+        """Return the agreement of every two pairs on the tiles used, along corrections node → (knot, 3), metres."""
         moved = [blocks.moves(tracks) for blocks in self.pairs]
         both = list(combinations(range(len(self.pairs)), 2))
-        alike: dict[tuple[int, int], list[Alike]] = {pairs: [] for pairs in both}
+        alike: dict[tuple[int, int], list[TileCoherence]] = {pairs: [] for pairs in both}
         for number, tile in enumerate(self.tiles):
             if used is None or used[number]:
-                seen = [
+                contribution = [
                     blocks.contribution(echoes[number], at)
                     for blocks, echoes, at in zip(self.pairs, self.echoes, moved, strict=True)
                 ]
                 for one, other in both:
-                    alike[one, other].append(Alike.of(tile, seen[one], seen[other]))
+                    alike[one, other].append(TileCoherence.of(tile, contribution[one], contribution[other]))
         return [
-            SpeckleAgreement((self.pairs[one], self.pairs[other]), self._even(found, one, used), tracks)
+            SpeckleAgreement(
+                (self.pairs[one], self.pairs[other]), self._weighted_by_brightness(found, one, used), tracks
+            )
             for (one, other), found in alike.items()
         ]
 
-    def _even(self, alike: Sequence[Alike], pair: int, used: NDArray[np.bool_] | None) -> list[Alike]:
-        """Return tiles, the darker ones counting less: they hold what brighter ones threw there.
+    def _weighted_by_brightness(
+        self, alike: Sequence[TileCoherence], pair: int, used: NDArray[np.bool_] | None
+    ) -> list[TileCoherence]:
+        """Return tiles, the darker ones with fewer cells: sidelobes of brighter ones cover them.
 
         Brightness is that of the ground: echoes fall off with the square of both distances.
         """
@@ -308,27 +316,28 @@ class SpeckleTiles:
         return [replace(one, cells=one.cells * float(part)) for one, part in zip(alike, share, strict=True)]
 
 
-# ---- Tracks refined where no point stands out: by the speckle that two pairs see alike -----------------------------
+# ---- Refinement by speckle ------------------------------------------------------------------------------------------
 
 
 LEAST_COHERENCE = 0.75
-"""Of tiles that were not fitted: less is left by tracks that are cycles wrong."""
+"""Of tiles that were not fitted, 0 to 1: tracks that are wrong by cycles leave less."""
 
 LEAST_GAIN = 0.1
-"""By which the coherence of those tiles must have grown."""
+"""Least growth of the coherence of those tiles."""
 
 LEAST_EVEN = 0.25
-"""Share of the ground that must be even: what a few points throw about agrees by chance."""
+"""Least share of the ground that must be even: sidelobes of a few points agree by chance."""
 
 LEAST_TILES = 8
+"""Least number of tiles: with fewer, none would be left for validation."""
 
-_STAGES, _ITERATIONS = 2, 15
-_HELD_OUT = 4  # every so many-th tile is not fitted
+_STAGES, _ITERATIONS = 2, 15  # of caching contributions; steps of L-BFGS-B in each
+_HELD_OUT = 4  # every fourth tile is left out of the fit
 
 
 @dataclass(frozen=True)
-class Agreed:
-    """What tiles say of tracks that were not fitted to them.
+class SpeckleEvidence:
+    """Coherence of tiles that were not fitted, before and after.
 
     Attributes
     ----------
@@ -347,7 +356,7 @@ class Agreed:
 
     @property
     def accepted(self) -> bool:
-        """Whether the tracks are to be believed."""
+        """Whether the tracks are used."""
         return self.after >= max(LEAST_COHERENCE, self.before + LEAST_GAIN) and self.even >= LEAST_EVEN
 
     @property
@@ -362,12 +371,12 @@ class Agreed:
 
 
 def refined_by_speckle(ground: SpeckleTiles, prior: Prior, knots_s: Floats) -> Refinement:
-    """Return the corrections with which pairs agree on the ground, and whether they are to be believed.
+    """Return the corrections at which pairs agree on the ground, and whether they are accepted.
 
     Parameters
     ----------
     ground
-        Tiles as all pairs see them.
+        Tiles of all pairs.
     prior
         Of the nodes.
     knots_s
@@ -384,20 +393,24 @@ def refined_by_speckle(ground: SpeckleTiles, prior: Prior, knots_s: Floats) -> R
     }
     if len(ground.pairs) < 2 or count < LEAST_TILES:
         why = (
-            "speckle of one pair says nothing of its tracks" if len(ground.pairs) < 2 else f"{count} tiles are too few"
+            "speckle of one pair does not determine its tracks"
+            if len(ground.pairs) < 2
+            else f"{count} tiles are too few"
         )
         flags = {"refinement_too_few_patches": why}
         return Refinement(TrackCorrection(knots_s, prior.tracks(nothing)), std_m, False, why, {"tiles": count}, flags)
     held_out = np.arange(count) % _HELD_OUT == 2
-    begun = _coherence(ground, prior, nothing, held_out)
-    told = _coherence(ground, prior, _solved(ground, prior, ~held_out), held_out)
-    agreed = Agreed(begun[0], told[0], count, _coherence(ground, prior, nothing, np.ones_like(held_out))[1])
-    found = _solved(ground, prior, np.ones_like(held_out)) if agreed.accepted else nothing
-    coherence = [round(agreed.before, 3), round(agreed.after, 3)]
-    report: dict[str, Any] = {"tiles": count, "even": round(agreed.even, 3), "coherence": coherence}
-    flags = {} if agreed.accepted else {"refinement_rejected": agreed.why}
+    before = _coherence(ground, prior, nothing, held_out)
+    after = _coherence(ground, prior, _solved(ground, prior, ~held_out), held_out)
+    evidence = SpeckleEvidence(
+        before[0], after[0], count, _coherence(ground, prior, nothing, np.ones_like(held_out))[1]
+    )
+    found = _solved(ground, prior, np.ones_like(held_out)) if evidence.accepted else nothing
+    coherence = [round(evidence.before, 3), round(evidence.after, 3)]
+    report: dict[str, Any] = {"tiles": count, "even": round(evidence.even, 3), "coherence": coherence}
+    flags = {} if evidence.accepted else {"refinement_rejected": evidence.why}
     correction = TrackCorrection(knots_s, prior.tracks(found))
-    return Refinement(correction, std_m, agreed.accepted, agreed.why, report, flags)
+    return Refinement(correction, std_m, evidence.accepted, evidence.why, report, flags)
 
 
 def _solved(ground: SpeckleTiles, prior: Prior, used: Bools) -> Floats:
@@ -412,7 +425,7 @@ def _solved(ground: SpeckleTiles, prior: Prior, used: Bools) -> Floats:
                 node: np.sum([by[node] for _, by in found], axis=0) for node in tracks
             }
 
-        unknowns = minimal(value, prior, Gauge.none(prior.size), unknowns, iterations=_ITERATIONS)
+        unknowns = minimise(value, prior, Gauge.none(prior.size), unknowns, iterations=_ITERATIONS)
     return unknowns
 
 

@@ -1,1 +1,1 @@
-"""Phase and coherence of two images of one scene, and the heights they tell."""
+"""Phase and coherence of two images of one scene, and heights from them."""

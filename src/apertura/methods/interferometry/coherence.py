@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 
 from apertura.common.contracts import Window
 
-# ---- How much two images can have in common: the share of the ground's spectrum that both have seen ----------------
+# ---- Common band of two images, and the window of coherence ---------------------------------------------------------
 
 
 def common_band(
     carriers: tuple[NDArray[np.float64], NDArray[np.float64]], spectra: tuple[NDArray[np.float64], NDArray[np.float64]]
 ) -> float:
-    """Return the coherence of ground that did not change, seen by two images through bands of Gaussian shape.
+    """Return the coherence of unchanged ground in two images of Gaussian bands.
 
     Parameters
     ----------
@@ -46,7 +46,7 @@ def common_band(
 
 
 def window_px(spectrum: NDArray[np.float64], spacing_m: float, *, looks: float = 16, most: int = 65) -> int:
-    """Return the side of the smallest window that holds some looks, pixels, odd.
+    """Return the side of the smallest window of at least `looks` independent samples, pixels, odd.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ def window_px(spectrum: NDArray[np.float64], spacing_m: float, *, looks: float =
     spacing_m
         Between pixels.
     looks
-        Independent samples that coherence is measured on.
+        Independent samples that coherence is estimated from.
     most
         A window is not wider than so many pixels.
 
@@ -70,7 +70,7 @@ def window_px(spectrum: NDArray[np.float64], spacing_m: float, *, looks: float =
     return int(min(2 * np.ceil((side - 1) / 2) + 1, most))
 
 
-# ---- Coherence and phase of two images of one scene, over a square window, and what chance makes of them -----------
+# ---- Coherence and phase over a square window -----------------------------------------------------------------------
 
 
 def coherence(
@@ -97,7 +97,7 @@ def coherence(
     phase
         (y, x) float32, rad, of the first less that of the second; NaN with the magnitude.
     looks
-        Independent samples in a whole window, by how each image's neighbours resemble each other; NaN of blocks
+        Independent samples in a whole window, by the autocorrelation of each image; NaN of blocks
         without a value.
 
     Raises
@@ -121,12 +121,12 @@ def coherence(
         raise ValueError(f"{first.shape=}, {second.shape=}, {window=}: one shape and an odd window are needed")
     there = np.isfinite(first) & np.isfinite(second)
     one, other = (np.where(there, image, 0).astype(np.complex128) for image in (first, second))
-    crossed = boxed(one * other.conj(), window)
-    power = boxed(np.abs(one) ** 2, window) * boxed(np.abs(other) ** 2, window)
-    told = there & (power > 0)
+    crossed = box_sum(one * other.conj(), window)
+    power = box_sum(np.abs(one) ** 2, window) * box_sum(np.abs(other) ** 2, window)
+    valid = there & (power > 0)
     magnitude, phase = np.full(first.shape, np.nan, np.float32), np.full(first.shape, np.nan, np.float32)
-    magnitude[told] = np.minimum(np.abs(crossed[told]) / np.sqrt(power[told]), 1)
-    phase[told] = np.angle(crossed[told])
+    magnitude[valid] = np.minimum(np.abs(crossed[valid]) / np.sqrt(power[valid]), 1)
+    phase[valid] = np.angle(crossed[valid])
     return magnitude, phase, _looks(one, other, window)
 
 
@@ -172,7 +172,7 @@ def unbiased(magnitude: NDArray[np.float32], looks: float) -> NDArray[np.float32
     return np.sqrt(np.maximum(square, 0)).astype(np.float32)
 
 
-def boxed(values: NDArray[Any], window: int) -> NDArray[Any]:
+def box_sum(values: NDArray[Any], window: int) -> NDArray[Any]:
     """Return the sum over a window about each element of a plane; beside the plane there is nothing.
 
     No running sum: that would leave rounding of a bright point in all that follows it.
@@ -196,8 +196,8 @@ def _looks(one: NDArray[np.complex128], other: NDArray[np.complex128], window: i
 
 
 def _correlation(image: NDArray[np.complex128], window: int) -> NDArray[np.complex128]:
-    """Return how alike pixels are that lie up to `window` - 1 apart: (2 `window` - 1,) twice, 1 in the middle."""
-    padded = np.pad(image, [(0, window - 1), (0, window - 1)])  # else the edges would meet
+    """Return the autocorrelation at lags below `window`: (2 `window` - 1,) twice, 1 in the middle."""
+    padded = np.pad(image, [(0, window - 1), (0, window - 1)])  # else the correlation would be circular
     alike = np.fft.ifft2(np.abs(np.fft.fft2(padded)) ** 2)
     near = np.arange(1 - window, window)
     alike = alike[np.ix_(near % alike.shape[0], near % alike.shape[1])]
@@ -205,11 +205,11 @@ def _correlation(image: NDArray[np.complex128], window: int) -> NDArray[np.compl
         return np.asarray(alike / alike[window - 1, window - 1].real)
 
 
-# ---- Coherence and phase of two whole images, tile by tile: what does not depend on how they lie to each other
+# ---- Coherence and phase of whole images, tile by tile --------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
-class Formed:
+class CoherenceMap:
     """Coherence and phase of two images.
 
     Attributes
@@ -227,10 +227,10 @@ class Formed:
     looks: float
 
 
-def formed(
+def map_coherence(
     first: NDArray[np.complex64], second: NDArray[np.complex64], tiles: Iterable[Window], *, window: int
-) -> Formed:
-    """Return what `apertura.methods.interferometry.coherence.coherence` tells of the whole.
+) -> CoherenceMap:
+    """Return coherence and phase of whole images, tile by tile, as `coherence` has them.
 
     Parameters
     ----------
@@ -245,7 +245,7 @@ def formed(
     --------
     >>> image = np.exp(1j * np.arange(64.0).reshape(8, 8) ** 2).astype(np.complex64)
     >>> halves = [(slice(0, 8), slice(0, 4)), (slice(0, 8), slice(4, 8))]
-    >>> apart, whole = formed(image, 1j * image, halves, window=3), coherence(image, 1j * image, window=3)
+    >>> apart, whole = map_coherence(image, 1j * image, halves, window=3), coherence(image, 1j * image, window=3)
     >>> bool((apart.magnitude == whole[0]).all() and (apart.phase == whole[1]).all())
     True
     """
@@ -266,7 +266,7 @@ def formed(
         planes[0][tile], planes[1][tile] = magnitude[inner], phase[inner]
         planes[2][tile] = _shared(one, other, window)[inner]
     there = [one for one in looks if np.isfinite(one)]
-    return Formed(planes[0], planes[1], planes[2], float(np.median(there)) if there else float("nan"))
+    return CoherenceMap(planes[0], planes[1], planes[2], float(np.median(there)) if there else float("nan"))
 
 
 def _shared(one: NDArray[np.complex64], other: NDArray[np.complex64], window: int) -> NDArray[np.float64]:
@@ -274,5 +274,5 @@ def _shared(one: NDArray[np.complex64], other: NDArray[np.complex64], window: in
     power = np.abs(one.astype(np.complex128) * other)
     there = np.isfinite(power)
     power = np.where(there, power, 0)
-    total, squares, count = boxed(power, window), boxed(power**2, window), boxed(there.astype(np.float64), window)
+    total, squares, count = box_sum(power, window), box_sum(power**2, window), box_sum(there.astype(np.float64), window)
     return np.asarray(total**2 / np.maximum(count * squares, np.finfo(np.float64).tiny))

@@ -1,4 +1,4 @@
-"""Two images of one scene compared: coherence and phase, which of it gives heights, and where the method ends."""
+"""Interferogram of two images of one scene: coherence, phase, heights, and the limits that it exceeds."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -9,34 +9,34 @@ from numpy.typing import NDArray
 from apertura.common.arrays import Floats
 from apertura.common.contracts import Window
 from apertura.common.flags import Flags
-from apertura.methods.interferometry.coherence import chance, formed, unbiased
+from apertura.methods.interferometry.coherence import chance, map_coherence, unbiased
 from apertura.methods.interferometry.heights import (
-    Known,
+    KnownHeight,
     Level,
     PlacedHeights,
     Unwrapped,
-    fits,
+    height_sensitive,
+    height_valid,
     least_coherence,
     level,
-    levelled,
     phase_std,
-    placed,
-    sensible,
+    place_heights,
+    remove_level,
     unwrap,
 )
 from apertura.methods.interferometry.sensitivity import Sensitivity
 
-# ---- Where the method ends: what an interferogram cannot tell, measured, in one line each --------------------------
+# ---- Limits of the method and their flags ---------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class InterferogramCounts:
-    """What was counted on one interferogram.
+    """Counts and medians of one interferogram.
 
     Attributes
     ----------
     common
-        Pixels that both images see plainly.
+        Pixels visible to both images, without shadow or layover.
     coherent
         Of them, those more coherent than chance; `sensitive`: those whose phase a height turns enough.
     coherence, chance
@@ -46,7 +46,7 @@ class InterferogramCounts:
     ambiguity_m
         Median height of one turn, metres.
     told
-        Pixels whose phase was unwrapped; `apart`: those of them in parts that the level does not hold for.
+        Pixels whose phase was unwrapped; `apart`: those of them in parts without a level.
     residues, loops, jumps, by
         As of `apertura.methods.interferometry.heights.Unwrapped`.
     folded
@@ -73,28 +73,28 @@ class InterferogramCounts:
 
 
 MOST_INCOHERENT = 0.5
-"""Share of the common pixels that may be as incoherent as chance."""
+"""Share of the common pixels that may be no more coherent than chance: more is flagged."""
 
 MOST_RESIDUES = 1e-3
-"""Residues per loop of four pixels."""
+"""Residues per loop of four pixels: more is flagged."""
 
 MOST_FOLDED = 0.01
-"""Share of the pixels told whose places several pixels show."""
+"""Share of the unwrapped pixels whose places several pixels show: more is flagged."""
 
 
-def raised(measured: InterferogramCounts) -> Flags:
+def interferogram_flags(measured: InterferogramCounts) -> Flags:
     """Return the limits that an interferogram exceeds: flag → what was measured.
 
     Examples
     --------
-    >>> sorted(raised(InterferogramCounts(100, 10, 100, 0.2, 0.18, 0.0, 2.0)))
+    >>> sorted(interferogram_flags(InterferogramCounts(100, 10, 100, 0.2, 0.18, 0.0, 2.0)))
     ['interferogram_decorrelated']
     """
     one, flags = measured, Flags()
     if one.common - one.coherent > MOST_INCOHERENT * one.common or not one.common:
         beyond = ": the tracks lie further apart than any coherence reaches" if one.overlap == 0 else ""
         flags["interferogram_decorrelated"] = (
-            f"{one.coherent} of {one.common} pixels that both images see are more coherent than chance; in the median "
+            f"{one.coherent} of {one.common} pixels visible to both are more coherent than chance; in the median "
             f"coherence is {one.coherence:.2f} where chance makes {one.chance:.2f} and geometry leaves "
             f"{one.overlap:.2f} of the spectrum in common{beyond}"
         )
@@ -127,25 +127,24 @@ def raised(measured: InterferogramCounts) -> Flags:
     return flags
 
 
-# ---- Two images of one scene, compared: coherence and phase, which of it tells heights, and these at their own
-# places
+# ---- Interferogram: coherence, phase, and heights at their own places -----------------------------------------------
 
-LEAST_SPREAD = 4.0
-"""Looks that a window's energy must be spread over: else a point beside its middle is all that it tells."""
+LEAST_LOOKS = 4.0
+"""Looks that a window's energy must be spread over: with fewer a point beside its middle decides its phase."""
 
 
 @dataclass(frozen=True, eq=False)
 class AssumedGround:
-    """What both images assume of each pixel.
+    """Ground that both images assume at each pixel.
 
     Attributes
     ----------
     height_m
         (y, x) float64, metres.
     plain
-        (y, x) bool, seen by both images, without shadow or layover.
+        (y, x) bool, visible to both images, without shadow or layover.
     sensed
-        What a height does to the phase there.
+        Of the phase to height there.
     shift_px
         (y, x, 2) float64, rows and columns from a pixel to the ground it shows, per metre of height.
     known
@@ -153,27 +152,27 @@ class AssumedGround:
     """
 
     height_m: Floats
-    plain: NDArray[np.bool_]
+    visible: NDArray[np.bool_]
     sensed: Sensitivity
     shift_px: Floats
-    known: Sequence[Known] = ()
+    known: Sequence[KnownHeight] = ()
 
 
 @dataclass(frozen=True, eq=False)
-class Compared:
-    """What two images tell.
+class Interferogram:
+    """Coherence, phase and heights of two images.
 
     Attributes
     ----------
     panels
         ``phase``, ``coherence`` and ``unwrapped`` where the images show it, ``height`` and ``height_std`` where the
-        ground lies: (y, x) float32, NaN where nothing is told.
+        ground lies: (y, x) float32, NaN where they are not valid.
     looks
         Independent samples of a window; NaN where there is none.
     measured
-        What flags follow from.
+        Counts that decide on the flags.
     level
-        What heights count from, and the constant taken off the phase; None where nothing is told.
+        Reference of the heights, and the constant removed from the phase; None without a valid pixel.
     """
 
     panels: Mapping[str, NDArray[np.float32]]
@@ -182,22 +181,22 @@ class Compared:
     level: Level | None
 
 
-def compared(
+def form_interferogram(
     first: NDArray[np.complex64],
     second: NDArray[np.complex64],
     ground: AssumedGround,
     tiles: Iterable[Window],
     *,
     window: int,
-) -> Compared:
-    """Return what two images on one grid tell.
+) -> Interferogram:
+    """Return the interferogram of two images on one grid.
 
     Parameters
     ----------
     first, second, tiles, window
-        As of `apertura.methods.interferometry.coherence.formed`.
+        As of `apertura.methods.interferometry.coherence.map_coherence`.
     ground
-        What both assume.
+        Assumed by both.
 
     Notes
     -----
@@ -205,23 +204,25 @@ def compared(
 
     Examples
     --------
-    An image against itself: coherent everywhere, and its phase tells no height.
+    An image against itself: coherent everywhere, and its phase is insensitive to height.
 
     >>> generator, one = np.random.default_rng(0), np.ones((32, 32))
     >>> image = (generator.normal(size=(32, 32)) + 1j * generator.normal(size=(32, 32))).astype(np.complex64)
     >>> same = Sensitivity(0 * one, 0 * one, np.zeros((32, 32, 2)), one, 30 * one)
     >>> flat = AssumedGround(0 * one, one > 0, same, np.zeros((32, 32, 2)))
-    >>> told = compared(image, image, flat, [(slice(0, 32), slice(0, 32))], window=5)
-    >>> told.measured.coherent, told.measured.sensitive, bool(np.isnan(told.panels["height"]).all())
+    >>> own = form_interferogram(image, image, flat, [(slice(0, 32), slice(0, 32))], window=5)
+    >>> own.measured.coherent, own.measured.sensitive, bool(np.isnan(own.panels["height"]).all())
     (1024, 0, True)
     """
-    both = formed(first, second, tiles, window=window)
+    both = map_coherence(first, second, tiles, window=window)
     magnitude, phase, looks = both.magnitude, both.phase, both.looks
-    common = ground.plain & np.isfinite(magnitude)
+    common = ground.visible & np.isfinite(magnitude)
     enough = looks > 1  # coherence of a single look is 1 whatever the images hold
     energy = looks * both.shared.astype(np.float64)  # looks that the window's energy is spread over
-    told_by_one = energy < LEAST_SPREAD
-    valid = common & ~told_by_one & fits(ground.sensed, magnitude, looks) if enough else np.zeros(common.shape, bool)
+    dominated = energy < LEAST_LOOKS
+    valid = (
+        common & ~dominated & height_valid(ground.sensed, magnitude, looks) if enough else np.zeros(common.shape, bool)
+    )
     centre = float(np.angle(np.exp(1j * phase[valid].astype(np.float64)).sum())) if valid.any() else 0.0
     centred = np.where(valid, np.angle(np.exp(1j * (phase - centre))), np.nan).astype(np.float32)
     unwrapped = unwrap(centred, magnitude, looks=looks)
@@ -230,8 +231,8 @@ def compared(
         for one in ground.known
         if common[one.row, one.column]
     ]
-    told = level(unwrapped, known)
-    alone = levelled(unwrapped, told) if told else np.full(common.shape, np.nan, np.float32)
+    reference = level(unwrapped, known)
+    alone = remove_level(unwrapped, reference) if reference else np.full(common.shape, np.nan, np.float32)
     at_place = _placed(ground, alone, magnitude, np.minimum(looks, 2 * energy), looks)
     panels = {
         "phase": np.where(common, phase, np.nan).astype(np.float32),
@@ -242,20 +243,20 @@ def compared(
     }
     coherent = magnitude > least_coherence(looks) if enough else np.zeros(common.shape, bool)
     counted = _measured(ground.sensed, common, coherent, magnitude, chance(looks) if enough else 1.0)
-    return Compared(panels, looks, _unwrapping(counted, unwrapped, alone, told, at_place), told)
+    return Interferogram(panels, looks, _unwrapping(counted, unwrapped, alone, reference, at_place), reference)
 
 
 def _placed(
     ground: AssumedGround, alone: NDArray[np.float32], magnitude: NDArray[np.float32], own: Floats, looks: float
 ) -> PlacedHeights:
-    """Return heights at their own places from the phase that height alone has."""
+    """Return heights at their own places from the phase due to height."""
     rise = ground.sensed.height(alone.astype(np.float64))
     std = np.full(rise.shape, np.nan)
     there = np.isfinite(rise)
     if there.any():
         steep = np.abs(ground.sensed.slope + 2 * ground.sensed.bend * rise)[there]
         std[there] = phase_std(unbiased(magnitude[there], looks), own[there]) / steep
-    return placed(ground.height_m, rise, std, ground.shift_px)
+    return place_heights(ground.height_m, rise, std, ground.shift_px)
 
 
 def _measured(
@@ -265,7 +266,7 @@ def _measured(
     magnitude: NDArray[np.float32],
     by_chance: float,
 ) -> InterferogramCounts:
-    """Return what the pixels are that both images see plainly."""
+    """Return counts and medians of the pixels visible to both images."""
     count = int(common.sum())
 
     def middle(values: NDArray[np.floating]) -> float:
@@ -274,11 +275,11 @@ def _measured(
     return InterferogramCounts(
         common=count,
         coherent=int((common & coherent).sum()),
-        sensitive=int((common & sensible(sensed)).sum()),
+        sensitive=int((common & height_sensitive(sensed)).sum()),
         coherence=middle(magnitude),
         chance=by_chance,
         overlap=middle(sensed.overlap),
-        ambiguity_m=min(middle(sensed.ambiguity_m), 1e9),  # a height that JSON can say
+        ambiguity_m=min(middle(sensed.ambiguity_m), 1e9),  # JSON has no infinity
     )
 
 
@@ -286,10 +287,10 @@ def _unwrapping(
     counted: InterferogramCounts,
     phase: Unwrapped,
     alone: NDArray[np.float32],
-    told: Level | None,
+    reference: Level | None,
     at_place: PlacedHeights,
 ) -> InterferogramCounts:
-    """Return the same with what became of the phase."""
+    """Return the counts completed by those of unwrapping."""
     unwrapped, kept = int(np.isfinite(phase.phase).sum()), int(np.isfinite(alone).sum())
     return replace(
         counted,
@@ -300,5 +301,5 @@ def _unwrapping(
         jumps=phase.jumps,
         by=phase.by,
         folded=at_place.folded,
-        points=len(told.points) if told else 0,
+        points=len(reference.points) if reference else 0,
     )

@@ -1,4 +1,4 @@
-"""From phase to height: unwrapping, which pixels give it, how well, from which level, and where that ground lies."""
+"""From phase to height: unwrapping, reference level, valid pixels, accuracy, and the places of the heights."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from apertura.common.arrays import Floats
 from apertura.methods.interferometry.sensitivity import Sensitivity
 
-# ---- From phase within a turn to phase that goes on from pixel to pixel; and how often the first contradicts itself
+# ---- Unwrapping and residues ----------------------------------------------------------------------------------------
 
-_LEAST_SHARE = 0.01  # of all pixels that a part is made of: the library's own, so that a speck is no part
+_LEAST_SHARE = 0.01  # of all pixels, least size of a connected part: snaphu's default
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,11 +22,11 @@ class Unwrapped:
     Attributes
     ----------
     phase
-        (y, x) float32, rad; NaN where it is not known.
+        (y, x) float32, rad; NaN where it is not valid.
     part
         (y, x) uint32, 0 outside; between two parts any number of turns may lie.
     by
-        The library and its version; empty: nobody unwrapped, the phase is within half a turn of its reference.
+        The library and its version; empty: not unwrapped, the phase is within half a turn of its reference.
     residues
         Loops of four pixels around which the wrapped phase does not come back to itself.
     loops
@@ -49,7 +49,7 @@ def unwrap(phase: NDArray[np.float32], coherence: NDArray[np.float32], *, looks:
     Parameters
     ----------
     phase
-        (y, x) float32, rad, NaN where it is not to be trusted.
+        (y, x) float32, rad, NaN where it is not valid.
     coherence
         (y, x) float32, 0 to 1.
     looks
@@ -62,12 +62,12 @@ def unwrap(phase: NDArray[np.float32], coherence: NDArray[np.float32], *, looks:
     Examples
     --------
     >>> ramp = np.angle(np.exp(0.4j * np.arange(40.0))) * np.ones((24, 1))
-    >>> told = unwrap(ramp.astype(np.float32), np.full((24, 40), 0.9, np.float32), looks=9.0)
-    >>> told.residues, told.jumps
+    >>> unwrapped = unwrap(ramp.astype(np.float32), np.full((24, 40), 0.9, np.float32), looks=9.0)
+    >>> unwrapped.residues, unwrapped.jumps
     (0, 48)
     """
     valid = np.isfinite(phase)
-    residues, loops, jumps = contradictions(phase)
+    residues, loops, jumps = count_residues(phase)
     by = _library()
     if not by or not jumps:
         return Unwrapped(phase, valid.astype(np.uint32), by, residues, loops, jumps)
@@ -91,12 +91,12 @@ def unwrap(phase: NDArray[np.float32], coherence: NDArray[np.float32], *, looks:
     )
 
 
-def contradictions(phase: NDArray[np.float32]) -> tuple[int, int, int]:
+def count_residues(phase: NDArray[np.float32]) -> tuple[int, int, int]:
     """Return residues, loops of four valid pixels, and neighbours more than half a turn apart.
 
     Examples
     --------
-    >>> contradictions(np.array([[0.0, 2.0], [-2.0, 4.0]], np.float32))
+    >>> count_residues(np.array([[0.0, 2.0], [-2.0, 4.0]], np.float32))
     (1, 1, 1)
     """
     down, right = np.diff(phase, axis=0), np.diff(phase, axis=1)
@@ -115,13 +115,11 @@ def _library() -> str:
         return ""
 
 
-# ---- From phase to height: which pixels give it, how well, from which level it counts, and where that ground lies
-
-# ---- From which level heights count: a constant phase between two images tells nothing, so something else must
+# ---- Reference level: the constant phase between two images is arbitrary --------------------------------------------
 
 
 @dataclass(frozen=True)
-class Known:
+class KnownHeight:
     """A point of known height, where the images show it.
 
     Attributes
@@ -131,7 +129,7 @@ class Known:
     row, column
         The pixel nearest to where it shows.
     phase_rad
-        The phase that its height alone would have there.
+        The phase due to its height there.
     measured_rad
         The phase that is measured there, within a turn; NaN where none is.
     """
@@ -145,7 +143,7 @@ class Known:
 
 @dataclass(frozen=True)
 class Level:
-    """What was taken off the phase.
+    """The constant removed from the phase, the level that heights count from.
 
     Attributes
     ----------
@@ -154,7 +152,7 @@ class Level:
     part
         The part of the unwrapped phase that it holds for; heights of others are unknown by whole turns.
     points
-        The points of known height that tell it; none: the median of the phase does.
+        The points of known height that give it; none: the median of the phase does.
     spread_rad
         Largest distance of such a point from the constant; None of fewer than two.
     """
@@ -165,7 +163,7 @@ class Level:
     spread_rad: float | None = None
 
 
-def level(phase: Unwrapped, known: Sequence[Known]) -> Level | None:
+def level(phase: Unwrapped, known: Sequence[KnownHeight]) -> Level | None:
     """Return the constant between two images, docs/theory/interferometry.md, eq. 15; None where no phase is valid.
 
     Parameters
@@ -178,58 +176,57 @@ def level(phase: Unwrapped, known: Sequence[Known]) -> Level | None:
     Examples
     --------
     >>> phase = np.array([[0.1, 0.2, 0.6]], np.float32)
-    >>> told = Unwrapped(phase, np.ones((1, 3), np.uint32), "", 0, 0, 0)
-    >>> level(told, []).phase_rad, round(level(told, [Known("mast", 0, 2, 0.5, 0.7)]).phase_rad, 3)
+    >>> unwrapped = Unwrapped(phase, np.ones((1, 3), np.uint32), "", 0, 0, 0)
+    >>> level(unwrapped, []).phase_rad, round(level(unwrapped, [KnownHeight("mast", 0, 2, 0.5, 0.7)]).phase_rad, 3)
     (0.2, 0.2)
     """
     valid = np.argwhere(np.isfinite(phase.phase) & (phase.part > 0))
     if not len(valid):
         return None
-    told = [(one, *_unwrapped(one, phase, valid)) for one in known if np.isfinite(one.measured_rad)]
-    if not told:
+    measured = [(one, *_unwrapped(one, phase, valid)) for one in known if np.isfinite(one.measured_rad)]
+    if not measured:
         sizes = np.bincount(phase.part[tuple(valid.T)])
         part = int(np.argmax(sizes[1:])) + 1
         return Level(round(float(np.median(phase.phase[phase.part == part])), 6), part)
-    parts = [part for *_, part in told]
+    parts = [part for *_, part in measured]
     part = max(sorted(set(parts)), key=parts.count)
-    apart = {one.name: value - one.phase_rad for one, value, of in told if of == part}
-    constant = float(np.median(list(apart.values())))
-    spread = max(abs(value - constant) for value in apart.values()) if len(apart) > 1 else None
-    return Level(round(constant, 6), part, tuple(apart), spread)
+    constants = {one.name: value - one.phase_rad for one, value, of in measured if of == part}
+    constant = float(np.median(list(constants.values())))
+    spread = max(abs(value - constant) for value in constants.values()) if len(constants) > 1 else None
+    return Level(round(constant, 6), part, tuple(constants), spread)
 
 
-def _unwrapped(one: Known, phase: Unwrapped, valid: NDArray[np.int64]) -> tuple[float, int]:
+def _unwrapped(one: KnownHeight, phase: Unwrapped, valid: NDArray[np.int64]) -> tuple[float, int]:
     """Return the phase measured at a point, by the turns and in the part of the valid pixel nearest to it."""
     near = tuple(valid[np.argmin(((valid - (one.row, one.column)) ** 2).sum(axis=1))])
     turns = np.round((float(phase.phase[near]) - one.measured_rad) / (2 * np.pi))
     return float(one.measured_rad + 2 * np.pi * turns), int(phase.part[near])
 
 
-def levelled(phase: Unwrapped, told: Level) -> NDArray[np.float32]:
-    """Return the phase that height alone has, (y, x) float32 rad: of one part, within half a turn if nobody unwrapped.
+def remove_level(phase: Unwrapped, reference: Level) -> NDArray[np.float32]:
+    """Return the phase due to height, (y, x) float32 rad: of one part, within half a turn if not unwrapped.
 
     Examples
     --------
     >>> phase = Unwrapped(np.array([[3.0]], np.float32), np.ones((1, 1), np.uint32), "", 0, 0, 1)
-    >>> levelled(phase, Level(-1.0, 1)).round(3)
+    >>> remove_level(phase, Level(-1.0, 1)).round(3)
     array([[-2.283]], dtype=float32)
     """
-    own = np.where(phase.part == told.part, phase.phase - told.phase_rad, np.nan).astype(np.float32)
+    own = np.where(phase.part == reference.part, phase.phase - reference.phase_rad, np.nan).astype(np.float32)
     return own if phase.by or not phase.jumps else np.angle(np.exp(1j * own)).astype(np.float32)
 
 
-# ---- From phase to height: which pixels tell it, how well, from which level it counts, and where that ground lies
-
+# ---- Valid pixels, accuracy, and places of the heights --------------------------------------------------------------
 BY_CHANCE = 1e-3
-"""Share of pixels that have nothing in common and still count as coherent."""
+"""False alarm rate: share of incoherent pixels that still count as coherent."""
 
 MARGIN = 1.4
-"""How much more the phase of simulated ground scatters than its bound, at most."""
+"""Factor on the Cramér-Rao bound of the phase: simulated ground scatters at most so much more."""
 
 
-_STEPS = 30  # of the search for the pixel that shows a place
-_MOST_COVERED = 1.5  # twice is folded over
-_FOUND_PX = 0.05  # a pixel that shows the place so nearly is the one
+_STEPS = 30  # of the fixed-point search for the pixel that shows a place
+_MOST_COVERED = 1.5  # pixels that may show one place: 2 mean layover
+_TOLERANCE_PX = 0.05  # tolerance of that search
 
 
 def least_coherence(looks: float) -> float:
@@ -264,8 +261,8 @@ def phase_std(coherence: NDArray[np.float32], looks: float | NDArray[np.float64]
     return np.asarray(np.minimum(bound, np.pi / np.sqrt(3)), np.float32)  # that of any phase at all
 
 
-def fits(sensed: Sensitivity, coherence: NDArray[np.float32], looks: float) -> NDArray[np.bool_]:
-    """Return which pixels tell a height: coherent beyond chance, and no height of the range's size in one turn.
+def height_valid(sensed: Sensitivity, coherence: NDArray[np.float32], looks: float) -> NDArray[np.bool_]:
+    """Return which pixels give a height: coherent beyond chance, and sensitive enough to height.
 
     Parameters
     ----------
@@ -277,10 +274,10 @@ def fits(sensed: Sensitivity, coherence: NDArray[np.float32], looks: float) -> N
         As of `phase_std`.
     """
     with np.errstate(invalid="ignore"):
-        return np.asarray(sensible(sensed) & (sensed.overlap > 0) & (coherence > least_coherence(looks)))
+        return np.asarray(height_sensitive(sensed) & (sensed.overlap > 0) & (coherence > least_coherence(looks)))
 
 
-def sensible(sensed: Sensitivity) -> NDArray[np.bool_]:
+def height_sensitive(sensed: Sensitivity) -> NDArray[np.bool_]:
     """Return where one turn of the phase is less height than the range: docs/theory/interferometry.md, section 5."""
     return np.asarray(sensed.ambiguity_m < sensed.range_m)
 
@@ -296,7 +293,7 @@ class PlacedHeights:
     std
         (y, x) float64, metres, by the phase's scatter alone.
     folded
-        Places that more than one pixel shows by the heights found: laid over, or unwrapped by whole turns too far.
+        Places that more than one pixel shows by these heights: layover, or errors of unwrapping by whole turns.
     """
 
     height: Floats
@@ -304,7 +301,7 @@ class PlacedHeights:
     folded: int
 
 
-def placed(ground_m: Floats, rise_m: Floats, std_m: Floats, shift_px: Floats) -> PlacedHeights:
+def place_heights(ground_m: Floats, rise_m: Floats, std_m: Floats, shift_px: Floats) -> PlacedHeights:
     """Return heights at the places that they belong to: ground that is higher than assumed shows where it is not.
 
     Parameters
@@ -323,8 +320,8 @@ def placed(ground_m: Floats, rise_m: Floats, std_m: Floats, shift_px: Floats) ->
     Examples
     --------
     >>> flat, rise = np.zeros((9, 9)), np.full((9, 9), 0.5)
-    >>> told = placed(flat, rise, 0.1 * rise, np.full((9, 9, 2), [0.0, 4.0]))
-    >>> told.height[4].round(2)
+    >>> heights = place_heights(flat, rise, 0.1 * rise, np.full((9, 9, 2), [0.0, 4.0]))
+    >>> heights.height[4].round(2)
     array([nan, nan, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5])
     """
     from scipy.ndimage import distance_transform_edt, map_coordinates
@@ -335,17 +332,17 @@ def placed(ground_m: Floats, rise_m: Floats, std_m: Floats, shift_px: Floats) ->
     nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
     moved = np.moveaxis(shift_px, -1, 0) * rise_m[tuple(nearest)]  # a pixel beside all that are known leads on to them
     place = np.stack(np.meshgrid(*map(np.arange, rise_m.shape), indexing="ij")).astype(np.float64)
-    shown, apart = place, np.full(rise_m.shape, np.inf)
+    shown, error_px = place, np.full(rise_m.shape, np.inf)
     for _ in range(_STEPS):
         target = place - [map_coordinates(one, shown, order=1, mode="nearest") for one in moved]
-        apart, shown = np.abs(target - shown).max(axis=0), target
-        if not (apart > _FOUND_PX).any():
+        error_px, shown = np.abs(target - shown).max(axis=0), target
+        if not (error_px > _TOLERANCE_PX).any():
             break
     folds = _covered(place + moved, np.abs(_stretch(moved)) * known) > _MOST_COVERED
-    found = (apart <= _FOUND_PX) & ~folds
+    converged = (error_px <= _TOLERANCE_PX) & ~folds
     height, std = (map_coordinates(one, shown, order=1, cval=np.nan) for one in (ground_m + rise_m, std_m))
-    folded = int(((apart > _FOUND_PX) | folds)[np.isfinite(height)].sum())
-    return PlacedHeights(np.where(found, height, np.nan), np.where(found, std, np.nan), folded)
+    folded = int(((error_px > _TOLERANCE_PX) | folds)[np.isfinite(height)].sum())
+    return PlacedHeights(np.where(converged, height, np.nan), np.where(converged, std, np.nan), folded)
 
 
 def _covered(to: Floats, area: Floats) -> Floats:

@@ -1,4 +1,4 @@
-"""How the phase between two images answers to height: radians per metre, where the ground then lies, what both see."""
+"""Sensitivity of the phase between two images to height: radians per metre, shift of the ground, common spectrum."""
 
 from dataclasses import dataclass
 
@@ -11,14 +11,14 @@ Legs = tuple[Floats, Floats]
 """Phase centres of transmitter and receiver of the pulses that make each place, (place, pulse, 3) metres each."""
 
 PROBE = 0.02
-"""Height that the answer is measured at, as a share of the range: large against rounding, small against the range."""
+"""Height step of the finite difference, as a share of the range: large against rounding, small against the range."""
 
 _STEPS = 4  # of Gauss and Newton; the first is right to first order in PROBE, each other squares what is left
 
 
 @dataclass(frozen=True, eq=False)
 class Sensitivity:
-    """What ground that lies higher than the images assume does to their phase.
+    """Change of the phase between two images with the height of the ground above the assumed one.
 
     Attributes
     ----------
@@ -65,7 +65,7 @@ class Sensitivity:
 def sensitivity(
     places_m: Floats, axes: Floats, first: Legs, second: Legs, *, band_hz: tuple[float, float]
 ) -> Sensitivity:
-    """Return how the phase between two images answers to height at some places.
+    """Return the sensitivity of the phase between two images to height at some places.
 
     Parameters
     ----------
@@ -81,12 +81,12 @@ def sensitivity(
     Examples
     --------
     Two tracks along x, 20 m away and 20 m high, the second 1 m higher, so that it looks 0.0244 rad steeper: 4π/λ times
-    that over sin θ = 0.7, and what lies higher shows nearer by cot θ.
+    that over sin θ = 0.7, and higher ground appears nearer by cot θ.
 
     >>> along = np.linspace(-4.0, 4.0, 9)[None, :, None] * [1.0, 0.0, 0.0]
     >>> low, high = along + [0.0, -20.0, 20.0], along + [0.0, -20.0, 21.0]
-    >>> told = sensitivity(np.zeros((1, 3)), np.eye(3), (low, low), (high, high), band_hz=(1.1e9, 1.3e9))
-    >>> told.slope.round(2), told.shift.round(2), told.overlap.round(2)
+    >>> sensed = sensitivity(np.zeros((1, 3)), np.eye(3), (low, low), (high, high), band_hz=(1.1e9, 1.3e9))
+    >>> sensed.slope.round(2), sensed.shift.round(2), sensed.overlap.round(2)
     (array([-1.75]), array([[-0.  ,  1.03]]), array([0.84]))
     """
     wavenumber = np.pi * (band_hz[0] + band_hz[1]) / SPEED_OF_LIGHT_M_S

@@ -1,1 +1,1 @@
-"""Clocks of recorders and logs: aligned by what a scene shows, and their drift."""
+"""Clocks of recorders and logs: offset and drift, estimated by a known point or by the sharpness of the scene."""

@@ -1,4 +1,4 @@
-"""By how much a recorder's clock is behind its log's and runs slow against it, and its range beyond geometry."""
+"""Offset and drift of a recorder's clock against its log's, and its path beyond geometry, at a known point."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -12,42 +12,40 @@ from apertura.common.flags import Flags
 from apertura.core.echo.compression import phasors, turned
 from apertura.methods.autofocus.motion import Logged, Recorded, plausible_offsets
 
-# ---- By how much a recorder's clock is behind its log's, and its range beyond geometry: where the image is sharpest
-#
-# First when the node moved, then where its echoes add up: here at a point whose place is known.
+# ---- Offset and path by coherent sum at a known point ---------------------------------------------------------------
 
 MOST_PULSES = 1024
-"""That offsets are tried on."""
+"""Of a recording, evenly spread, on which offsets are tried: the search costs one sum per offset."""
 
-RIVAL_DB = -1.0
-"""Another offset that adds up so well makes it uncertain which is the right one."""
+AMBIGUITY_DB = -1.0
+"""Power of the second best offset against the best from which the best is ambiguous."""
 
 LEAST_CONTRAST_DB = 6.0
-"""Peak over what other offsets give: less is chance."""
+"""Peak over the median of all offsets: less is chance."""
 
-_STEPS_PER_WAVE = 8
-_OVERSAMPLING = 8
-_WIDTH_DB = -1.0
+_STEPS_PER_WAVE = 8  # offsets per wavelength of change of the fastest path
+_OVERSAMPLING = 8  # of paths
+_WIDTH_DB = -1.0  # level of the peak at which widths are measured
 
 
 @dataclass(frozen=True)
 class Alignment:
-    """How a recorder stands to its log.
+    """Offset, path and drift of a recorder against its log.
 
     Attributes
     ----------
     offset_s, path_m
-        To be added to the recorder's times; electrical path beyond geometry, metres of total path.
+        To add to the recorder's times, seconds; electrical path beyond geometry, metres of total path.
     offset_width_s, path_width_m
-        Within which the peak falls by a decibel: by so much an offset may be off before it costs that.
+        Errors of offset and path that lower the peak by a decibel.
     contrast_db
-        Peak above what other offsets give.
+        Peak over the median of all offsets.
     report
-        What was found on the way.
+        Method and search, as JSON values.
     drift_ppm
-        By which more is to be added for every second since the first pulse.
+        Further microseconds to add for every second since the first pulse.
     flags
-        Edge crossed → what was measured, in one line.
+        Flag → what was measured, in one line.
     """
 
     offset_s: float
@@ -61,13 +59,13 @@ class Alignment:
 
 
 @dataclass(frozen=True, eq=False)
-class Gathering:
-    """How well echoes add up at one point, by offset and path.
+class PointResponse:
+    """Coherent sum of echoes at one point, by offset and path.
 
     Attributes
     ----------
     echo, log
-        What was recorded, and flown.
+        Echoes by the recorder's clock; antennas by the log's.
     point_m
         (3,) float64, metres, in the frame of the antennas.
     """
@@ -81,7 +79,7 @@ class Gathering:
         at_s = self.echo.time_s + offset_s
         kept = self.log.inside(at_s)
         some, speed = self.echo[kept], self.log.speeds_m_s(at_s)[kept]
-        paths_s = self.log.placed(at_s[kept]).path(self.point_m) / SPEED_OF_LIGHT_M_S - some.reference_delay_s
+        paths_s = self.log.phase_centres(at_s[kept]).path(self.point_m) / SPEED_OF_LIGHT_M_S - some.reference_delay_s
         frequency = self.echo.frequency_hz
         spacing_hz = float(frequency[-1] - frequency[0]) / (frequency.size - 1)
         weight = speed / max(float(speed.sum()), 1e-30)
@@ -91,7 +89,7 @@ class Gathering:
         return np.asarray(summed * (taper / taper.sum()), np.complex64)
 
     def powers(self, offset_s: float) -> tuple[Floats, Floats]:
-        """Return paths beyond geometry (m), as far as they are told apart, and the power of the point there."""
+        """Return paths beyond geometry (m), over the unambiguous range, and the power of the point at each."""
         frequency = self.echo.frequency_hz
         length = _OVERSAMPLING * frequency.size
         spacing_hz = float(frequency[-1] - frequency[0]) / (frequency.size - 1)
@@ -114,13 +112,13 @@ def align_on_point(
     Parameters
     ----------
     echo, log
-        What was recorded, and flown.
+        Echoes by the recorder's clock; antennas by the log's.
     point_m
         (3,) float64, metres, in the frame of the antennas.
     within_s
-        Offsets that are thought possible.
+        Least and largest offset to consider, seconds.
     search_m
-        Paths of either sign up to this are considered, metres; 0: none is sought.
+        Paths of either sign up to this are searched, metres; 0: the path is fixed.
 
     Raises
     ------
@@ -133,44 +131,44 @@ def align_on_point(
     """
     some = echo.moving()[:: -(-len(echo) // MOST_PULSES)]
     low, high = plausible_offsets(echo, log, within_s)
-    gathering = Gathering(some, log, point_m)
+    response = PointResponse(some, log, point_m)
     offsets_s = offset_steps(some, log, low, high)
-    searched = [gathering.powers(offset_s) for offset_s in offsets_s]
+    searched = [response.powers(offset_s) for offset_s in offsets_s]
     near = np.abs(searched[0][0]) <= max(search_m, 1e-9)
     paths_m, power = searched[0][0][near], np.array([one[near] for _, one in searched])
     row, column = np.unravel_index(int(power.argmax()), power.shape)
-    found = polished(
-        gathering.power, float(offsets_s[row]), float(paths_m[column]), _steps(offsets_s, paths_m, search_m)
+    found = refine_maximum(
+        response.power, float(offsets_s[row]), float(paths_m[column]), _steps(offsets_s, paths_m, search_m)
     )
-    apart = widths(gathering.power, *found, _steps(offsets_s, paths_m, search_m))
-    contrast_db = 10 * float(np.log10(gathering.power(*found) / max(float(np.median(power)), 1e-300)))
-    flags = doubts(power.max(axis=1), offsets_s, found[0], apart[0], contrast_db)
+    peak_width = peak_widths(response.power, *found, _steps(offsets_s, paths_m, search_m))
+    contrast_db = 10 * float(np.log10(response.power(*found) / max(float(np.median(power)), 1e-300)))
+    flags = alignment_flags(power.max(axis=1), offsets_s, found[0], peak_width[0], contrast_db)
     report = {"method": "point", "plausible_s": [round(low, 3), round(high, 3)], "pulses": len(some)}
-    return Alignment(*found, *apart, contrast_db, report, flags=flags)
+    return Alignment(*found, *peak_width, contrast_db, report, flags=flags)
 
 
 def offset_steps(echo: Recorded, log: Logged, low: float, high: float) -> Floats:
-    """Return offsets so near to each other that no path changes by more than a part of a wave in between."""
+    """Return offsets in steps over which no path changes by more than an eighth of a wave."""
     step_s = offset_step_s(echo, log)
     return np.arange(low, high + step_s, step_s)
 
 
 def offset_step_s(echo: Recorded, log: Logged) -> float:
-    """Return in which time no path changes by more than a part of a wave, seconds."""
+    """Return the time over which no path changes by more than an eighth of a wave, seconds."""
     times_s = np.linspace(log.first_s, log.last_s, 2048)
     fastest = float(np.quantile(log.speeds_m_s(times_s), 0.95))
     return echo.shortest_wave_m / (_STEPS_PER_WAVE * max(fastest, 1e-6))
 
 
 def _steps(offsets_s: Floats, paths_m: Floats, search_m: float) -> tuple[float, float]:
-    """Return the steps between offsets and paths; that of paths is 0 where none is sought."""
+    """Return the steps between offsets and paths; that of paths is 0 where the path is fixed."""
     return float(offsets_s[1] - offsets_s[0]), float(paths_m[1] - paths_m[0]) if search_m > 0 else 0.0
 
 
-def polished(
+def refine_maximum(
     power: Callable[[float, float], float], offset_s: float, path_m: float, steps: tuple[float, float]
 ) -> tuple[float, float]:
-    """Return the maximum next to a place of a grid."""
+    """Return offset and path of the maximum next to a node of the search grid."""
     from scipy.optimize import minimize  # slow to import
 
     def falls(at: Floats) -> float:
@@ -182,10 +180,10 @@ def polished(
     return offset_s + float(done.x[0]) * steps[0], path_m + float(done.x[-1]) * steps[1]
 
 
-def widths(
+def peak_widths(
     power: Callable[[float, float], float], offset_s: float, path_m: float, steps: tuple[float, float]
 ) -> tuple[float, float]:
-    """Return by how much offset and path may each be off before the peak falls by a decibel."""
+    """Return the errors of offset and path that each lower the peak by a decibel."""
     least = power(offset_s, path_m) * 10 ** (_WIDTH_DB / 10)
 
     def width(step: float, at: Callable[[float], float]) -> float:
@@ -198,14 +196,14 @@ def widths(
     return width(steps[0], lambda apart: power(offset_s + apart, path_m)), path_width
 
 
-def doubts(power: Floats, offsets_s: Floats, best_s: float, width_s: float, contrast_db: float) -> Flags:
-    """Return what makes an offset doubtful: others nearly as good, the edge of the search, little contrast."""
+def alignment_flags(power: Floats, offsets_s: Floats, best_s: float, width_s: float, contrast_db: float) -> Flags:
+    """Return flags of an offset: ambiguous, at the edge of the search, of little contrast."""
     flags = Flags()
     away = np.abs(offsets_s - best_s) > 4 * width_s
-    rival = float(power.max(initial=0.0, where=away)) / float(power.max())
-    if rival > 10 ** (RIVAL_DB / 10):
+    second = float(power.max(initial=0.0, where=away)) / float(power.max())
+    if second > 10 ** (AMBIGUITY_DB / 10):
         other_s = float(offsets_s[np.where(away, power, 0.0).argmax()])
-        flags["alignment_ambiguous"] = f"an offset of {other_s:.3f} s is only {-10 * np.log10(rival):.1f} dB worse"
+        flags["alignment_ambiguous"] = f"an offset of {other_s:.3f} s is only {-10 * np.log10(second):.1f} dB worse"
     if 2 * width_s > offsets_s[-1] - offsets_s[0]:
         flags["alignment_ambiguous"] = f"all offsets from {offsets_s[0]:.3f} to {offsets_s[-1]:.3f} s do as well"
     if min(best_s - offsets_s[0], offsets_s[-1] - best_s) < width_s:
@@ -215,42 +213,41 @@ def doubts(power: Floats, offsets_s: Floats, best_s: float, width_s: float, cont
     return flags
 
 
-# ---- By how much a recorder's clock runs slow against its log's: what offset alone leaves, found on a long
-# recording
+# ---- Drift of a recorder's clock against its log's ------------------------------------------------------------------
 
 MOST_PPM = 200.0
-"""Crystals are better."""
+"""Largest drift searched, parts per million: crystal oscillators are within."""
 
 
-def drifting(time_s: Floats, drift_ppm: float) -> Floats:
-    """Return times of a recorder whose clock is slow by `drift_ppm`, as its middle has them.
+def apply_drift(time_s: Floats, drift_ppm: float) -> Floats:
+    """Return times of a recorder corrected for a clock that is slow by `drift_ppm`, about their middle.
 
     Examples
     --------
-    >>> drifting(np.array([0.0, 50.0, 100.0]), 20.0).round(6).tolist()
+    >>> apply_drift(np.array([0.0, 50.0, 100.0]), 20.0).round(6).tolist()
     [-0.001, 50.0, 100.001]
     """
     middle_s = (time_s[0] + time_s[-1]) / 2
     return np.asarray(middle_s + (time_s - middle_s) * (1 + drift_ppm * 1e-6))
 
 
-def with_drift(found: Alignment, echo: Recorded, log: Logged, point_m: Floats) -> Alignment:
-    """Return an alignment with the drift at which echoes add up best at a known point, or that none can be told.
+def estimate_drift(found: Alignment, echo: Recorded, log: Logged, point_m: Floats) -> Alignment:
+    """Return an alignment with the drift at which echoes add up best at a known point, if the recording resolves it.
 
     Parameters
     ----------
     found
         Without drift.
     echo, log
-        What was recorded, and flown.
+        Echoes by the recorder's clock; antennas by the log's.
     point_m
         (3,) float64, metres, in the frame of the antennas.
 
     Notes
     -----
     Source: docs/theory/tracks.md, "Clock of the recorder". Drift is taken about the middle of the recording, where it
-    does not pull at the offset; what is returned counts from the first pulse, as config/clocks.tsv does. A drift that
-    moves no path by an eighth of a wave over half of the recording is not sought.
+    is independent of the offset; what is returned counts from the first pulse, as config/clocks.tsv does. A drift that
+    moves no path by an eighth of a wave over half of the recording is not estimated.
     """
     from scipy.optimize import minimize  # slow to import
 
@@ -259,11 +256,11 @@ def with_drift(found: Alignment, echo: Recorded, log: Logged, point_m: Floats) -
     half_s = float(time_s[-1] - time_s[0]) / 2
     step_ppm = 1e6 * offset_step_s(echo, log) / max(half_s, 1e-12)
     if step_ppm > MOST_PPM:
-        return replace(found, report={**found.report, "drift": f"cannot be told: {step_ppm:.0f} ppm move no path"})
+        return replace(found, report={**found.report, "drift": f"not observable: {step_ppm:.0f} ppm move no path"})
 
     def power(ppm: float, offset_s: float, path_m: float) -> float:
-        times_s = drifting(time_s, ppm)
-        return Gathering(replace(some, time_s=times_s), log, point_m).power(offset_s, path_m)
+        times_s = apply_drift(time_s, ppm)
+        return PointResponse(replace(some, time_s=times_s), log, point_m).power(offset_s, path_m)
 
     tried = np.arange(-MOST_PPM, MOST_PPM + step_ppm, step_ppm)
     at = found.offset_s, found.path_m
@@ -285,6 +282,6 @@ def with_drift(found: Alignment, echo: Recorded, log: Logged, point_m: Floats) -
     done = minimize(falls, np.zeros(free.size), method="Nelder-Mead", options={"initial_simplex": simplex})
     offset_s, path_m, ppm = moved(done.x)
     gain_db = 10 * float(np.log10(-done.fun / max(power(0.0, *at), 1e-300)))
-    first_s = float(drifting(time_s, ppm)[0] - time_s[0])
+    first_s = float(apply_drift(time_s, ppm)[0] - time_s[0])
     report = {**found.report, "drift": f"{gain_db:.2f} dB better than without"}
     return replace(found, offset_s=offset_s + first_s, path_m=path_m, drift_ppm=ppm, report=report)

@@ -1,4 +1,4 @@
-"""A recorder's clock and path where no point is known: offset and path at which the image of the ground is sharpest."""
+"""Offset and path of a recorder without a known point: those at which the image of the ground is sharpest."""
 
 from dataclasses import dataclass, replace
 
@@ -16,33 +16,33 @@ from apertura.methods.autofocus.motion import Logged, Recorded, plausible_offset
 from apertura.methods.synchronisation.clock_alignment import (
     MOST_PULSES,
     Alignment,
-    doubts,
+    alignment_flags,
     offset_steps,
-    polished,
-    widths,
+    peak_widths,
+    refine_maximum,
 )
 
 MOST_PIXELS = 96
-"""Along a side of the image that offsets are tried on."""
+"""Along a side of the coarse image on which offsets are tried."""
 
-_OVERSAMPLING = 2.0
-_ABOUT_CELLS = 8  # of range, about the brightest place, that decide in the end
-_FINE = 4  # pixels in a cell there
-_BEST = 3  # places of the search that are followed to their tops
+_OVERSAMPLING = 2.0  # of range profiles
+_ABOUT_CELLS = 8  # of range: half a side of the fine image about the brightest place
+_FINE = 4  # pixels per cell of the fine image
+_MAXIMA = 3  # of the coarse search that are refined
 
 
 @dataclass(frozen=True, eq=False)
 class SceneSharpness:
-    """How sharp an image of some places is, by offset and path.
+    """Sharpness of an image of some places, by offset and path.
 
     Attributes
     ----------
     profiles
-        Of the recorder, (pulse, range), over all of its range; their aperture means nothing yet.
+        Of the recorder, (pulse, range), over all of its range; their aperture is a placeholder.
     time_s
         (pulse,) float64, seconds by the recorder.
     log
-        What was flown.
+        Antennas by the log's clock.
     places_m
         (y, x, 3) float64, metres in the frame of the antennas.
     """
@@ -54,7 +54,7 @@ class SceneSharpness:
 
     @classmethod
     def of(cls, echo: Recorded, log: Logged, places_m: Floats) -> "SceneSharpness":
-        """Return it for echoes; pulses are compressed once."""
+        """Return the sharpness of echoes; pulses are compressed once."""
         frequency = echo.frequency_hz
         step_m, length = range_step(frequency, oversampling=_OVERSAMPLING)
         taper = np.hanning(frequency.size + 2)[1:-1]
@@ -68,8 +68,8 @@ class SceneSharpness:
             count=length,
             oversampling=_OVERSAMPLING,
         )
-        anywhere = log.placed(np.full(len(echo), log.first_s))
-        profiles = Profiles(samples, start_m, step_m, centre_frequency(frequency), _OVERSAMPLING, anywhere)
+        placeholder = log.phase_centres(np.full(len(echo), log.first_s))
+        profiles = Profiles(samples, start_m, step_m, centre_frequency(frequency), _OVERSAMPLING, placeholder)
         return cls(profiles, echo.time_s, log, places_m)
 
     def image(self, offset_s: float, path_m: float) -> NDArray[np.complex64]:
@@ -81,13 +81,13 @@ class SceneSharpness:
         engine = load_engine("native")
         if not engine.available():
             engine = load_engine("numba")
-        seen = replace(
+        at_offset = replace(
             self.profiles,
             samples=self.profiles.samples[kept] * weight[:, None],
             start_m=self.profiles.start_m[kept] - path_m,
-            aperture=self.log.placed(at_s[kept]),
+            aperture=self.log.phase_centres(at_s[kept]),
         )
-        return np.asarray(np.nan_to_num(engine.form(engine.prepare(seen), self.places_m)))
+        return np.asarray(np.nan_to_num(engine.form(engine.prepare(at_offset), self.places_m)))
 
     def value(self, offset_s: float, path_m: float) -> float:
         """Return the sharpness: mean square power over the mean power squared; 2 for speckle, more for points."""
@@ -104,18 +104,18 @@ def align_on_scene(
     within_s: tuple[float, float],
     search_m: float,
 ) -> Alignment:
-    """Return the offset and the path at which the image of the ground is sharpest; no place in it is known.
+    """Return the offset and the path at which the image of the ground is sharpest, without a known point.
 
     Parameters
     ----------
     echo, log
-        What was recorded, and flown.
+        Echoes by the recorder's clock; antennas by the log's.
     grid, terrain
-        The scene, which holds what is bright.
+        The scene, which must contain bright places.
     within_s
-        Offsets that are thought possible.
+        Least and largest offset to consider, seconds.
     search_m
-        Paths of either sign up to this are considered, metres; 0: none is sought.
+        Paths of either sign up to this are searched, metres; 0: the path is fixed.
 
     Raises
     ------
@@ -124,8 +124,8 @@ def align_on_scene(
 
     Notes
     -----
-    Source: docs/theory/tracks.md, "Clock of the recorder". Paths are told from offsets, and places from paths, by the
-    curvature of a point's history alone: the aperture must not be short against the distance.
+    Source: docs/theory/tracks.md, "Clock of the recorder". Only the curvature of a point's phase history separates
+    paths from offsets, and places from paths: the aperture must not be short against the distance.
     """
     some = echo.moving()[:: -(-len(echo) // MOST_PULSES)]
     low, high = plausible_offsets(echo, log, within_s)
@@ -136,21 +136,21 @@ def align_on_scene(
     paths_m = np.arange(-search_m, search_m + cell_m, 2 * cell_m) if search_m > 0 else np.zeros(1)
     values = np.array([[coarse.value(offset_s, path_m) for path_m in paths_m] for offset_s in offsets_s])
     steps = float(offsets_s[1] - offsets_s[0]), 2 * cell_m if search_m > 0 else 0.0
-    tops = []
-    for place in np.argsort(-values, axis=None)[:_BEST]:
+    maxima = []
+    for place in np.argsort(-values, axis=None)[:_MAXIMA]:
         row, column = np.unravel_index(int(place), values.shape)
-        start = polished(coarse.value, float(offsets_s[row]), float(paths_m[column]), steps)
+        start = refine_maximum(coarse.value, float(offsets_s[row]), float(paths_m[column]), steps)
         fine = replace(coarse, places_m=_about(coarse, start, grid, terrain, cell_m))
-        found = polished(fine.value, *start, (steps[0] / 2, steps[1] / 2))
-        tops.append((float(np.abs(fine.image(*found)).max()), fine, found))
-    peak, fine, found = max(tops, key=lambda top: top[0])
-    apart = widths(fine.value, *found, steps)
+        found = refine_maximum(fine.value, *start, (steps[0] / 2, steps[1] / 2))
+        maxima.append((float(np.abs(fine.image(*found)).max()), fine, found))
+    peak, fine, found = max(maxima, key=lambda top: top[0])
+    widths = peak_widths(fine.value, *found, steps)
     image = np.abs(fine.image(*found))
     contrast_db = 20 * float(np.log10(peak / max(float(np.median(np.abs(coarse.image(*found)))), 1e-300)))
     brightest = fine.places_m[np.unravel_index(int(image.argmax()), image.shape)]
     report = {"method": "sharpness", "plausible_s": [round(low, 3), round(high, 3)], "pulses": len(some)}
-    flags = doubts(values.max(axis=1), offsets_s, found[0], apart[0], contrast_db)
-    return Alignment(*found, *apart, contrast_db, report | {"brightest_m": brightest.tolist()}, flags=flags)
+    flags = alignment_flags(values.max(axis=1), offsets_s, found[0], widths[0], contrast_db)
+    return Alignment(*found, *widths, contrast_db, report | {"brightest_m": brightest.tolist()}, flags=flags)
 
 
 def _coarse(grid: SceneGrid, terrain: Terrain, cell_m: float) -> Floats:
@@ -167,7 +167,7 @@ def _about(
     image = np.abs(coarse.image(*start))
     down, right = np.unravel_index(int(image.argmax()), image.shape)
     step = max(1, round(cell_m / grid.spacing_m), -(-max(grid.shape) // MOST_PIXELS))
-    apart = cell_m / (_FINE * grid.spacing_m)
-    around = np.arange(-_ABOUT_CELLS * _FINE, _ABOUT_CELLS * _FINE + 1) * apart
+    step_px = cell_m / (_FINE * grid.spacing_m)
+    around = np.arange(-_ABOUT_CELLS * _FINE, _ABOUT_CELLS * _FINE + 1) * step_px
     row, column = (step // 2 + step * place for place in (down, right))
     return terrain.positions_at(grid, *np.meshgrid(row + around, column + around, indexing="ij"))

@@ -1,6 +1,6 @@
 """The campaign folder's config: one model generates the defaults, the JSON schema and the validation.
 
-Only `load`, `steps` and the command line see these objects; wings get plain arrays and numbers. One file per section.
+Only `pipeline`, `views` and `research` use these objects; other layers get plain arrays and numbers.
 """
 
 from apertura.pipeline.config.config import CONFIG, Settings, located, read_settings, validated

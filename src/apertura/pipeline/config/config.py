@@ -1,4 +1,4 @@
-"""The config as one value: from config/config.yaml to `Settings`, or to the message that says all that is wrong."""
+"""The config as one value: config/config.yaml validated as `Settings`; all errors are one message."""
 
 from pathlib import Path
 from typing import Self
@@ -13,7 +13,7 @@ from apertura.pipeline.config.section import Name, Section, Title
 from apertura.pipeline.config.waveform import PhaseHistoryWaveform, Waveform
 
 CONFIG = Path("config/config.yaml")
-"""Where the config lies in a campaign folder."""
+"""Path of the config in a campaign folder."""
 
 
 class Settings(Section):
@@ -61,7 +61,7 @@ def read_settings(path: Path) -> Settings:
 
 
 def located(message: str) -> str:
-    """Return a message with the config's place before it, where it begins with a key of it: wings know no files.
+    """Return a message with the config's path before it, where it begins with a key of it.
 
     Examples
     --------

@@ -106,7 +106,7 @@ def _flight(cells: dict[str, str], known: Collection[str], *, where: str) -> Fli
     return Flight(cells["flight"], cells["kind"], cells["transmitter"], nodes)
 
 
-# ---- config/segments.tsv: which part of the track images a pair; without the file, all of it -----------------------
+# ---- config/segments.tsv: part of the track that images a pair ------------------------------------------------------
 
 SEGMENTS = Path("config/segments.tsv")
 _FIRST_YEAR, _LAST_YEAR = 1980, 2199
@@ -175,7 +175,7 @@ def _utc(text: str) -> datetime | None:
     return time if _FIRST_YEAR <= time.year <= _LAST_YEAR else None
 
 
-# ---- config/clocks.tsv: what the clock of a recorder is behind that of its node's log; without the file, nothing
+# ---- config/clocks.tsv: offset and drift of recorders against logs --------------------------------------------------
 
 CLOCKS = Path("config/clocks.tsv")
 CLOCK_COLUMNS = ["flight", "node", "offset_s", "drift_ppm", "std_s"]
@@ -194,7 +194,7 @@ class ClockRow:
     drift_ppm
         By which more is to be added for every second since.
     std_s
-        Standard deviation of the offset; None: nobody knows.
+        Standard deviation of the offset; None: unknown.
     """
 
     flight: str
@@ -204,7 +204,7 @@ class ClockRow:
     std_s: float | None = None
 
     def utc(self, times: "NDArray[np.datetime64]") -> "NDArray[np.datetime64]":
-        """Return times of a recorder as the log's clock has them.
+        """Return times of a recorder converted to the log's clock.
 
         Parameters
         ----------
@@ -244,7 +244,7 @@ def read_clocks(path: Path, *, flights: Sequence[Flight]) -> Iterator[ClockRow]:
     if not path.is_file():
         return
     nodes = {flight.name: flight.participants for flight in flights}
-    told: set[tuple[str, str]] = set()
+    stated: set[tuple[str, str]] = set()
     for where, cells in table_rows(path, CLOCK_COLUMNS, remedy="Write one line per flight and node."):
         flight, node = cells["flight"], cells["node"]
         problem = ""
@@ -252,11 +252,11 @@ def read_clocks(path: Path, *, flights: Sequence[Flight]) -> Iterator[ClockRow]:
             problem = f"flight {quoted(flight)} is not in {FLIGHTS}"
         elif node not in nodes[flight]:
             problem = f"flight {flight} has no node {quoted(node)}"
-        elif (flight, node) in told:
+        elif (flight, node) in stated:
             problem = f"flight {flight}, node {node} a second time"
         if problem:
             raise CampaignError(problem, where=where, expected=_EXPECTED, remedy="Correct the line.")
-        told.add((flight, node))
+        stated.add((flight, node))
         offset = _number(cells, "offset_s", where, most=_FARTHEST_S) or Decimal(0)
         drift = _number(cells, "drift_ppm", where, most=_LARGEST_PPM) or Decimal(0)
         std = _number(cells, "std_s", where, most=_FARTHEST_S)

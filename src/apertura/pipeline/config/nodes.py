@@ -1,4 +1,4 @@
-"""Section `nodes`: what each UAV carries, where it sits, where its antennas look, and what its log cannot say."""
+"""Section `nodes`: equipment of each UAV, lever arms, antennas, and values that its log lacks."""
 
 from typing import Annotated, Literal, Self
 
@@ -8,7 +8,7 @@ from apertura.formats.names import TRACKS
 from apertura.formats.tracks.log_options import LogOptions
 from apertura.pipeline.config.section import Metres3, Section
 
-# ---- Section `nodes.<n>.log`: what a flight log cannot say of itself -----------------------------------------------
+# ---- Section `nodes.<n>.log`: values that a flight log lacks --------------------------------------------------------
 
 Latitude = Annotated[float, Field(ge=-90, le=90)]
 Longitude = Annotated[float, Field(ge=-180, le=360)]
@@ -58,7 +58,7 @@ class Log(Section):
         return LogOptions(**read)
 
 
-# ---- Section `nodes`: what each UAV carries, where it sits, where its antennas look --------------------------------
+# ---- Section `nodes`: equipment, lever arms, antennas ---------------------------------------------------------------
 
 StandardDeviation = Annotated[float, Field(gt=0)]
 Beamwidth = Annotated[float, Field(gt=0, le=180)]
@@ -161,7 +161,7 @@ class Node(Section):
 
     @property
     def poorest_fix(self) -> str:
-        """What `worst_fix` asks of a log with RTK."""
+        """Value of `worst_fix` for a log with RTK."""
         return "fix" if self.worst_fix == "auto" else self.worst_fix
 
     @model_validator(mode="after")

@@ -12,7 +12,7 @@ from apertura.common.errors import CampaignError, quoted
 from apertura.core.imaging.choices import ImagingChoices
 from apertura.pipeline.config.section import CrsName, Metres3, Name, Section, Title, plain_crs
 
-# ---- Sections `processing`, how to compute, and `calibration`, path offsets from a flight over a reflector ---------
+# ---- Sections `processing` and `calibration` ------------------------------------------------------------------------
 
 
 class Fusion(Section):
@@ -70,7 +70,7 @@ class Calibration(Section):
     search_m: float = Field(10.0, gt=0, description="offsets of either sign up to this are considered, m")
 
 
-# ---- Section `interferometry`: which images are compared in phase, two by two, for coherence and heights -----------
+# ---- Section `interferometry`: pairs of images for interferograms ---------------------------------------------------
 
 LEAST_WINDOW_PX = 3
 """Any two pixels are coherent: a window must hold several."""
@@ -120,7 +120,7 @@ class Interferometry(Section):
         return first, second
 
 
-def check_interferometry(asked: Interferometry, known: Sequence[str], *, where: Path) -> None:
+def check_interferometry(requested: Interferometry, known: Sequence[str], *, where: Path) -> None:
     """Raise CampaignError unless every image named is one of the campaign's.
 
     Parameters
@@ -132,7 +132,7 @@ def check_interferometry(asked: Interferometry, known: Sequence[str], *, where: 
     where
         The config.
     """
-    for name, images in asked.pairs.items():
+    for name, images in requested.pairs.items():
         for image in images:
             if image not in known:
                 raise CampaignError(
@@ -147,7 +147,7 @@ def check_interferometry(asked: Interferometry, known: Sequence[str], *, where: 
 
 
 class KnownPoint(Section):
-    """A point that shows in the images and whose place is known: refined tracks are tied to it."""
+    """A point of known place that is visible in the images: it fixes the position of refined tracks."""
 
     name: Title = Field(description="what it is called")
     position_m: Metres3 = Field(description="easting, northing in scene.crs, ellipsoidal height (z in local), m")

@@ -1,4 +1,4 @@
-"""What every section and table of the config is, and the names that become names of folders."""
+"""Base classes of sections and tables of the config, and names of flights and nodes."""
 
 import csv
 import io
@@ -12,7 +12,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict
 from apertura.common.documents import read_text
 from apertura.common.errors import CampaignError, quoted
 
-# ---- What every section of the config is, and the names that become names of folders -------------------------------
+# ---- Base of every section; names that become names of folders ------------------------------------------------------
 
 RESERVED_NAMES = frozenset(
     {"fused", "layers", "stac", "map", "mosaic", "interferometry", "study", "logs", "benchmarks", "tiles", "workflow"}
@@ -26,7 +26,7 @@ WAVEFORM_KINDS = (
     "ofdm, samples (a pulse given by its samples), fmcw (beat signals of sweeps) or phase_history "
     "(frequency-domain samples); `apertura init --kind` writes the keys of each"
 )
-"""What the key waveform.kind says of itself, whichever kind it is."""
+"""Description of the key waveform.kind."""
 
 _AUTHORITY = "[A-Za-z][A-Za-z0-9_]{0,31}"
 _CODE = _AUTHORITY + ":[A-Za-z0-9_.-]{1,31}"

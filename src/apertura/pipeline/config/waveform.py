@@ -8,19 +8,19 @@ from pydantic import Field, field_validator, model_validator
 from apertura.formats.names import PHASE_HISTORIES
 from apertura.pipeline.config.section import WAVEFORM_KINDS, Section
 
-# ---- Waveforms that are recorded as samples: OFDM symbols, and pulses given by their samples -----------------------
+# ---- Waveforms recorded as samples: OFDM symbols, sampled pulses ----------------------------------------------------
 
 
 class SampledWaveform(Section):
-    """One pulse per trigger, recorded as samples: what the road from captures to transfer functions asks of any kind.
+    """One pulse per trigger, recorded as samples: the common interface from captures to transfer functions.
 
-    Kinds say by `file_key` which of their keys names the file of what was sent, by `delay_key` and `held_by` what holds
-    an echo whole.
+    Each kind states in `file_key` the key that names the file of the transmitted signal, in `delay_key` and
+    `limit_name` the key and the name of the interval in which an echo must arrive.
     """
 
     file_key: ClassVar[str]
     delay_key: ClassVar[str]
-    held_by: ClassVar[str]
+    limit_name: ClassVar[str]
 
     kind: str = Field(description=WAVEFORM_KINDS)
     carrier_hz: float = Field(gt=0, description="RF carrier: what lies at baseband zero, Hz", examples=[1.2e9])
@@ -30,17 +30,17 @@ class SampledWaveform(Section):
     @property
     @abstractmethod
     def longest_delay_s(self) -> float:
-        """Delay up to which an echo is held whole, seconds."""
+        """Delay up to which a whole echo is recorded, seconds."""
 
     @property
     @abstractmethod
     def middle_s(self) -> float:
-        """When the middle of what an echo is measured by was sent, seconds after the pulse began."""
+        """Time of the middle of the measured part of the pulse, seconds after its beginning."""
 
     @property
     @abstractmethod
     def capture_s(self) -> float:
-        """How long a capture lasts, seconds; nothing beyond is used."""
+        """Duration of a capture, seconds; nothing beyond is used."""
 
     @property
     @abstractmethod
@@ -66,7 +66,7 @@ class SampledWaveform(Section):
 class OfdmWaveform(SampledWaveform):
     """One OFDM symbol per pulse."""
 
-    file_key, delay_key, held_by = "codes", "cyclic_prefix_s", "the cyclic prefix"
+    file_key, delay_key, limit_name = "codes", "cyclic_prefix_s", "the cyclic prefix"
 
     kind: Literal["ofdm"] = Field(description=WAVEFORM_KINDS)
     codes: str = Field("raw/codes.npy", description="transmitted code symbols, complex64 (subcarriers,)")
@@ -138,7 +138,7 @@ class OfdmWaveform(SampledWaveform):
 class PulseWaveform(SampledWaveform):
     """A pulse given by its samples and sent once per trigger: a chirp, a code, whatever a loop-back captured."""
 
-    file_key, delay_key, held_by = "pulse", "listen_s", "the listening time"
+    file_key, delay_key, limit_name = "pulse", "listen_s", "the listening time"
 
     kind: Literal["samples"] = Field(description=WAVEFORM_KINDS)
     pulse: str = Field(
@@ -168,7 +168,7 @@ class PulseWaveform(SampledWaveform):
 
     @property
     def capture_s(self) -> float:
-        """What goes before, the pulse, and its longest delay."""
+        """Lead time, pulse, and longest delay."""
         return self.lead_s + self.pulse_s + self.listen_s
 
     @property
@@ -202,7 +202,7 @@ class PulseWaveform(SampledWaveform):
         return self
 
 
-# ---- Waveforms that enter as transfer functions: phase history of other radars, beat signals of FMCW ---------------
+# ---- Waveforms as transfer functions: phase histories, beat signals of FMCW -----------------------------------------
 
 _MOST_SAMPLES = 1_000_000
 """Of a sweep; ramps of real radars have 100 to 100 000."""

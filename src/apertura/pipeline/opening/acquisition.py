@@ -1,4 +1,4 @@
-"""What one node recorded in a flight: samples by channel, antennas by pulse, by the clocks of recorder and log."""
+"""Recording of one node in a flight: samples by channel, antennas by pulse, by the clocks of recorder and log."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -26,7 +26,7 @@ from apertura.pipeline.opening.reading import read_history
 from apertura.pipeline.opening.transmitted import Transmitted, check_mixing
 from apertura.pipeline.store import manifest_of, open_stage
 
-# ---- What one node recorded in one flight: its samples by channel and its antennas by pulse ------------------------
+# ---- Recording of one node: samples by channel, antennas by pulse ---------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Acquisition(NodeLog):
     samples
         The recorder's file.
     files
-        raw/<flight>/<node>, what its files' names begin with.
+        raw/<flight>/<node>, with which its files' names begin.
     recording
         Its files of samples, for messages.
     numerology
@@ -54,14 +54,14 @@ class Acquisition(NodeLog):
     numerology: Numerology
 
     def reader(self, channels: Sequence[str], pulses: NDArray[np.int64]) -> Read:
-        """Return what reads channels of some captures from the recorder's file, a block of them at a time.
+        """Return a function that reads channels of some captures from the recorder's file, block by block.
 
         Parameters
         ----------
         channels
             Names.
         pulses
-            (capture,) int64, which captures of the recording; they are then asked for by their place here.
+            (capture,) int64, captures of the recording; the function takes indices into this.
 
         Raises
         ------
@@ -114,12 +114,12 @@ def open_acquisition(campaign: Campaign, flight: str, node: str, sent: Transmitt
     files = Path("raw") / flight / node
     recording, log = (_read_from(stage, files) for stage in (raw, track))
     for key, recorded in (("sample_rate_hz", raw.attrs["sample_rate_hz"]), ("carrier_hz", raw.attrs["frequency_hz"])):
-        asked = getattr(sent.waveform, key)
-        if abs(recorded - asked) > 1e-9 * asked:
+        requested = getattr(sent.waveform, key)
+        if abs(recorded - requested) > 1e-9 * requested:
             raise CampaignError(
                 f"recorded with {key} {recorded:.6f}",
                 where=recording,
-                expected=f"{asked:.6f}, as config/config.yaml: waveform.{key}",
+                expected=f"{requested:.6f}, as config/config.yaml: waveform.{key}",
                 remedy="Correct whichever is wrong; every node of a flight shares one waveform.",
             )
     path = inside(campaign.root, raw.attrs["samples"], where=campaign.stage("raw", flight, node))
@@ -144,7 +144,7 @@ def _check_same(campaign: Campaign, raw: xr.Dataset) -> None:
 
 
 def _read_from(stage: xr.Dataset, files: Path) -> str:
-    """Return the node's own files that a stage was read from; a preamble lies elsewhere."""
+    """Return the node's own files that a stage was read from, without the preamble."""
     own = [name for name in stage.attrs["inputs"] if name.startswith(f"{files.as_posix()}.")]
     return " and ".join(own or stage.attrs["inputs"])  # a collection may give other names
 
@@ -163,32 +163,32 @@ def common_pulses(tx: Acquisition, rx: Acquisition, *, prf_hz: float) -> Associa
     )
 
 
-# ---- A node's echoes by the clock of its recorder, and where it was by the clock of its log ------------------------
+# ---- Echoes by the recorder's clock and antennas by the log's -------------------------------------------------------
 
 MOST_PULSES = 8192
-"""That are read of a recording: their changes tell when the node moved."""
+"""Of a recording, evenly spread: bounds memory; their changes show when the node moved."""
 
 _SECOND = np.timedelta64(1, "s")
 
 
 @dataclass(frozen=True, eq=False)
 class Unaligned:
-    """What is to be aligned.
+    """Echoes and log of a node before alignment.
 
     Attributes
     ----------
     echo, log
         As `apertura.methods.synchronisation` takes them: each by seconds of its own, from its first pulse and epoch.
     apart_ns
-        By how much the log's first epoch is later than the recorder's first pulse.
+        Delay of the log's first epoch against the recorder's first pulse, nanoseconds.
     applied_ns
-        What of an offset in config/clocks.tsv is in the recorder's times already.
+        Offset of config/clocks.tsv that the recorder's times already contain, nanoseconds.
     stated_ns
         That offset, 0 without.
     applied_ppm
-        What of a drift stated there is in them already.
+        Drift stated there that they already contain.
     taken_off_m
-        Path beyond geometry that is taken off the echoes already.
+        Path beyond geometry that was already removed from the echoes.
     own_clock
         Whether the recorder's times mean nothing but differences.
     """
@@ -208,17 +208,17 @@ class Unaligned:
         return replace(self, echo=replace(self.echo, reference_delay_s=delay_s), taken_off_m=path_m)
 
     def offset_ns(self, offset_s: float) -> int:
-        """Return what clocks.tsv is to state, for an offset between the first pulse and the first epoch."""
+        """Return the offset for clocks.tsv, given one between the first pulse and the first epoch."""
         return self.applied_ns + self.apart_ns + round(offset_s * 1e9)
 
     @property
     def stated_s(self) -> float:
-        """What `offset_ns` makes of it is what is stated already."""
+        """Offset at which `offset_ns` returns the stated one, seconds."""
         return (self.stated_ns - self.applied_ns - self.apart_ns) * 1e-9
 
 
 def unaligned(campaign: Campaign, flight: str, node: str) -> Unaligned:
-    """Return what a node that sends and receives recorded in a flight, and its log.
+    """Return echoes and log of a node that sends and receives.
 
     Raises
     ------
@@ -256,7 +256,7 @@ def unaligned(campaign: Campaign, flight: str, node: str) -> Unaligned:
 
 
 def _some(history: xr.Dataset) -> xr.Dataset:
-    """Return so many of the pulses, evenly spread, that memory is bounded."""
+    """Return at most `MOST_PULSES` pulses, evenly spread."""
     return history.isel(pulse=slice(None, None, -(-history.sizes["pulse"] // MOST_PULSES)))
 
 
@@ -264,12 +264,12 @@ def _logged(log: NodeLog) -> Logged:
     times = log.track.time.values[log.checked.kept]
     began = log.track.time.values[0]
 
-    def placed(at_s: NDArray[np.float64]) -> Aperture:
+    def phase_centres(at_s: NDArray[np.float64]) -> Aperture:
         at = began + np.round(at_s * 1e9).astype("timedelta64[ns]")
         return Aperture(log.antenna("radar_tx", at), log.antenna("radar_rx", at))
 
     first_s, last_s = _seconds(times[[0, -1]], began)
-    return Logged(placed, first_s + 1e-9, last_s - 1e-9)
+    return Logged(phase_centres, first_s + 1e-9, last_s - 1e-9)
 
 
 def _seconds(times: NDArray[np.datetime64], began: np.datetime64) -> NDArray[np.float64]:

@@ -24,42 +24,42 @@ from apertura.pipeline.opening.plan import paths_to_middle, positions_loss_db
 from apertura.pipeline.opening.scene import OpenScene
 from apertura.pipeline.store import manifest_of, open_stage
 
-# ---- Whether and how the tracks of an open flight are refined, before anything is looked for -----------------------
+# ---- Decision whether and how the tracks of a flight are refined ----------------------------------------------------
 
 ASSUMED_STD_M = 0.02
-"""Error of positions in each axis where a refinement is asked for and nobody said: that of a fair RTK solution."""
+"""Metres in each axis, assumed for positions of unstated error when a refinement is requested: a fair RTK solution."""
 
 LEAST_STD_M = 1e-3
-"""Of what a log or config states as exact."""
+"""Metres, lower bound of a stated deviation: a prior of zero would fix the track."""
 
 ONE_PHASE = "minimum_entropy"
-"""What auto takes where one phase suffices: at the cost of the phase gradient it is believed at least as often."""
+"""Method of auto where one phase suffices: accepted at least as often as phase_gradient, at its cost."""
 
 
 def autofocus_of(campaign: Campaign, pairs: Sequence[OpenPair], scene: OpenScene) -> tuple[Decision, ...]:
     """Return whether the tracks of a flight, of which these are all pairs, are to be refined; if so, how; and why."""
-    asked = campaign.settings.processing
+    requested = campaign.settings.processing
     silent = [node for node, known in positions_of(pairs).items() if known.std_m is None]
     loss_db = {pair.name: positions_loss_db(campaign, pair, scene) for pair in pairs}
-    decision = decide_autofocus(asked.autofocus, loss_db, silent)
+    decision = decide_autofocus(requested.autofocus, loss_db, silent)
     if decision.value == "off":
         return (decision,)
     variances = {pair.name: _variance(pair, scene, errors_of(pairs)) for pair in pairs}
     known = bool(campaign.settings.scene.reference_points)
-    return decision, decide_method(asked.autofocus_method, variances, known_points=known)
+    return decision, decide_method(requested.autofocus_method, variances, known_points=known)
 
 
-def decide_method(asked: str, variances: Mapping[str, SpaceVariance], *, known_points: bool) -> Decision:
+def decide_method(requested: str, variances: Mapping[str, SpaceVariance], *, known_points: bool) -> Decision:
     """Return how tracks are refined, and why.
 
     Parameters
     ----------
-    asked
+    requested
         auto, tracks, or a row of `apertura.methods.autofocus.one_phase.METHODS`.
     variances
         Pair → what one phase per pulse leaves of it.
     known_points
-        Whether the scene has points whose places are known: only tracks can be tied to them.
+        Whether the scene has reference points: only the method tracks can use them.
 
     Examples
     --------
@@ -68,8 +68,8 @@ def decide_method(asked: str, variances: Mapping[str, SpaceVariance], *, known_p
     >>> decide_method("auto", {"a-a": SpaceVariance(0.02, -0.001)}, known_points=True).value
     'tracks'
     """
-    if asked != "auto":
-        return Decision("autofocus_method", asked, "asked for")
+    if requested != "auto":
+        return Decision("autofocus_method", requested, "asked for")
     if known_points:
         return Decision("autofocus_method", "tracks", "auto: only tracks can be tied to scene.reference_points")
     pair, worst = min(variances.items(), key=lambda one: one[1].loss_db)
@@ -109,15 +109,14 @@ def _stated(known: NodePositions) -> tuple[float, float, float]:
     return east, north, up
 
 
-# ---- Tracks as refined: where images take the places of their antennas from, and the only place where that is
-# decided
+# ---- Refined tracks, from which images take their phase centres -----------------------------------------------------
 
 _QUOTED = ("gain_fitted_db", "gain_held_out_db", "held_out_better")
 
 
 @dataclass(frozen=True, eq=False)
 class RefinedTrack:
-    """What step `refine` found of a flight.
+    """Outcome of step `refine` for a flight.
 
     Attributes
     ----------
@@ -135,7 +134,7 @@ class RefinedTrack:
 
     @classmethod
     def of(cls, stage: xr.Dataset) -> "RefinedTrack":
-        """Return what a stage says."""
+        """Return the outcome stored in a stage."""
         time, nodes = stage.time.values, stage.attrs["nodes"]
         if not stage.attrs["accepted"] or not len(time):
             return cls(stage, None, np.datetime64(0, "ns"))
@@ -151,15 +150,15 @@ class RefinedTrack:
         return tuple(Decision(name, one["value"], one["reason"] + became.get(name, "")) for name, one in made)
 
     def report(self, pair: str) -> dict[str, Any]:
-        """Return what image.json says of a pair's tracks."""
-        told = self.stage.attrs
-        made = {name: f"{one['value']}: {one['reason']}" for name, one in told["decisions"].items()}
+        """Return the refinement of a pair's tracks for image.json."""
+        attrs = self.stage.attrs
+        made = {name: f"{one['value']}: {one['reason']}" for name, one in attrs["decisions"].items()}
         return {
             "decision": made["autofocus"],
             **({"method": made["autofocus_method"]} if "autofocus_method" in made else {}),
-            "accepted": told["accepted"],
-            "why": told["why"],
-            **{name: told["report"][name] for name in _QUOTED if name in told["report"]},
+            "accepted": attrs["accepted"],
+            "why": attrs["why"],
+            **{name: attrs["report"][name] for name in _QUOTED if name in attrs["report"]},
             **({} if self.correction is None else _sizes_cm(self.correction, pair)),
         }
 

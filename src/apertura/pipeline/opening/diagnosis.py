@@ -16,10 +16,10 @@ from apertura.core.geometry.aperture import Aperture
 from apertura.core.imaging.range_profiles import aperture_of, phase_history_of
 from apertura.pipeline.opening.acquisition import Acquisition
 
-# ---- What may be wrong with a flight, as geometries to try: each suspicion with the echoes as they would be then
+# ---- Hypotheses of what is wrong with a flight, each with its echoes ------------------------------------------------
 
 MOST_PULSES = 512
-"""Pulses of a pair that suspicions are tried on, evenly spread."""
+"""Pulses of a pair on which hypotheses are tried, evenly spread."""
 
 _SHIFTS_S = (18.0, 37.0, 19.0, 17.0, 5.0, 3.0, 2.0, 1.0, 0.7, 0.5, 0.3, 0.2, 0.1, 0.05)
 _HEIGHTS_M = (50.0, 47.0, 20.0, 10.0, 5.0, 2.0, 1.0, 0.5)
@@ -58,19 +58,19 @@ class PairGeometry:
 
 
 @dataclass(frozen=True)
-class Suspicion:
-    """One thing that may be wrong.
+class Hypothesis:
+    """One possible error of the campaign.
 
     Attributes
     ----------
     what
-        Said of the campaign: 'the times of the log of uav1 are 18.00 s late: GPST taken for UTC?'.
+        Line for the reader: 'the times of the log of uav1 are 18.00 s late: GPST taken for UTC?'.
     kind
-        Short name.
+        Short name of its kind.
     histories
-        The echoes of the flight's pairs if it is true.
+        Echoes of the flight's pairs if it is true.
     height_m
-        By which the ground is higher.
+        Rise of the ground, metres.
     """
 
     what: str
@@ -80,14 +80,14 @@ class Suspicion:
 
 
 def evidence_of(nodes: Mapping[str, Acquisition], pair: str, echo: xr.Dataset, window: str) -> PairGeometry:
-    """Return the echo of a pair, weighted by a window, as evidence; give it `some_pulses`."""
+    """Return the echo of a pair, weighted by a window, with its geometry; give it `some_pulses`."""
     tx, rx = (nodes[name] for name in pair.split("-"))
     time = echo.time.values
     return PairGeometry(pair, phase_history_of(echo, window), time, _sidelink_m(tx, rx, time))
 
 
-def seen_from(nodes: Mapping[str, Acquisition], found: Sequence[PairGeometry]) -> list[PairGeometry]:
-    """Return the same echoes with antennas, and sidelinks given back, where other logs of their nodes put them."""
+def moved_evidence(nodes: Mapping[str, Acquisition], found: Sequence[PairGeometry]) -> list[PairGeometry]:
+    """Return the same echoes with antennas and sidelink lengths from other logs of their nodes."""
     moved = []
     for one, history in zip(found, _flown(nodes, found), strict=True):
         tx, rx = (nodes[name] for name in one.pair.split("-"))
@@ -96,12 +96,12 @@ def seen_from(nodes: Mapping[str, Acquisition], found: Sequence[PairGeometry]) -
 
 
 def some_pulses(echo: xr.Dataset) -> slice:
-    """Return the pulses of an echo that suspicions are tried on."""
+    """Return the pulses of an echo on which hypotheses are tried."""
     return aperture_of(echo).sample(MOST_PULSES)
 
 
-def suspicions(nodes: Mapping[str, Acquisition], found: Sequence[PairGeometry]) -> Iterator[Suspicion]:
-    """Yield everything that is worth a try on a flight, the likeliest first; what its logs cannot tell is left out.
+def hypotheses_of(nodes: Mapping[str, Acquisition], found: Sequence[PairGeometry]) -> Iterator[Hypothesis]:
+    """Yield all hypotheses on a flight, the likeliest first; those that its logs do not cover are left out.
 
     Parameters
     ----------
@@ -119,11 +119,11 @@ def suspicions(nodes: Mapping[str, Acquisition], found: Sequence[PairGeometry]) 
     yield from _swapped_tracks(nodes, found)
     for height_m in (sign * size for size in _HEIGHTS_M for sign in (1, -1)):
         what = f"the ground lies {height_m:+.1f} m from where the config has it: another datum?"
-        yield Suspicion(what, "height", tuple(one.history for one in found), height_m)
+        yield Hypothesis(what, "height", tuple(one.history for one in found), height_m)
     yield from _longer_paths(nodes, found)
 
 
-def _shifted_logs(nodes: Mapping[str, Acquisition], found: Sequence[PairGeometry]) -> Iterator[Suspicion]:
+def _shifted_logs(nodes: Mapping[str, Acquisition], found: Sequence[PairGeometry]) -> Iterator[Hypothesis]:
     groups = [*((name,) for name in nodes), *([tuple(nodes)] if len(nodes) > 1 else [])]
     for shift_s in (sign * size for size in _SHIFTS_S for sign in (-1, 1)):
         for group in groups:
@@ -131,10 +131,10 @@ def _shifted_logs(nodes: Mapping[str, Acquisition], found: Sequence[PairGeometry
             late = f"{abs(shift_s):.2f} s {'late' if shift_s > 0 else 'early'}{_TIME_SYSTEMS.get(shift_s, '')}"
             histories = _flown(nodes, found, shift_s=dict.fromkeys(group, shift_s))
             if histories:
-                yield Suspicion(f"the times of {who} are {late}", "time", histories)
+                yield Hypothesis(f"the times of {who} are {late}", "time", histories)
 
 
-def _other_arms(nodes: Mapping[str, Acquisition], found: Sequence[PairGeometry]) -> Iterator[Suspicion]:
+def _other_arms(nodes: Mapping[str, Acquisition], found: Sequence[PairGeometry]) -> Iterator[Hypothesis]:
     for name, node in nodes.items():
         arms = {point: np.array(getattr(node.settings.lever_arms_m, point)) for point in _POINTS}
         if not any(arm.any() for arm in arms.values()):
@@ -145,7 +145,7 @@ def _other_arms(nodes: Mapping[str, Acquisition], found: Sequence[PairGeometry])
                 turned = {point: tuple(arm * flip) for point, arm in arms.items()}
                 histories = _flown({**nodes, name: _with_arms(node, turned)}, found)
                 if histories:
-                    yield Suspicion(
+                    yield Hypothesis(
                         f"{word} axis of the lever arms of {name} has the other sign", "lever arm", histories
                     )
 
@@ -155,7 +155,7 @@ def _with_arms(node: Acquisition, arms: Mapping[str, tuple[float, ...]]) -> Acqu
     return replace(node, settings=node.settings.model_copy(update={"lever_arms_m": lever_arms}))
 
 
-def _swapped_tracks(nodes: Mapping[str, Acquisition], found: Sequence[PairGeometry]) -> Iterator[Suspicion]:
+def _swapped_tracks(nodes: Mapping[str, Acquisition], found: Sequence[PairGeometry]) -> Iterator[Hypothesis]:
     names = list(nodes)
     for i, first in enumerate(names):
         for second in names[i + 1 :]:
@@ -166,11 +166,11 @@ def _swapped_tracks(nodes: Mapping[str, Acquisition], found: Sequence[PairGeomet
             }
             histories = _flown(swapped, found)
             if histories:
-                yield Suspicion(f"the tracks of {first} and {second} are swapped", "tracks swapped", histories)
+                yield Hypothesis(f"the tracks of {first} and {second} are swapped", "tracks swapped", histories)
 
 
 def _placed(node: Acquisition, other: Acquisition) -> Acquisition:
-    """Return a node at the positions of another, turned as its own log says."""
+    """Return a node at the positions of another, with its own attitude."""
     at = node.log_seconds(other.track.time.values)
     own = node.log_seconds(node.track.time.values)
     turned = np.unwrap(node.track.attitude.values, axis=0)
@@ -178,7 +178,7 @@ def _placed(node: Acquisition, other: Acquisition) -> Acquisition:
     return replace(node, track=other.track.assign(attitude=(("epoch", "axis"), attitude)))
 
 
-def _longer_paths(nodes: Mapping[str, Acquisition], found: Sequence[PairGeometry]) -> Iterator[Suspicion]:
+def _longer_paths(nodes: Mapping[str, Acquisition], found: Sequence[PairGeometry]) -> Iterator[Hypothesis]:
     for place, one in enumerate(found):
         tx, rx = one.pair.split("-")
         cell_m = SPEED_OF_LIGHT_M_S / nodes[tx].numerology.sample_rate_hz
@@ -190,7 +190,7 @@ def _longer_paths(nodes: Mapping[str, Acquisition], found: Sequence[PairGeometry
             what = f"{what}: captures begin {count} from {begin}?" if count else f"{what}: a path offset?"
             histories = [other.history for other in found]
             histories[place] = _delayed(one.history, -path_m)
-            yield Suspicion(what, "prefix" if count else "range", tuple(histories))
+            yield Hypothesis(what, "prefix" if count else "range", tuple(histories))
 
 
 def _flown(
@@ -219,7 +219,7 @@ def _sidelink_m(tx: Acquisition, rx: Acquisition, tx_at: Times, rx_at: Times | N
 
 
 def _delayed(history: PhaseHistory, path_m: Any) -> PhaseHistory:
-    """Return an echo whose paths are longer than they were taken for."""
+    """Return an echo over paths that are longer by `path_m`."""
     return replace(history, reference_delay_s=history.reference_delay_s + path_m / SPEED_OF_LIGHT_M_S)
 
 

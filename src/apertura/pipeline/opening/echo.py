@@ -1,4 +1,4 @@
-"""The echo of a pair from what its nodes recorded: which pulses, from where, and how their transfer functions form."""
+"""The echo of a pair from the recordings of its nodes: pulses, positions, transfer functions."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -27,12 +27,12 @@ from apertura.pipeline.opening.transmitted import Transmitted
 
 @dataclass(frozen=True, eq=False)
 class PairEcho:
-    """The echo of a pair, whose transfer functions are formed when they are asked for, block by block.
+    """The echo of a pair, whose transfer functions are formed lazily, block by block.
 
     Attributes
     ----------
     dataset
-        The stage without `transfer`, and with `row` (pulse,): what `form` calls each pulse.
+        The stage without `transfer`, and with `row` (pulse,): index of each pulse for `form`.
     form
         Rows (pulse,) int64, ascending → transfer functions of a few pulses, (pulse, subcarrier) complex64.
     saturation
@@ -45,7 +45,7 @@ class PairEcho:
 
     @classmethod
     def recorded(cls, echo: xr.Dataset) -> "PairEcho":
-        """Return the echo of a recorder that hands over transfer functions."""
+        """Return the echo of a recorder that stores transfer functions."""
         history = echo.transfer
 
         def form(rows: Pulses) -> Complexes:
@@ -85,11 +85,11 @@ def pair_echo(
     processing: Processing,
     calibration: dict[str, Any] | None,
 ) -> PairEcho:
-    """Return the echo of a pair from what its nodes recorded; path offsets are the calibration's, or the config's."""
+    """Return the echo of a pair from its nodes' recordings; path offsets are the calibration's, or the config's."""
     pulses = common_pulses(tx, rx, prf_hz=sent.waveform.prf_hz)
     paired = np.flatnonzero(~pulses.outlier)
-    placed = place(tx, rx, tx.raw.time.values[pulses.tx_index[paired]])
-    paired = paired[placed.good]
+    positions = place(tx, rx, tx.raw.time.values[pulses.tx_index[paired]])
+    paired = paired[positions.good]
     at = tx.raw.time.values[pulses.tx_index[paired]]
     measured, sidelink_m = _transfer((tx, rx), pulses.rx_index[paired], at, sent, processing)
     at = at[measured.kept]
@@ -114,7 +114,7 @@ def pair_echo(
             **_axes((tx, rx), at),
             **_sidelink_vector((tx, rx), at),
         },
-        attrs=_attributes((tx, rx), pulses, placed, measured, at=at, calibration=calibration)
+        attrs=_attributes((tx, rx), pulses, positions, measured, at=at, calibration=calibration)
         | {"stated_offset_m": offset_m},
     )
     return PairEcho(dataset, form, measured.saturation)
@@ -123,24 +123,24 @@ def pair_echo(
 def _attributes(
     nodes: tuple[Acquisition, Acquisition],
     pulses: Association,
-    placed: PulsePositions,
+    positions: PulsePositions,
     measured: Transfer,
     *,
     at: Times,
     calibration: dict[str, Any] | None,
 ) -> dict[str, Any]:
-    """Return what was found on the way to the pulses used, those sent `at`: edges crossed, pulses left out."""
+    """Return the attributes of an echo whose pulses were sent `at`: flags, counts of pulses left out, reports."""
     missing = missing_flags(at.astype("datetime64[ns]").astype(np.int64))
     attrs = {
         "frame": "ecef",
         "pair": "-".join(node.name for node in nodes),
         **measured.report,
-        "positions": placed.report,
+        "positions": positions.report,
         "time_tags": _time_tags(nodes[0], pulses),
         "flags": Flags.merged(
-            pulses.flags, placed.flags, measured.flags, missing, calibration["flags"] if calibration else {}
+            pulses.flags, positions.flags, measured.flags, missing, calibration["flags"] if calibration else {}
         ),
-        "pulses": _counted(len(nodes[0].raw.time), pulses, placed, measured),
+        "pulses": _counted(len(nodes[0].raw.time), pulses, positions, measured),
     }
     if calibration:
         attrs["calibration"] = {name: calibration[name] for name in ("flight", "offset_m", "std_m")}
@@ -154,9 +154,9 @@ def _transfer(
     sent: Transmitted,
     processing: Processing,
 ) -> tuple[Transfer, NDArray[np.float64]]:
-    """Return what some captures, sent `at` the transmitter's tags, measured, and the sidelink's length (m); 0 without.
+    """Return the transfer functions of captures, sent `at` the transmitter's tags, and sidelink lengths (m); 0 without.
 
-    Both of its ends are where the logs put them at the transmitter's tag (docs/theory.md, "Geometry").
+    Both of its ends are taken from the logs at the transmitter's tag (docs/theory.md, "Geometry").
     """
     tx, rx = nodes
     if tx.name == rx.name:
@@ -191,11 +191,11 @@ def _of_what_was_sent(measured: Transfer, sent: Transmitted) -> Transfer:
     """Return what captures measured, with what was decided of the waveform, and whether they hold it whole."""
     flags, waveform = dict(sent.flags), sent.waveform
     if measured.report.get("sidelink", {}).get("method") in DIVIDING:
-        flags.pop("waveform_sidelobes", None)  # whatever the pulse is like, it is in both channels
+        flags.pop("waveform_sidelobes", None)  # the pulse cancels: it is in both channels
     if isinstance(waveform, PulseWaveform) and measured.sidelink_delay_m is not None:
-        held = {name: getattr(waveform, name) for name in ("lead_s", "pulse_s", "listen_s")}
+        window = {name: getattr(waveform, name) for name in ("lead_s", "pulse_s", "listen_s")}
         cell_s = 1 / (sent.numerology.numbers.size * sent.numerology.spacing_hz)
-        cut = cut_pulses(measured.sidelink_delay_m / SPEED_OF_LIGHT_M_S, cell_s=cell_s, **held)
+        cut = cut_pulses(measured.sidelink_delay_m / SPEED_OF_LIGHT_M_S, cell_s=cell_s, **window)
         flags = Flags.merged(flags, cut)
     report = {**measured.report, **({"waveform": sent.report} if sent.report else {})}
     return replace(measured, flags=Flags.merged(measured.flags, flags), report=report)
@@ -210,13 +210,13 @@ def _time_tags(tx: Acquisition, pulses: Association) -> dict[str, Any]:
     }
 
 
-def _counted(sent: int, pulses: Association, placed: PulsePositions, measured: Transfer) -> dict[str, Any]:
+def _counted(sent: int, pulses: Association, positions: PulsePositions, measured: Transfer) -> dict[str, Any]:
     """Return how many of the pulses sent are used, how many not, and why."""
     used = int(measured.kept.sum())
     reasons = {
         "unpaired": pulses.tx_dropped,
         "time_tag_outlier": int(pulses.outlier.sum()),
-        **placed.reasons,
+        **positions.reasons,
         "sidelink_lost": int((~measured.kept).sum()),
     }
     return {"used": used, "dropped": sent - used, "reasons": {why: count for why, count in reasons.items() if count}}

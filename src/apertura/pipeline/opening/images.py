@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
 
-# ---- A layer of a pair, opened as the workflow left it; any raster, read to few places -----------------------------
+# ---- Layers of a pair; rasters read at a few places -----------------------------------------------------------------
 
 
 @contextmanager
@@ -70,13 +70,13 @@ def averaged(raster: Any, dots: int) -> NDArray[np.float32]:
     return values
 
 
-# ---- How two finished images of a campaign agree, by the bright points that each found in itself -------------------
+# ---- Agreement of two images by their bright points -----------------------------------------------------------------
 
 
 def agreement_of(first: "xr.Dataset", second: "xr.Dataset", grid: SceneGrid) -> Agreement | None:
     """Return how a second stage `image` lies against a first; None where they share no bright point.
 
-    None as well where pixels are wider than a resolution cell: they do not tell where a point is.
+    None as well where pixels are wider than a resolution cell: they do not resolve the place of a point.
     """
     if not comparable(first, second, grid):
         return None
@@ -86,7 +86,7 @@ def agreement_of(first: "xr.Dataset", second: "xr.Dataset", grid: SceneGrid) -> 
 def agreement_by_focus(
     images: tuple[BlockRaster, BlockRaster], focus: tuple[Mapping[str, Any], Mapping[str, Any]], grid: SceneGrid
 ) -> Agreement | None:
-    """Return how two images on a grid agree, by what `apertura.core.imaging.focus_check.focus_report` says of each."""
+    """Return the agreement of two images on a grid, by `apertura.core.imaging.focus_check.focus_report` of each."""
     return agreement(
         images,
         (_points(focus[0], grid), _points(focus[1], grid)),
@@ -98,7 +98,7 @@ def agreement_by_focus(
 
 
 def comparable(first: "xr.Dataset", second: "xr.Dataset", grid: SceneGrid) -> bool:
-    """Return whether the pixels of two images are fine enough to tell where their points are."""
+    """Return whether the pixels of two images are fine enough to compare the places of points."""
     return bool(grid.spacing_m <= min(_focus(image)["cell_m"] for image in (first, second)))
 
 

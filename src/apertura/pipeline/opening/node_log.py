@@ -20,7 +20,7 @@ from apertura.pipeline.opening.reading import read_log
 
 @dataclass(frozen=True)
 class NodeLog:
-    """A node's log in one flight, and what the config says of the node.
+    """A node's log in one flight, with the node's settings.
 
     Attributes
     ----------
@@ -31,7 +31,7 @@ class NodeLog:
     log
         Its file, for messages.
     shortest_wave_m
-        What errors between epochs are held against.
+        Wavelength of the highest frequency, metres: errors between epochs are compared with it.
     """
 
     name: str
@@ -42,7 +42,7 @@ class NodeLog:
 
     @cached_property
     def checked(self) -> CheckedTrack:
-        """What may be used of the log: errors of λ/16 between its epochs are borne."""
+        """Epochs of the log that may be used: errors up to λ/16 between epochs are tolerated."""
         poor = np.zeros(self.track.sizes["epoch"], bool)
         if "fix" in self.track:
             poor = poorer_fix(self.track.fix.values, self.settings.worst_fix)
@@ -76,7 +76,7 @@ class NodeLog:
 
     @cached_property
     def smoothing_residual_m(self) -> float | None:
-        """RMS of what smoothing takes off the sound epochs, in one axis, metres; None where none is asked."""
+        """RMS change of the valid epochs by smoothing, in one axis, metres; None without smoothing."""
         if self.settings.log.smoothing_m is None:
             return None
         times, position, _ = self._sound

@@ -1,4 +1,4 @@
-"""A pair, opened once: its pulses, its antennas' beams, its echo, or what the flight logs promise of it."""
+"""A pair, opened once: pulses, beams and echo, or before that is formed its geometry from the flight logs."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -35,7 +35,7 @@ from apertura.pipeline.opening.scene import Flown, OpenScene
 from apertura.pipeline.opening.transmitted import transmitted
 from apertura.pipeline.store import manifest_of, open_stage
 
-# ---- Antennas of a pair: from what the config states of them to the beams that weigh its pulses --------------------
+# ---- Antennas of a pair: from the config to the beams that weigh pulses ---------------------------------------------
 
 _STAGED = {"radar_tx": "tx_axes", "radar_rx": "rx_axes"}
 _POINTS = 33
@@ -86,21 +86,21 @@ def _beam(antenna: Antenna, pattern: Path | None, axes: NDArray[np.float64]) -> 
 
 
 def antennas_report(campaign: Campaign, pair: str, illumination: Illumination | None) -> dict[str, Any]:
-    """Return what image.json says of a pair's antennas: what was stated, and how many pulses see the scene."""
+    """Return the antennas of a pair for image.json: as stated, and how many pulses illuminate the scene."""
     stated = {point: {"node": node, **beam.model_dump()} for point, (node, beam) in campaign.antennas(pair).items()}
     if illumination is None or not stated:
         return {}
     return {"antennas": {**stated, "pulses_seeing": {**illumination.counts, "of": illumination.pulses}}}
 
 
-def lit(
+def scene_illumination(
     campaign: Campaign,
     pair: str,
     beams: Beams | None,
     scene: OpenScene,
     aperture: Aperture,
 ) -> Illumination | None:
-    """Return how many pulses see each point of the scene; None without beams.
+    """Return how many pulses illuminate points of the scene; None without beams.
 
     Parameters
     ----------
@@ -116,7 +116,7 @@ def lit(
     Raises
     ------
     CampaignError
-        If no pulse sees anything of the scene.
+        If no pulse illuminates any point of the scene.
     """
     if beams is None:
         return None
@@ -153,13 +153,13 @@ def _refuse(
     raise CampaignError(
         f"zero pulses in the beam: the middle of the scene lies {'; and '.join(lines)}",
         where=f"config/config.yaml: {', '.join(keys)}",
-        expected="a scene that both antennas of some pulse see",
+        expected="a scene that both antennas illuminate in some pulse",
         remedy="Check boresight_deg (azimuth clockwise from forward: right is +90; elevation: down is negative), the "
         "log's yaw (clockwise from north) and scene.bounds_m.",
     )
 
 
-# ---- The echo of a recorder that hands over transfer functions, as it lies in raw/; its positions may lie in a log
+# ---- Echo of a recorder of transfer functions, and its positions ----------------------------------------------------
 
 
 def recorded_echo(campaign: Campaign, flight: str, pair: str) -> xr.Dataset:
@@ -241,7 +241,7 @@ def _placed_by_logs(campaign: Campaign, flight: str, nodes: tuple[str, str], his
     )
 
 
-# ---- A pair, opened once: from its echo, or before that is formed from what the flight logs promise ----------------
+# ---- A pair, opened from its echo, or before that from the flight logs ----------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -274,7 +274,7 @@ class OpenPair:
     left
         What is left of errors of position after the tracks were refined; None where they are those of the logs.
     report
-        What the echo stage says of itself: its attributes; empty before it is formed.
+        Attributes of stage echo; empty before it is formed.
     """
 
     flight: str
@@ -305,7 +305,7 @@ class OpenPair:
 
 
 def open_pair(campaign: Campaign, flight: str, pair: str, *, echo: xr.Dataset | None = None) -> OpenPair:
-    """Return what is known of a pair: `echo`, its stage as far as it is formed, or what the logs promise."""
+    """Return an open pair from `echo`, its stage as far as it is formed, or from the logs."""
     waveform = campaign.settings.waveform
     if echo is None and manifest_of(campaign.stage("echo", flight, pair)).is_file():
         echo = open_stage(campaign.stage("echo", flight, pair), "echo")
@@ -335,7 +335,7 @@ def open_pair(campaign: Campaign, flight: str, pair: str, *, echo: xr.Dataset | 
 
 
 def _expected(campaign: Campaign, flight: str, pair: str, waveform: SampledWaveform) -> OpenPair:
-    """Return what the logs promise: the transmitter's pulses, as far as every log reaches."""
+    """Return the pair expected from the logs: the transmitter's pulses within all logs."""
     frequency = transmitted(campaign, waveform).numerology.frequency_hz
     tx, rx = (raw_log(campaign, flight, node, shortest_wave(frequency)) for node in pair.split("-"))
     first = max(log.track.time.values[0] for log in (tx, rx))
@@ -385,7 +385,7 @@ def _legs(pair: str) -> tuple[str, ...]:
 
 
 def _positions(stated: Mapping[str, Any]) -> NodePositions:
-    """Return what an echo stage says of a node's positions; its deviations are north, east, up."""
+    """Return the position errors of a node stated in an echo stage, whose deviations are north, east, up."""
     std = stated.get("std_m")
     axes = None if std is None else (float(std[1]), float(std[0]), float(std[2]))
     return NodePositions(

@@ -24,11 +24,11 @@ from apertura.core.scene.clearance import check_antennas
 from apertura.core.scene.terrain import GroundModels
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import CONFIG, SampledWaveform
-from apertura.pipeline.opening.pair import OpenPair, lit
+from apertura.pipeline.opening.pair import OpenPair, scene_illumination
 from apertura.pipeline.opening.scene import OpenScene
 from apertura.pipeline.store import manifest_of
 
-# ---- The error budget of a pair: what the config, the logs and the echo say of each cause, before and after imaging
+# ---- Error budget of a pair, from config, logs and echo -------------------------------------------------------------
 
 _MS, _CM, _PPM = 1e-3, 1e-2, 1e-6
 
@@ -39,7 +39,7 @@ def budget_of(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> list[Budg
     Parameters
     ----------
     campaign, pair, scene
-        What is known; before the echo is formed, what the config and the logs say.
+        Settings, pair and ground; before the echo is formed, by the config and the logs.
 
     Notes
     -----
@@ -105,7 +105,7 @@ def _positions(campaign: Campaign, pair: OpenPair, paths: PointPaths) -> list[Bu
 
 
 def _between_epochs(paths: PointPaths, pair: OpenPair) -> list[BudgetLine]:
-    """Return what the spline between the epochs of the logs errs by: noise that lasts an epoch."""
+    """Return the error of the spline between epochs of the logs: noise of one epoch's correlation time."""
     stated = pair.report.get("positions", {})
     errors = [stated.get(leg, {}).get("interpolation_m") for leg in ("tx", "rx")[: len(pair.positions)]]
     if any(error is None for error in errors):
@@ -117,7 +117,7 @@ def _between_epochs(paths: PointPaths, pair: OpenPair) -> list[BudgetLine]:
 
 
 def arithmetic_line(error_db: float) -> BudgetLine:
-    """Return what the numerical error measured costs."""
+    """Return the loss by the measured numerical error."""
     return BudgetLine(
         "arithmetic", f"{error_db:.1f} dB measured", Effect(10 * np.log10(1 - 10 ** (error_db / 10)), 0, 0)
     )
@@ -163,7 +163,7 @@ def _sidelink(report: Mapping[str, Any], *, subcarriers: int) -> list[BudgetLine
     ]
 
 
-# ---- How each pair of a campaign will be imaged: from its echo, or from the flight logs before anything ran --------
+# ---- Plan of each pair, from its echo or before that from the flight logs -------------------------------------------
 
 
 def plan_pair(campaign: Campaign, pair: OpenPair, scene: OpenScene, *, threads: int = 1) -> Plan:
@@ -172,9 +172,9 @@ def plan_pair(campaign: Campaign, pair: OpenPair, scene: OpenScene, *, threads: 
     Parameters
     ----------
     campaign
-        Whose config asks.
+        With its settings.
     pair, scene
-        What is known of the pair, and the campaign's grid and ground.
+        The open pair, and the campaign's grid and ground.
     threads
         Tiles formed at once: for seconds and bytes; nothing is chosen by it.
 
@@ -185,7 +185,7 @@ def plan_pair(campaign: Campaign, pair: OpenPair, scene: OpenScene, *, threads: 
     """
     where = f"flight {pair.flight}, pair {pair.name}"
     flags = check_antennas(scene.grid, scene.terrain, pair.aperture, where=where)
-    accuracy = asked_accuracy(campaign, pair, scene)
+    accuracy = accuracy_of(campaign, pair, scene)
     plan = plan_job(campaign, job_of(campaign, pair, scene, threads=threads), accuracy_db=float(accuracy.value))
     plan = replace(plan, decisions=(*plan.decisions, accuracy), flags=Flags.merged(flags, plan.flags))
     written = manifest_of(campaign.stage("image", pair.flight, pair.name)).is_file()
@@ -200,11 +200,11 @@ def plan_job(campaign: Campaign, job: Job, *, accuracy_db: float) -> Plan:
     return make_plan(job, accuracy_db=accuracy_db, overrides=overrides, where=f"{CONFIG}: processing")
 
 
-def asked_accuracy(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> Decision:
-    """Return the numerical error to ask for, and why."""
-    asked = campaign.settings.processing.accuracy_db
-    if asked != "auto":
-        return Decision("accuracy_db", asked, "asked for")
+def accuracy_of(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> Decision:
+    """Return the numerical error to request, and why."""
+    requested = campaign.settings.processing.accuracy_db
+    if requested != "auto":
+        return Decision("accuracy_db", requested, "asked for")
     return decide_accuracy(budget_of(campaign, pair, scene))
 
 
@@ -223,7 +223,7 @@ def job_of(campaign: Campaign, pair: OpenPair, scene: OpenScene, *, threads: int
     )
     return replace(
         job,
-        illumination=lit(campaign, pair.name, job.beams, scene, pair.aperture),
+        illumination=scene_illumination(campaign, pair.name, job.beams, scene, pair.aperture),
         tile_px=campaign.settings.processing.tile_px,
         threads=threads,
         path_limit_m=pair.path_limit_m,
@@ -232,12 +232,12 @@ def job_of(campaign: Campaign, pair: OpenPair, scene: OpenScene, *, threads: int
 
 
 def weighing(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> Beams | None:
-    """Return what weighs the pulses of a pair over the scene, antennas and the sector integrated; None where all count.
+    """Return the weights of a pair's pulses over the scene by antennas and sector; None where all count alike.
 
-    As `job_of` settles it, without a look at the echo: what profiles must cover follows from it.
+    As in `job_of`, but without the echo: the ranges that profiles must cover follow from it.
     """
-    centre_hz, asked = centre_frequency(pair.frequency_hz), campaign.settings.processing.integrated
-    settled = settle(pair.aperture, centre_hz, scene.grid, scene.level, antennas=pair.beams, asked=asked)
+    centre_hz, requested = centre_frequency(pair.frequency_hz), campaign.settings.processing.integrated
+    settled = settle(pair.aperture, centre_hz, scene.grid, scene.level, antennas=pair.beams, asked=requested)
     return Beams.within(settled.sector, pair.beams)
 
 
@@ -249,7 +249,7 @@ def check_fits(plan: Plan, *, free_disk: int | None, where: str, memory: int | N
     plan
         Of one pair.
     free_disk
-        Bytes; None: do not ask.
+        Bytes; None: not checked.
     where
         Flight and pair.
     memory

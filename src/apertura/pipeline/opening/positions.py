@@ -15,7 +15,7 @@ from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import SEGMENTS, Node
 from apertura.pipeline.opening.node_log import NodeLog
 
-# ---- Which pulses of a flight image a pair: those inside its lines of segments.tsv ---------------------------------
+# ---- Pulses inside the segments of a pair ---------------------------------------------------------------------------
 
 
 def inside_segments(campaign: Campaign, flight: str, pair: str, times: NDArray[np.datetime64]) -> NDArray[np.bool_]:
@@ -49,10 +49,10 @@ def keep_segments(campaign: Campaign, flight: str, pair: str, echo: xr.Dataset) 
     return echo.isel(pulse=inside).assign_attrs(pulses=counts)
 
 
-# ---- Which pulses of a pair have positions that can be trusted, and how well they are known ------------------------
+# ---- Pulses of valid positions, and the errors of these -------------------------------------------------------------
 
 _LINES = {
-    "fix_poor": "the log's solution is poorer than {asked}",
+    "fix_poor": "the log's solution is poorer than {poorest_fix}",
     "track_gap": "no epochs",
     "track_outlier": "outliers or steps of the log",
     "track_frozen": "epochs that repeat the position before them",
@@ -62,7 +62,7 @@ _LINES = {
 
 @dataclass(frozen=True, eq=False)
 class PulsePositions:
-    """What the logs say of a pair's pulses.
+    """Validity of the positions of a pair's pulses.
 
     Attributes
     ----------
@@ -108,18 +108,18 @@ def place(tx: NodeLog, rx: NodeLog, at: Times) -> PulsePositions:
     report = {
         leg: position_error(node.track, node.settings, at[good])
         | {"node": node.name, "interpolation_m": node.checked.interpolation_m}
-        | _told(node)
+        | _log_report(node)
         for leg, node in (("tx", tx), ("rx", rx))
     }
     return PulsePositions(good, {cause: count for cause, count in reasons.items() if count}, flags, report)
 
 
-def _told(node: NodeLog) -> dict[str, Any]:
-    """Return what a person should know of how a log was read and smoothed, where there is something."""
-    told = {"smoothing_residual_m": node.smoothing_residual_m} | {
+def _log_report(node: NodeLog) -> dict[str, Any]:
+    """Return the report on reading and smoothing of a log; empty without remarks."""
+    values = {"smoothing_residual_m": node.smoothing_residual_m} | {
         name: node.track.attrs.get(name) for name in ("source", "remarks")
     }
-    return {name: value for name, value in told.items() if value is not None}
+    return {name: value for name, value in values.items() if value is not None}
 
 
 def position_error(track: xr.Dataset, settings: Node, at: Times) -> dict[str, Any]:
@@ -142,7 +142,7 @@ def position_error(track: xr.Dataset, settings: Node, at: Times) -> dict[str, An
 
 
 def stated_error(settings: Node) -> dict[str, Any]:
-    """Return what the config says of the error of a node's positions, as `position_error`."""
+    """Return the error of a node's positions stated in the config, as `position_error`."""
     stated = settings.position_std_m
     std_m = None if stated is None else np.broadcast_to(stated, 3).tolist()
     stated_by = "nobody" if stated is None else "config"
@@ -155,7 +155,7 @@ def stated_error(settings: Node) -> dict[str, Any]:
 
 
 def _flags(node: NodeLog, at: Times, barred: dict[str, NDArray[np.bool_]]) -> dict[str, str]:
-    """Return what of a node's log touches its pulses: flag → one line."""
+    """Return the faults of a node's log that affect its pulses: flag → one line."""
     checked, lines = node.checked, {}
     begin, end = node.log_seconds(at[[0, -1]]) + np.array([-1.0, 1.0]) * 2 * node.interval_s
     for name, what in _LINES.items():
@@ -165,8 +165,8 @@ def _flags(node: NodeLog, at: Times, barred: dict[str, NDArray[np.bool_]]) -> di
             continue
         worst = f"; {len(faults)} found, worst {_worst(node, faults)}" if faults else ""
         longest = _longest(node, checked, name) if out else ""
-        asked = what.format(asked=node.settings.poorest_fix)
-        lines[name] = f"{node.name}: {out} of {len(at)} pulses left out: {asked}{longest}{worst}"
+        reason = what.format(poorest_fix=node.settings.poorest_fix)
+        lines[name] = f"{node.name}: {out} of {len(at)} pulses left out: {reason}{longest}{worst}"
     if node.track.attrs["dropped"]:
         counted = ", ".join(f"{count} {why}" for why, count in node.track.attrs["dropped"].items())
         lines["track_epochs_dropped"] = f"{node.name}: epochs of the log left out: {counted}"

@@ -1,4 +1,4 @@
-"""What lies in raw/ of a campaign, read as its config says: flight logs and phase histories."""
+"""Flight logs and phase histories of raw/, read by the settings of a campaign."""
 
 from typing import TYPE_CHECKING
 
@@ -16,7 +16,7 @@ def read_log(campaign: Campaign, flight: str, node: str) -> "xr.Dataset":
 
 
 def read_history(campaign: Campaign, flight: str, node: str, *, pair: str) -> "xr.Dataset":
-    """Return the phase history that a node of a pair recorded, as its format and the config say."""
+    """Return the phase history recorded by a node of a pair, by its format and the config."""
     described = campaign.settings.waveform.model_dump()
     files = campaign.history_files(flight, node)
     return read_phase_history(described["format"], files, pair=pair, described=described)

@@ -1,4 +1,4 @@
-"""A campaign from Python: its flights and pairs, and what the workflow made of them, by name."""
+"""A campaign from Python: its flights, pairs and results, by name."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ _OF_THE_CAMPAIGN = {"cube", "terrain"}
 
 @dataclass(frozen=True)
 class OpenCampaign:
-    """A validated campaign folder with its results; everything is read when it is asked for.
+    """A validated campaign folder with its results; everything is read on first use.
 
     Attributes
     ----------
@@ -133,7 +133,7 @@ def open_campaign(path: str | Path) -> OpenCampaign:
 
 
 def assessment_of(campaign: Campaign, flight: str) -> dict[str, Any]:
-    """Return what step `assess` wrote of a flight: how its images agree, their flags, what the coherent sum holds.
+    """Return the assessment of a flight: agreement of its images, their flags, members of the coherent sum.
 
     Raises
     ------

@@ -26,19 +26,19 @@ from apertura.pipeline.config import Scene
 from apertura.pipeline.config.section import plain_crs
 from apertura.pipeline.store import manifest_of, open_array, open_document, open_stage, remake
 
-# ---- The ground under a scene as the config states it: flat at a height, or a DEM, and the files that takes --------
+# ---- Ground of the config: flat at a height, or a DEM ---------------------------------------------------------------
 
 _BLOCKS = 32
 
 
 @dataclass(frozen=True)
 class ConfiguredGround:
-    """What the config says of the ground: flat at a height, or a DEM; and the files that takes.
+    """Ground stated in the config: flat at a height, or a DEM; and the files that it needs.
 
     Attributes
     ----------
     flat_m
-        Height of flat ground above what `height_datum` says.
+        Height of flat ground above `height_datum`, metres.
     dem
         The DEM; None: flat ground.
     geoid
@@ -53,14 +53,14 @@ class ConfiguredGround:
     crs: str
 
     @classmethod
-    def of(cls, asked: Scene, files: Mapping[str, Path], *, crs: str) -> "ConfiguredGround":
+    def of(cls, requested: Scene, files: Mapping[str, Path], *, crs: str) -> "ConfiguredGround":
         """Open what section `scene` names; `files` are those of `Campaign.height_files`."""
         named = files.get("geoid")
-        if asked.dem and asked.dem_datum:
-            dem = open_dem(files["dem"], crs, datum=asked.dem_datum, geoid=named)
-            return cls(asked.height_m, dem, None, crs)
-        geoid = None if asked.height_datum == "ellipsoid" else geoid_file(asked.height_datum, named)
-        return cls(asked.height_m, None, geoid, crs)
+        if requested.dem and requested.dem_datum:
+            dem = open_dem(files["dem"], crs, datum=requested.dem_datum, geoid=named)
+            return cls(requested.height_m, dem, None, crs)
+        geoid = None if requested.height_datum == "ellipsoid" else geoid_file(requested.height_datum, named)
+        return cls(requested.height_m, None, geoid, crs)
 
     @property
     def inputs(self) -> dict[str, str]:
@@ -109,7 +109,7 @@ class ConfiguredGround:
         return {"height_m": "height_m and the undulation at the scene's middle"} if self.geoid else {}
 
 
-# ---- A campaign's grid and the ground under it, opened together: from the results, or as they will be --------------
+# ---- Grid and ground of a campaign, from its results or its config --------------------------------------------------
 
 _FARTHEST_M = 1e9
 
@@ -196,12 +196,12 @@ class OpenScene:
 
     @property
     def report(self) -> dict[str, Any]:
-        """What image.json says of the terrain; nothing of flat ground."""
+        """Terrain for image.json; empty for flat ground."""
         return {"terrain": self.parents[0].attrs["terrain"]} if self.parents else {}
 
 
 def settled_scene(campaign: Campaign) -> OpenScene:
-    """Return what results/scene.json settled, on level ground: whoever needs the ground itself opens the scene.
+    """Return the scene of results/scene.json on level ground; `open_scene` also opens the ground itself.
 
     Raises
     ------
@@ -242,48 +242,51 @@ def open_scene(campaign: Campaign) -> OpenScene:
 
 
 def expected_scene(campaign: Campaign, flown: Callable[[], Flown]) -> OpenScene:
-    """Return the scene as `open_scene`, or what it will be; voids of a DEM are refused here as they will be.
+    """Return the scene as `open_scene`, or before that as planned; voids of a DEM are rejected here too.
 
-    `flown` gives what the first image flight flew; asked only where something is `auto`.
+    `flown` gives the apertures of the first image flight; needed only where something is `auto`.
     """
-    asked = campaign.settings.scene
-    if "auto" in {asked.crs, asked.bounds_m, asked.spacing_m} and manifest_of(campaign.result("scene.json")).is_file():
+    requested = campaign.settings.scene
+    if (
+        "auto" in {requested.crs, requested.bounds_m, requested.spacing_m}
+        and manifest_of(campaign.result("scene.json")).is_file()
+    ):
         scene = settled_scene(campaign)
     else:
         grid, ground, chosen = settled(campaign, flown)
         level = ground.level(grid)
         scene = OpenScene(grid, level, level, (), ground.inputs, chosen)
-    if asked.dem is None:
+    if requested.dem is None:
         return scene
     if manifest_of(campaign.stage("terrain")).is_file():
         return open_scene(campaign)
-    dem = ConfiguredGround.of(asked, campaign.height_files(), crs=scene.grid.crs).dem
+    dem = ConfiguredGround.of(requested, campaign.height_files(), crs=scene.grid.crs).dem
     return replace(scene, terrain=UncheckedDem(dem, scene.grid)) if dem else scene
 
 
 def settled(campaign: Campaign, flown: Callable[[], Flown]) -> tuple[SceneGrid, ConfiguredGround, dict[str, str]]:
-    """Return the grid that is asked for, every `auto` settled from a flight; its ground; and why.
+    """Return the requested grid, every `auto` decided from a flight; its ground; and the reasons.
 
     Parameters
     ----------
     campaign
-        Whose config asks.
+        With its settings.
     flown
-        Gives what the first image flight flew; asked only where something is `auto`.
+        Gives the apertures of the first image flight; needed only where something is `auto`.
     """
-    asked, chosen = campaign.settings.scene, {}
-    crs, bounds, spacing = asked.crs, asked.bounds_m, asked.spacing_m
+    requested, chosen = campaign.settings.scene, {}
+    crs, bounds, spacing = requested.crs, requested.bounds_m, requested.spacing_m
     if crs == "auto":
         crs, chosen["crs"] = utm_crs(_middle(flown())), "UTM zone of the first image flight"
-    ground = ConfiguredGround.of(asked, campaign.height_files(), crs=crs)
+    ground = ConfiguredGround.of(requested, campaign.height_files(), crs=crs)
     height_m = None
     if bounds == "auto":
         bounds, height_m = _bounds(flown(), ground)
-        chosen["bounds_m"] = "ground that the first image flight sees well (docs/theory.md, eq. 8)"
+        chosen["bounds_m"] = "ground that the first image flight illuminates well (docs/theory.md, eq. 8)"
     if spacing == "auto":
         spacing = _spacing(flown(), ground, bounds, height_m)
         chosen["spacing_m"] = "a third of the finest resolution cell (docs/theory.md, eq. 8)"
-    if "auto" in {asked.bounds_m, asked.spacing_m}:
+    if "auto" in {requested.bounds_m, requested.spacing_m}:
         bounds = _whole_pixels(bounds, spacing)
     grid = SceneGrid.from_bounds(crs, bounds, spacing_m=spacing, name=campaign.settings.campaign)
     return grid, ground, chosen | ground.reason

@@ -17,7 +17,7 @@ from apertura.formats.recordings.sample_file import SampleFile
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import CONFIG, OfdmWaveform, PulseWaveform, SampledWaveform
 
-# ---- Whether the band of a waveform can be had of real samples -----------------------------------------------------
+# ---- Band limits of real samples ------------------------------------------------------------------------------------
 
 
 def check_mixing(samples: SampleFile, numerology: Numerology, *, where: object) -> None:
@@ -46,7 +46,7 @@ def check_mixing(samples: SampleFile, numerology: Numerology, *, where: object) 
         )
 
 
-# ---- What was transmitted: code symbols or the samples of a pulse, and what was sent before each symbol ------------
+# ---- The transmitted signal: code symbols or samples of a pulse -----------------------------------------------------
 
 MOST_SYMBOLS = 1 << 24
 """Code symbols of a waveform."""
@@ -66,7 +66,7 @@ _LEAST_INSIDE = 0.01  # of the pulse's energy, in the band
 
 @dataclass(frozen=True, eq=False)
 class Transmitted:
-    """What was sent, as the road of an echo takes it: whatever the kind of waveform, nothing after it asks for more.
+    """The transmitted signal as echo processing needs it, for any kind of waveform.
 
     Attributes
     ----------
@@ -75,9 +75,9 @@ class Transmitted:
     numerology
         Grid of the frequencies that echoes are measured at.
     inverse
-        (subcarrier,) complex64 that takes what was sent out of an echo.
+        (subcarrier,) complex64, inverse filter of the transmitted signal.
     report, flags
-        What was decided of it, and edges crossed.
+        Decisions on it, and flags.
     """
 
     waveform: SampledWaveform
@@ -88,12 +88,12 @@ class Transmitted:
 
 
 def transmitted(campaign: Campaign, waveform: SampledWaveform) -> Transmitted:
-    """Return what was transmitted, as a waveform says it of the campaign's file.
+    """Return the transmitted signal, from a waveform and the campaign's file of codes or samples.
 
     Raises
     ------
     CampaignError
-        If the file is missing, or not what the waveform says.
+        If the file is missing or contradicts the waveform.
     """
     if isinstance(waveform, OfdmWaveform):
         inverse = 1 / read_codes(campaign.sent_file, waveform.subcarriers)

@@ -1,4 +1,4 @@
-"""Two images of a campaign, opened to be compared in phase: what each pixel's pulses make of a height."""
+"""Two images of a campaign, opened for an interferogram: sensitivity of each pixel's phase to height."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from apertura.common.errors import CampaignError
 from apertura.core.imaging.range_profiles import aperture_of
 from apertura.core.scene.looks import Looks
 from apertura.methods.interferometry.comparison import AssumedGround
-from apertura.methods.interferometry.heights import Known
+from apertura.methods.interferometry.heights import KnownHeight
 from apertura.methods.interferometry.sensitivity import Legs, Sensitivity, sensitivity
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import CONFIG
@@ -60,11 +60,11 @@ def open_two(campaign: Campaign, name: str, scene: OpenScene) -> TwoImages:
     CampaignError
         If there is no such key, or the two images are of other frequencies.
     """
-    asked = campaign.settings.interferometry
-    if name not in asked.pairs:
-        expected = f"one of {', '.join(asked.pairs) or 'none: no two images are named'}"
+    requested = campaign.settings.interferometry
+    if name not in requested.pairs:
+        expected = f"one of {', '.join(requested.pairs) or 'none: no two images are named'}"
         raise CampaignError(f"no interferogram {name!r}", f"{CONFIG}: interferometry.pairs", expected, "Name it there.")
-    images = asked.images(name)
+    images = requested.images(name)
     bands, legs, looks = [], [], []
     for flight, pair in images:
         echo, profile = (open_stage(campaign.stage(stage, flight, pair), stage) for stage in ("echo", "profile"))
@@ -79,19 +79,19 @@ def open_two(campaign: Campaign, name: str, scene: OpenScene) -> TwoImages:
     first, second = ("/".join(image) for image in images)
     stages = [open_stage(campaign.stage("image", *image), "image") for image in images]
     sensed = _sensed(scene, looks[0], legs, bands[0])
-    plain = np.logical_and(*(_plain(campaign, *image) for image in images))
-    return TwoImages((first, second), (stages[0], stages[1]), _ground(campaign, scene, sensed, plain))
+    visible = np.logical_and(*(_plain(campaign, *image) for image in images))
+    return TwoImages((first, second), (stages[0], stages[1]), _ground(campaign, scene, sensed, visible))
 
 
 def _legs(looks: Looks) -> Legs:
-    """Return where some of the pulses of each node of the lattice were sent from and received, (node, pulse, 3)."""
+    """Return phase centres of some pulses of each node of the lattice, (node, pulse, 3)."""
     pulses = looks.pulses.reshape(-1, looks.pulses.shape[-1])
     tx, rx = (leg[pulses] for leg in looks.aperture.legs)
     return tx, rx
 
 
 def _sensed(scene: OpenScene, looks: Looks, legs: Sequence[Legs], band_hz: tuple[float, float]) -> Sensitivity:
-    """Return the answer to height at every pixel: told at the nodes of the lattice, between them bilinear."""
+    """Return the sensitivity to height at every pixel: computed at nodes of the lattice, bilinear between them."""
     lattice, grid = looks.lattice, scene.grid
     rows, columns = np.meshgrid(*lattice.nodes, indexing="ij")
     places = scene.terrain.positions_at(grid, rows, columns).reshape(-1, 3)
@@ -106,19 +106,19 @@ def _sensed(scene: OpenScene, looks: Looks, legs: Sequence[Legs], band_hz: tuple
 
 
 def _plain(campaign: Campaign, flight: str, pair: str) -> NDArray[np.bool_]:
-    """Return which pixels a pair sees without shadow or layover."""
+    """Return which pixels are visible to a pair, without shadow or layover."""
     with opened_layer(campaign, flight, pair, "mask.tif") as raster:
-        plain: NDArray[np.bool_] = raster.read(1) == 0
-    return plain
+        visible: NDArray[np.bool_] = raster.read(1) == 0
+    return visible
 
 
-def _ground(campaign: Campaign, scene: OpenScene, sensed: Sensitivity, plain: NDArray[np.bool_]) -> AssumedGround:
+def _ground(campaign: Campaign, scene: OpenScene, sensed: Sensitivity, visible: NDArray[np.bool_]) -> AssumedGround:
     """Return what is assumed of the ground, and the points of known height as the images show them."""
     height_m = np.broadcast_to(np.asarray(scene.terrain.heights(scene.grid), np.float64), scene.grid.shape)
     shift_px = np.stack([-sensed.shift[..., 1], sensed.shift[..., 0]], axis=-1) / scene.grid.spacing_m
     points = [point.model_dump() for point in campaign.settings.scene.reference_points]
     known = [one for point in points if (one := _shown(point, scene, sensed, height_m, shift_px)) is not None]
-    return AssumedGround(height_m, plain, sensed, shift_px, known)
+    return AssumedGround(height_m, visible, sensed, shift_px, known)
 
 
 def _shown(
@@ -127,7 +127,7 @@ def _shown(
     sensed: Sensitivity,
     height_m: NDArray[np.float64],
     shift_px: NDArray[np.float64],
-) -> Known | None:
+) -> KnownHeight | None:
     """Return the pixel that shows a point, and the phase that its height makes there; None beside the grid."""
     x_m, y_m, z_m = point["position_m"]
     place = np.array(scene.grid.pixel_of(x_m, y_m))
@@ -139,4 +139,4 @@ def _shown(
         rise = z_m - height_m[row, column]
         pixel = np.round(place - shift_px[row, column] * rise).astype(int)
     phase = sensed.slope[row, column] * rise + sensed.bend[row, column] * rise**2
-    return Known(point["name"], int(row), int(column), float(phase))
+    return KnownHeight(point["name"], int(row), int(column), float(phase))

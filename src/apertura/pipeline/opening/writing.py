@@ -217,7 +217,7 @@ def _starts(recorded: RecordedNode, samples: NDArray[Any], stem: Path) -> NDArra
 
 
 def _times(given: ArrayLike | None, stem: Path, name: str) -> NDArray[np.datetime64]:
-    """Return times as datetime64[ns]; of texts those that say another zone than UTC are refused."""
+    """Return times as datetime64[ns]; texts in another zone than UTC are rejected."""
     times = np.asarray([] if given is None else given).reshape(-1)
     try:
         if times.dtype.kind != "M":
@@ -236,7 +236,7 @@ def _blocks(samples: NDArray[Any]) -> Iterator[NDArray[Any]]:
 
 
 def _check_opens(campaign: Campaign, flights: Mapping[str, RecordedFlight]) -> None:
-    """Raise CampaignError unless what was written is what a run would read."""
+    """Raise CampaignError unless a run would read back the written campaign."""
     for flight in campaign.flights:
         for node in flight.participants:
             recording = open_recording(campaign.recording_files(flight.name, node))

@@ -12,7 +12,7 @@ from pathlib import Path
 from statistics import fmean, median
 
 from apertura.common.errors import CampaignError, shown
-from apertura.common.progress import told_at
+from apertura.common.progress import progress_path
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.lineage import places
 from apertura.pipeline.resources import Resources
@@ -38,7 +38,7 @@ class StepProgress:
     def of(cls, campaign: Campaign, job: JobRecord) -> "StepProgress | None":
         """Return what a job tells; None if nothing."""
         with suppress(CampaignError, OSError, ValueError, KeyError, TypeError):
-            said = json.loads(campaign.result(*told_at(job.step)).read_text("utf-8"))
+            said = json.loads(campaign.result(*progress_path(job.step)).read_text("utf-8"))
             told = cls(shown(said["what"]), int(said["done"]), int(said["total"]), said["since"], said["at"])
             if 0 <= told.done <= told.total and told.total and job.begun_s - 5 <= told.since_s <= told.at_s < LAST_S:
                 return told

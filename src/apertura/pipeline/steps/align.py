@@ -1,4 +1,4 @@
-"""`apertura align`: the clock and the range of a recorder against its flight log, from the echoes themselves."""
+"""`apertura align`: clock offset, drift and path of a recorder against its flight log, from its echoes."""
 
 from decimal import Decimal
 from pathlib import Path
@@ -10,7 +10,7 @@ from apertura.common.paths import inside
 from apertura.core.geometry.geodesy import frame_from_map
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import FlatGround
-from apertura.methods.synchronisation.clock_alignment import Alignment, align_on_point, with_drift
+from apertura.methods.synchronisation.clock_alignment import Alignment, align_on_point, estimate_drift
 from apertura.methods.synchronisation.scene_alignment import align_on_scene
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import CLOCK_COLUMNS, CLOCKS, CONFIG
@@ -18,7 +18,7 @@ from apertura.pipeline.opening.acquisition import Unaligned, unaligned
 from apertura.pipeline.opening.scene import ConfiguredGround
 
 NEAR_S = 5.0
-"""How far a clock that tells UTC is thought to be off."""
+"""Largest offset searched for a clock in UTC, seconds; of a clock without UTC every offset is searched."""
 
 
 def align(
@@ -31,7 +31,7 @@ def align(
     search_m: float = 10.0,
     drift: bool = False,
 ) -> tuple[Alignment, dict[str, Any]]:
-    """Return how the recorder of a node stands to its log, and what that means in the campaign's own terms.
+    """Return the alignment of a recorder to its log, and the same as values of the campaign's config.
 
     Parameters
     ----------
@@ -39,13 +39,13 @@ def align(
         Of a node that sends and receives.
     point
         Easting, northing in the scene's CRS and ellipsoidal height (z in a local frame) of a reflector, metres; None:
-        what is bright on the ground of the scene, wherever it stands.
+        by the sharpness of the scene.
     search_s
-        How far the clock may be off; None: `NEAR_S`, or anything where the recorder has no clock but its own.
+        How far the clock may be off; None: `NEAR_S`, or overlapping where the recorder has no clock but its own.
     search_m
-        How long the electrical path may be, metres of total path; 0: it is as the config says.
+        How long the electrical path may be, metres of total path; 0: as stated in the config.
     drift
-        Whether to find by how much the recorder's clock runs slow, too; that takes a reflector.
+        Whether to estimate the drift of the recorder's clock as well; needs a reflector.
 
     Returns
     -------
@@ -57,13 +57,13 @@ def align(
     Raises
     ------
     CampaignError
-        If nothing can be told.
+        If nothing can be estimated.
     """
     if drift and point is None:
         raise CampaignError(
             "a drift asked for without a point",
             where="apertura align --drift",
-            expected="the place of a reflector: sharpness alone does not tell a drift",
+            expected="the place of a reflector: sharpness alone does not determine a drift",
             remedy="Give it by --point, or leave --drift out.",
         )
     given = unaligned(campaign, campaign.flight(flight).name, node)
@@ -76,12 +76,12 @@ def align(
         else:
             place = frame_from_map(campaign.settings.scene.crs, *point)
             found = align_on_point(given.echo, given.log, place, within_s=within_s, search_m=search_m)
-            found = with_drift(found, given.echo, given.log, place) if drift else found
+            found = estimate_drift(found, given.echo, given.log, place) if drift else found
     except ValueError as error:
         raise CampaignError(
             str(error),
             where=campaign.root / "raw" / flight,
-            expected="a recording made while the log tells where its node was",
+            expected="a recording within the times of the log of its node",
             remedy="Check that recording and log belong together, and nodes.<node>.log.",
         ) from error
     offset = Decimal(given.offset_ns(found.offset_s)).scaleb(-9)
@@ -89,8 +89,10 @@ def align(
     return found, stated | {"path_offset_m": given.taken_off_m + found.path_m}
 
 
-def keep(campaign: Campaign, flight: str, node: str, *, offset_s: str, std_s: float, drift_ppm: float = 0.0) -> Path:
-    """Write the line of a node's clock into config/clocks.tsv; those of others are kept."""
+def write_clock(
+    campaign: Campaign, flight: str, node: str, *, offset_s: str, std_s: float, drift_ppm: float = 0.0
+) -> Path:
+    """Write the line of a node's clock into config/clocks.tsv; the others stay."""
     path = inside(campaign.root, CLOCKS.as_posix(), where=campaign.root)
     others = [clock for clock in campaign.clocks if (clock.flight, clock.node) != (flight, node)]
     kept = [
@@ -102,51 +104,51 @@ def keep(campaign: Campaign, flight: str, node: str, *, offset_s: str, std_s: fl
     return path
 
 
-def print_alignment(campaign: Campaign, flight: str, node: str, *, write: bool, **asked: Any) -> None:
-    """Align, say what was found and what to do with it, and write clocks.tsv where that is asked."""
-    found, stated = align(campaign, flight, node, **asked)
+def print_alignment(campaign: Campaign, flight: str, node: str, *, write: bool, **options: Any) -> None:
+    """Align, print the result and the lines for the config, and with `write` write clocks.tsv."""
+    found, stated = align(campaign, flight, node, **options)
     print(
         f"{flight} {node}: the recording begins {found.offset_s:.4f} s ± {found.offset_width_s:.4f} s after the first "
         f"epoch of the log; path beyond geometry {stated['path_offset_m']:.4f} m ± {found.path_width_m:.4f} m"
     )
     print(
         f"by {found.report['method']}, on {found.report['pulses']} pulses, {found.contrast_db:.1f} dB above "
-        f"{'other offsets' if asked['point'] else 'the median of the image'}"
+        f"{'other offsets' if options['point'] else 'the median of the image'}"
     )
     for name, line in found.flags.items():
         print(f"{name}: {line}")
-    if asked["drift"]:
+    if options["drift"]:
         print(f"drift {found.drift_ppm:.2f} ppm: {found.report['drift']}")
     cells = (flight, node, stated["offset_s"], stated["drift_ppm"], f"{found.offset_width_s:.6f}")
     print(f"{CLOCKS}: {chr(9).join(map(str, cells))}")
-    if asked["search_m"] > 0:
+    if options["search_m"] > 0:
         print(f"{CONFIG}: nodes.{node}.path_offset_m.radar: {stated['path_offset_m']:.4f}")
     if write:
         clock = {name: stated[name] for name in ("offset_s", "drift_ppm")}
-        path = keep(campaign, flight, node, std_s=found.offset_width_s, **clock)
+        path = write_clock(campaign, flight, node, std_s=found.offset_width_s, **clock)
         print(f"{path} is written")
 
 
 def _within(given: Unaligned, search_s: float | None) -> tuple[float, float]:
-    """Return which offsets between first pulse and first epoch are tried."""
+    """Return the least and largest offset between first pulse and first epoch to try, seconds."""
     recorded_s = float(given.echo.time_s[-1])
-    anything = given.log.first_s - recorded_s, given.log.last_s
+    overlapping = given.log.first_s - recorded_s, given.log.last_s
     if search_s is None and given.own_clock:
-        return anything
+        return overlapping
     near_s = NEAR_S if search_s is None else search_s
-    return max(anything[0], given.stated_s - near_s), min(anything[1], given.stated_s + near_s)
+    return max(overlapping[0], given.stated_s - near_s), min(overlapping[1], given.stated_s + near_s)
 
 
 def _scene(campaign: Campaign) -> tuple[SceneGrid, FlatGround]:
     """Return the grid that the config states, and level ground."""
-    asked = campaign.settings.scene
-    if "auto" in {asked.crs, asked.bounds_m, asked.spacing_m}:
+    settings = campaign.settings.scene
+    if "auto" in {settings.crs, settings.bounds_m, settings.spacing_m}:
         raise CampaignError(
             "crs, bounds_m or spacing_m is auto",
             where=f"{CONFIG}: scene",
             expected="a scene that is stated: what is settled from a flight needs its clock first",
             remedy="State them, or give the place of a reflector by --point.",
         )
-    bounds_m, spacing_m = asked.bounds_m, asked.spacing_m
-    grid = SceneGrid.from_bounds(asked.crs, bounds_m, spacing_m=spacing_m)  # type: ignore[arg-type]
-    return grid, ConfiguredGround.of(asked, campaign.height_files(), crs=asked.crs).level(grid)
+    bounds_m, spacing_m = settings.bounds_m, settings.spacing_m
+    grid = SceneGrid.from_bounds(settings.crs, bounds_m, spacing_m=spacing_m)  # type: ignore[arg-type]
+    return grid, ConfiguredGround.of(settings, campaign.height_files(), crs=settings.crs).level(grid)

@@ -1,4 +1,4 @@
-"""Rule `assess`: what the images of a flight say of each other, which to add, what would make a bad one better."""
+"""Rule `assess`: agreement of a flight's images, which of them to add, and hypotheses for bad ones."""
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -23,7 +23,14 @@ from apertura.pipeline.config import OfdmWaveform, SampledWaveform
 from apertura.pipeline.lineage import result_of
 from apertura.pipeline.opening.acquisition import Acquisition, open_acquisition
 from apertura.pipeline.opening.autofocus import open_refined
-from apertura.pipeline.opening.diagnosis import PairGeometry, Suspicion, evidence_of, seen_from, some_pulses, suspicions
+from apertura.pipeline.opening.diagnosis import (
+    Hypothesis,
+    PairGeometry,
+    evidence_of,
+    hypotheses_of,
+    moved_evidence,
+    some_pulses,
+)
 from apertura.pipeline.opening.echo import pair_echo
 from apertura.pipeline.opening.images import agreement_of, agreement_report, comparable, shows_points_of
 from apertura.pipeline.opening.scene import OpenScene, open_scene, settled_scene
@@ -31,10 +38,10 @@ from apertura.pipeline.opening.transmitted import Transmitted, transmitted
 from apertura.pipeline.steps.calibration import calibrated
 from apertura.pipeline.store import open_stage, save_document
 
-# ---- What would make a bad image better: hypotheses tried on one bright place, the best of them named --------------
+# ---- Hypotheses that would sharpen a bad image, tried on a bright place ---------------------------------------------
 
 LEAST_GAIN_DB = 1.0
-"""A hypothesis is named if the echoes of the flight gather better by so much where it is true."""
+"""Least gain of the measure at which a hypothesis is reported; below 2 dB weak evidence (docs/theory/focus.md)."""
 
 _SIDE_PX = 128
 _PIXELS_PER_CELL = 2.5
@@ -44,7 +51,7 @@ _MOST_NAMED = 3
 def hypotheses(
     campaign: Campaign, flight: str, *, brightest: tuple[float, float], cell_m: float
 ) -> list[dict[str, Any]]:
-    """Return what would make the images of a flight sharper and agree, the best first; nothing is changed by it.
+    """Return the hypotheses that would make the images of a flight sharper and agree, the best first.
 
     Parameters
     ----------
@@ -58,7 +65,7 @@ def hypotheses(
     Returns
     -------
     list
-        what, kind, and gain_db: how much more of the echoes gathers at one place.
+        what, kind, and gain_db: gain of the peak power at the bright place.
     """
     waveform = campaign.settings.waveform
     if not isinstance(waveform, SampledWaveform):
@@ -72,19 +79,19 @@ def hypotheses(
     ]
     nodes = {name: track.node(node) for name, node in logged.items()}
     if track.correction is not None:
-        found = seen_from(nodes, found)
+        found = moved_evidence(nodes, found)
     scene = open_scene(campaign)
     now = gathered([one.history for one in found], _around(scene, brightest, cell_m), scene.level.height_m)
-    named: list[tuple[float, Suspicion]] = []
-    for suspicion in chain(suspicions(nodes, found), _other_echoes(campaign, flight, nodes, found, sent=sent)):
-        grid = _around(scene, _moved(scene.grid, brightest, found, suspicion.histories), cell_m)
+    named: list[tuple[float, Hypothesis]] = []
+    for hypothesis in chain(hypotheses_of(nodes, found), _other_echoes(campaign, flight, nodes, found, sent=sent)):
+        grid = _around(scene, _moved(scene.grid, brightest, found, hypothesis.histories), cell_m)
         try:
-            then = gathered(suspicion.histories, grid, scene.level.height_m + suspicion.height_m)
-        except ValueError:  # the places are too far apart for one pulse: it is not that
+            then = gathered(hypothesis.histories, grid, scene.level.height_m + hypothesis.height_m)
+        except ValueError:  # the places are too far apart for one pulse: rejected
             continue
         gain_db = 10 * float(np.log10(max(then, 1e-12) / now))
         if gain_db > LEAST_GAIN_DB:
-            named.append((gain_db, suspicion))
+            named.append((gain_db, hypothesis))
     named.sort(key=lambda one: -one[0])
     return [{"what": one.what, "kind": one.kind, "gain_db": round(gain_db, 2)} for gain_db, one in named[:_MOST_NAMED]]
 
@@ -100,8 +107,8 @@ def _other_echoes(
     found: Sequence[PairGeometry],
     *,
     sent: Transmitted,
-) -> Iterator[Suspicion]:
-    """Yield what only another reading of the samples shows: channels swapped, the other end of the band as carrier."""
+) -> Iterator[Hypothesis]:
+    """Yield hypotheses that need other echoes: channels swapped, the carrier at the other end of the band."""
     calibration = {one.pair: calibrated(campaign, flight, one.pair) for one in found}
 
     def formed(one: PairGeometry, nodes: Mapping[str, Acquisition], sent: Transmitted) -> PhaseHistory:
@@ -116,7 +123,7 @@ def _other_echoes(
         changed = transmitted(campaign, waveform.model_copy(update={"carrier_is": other}))
         placed = {name: replace(node, numerology=changed.numerology) for name, node in nodes.items()}
         with suppress(CampaignError):
-            yield Suspicion(
+            yield Hypothesis(
                 f"waveform.carrier_is is {other}", "carrier_is", tuple(formed(one, placed, changed) for one in found)
             )
     for name, node in nodes.items():
@@ -127,11 +134,11 @@ def _other_echoes(
                 histories = (
                     formed(one, swapped, sent) if one.pair.endswith(f"-{name}") else one.history for one in found
                 )
-                yield Suspicion(f"the channels of {name} are swapped", "channels", tuple(histories))
+                yield Hypothesis(f"the channels of {name} are swapped", "channels", tuple(histories))
 
 
 def hypothesis_line(named: Sequence[dict[str, Any]]) -> str:
-    """Return what to look at first, to be put behind a flag; nothing where no hypothesis helps."""
+    """Return the best hypothesis, to append to a flag; empty without one."""
     return f"; focus improves {named[0]['gain_db']:.1f} dB if {named[0]['what']}" if named else ""
 
 
@@ -145,7 +152,7 @@ def _around(scene: OpenScene, place: tuple[float, float], cell_m: float) -> Scen
 def _moved(
     grid: SceneGrid, place: tuple[float, float], found: Sequence[PairGeometry], histories: Sequence[Any]
 ) -> tuple[float, float]:
-    """Return where a place is expected if the antennas were elsewhere: as far away as they are, on average."""
+    """Return the expected place for other antenna positions: shifted by their mean shift."""
     rows, columns = [], []
     for one, history in zip(found, histories, strict=True):
         for before, after in zip(one.history.aperture.legs, history.aperture.legs, strict=True):
@@ -155,18 +162,18 @@ def _moved(
     return place[0] + grid.spacing_m * float(np.mean(columns)), place[1] - grid.spacing_m * float(np.mean(rows))
 
 
-# ---- Rule `assess`: what the images of one flight say of each other, and which of them may be added up -------------
+# ---- Rule `assess`: agreement of a flight's images, and which are added ---------------------------------------------
 
 _PHASE = "pairs_out_of_phase"
 _LOOKS_WRONG = frozenset({"defocused", "echo_elsewhere", "pairs_apart", _PHASE, "pair_unconfirmed"})
-"""Flags that a wrong geometry raises, and for which a remedy is looked for."""
+"""Flags that a wrong geometry raises; hypotheses are tried where one is raised."""
 
-_SURE_SNR_DB = 20.0
+_VISIBLE_SNR_DB = 20.0
 """A bright point this far above the noise should show in every image of the scene."""
 
 
 def assess(campaign: Campaign, flight: str) -> Path:
-    """Write results/<flight>/assessment.json: how the pairs agree, what to look at, what the coherent sum holds."""
+    """Write results/<flight>/assessment.json: agreement of the pairs, hypotheses, members of the coherent sum."""
     lineage = result_of(campaign, "assessment", flight).begin(campaign.root)
     pairs, grid = campaign.flight(flight).pairs, settled_scene(campaign).grid
     images = {pair: open_stage(campaign.stage("image", flight, pair), "image") for pair in pairs}
@@ -178,7 +185,7 @@ def assess(campaign: Campaign, flight: str) -> Path:
         pair
         for pair, one in found.items()
         if one is None
-        and _sure(quality[reference]["focus"])
+        and _visible(quality[reference]["focus"])
         and comparable(images[reference], images[pair], grid)
         and (
             quality[pair]["focus"]["verdict"] == "defocused"
@@ -191,11 +198,11 @@ def assess(campaign: Campaign, flight: str) -> Path:
         unfit=_unfit(found, unconfirmed, reference),
         align=refined or campaign.settings.processing.fusion.align_phase,
     )
-    # A path that is constant for a pair is what images do not tell of refined tracks: its phase was taken off.
+    # A path that is constant for a pair is invisible to the refinement of tracks: its phase is removed here.
     flags = _flags(found, reference, unconfirmed, taken_off={_PHASE} if refined else set())
     for pair, name, line in _wrong_codes(quality):
         flags[pair][name] = line
-    named = _suspected(campaign, flight, images, flags, reference)
+    named = _hypotheses(campaign, flight, images, flags, reference)
     report = {
         "flight": flight,
         "reference": reference,
@@ -214,13 +221,13 @@ def assess(campaign: Campaign, flight: str) -> Path:
 def _flags(
     found: Mapping[str, Agreement | None], reference: str, unconfirmed: Collection[str], *, taken_off: Collection[str]
 ) -> dict[str, Flags]:
-    """Return pair → flags of disagreement; both of two carry it, since which is wrong their images cannot tell.
+    """Return pair → flags of disagreement; both of two carry it, since their images do not show which is wrong.
 
-    What is `taken_off` before pairs are added, as the phase of tracks that were refined, is none.
+    Flags in `taken_off`, as the phase of refined tracks, are corrected before pairs are added and not raised.
     """
     flags = {pair: Flags() for pair in (reference, *found)}
     for pair, one in found.items():
-        raised = _disagreement(one, (reference, pair), sure=pair in unconfirmed)
+        raised = _disagreement(one, (reference, pair), certain=pair in unconfirmed)
         for side, (name, line) in product((pair, reference), raised.items()):
             if name not in taken_off:
                 flags[side] = Flags.merged(flags[side], {name: line})
@@ -228,7 +235,7 @@ def _flags(
 
 
 def _unfit(found: Mapping[str, Agreement | None], unconfirmed: Collection[str], reference: str) -> dict[str, str]:
-    """Return pairs that show other places than the reference, whose phases there mean nothing → why."""
+    """Return pair → reason, for pairs whose points lie elsewhere than the reference's: their phases mean nothing."""
     apart = {
         pair: f"its bright points lie {100 * one.shift_m:.1f} cm from those of {reference}"
         for pair, one in found.items()
@@ -237,21 +244,21 @@ def _unfit(found: Mapping[str, Agreement | None], unconfirmed: Collection[str], 
     return apart | dict.fromkeys(unconfirmed, f"shows none of the bright points of {reference}")
 
 
-def _suspected(
+def _hypotheses(
     campaign: Campaign,
     flight: str,
     images: Mapping[str, xr.Dataset],
     flags: dict[str, Flags],
     reference: str,
 ) -> list[dict[str, Any]]:
-    """Try what may be wrong where the images look so; put the best behind their flags."""
-    looking = {pair: _LOOKS_WRONG & {*images[pair].attrs["flags"], *raised} for pair, raised in flags.items()}
-    if not any(looking.values()):
+    """Try hypotheses where flags indicate a wrong geometry; append the best to these flags."""
+    suspicious = {pair: _LOOKS_WRONG & {*images[pair].attrs["flags"], *raised} for pair, raised in flags.items()}
+    if not any(suspicious.values()):
         return []
     quality = images[reference].attrs["quality"]
     brightest = quality["brightest"]["x_m"], quality["brightest"]["y_m"]
     named = hypotheses(campaign, flight, brightest=brightest, cell_m=quality["focus"]["cell_m"])
-    for pair, names in looking.items():
+    for pair, names in suspicious.items():
         for name in names:
             line = flags[pair].get(name) or images[pair].attrs["flags"][name]
             flags[pair][name] = line + hypothesis_line(named)
@@ -259,20 +266,20 @@ def _suspected(
 
 
 def _rank(focus: Mapping[str, Any]) -> tuple[int, float]:
-    """Return how little a pair's focus is to be trusted."""
+    """Return the rank of a pair's focus, the best first."""
     return ["focused", "defocused", "cannot tell"].index(focus["verdict"]), -focus.get("loss_db", 0.0)
 
 
-def _sure(focus: Mapping[str, Any]) -> bool:
-    return any(point["snr_db"] > _SURE_SNR_DB for point in focus["points"])
+def _visible(focus: Mapping[str, Any]) -> bool:
+    return any(point["snr_db"] > _VISIBLE_SNR_DB for point in focus["points"])
 
 
-def _disagreement(one: Agreement | None, pairs: tuple[str, str], *, sure: bool) -> dict[str, str]:
-    """Return flags of the reference and another pair: which of them is wrong, their images alone cannot tell."""
+def _disagreement(one: Agreement | None, pairs: tuple[str, str], *, certain: bool) -> dict[str, str]:
+    """Return flags of the reference and another pair; their images alone do not show which of them is wrong."""
     reference, pair = pairs
     if one is None:
         line = f"{pair} shows none of the bright points of {reference}: its echo is too weak, or one of them is wrong"
-        return {"pair_unconfirmed": line} if sure else {}
+        return {"pair_unconfirmed": line} if certain else {}
     raised = {}
     if one.shifted:
         raised["pairs_apart"] = (

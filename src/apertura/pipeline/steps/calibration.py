@@ -29,13 +29,13 @@ def calibrate(campaign: Campaign, flight: str) -> Path:
     CampaignError
         If config/config.yaml has no calibration section, or no reflector stands out.
     """
-    asked, lineage = _asked(campaign), result_of(campaign, "calibration", flight).begin(campaign.root)
-    report: dict[str, Any] = {"flight": flight, "reflector_m": list(asked.reflector_m), "pairs": {}}
+    requested, lineage = _settings(campaign), result_of(campaign, "calibration", flight).begin(campaign.root)
+    report: dict[str, Any] = {"flight": flight, "reflector_m": list(requested.reflector_m), "pairs": {}}
     codes = []
     for pair in campaign.flight(flight).pairs:
         echo = open_stage(campaign.stage("echo", flight, pair), "echo")
         codes.append(echo.attrs["code_sha256"])
-        report["pairs"][pair] = _pair(campaign, echo, asked, where=f"flight {flight}, pair {pair}") | {
+        report["pairs"][pair] = _pair(campaign, echo, requested, where=f"flight {flight}, pair {pair}") | {
             "inputs": echo.attrs["inputs"]
         }
     report["code_sha256"] = chained_sha256(lineage.result.code_sha256, codes)
@@ -45,11 +45,11 @@ def calibrate(campaign: Campaign, flight: str) -> Path:
 
 
 def calibrated(campaign: Campaign, flight: str, pair: str) -> dict[str, Any] | None:
-    """Return what an imaging flight takes from the calibration flight for a pair; None: the config's offsets."""
-    asked = campaign.settings.calibration
-    if asked is None or campaign.flight(flight).kind == "calibration":
+    """Return the calibrated offset of a pair for an imaging flight; None: the config's offsets are used."""
+    requested = campaign.settings.calibration
+    if requested is None or campaign.flight(flight).kind == "calibration":
         return None
-    path = campaign.result(asked.flight, "calibration.json")
+    path = campaign.result(requested.flight, "calibration.json")
     document = open_document(path)
     with undamaged(path, expected="what step calibrate writes", remedy=remake(path)):
         offsets = {name: _taken(offset) for name, offset in document["pairs"].items()}
@@ -57,14 +57,14 @@ def calibrated(campaign: Campaign, flight: str, pair: str) -> dict[str, Any] | N
         raise CampaignError(
             f"no offset of pair {pair}",
             where=path,
-            expected=f"the pairs of flight {flight}; {asked.flight} calibrated {sorted(offsets)}",
+            expected=f"the pairs of flight {flight}; {requested.flight} calibrated {sorted(offsets)}",
             remedy="Fly the calibration with the same transmitter and nodes, or take out config: calibration.",
         )
-    return {"flight": asked.flight, **offsets[pair]}
+    return {"flight": requested.flight, **offsets[pair]}
 
 
 def _taken(offset: dict[str, Any]) -> dict[str, Any]:
-    """Return what is taken of a pair's report; raise an error that says what is wrong with it."""
+    """Return the validated values of a pair's report."""
     std_m = offset["std_m"]
     return {
         "offset_m": float(offset["offset_m"]),
@@ -74,22 +74,22 @@ def _taken(offset: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _asked(campaign: Campaign) -> Calibration:
+def _settings(campaign: Campaign) -> Calibration:
     if campaign.settings.calibration is None:
         raise CampaignError(
             "no section calibration",
             where="config/config.yaml",
             expected="calibration.flight and calibration.reflector_m for a flight of kind calibration",
-            remedy="Say where the reflector stands.",
+            remedy="State the place of the reflector.",
         )
     return campaign.settings.calibration
 
 
-def _pair(campaign: Campaign, echo: xr.Dataset, asked: Calibration, *, where: str) -> dict[str, Any]:
-    reflector = frame_from_map(campaign.settings.scene.crs, *asked.reflector_m)
+def _pair(campaign: Campaign, echo: xr.Dataset, requested: Calibration, *, where: str) -> dict[str, Any]:
+    reflector = frame_from_map(campaign.settings.scene.crs, *requested.reflector_m)
     path_m = Aperture(echo.tx_position.values, echo.rx_position.values).path(reflector)
     transfer, frequency = Rows(echo.transfer), echo.frequency.values
-    offset = estimate_path_offset(transfer, frequency, path_m=path_m, search_m=asked.search_m, where=where)
+    offset = estimate_path_offset(transfer, frequency, path_m=path_m, search_m=requested.search_m, where=where)
     history = reflector_history(transfer, frequency, path_m=path_m + offset.offset_m)
     phase = np.unwrap(np.angle(history))
     return {
@@ -106,5 +106,5 @@ def _pair(campaign: Campaign, echo: xr.Dataset, asked: Calibration, *, where: st
 
 
 def calibration_spec(offset: dict[str, Any] | None) -> str:
-    """Return what was taken from a calibration flight as one line for provenance."""
+    """Return the calibration used as one line for provenance."""
     return canonical_json({name: offset[name] for name in ("flight", "offset_m", "std_m")} if offset else None)

@@ -1,4 +1,4 @@
-"""Rule `coverage`: what all flights and pairs of a campaign cover, as a picture and for a GIS."""
+"""Rule `coverage`: coverage of all flights and pairs of a campaign, as a picture and for a GIS."""
 
 from pathlib import Path
 from typing import Any
@@ -74,7 +74,7 @@ def transform_of(grid: SceneGrid, looks: NDArray[np.float32]) -> Affine:
 
 
 def place_of(scene: OpenScene) -> Any:
-    """Return what turns map coordinates into longitude, latitude and height; None in a local frame."""
+    """Return the transformation of map coordinates to longitude, latitude, height; None in a local frame."""
     if scene.grid.crs == LOCAL:
         return None
 

@@ -1,4 +1,4 @@
-"""Rule `cphd`: the calibrated transfer functions of a pair as a CPHD file, for those who ask for it."""
+"""Rule `cphd`: the calibrated transfer functions of a pair as a CPHD file, on request."""
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -46,7 +46,7 @@ def cphd(campaign: Campaign, flight: str, pair: str) -> Path:
 def _collection(
     campaign: Campaign, flight: str, echo: xr.Dataset, scene: OpenScene, tags: Mapping[str, str]
 ) -> CphdCollection:
-    """Return what the file says of the echo; a frame without a place on Earth is put at latitude and longitude 0.
+    """Return the file's metadata of the echo; a local frame is put at latitude and longitude 0.
 
     There east, north and up are axes of ECEF, and metres keep their value: only the height is rounded, by 1 nm.
     """
@@ -88,7 +88,7 @@ def _east_north_up(point_m: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _referred(echo: xr.Dataset, collection: CphdCollection) -> Iterator[NDArray[np.complex64]]:
-    """Yield the samples with the delay of the reference point taken off, instead of that of the stage."""
+    """Yield the samples referred to the delay of the reference point instead of that of the stage."""
     further = collection.reference_delay_s - echo.reference_delay.values
     frequency: Any = echo.frequency.values
     with progress("pulses", len(further)) as done:

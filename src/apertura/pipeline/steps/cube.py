@@ -24,7 +24,7 @@ from apertura.pipeline.opening.scene import settled_scene
 from apertura.pipeline.steps.stamping import stamped
 from apertura.pipeline.store import create, finish, open_array, open_stage, writing
 
-# ---- What the cube says of each flight and pair: names, time, view, quality ----------------------------------------
+# ---- Coordinates and quality of each flight and pair ----------------------------------------------------------------
 
 Images = Mapping[tuple[str, str], xr.Dataset]
 """Flight and pair → stage `image`."""
@@ -48,8 +48,8 @@ def labels(images: Images, assessed: Mapping[str, Mapping[str, Any]], pairs: Seq
     for place, (flight, one) in enumerate(assessed.items()):
         for pair in pairs:
             if (flight, pair) in images:
-                told = _quoted(images[flight, pair], one, pair)
-                for name, value in told.items():
+                measures = _quoted(images[flight, pair], one, pair)
+                for name, value in measures.items():
                     if value is not None:
                         values[name][place, pairs.index(pair)] = value
     return xr.Dataset(
@@ -81,9 +81,9 @@ def _middle(images: Images, flight: str) -> Any:
 
 
 def _quoted(image: xr.Dataset, assessed: Mapping[str, Any], pair: str) -> dict[str, float | str | None]:
-    """Return what an image and its flight's assessment say: name of a row of `QUOTED` → value; None: nothing."""
+    """Return the quality of an image and its assessment: name of a row of `QUOTED` → value or None."""
     quality = image.attrs["quality"]
-    view, focus, pulses = quality["view"], quality["focus"], quality.get("pulses", {})  # phase history tells none
+    view, focus, pulses = quality["view"], quality["focus"], quality.get("pulses", {})  # a phase history has none
     return {
         "heading": view["heading_deg"],
         "look_direction": view["look_deg"],
@@ -107,7 +107,7 @@ def _quoted(image: xr.Dataset, assessed: Mapping[str, Any], pair: str) -> dict[s
     }
 
 
-# ---- Coherence and phase between the images of a cube: a flight's pairs, and a pair's flights ----------------------
+# ---- Coherence and phase between the images of a cube ---------------------------------------------------------------
 
 _TILES_AT_ONCE = 4
 """Along a side: tiles are read with a margin, and what they share is read once."""
@@ -141,7 +141,7 @@ def window_of(images: Images, spacing_m: float) -> int:
 
 
 def shared_band(one: xr.Dataset, other: xr.Dataset) -> float:
-    """Return the most that unchanged ground can show of coherence, docs/theory/interferometry.md, eq. 1a."""
+    """Return the coherence of unchanged ground, docs/theory/interferometry.md, eq. 1a."""
     carriers = tuple(np.array(image.attrs["quality"]["view"]["carrier_cycles_m"]) for image in (one, other))
     return common_band((carriers[0], carriers[1]), (_spectrum(one), _spectrum(other)))
 
@@ -209,7 +209,7 @@ def _against(window: Window, whole: Window) -> Window:
     return rows, columns
 
 
-# ---- Rule `cube`: every image of the campaign on one grid, each flight's pairs added up, and phases between images
+# ---- Rule `cube`: all images, sums of each flight, phases between images --------------------------------------------
 
 _PHASE = "coherence", "phase"
 
@@ -217,7 +217,7 @@ _PHASE = "coherence", "phase"
 def cube(campaign: Campaign) -> Path:
     """Write results/cube.zarr: images (flight, pair, y, x), sums of each flight, coherence and phase between images.
 
-    Tile by tile; a tile that no pulse of a pair sees is not stored and reads as NaN, as in its image.
+    Tile by tile; a tile that no pulse of a pair illuminates is not stored and reads as NaN, as in its image.
     """
     flights, lineage = campaign.image_flights, result_of(campaign, "cube").begin(campaign.root)
     images = {
@@ -241,23 +241,25 @@ def cube(campaign: Campaign) -> Path:
         tile = {"y": side, "x": side, "flight": 1, "pair": 1}
         chunks = {name: tuple(tile[dim] for dim in STAGES["cube"].variables[name].dims) for name in RASTERS}
         create(wip, empty, chunks | {name: empty[name].shape for name in MEASURED}, consolidated=True)
-        held = _Held({name: open_array(wip, name) for name in (*RASTERS, *MEASURED)}, [*assessed], empty.attrs["pairs"])
+        arrays = _CubeArrays(
+            {name: open_array(wip, name) for name in (*RASTERS, *MEASURED)}, [*assessed], empty.attrs["pairs"]
+        )
         for flight, one in assessed.items():
-            _add_up(images, one["fusion"]["phases_rad"], held, flight, windows)
+            _add_up(images, one["fusion"]["phases_rad"], arrays, flight, windows)
             single_db = [
                 images[flight, pair].attrs["quality"]["noise_floor_db"] for pair in one["fusion"]["phases_rad"]
             ]
-            sum_db = survey(held.plane("coherent", flight), windows).noise_floor_db
-            held.plane("coherent_noise_floor", flight)[()] = sum_db
-            held.plane("clutter_reduction", flight)[()] = clutter_reduction_db(single_db, sum_db)
-        _compare(images, {flight: one["reference"] for flight, one in assessed.items()}, held, grid, side=side)
+            sum_db = survey(arrays.plane("coherent", flight), windows).noise_floor_db
+            arrays.plane("coherent_noise_floor", flight)[()] = sum_db
+            arrays.plane("clutter_reduction", flight)[()] = clutter_reduction_db(single_db, sum_db)
+        _compare(images, {flight: one["reference"] for flight, one in assessed.items()}, arrays, grid, side=side)
         finish(wip, folder, lineage=lineage)
     return folder
 
 
 @dataclass(frozen=True)
 class _Plane:
-    """What an array holds of one flight, or of one pair of it."""
+    """The plane of an array of one flight, or of one pair of it."""
 
     array: Any
     place: tuple[int, ...]
@@ -276,7 +278,7 @@ class _Plane:
 
 
 @dataclass(frozen=True)
-class _Held:
+class _CubeArrays:
     """The arrays of the cube, by name, flight and pair."""
 
     arrays: Mapping[str, Any]
@@ -289,14 +291,16 @@ class _Held:
         return _Plane(self.arrays[name], place)
 
 
-def _add_up(images: Images, phases_rad: Mapping[str, float], held: _Held, flight: str, windows: list[Window]) -> None:
+def _add_up(
+    images: Images, phases_rad: Mapping[str, float], arrays: _CubeArrays, flight: str, windows: list[Window]
+) -> None:
     """Copy the images of a flight and write their sums, tile by tile; `phases_rad` of those added coherently."""
     present = {pair: image for (name, pair), image in images.items() if name == flight}
     peaks = np.array([image.attrs["quality"]["brightest"]["amplitude"] for image in present.values()])
     added = np.array([pair in phases_rad for pair in present])
     turned = np.array([phases_rad[pair] for pair in present if pair in phases_rad])
-    copies = [held.plane("image", flight, pair) for pair in present]
-    sums = {name: held.plane(name, flight) for name in ("coherent", "noncoherent", "magnitude")}
+    copies = [arrays.plane("image", flight, pair) for pair in present]
+    sums = {name: arrays.plane(name, flight) for name in ("coherent", "noncoherent", "magnitude")}
     for window in windows:
         stack = np.stack([image.image[window].values for image in present.values()])
         there = ~np.isnan(stack).all(axis=(1, 2))
@@ -309,19 +313,19 @@ def _add_up(images: Images, phases_rad: Mapping[str, float], held: _Held, flight
             sums["magnitude"][window] = magnitude_sum(stack, peaks)
 
 
-def _compare(images: Images, references: Mapping[str, str], held: _Held, grid: SceneGrid, *, side: int) -> None:
+def _compare(images: Images, references: Mapping[str, str], arrays: _CubeArrays, grid: SceneGrid, *, side: int) -> None:
     """Write coherence and phase of each image with its flight's reference pair and its pair's first flight."""
     window = window_of(images, grid.spacing_m)
-    for kind, rows in compared(images, references, reference_flights(images, held.pairs)).items():
+    for kind, rows in compared(images, references, reference_flights(images, arrays.pairs)).items():
         for one, other in rows.items():
-            both, planes = (images[one], images[other]), [held.plane(f"{kind}_{name}", *one) for name in _PHASE]
-            told = write_phase(both, (planes[0], planes[1]), grid, side=side, window=window)
-            for name, value in zip(("looks", "chance", "common_band"), (*told, shared_band(*both)), strict=True):
-                held.plane(f"{kind}_{name}", *one)[()] = value
+            both, planes = (images[one], images[other]), [arrays.plane(f"{kind}_{name}", *one) for name in _PHASE]
+            measures = write_phase(both, (planes[0], planes[1]), grid, side=side, window=window)
+            for name, value in zip(("looks", "chance", "common_band"), (*measures, shared_band(*both)), strict=True):
+                arrays.plane(f"{kind}_{name}", *one)[()] = value
 
 
 def _between_flights(references: Mapping[str, xr.Dataset], grid: SceneGrid) -> dict[str, Any]:
-    """Return how each flight's reference image lies against the first flight's, and its flags."""
+    """Return the shift of each flight's reference image against the first flight's, and its flags."""
     (first, image), *others = references.items()
     between: dict[str, Any] = {}
     flags: dict[str, Flags] = {}
@@ -339,7 +343,7 @@ def _between_flights(references: Mapping[str, xr.Dataset], grid: SceneGrid) -> d
 
 
 def _empty(images: Images, assessed: Mapping[str, Mapping[str, Any]], grid: SceneGrid) -> xr.Dataset:
-    """Return the cube without the values of its rasters, and of what is measured on them."""
+    """Return the cube without the values of its rasters and of measures on them."""
     pairs = sorted({pair for _, pair in images})
     named = labels(images, assessed, pairs)
     sizes = {**named.sizes, "y": grid.shape[0], "x": grid.shape[1]}

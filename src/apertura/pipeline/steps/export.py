@@ -113,7 +113,7 @@ def _georeference(grid: SceneGrid) -> dict[str, Any]:
 
 
 def _with_code(origin: Provenance, assessed: Mapping[str, Any]) -> Provenance:
-    """Return where a file comes from, with the code that assessed its flight."""
+    """Return the provenance of a file, with the code that assessed its flight."""
     return replace(origin, code_sha256=chained_sha256(origin.code_sha256, [assessed["code_sha256"]]))
 
 
@@ -129,7 +129,7 @@ def _fused_provenance(
 
 
 def _divided(images: Mapping[str, xr.Dataset], fusion: Mapping[str, Any]) -> dict[str, Radiometry]:
-    """Return what the values of the sums mean: which pair was divided by what."""
+    """Return the radiometry of the sums: the divisor of each pair."""
     peaks = {pair: image.attrs["quality"]["brightest"]["amplitude"] for pair, image in images.items()}
     return of_sums(peaks, fusion["phases_rad"])
 
@@ -137,16 +137,18 @@ def _divided(images: Mapping[str, xr.Dataset], fusion: Mapping[str, Any]) -> dic
 def _measures(
     grid: SceneGrid, tile_px: int, sums: Mapping[str, BlockRaster], radiometry: Mapping[str, Radiometry]
 ) -> dict[str, Any]:
-    """Return what the pixels of the sums tell."""
+    """Return measures of the pixels of the sums."""
     windows = list(grid.tiles(tile_px))
     surveys = {source: survey(layer, windows) for source, layer in sums.items()}
     top = surveys["coherent"]
     peak = find_peak(sums["coherent"], top.row, top.column)
     x, y = map(float, grid.map_at(peak.row, peak.column))
     peaks = {source: one.peak for source, one in surveys.items()} | {"coherent": float(abs(peak.value))}
-    seen = {source: radiometry[source].measured(peaks[source], one.noise_floor_db) for source, one in surveys.items()}
+    measured = {
+        source: radiometry[source].measured(peaks[source], one.noise_floor_db) for source, one in surveys.items()
+    }
     return {
-        "radiometry": {source: one.report for source, one in {**radiometry, **seen}.items()},
+        "radiometry": {source: one.report for source, one in {**radiometry, **measured}.items()},
         "entropy": {source: round(one.entropy, 6) for source, one in surveys.items()},
         "noise_floor_db": top.noise_floor_db,
         "brightest": {"x_m": round(x, 4), "y_m": round(y, 4), "amplitude": float(abs(peak.value))},
@@ -159,32 +161,32 @@ def _coherence(assessed: Mapping[str, Any]) -> dict[str, float | int | None]:
     None where no pair's phase was measured.
     """
     added, agreed = assessed["fusion"]["phases_rad"], assessed["pairs"]
-    told = {pair: agreed[pair]["agreement"] for pair in added if agreed[pair]["agreement"]}
-    chance = {"chance": round(1 / (len(told) + 1), 4), "pairs": len(told) + 1 if told else 0}
-    if not told:
+    reports = {pair: agreed[pair]["agreement"] for pair in added if agreed[pair]["agreement"]}
+    chance = {"chance": round(1 / (len(reports) + 1), 4), "pairs": len(reports) + 1 if reports else 0}
+    if not reports:
         return {"mean": None, **chance}
-    phasors = [one["coherence"] * np.exp(1j * (one["phase_rad"] - added[pair])) for pair, one in told.items()]
-    return {"mean": round(float(abs(1 + sum(phasors)) ** 2) / (len(told) + 1) ** 2, 4), **chance}
+    phasors = [one["coherence"] * np.exp(1j * (one["phase_rad"] - added[pair])) for pair, one in reports.items()]
+    return {"mean": round(float(abs(1 + sum(phasors)) ** 2) / (len(reports) + 1) ** 2, 4), **chance}
 
 
 def _flags(of_pairs: Mapping[str, Mapping[str, str]], left_out: Mapping[str, str]) -> Flags:
-    """Return the flags of all pairs, each line with its pairs unless all say it, and who is not in the coherent sum."""
+    """Return the flags of all pairs, each line with its pairs unless all carry it, and the pairs that are left out."""
     raised: dict[str, dict[str, list[str]]] = {}
     for pair, flags in of_pairs.items():
         for flag, line in flags.items():
             raised.setdefault(flag, {}).setdefault(line, []).append(pair)
-    said = {
+    flags = {
         flag: "; ".join(
             line if len(pairs) == len(of_pairs) else f"{' and '.join(pairs)}: {line}" for line, pairs in lines.items()
         )
         for flag, lines in raised.items()
     }
     alone = "; ".join(f"{pair} is not in the coherent sum: {why}" for pair, why in left_out.items())
-    return Flags.merged(said, {"pair_left_out": alone} if alone else {})
+    return Flags.merged(flags, {"pair_left_out": alone} if alone else {})
 
 
 def _worst(images: Mapping[str, xr.Dataset], fusion: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what the errors and models of some images say of their sum."""
+    """Return the worst errors and models of the images, as those of their sum."""
     qualities = [image.attrs["quality"] for image in images.values()]
     worst = max(qualities, key=lambda quality: quality["numerical_error_db"])
     left_out = "".join(f"; without {pair}: {why}" for pair, why in fusion["left_out"].items())
@@ -208,7 +210,7 @@ def _worst(images: Mapping[str, xr.Dataset], fusion: Mapping[str, Any]) -> dict[
 
 
 def _quality_tags(report: Mapping[str, Any]) -> dict[str, str]:
-    told = {name: report[name] for name in ("budget", "budgets", "focus", "fusion", "redone") if report.get(name)}
+    reports = {name: report[name] for name in ("budget", "budgets", "focus", "fusion", "redone") if report.get(name)}
     return {
         "APERTURA_INSTRUCTION_SET": report["instruction_set"],
         "APERTURA_ERROR_DB": f"{report['numerical_error_db']:.2f}",
@@ -216,5 +218,5 @@ def _quality_tags(report: Mapping[str, Any]) -> dict[str, str]:
         "APERTURA_PEAK_ERROR_DB": f"{report['peak_error_db']:.2f}",
         "APERTURA_FLAGS": canonical_json(report["flags"]),
         "APERTURA_MODELS": canonical_json(report["models"]),
-        **{f"APERTURA_{name.upper()}": canonical_json(value) for name, value in told.items()},
+        **{f"APERTURA_{name.upper()}": canonical_json(value) for name, value in reports.items()},
     }

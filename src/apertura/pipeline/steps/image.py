@@ -29,7 +29,7 @@ from apertura.pipeline.steps.stamping import stamped
 from apertura.pipeline.store import finish, mark_rewritten, open_array, open_stage, resume, sharing, writing
 
 _MISSING = np.complex64(complex(np.nan, np.nan))
-"""What a tile that no pulse sees reads as; it is not stored."""
+"""Value of a tile that no pulse illuminates; it is not stored."""
 
 _QUOTED = ("pulses", "positions", "time_tags", "sidelink", "clock", "code", "calibration")
 
@@ -113,7 +113,7 @@ def tiles(campaign: Campaign, flight: str, pair: str, share: str, *, threads: in
 
 @dataclass(frozen=True, eq=False)
 class _Work:
-    """What both rules open: where the stage goes, what it quotes, what forms it."""
+    """Common inputs of both rules: folder of the stage, reports that it quotes, formation."""
 
     folder: Path
     echo: xr.Dataset
@@ -127,7 +127,7 @@ class _Work:
 
     @property
     def report(self) -> dict[str, Any]:
-        """What image.json says of which pulses and which tiles count."""
+        """Pulses and tiles used, for image.json."""
         integration, formation = self.formation.plan.integration, self.formation
         empty = 1 - len(formation.windows) / len(formation.tiles)
         tiles = {"tiles": {"formed": len(formation.windows), "empty_share": round(empty, 6)}}

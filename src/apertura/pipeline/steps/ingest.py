@@ -1,4 +1,4 @@
-"""Rule `ingest`: what a node recorded in a flight, as `raw` and `track`."""
+"""Rule `ingest`: the recording and log of a node in a flight, as stages `raw` and `track`."""
 
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Rule `interferogram`: two images of one scene compared in phase: coherence, unwrapped phase, heights."""
+"""Rule `interferogram`: coherence, unwrapped phase and heights of two images of one scene."""
 
 from dataclasses import asdict
 from math import isfinite
@@ -11,7 +11,7 @@ from rasterio import Affine
 from apertura.common.atomic import write_json
 from apertura.common.provenance import Provenance, canonical_json
 from apertura.formats.export import write_exports
-from apertura.methods.interferometry.comparison import Compared, compared, raised
+from apertura.methods.interferometry.comparison import Interferogram, form_interferogram, interferogram_flags
 from apertura.methods.interferometry.heights import Level
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.lineage import result_of
@@ -43,7 +43,7 @@ def interferogram(campaign: Campaign, name: str) -> list[Path]:
     tiles = scene.grid.tiles(campaign.settings.processing.tile_px)
     first, second = (stage.image for stage in two.images)
     window = campaign.settings.interferometry.window_px
-    found = compared(first, second, two.ground, tiles, window=window)
+    found = form_interferogram(first, second, two.ground, tiles, window=window)
     origin = Provenance.of(
         lineage.modules,
         dict(zip(two.names, two.images, strict=True)),
@@ -67,8 +67,8 @@ def interferogram(campaign: Campaign, name: str) -> list[Path]:
     return written
 
 
-def _report(found: Compared, two: TwoImages) -> dict[str, Any]:
-    """Return what interferogram.json says."""
+def _report(found: Interferogram, two: TwoImages) -> dict[str, Any]:
+    """Return the values of interferogram.json."""
     flagged = {name: stage.attrs["flags"] for name, stage in zip(two.names, two.images, strict=True)}
     stds = found.panels["height_std"]
     there = stds[np.isfinite(stds)]
@@ -79,26 +79,26 @@ def _report(found: Compared, two: TwoImages) -> dict[str, Any]:
         "flags_of_images": {name: flags for name, flags in flagged.items() if flags},
         "looks": round(found.looks, 3) if isfinite(found.looks) else None,
         "measured": measured,
-        "level": None if found.level is None else {**asdict(found.level), "says": _says(found.level)},
+        "level": None if found.level is None else {**asdict(found.level), "says": _level_line(found.level)},
         "height_std_m": std_m,
-        "says": _told(found, std_m),
-        "flags": raised(found.measured),
+        "says": _summary(found, std_m),
+        "flags": interferogram_flags(found.measured),
     }
 
 
-def _told(found: Compared, std_m: float | None) -> str:
-    """Return what came of it, in one line."""
+def _summary(found: Interferogram, std_m: float | None) -> str:
+    """Return the outcome in one line."""
     coherence = f"coherence {found.measured.coherence:.2f}, {found.measured.chance:.2f} by chance"
     if found.level is None or std_m is None:
         return f"{coherence}; no heights"
     return (
         f"{coherence}; heights to {std_m:.2g} m, {found.measured.ambiguity_m:.3g} m for a turn of the phase; "
-        f"{_says(found.level)}"
+        f"{_level_line(found.level)}"
     )
 
 
-def _says(level: Level) -> str:
-    """Return what heights count from, in one line."""
+def _level_line(level: Level) -> str:
+    """Return the reference of the heights in one line."""
     if not level.points:
         return "heights count from the terrain: the median phase is taken for none"
     spread = "" if level.spread_rad is None else f", which agree to {level.spread_rad:.2f} rad"

@@ -1,4 +1,4 @@
-"""Rule `layers`: how a pair sees the scene, as GeoTIFFs on the campaign's grid: angles, mask, looks and noise."""
+"""Rule `layers`: angles, mask, looks and noise of a pair, as GeoTIFFs on the campaign's grid."""
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -67,7 +67,7 @@ def _noise(profiles: Profiles, scene: OpenScene, beams: Beams | None) -> float:
 
 @dataclass(frozen=True)
 class LazyLayer:
-    """A raster whose blocks are computed when they are read: tiles of them, by some threads.
+    """A raster whose blocks are computed on reading, tile by tile, in threads.
 
     Attributes
     ----------
@@ -134,20 +134,20 @@ def _inside(looks: Looks, window: Window, values: NDArray[np.float64]) -> NDArra
 
 
 def _mask(scene: OpenScene, looks: Looks) -> Callable[[Window], NDArray[np.uint8]]:
-    """Return what marks the pixels of a window, each by the pulses that make the lattice's node nearest to it."""
+    """Return the mask of a window, each pixel by the pulses that form the nearest node of the lattice."""
     level = isinstance(scene.terrain, FlatGround)
     relief = None if level else Relief.of(scene.grid, scene.terrain, scene.level.height_m)
 
     def mask(window: Window) -> NDArray[np.uint8]:
-        seen = looks.seen(window)
-        marked = np.where(seen, 0, OUTSIDE).astype(np.uint8)
-        if relief is None or not seen.any():
+        visible = looks.seen(window)
+        marked = np.where(visible, 0, OUTSIDE).astype(np.uint8)
+        if relief is None or not visible.any():
             return marked
         for node, part in looks.lattice.nearest(window):
             here = tuple(slice(at.start - by.start, at.stop - by.start) for at, by in zip(part, window, strict=True))
-            if seen[here].any():
+            if visible[here].any():
                 tx, rx = (relief.above(leg) for leg in looks.aperture[looks.pulses[node].astype(np.int64)].legs)
-                marked[here] = np.where(seen[here], visibility(relief, tx, rx, part), OUTSIDE)
+                marked[here] = np.where(visible[here], visibility(relief, tx, rx, part), OUTSIDE)
         return marked
 
     return mask

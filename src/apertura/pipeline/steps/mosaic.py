@@ -39,8 +39,8 @@ def mosaic(campaign: Campaign) -> list[Path]:
 def _made(root: Path, manifests: Iterable[str]) -> dict[Path, tuple[Path, str]]:
     """Return product → the manifest that describes it, and its hash there."""
     paths = [root / manifest for manifest in manifests]
-    told = [(path, name, digest) for path in paths for name, digest in read_manifest(path)["files"].items()]
-    return {path.parent / name: (path, digest) for path, name, digest in told}
+    hashes = [(path, name, digest) for path in paths for name, digest in read_manifest(path)["files"].items()]
+    return {path.parent / name: (path, digest) for path, name, digest in hashes}
 
 
 def _check(product: Path, made: Mapping[Path, tuple[Path, str]]) -> None:

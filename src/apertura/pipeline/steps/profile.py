@@ -1,4 +1,4 @@
-"""Rule `profile`: transfer functions of a pair become range profiles, cropped to what the scene needs."""
+"""Rule `profile`: range profiles of a pair from its transfer functions, cropped to the ranges of the scene."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -40,7 +40,7 @@ def profile(campaign: Campaign, flight: str, pair: str) -> Path:
     window = RangeWindow.of(aperture, scene.grid, scene.terrain, frequency, beams=beams)
     _check_held(window.farthest_m, source.path_limit.values, campaign, where=where)
     _check_unambiguous(window)
-    asked = campaign.settings.processing.window
+    requested = campaign.settings.processing.window
     zeros = np.broadcast_to(np.complex64(0), (len(aperture), window.samples))
     dataset = source[["time", "tx_position", "rx_position"]].assign(
         profile=(("pulse", "range"), zeros), start=("pulse", window.start_m)
@@ -49,42 +49,42 @@ def profile(campaign: Campaign, flight: str, pair: str) -> Path:
         "step_m": window.step_m,
         "centre_frequency_hz": centre_frequency(frequency),
         "oversampling": window.unambiguous / len(frequency),
-        "window": asked,
+        "window": requested,
     }
     settings, parents = {**lineage.result.settings, **scene.spec}, [source, *scene.parents]
     inputs = merged(scene.inputs, pattern_digests(campaign, pair))
     how: dict[str, Any] = {"modules": lineage.modules, "parents": parents, "settings": settings, "inputs": inputs}
     stage, folder = stamped(dataset, "profile", **how), campaign.stage("profile", flight, pair)
     with writing(folder) as wip:
-        write_blocks(wip, stage, "profile", _compressed(source, asked, window, scene))
+        write_blocks(wip, stage, "profile", _compressed(source, requested, window, scene))
         finish(wip, folder, lineage=lineage)
     return folder
 
 
 def _compressed(
-    source: xr.Dataset, asked: str, window: RangeWindow, scene: OpenScene
+    source: xr.Dataset, requested: str, window: RangeWindow, scene: OpenScene
 ) -> Iterator[NDArray[np.complex64]]:
     """Yield the profiles of one chunk of the echo at a time; zeros where none of its pulses adds to the scene."""
     for part in blocks_of_rows(source, "transfer"):
         if not window.contributing[part].any():
             yield np.zeros((part.stop - part.start, window.samples), np.complex64)
             continue
-        history = phase_history_of(source.isel(pulse=part), asked)
+        history = phase_history_of(source.isel(pulse=part), requested)
         here = replace(window, start_m=window.start_m[part], farthest_m=window.farthest_m[part])
         yield range_compress(history, scene.grid, scene.terrain, window=here).samples
 
 
 def _check_held(farthest: NDArray[np.float64], limit: NDArray[np.float64], campaign: Campaign, *, where: str) -> None:
-    """Raise CampaignError where echoes arrive too late for captures to hold them whole."""
+    """Raise CampaignError where echoes of the scene arrive after the captures end."""
     waveform = campaign.settings.waveform
-    key, held_by = "path_limit", "the recorded delays"
+    key, limit_name = "path_limit", "the recorded delays"
     if isinstance(waveform, SampledWaveform):
-        key, held_by = waveform.delay_key, waveform.held_by
+        key, limit_name = waveform.delay_key, waveform.limit_name
     beyond = np.flatnonzero(farthest > limit)
     if beyond.size:
         pulse = int((farthest - limit).argmax())
         raise CampaignError(
-            f"at {beyond.size} pulses echoes of the scene arrive after {held_by}, worst at pulse {pulse}: "
+            f"at {beyond.size} pulses echoes of the scene arrive after {limit_name}, worst at pulse {pulse}: "
             f"total path {farthest[pulse]:.1f} m",
             where=where,
             expected=f"at most {limit[pulse]:.1f} m (c·{key} less the path offsets)",

@@ -51,7 +51,7 @@ def _workflow() -> dict[str, str]:
 
 
 class _Made(NamedTuple):
-    """A result, and what its manifest says."""
+    """A result and its manifest."""
 
     name: str
     where: tuple[str, ...]
@@ -60,14 +60,14 @@ class _Made(NamedTuple):
 
 
 def _results(campaign: Campaign) -> Iterator[_Made]:
-    """Yield every result that the crate tells of."""
+    """Yield every result that the crate describes."""
     for name, where, result in places_of(campaign):
         if name != "ro_crate" and not on_demand(result.manifest):
             path = campaign.root / result.manifest
-            recorded, expected = read_manifest(path), "a manifest that says what a result was made from"
+            recorded, expected = read_manifest(path), "a manifest that states the sources of a result"
             with undamaged(path, expected=expected, remedy=f"Delete {path} and run the workflow again."):
-                told = {key: str(recorded[key]) for key in ("code", "settings")}
-                yield _Made(name, where, result, {**recorded, **told, "sources": dict(recorded["sources"])})
+                hashes = {key: str(recorded[key]) for key in ("code", "settings")}
+                yield _Made(name, where, result, {**recorded, **hashes, "sources": dict(recorded["sources"])})
 
 
 def _jobs(campaign: Campaign, made: Sequence[_Made], known: Mapping[str, str]) -> Iterator[CrateJob]:

@@ -18,11 +18,11 @@ from apertura.pipeline.opening.scene import ConfiguredGround, Flown, OpenScene, 
 from apertura.pipeline.steps.stamping import stamped
 from apertura.pipeline.store import finish, open_array, open_stage, resume, save_document, writing
 
-# ---- Rule `scene`: the campaign's one grid, every `auto` settled once, so that each image of each flight lies on it
+# ---- Rule `scene`: the campaign's one grid, every `auto` decided once -----------------------------------------------
 
 
 def scene(campaign: Campaign) -> Path:
-    """Write results/scene.json: the grid that config/config.yaml asks for and the height of its ground, and why."""
+    """Write results/scene.json: the grid requested in config/config.yaml, the height of its ground, and reasons."""
     lineage = result_of(campaign, "scene").begin(campaign.root)
     grid, ground, chosen = settled(campaign, cache(lambda: _first_flight(campaign)))
     path, height_m = campaign.result("scene.json"), ground.level(grid).height_m
@@ -46,7 +46,7 @@ def _first_flight(campaign: Campaign) -> Flown:
     )
 
 
-# ---- Rule `terrain`: the DEM becomes the height of every pixel, once, for every flight and pair --------------------
+# ---- Rule `terrain`: height of every pixel from the DEM -------------------------------------------------------------
 
 
 def terrain(campaign: Campaign) -> Path:

@@ -16,7 +16,15 @@ from apertura.common.errors import CampaignError
 from apertura.common.paths import inside
 from apertura.common.provenance import lock_sha256, software
 from apertura.formats.catalog import CATALOG
-from apertura.formats.catalog.stac import AcquisitionTime, Image, asset_of, catalog_files, instant, projection, told_by
+from apertura.formats.catalog.stac import (
+    AcquisitionTime,
+    Image,
+    asset_of,
+    catalog_files,
+    instant,
+    projection,
+    read_facts,
+)
 from apertura.formats.export.coverage import Covered, feature_collection
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.lineage import result_of
@@ -49,7 +57,7 @@ class _Described:
     scene: OpenScene
 
     def images(self) -> list[Image]:
-        """Return what the catalog says of each flight: every pair, then every sum."""
+        """Return the catalog's images by flight: every pair, then every sum."""
         images = []
         for flight in self.campaign.image_flights:
             looks = {pair: few_looks(self.campaign, flight.name, pair) for pair in flight.pairs}
@@ -60,7 +68,7 @@ class _Described:
 
     def _pair(self, flight: str, pair: str, looks: NDArray[np.float32]) -> Image:
         files = self._listed(flight, pair, "export") | self._listed(flight, pair, "layers")
-        told = {
+        facts = {
             "sar:instrument_mode": _mode(pair),
             "sar:product_type": "SLC",
             "sar:looks_range": 1,
@@ -72,14 +80,14 @@ class _Described:
             f"{self.campaign.settings.campaign} · flight {flight} · {pair}",
             self._footprint(looks),
             self._acquisition(flight, pair),
-            {**told, **self._properties(flight, pair)},
+            {**facts, **self._properties(flight, pair)},
             *self._assets(files),
         )
 
     def _sum(self, flight: str, name: str, pairs: Sequence[Image], looks: NDArray[np.float32]) -> Image:
         others = tuple(f"{other}_" for other in _SUMS if other != name)
         listed = self._listed(flight, "fused", "export")
-        told = {
+        facts = {
             "sar:instrument_mode": "multistatic" if len(pairs) > 1 else _mode(pairs[0].name),
             "sar:product_type": _SUMS[name],
         }
@@ -89,7 +97,7 @@ class _Described:
             f"{self.campaign.settings.campaign} · flight {flight} · {name} sum of {len(pairs)} pairs",
             self._footprint(looks),
             AcquisitionTime.together([pair.acquisition for pair in pairs]),
-            {**told, **self._properties(flight, "fused")},
+            {**facts, **self._properties(flight, "fused")},
             *self._assets({path: digest for path, digest in listed.items() if not path.name.startswith(others)}),
             [pair.name for pair in pairs],
         )
@@ -106,14 +114,14 @@ class _Described:
         for path, digest in files.items():
             if not path.is_file():
                 raise CampaignError("no such file", path, "a finished product", "Run the workflow again.")
-            told, name = told_by(path), quote(self.campaign.relative(path).removeprefix("results/"))
+            facts, name = read_facts(path), quote(self.campaign.relative(path).removeprefix("results/"))
             key = path.stem if path.suffix == ".tif" else path.name
-            assets[key] = asset_of(path, f"../../../{name}", sha256=digest, told=told)
-            inputs = inputs or dict(told.inputs)
+            assets[key] = asset_of(path, f"../../../{name}", sha256=digest, facts=facts)
+            inputs = inputs or dict(facts.inputs)
         return assets, inputs
 
     def _properties(self, flight: str, name: str) -> dict[str, Any]:
-        """Return where an image lies, how it was made, and what it says of itself."""
+        """Return the properties of an image: projection, processing, quality."""
         path = self.campaign.result(flight, name, "image.json")
         manifest = path.with_name("export.manifest.json")
         report, remedy = open_listed(path, manifest), f"Delete {manifest} and run the workflow again."
@@ -167,5 +175,5 @@ def _resolution(brightest: Mapping[str, Any]) -> dict[str, float]:
 
 
 def _mode(pair: str) -> str:
-    """Return whether a pair's transmitter is its receiver, in the words of the extension sar."""
+    """Return monostatic or bistatic, in the terms of the extension sar."""
     return "monostatic" if len(set(pair.split("-"))) == 1 else "bistatic"

@@ -1,4 +1,4 @@
-"""How a step's result inherits where it came from: settings, inputs and code of the stages before it."""
+"""Provenance of a step's result: its own settings, inputs and code, and those of the stages before it."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -30,7 +30,7 @@ def stamped(
     stage
         A key of `apertura.common.contracts.STAGES`.
     modules
-        ``__name__`` of the step's module, and modules that rows named to it; their import closure is the code that ran.
+        ``__name__`` of the step's module and of modules named by rows of tables; the code hash covers their imports.
     parents, settings, inputs
         As `apertura.common.provenance.Provenance.of`.
     """
@@ -39,14 +39,14 @@ def stamped(
 
 
 def tags_of(origin: Provenance, lineage: Lineage) -> dict[str, str]:
-    """Return the tags of a file of a result: where it comes from, and the hashes of all that it was made from.
+    """Return the provenance tags of an exported file: settings, inputs and code, and the hashes of its source files.
 
     Parameters
     ----------
     origin
         Settings, inputs and code, its own and those of the stages before it.
     lineage
-        The result; its sources are named with their hashes as they were found.
+        Of the result, with the sha256 of each of its sources.
     """
     return replace(origin, software=joined(origin.software, software())).tags() | {
         "APERTURA_SOURCES": canonical_json(lineage.sources.digests),
@@ -72,13 +72,13 @@ def stamp(
     stage
         A key of `STAGES`.
     runspec
-        Every setting that mattered for this stage and those before it.
+        Settings that this stage and those before it used.
     inputs
         Role → sha256 of each thing read.
     code_sha256
         Chain of the code hashes of this stage and those before it.
     software
-        Name → version of what this stage and those before it were made with.
+        Package → version, of this stage and those before it.
 
     Returns
     -------

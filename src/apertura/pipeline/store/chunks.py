@@ -29,14 +29,14 @@ if TYPE_CHECKING:
     import xarray as xr
 
 
-# ---- Arrays too long for memory, written block by block along their first dimension --------------------------------
+# ---- Arrays written block by block along their first dimension ------------------------------------------------------
 
 _CHUNK_BYTES = 8 << 20
 _FEWEST_ROWS = 16
 
 
 def write_blocks(wip: Path, stage: "xr.Dataset", name: str, blocks: Iterable[NDArray[Any]]) -> None:
-    """Write a stage whose array `name` comes in blocks; what `wip` held is begun anew.
+    """Write a stage whose array `name` comes in blocks; earlier content of `wip` is discarded.
 
     Parameters
     ----------
@@ -58,24 +58,24 @@ def write_blocks(wip: Path, stage: "xr.Dataset", name: str, blocks: Iterable[NDA
     rows, *rest = stage[name].shape
     chunk = rows_of_chunk(stage[name].dtype.itemsize * int(np.prod(rest, dtype=int)))
     create(wip, stage, {name: (max(1, min(chunk, rows)), *rest)}, packed=False)
-    array, held, written = open_array(wip, name), np.empty((chunk, *rest), stage[name].dtype), 0
+    array, buffer, written = open_array(wip, name), np.empty((chunk, *rest), stage[name].dtype), 0
     filled = 0
     for block in _counted(blocks, stage[name]):
         taken = 0
         while taken < len(block):
             count = min(chunk - filled, len(block) - taken)
-            held[filled : filled + count] = block[taken : taken + count]
+            buffer[filled : filled + count] = block[taken : taken + count]
             filled, taken = filled + count, taken + count
             if filled == chunk or written + filled == rows:
-                if held[:filled].any():
-                    array[written : written + filled] = held[:filled]
+                if buffer[:filled].any():
+                    array[written : written + filled] = buffer[:filled]
                 written, filled = written + filled, 0
     if written + filled != rows:
         raise ValueError(f"{written + filled} rows of {name}: must be {rows}")
 
 
 def _counted(blocks: Iterable[NDArray[Any]], array: "xr.DataArray") -> Iterator[NDArray[Any]]:
-    """Yield blocks, and tell how many rows are done."""
+    """Yield blocks, and report how many rows are done."""
     with progress(f"{array.dims[0]}s", len(array)) as done:
         for block in blocks:
             yield block
@@ -101,7 +101,7 @@ def rows_of_chunk(row_bytes: int) -> int:
     return max(_FEWEST_ROWS, 1 << (max(1, _CHUNK_BYTES // max(1, row_bytes)).bit_length() - 1))
 
 
-# ---- Chunks on disk: brought to the disk before they have their name, and checked by their sum when they are read
+# ---- Chunks on disk: written through, renamed, checked on reading ---------------------------------------------------
 
 # What a user has set for zarr (ZARR_…, ~/.config/zarr) changes no byte of ours: one order of arrays and of sums.
 zarr.config.update(zarr.config.defaults[0], priority="new")
@@ -183,7 +183,7 @@ def _json(value: Buffer) -> object:
     try:
         return json.loads(value.to_bytes())
     except (ValueError, RecursionError):
-        return None  # which zarr will say
+        return None  # zarr raises its own error
 
 
 def array_of(folder: Path, name: str, mode: str) -> Any:
@@ -260,7 +260,7 @@ def skeleton(
             chunks=shape,
             dtype=array.dtype,
             compressors=CODECS if packed else CODECS[-1:],
-            fill_value=array.values.flat[0],  # what a chunk that nobody writes holds
+            fill_value=array.values.flat[0],  # of a chunk that is never written
             dimension_names=[str(dim) for dim in array.dims],
             attributes=array.attrs | ({"grid_mapping": "spatial_ref"} if {"y", "x"} <= set(array.dims) else {}),
         )

@@ -1,4 +1,4 @@
-"""Work in progress: who may write a stage, how it is picked up again, and the rename that finishes it."""
+"""Work in progress: lock, resume, and the rename that finishes a stage."""
 
 import errno
 import fcntl
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
 
-# ---- Work in progress: who may write a stage, and the rename that finishes it --------------------------------------
+# ---- Lock of a stage, and the rename that finishes it ---------------------------------------------------------------
 
 
 @contextmanager
@@ -97,7 +97,7 @@ def finish(wip: Path, folder: Path, *, lineage: ResultOrigin | None = None, **at
     wip, folder
         As `writing` yields and takes them.
     lineage
-        What it was made from, as `write_manifest` takes it.
+        Its sources, settings and code, for `write_manifest`.
     **attributes
         Attributes of the stage that are known only now, such as what was measured on it.
     """
@@ -105,7 +105,7 @@ def finish(wip: Path, folder: Path, *, lineage: ResultOrigin | None = None, **at
         from apertura.pipeline.store.chunks import update_attributes
 
         update_attributes(wip, attributes)
-    for partial in wip.rglob("*.partial"):  # what a killed writer left
+    for partial in wip.rglob("*.partial"):  # of a killed writer
         partial.unlink()
     files = sha256_tree(wip)
     with naming(_lock_of(folder)), _lock_of(folder).open("w", encoding="utf-8") as lock:
@@ -117,8 +117,7 @@ def finish(wip: Path, folder: Path, *, lineage: ResultOrigin | None = None, **at
     write_manifest(manifest_of(folder), {f"{folder.name}/{name}": digest for name, digest in files.items()}, lineage)
 
 
-# ---- Work in progress picked up again: what it holds is checked, what is damaged is made again, and a notice says
-# so
+# ---- Resuming work in progress: checks and repair of its chunks -----------------------------------------------------
 
 _LOG = logging.getLogger(__name__)
 _REWRITTEN = "rewritten_chunks"
@@ -128,7 +127,7 @@ _PROVENANCE = ("runspec", "inputs", "code_sha256")
 def resume(wip: Path, stage: "xr.Dataset", name: str, windows: Sequence[Window]) -> list[Window]:
     """Return the windows of array `name` that `wip` does not hold yet; create `wip` if it is absent or other work.
 
-    Nothing found in `wip` is trusted: what is damaged is made again, and a notice says so.
+    Nothing in `wip` is trusted: damaged chunks are computed again, with a notice.
 
     Parameters
     ----------
@@ -188,7 +187,7 @@ def is_work_on(wip: Path, stage: "xr.Dataset") -> bool:
 def missing(wip: Path, name: str, windows: Sequence[Window]) -> list[Window]:
     """Return the windows of array `name` whose chunks `wip` does not hold as they were written.
 
-    A chunk that is damaged is removed, and a notice says so.
+    A damaged chunk is removed, with a notice.
     """
     array = open_array(wip, name, "r")
     return [window for window in windows if not _is_whole(wip / name / _key(window, windows), array, window)]
@@ -212,7 +211,7 @@ def _is_whole(path: Path, array: Any, window: Window) -> bool:
 
 
 def _notice(path: Path, error: BaseException, what: str) -> None:
-    """Tell on stderr, where nothing else is set up, that something in work in progress is made again."""
+    """Log on stderr, if no handler is set up, that part of work in progress is computed again."""
     _LOG.warning("%s is damaged (%s): %s", path, f"{error}".split(";")[0] or type(error).__name__, what)
 
 

@@ -31,7 +31,7 @@ def save_stage(
     chunks
         Dimension → chunk length; a dimension not named is one chunk.
     lineage
-        What it was made from, as `apertura.pipeline.store.manifest.write_manifest` takes it.
+        Its sources, settings and code, for `apertura.pipeline.store.manifest.write_manifest`.
     """
     from apertura.pipeline.store.chunks import encoding_of
 
@@ -50,7 +50,7 @@ def open_stage(folder: Path, stage: str) -> "xr.Dataset":
     Raises
     ------
     CampaignError
-        If the folder is missing, or is not what the manifest describes; later, if a chunk that is read is damaged.
+        If the folder is missing or contradicts its manifest; on reading, if a chunk is damaged.
     ContractError
         If its arrays break the contract.
     """

@@ -23,7 +23,7 @@ from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.lineage import result_of
 from apertura.pipeline.opening.autofocus import open_refined
 from apertura.pipeline.opening.pair import open_pair
-from apertura.pipeline.opening.plan import asked_accuracy, job_of, plan_job
+from apertura.pipeline.opening.plan import accuracy_of, job_of, plan_job
 from apertura.pipeline.opening.scene import OpenScene, open_scene
 from apertura.pipeline.rules import STUDY
 from apertura.pipeline.store import open_stage, record_files
@@ -93,7 +93,7 @@ def speed_accuracy(campaign: Campaign, flight: str, pair: str, *, seconds: float
     if opened.history is None:
         raise ValueError("the echo stage is not there")
     history, beams = opened.history[block], opened.beams and opened.beams[block]
-    accuracy_db = float(asked_accuracy(campaign, opened, scene).value)
+    accuracy_db = float(accuracy_of(campaign, opened, scene).value)
     opened = replace(opened, aperture=history.aperture, history=history, beams=beams)
     job = job_of(campaign, opened, scene)
     plan, search = plan_job(campaign, job, accuracy_db=accuracy_db), SettingSearch(job)
