@@ -14,7 +14,7 @@ from apertura.common.errors import CampaignError
 from apertura.core.geometry.geodesy import ecef_from_geodetic
 from apertura.core.geometry.phase_centres import TrackCorrection
 from apertura.core.imaging.range_profiles import profiles_of
-from apertura.core.planning.decisions import BORNE_DB, decide_autofocus
+from apertura.core.planning.decisions import TOLERATED_LOSS_DB, decide_autofocus
 from apertura.core.planning.plan import Decision
 from apertura.methods.autofocus.inputs import Refinement, Sighting
 from apertura.pipeline.campaign import Campaign
@@ -61,8 +61,8 @@ def image_of(campaign, pair):
 @pytest.mark.parametrize(
     ("asked", "loss_db", "silent", "value"),
     [
-        ("auto", -BORNE_DB - 0.01, [], "on"),
-        ("auto", -BORNE_DB + 0.01, [], "off"),
+        ("auto", -TOLERATED_LOSS_DB - 0.01, [], "on"),
+        ("auto", -TOLERATED_LOSS_DB + 0.01, [], "off"),
         ("auto", -5.0, ["b"], "off"),
         ("on", 0.0, ["a", "b"], "on"),
         ("off", -5.0, [], "off"),

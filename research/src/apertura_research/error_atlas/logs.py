@@ -69,7 +69,7 @@ def told_by(flown: Flight, generator: Generator, **logs: Log) -> Told:
     places, used, flags = {}, np.ones(len(flown.time_s), bool), dict[str, str]()
     for node, log in logs.items():
         places[node], checked = log.checked(flown, node, generator)
-        barred = checked.barred(flown.time_s)
+        barred = checked.excluded(flown.time_s)
         flags |= {cause: node for cause, out in barred.items() if out.any()}
         flags |= {cause: node for cause, found in checked.faults.items() if found}
         for out in barred.values():

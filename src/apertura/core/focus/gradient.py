@@ -1,4 +1,4 @@
-"""How an objective of an image changes with each phase centre and each path: the exact adjoint of forming it."""
+"""Gradient of an objective of an image with respect to phase centres and paths: the exact adjoint of its formation."""
 
 from dataclasses import dataclass
 
@@ -21,7 +21,7 @@ class Gradient:
         (pulse, 3) float64, with respect to the phase centre of transmitter and receiver, in the frame of the phase
         centres. Where one node does both, its derivative is their sum.
     path_m
-        (pulse,) float64, with respect to how much further all echoes of a pulse lie (`Profiles.moved`).
+        (pulse,) float64, with respect to a path added to all echoes of a pulse (`Profiles.moved`).
     """
 
     tx_m: NDArray[np.float64]
@@ -37,18 +37,18 @@ def path_gradient(
     Parameters
     ----------
     profiles
-        At least twice oversampled; they may be read as they are asked for.
+        At least twice oversampled; they may be read on access.
     places_m
         (place, 3) float64, metres, in the frame of the phase centres.
     slope
-        (place,) complex, G = ∂J/∂Re + j·∂J/∂Im: what the objective gains as the sum changes, J + Re Σ G*·change.
+        (place,) complex, G = ∂J/∂Re + j·∂J/∂Im: the objective changes by Re Σ G*·change of the sum.
     beams
         Weight of each pulse at each place; that it changes with the phase centres is neglected. None by default.
 
     Returns
     -------
     Gradient
-        Exact for the sum as `block_contributions` forms it, rounded as float32 where a pulse and a place meet.
+        Exact for the sum as `block_contributions` forms it, rounded to float32 for each pulse and place.
 
     Raises
     ------

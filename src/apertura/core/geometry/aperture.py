@@ -1,4 +1,4 @@
-"""The synthetic aperture of a pair: where both phase centres were at each pulse, and what follows from it."""
+"""The synthetic aperture of a pair: phase centres at each pulse, total paths, phase rates and resolution."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -163,7 +163,8 @@ class Aperture:
         band_hz
             Lowest and highest frequency.
         weigh
-            Pulses and points → weights; points of which less than a half is left do not count. By default all count.
+            Pulses and points → weights; points whose summed weight is below one half do not count. By default all
+            count.
 
         Notes
         -----
@@ -199,7 +200,7 @@ class Aperture:
         axes
             (axis, 3) float64, unit vectors.
         frequency_hz
-            (frequency,) float64, samples of the band, each counting alike.
+            (frequency,) float64, samples of the band, of equal weight.
         weigh
             As of `resolution_cell_m`.
 

@@ -1,4 +1,4 @@
-"""The differentiable front door: how one's own objective of an image changes with where its pulses were."""
+"""Gradient of a caller's objective of an image with respect to phase centres and paths."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -58,7 +58,7 @@ def gradient(
 
     Notes
     -----
-    Source: docs/theory/autofocus.md, eq. 6 to 8: the exact derivative of the interpolated, turned and summed samples.
+    Source: docs/theory/autofocus.md, eq. 6 to 8: the exact derivative of the interpolated, rotated and summed samples.
     Finite differences of images by `backproject` agree as far as their engine's error lets them.
 
     Examples

@@ -14,7 +14,7 @@ from apertura.common.flags.raised import Flags
 from apertura.core.antenna.beam import Beams
 from apertura.core.echo.compression import centre_frequency
 from apertura.core.focus.job import Job
-from apertura.core.imaging.job import imaging_job, settle
+from apertura.core.imaging.job import decide_integration, imaging_job
 from apertura.core.planning.decisions import decide_accuracy
 from apertura.core.planning.plan import Decision, Plan, memory_limit
 from apertura.core.planning.planner import make_plan
@@ -237,7 +237,9 @@ def weighing(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> Beams | No
     As `job_of` settles it, without a look at the echo: what profiles must cover follows from it.
     """
     centre_hz, asked = centre_frequency(pair.frequency_hz), campaign.settings.processing.integrated
-    settled = settle(pair.aperture, centre_hz, scene.grid, scene.level, antennas=pair.beams, asked=asked)
+    settled = decide_integration(
+        pair.aperture, centre_hz, scene.grid, scene.level, antennas=pair.beams, requested=asked
+    )
     return Beams.within(settled.sector, pair.beams)
 
 
