@@ -5,7 +5,7 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 from scipy import fft
 
-from apertura.core.echo.compression import phasors, turned
+from apertura.core.echo.compression import phasors, rotated
 from apertura.simulation.synthesis import Channel, sampling_rate
 
 
@@ -49,11 +49,11 @@ def periodic_samples(channel: Channel, generator: Generator | None, pulses: NDAr
     bins = np.zeros((len(pulses), waveform.dft_samples), np.complex64)
     bins[:, waveform.first_subcarrier + np.arange(len(waveform.codes))] = spectrum
     period = fft.ifft(bins, axis=1, norm="forward")
-    period *= turned(np.ones(1), channel.phase_rad[pulses, None] / (2 * np.pi))
+    period *= rotated(np.ones(1), channel.phase_rad[pulses, None] / (2 * np.pi))
     captures = np.take(period, np.arange(waveform.capture_samples) % waveform.dft_samples, axis=1)
     if channel.cfo_hz:
         turns = -channel.cfo_hz / sampling_rate(channel) * np.arange(waveform.capture_samples)
-        captures = captures * turned(np.ones(1), np.asarray(turns, np.float64))
+        captures = captures * rotated(np.ones(1), np.asarray(turns, np.float64))
     if generator is not None and channel.noise_variance:
         parts = captures.view(np.float32)
         parts += generator.standard_normal(parts.shape, np.float32) * np.float32(np.sqrt(channel.noise_variance / 2))
@@ -70,6 +70,6 @@ def _spectrum(channel: Channel, pulses: NDArray[np.intp]) -> NDArray[np.complex6
     total = np.zeros((len(pulses), len(waveform.codes)), np.complex64)
     first = waveform.frequency_hz[0]
     for path in np.flatnonzero(heard.any(axis=0)):
-        level = turned(amplitude[:, path], -first * seen_s[:, path])
+        level = rotated(amplitude[:, path], -first * seen_s[:, path])
         total += level[:, None] * phasors(-waveform.subcarrier_spacing_hz * seen_s[:, path], total.shape[1])
     return total
