@@ -104,7 +104,7 @@ def test_a_band_that_nobody_states_is_where_the_pulse_is(name, widest):
 
 
 @pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("asked", ["inverse", "matched"])
+@pytest.mark.parametrize("requested", ["inverse", "matched"])
 def test_the_filter_loses_what_it_says(name, requested):
     """Noise through the filter, against N·SNR of the matched one."""
     pulse = pulse_samples(name, **SIZES)

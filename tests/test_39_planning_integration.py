@@ -139,7 +139,7 @@ def test_a_scene_that_reaches_beyond_the_swath_is_flagged_with_its_share():
     assert chosen.report["pulses_per_pixel"]["least"] == 0
 
 
-@pytest.mark.parametrize("asked", [{"degrees": 0}, {"resolution_m": -1}, {"degrees": 4, "resolution_m": 1}, "some"])
+@pytest.mark.parametrize("requested", [{"degrees": 0}, {"resolution_m": -1}, {"degrees": 4, "resolution_m": 1}, "some"])
 def test_what_is_no_integration_is_refused(requested):
     with pytest.raises(ValueError, match="integration"):
         ImagingChoices(integration=requested)

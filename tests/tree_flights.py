@@ -18,7 +18,7 @@ STEP_M = C / BANDWIDTH_HZ / 2
 WAVENUMBERS = {"wavenumber_rad_m": 2 * np.pi * 1.2e9 / C, "band_rad_m": np.pi * BANDWIDTH_HZ / C}
 
 
-def view(scene, pixels):
+def seen(scene, pixels):
     """A flight and profiles that hold what lies around its pixels, too: filters of trees are long."""
     around = [pixels[::9, ::9].reshape(-1, 3) + [east, north, 0] for east in (-5, 5) for north in (-5, 5)]
     wide = scene.profiles(ecef(np.concatenate(around)))
@@ -27,7 +27,7 @@ def view(scene, pixels):
 
 def flown(pixels, **options):
     """A flight over pixels on which scatterers stand."""
-    return view(fly(scatter(pixels), **options), pixels)
+    return seen(fly(scatter(pixels), **options), pixels)
 
 
 def setting(flight, **requested) -> Setting:
@@ -45,7 +45,7 @@ def shaken(flight, jitter_m, *, together=False):
     white = jitter_m * np.random.default_rng(8).standard_normal((2, *flight.scene.tx.shape))
     scene = replace(flight.scene, tx=flight.scene.tx + white[0], rx=flight.scene.rx + white[0 if together else 1])
     silent = replace(scene, transfer=np.zeros_like(scene.transfer))
-    return view(silent, flight.pixels)
+    return seen(silent, flight.pixels)
 
 
 def heard(flight):

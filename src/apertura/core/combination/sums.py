@@ -93,7 +93,7 @@ class CoherentSum:
 
 
 def choose_fusion(
-    reference: str, found: Mapping[str, Phase | None], *, unfit: Mapping[str, str], align: bool
+    reference: str, measured: Mapping[str, Phase | None], *, unfit: Mapping[str, str], align: bool
 ) -> CoherentSum:
     """Return which pairs add coherently to the reference.
 
@@ -101,7 +101,7 @@ def choose_fusion(
     ----------
     reference
         The pair that others are measured against.
-    found
+    measured
         Every other pair → its phase against the reference at bright points; None where they share none.
     unfit
         Pairs that show other places than the reference → why.
@@ -114,7 +114,7 @@ def choose_fusion(
     {'a-a': 0.0, 'a-b': 0.0}
     """
     phases, left_out, why = {reference: 0.0}, {}, {reference: "the others are measured against it"}
-    for pair, phase in found.items():
+    for pair, phase in measured.items():
         if pair in unfit:
             left_out[pair] = unfit[pair]
         elif phase is None:
@@ -168,8 +168,8 @@ def coherent_sum(
     >>> coherent_sum(np.array([[[2.0, 0.0]], [[4.0j, 0.0]]], np.complex64), np.array([2.0, 4.0])).round(3)
     array([[0.5+0.5j, 0. +0.j ]], dtype=complex64)
     """
-    turned = np.exp(-1j * np.asarray(phases_rad)).astype(np.complex64)
-    return np.asarray(_mean(_normalised(images, peaks) * turned.reshape(-1, 1, 1)), np.complex64)
+    rotation = np.exp(-1j * np.asarray(phases_rad)).astype(np.complex64)
+    return np.asarray(_mean(_normalised(images, peaks) * rotation.reshape(-1, 1, 1)), np.complex64)
 
 
 def noncoherent_sum(images: NDArray[np.complex64], peaks: NDArray[np.float64]) -> NDArray[np.float32]:

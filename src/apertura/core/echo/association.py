@@ -292,7 +292,7 @@ LARGEST_OFFSET_S = 20e-3
 OUTLIER_S = 5e-3
 """Seconds: a single tag within this of the line is as accurate as tags are."""
 
-_OUTLIER_SIGMA = 6.0
+_OUTLIER_SIGMA = 6.0  # scatters of all tags: an outlier deviates by more than this and `OUTLIER_S`
 
 LARGEST_UNPAIRED = 0.05
 """Share of the transmitter's pulses before or after the other recording above which a flag is raised."""

@@ -26,7 +26,7 @@ AMBIGUOUS_SHARE = 0.4
 GROUPS = 16
 """Parts of the flight from whose scatter the standard deviation of the clock follows."""
 
-_SMALLEST_REPEAT = 32
+_SMALLEST_REPEAT = 32  # samples of a capture that repeat, at least
 
 
 @dataclass(frozen=True)

@@ -138,8 +138,8 @@ def compress(
 
     Notes
     -----
-    Source: docs/theory.md, eq. 4. Referring the profile to band centre halves the bandwidth an interpolator
-    meets; exp(+j2πf_mid·ρ/c) remains for backprojection. Where the swath is a part of the unambiguous range, the
+    Source: docs/theory.md, eq. 4. Referring the profile to band centre halves the bandwidth of an
+    interpolator; exp(+j2πf_mid·ρ/c) remains for backprojection. Where the swath is a part of the unambiguous range, the
     subcarriers are decimated to it first (docs/theory.md, eq. 4a), at the accuracy of complex64.
 
     Examples

@@ -15,7 +15,7 @@ FALSE_ALARM = 1e-5
 
 _COHERENT_PULSES = 8, 32, 128  # pulses added coherently, at each Doppler
 _GUARD_CELLS = 8  # on both sides of the prefix, within reach of sidelobes of echoes inside
-_FEWEST_CELLS = 32
+_FEWEST_CELLS = 32  # outside the prefix, to estimate the floor from
 _NOISE_SIGMAS = 6.0  # above it, cells outside the prefix may scatter more than noise
 _SPREAD_SIGMAS = 10.0  # above it, they do
 
@@ -76,7 +76,7 @@ def own_code(transfer: NDArray[np.complex64], *, prefix_cells: int) -> CodeEvide
     for run in [run for run in _COHERENT_PULSES if run <= pulses] or [pulses]:
         level, needed, scatter = _strongest(profile, run, 2 * prefix_cells, beyond)
         scattered = max(scattered, scatter)
-        line = f"the strongest echo held whole, {run} pulses added, is {_db(level):.1f} dB above what lies beyond"
+        line = f"the strongest complete echo, {run} pulses added, is {_db(level):.1f} dB above what lies beyond"
         if level >= needed:
             return CodeEvidence(True, line)
     if scattered > _SPREAD_SIGMAS:
@@ -126,7 +126,7 @@ STEADY = 0.93
 ECHO_DB = 13.0
 """dB of mean power above the noise of the cells that are evaluated: phases of weaker ones scatter by noise."""
 
-_FEWEST_TRIPLES = 20
+_FEWEST_TRIPLES = 20  # of consecutive pulses, to estimate a coherence from
 _EVEN = 0.25  # of the usual interval: tolerated deviation; larger ones mean missing pulses
 
 

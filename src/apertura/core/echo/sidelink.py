@@ -24,7 +24,7 @@ WIENER_SNR_DB = 6.0
 """dB per subcarrier, least SNR for `wiener` (same source)."""
 
 RIPPLE_DB = 0.5
-"""dB peak to peak, largest ripple of the sidelink that a method may leave (same source)."""
+"""dB peak to peak, largest ripple that a method which does not remove it may leave (same source)."""
 
 FIT_SNR_DB = 13.4
 """dB of the whole pulse, N·SNR: below it the errors of the two fitted parameters cost more than 0.2 dB."""

@@ -51,8 +51,8 @@ class Averaging:
             return
         direct = path.select(locked)
         size = 1 / direct.amplitude
-        turned = (size * np.exp(-1j * direct.phase_rad)).astype(np.complex64)
-        unit = profile[locked] * turned[:, None]
+        inverse = (size * np.exp(-1j * direct.phase_rad)).astype(np.complex64)
+        unit = profile[locked] * inverse[:, None]
         power = np.square(unit.real) + np.square(unit.imag)
         self._power += power.sum(0)
         self._mean += unit.sum(0)

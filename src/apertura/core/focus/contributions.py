@@ -101,11 +101,11 @@ def tap_polynomials() -> NDArray[np.float64]:
     given = np.einsum("wt,un,u->wutn", np.exp(1j * omega[:, None] * tap), powers, root).reshape(
         -1, powers[0].size * TAPS
     )
-    wanted = (np.exp(1j * omega[:, None] * place) * root).ravel()
-    left, right = (np.concatenate([part.real, part.imag]) for part in (given, wanted))
+    ideal = (np.exp(1j * omega[:, None] * place) * root).ravel()
+    left, right = (np.concatenate([part.real, part.imag]) for part in (given, ideal))
     free = _joined()
-    found = free @ np.linalg.lstsq(left @ free, right, rcond=None)[0]
-    return np.ascontiguousarray(found.reshape(TAPS, DEGREE + 1).T)
+    coefficients = free @ np.linalg.lstsq(left @ free, right, rcond=None)[0]
+    return np.ascontiguousarray(coefficients.reshape(TAPS, DEGREE + 1).T)
 
 
 @lru_cache

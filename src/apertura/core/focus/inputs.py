@@ -171,7 +171,7 @@ class Profiles:
         if not self.oversampling >= 1.5:
             raise ValueError(f"{self.oversampling=}: must be at least 1.5")
         if not len(self):
-            raise ValueError(f"{self.samples.shape=}: has no pulse")
+            raise ValueError(f"{self.samples.shape=}: holds no pulse")
         start_m = np.ascontiguousarray(self.start_m, np.float64)
         places = [np.asarray(leg, np.float64) for leg in self.aperture.legs]
         if not all(np.isfinite(values).all() for values in (start_m, *places)):

@@ -71,8 +71,8 @@ def design(pulses: int, factor: int, *, widest_cycles: float, error_db: float = 
 
     Examples
     --------
-    >>> found = design(1000, 4, widest_cycles=0.02)
-    >>> len(found.at) < 270, bool(np.allclose(found.weight.sum(axis=0), 1, atol=5e-4))
+    >>> presum = design(1000, 4, widest_cycles=0.02)
+    >>> len(presum.at) < 270, bool(np.allclose(presum.weight.sum(axis=0), 1, atol=5e-4))
     (True, True)
     >>> design(1000, 4, widest_cycles=0.2) is None
     True
@@ -90,9 +90,9 @@ def design(pulses: int, factor: int, *, widest_cycles: float, error_db: float = 
     pulse = np.arange(pulses)
     first = np.clip(np.searchsorted(at, pulse - half), 0, len(at))
     rows = first[:, None] + np.arange(2 * half // factor + 2)
-    apart = (at[np.minimum(rows, len(at) - 1)] - pulse[:, None]) / half
-    taps = np.sinc(apart * half / factor) * kaiser_window(apart, beta)
-    inside = (np.abs(apart) <= 1) & (rows < len(at))
+    distance = (at[np.minimum(rows, len(at) - 1)] - pulse[:, None]) / half
+    taps = np.sinc(distance * half / factor) * kaiser_window(distance, beta)
+    inside = (np.abs(distance) <= 1) & (rows < len(at))
     columns = np.broadcast_to(pulse[:, None], rows.shape)
     weight = sparse.csr_array((taps[inside], (rows[inside], columns[inside])), shape=(len(at), pulses))
     return Presum(factor, at, weight)
@@ -132,9 +132,9 @@ def _positions(position_m: NDArray[np.float64], at: NDArray[np.float64]) -> NDAr
     inside = np.clip(at, 0, last)
     lower = np.minimum(inside.astype(int), max(0, last - 1))
     part = (inside - lower)[:, None]
-    found = position_m[lower] * (1 - part) + position_m[np.minimum(lower + 1, last)] * part
+    between = position_m[lower] * (1 - part) + position_m[np.minimum(lower + 1, last)] * part
     slopes = (position_m[1] - position_m[0], position_m[-1] - position_m[-2]) if last else (np.zeros(3), np.zeros(3))
-    return np.asarray(found + np.minimum(at, 0)[:, None] * slopes[0] + np.maximum(at - last, 0)[:, None] * slopes[1])
+    return np.asarray(between + np.minimum(at, 0)[:, None] * slopes[0] + np.maximum(at - last, 0)[:, None] * slopes[1])
 
 
 def presummed(profiles: Profiles, presum: Presum, middle_m: NDArray[np.float64]) -> Profiles:

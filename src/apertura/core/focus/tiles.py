@@ -36,8 +36,8 @@ KEY = "processing.scheduler"
 NAMED_BY = "DASK_SCHEDULER_ADDRESS"
 """Environment variable, dask's own: who connects to a scheduler runs what that sends, and a config is untrusted."""
 
-_CONNECT_S = 5.0
-_WORKERS_S = 10.0
+_CONNECT_S = 5.0  # to wait for a scheduler
+_WORKERS_S = 10.0  # to wait for its first worker
 
 
 def cluster_tiles(
@@ -122,7 +122,7 @@ class TilesLayer(MaterializedLayer):
     """The tasks of some tiles of an image.
 
     Blocks of pulses follow one another: the next one's tables are prepared when every tile has its part of the last.
-    dask would therefore compute all tiles for the sake of one; here whoever asks for some gets the graph of those.
+    dask would therefore compute all tiles for the sake of one; here the graph has the requested tiles only.
 
     Parameters
     ----------

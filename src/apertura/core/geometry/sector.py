@@ -139,10 +139,10 @@ class Sector:
         """
         slack = np.zeros((len(aperture), *points_m.shape[:-1]))
         for axis, leg in zip((self.tx_axis, self.rx_axis), aperture.legs, strict=True):
-            apart = points_m - leg.reshape(-1, *(1,) * (points_m.ndim - 1), 3)
+            leg_m = points_m - leg.reshape(-1, *(1,) * (points_m.ndim - 1), 3)
             length = np.linalg.norm(axis, axis=1).reshape(-1, *(1,) * (points_m.ndim - 1))
             # a direction rotates by asin(radius/range) at most; the difference of the unit vectors is less
-            turn = np.minimum(1.0, radius_m / np.linalg.norm(apart, axis=-1))
+            turn = np.minimum(1.0, radius_m / np.linalg.norm(leg_m, axis=-1))
             slack += length * np.where(turn < 1, np.pi / 2 * turn, 2.0)
         return slack
 

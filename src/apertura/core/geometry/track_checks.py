@@ -25,7 +25,7 @@ FINEST_GRAIN_M = 0.01
 
 _SIGMA = 10.0  # a fault is so many times the log's own scatter
 _SMOOTHER = {1: 7.0, 2: 12.0, 3: 20.0}  # epochs taken out → how many times smoother their neighbours must become
-_STEP_SMOOTHER = 10.0
+_STEP_SMOOTHER = 10.0  # times smoother the neighbours of a step must become without it
 _AGILE_M_S2 = 10.0  # a node may have flown a step that takes no more than this, forth and back within an interval
 _CHI3_MEDIAN = 1.538  # median length of a vector of three standard normal components
 _MOST_ROUNDS = 20
@@ -73,7 +73,7 @@ def misfits(time_s: Floats, position_m: Floats) -> Floats:
 
 
 def scatter_m(misfit_m: Floats) -> float:
-    """Return the robust scatter of an axis of `misfits`, metres; a log that mostly stands still does not hide it.
+    """Return the robust scatter of an axis of `misfits`, metres; also of a log that mostly repeats one position.
 
     Where most epochs repeat a coarse position exactly, its grain follows from the few that move.
 
@@ -166,10 +166,10 @@ def _spike(time_s: Floats, position_m: Floats, epoch: int, scatter: float) -> Fa
             near = np.r_[first - 6 : first, last + 1 : last + 7]
             group = np.arange(first, last + 1)
             nodes = np.tile([first - 2, first - 1, last + 1, last + 2], (count, 1))
-            apart = position_m[group] - np.einsum(
+            error_m = position_m[group] - np.einsum(
                 "ek,eka->ea", _lagrange(time_s[nodes], time_s[group]), position_m[nodes]
             )
-            worst = apart[np.argmax(np.linalg.norm(apart, axis=1))]
+            worst = error_m[np.argmax(np.linalg.norm(error_m, axis=1))]
             size = float(np.linalg.norm(worst))
             left = misfits(time_s[near], position_m[near])[4:8] @ (worst / max(size, 1e-12))
             if size > max(_SIGMA * scatter, LEAST_FAULT_M, smoother * float(np.sqrt(np.mean(left**2)))):
@@ -432,8 +432,8 @@ def _gap_error_m(time_s: Floats, position_m: Floats, missing: int) -> float:
         here = np.arange(start, start + width)
         out = here[_SUPPORT:-_SUPPORT]
         rest = np.setdiff1d(here, out)
-        apart = position_spline(time_s[rest], position_m[rest])(time_s[out]) - position_m[out]
-        errors.append(float(np.linalg.norm(apart, axis=1).max()))
+        error_m = position_spline(time_s[rest], position_m[rest])(time_s[out]) - position_m[out]
+        errors.append(float(np.linalg.norm(error_m, axis=1).max()))
     return float(np.quantile(errors, 0.9)) if errors else np.inf
 
 
@@ -441,6 +441,6 @@ def _interpolation_m(time_s: Floats, position_m: Floats) -> float | None:
     """Return the RMS error of the spline between epochs: that of every second epoch over 2⁴, one axis, metres."""
     if len(time_s) < 12:
         return None
-    apart = position_spline(time_s[::2], position_m[::2])(time_s[1:-1:2]) - position_m[1:-1:2]
-    inner = np.linalg.norm(apart, axis=1)[2:-2] / np.sqrt(3)
+    error_m = position_spline(time_s[::2], position_m[::2])(time_s[1:-1:2]) - position_m[1:-1:2]
+    inner = np.linalg.norm(error_m, axis=1)[2:-2] / np.sqrt(3)
     return float(np.sqrt(np.mean(inner**2))) / 16

@@ -113,7 +113,7 @@ UNFOCUSED_ECHO_DB = 25.0
 LEAST_PULSES = 64
 """Pulses: fewer cannot show whether a point dominates its cell (2 in each of the 32 blocks of `point_focus`)."""
 
-_MOST_PULSES = 64
+_MOST_PULSES = 64  # sampled to search echoes outside the scene
 _NEAR_CELLS = 4  # about the direct path and at the swath's edges, where responses have their sidelobes
 
 
@@ -150,7 +150,7 @@ def echo_elsewhere(history: PhaseHistory, grid: SceneGrid, terrain: Terrain) -> 
         at_m = float(np.median(path_m[np.arange(len(some)), beside.argmax(axis=1)]))
         return (
             f"the strongest echo, {above_db:.0f} dB above all from the scene, has a total path of {at_m:.1f} m, while "
-            f"{scene}: heights, positions or path offsets are wrong, or something bright stands elsewhere"
+            f"{scene}: heights, positions or path offsets are wrong, or something bright is elsewhere"
         )
     alone_db = _median_db(inside / np.maximum(np.nanmedian(within, axis=1), 1e-30))
     if len(history) >= LEAST_PULSES and alone_db > UNFOCUSED_ECHO_DB:
@@ -260,10 +260,10 @@ POINT_SPACING_CELLS = 6.0
 SPECKLE = 0.06
 """Power around a bright point relative to its own, above which it may be speckle: the brightest of 10⁶ has 0.07."""
 
-_PATCHES = 4
-_PLACES_PER_CELL = 2.5
-_CELL_POINTS = 5
-_BAND_SAMPLES = 9
+_PATCHES = 4  # imaged by subapertures: the brightest places
+_PLACES_PER_CELL = 2.5  # of a patch along a side
+_CELL_POINTS = 5  # along a side of the scene, at which the resolution cell is computed
+_BAND_SAMPLES = 9  # frequencies of the spatial spectrum
 _WINDOWED = 0.62  # a Hann window leaves a band as wide, in standard deviation, as this share of it without
 
 

@@ -26,8 +26,8 @@ from apertura.core.scene.terrain import FlatGround, GroundModels, Terrain
 
 # ---- Checks of inputs against the scene
 
-_POINTS = 9
-_PULSES = 256
+_POINTS = 9  # along a side of the scene, sampled
+_PULSES = 256  # sampled for total paths
 
 
 def check_inputs(inputs: PhaseHistory | Profiles, grid: SceneGrid, terrain: Terrain) -> dict[str, str]:
@@ -102,8 +102,8 @@ def _outside(inputs: PhaseHistory | Profiles, points: np.ndarray) -> float:
 
 # ---- The planner's job of a pair and a scene
 
-_PATCH_PX = 256
-_CONTENT_PIXELS = 128
+_PATCH_PX = 256  # side of the windows whose positions predictions use
+_CONTENT_PIXELS = 128  # random ones for `content_loss_db`
 _CONTENT_PULSES = 16384  # at most: their terms at so many pixels take 32 MB
 
 

@@ -139,9 +139,9 @@ def _by_rule(job: Job) -> Decision:
 
 def _tolerance(job: Job) -> tuple[float, str]:
     """Return how far heights may be wrong, metres, and why."""
-    apart = job.aperture.middle_m[job.aperture.sample(64)][:, None] - job.points_m
-    above = apart @ vertical(job.ground_m)
-    ground = np.sqrt(np.maximum((apart**2).sum(-1) - above**2, 1e-6))
+    offset_m = job.aperture.middle_m[job.aperture.sample(64)][:, None] - job.points_m
+    above = offset_m @ vertical(job.ground_m)
+    ground = np.sqrt(np.maximum((offset_m**2).sum(-1) - above**2, 1e-6))
     nearest, steepest = float(ground.min()), float((np.abs(above) / ground).max())
     wobble_m = job.aperture.wobble_m
     focus_m = FOCUS_RAD * job.wavelength_m * nearest / (4 * np.pi * max(wobble_m, 1e-9))

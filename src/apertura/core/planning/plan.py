@@ -344,6 +344,6 @@ def memory_limit(*, groups: Path = Path("/proc/self/cgroup"), root: Path = Path(
             top = root / controllers if controllers else root
             own = top / path.lstrip("/")
             stated = [folder / name for folder in (own, *own.parents) if folder.is_relative_to(top)]
-            found = [file.read_text(encoding="utf-8").strip() for file in stated if file.is_file()]
-            limits += [int(text) for text in found if text.isdecimal()]  # 'max': none
+            texts = [file.read_text(encoding="utf-8").strip() for file in stated if file.is_file()]
+            limits += [int(text) for text in texts if text.isdecimal()]  # 'max': none
     return min(limits)

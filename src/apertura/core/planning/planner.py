@@ -174,6 +174,7 @@ MARGIN_DB = 3.0
 """dB of predicted errors below the requested accuracy: what predictions may be too low by (benchmarks/planner.py)."""
 
 PRESUM_FACTORS = (16, 12, 8, 6, 5, 4, 3, 2)
+"""Pulses per virtual pulse that are tried, the largest first."""
 
 
 def make_plan(

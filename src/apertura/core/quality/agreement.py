@@ -120,11 +120,11 @@ def agreement(
     _, matched = common_shift(lists[0], lists[1], reach=reach, gate=cell_m)
     if len(matched) < max(1 if alone else 2, min(map(len, points)) / 2):
         return None
-    apart = np.array([np.subtract(lists[1][j][:2], lists[0][i][:2]) for i, j in matched])
+    shifts = np.array([np.subtract(lists[1][j][:2], lists[0][i][:2]) for i, j in matched])
     values = np.array([_between(images, points[0][i], points[1][j]) for i, j in matched])
-    shift, count = np.median(apart, axis=0), len(matched)
+    shift, count = np.median(shifts, axis=0), len(matched)
     unit = 2 * np.pi * np.linalg.cholesky(spectrum)  # metres to units of eq. 6
-    units = (apart - shift) @ unit
+    units = (shifts - shift) @ unit
     background = float(np.median([points[0][i].background + points[1][j].background for i, j in matched])) / 2
     std = np.hypot(1.2533 * 1.4826 * np.median(np.abs(units)), np.sqrt(background / 2 + _POINT**2)) / np.sqrt(count)
     phasor = _mean_phasor(values)

@@ -62,14 +62,14 @@ def bright_points(image: BlockRaster, windows: Iterable[Window], *, apart_px: in
     >>> [(round(p.row, 1), round(p.column, 1)) for p in bright_points(image, [whole], apart_px=16)]
     [(30.2, 33.5), (20.0, 90.0)]
     """
-    found: list[tuple[float, int, int]] = []
+    maxima: list[tuple[float, int, int]] = []
     for window in windows:
         magnitude = np.abs(np.nan_to_num(np.asarray(image[window])))
-        found += _cell_maxima(magnitude, window, apart_px)
-    found.sort(key=lambda one: (-one[0], one[1], one[2]))
+        maxima += _cell_maxima(magnitude, window, apart_px)
+    maxima.sort(key=lambda one: (-one[0], one[1], one[2]))
     kept: list[tuple[float, int, int]] = []
-    for one in found:
-        if not one[0] > found[0][0] * 10 ** (DEEPEST_DB / 20) or len(kept) == MOST_POINTS:
+    for one in maxima:
+        if not one[0] > maxima[0][0] * 10 ** (DEEPEST_DB / 20) or len(kept) == MOST_POINTS:
             break
         if all(np.hypot(one[1] - row, one[2] - column) >= apart_px for _, row, column in kept):
             kept.append(one)

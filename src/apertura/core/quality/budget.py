@@ -16,7 +16,7 @@ ARITHMETIC_BELOW_DB = 10.0
 LEAST_ACCURACY_DB, MOST_ACCURACY_DB = -40.0, -60.0
 """dB, range of `accuracy_db: auto`: errors above the first show as sidelobes, errors below the second are invisible."""
 
-NO_EFFECT = Effect(0.0, 0.0, 0.0)
+NO_EFFECT = Effect(0.0, 0.0, 0.0)  # of a cause without error
 
 
 @dataclass(frozen=True)

@@ -48,7 +48,7 @@ def error_bound(
     Parameters
     ----------
     computed, exact
-        (draw,) complex, the drawn pixels; a pixel drawn twice stands twice.
+        (draw,) complex, the drawn pixels; a pixel drawn twice is listed twice.
     density
         (draw,) float64, how often a draw like this takes that pixel on average.
     power
@@ -63,8 +63,8 @@ def error_bound(
     Examples
     --------
     >>> noise = 1e-3 * np.exp(2j * np.pi * np.random.default_rng(1).random(256))
-    >>> found = error_bound(np.ones(256), 1 + noise, np.full(256, 0.01), power=25600.0)
-    >>> round(found.estimate_db, 1), 0 < found.bound_db - found.estimate_db < 0.2
+    >>> bound = error_bound(np.ones(256), 1 + noise, np.full(256, 0.01), power=25600.0)
+    >>> round(bound.estimate_db, 1), 0 < bound.bound_db - bound.estimate_db < 0.2
     (-60.0, True)
     """
     values = computed.astype(np.complex128)

@@ -11,7 +11,7 @@ from apertura.core.quality.measures import coherence_factor
 
 # ---- Subapertures: noise, drift and entropy
 
-_RANDOM_DRAWS = 8
+_RANDOM_DRAWS = 8  # of random phases, averaged
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ def compare_parts(parts: NDArray[np.complex64], *, spacing_m: float, generator: 
     """
     if not len(parts):
         return SubApertures(*(float("nan"),) * 5)
-    whole = parts.sum(axis=(1, 2))
+    full = parts.sum(axis=(1, 2))
     drifts = np.array([_drift_px(patch.sum(axis=0)) for patch in parts]) * spacing_m
     common = np.median(drifts, axis=0)
     spread = 1.4826 * np.median(np.abs(drifts - common), axis=0)
@@ -72,7 +72,7 @@ def compare_parts(parts: NDArray[np.complex64], *, spacing_m: float, generator: 
         snr_db=float(np.median([_snr_of_halves_db(*patch.sum(axis=1)) for patch in parts])),
         drift_m=float(np.sqrt((common**2).sum(axis=-1).mean())),
         drift_std_m=float(np.sqrt((spread**2).sum(axis=-1).mean() / len(parts))),
-        entropy=float(np.median([_entropy(patch) for patch in whole])),
+        entropy=float(np.median([_entropy(patch) for patch in full])),
         entropy_by_chance=float(np.median([_entropy_by_chance(patch.sum(axis=0), generator) for patch in parts])),
     )
 
@@ -89,8 +89,8 @@ def _drift_px(parts: NDArray[np.complex64]) -> NDArray[np.float64]:
     power = np.abs(parts).astype(np.float64) ** 2
     power /= np.maximum(power.sum(axis=(-2, -1), keepdims=True), 1e-30)
     mean = np.fft.rfft2(power.mean(axis=0) - power.mean())
-    found = np.array([_peak(np.fft.irfft2(np.fft.rfft2(one) * mean.conj(), one.shape)) for one in power])
-    return np.asarray(found - found.mean(axis=0))
+    shifts = np.array([_peak(np.fft.irfft2(np.fft.rfft2(one) * mean.conj(), one.shape)) for one in power])
+    return np.asarray(shifts - shifts.mean(axis=0))
 
 
 def _peak(correlation: NDArray[np.float64]) -> list[float]:
@@ -113,7 +113,7 @@ def _entropy(patch: NDArray[np.complexfloating]) -> float:
 
 def _entropy_by_chance(parts: NDArray[np.complex64], generator: np.random.Generator) -> float:
     phases = np.exp(2j * np.pi * generator.random((_RANDOM_DRAWS, len(parts))))
-    return float(np.mean([_entropy(np.tensordot(turned, parts, 1)) for turned in phases]))
+    return float(np.mean([_entropy(np.tensordot(phasors, parts, 1)) for phasors in phases]))
 
 
 # ---- Focus of isolated bright points, from contributions of pulses
@@ -131,8 +131,8 @@ DEFOCUSED_DB = -1.0
 """dB, loss of a peak beyond which an image is called defocused."""
 
 _TREND = 5  # degree of the polynomial that models patterns, range and aspect in the log-amplitude
-_PADDING = 8
-_SIGMAS = 5.0
+_PADDING = 8  # of the spectrum of blocks, whose maximum removes a linear phase
+_SIGMAS = 5.0  # by which a drift must exceed a cell to be called defocused
 
 
 @dataclass(frozen=True)

@@ -134,8 +134,8 @@ class PointPaths:
         """
         legs = []
         for leg in self.aperture.legs:
-            apart = leg - self.point_m
-            legs.append(apart / np.linalg.norm(apart, axis=1, keepdims=True))
+            offset_m = leg - self.point_m
+            legs.append(offset_m / np.linalg.norm(offset_m, axis=1, keepdims=True))
         if same:
             return ((legs[0] + legs[1]) @ self.axes.T,)
         if sidelink:

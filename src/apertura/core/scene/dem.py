@@ -287,7 +287,7 @@ def open_dem(
         Datum of the heights: 'ellipsoid', 'egm96', 'egm2008', or 'carried' (declared by the raster's CRS; in a local
         scene: z of the frame).
     geoid
-        Grid of undulations; looked for on PROJ's search path if None.
+        Grid of undulations; searched on PROJ's path if None.
 
     Raises
     ------
@@ -363,7 +363,7 @@ def _header(path: Path) -> tuple[tuple[float, ...], tuple[int, int], str, CRS | 
     inverse = ~place
     coefficients = (inverse.a, inverse.b, inverse.c, inverse.d, inverse.e, inverse.f)
     if not np.isfinite(coefficients).all():
-        raise _wrong(path, f"pixels of {sides[0]:g} × {sides[1]:g} units", "pixels that can be told apart")
+        raise _wrong(path, f"pixels of {sides[0]:g} × {sides[1]:g} units", "pixels of distinct position")
     return coefficients, shape, unit, system
 
 

@@ -120,9 +120,9 @@ def _of_tif(grid: Path, longitude: Floats, latitude: Floats) -> Floats:
         turn = 360 / abs(place.a)
         column = np.mod((longitude - place.c) / place.a - 0.5 + 1e-6, turn) - 1e-6  # the first post is inside
         row = (latitude - place.f) / place.e - 0.5
-        whole = columns >= round(turn)
+        around_earth = columns >= round(turn)
         inside = (row >= -1e-6) & (row <= rows - 1 + 1e-6) & (column >= -1e-6)
-        inside &= whole | (column <= columns - 1 + 1e-6)
+        inside &= around_earth | (column <= columns - 1 + 1e-6)
         undulations = np.full(row.shape, np.nan)
         if not inside.any():
             return undulations
@@ -132,7 +132,7 @@ def _of_tif(grid: Path, longitude: Floats, latitude: Floats) -> Floats:
             raise ValueError(f"{last - first} rows of {columns} posts are needed at once")
         values = raster.read(1, window=Window(0, first, columns, last - first), masked=True)
         values = values.astype(np.float64).filled(np.nan) * raster.scales[0] + raster.offsets[0]
-    if whole:
+    if around_earth:
         values = np.concatenate([values, values[:, :1]], axis=1)
     undulations[inside] = bilinear(values[None], row[inside] - first, column[inside])[0]
     return undulations

@@ -89,8 +89,8 @@ class Lattice:
         smooth = np.asarray(top + up * (bottom - top), np.float64)
         if farthest is None:
             return smooth
-        apart = np.max([np.linalg.norm(corner - corners[0], axis=-1) for corner in corners[1:]], axis=0)
-        jumps = (apart > farthest).any(axis=tuple(range(2, apart.ndim)))
+        distance = np.max([np.linalg.norm(corner - corners[0], axis=-1) for corner in corners[1:]], axis=0)
+        jumps = (distance > farthest).any(axis=tuple(range(2, distance.ndim)))
         if jumps.any():
             near = values[np.ix_(np.where(up.ravel() < 0.5, low, high), np.where(across.ravel() < 0.5, left, right))]
             smooth[jumps] = near[jumps]
@@ -310,15 +310,15 @@ def _any(beams: Beams, aperture: Aperture, points: Floats, pulses: NDArray[np.in
 def _centres(aperture: Aperture, beams: Beams | None, points: Floats, weight: Floats) -> Floats:
     """Return both antennas (point, 2, 3) where each point is passed closest, between pulses too."""
     sector = None if beams is None else beams.sector
-    apart = aperture.path(points) if sector is None else sector.place(aperture, points) ** 2
+    distance = aperture.path(points) if sector is None else sector.place(aperture, points) ** 2
     dark = weight == 0
-    apart = apart + _NO_WEIGHT_PENALTY * dark
-    column, best = np.arange(len(points)), apart.argmin(axis=0)
+    distance = distance + _NO_WEIGHT_PENALTY * dark
+    column, best = np.arange(len(points)), distance.argmin(axis=0)
     legs = np.stack(aperture.legs, axis=1)
     if len(aperture) < 3:
         return np.asarray(legs[best])
     inner = np.clip(best, 1, len(aperture) - 2)
-    before, here, after = (apart[inner + step, column] for step in (-1, 0, 1))
+    before, here, after = (distance[inner + step, column] for step in (-1, 0, 1))
     same_weighting = (dark[inner - 1, column] == dark[inner, column]) & (dark[inner, column] == dark[inner + 1, column])
     bend = before - 2 * here + after
     fit = (inner == best) & (bend > 0) & same_weighting
@@ -331,5 +331,5 @@ def _spread(weight: Floats) -> NDArray[np.int64]:
     """Return pulses (point, `SPREAD`) evenly spread over those that weigh half or more of the most, of all if none."""
     size = np.abs(weight)
     count = np.cumsum(size >= size.max(axis=0) / 2, axis=0)
-    wanted = 1 + np.round(np.linspace(0, 1, SPREAD)[:, None] * (count[-1] - 1))
-    return np.stack([(count >= number).argmax(axis=0) for number in wanted], axis=-1)
+    ranks = 1 + np.round(np.linspace(0, 1, SPREAD)[:, None] * (count[-1] - 1))
+    return np.stack([(count >= number).argmax(axis=0) for number in ranks], axis=-1)

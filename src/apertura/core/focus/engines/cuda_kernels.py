@@ -48,7 +48,7 @@ def expand(samples, taps, lead, down, carrier, turn, cells):  # type: ignore[no-
 # ---- Sums of tables over patches on a GPU
 #
 # numba compiles these functions for the device, or its simulator runs them as Python (NUMBA_ENABLE_CUDASIM=1).
-# Literals are float64 to numba: float32 constants stand in names, or one literal would slow every pixel down.
+# Literals are float64 to numba: float32 constants have names, since one literal would slow every pixel down.
 # Equations are those of docs/theory/engine.md, "A GPU".
 
 warnings.filterwarnings("ignore", "Grid size .* low occupancy")  # expected of the certificate's patches

@@ -57,7 +57,7 @@ _SIMULATED_S = 1e-4  # per pixel and pulse, in Python: this one is measured
 
 
 def simulated() -> bool:
-    """Return whether numba's simulator stands for the device: for tests, thousands of times slower.
+    """Return whether numba's simulator replaces the device: for tests, thousands of times slower.
 
     Examples
     --------

@@ -95,7 +95,7 @@ _double = ctypes.c_double
 TREE_NODES, TREE_SLOTS, TREE_LEVELS, TREE_GROUP, TREE_SIDE, TREE_DELAYS, TREE_FEWER = 128, 136, 4, 64, 256, 12, 28
 TREE_TERMS, TREE_MORE, TREE_WEIGHTS = 21, 4, 16
 """As in native/tree_job.hpp: nodes along an axis; places of them and of pixels; levels; pulses of
-a leaf; pixels along a tile; taps that align a pulse; pulses that stand for those of a leaf, at most."""
+a leaf; pixels along a tile; taps that align a pulse; pulses that replace those of a leaf, at most."""
 
 
 class BeamJob(ctypes.Structure):

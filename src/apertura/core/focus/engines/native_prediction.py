@@ -111,14 +111,15 @@ OVERSAMPLINGS: Mapping[int, tuple[int, ...]] = {
 """Degree of the polynomials → cells per resolution cell that are considered."""
 
 TOLERANCES_RAD = (1.5e-3, 1e-3, 7e-4, 5e-4, 3e-4, 1.5e-4, 5e-5, 1.5e-5)
+"""Phase errors of the path series that are considered, rad."""
 
 WIDE_SUM_DB = -105.0
 """Below this error the sum over pulses is float64; in float32 it errs by about -115 dB."""
 
 _PULSES, _PULSES_OF_SECTOR = 48, 512  # sampled for the geometry
-_WORST_TO_RMS = 1 / 3
-_FLOAT32_RAD = 2e-6
-_NO_ERROR = 1e-20
+_WORST_TO_RMS = 1 / 3  # RMS phase error over the largest in a patch
+_FLOAT32_RAD = 2e-6  # of tables and look-ups
+_NO_ERROR = 1e-20  # added before a logarithm
 
 # Seconds on one core: per pulse, cell and coefficient; per pixel and pulse by degree, for each path variant; with beams
 # per pixel and pulse that antennas weigh smoothly (on top), pixel by pixel (instead), and not at all.

@@ -185,8 +185,8 @@ def design_table(
     ideal = np.exp(1j * omega * (starts - first_sample)[:, None])[:, None] * _coefficients(omega * down / up, degree)
     before = taps // 2 - 1
     basis = np.exp(1j * omega[:, None] * (np.arange(taps) - before))
-    wanted = ideal.reshape(-1, omega.size).T
-    filters = np.linalg.lstsq(_stacked(basis), _stacked(wanted), rcond=1e-9)[0].T.reshape(up, degree + 1, taps)
+    target = ideal.reshape(-1, omega.size).T
+    filters = np.linalg.lstsq(_stacked(basis), _stacked(target), rcond=1e-9)[0].T.reshape(up, degree + 1, taps)
     given = np.einsum("pkt,wt->pkw", filters, basis)
     carrier_rad_per_cell = carrier_rad_per_sample * down / up
     polynomial, phase = _phase(carrier_rad_per_cell)

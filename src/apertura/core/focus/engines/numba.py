@@ -57,10 +57,10 @@ def candidates(job: Job, *, pulses: int, requested: Mapping[str, Any]) -> Iterat
     -----
     Source: docs/theory/planner.md, "Error" and "Cost".
     """
-    signal, wanted = job.signal, option_values(requested, "oversampling", OVERSAMPLINGS)
+    signal, considered = job.signal, option_values(requested, "oversampling", OVERSAMPLINGS)
     form_s = job.pixels * pulses * job.share * (_PIXEL_S + job.weights * BEAM_S)
-    for oversampling in wanted:
-        if oversampling < signal.oversampling and len(wanted) > 1:
+    for oversampling in considered:
+        if oversampling < signal.oversampling and len(considered) > 1:
             continue
         factor = max(1, round(oversampling / signal.oversampling))
         samples = pulses * signal.samples * factor

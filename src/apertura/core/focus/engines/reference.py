@@ -121,7 +121,7 @@ def _polynomial(coefficients, argument):  # type: ignore[no-untyped-def]
         for n in range(coefficients.shape[1] - 1, -1, -1):
             c_real, c_imag = coefficients[p, n].real, coefficients[p, n].imag
             for i in range(count):
-                turned = real[p, i] * z_real[i] - imag[p, i] * z_imag[i] + c_real
+                real_part = real[p, i] * z_real[i] - imag[p, i] * z_imag[i] + c_real
                 imag[p, i] = real[p, i] * z_imag[i] + imag[p, i] * z_real[i] + c_imag
-                real[p, i] = turned
+                real[p, i] = real_part
     return real + 1j * imag

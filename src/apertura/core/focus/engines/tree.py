@@ -187,11 +187,11 @@ class _Block:
         )
         pulses_of = np.minimum(TREE_GROUP, len(trees) - TREE_GROUP * np.arange(-(-len(trees) // TREE_GROUP)))
         left: list[Task] = []
-        for (tile, wanted), variant in zip(tasks, chunk.add(tasks), strict=True):
-            direct = wanted & (variant == DIRECTLY)
+        for (tile, selected), variant in zip(tasks, chunk.add(tasks), strict=True):
+            direct = selected & (variant == DIRECTLY)
             smaller = self._quartered(tile) if direct.any() else []
             left += [(quarter, direct) for quarter in smaller]
-            done = wanted & ~direct if smaller else wanted
+            done = selected & ~direct if smaller else selected
             self.counts += self.image[tile.window].size * np.bincount(variant[done], pulses_of[done], 3).astype(
                 np.int64
             )

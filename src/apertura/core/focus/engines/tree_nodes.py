@@ -85,8 +85,8 @@ def weights(count: int, places: NDArray[np.float64], error_db: int, band_rad: fl
     Examples
     --------
     >>> at = np.array([-0.3, 0.8])
-    >>> found = weights(12, at, -62, 6.0) @ np.exp(5j * nodes(12, -62))
-    >>> bool(np.abs(found - np.exp(5j * at)).max() < 1e-3)
+    >>> surfaces = weights(12, at, -62, 6.0) @ np.exp(5j * nodes(12, -62))
+    >>> bool(np.abs(surfaces - np.exp(5j * at)).max() < 1e-3)
     True
     """
     here = nodes(count, error_db)
@@ -119,11 +119,11 @@ def supports(error_db: int) -> NDArray[np.float64]:
     """
     text = (files("apertura.core.focus.engines") / "tree_supports.csv").read_text(encoding="utf-8").splitlines()[1:]
     column = text[0].split(",").index(str(error_db))
-    found = np.zeros(MOST_NODES + 1)
+    surfaces = np.zeros(MOST_NODES + 1)
     for line in text[1:]:
         values = line.split(",")
-        found[int(values[0]) :] = float(values[column])
-    return found
+        surfaces[int(values[0]) :] = float(values[column])
+    return surfaces
 
 
 def widest_band(count: int, error_db: int) -> float:
@@ -185,8 +185,8 @@ def _sinc(band_rad: float, a: NDArray[np.float64], b: NDArray[np.float64]) -> ND
 DEGREE = 6
 """Degree of a surface that is no plane."""
 
-_PLANE_M = 2e-5
-_THIN = 20
+_PLANE_M = 2e-5  # RMS distance of pixels from a plane that counts as one
+_THIN = 20  # pixels along a side that a surface is fitted to, at most
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,7 +249,7 @@ def surfaces_of(pixels: NDArray[np.float64], parts: list[Window]) -> list[Surfac
     >>> surfaces_of(np.stack([x, y, 0.001 * x * x], -1), [(slice(0, 30), slice(0, 40))])[0].rough_m < 1e-9
     True
     """
-    found = [Surface(np.zeros((1, 1, 3)), np.zeros(3), np.zeros(3), np.inf)] * len(parts)
+    surfaces = [Surface(np.zeros((1, 1, 3)), np.zeros(3), np.zeros(3), np.inf)] * len(parts)
     left = list(range(len(parts)))
     for degree in (1, DEGREE):
         fitted = [_fit(pixels[parts[number]], degree) for number in left]
@@ -257,11 +257,11 @@ def surfaces_of(pixels: NDArray[np.float64], parts: list[Window]) -> list[Surfac
         for number, coefficients, rest in zip(left, fitted, rests, strict=True):
             if np.isfinite(rest):
                 centre = _value(coefficients, 0.0)
-                found[number] = Surface(coefficients, centre, _across(coefficients), float(np.sqrt(rest)))
-        left = [number for number in left if _PLANE_M < found[number].rough_m < np.inf]
+                surfaces[number] = Surface(coefficients, centre, _across(coefficients), float(np.sqrt(rest)))
+        left = [number for number in left if _PLANE_M < surfaces[number].rough_m < np.inf]
         if not left:
             break
-    return found
+    return surfaces
 
 
 def _fit(pixels: NDArray[np.float64], degree: int) -> NDArray[np.float64]:
@@ -269,9 +269,9 @@ def _fit(pixels: NDArray[np.float64], degree: int) -> NDArray[np.float64]:
     middle = pixels[pixels.shape[0] // 2, pixels.shape[1] // 2]
     (rows, fit_rows), (columns, fit_columns) = (_fitting(size, degree) for size in pixels.shape[:2])
     offsets = pixels[np.ix_(rows, columns)] - middle  # places may be those of the Earth's centre
-    found = np.tensordot(fit_rows, fit_columns @ offsets, 1)
-    found[0, 0] += middle
-    return np.ascontiguousarray(found)
+    coefficients = np.tensordot(fit_rows, fit_columns @ offsets, 1)
+    coefficients[0, 0] += middle
+    return np.ascontiguousarray(coefficients)
 
 
 def _residuals(

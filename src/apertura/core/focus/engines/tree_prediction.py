@@ -133,7 +133,7 @@ PRESUMS_DB = (0, 6, 12)
 SIDES_PX, CHUNKS = (64, 128, 256), (256, 1024, 2048)
 """Sides of tiles and pulses of the largest subaperture that are considered."""
 
-_FLOAT32_DB = -92.0
+_FLOAT32_DB = -92.0  # error of float32 sums
 _FLOAT32 = 2e-7  # of a phase of so many radians: path lengths, and places of cells
 
 # Seconds on one core, of the same machine as the direct kernel's in native_prediction.py.

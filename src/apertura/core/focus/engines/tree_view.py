@@ -69,12 +69,12 @@ def leaf_roughness(one_m: NDArray[np.float64], other_m: NDArray[np.float64]) -> 
     Examples
     --------
     >>> jitter = 1e-3 * np.random.default_rng(1).standard_normal((2, 1, 64, 3))
-    >>> apart, together = (leaf_roughness(jitter[0], other)[0, 0] for other in (jitter[1], jitter[0]))
-    >>> bool(1.2e-3 < apart < 1.8e-3 < together < 2.4e-3)
+    >>> variance, together = (leaf_roughness(jitter[0], other)[0, 0] for other in (jitter[1], jitter[0]))
+    >>> bool(1.2e-3 < variance < 1.8e-3 < together < 2.4e-3)
     True
     """
-    apart = _widest(one_m) + _widest(other_m)
-    return np.asarray(np.sqrt(np.maximum(apart, _widest(one_m + other_m))))
+    variance = _widest(one_m) + _widest(other_m)
+    return np.asarray(np.sqrt(np.maximum(variance, _widest(one_m + other_m))))
 
 
 def _widest(leaves_m: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -328,7 +328,7 @@ def counts_of(view: TileView, *, nodes_db: int, presum_db: float, weighted: bool
 #
 # docs/theory/tree.md, "Sheets".
 
-MOST_SHEETS = 32
+MOST_SHEETS = 32  # of a tile: more cost more than the direct sum
 
 _TABLE = 8192  # heights between the sheets with tabulated weights
 _SAMPLED = 64  # pulses that are evaluated
