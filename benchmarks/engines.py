@@ -68,7 +68,7 @@ def native_contestants(jobs: dict[str, Job]) -> list[Contestant]:
     flat = jobs["bistatic"]
     contestants = [
         Contestant(f"native {isa}", "bistatic", former(flat), flat, isa=isa, every=1 + (isa == "portable"))
-        for isa in filter(native_binding.runs, native.INSTRUCTION_SETS)
+        for isa in filter(native_binding.supports, native.INSTRUCTION_SETS)
     ]
     fast, linear = contestants[0].isa, {"oversampling": 10, "degree": 1}
     contestants += [

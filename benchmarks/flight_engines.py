@@ -66,7 +66,9 @@ def main() -> None:
         wrong = np.nan_to_num(image[*pixels.T]) - exact  # what no pulse sees is zero in the double sum
         power = np.mean([np.mean(np.abs(np.nan_to_num(image[window])) ** 2) for window in windows])
         error_db = 10 * np.log10(np.mean(np.abs(wrong) ** 2) / power)
-        ways = ", ".join(f"{count / formation.ways.total():.0%} {way}" for way, count in formation.ways.items())
+        ways = ", ".join(
+            f"{count / formation.variant_counts.total():.0%} {way}" for way, count in formation.variant_counts.items()
+        )
         whole = spent * len(formation.windows) / len(windows)
         line = f"{formation.plan.setting.line}, {formation.plan.accuracy_db:.0f} dB asked"
         print(

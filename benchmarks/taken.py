@@ -111,7 +111,7 @@ def _planned(job: Job) -> PlannedJob:
 
 def _cheapest(engine: object, job: PlannedJob, pulses: int, target_db: float) -> Setting:
     """Return the cheapest setting that errs less than a target."""
-    settings: list[Setting] = list(engine.candidates(job, pulses=pulses, asked={}))  # type: ignore[attr-defined]
+    settings: list[Setting] = list(engine.candidates(job, pulses=pulses, requested={}))  # type: ignore[attr-defined]
     exact = [setting for setting in settings if setting.error_db <= target_db]
     return min(exact, key=lambda setting: setting.seconds + setting.table_seconds)
 

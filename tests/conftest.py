@@ -114,7 +114,7 @@ def pytest_generate_tests(metafunc):
     if "isa" in metafunc.fixturenames:
         from apertura.core.focus.engines import native, native_binding
 
-        taken = next(filter(native_binding.runs, native.INSTRUCTION_SETS), None)
+        taken = next(filter(native_binding.supports, native.INSTRUCTION_SETS), None)
         others = [pytest.param(isa, marks=pytest.mark.slow) for isa in native.INSTRUCTION_SETS if isa != taken]
         metafunc.parametrize("isa", [taken, *others] if taken else others, indirect=True)
 
@@ -124,7 +124,7 @@ def isa(request, monkeypatch):
     """An instruction set that the compiled engine runs on."""
     from apertura.core.focus.engines import native_binding
 
-    if not native_binding.runs(request.param):
+    if not native_binding.supports(request.param):
         pytest.skip(f"this machine has no {request.param}")
     monkeypatch.setenv("APERTURA_ISA", request.param)
     return request.param

@@ -37,14 +37,14 @@ def tables(plain):
     return cuda.prepare(plain[2])
 
 
-def predicted_db(scene, pixels, profiles, **asked):
+def predicted_db(scene, pixels, profiles, **requested):
     """What the engine's own prediction says of a setting."""
     signal = Signal(scene.carrier_hz, 2.0, profiles.step_m, profiles.samples.shape[1])
     spacing = float(np.linalg.norm((pixels[0, 1] - pixels[0, 0])[:2]))
     job = Job(
         profiles.aperture, ecef(pixels), pixels.shape[:2], spacing, scene.carrier_hz, BANDWIDTH_HZ, SUBCARRIERS, signal
     )
-    (setting,) = candidates(job, pulses=len(profiles), asked=asked)
+    (setting,) = candidates(job, pulses=len(profiles), requested=requested)
     return setting.error_db
 
 

@@ -59,14 +59,14 @@ def test_a_sampled_cut_keeps_its_main_lobe_alone():
     assert gain.min() >= 0.1
 
 
-def test_pulses_that_see_a_place_are_counted():
+def test_pulses_that_illuminate_a_place_are_counted():
     tx, places = straight_track(3000), np.array([[0.0, 20, 0], [2.0, 20, 0], [0.0, -20, 0]])
     beams = Beams(side_beam((4.0, 60.0), boresight_deg=(-90.0, -26.6), pulses=3000))
-    lit = illuminate(beams, monostatic(tx), places)
+    illumination = illuminate(beams, monostatic(tx), places)
     half_m = np.hypot(20, 10) * np.tan(np.radians(4 * np.sqrt(20 / 12.0412)))
     expected = [2 * half_m / 6 * 3000, (half_m + 1) / 6 * 3000, 0]
-    np.testing.assert_allclose(lit.seen, expected, atol=12)
-    assert lit.unseen == pytest.approx(1 / 3)
+    np.testing.assert_allclose(illumination.pulse_counts, expected, atol=12)
+    assert illumination.unilluminated == pytest.approx(1 / 3)
 
 
 def jobs(beams, *, shape=(200, 200)):

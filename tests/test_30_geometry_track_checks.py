@@ -124,7 +124,7 @@ def test_a_gap_bars_pulses_where_the_spline_through_it_would_err(missing, barred
         assert (result.holes[0].start_s, result.holes[0].end_s) == pytest.approx((19.9, 23.0))
         assert 0.1 < spline_m < 30
         at_s = np.array([19.9, 19.95, 22.9, 23.0, 23.1])
-        assert result.barred(at_s)["track_gap"].tolist() == [False, True, True, False, False]
+        assert result.excluded(at_s)["track_gap"].tolist() == [False, True, True, False, False]
 
 
 def test_a_long_gap_in_a_flight_that_the_spline_follows_bars_nothing():
@@ -142,7 +142,7 @@ def test_pulses_of_a_poor_fix_are_barred_however_short_it_is():
     assert {hole.cause for hole in holes} == {"fix_poor"}
     edges = np.array(sorted(hole[:2] for hole in holes))
     np.testing.assert_allclose(edges, [(-np.inf, 0.2), (9.9, 10.1), (39.8, np.inf)])
-    assert checked(time_s, place, poor=np.ones(400, bool)).barred(time_s)["fix_poor"].all()
+    assert checked(time_s, place, poor=np.ones(400, bool)).excluded(time_s)["fix_poor"].all()
 
 
 def test_a_log_that_freezes_and_jumps_is_not_splined_through_the_frozen_epochs():

@@ -53,7 +53,7 @@ def sound(path, starts, *, count, scale=8000, dtype=np.int16, high_s=20e-3):
 
 def beats_from(sweep, late_s, start_s):
     """A sweep whose first sample is taken `late_s` after its beginning."""
-    elapsed = np.arange(sweep.whole + 2) / sweep.sample_rate_hz + late_s
+    elapsed = np.arange(sweep.sweep_samples + 2) / sweep.sample_rate_hz + late_s
     total = np.zeros(len(elapsed))
     for path, amplitude in ((np.full_like(elapsed, 60.0), 1.0), (90.0 - 2 * (start_s + elapsed), 0.5)):
         own = elapsed - path / 299_792_458.0
@@ -125,7 +125,7 @@ def test_of_a_sync_pulse_with_an_edge_that_is_sampled_the_fraction_counts(tmp_pa
     inside = slice(40, -40)
     error = np.abs(stage.transfer.values - truth)[:, inside].max() / 8000
     assert error < 0.03
-    roughly = transfer_of(np.stack([samples[int(np.ceil(one)) :, 1][: COFFEE.whole] for one in starts]), COFFEE)
+    roughly = transfer_of(np.stack([samples[int(np.ceil(one)) :, 1][: COFFEE.sweep_samples] for one in starts]), COFFEE)
     assert np.abs(roughly - truth)[:, inside].max() / 8000 > 0.3
 
 

@@ -7,7 +7,7 @@ import yaml
 from apertura.common.errors import CampaignError
 from apertura.core.echo.captures import blocks_of
 from apertura.core.echo.demodulate import Numerology, demodulate
-from apertura.core.echo.pulse_filter import cut_pulses, occupied_band, pulse_filter, pulse_spectrum
+from apertura.core.echo.pulse_filter import occupied_band, pulse_filter, pulse_spectrum, truncation_flags
 from apertura.core.echo.transfer import transfer_by_sidelink
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import PulseWaveform, validated
@@ -104,12 +104,12 @@ def test_a_band_that_nobody_states_is_where_the_pulse_is(name, widest):
 
 
 @pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("asked", ["inverse", "matched"])
-def test_the_filter_loses_what_it_says(name, asked):
+@pytest.mark.parametrize("requested", ["inverse", "matched"])
+def test_the_filter_loses_what_it_says(name, requested):
     """Noise through the filter, against N·SNR of the matched one."""
     pulse = pulse_samples(name, **SIZES)
     spectrum = pulse_spectrum(pulse, lead=0, length=LENGTH)[middle_band() % LENGTH]
-    chosen = pulse_filter(spectrum, asked=asked)
+    chosen = pulse_filter(spectrum, requested=requested)
     rng = np.random.default_rng(1)
     noise = (rng.normal(size=(4000, spectrum.size, 2)) @ [1, 1j]) / np.sqrt(2)
     best = (np.abs(spectrum) ** 2).sum()
@@ -123,11 +123,11 @@ def test_inverse_leaves_the_sidelobes_of_the_window_and_matched_those_of_the_pul
     spectrum = pulse_spectrum(pulse_samples(name, **SIZES), lead=0, length=LENGTH)[numbers % LENGTH]
     window = np.hanning(spectrum.size)
     highest = {}
-    for asked in ("inverse", "matched"):
+    for requested in ("inverse", "matched"):
         response = np.abs(
-            np.fft.ifft(window * spectrum * pulse_filter(spectrum, asked=asked).inverse, 16 * len(window))
+            np.fft.ifft(window * spectrum * pulse_filter(spectrum, requested=requested).inverse, 16 * len(window))
         )
-        highest[asked] = 20 * np.log10(response[38:-38].max() / response[0])
+        highest[requested] = 20 * np.log10(response[38:-38].max() / response[0])
     assert highest["inverse"] == pytest.approx(-31.5, abs=1.5)
     if name != "chirp":
         assert highest["matched"] > -24
@@ -138,19 +138,19 @@ def test_auto_takes_matched_for_a_flat_spectrum_inverse_for_an_uneven_one_and_ma
     flat = np.exp(2j * np.pi * rng.random(500))
     uneven = flat * (1 + 0.3 * np.cos(np.arange(500) / 20))
     gaps = flat * np.where(np.arange(500) % 2, 1.0, 1e-3)
-    assert [pulse_filter(one, asked="auto").report["filter"] for one in (flat, uneven, gaps)] == [
+    assert [pulse_filter(one, requested="auto").report["filter"] for one in (flat, uneven, gaps)] == [
         "matched",
         "inverse",
         "matched",
     ]
-    assert pulse_filter(flat, asked="auto").flags == pulse_filter(uneven, asked="auto").flags == {}
-    assert "waveform_sidelobes" in pulse_filter(gaps, asked="auto").flags
+    assert pulse_filter(flat, requested="auto").flags == pulse_filter(uneven, requested="auto").flags == {}
+    assert "waveform_sidelobes" in pulse_filter(gaps, requested="auto").flags
     weak = flat * np.where(np.arange(500) % 2, 1.0, 0.14)
-    assert pulse_filter(weak, asked="auto").report["filter"] == "matched"
-    line = pulse_filter(weak, asked="inverse").flags["waveform_noise"]
+    assert pulse_filter(weak, requested="auto").report["filter"] == "matched"
+    line = pulse_filter(weak, requested="inverse").flags["waveform_noise"]
     assert line == "inverse loses 11.2 dB of the signal to noise ratio: 50% of the band lies 10 dB below its mean"
     with pytest.raises(ValueError, match="no energy"):
-        pulse_filter(np.zeros(8), asked="auto")
+        pulse_filter(np.zeros(8), requested="auto")
 
 
 @pytest.mark.parametrize("cfo_hz", [0.0, 3e4])
@@ -168,7 +168,7 @@ def test_division_needs_no_clock_where_the_pulse_is_sent_once(cfo_hz):
     numerology = numerology_of(numbers, LENGTH - len(pulse))
     measured = transfer_by_sidelink(
         lambda some: {name: one[some] for name, one in iq.items()},
-        pulse_filter(spectrum, asked="inverse").inverse,
+        pulse_filter(spectrum, requested="inverse").inverse,
         numerology,
         symbol_samples=LENGTH,
         sidelink_m=np.full(40, 11.7),
@@ -188,8 +188,8 @@ def test_division_needs_no_clock_where_the_pulse_is_sent_once(cfo_hz):
 
 def test_captures_that_begin_in_the_direct_pulse_or_end_in_it_are_counted():
     held = {"lead_s": 0.2e-6, "pulse_s": 1e-6, "listen_s": 0.5e-6, "cell_s": 2.5e-9}
-    assert cut_pulses(np.array([0.0, -0.2e-6, 0.5e-6, np.nan]), **held) == {}
-    assert "2 of 3 pulses" in cut_pulses(np.array([0.0, -0.25e-6, 0.75e-6]), **held)["pulse_cut"]
+    assert truncation_flags(np.array([0.0, -0.2e-6, 0.5e-6, np.nan]), **held) == {}
+    assert "2 of 3 pulses" in truncation_flags(np.array([0.0, -0.25e-6, 0.75e-6]), **held)["pulse_cut"]
 
 
 PULSE = {

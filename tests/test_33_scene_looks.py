@@ -78,7 +78,7 @@ def test_looks_are_the_pulses_that_count_and_fewer_at_a_smooth_edge():
 @pytest.mark.parametrize("kind", WEIGHED)
 def test_outside_is_exact_at_every_pixel(kind):
     looks = Looks.of(GRID, GROUND, FLOWN, WEIGHED[kind], threads=2)
-    seen = assembled(looks, looks.seen).astype(bool)
+    seen = assembled(looks, looks.illuminated).astype(bool)
     rows, columns, points = some_pixels(1500)
     assert np.array_equal(seen[rows, columns], (every_weight(WEIGHED[kind], points) != 0).any(axis=0))
     if kind in {"sector", "wide"}:

@@ -80,9 +80,9 @@ def test_pulses_that_are_weighed_are_left_to_other_engines(monkeypatch):
     monkeypatch.setattr(cuda, "available", lambda: True)
     seen = {"beams": Beams(beam_of(), beam_of())}
     assert plan(**seen).engine != "cuda"
-    for asked in ({"engine": "cuda"}, {"engine_options": {"cuda": {"oversampling": 8}}}):
+    for requested in ({"engine": "cuda"}, {"engine_options": {"cuda": {"oversampling": 8}}}):
         with pytest.raises(CampaignError, match="cannot form this image, whose pulses are weighed by antennas") as told:
-            plan(overrides=asked, **seen)
+            plan(overrides=requested, **seen)
         assert "numba" in told.value.expected
         assert "cuda" not in told.value.expected
 
@@ -92,8 +92,8 @@ def test_an_engine_that_nobody_has_timed_is_taken_by_name_alone(monkeypatch):
     monkeypatch.setattr(cuda, "available", lambda: True)
     large = plan(shape=(20000, 20000))
     assert "cuda" not in {large.engine, *(setting.engine for setting in large.fallbacks)}
-    for asked in ({"engine": "cuda"}, {"engine_options": {"cuda": {"oversampling": 8}}}):
-        named = plan(shape=(20000, 20000), overrides=asked)
+    for requested in ({"engine": "cuda"}, {"engine_options": {"cuda": {"oversampling": 8}}}):
+        named = plan(shape=(20000, 20000), overrides=requested)
         assert named.engine == "cuda"
         assert any("seconds are not measured" in decision.reason for decision in named.decisions)
     monkeypatch.setattr(cuda, "TIMED", True)
@@ -107,8 +107,8 @@ def test_the_simulator_is_said_to_be_slower_than_the_double_sum_and_is_no_fallba
     without_library(monkeypatch)
     monkeypatch.setattr(cuda, "available", lambda: True)
     job = planning_job()
-    (double_sum,) = load_engine("reference").candidates(job, pulses=300, asked={})
-    settings = list(candidates(job, pulses=300, asked={}))
+    (double_sum,) = load_engine("reference").candidates(job, pulses=300, requested={})
+    settings = list(candidates(job, pulses=300, requested={}))
     assert min(setting.seconds for setting in settings) > 10 * double_sum.seconds
     assert min(setting.error_db for setting in settings) < -100
     last = SettingSearch(job).fallbacks(Setting("numba", {}, {}, -94.0, 1.0))

@@ -74,7 +74,7 @@ def test_a_library_that_tells_no_layout_is_refused(tmp_path, monkeypatch):
 
 def test_no_environment_variable_means_the_best(monkeypatch):
     monkeypatch.delenv("APERTURA_ISA", raising=False)
-    assert native.instruction_set() == next(filter(native_binding.runs, native.INSTRUCTION_SETS))
+    assert native.instruction_set() == next(filter(native_binding.supports, native.INSTRUCTION_SETS))
     assert "APERTURA_ISA" not in os.environ
 
 

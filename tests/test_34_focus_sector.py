@@ -19,7 +19,7 @@ from scenes import (
 )
 
 from apertura.core.antenna.beam import Beams
-from apertura.core.antenna.illumination import reached
+from apertura.core.antenna.illumination import illumination_mask
 from apertura.core.focus.engines import native, numba, reference
 from apertura.core.focus.engines.engine import Setting
 from apertura.core.focus.reach import PULSES, Reach
@@ -150,7 +150,7 @@ def test_pulses_that_are_left_out_add_nothing_at_all(antenna):
     beams = Beams(beam, None, Sector.of(aperture, chord_m=3.0, centre=0.05, half=0.12))
     middle = generator.uniform([-70, 10, -2], [70, 60, 4], (40, 3))
     radius = generator.uniform(0.1, 9.0, 40)
-    lit = reached(beams, aperture, middle, radius, pulses=PULSES)
+    lit = illumination_mask(beams, aperture, middle, radius, pulses=PULSES)
     inside = middle + generator.uniform(-1, 1, (60, 40, 3)) * radius[:, None] / np.sqrt(3)
     weight = beams.weight(aperture, inside.reshape(-1, 3)).reshape(1000, 60, 40) != 0
     needed = np.add.reduceat(weight.any(axis=1), np.arange(0, 1000, PULSES), axis=0) > 0
@@ -190,9 +190,9 @@ def test_tiles_beyond_the_swath_are_not_formed():
     away = replace(beyond, north_m=beyond.north_m + 400)
     narrow = Beams(sector=Sector.of(aperture[:640], chord_m=4.0, centre=0.0, half=0.1))
     reach = Reach.of(narrow, aperture[:640], away, FLAT, [(slice(0, 32), slice(0, 32))])
-    assert reach.seen.tolist() == [True]
+    assert reach.illuminated.tolist() == [True]
     far = replace(beyond, west_m=beyond.west_m + 150)
-    assert not Reach.of(narrow, aperture[:640], far, FLAT, [(slice(0, 32), slice(0, 32))]).seen.any()
+    assert not Reach.of(narrow, aperture[:640], far, FLAT, [(slice(0, 32), slice(0, 32))]).illuminated.any()
 
 
 @pytest.mark.slow

@@ -14,7 +14,7 @@ from apertura.core.antenna.beam import Beam, Beams
 from apertura.core.focus.engines import native, pieces, reference, tree
 from apertura.core.focus.engines.tree_inputs import roughness
 from apertura.core.focus.engines.tree_nodes import nodes, supports, surfaces_of, weights, widest_band
-from apertura.core.focus.engines.tree_view import highest, nodes_for
+from apertura.core.focus.engines.tree_view import nodes_for, peak_band
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.sector import Sector
 
@@ -81,7 +81,7 @@ def test_tiles_at_the_end_of_profiles_go_directly():
     whole, _ = formed(flight)
     flight.profiles = replace(flight.profiles, samples=flight.profiles.samples[:, :100])
     image, share = formed(flight)
-    cells = tree.prepare(flight.profiles).directly(-74).oversampling
+    cells = tree.prepare(flight.profiles).direct_setting(-74).oversampling
     direct = native.form(native.prepare(flight.profiles, oversampling=cells), ecef(flight.pixels))
     assert 0.2 < share[0] < 0.8
     assert share[1] > 0.2
@@ -241,7 +241,7 @@ def test_a_profile_that_begins_elsewhere_is_seen_wherever_it_comes(first):
     flight.profiles = replace(flight.profiles, start_m=start_m, samples=samples)
     image, share = formed(flight)
     assert share[1] > 0.2
-    cells = tree.prepare(flight.profiles).directly(-74).oversampling
+    cells = tree.prepare(flight.profiles).direct_setting(-74).oversampling
     direct = native.form(native.prepare(flight.profiles, oversampling=cells), ecef(flight.pixels))
     assert decibels(image - direct, direct) <= -62
 
@@ -296,7 +296,7 @@ def test_a_slope_that_peaks_in_a_tile_takes_the_nodes_of_its_airy_tail():
         return decibels(found - wave, wave)
 
     slopes = np.tile(highest_rad - bend_rad * seen**2 / 2, (8, 1))
-    band_rad = highest(np.stack([slopes, slopes.T]))[0]
+    band_rad = peak_band(np.stack([slopes, slopes.T]))[0]
     assert left_db(band_rad) < -70
     assert left_db(highest_rad) > -30
     assert band_rad < highest_rad + 10

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from apertura.core.quality.error_check import Brightness, Certificate, error_bound, random_pixels
-from apertura.core.quality.measures import coherence_factor, numerical_error, survey
+from apertura.core.quality.measures import coherence_factor, image_statistics, numerical_error
 from apertura.core.quality.point_targets import BandLimitedPatch, cut_through, find_peak
 from apertura.core.scene.grid import SceneGrid
 
@@ -113,7 +113,7 @@ def test_a_survey_by_windows_is_the_survey_of_the_whole():
     image = (generator.standard_normal((60, 50)) + 1j * generator.standard_normal((60, 50))).astype(np.complex64)
     image[7, 8] = np.nan
     grid = SceneGrid("local", 0, 0, 1, (60, 50))
-    whole, parts = (survey(image, list(grid.tiles(side))) for side in (64, 16))
+    whole, parts = (image_statistics(image, list(grid.tiles(side))) for side in (64, 16))
     assert (whole.row, whole.column, whole.noise_floor_db) == (parts.row, parts.column, parts.noise_floor_db)
     assert whole.entropy == pytest.approx(parts.entropy, abs=1e-9)
     power = np.abs(image[np.isfinite(image)]).astype(float) ** 2

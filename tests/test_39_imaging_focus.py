@@ -6,7 +6,7 @@ import pytest
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.focus.inputs import PhaseHistory
 from apertura.core.geometry.aperture import Aperture
-from apertura.core.imaging.focus_check import PART_PX, PARTS, echo_elsewhere, gathered, part_images
+from apertura.core.imaging.focus_check import PART_PX, PARTS, echo_elsewhere, joint_peak_power, part_images
 from apertura.core.imaging.range_profiles import range_compress
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import FlatGround
@@ -82,6 +82,6 @@ def test_echoes_gather_best_where_the_antennas_were():
     moved = PhaseHistory(
         history.transfer, FREQUENCY_HZ, history.weight, history.reference_delay_s, Aperture(wrong, wrong)
     )
-    right, less = (gathered([one], GRID, 0.0) for one in (history, moved))
+    right, less = (joint_peak_power([one], GRID, 0.0) for one in (history, moved))
     assert 0.8 < right < 1.3
     assert less < 0.7 * right

@@ -28,8 +28,10 @@ def points(size_m: float = 20.0) -> np.ndarray:
     return np.stack([east, north, 0 * east], -1)
 
 
-def settled(aperture, *, spacing_m=0.05, asked="auto", antennas=None):
-    return integrate(aperture, points(), spacing_m=spacing_m, wavelength_m=WAVELENGTH, asked=asked, antennas=antennas)
+def settled(aperture, *, spacing_m=0.05, requested="auto", antennas=None):
+    return integrate(
+        aperture, points(), spacing_m=spacing_m, wavelength_m=WAVELENGTH, requested=requested, antennas=antennas
+    )
 
 
 def test_what_the_pixels_carry_is_not_cut():
@@ -39,7 +41,7 @@ def test_what_the_pixels_carry_is_not_cut():
     whole = settled(aperture, spacing_m=cell_m / 3)
     assert whole.sector is None
     assert whole.count == len(aperture)
-    assert settled(aperture, spacing_m=3 * cell_m, asked="all").sector is None
+    assert settled(aperture, spacing_m=3 * cell_m, requested="all").sector is None
 
 
 def test_a_coarse_grid_takes_what_it_carries():
@@ -56,7 +58,7 @@ def test_a_coarse_grid_takes_what_it_carries():
 
 def test_degrees_are_the_angle_of_a_straight_pass():
     aperture = straight()
-    sector = settled(aperture, asked={"degrees": 30.0}).sector
+    sector = settled(aperture, requested={"degrees": 30.0}).sector
     place = np.array([[0.0, 40.0, 0.0]])
     seen = aperture.tx_m[sector.weight(aperture, place)[:, 0] >= 0.5]
     turn = np.degrees(np.arctan2(seen[:, 0], np.hypot(40.0, 20.0)))
@@ -99,11 +101,11 @@ def test_a_target_inside_the_swath_has_the_amplitude_of_its_echo():
 def test_a_scene_that_is_not_passed_is_integrated_where_it_was_nearest():
     """The flight ends 30 m before the scene: the sector lies at the flight's end, as wide as asked."""
     ahead = straight(60.0, 800, east_m=-70.0)
-    chosen = settled(ahead, asked={"degrees": 6.0})
+    chosen = settled(ahead, requested={"degrees": 6.0})
     assert chosen.sector.centre > 0.4
     weight = chosen.sector.weight(ahead, points().reshape(-1, 3))
     assert np.median((weight > 0.99).any(axis=0)) == 1  # at zero Doppler none of the scene would be seen
-    assert settled(straight(), asked={"degrees": 6.0}).sector.centre == 0.0
+    assert settled(straight(), requested={"degrees": 6.0}).sector.centre == 0.0
 
 
 def test_antennas_that_look_ahead_are_integrated_where_they_look():
@@ -112,7 +114,7 @@ def test_antennas_that_look_ahead_are_integrated_where_they_look():
     look = np.array([np.sin(squint), np.cos(squint), 0.0])
     axes = np.stack([look, [np.cos(squint), -np.sin(squint), 0.0], [0.0, 0.0, 1.0]])
     beam = Beam(np.broadcast_to(axes, (len(flown), 3, 3)), angle, np.ones(3), angle, np.ones(3))
-    chosen = settled(flown, asked={"degrees": 10.0}, antennas=Beams(beam, beam))
+    chosen = settled(flown, requested={"degrees": 10.0}, antennas=Beams(beam, beam))
     assert chosen.sector.centre == pytest.approx(np.sin(squint))
     assert chosen.report["squint_deg"] == pytest.approx(25.0)
 
@@ -122,28 +124,28 @@ def test_a_circle_about_the_scene_counts_as_a_whole_and_says_so():
     turn = np.linspace(0, 2 * np.pi, 2000)
     circle = monostatic(np.stack([60 * np.cos(turn), 40 + 60 * np.sin(turn), np.full(2000, 40.0)], -1))
     near = points(2.0) + [0.0, 9.0, 0.0]
-    asked = {"spacing_m": 0.3, "wavelength_m": WAVELENGTH}
-    assert integrate(circle, near, **asked).sector is None
-    chosen = integrate(circle, near, **asked, asked={"degrees": 10.0})
+    requested = {"spacing_m": 0.3, "wavelength_m": WAVELENGTH}
+    assert integrate(circle, near, **requested).sector is None
+    chosen = integrate(circle, near, **requested, requested={"degrees": 10.0})
     assert chosen.report["pulses_per_pixel"]["median"] == 2000
     assert "integration_turns" in chosen.flags
-    assert "integration_turns" not in settled(straight(), asked={"degrees": 10.0}).flags
+    assert "integration_turns" not in settled(straight(), requested={"degrees": 10.0}).flags
 
 
 def test_a_scene_that_reaches_beyond_the_swath_is_flagged_with_its_share():
     beside = points(120.0)
-    chosen = integrate(straight(40.0), beside, spacing_m=0.5, wavelength_m=WAVELENGTH, asked={"degrees": 8.0})
+    chosen = integrate(straight(40.0), beside, spacing_m=0.5, wavelength_m=WAVELENGTH, requested={"degrees": 8.0})
     assert 20 < float(chosen.flags["outside_swath"].split()[0]) < 80
     assert chosen.report["pulses_per_pixel"]["least"] == 0
 
 
-@pytest.mark.parametrize("asked", [{"degrees": 0}, {"resolution_m": -1}, {"degrees": 4, "resolution_m": 1}, "some"])
-def test_what_is_no_integration_is_refused(asked):
+@pytest.mark.parametrize("requested", [{"degrees": 0}, {"resolution_m": -1}, {"degrees": 4, "resolution_m": 1}, "some"])
+def test_what_is_no_integration_is_refused(requested):
     with pytest.raises(ValueError, match="integration"):
-        ImagingChoices(integration=asked)
+        ImagingChoices(integration=requested)
     with pytest.raises(CampaignError, match="integration"):
         backproject(
             strip_history(straight(60.0, 64), np.zeros((1, 3))),
             SceneGrid("local", 0, 40, 1.0, (8, 8)),
-            integration=asked,
+            integration=requested,
         )

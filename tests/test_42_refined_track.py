@@ -14,7 +14,7 @@ from apertura.common.errors import CampaignError
 from apertura.core.geometry.geodesy import ecef_from_geodetic
 from apertura.core.geometry.phase_centres import TrackCorrection
 from apertura.core.imaging.range_profiles import profiles_of
-from apertura.core.planning.decisions import BORNE_DB, decide_autofocus
+from apertura.core.planning.decisions import TOLERATED_LOSS_DB, decide_autofocus
 from apertura.core.planning.plan import Decision
 from apertura.methods.autofocus.inputs import PairRecord, Refinement
 from apertura.pipeline.campaign import Campaign
@@ -52,8 +52,8 @@ def refresh(campaign):
 @pytest.mark.parametrize(
     ("asked", "loss_db", "silent", "value"),
     [
-        ("auto", -BORNE_DB - 0.01, [], "on"),
-        ("auto", -BORNE_DB + 0.01, [], "off"),
+        ("auto", -TOLERATED_LOSS_DB - 0.01, [], "on"),
+        ("auto", -TOLERATED_LOSS_DB + 0.01, [], "off"),
         ("auto", -5.0, ["b"], "off"),
         ("on", 0.0, ["a", "b"], "on"),
         ("off", -5.0, [], "off"),

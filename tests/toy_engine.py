@@ -24,9 +24,9 @@ def available() -> bool:
     return True
 
 
-def candidates(job: Job, *, pulses: int, asked: Mapping[str, Any]) -> Iterator[Setting]:
+def candidates(job: Job, *, pulses: int, requested: Mapping[str, Any]) -> Iterator[Setting]:
     """Yield a setting per refinement: so cheap that the planner takes it wherever -20 dB are enough."""
-    for refine in (asked.get("refine"),) if asked.get("refine") else (1, 4):
+    for refine in (requested.get("refine"),) if requested.get("refine") else (1, 4):
         yield Setting(
             "toy",
             {"refine": refine},

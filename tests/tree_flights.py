@@ -10,7 +10,7 @@ from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
 from apertura.core.focus.engines import tree
 from apertura.core.focus.engines.engine import Setting
 from apertura.core.focus.engines.tree_nodes import surfaces_of
-from apertura.core.focus.engines.tree_view import counts_of, look, subaperture_sizes
+from apertura.core.focus.engines.tree_view import counts_of, subaperture_sizes, view_of_tile
 from apertura.core.focus.job import Job, Signal
 from apertura.core.geometry.aperture import Aperture
 
@@ -30,14 +30,14 @@ def flown(pixels, **options):
     return seen(fly(scatter(pixels), **options), pixels)
 
 
-def setting(flight, **asked) -> Setting:
+def setting(flight, **requested) -> Setting:
     """What the tree predicts of a flight with these options."""
     places, shape = ecef(flight.pixels), flight.pixels.shape[:2]
     corners = places[np.ix_(*(np.linspace(0, size - 1, 3).astype(int) for size in shape))]
     signal = Signal(flight.scene.carrier_hz, 2.0, STEP_M, flight.profiles.samples.shape[1])
     job = Job(flight.aperture, corners, shape, 0.05, flight.scene.carrier_hz, BANDWIDTH_HZ, SUBCARRIERS, signal)
-    asked = {"side_px": 64, "chunk": 256} | asked
-    return next(iter(tree.candidates(job, pulses=len(flight.aperture), asked=asked)))
+    requested = {"side_px": 64, "chunk": 256} | requested
+    return next(iter(tree.candidates(job, pulses=len(flight.aperture), requested=requested)))
 
 
 def shaken(flight, jitter_m, *, together=False):
@@ -57,9 +57,9 @@ def heard(flight):
     return SimpleNamespace(**vars(flight) | {"profiles": replace(flight.profiles, samples=noise)})
 
 
-def formed(flight, pixels=None, *, beams=None, **asked):
+def formed(flight, pixels=None, *, beams=None, **requested):
     """The image, and which part of it went by tree, directly and silently."""
-    chosen, counts = setting(flight, **{"nodes_db": -74} | asked), np.zeros(3, np.int64)
+    chosen, counts = setting(flight, **{"nodes_db": -74} | requested), np.zeros(3, np.int64)
     places = ecef(flight.pixels if pixels is None else pixels)
     trees = tree.prepare(flight.profiles, **chosen.options)
     image = tree.form(trees, places, beams=beams, counts=counts, **chosen.form_options)
@@ -70,7 +70,7 @@ def formed(flight, pixels=None, *, beams=None, **asked):
 def counted(aperture, pixels, nodes_db=-74, *, presum_db=-74, carrier_hz=1.2e9):
     """Numbers of nodes and of pulses made of a leaf's on one tile of pixels, from one chunk of pulses."""
     (surface,) = surfaces_of(np.ascontiguousarray(pixels), [tuple(slice(0, size) for size in pixels.shape[:2])])
-    seen = look(
+    view = view_of_tile(
         aperture, surface, subaperture_sizes(256), **WAVENUMBERS | {"wavenumber_rad_m": 2 * np.pi * carrier_hz / C}
     )
-    return counts_of(seen, nodes_db=nodes_db, presum_db=presum_db, weighted=False)
+    return counts_of(view, nodes_db=nodes_db, presum_db=presum_db, weighted=False)

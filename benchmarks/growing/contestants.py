@@ -154,7 +154,7 @@ class House:
         windows = _formed(self.scene, setting.form_seconds, limit_s, fields=fields)
         module, ground, grid = load_engine(engine), plan.terrain, self.scene.grid
 
-        ways: tuple[str, ...] = getattr(module, "WAYS", ())
+        ways: tuple[str, ...] = getattr(module, "VARIANTS", ())
         went: dict[str, int] = {}
 
         def run() -> tuple[Image, float, float]:
@@ -164,7 +164,7 @@ class House:
             begin, pixels_s = time.process_time(), 0.0
             given = inputs(self.profiles)
             shared_s = time.process_time() - begin
-            for block in pulse_blocks_of(len(given), setting.pulse_blocks, whole=True):
+            for block in pulse_blocks_of(len(given), setting.pulse_blocks, any_start=True):
                 begin = time.process_time()
                 tables = module.prepare(given[block], **setting.options)
                 shared_s += time.process_time() - begin

@@ -24,7 +24,7 @@ _COUNT = 6
 
 
 def _beats() -> np.ndarray:
-    return np.cos(np.arange(_COUNT)[:, None] + 0.5 * np.arange(SWEEP.whole))
+    return np.cos(np.arange(_COUNT)[:, None] + 0.5 * np.arange(SWEEP.sweep_samples))
 
 
 def _saved(array: np.ndarray) -> bytes:
@@ -59,9 +59,9 @@ def sounds() -> list[bytes]:
     files = []
     for dtype, scale in (("<i2", 8000), ("<f4", 0.5)):
         high = np.zeros((_COUNT, 88))
-        high[:, 10 : 10 + SWEEP.whole] = 1
+        high[:, 10 : 10 + SWEEP.sweep_samples] = 1
         beat = np.zeros_like(high)
-        beat[:, 10 : 10 + SWEEP.whole] = _beats()
+        beat[:, 10 : 10 + SWEEP.sweep_samples] = _beats()
         target = io.BytesIO()
         wavfile.write(target, 44_100, (scale * np.stack([high.ravel(), beat.ravel()], 1)).astype(dtype))
         files.append(target.getvalue())

@@ -1,6 +1,6 @@
 """Kaiser's window and the sinc it bounds, the one interpolator of band-limited samples in this package.
 
-In numpy alone: scipy.signal has the window at whole samples only, and costs a second to import.
+In numpy alone: scipy.signal has the window at integer samples only, and costs a second to import.
 """
 
 import numpy as np
@@ -53,7 +53,7 @@ def kaiser_sinc(distance: Floats, *, half: int, beta: float) -> Floats:
     Parameters
     ----------
     distance
-        (...,) float64, from the wanted place to each sample, in samples.
+        (...,) float64, from the interpolated place to each sample, in samples.
     half
         Samples on each side that take part.
     beta

@@ -177,7 +177,7 @@ def beat_signal(
     >>> beat_signal(sweep, np.zeros(1), [lambda t: np.full_like(t, 60.0)], [1.0]).shape
     (1, 500)
     """
-    elapsed = np.arange(sweep.whole) / sweep.sample_rate_hz
+    elapsed = np.arange(sweep.sweep_samples) / sweep.sample_rate_hz
     at = np.asarray(start_s)[:, None] + elapsed
     reference = _phase(sweep, elapsed - sweep.reference_delay_s)
     total = np.zeros(at.shape, np.complex128)

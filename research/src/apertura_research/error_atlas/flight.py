@@ -268,7 +268,7 @@ def assumed_from_logs(flown: TrueFlight, generator: Generator, **logs: LogErrors
     places, used, flags = {}, np.ones(len(flown.time_s), bool), dict[str, str]()
     for node, log in logs.items():
         places[node], checked = log.checked(flown, node, generator)
-        barred = checked.barred(flown.time_s)
+        barred = checked.excluded(flown.time_s)
         flags |= {cause: node for cause, out in barred.items() if out.any()}
         flags |= {cause: node for cause, text in checked.faults.items() if text}
         for out in barred.values():

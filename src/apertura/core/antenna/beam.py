@@ -1,4 +1,4 @@
-"""Where an antenna looks: patterns about its axes, and the weight of each pulse at each pixel."""
+"""Antenna patterns about their axes, and the weight of each pulse at each pixel."""
 
 from dataclasses import dataclass, replace
 
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.sector import Sector
 
-# ---- Patterns of antennas: a Gaussian beam of given width or sampled cuts, and the axes they are counted from ------
+# ---- Antenna patterns: Gaussian or sampled cuts, and antenna axes
 
 Cut = tuple[NDArray[np.float64], NDArray[np.float64]]
 """One cut through a pattern: equally spaced angles (rad) and field relative to its peak."""
@@ -98,7 +98,7 @@ def sampled_cut(angle_deg: NDArray[np.float64], gain_db: NDArray[np.float64], *,
 
     Notes
     -----
-    The sign of the field changes behind a null and a gain in dB does not tell it: what lies there is left out.
+    The sign of the field changes behind a null and a gain in dB does not contain it: what lies there is left out.
 
     Examples
     --------
@@ -114,7 +114,7 @@ def sampled_cut(angle_deg: NDArray[np.float64], gain_db: NDArray[np.float64], *,
     return np.radians(fine[first:last]), 10 ** (level[first:last] / 20)
 
 
-# ---- Where an antenna looks: the weight of each pulse at each pixel ------------------------------------------------
+# ---- Gain of each pulse at each pixel
 
 
 @dataclass(frozen=True)
@@ -224,7 +224,7 @@ class Beam:
 
 @dataclass(frozen=True)
 class Beams:
-    """What weighs pulses: beams of transmitter and receiver, and the sector that pixels are integrated over.
+    """Weights of pulses: beams of transmitter and receiver, and the sector that pixels are integrated over.
 
     Attributes
     ----------

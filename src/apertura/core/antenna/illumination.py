@@ -1,4 +1,4 @@
-"""What beams make of a scene: how many pulses see each place."""
+"""Illumination of a scene by antenna beams: how many pulses illuminate each place."""
 
 from dataclasses import dataclass
 
@@ -8,71 +8,71 @@ from numpy.typing import NDArray
 from apertura.core.antenna.beam import Beam, Beams
 from apertura.core.geometry.aperture import Aperture
 
-_PULSES = 1024
-_AT_ONCE = 64
+_PULSES = 1024  # evaluated at most, of longer apertures
+_AT_ONCE = 64  # pulses, or blocks, evaluated together: bounds memory
 
 
 @dataclass(frozen=True)
 class Illumination:
-    """How many pulses see each point of a grid over the scene.
+    """How many pulses illuminate each point of a grid over the scene.
 
     Attributes
     ----------
-    seen
-        (place,) int64.
+    pulse_counts
+        (place,) int64, pulses that illuminate each place.
     pulses
-        How many there are.
+        Number of pulses of the aperture.
 
     Examples
     --------
     >>> Illumination(np.array([0, 20, 40, 60]), 100).line
-    'of 100 pulses a place of the scene is seen by 0 to 60 (median 30); 25 % of places are seen by none'
+    'of 100 pulses a place of the scene is illuminated by 0 to 60 (median 30); 25 % of places by none'
     """
 
-    seen: NDArray[np.int64]
+    pulse_counts: NDArray[np.int64]
     pulses: int
 
     @property
-    def unseen(self) -> float:
-        """Share of the places that no pulse sees."""
-        return float((self.seen == 0).mean())
+    def unilluminated(self) -> float:
+        """Share of the places that no pulse illuminates."""
+        return float((self.pulse_counts == 0).mean())
 
     @property
     def counts(self) -> dict[str, int]:
-        """Least, median and most pulses that see a place."""
-        least, median, most = np.quantile(self.seen, [0, 0.5, 1]).round().astype(int)
+        """Least, median and most pulses that illuminate a place."""
+        least, median, most = np.quantile(self.pulse_counts, [0, 0.5, 1]).round().astype(int)
         return {"least": int(least), "median": int(median), "most": int(most)}
 
     @property
     def line(self) -> str:
-        """All of it in a few words."""
+        """The counts in one line."""
         least, median, most = self.counts.values()
-        line = f"of {self.pulses} pulses a place of the scene is seen by {least} to {most} (median {median})"
-        return f"{line}; {100 * self.unseen:.0f} % of places are seen by none" if self.unseen else line
+        line = f"of {self.pulses} pulses a place of the scene is illuminated by {least} to {most} (median {median})"
+        return f"{line}; {100 * self.unilluminated:.0f} % of places by none" if self.unilluminated else line
 
 
 def illuminate(beams: Beams, aperture: Aperture, place_m: NDArray[np.float64]) -> Illumination:
-    """Return how many pulses see each place.
+    """Return how many pulses illuminate each place.
 
     Parameters
     ----------
     beams
         Of every pulse.
     aperture
-        Of more than 1024 pulses, evenly spread ones stand for all.
+        Of more than 1024 pulses an evenly spaced sample is evaluated.
     place_m
         (place, 3) float64, metres.
     """
     some = slice(None, None, -(-len(aperture) // _PULSES))
     few, beams = aperture[some], beams[some]
-    seen = np.zeros(len(place_m), np.int64)
+    pulse_counts = np.zeros(len(place_m), np.int64)
     for first in range(0, len(few), _AT_ONCE):
         part = slice(first, first + _AT_ONCE)
-        seen += (beams[part].weight(few[part], place_m) != 0).sum(axis=0)
-    return Illumination(np.rint(seen * (len(aperture) / len(few))).astype(np.int64), len(aperture))
+        pulse_counts += (beams[part].weight(few[part], place_m) != 0).sum(axis=0)
+    return Illumination(np.rint(pulse_counts * (len(aperture) / len(few))).astype(np.int64), len(aperture))
 
 
-def reached(
+def illumination_mask(
     beams: Beams | None,
     aperture: Aperture,
     middle_m: NDArray[np.float64],
@@ -80,12 +80,12 @@ def reached(
     *,
     pulses: int,
 ) -> NDArray[np.bool_]:
-    """Return which blocks of pulses may weigh anything inside balls about places.
+    """Return which blocks of pulses may illuminate balls about places.
 
     Parameters
     ----------
     beams
-        Of every pulse; None reaches everything.
+        Of every pulse; None illuminates everything.
     aperture
         Of every pulse.
     middle_m, radius_m
@@ -96,19 +96,19 @@ def reached(
     Returns
     -------
     ndarray
-        (block, place) bool. Where it is False the weight of each pulse is zero all over the ball.
+        (block, place) bool. False where the weight of every pulse of the block is zero all over the ball.
     """
     count = -(-len(aperture) // pulses)
-    lit = np.ones((count, len(middle_m)), bool)
+    mask = np.ones((count, len(middle_m)), bool)
     if beams is None:
-        return lit
+        return mask
     for first in range(0, count, _AT_ONCE):
         part = slice(first * pulses, (first + _AT_ONCE) * pulses)
-        lit[first : first + _AT_ONCE] = _reached(beams[part], aperture[part], middle_m, radius_m, pulses)
-    return lit
+        mask[first : first + _AT_ONCE] = _block_mask(beams[part], aperture[part], middle_m, radius_m, pulses)
+    return mask
 
 
-def _reached(
+def _block_mask(
     beams: Beams, aperture: Aperture, middle_m: NDArray[np.float64], radius_m: NDArray[np.float64], pulses: int
 ) -> NDArray[np.bool_]:
     starts = np.arange(0, len(aperture), pulses)
@@ -119,16 +119,16 @@ def _reached(
         radius_m + np.maximum.reduceat(np.linalg.norm(leg - there[block], axis=1), starts)[:, None]
         for leg, there in zip(aperture.legs, middle.legs, strict=True)
     ]
-    lit = np.ones((len(starts), len(middle_m)), bool)
+    mask = np.ones((len(starts), len(middle_m)), bool)
     if beams.sector is not None:
         there = beams.sector[middles]
-        turned = beams.sector.turned(there[block])
-        slack = there.slack(middle, middle_m, np.maximum(*radius)) + np.maximum.reduceat(turned, starts)[:, None]
-        lit &= np.abs(there.place(middle, middle_m)) - slack < beams.sector.outer
+        rotation = beams.sector.axis_change(there[block])
+        slack = there.slack(middle, middle_m, np.maximum(*radius)) + np.maximum.reduceat(rotation, starts)[:, None]
+        mask &= np.abs(there.place(middle, middle_m)) - slack < beams.sector.outer
     for beam, leg, around in zip((beams.transmit, beams.receive), middle.legs, radius, strict=True):
         if beam is not None:
-            lit &= _in_pattern(beam, middles, starts, middle_m - leg[:, None], around)
-    return lit
+            mask &= _in_pattern(beam, middles, starts, middle_m - leg[:, None], around)
+    return mask
 
 
 def _in_pattern(
@@ -138,15 +138,15 @@ def _in_pattern(
     away_m: NDArray[np.float64],
     radius_m: NDArray[np.float64],
 ) -> NDArray[np.bool_]:
-    """Return which balls (block, place) may touch the pattern at any pulse of a block: its cone and its elevations."""
+    """Return which balls (block, place) may intersect the pattern's cone and elevations at a pulse of a block."""
     range_m = np.linalg.norm(away_m, axis=-1)
     near = np.arcsin(np.minimum(1.0, radius_m / range_m)) + 1e-6
     off, above = (np.empty(range_m.shape) for _ in range(2))
     for axis, angle in ((0, off), (2, above)):
         each = beam.axes[:, axis]
         there = each[middles]
-        turned = _angle((each * np.repeat(there, np.diff(starts, append=len(each)), axis=0)).sum(axis=1))
-        near += np.maximum.reduceat(turned, starts)[:, None]
+        rotation = _angle((each * np.repeat(there, np.diff(starts, append=len(each)), axis=0)).sum(axis=1))
+        near += np.maximum.reduceat(rotation, starts)[:, None]
         angle[:] = _angle(np.einsum("bpx,bx->bp", away_m, there) / range_m)
     elevation = np.pi / 2 - above
     inside = (elevation + near > beam.elevation_rad[0]) & (elevation - near < beam.elevation_rad[-1])
@@ -160,12 +160,12 @@ def _angle(cosine: NDArray[np.float64]) -> NDArray[np.float64]:
 def decide_antennas(
     beams: Beams | None, illumination: Illumination | None
 ) -> tuple[list[tuple[str, str]], dict[str, str]]:
-    """Return which antennas have beams and what they see, in one line, and the flag `beam_misses`; neither without."""
+    """Return which antennas have beams with the illumination, and the flag `beam_misses`; empty without beams."""
     if beams is None or beams.antennas is None or illumination is None:
         return [], {}
-    looking = [name for name in ("transmit", "receive") if getattr(beams, name) is not None]
-    misses = f"{100 * illumination.unseen:.1f} % of the scene is seen by no pulse: its pixels are zero"
+    with_beam = [name for name in ("transmit", "receive") if getattr(beams, name) is not None]
+    misses = f"{100 * illumination.unilluminated:.1f} % of the scene is illuminated by no pulse: its pixels are zero"
     return (
-        [(", ".join(looking), illumination.line)],
-        {"beam_misses": misses} if illumination.unseen else {},
+        [(", ".join(with_beam), illumination.line)],
+        {"beam_misses": misses} if illumination.unilluminated else {},
     )

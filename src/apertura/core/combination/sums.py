@@ -1,4 +1,4 @@
-"""Images of one flight added up: which of them with their phases, what sums hold, what they do to clutter."""
+"""Sums of the images of one flight: choice of coherent pairs, sums, and clutter reduction."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -7,7 +7,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-# ---- What a coherent sum does to what is not a target --------------------------------------------------------------
+# ---- Clutter reduction
 
 
 def clutter_reduction_db(single_db: Sequence[float], coherent_db: float) -> float:
@@ -45,11 +45,11 @@ def clutter_reduction_db(single_db: Sequence[float], coherent_db: float) -> floa
     return float(10 * np.log10(np.mean(10 ** (np.asarray(single_db) / 10))) - coherent_db)
 
 
-# ---- Which images of a flight are added with their phases: those that were seen to be in phase, or made so ---------
+# ---- Choice of the pairs that are added coherently
 
 
 class Phase(Protocol):
-    """How a pair lies against the reference in phase."""
+    """Phase of a pair against the reference."""
 
     @property
     def phase_rad(self) -> float: ...  # noqa: D102
@@ -64,17 +64,17 @@ class Phase(Protocol):
 
 
 LEAST_COHERENCE = 0.5
-"""Phases of the points of two images that scatter more than this say nothing that a constant could mend."""
+"""Mean phasor over common points, 0 to 1: below it phases scatter too much for a constant phase to correct."""
 
 
 @dataclass(frozen=True)
 class CoherentSum:
-    """What the coherent sum holds.
+    """The pairs of a coherent sum.
 
     Attributes
     ----------
     phases_rad
-        Pair → phase taken off before it is added; 0 where none was asked for or needed.
+        Pair → phase removed before it is added; 0 where none was requested or needed.
     left_out
         Pair → why it is only in the sums without phase.
     why
@@ -93,7 +93,7 @@ class CoherentSum:
 
 
 def choose_fusion(
-    reference: str, found: Mapping[str, Phase | None], *, unfit: Mapping[str, str], align: bool
+    reference: str, measured: Mapping[str, Phase | None], *, unfit: Mapping[str, str], align: bool
 ) -> CoherentSum:
     """Return which pairs add coherently to the reference.
 
@@ -101,12 +101,12 @@ def choose_fusion(
     ----------
     reference
         The pair that others are measured against.
-    found
+    measured
         Every other pair → its phase against the reference at bright points; None where they share none.
     unfit
         Pairs that show other places than the reference → why.
     align
-        Whether a constant phase is taken off.
+        Whether a constant phase is removed.
 
     Examples
     --------
@@ -114,7 +114,7 @@ def choose_fusion(
     {'a-a': 0.0, 'a-b': 0.0}
     """
     phases, left_out, why = {reference: 0.0}, {}, {reference: "the others are measured against it"}
-    for pair, phase in found.items():
+    for pair, phase in measured.items():
         if pair in unfit:
             left_out[pair] = unfit[pair]
         elif phase is None:
@@ -132,7 +132,7 @@ def choose_fusion(
     return CoherentSum(phases, left_out, why)
 
 
-# ---- What the pairs of one flight add up to ------------------------------------------------------------------------
+# ---- Sums
 
 
 def coherent_sum(
@@ -146,17 +146,17 @@ def coherent_sum(
     Parameters
     ----------
     images
-        (pair, y, x) complex64 on one grid or a block of it, carriers kept; NaN where a pair sees nothing, to which it
-        adds nothing.
+        (pair, y, x) complex64 on one grid or a block of it, carriers kept; NaN where no pulse of a pair illuminates
+        the pixel: it adds nothing.
     peaks
         (pair,) float64, largest magnitude of each whole image.
     phases_rad
-        (pair,) float64, taken off each image first.
+        (pair,) float64, removed from each image first.
 
     Returns
     -------
     ndarray
-        (y, x) complex64, 1 where every image peaks in phase, NaN where no pair sees anything.
+        (y, x) complex64, 1 where every image peaks in phase, NaN where no pair illuminates the pixel.
 
     Raises
     ------
@@ -168,12 +168,12 @@ def coherent_sum(
     >>> coherent_sum(np.array([[[2.0, 0.0]], [[4.0j, 0.0]]], np.complex64), np.array([2.0, 4.0])).round(3)
     array([[0.5+0.5j, 0. +0.j ]], dtype=complex64)
     """
-    turned = np.exp(-1j * np.asarray(phases_rad)).astype(np.complex64)
-    return np.asarray(_mean(_normalised(images, peaks) * turned.reshape(-1, 1, 1)), np.complex64)
+    rotation = np.exp(-1j * np.asarray(phases_rad)).astype(np.complex64)
+    return np.asarray(_mean(_normalised(images, peaks) * rotation.reshape(-1, 1, 1)), np.complex64)
 
 
 def noncoherent_sum(images: NDArray[np.complex64], peaks: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Return the mean power of peak-normalised images: no gain in resolution, less speckle, no phase to trust.
+    """Return the mean power of peak-normalised images: no gain in resolution, less speckle, no phase errors.
 
     Parameters and errors as `coherent_sum`; returns (y, x) float32, linear power.
 
@@ -200,10 +200,10 @@ def magnitude_sum(images: NDArray[np.complex64], peaks: NDArray[np.float64]) -> 
 
 
 def _mean(images: NDArray[Any]) -> NDArray[Any]:
-    """Return the mean over all pairs; one that sees nothing of a pixel counts as zero, and NaN if none does."""
-    unseen = np.isnan(images)
-    mean: NDArray[Any] = np.where(unseen, 0, images).mean(axis=0)
-    mean[unseen.all(axis=0)] = np.nan
+    """Return the mean over all pairs; one without a value at a pixel counts as zero, and NaN if none has one."""
+    missing = np.isnan(images)
+    mean: NDArray[Any] = np.where(missing, 0, images).mean(axis=0)
+    mean[missing.all(axis=0)] = np.nan
     return mean
 
 

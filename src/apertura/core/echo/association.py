@@ -1,4 +1,4 @@
-"""Which capture of the receiver belongs to which pulse of the transmitter, when that is suspect, what is missing."""
+"""Association of the receiver's captures with the transmitter's pulses, flags of wrong tags, and missing pulses."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -11,14 +11,14 @@ from apertura.common.arrays import Floats
 from apertura.common.errors import CampaignError
 from apertura.core.echo.trigger import ABSENT
 
-# ---- How the time tags of two nodes lie to each other: an offset, a drift, and the pairs that follow from them
+# ---- Offset and drift between the time tags of two nodes
 
 Integers = NDArray[np.int64]
 Pairs = tuple[Integers, Integers]
-"""Something of the transmitter and the same of the receiver: tags, or indices of paired pulses."""
+"""Of the transmitter and of the receiver: tags, or indices of paired pulses."""
 
 LARGEST_DRIFT_PPM = 100.0
-"""Free-running crystals stay inside this; a faster drift of the tags is not searched for."""
+"""ppm, largest drift of the tags that is searched: free-running crystals stay inside."""
 
 
 class TagLine(NamedTuple):
@@ -64,7 +64,7 @@ def fit_pairs(tags: Pairs, pairs: Pairs, interval_ns: float) -> TagLine:
     offset_ns = (rx_tag - tx_tag).astype(np.float64)
     elapsed_ns = (rx_tag - rx_tag[0]).astype(np.float64)
     drift = 0.0
-    if LARGEST_DRIFT_PPM * 1e-6 * elapsed_ns[-1] > interval_ns / 100:  # else jitter would pose as drift
+    if LARGEST_DRIFT_PPM * 1e-6 * elapsed_ns[-1] > interval_ns / 100:  # else jitter would be fitted as drift
         some = np.unique(np.linspace(0, rx_tag.size - 1, 300).astype(int))
         drift = _theil_sen_slope(elapsed_ns[some], offset_ns[some])
     return TagLine(float(np.median(offset_ns - drift * elapsed_ns)), drift, int(rx_tag[0]))
@@ -77,7 +77,7 @@ def _theil_sen_slope(x: Floats, y: Floats) -> float:
 
 
 def residual_ns(tags: Pairs, pairs: Pairs, line: TagLine) -> Floats:
-    """Return (pair,) float64: how far the receiver's tag lies from where the line puts it, nanoseconds."""
+    """Return (pair,) float64: residual of the receiver's tag from the line, nanoseconds."""
     rx_tag = tags[1][pairs[1]]
     return np.asarray(rx_tag - tags[0][pairs[0]] - _offset_ns(rx_tag, line), np.float64)
 
@@ -86,7 +86,7 @@ def _offset_ns(rx_tag: Integers, line: TagLine) -> Floats:
     return np.asarray(line.offset_ns + line.drift * (rx_tag - line.origin_ns), np.float64)
 
 
-# ---- Which capture of the receiver belongs to which pulse of the transmitter, and when that answer is suspect ------
+# ---- Association
 
 
 @dataclass(frozen=True)
@@ -104,9 +104,9 @@ class Association:
     residual_s
         RMS of the tags about that line, seconds.
     method
-        What the pairs rest on.
+        Basis of the pairs: frame numbers or tags.
     outlier
-        (pair,) bool, whose tags leave that line by more than a tag may err: one of the two is wrong.
+        (pair,) bool, whose tags deviate from that line by more than the error of a tag: one of the two is wrong.
     tx_dropped, rx_dropped
         Pulses of each recording without a partner.
     flags
@@ -150,12 +150,12 @@ def associate(
     tx_frame, rx_frame
         (pulse,) int64 frame numbers, -1 where the payload was not read; None without a counter.
     frame_modulus
-        Count at which the counter returns to zero. None: the power of two above the largest number seen, if
+        Count at which the counter returns to zero. None: the power of two above the largest number, if
         a counter ever steps back.
     speed_m_s
-        Of the transmitter, to say how far tags that are apart move it, metres per second; None: unknown.
+        Of the transmitter, to state the displacement by an offset of tags, metres per second; None: unknown.
     where
-        What to call the recordings in errors.
+        Name of the recordings in errors.
 
     Raises
     ------
@@ -185,7 +185,7 @@ def associate(
     else:
         pairs, conflicts = _agreed_pairs(tags, by_frame, frames, interval_ns)
     if pairs[0].size == 0:
-        raise _nothing_in_common(tags, repetition_interval_s, where)
+        raise _no_common_pulse(tags, repetition_interval_s, where)
     line = fit_pairs(tags, pairs, interval_ns)
     residual = residual_ns(tags, pairs, line) * 1e-9
     association = Association(
@@ -212,7 +212,7 @@ def _require_ascending(tags: Integers, node: str, where: str) -> None:
         )
 
 
-def _nothing_in_common(tags: Pairs, repetition_interval_s: float, where: str) -> CampaignError:
+def _no_common_pulse(tags: Pairs, repetition_interval_s: float, where: str) -> CampaignError:
     gap_s = [(tags[1][0] - tags[0][0]) * 1e-9, (tags[1][-1] - tags[0][-1]) * 1e-9]
     return CampaignError(
         f"no pulse pairs: the receiver begins {gap_s[0]:+.3f} s and ends {gap_s[1]:+.3f} s from the transmitter",
@@ -246,7 +246,7 @@ def _agreed_pairs(
     return (tx[ascending], rx[ascending]), int((~agreed).sum())
 
 
-# ---- Pulses that carry the same frame number, however often the counter wrapped between them -----------------------
+# ---- Pairs by frame number
 
 
 def pairs_by_frame(
@@ -264,7 +264,7 @@ def pairs_by_frame(
     if modulus is not None:
         tx_count = _unwrapped(tx_count, tags[0][tx], interval_ns, modulus)
         rx_count = _unwrapped(rx_count, tags[1][rx], interval_ns, modulus)
-        # whole turns of the counter between the nodes: those that bring their tags closest
+        # number of wraps of the counter between the nodes: the one that brings their tags closest
         expected_ns = tags[0][tx[0]] + (rx_count - tx_count[0]) * interval_ns
         rx_count += modulus * int(np.rint(np.median(tags[1][rx] - expected_ns) / (modulus * interval_ns)))
     _, at_tx, at_rx = np.intersect1d(tx_count, rx_count, return_indices=True)
@@ -272,36 +272,36 @@ def pairs_by_frame(
 
 
 def _unwrapped(count: Integers, tags: Integers, interval_ns: float, modulus: int) -> Integers:
-    """Return the count that never wraps; a misread number costs itself, not those after it."""
+    """Return the count without wraps; a misread number does not change those after it."""
     step = np.mod(np.diff(count), modulus)
     step += modulus * np.rint((np.diff(tags) / interval_ns - step) / modulus).astype(np.int64)
     return np.asarray(count[0] + np.concatenate([[0], np.cumsum(step)]), np.int64)
 
 
-# ---- When a pairing of two nodes' pulses is suspect, and which tags are wrong by themselves ------------------------
+# ---- Flags of an association
 
 LARGEST_JITTER = 1 / 6
 """RMS scatter of the tags, in repetition intervals, at which one pulse in 370 (3σ) reaches its neighbour."""
 
-NEAR_HALF = 0.4
-"""Offsets beyond this share of a repetition interval could as well belong to the neighbouring pulse."""
+AMBIGUOUS_SHARE = 0.4
+"""Share of a repetition interval: offsets beyond it may belong to the neighbouring pulse, which begins at one half."""
 
-APART_S = 20e-3
-"""Offset between two nodes' tags, good to a few milliseconds each, that is no longer the error of good tags."""
+LARGEST_OFFSET_S = 20e-3
+"""Seconds, largest offset between two nodes' tags that errors of a few milliseconds each explain."""
 
 OUTLIER_S = 5e-3
-"""A single tag that leaves the line by no more than this is as good as tags are."""
+"""Seconds: a single tag within this of the line is as accurate as tags are."""
 
-_OUTLIER_SIGMA = 6.0
+_OUTLIER_SIGMA = 6.0  # scatters of all tags: an outlier deviates by more than this and `OUTLIER_S`
 
 LARGEST_UNPAIRED = 0.05
-"""Share of the transmitter's pulses before or after the other recording that is worth a remark."""
+"""Share of the transmitter's pulses before or after the other recording above which a flag is raised."""
 
-_FEW = 2  # pulses that a recorder may begin late or end early by
+_FEW = 2  # pulses by which a recorder may begin late or end early
 
 
 def is_outlier(residual_s: Floats) -> NDArray[np.bool_]:
-    """Return (pair,) bool: which tags leave the line by more than `OUTLIER_S` and six times the scatter of all.
+    """Return (pair,) bool: which tags deviate from the line by more than `OUTLIER_S` and six times the scatter of all.
 
     Examples
     --------
@@ -322,7 +322,7 @@ def tag_jitter_s(time_ns: Integers) -> float:
 
     Notes
     -----
-    Where triggers do not come in equal steps this is an upper bound. An error that all tags share cannot be seen.
+    Where triggers do not come in equal steps this is an upper bound. An error common to all tags is not measured.
 
     Examples
     --------
@@ -360,13 +360,13 @@ def association_flags(
     """
     flags = {}
     share, by_tags = abs(association.offset_s) / interval_s, association.method == "time tags"
-    if by_tags and share > NEAR_HALF:
+    if by_tags and share > AMBIGUOUS_SHARE:
         flags["association_ambiguous"] = (
             f"tags are {association.offset_s:+.4f} s apart, {share:.2f} of a repetition interval: "
             "every pair may be off by one pulse"
         )
-    if abs(association.offset_s) > APART_S:
-        flags["time_tags_apart"] = _apart(association, speed_m_s)
+    if abs(association.offset_s) > LARGEST_OFFSET_S:
+        flags["time_tags_apart"] = _offset_line(association, speed_m_s)
     if conflicts:
         flags["frame_counter_conflict"] = f"{conflicts} pulses dropped: frame counter and time tags disagree"
     if by_tags and association.residual_s > interval_s * LARGEST_JITTER:
@@ -389,7 +389,7 @@ def association_flags(
     return flags
 
 
-def _apart(association: "Association", speed_m_s: float | None) -> str:
+def _offset_line(association: "Association", speed_m_s: float | None) -> str:
     line = f"time tags of the nodes are {association.offset_s:+.4f} s apart (pairs by {association.method})"
     if speed_m_s is None:
         return line
@@ -409,19 +409,19 @@ def _unpaired(association: "Association", tags: Pairs, interval_s: float) -> str
     return line
 
 
-# ---- What pulses that are missing inside an aperture do to its image -----------------------------------------------
+# ---- Missing pulses
 
 LARGEST_SIDELOBE = 0.1
-"""Of the peak, what missing pulses may add anywhere along the track: -20 dB, of a tenth of the aperture in a row."""
+"""Amplitude over the peak, largest sidelobe by missing pulses: -20 dB, of a tenth of the aperture in a row."""
 
 
 def missing_pulses(time_ns: Integers) -> tuple[int, float]:
-    """Return how many pulses are missing between the first and the last, and the highest sidelobe that they add.
+    """Return the number of pulses missing between the first and the last, and the highest sidelobe they cause.
 
     Parameters
     ----------
     time_ns
-        (pulse,) int64, ascending tags of the pulses that there are; most are one interval apart.
+        (pulse,) int64, ascending tags of the recorded pulses; most are one interval apart.
 
     Returns
     -------

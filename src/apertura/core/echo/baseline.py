@@ -1,4 +1,4 @@
-"""The sidelink's measured delay against the baseline of the tracks: whether pulses carry their own positions."""
+"""The sidelink's measured delay against the baseline of the tracks: a check of the association of pulses."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -9,32 +9,32 @@ from numpy.typing import NDArray
 from apertura.common.arrays import Floats
 
 EXPLAINED_M = 0.05
-"""Movement of a sidelink that errors of the logged positions alone may explain."""
+"""Metres of movement of a sidelink that errors of the logged positions alone may explain."""
 
 SIGMAS = 5.0
-"""Of the noise of a median, what one of a thousand windows reaches by chance once in 3000 flights."""
+"""Standard deviations of a median's noise that one of a thousand windows reaches by chance once in 3000 flights."""
 
 _MEDIAN_PULSES = 15, 61, 241
-"""Of the running medians that tell movement from jitter, odd numbers: the longer, the less noise and the slower."""
+"""Lengths of the running medians that separate movement from jitter, odd: the longer, the less noise and the slower."""
 
 _WINDOWS_AT_ONCE = 4096
-_ENOUGH = 64  # windows apart from each other that tell their own noise
+_ENOUGH = 64  # disjoint windows from which their noise is estimated
 
 
 @dataclass(frozen=True)
 class BaselineResidual:
-    """What the measured delay does that the baseline does not, a constant and a linear drift apart.
+    """Residual of the measured delay against the baseline, without a constant and a linear drift.
 
     Attributes
     ----------
     residual_m, noise_m
-        RMS of the residual's running median, metres, and the standard deviation that jitter alone gives that median.
+        RMS of the residual's running median, metres, and the standard deviation of that median by jitter alone.
     jitter_m
         Standard deviation of a single pulse, metres: of the trigger, mostly.
     largest_m, pulse
-        Where the running median is furthest out, metres, and at which pulse.
+        Largest running median, metres, and its pulse.
     excess
-        How many times what may be explained `largest_m` is, over running medians of several lengths.
+        `largest_m` relative to what noise and position errors explain, over running medians of several lengths.
     """
 
     residual_m: float
@@ -46,7 +46,7 @@ class BaselineResidual:
 
 
 def baseline_residual(delay_m: Floats, baseline_m: Floats) -> BaselineResidual | None:
-    """Return how far the measured path of a sidelink follows its geometry; None of less than 30 pulses.
+    """Return the residual of a sidelink's measured path from its geometry; None of less than 30 pulses.
 
     Parameters
     ----------
@@ -70,8 +70,8 @@ def baseline_residual(delay_m: Floats, baseline_m: Floats) -> BaselineResidual |
         return None
     residual = delay_m[pulse] - baseline_m[pulse]
     jitter = 1.4826 * float(np.median(np.abs(np.diff(residual)))) / 2**0.5
-    found = [_smoothed(pulse, residual, jitter, width) for width in _MEDIAN_PULSES if 2 * width <= pulse.size]
-    return max(found, key=lambda one: one.excess)
+    residuals = [_smoothed(pulse, residual, jitter, width) for width in _MEDIAN_PULSES if 2 * width <= pulse.size]
+    return max(residuals, key=lambda one: one.excess)
 
 
 def _smoothed(pulse: NDArray[np.intp], residual: Floats, jitter_m: float, width: int) -> BaselineResidual:
@@ -97,7 +97,7 @@ def _smoothed(pulse: NDArray[np.intp], residual: Floats, jitter_m: float, width:
 
 
 def sigmas(windows: int) -> float:
-    """Return how many standard deviations the highest of so many windows must reach, at the same chance for any flight.
+    """Return the threshold in standard deviations for the highest of so many windows, of equal false alarm per flight.
 
     Examples
     --------
@@ -108,16 +108,16 @@ def sigmas(windows: int) -> float:
 
 
 def detect_wrong_association(residual: BaselineResidual | None) -> str | None:
-    """Return one line saying where the measured sidelink leaves the geometry of its pulses, or None.
+    """Return one line on where the measured sidelink deviates from the geometry of its pulses, or None.
 
-    A constant and a linear drift belong to the clocks. What still moves by more than `EXPLAINED_M` and by more than
-    five times its own noise, six of a long flight, cannot come from trigger jitter: the pulses carry positions of other
+    A constant and a linear drift are of the clocks. A residual that moves by more than `EXPLAINED_M` and by more than
+    five times its own noise, six of a long flight, cannot come from trigger jitter: pulses have positions of other
     pulses, or wrong ones.
 
     Notes
     -----
     Source: docs/theory/echo_methods.md, "Association". Two nodes that keep their distance give no evidence either way:
-    the prediction itself must move for a wrong pair to show.
+    the baseline must change for a wrong pair to be detected.
 
     Examples
     --------
@@ -136,7 +136,7 @@ def detect_wrong_association(residual: BaselineResidual | None) -> str | None:
 
 
 def best_baseline(delay_m: Floats, baselines_m: Mapping[str, Floats]) -> tuple[str, float] | None:
-    """Return which of several baselines the measured delay follows best, and its residual (m); None if none is better.
+    """Return the baseline that fits the measured delay best, and its residual (m); None if no other is better.
 
     Parameters
     ----------
@@ -144,7 +144,7 @@ def best_baseline(delay_m: Floats, baselines_m: Mapping[str, Floats]) -> tuple[s
         (pulse,) float64, metres, as measured; NaN where the sidelink did not lock.
     baselines_m
         Name → (pulse,) float64, metres, the first as stated: with a log shifted in time, tracks exchanged, a lever arm
-        turned. Another is better if what leaves it is half of what leaves the first, or less, and more than noise.
+        rotated. Another is better if its residual is at most half of that of the first, and that exceeds noise.
 
     Examples
     --------

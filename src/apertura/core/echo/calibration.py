@@ -1,4 +1,4 @@
-"""What a reflector at a known place tells of a node: its path offset, and its phase from pulse to pulse."""
+"""Calibration on a reflector at a known place: a node's path offset, and its phase from pulse to pulse."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -17,13 +17,13 @@ from apertura.common.flags import Flags
 from apertura.core.echo.captures import AT_ONCE
 
 FALSE_REFLECTOR = 1e-3
-"""Chance that clutter or noise alone passes for a reflector."""
+"""Probability that clutter or noise alone is detected as a reflector."""
 
 NEEDED_STD_M = 0.02
-"""A path offset less certain than this costs focus where several nodes are added coherently."""
+"""Metres, standard deviation of a path offset above which coherent sums of several nodes lose focus."""
 
 RIVAL_DB = -6.0
-"""A second reflector this strong makes it uncertain which of them is the known one."""
+"""dB below the reflector: a second one stronger than this makes it uncertain which of them is the known one."""
 
 _GROUPS = 16
 _OVERSAMPLING = 8
@@ -49,9 +49,9 @@ class PathOffset:
     std_m
         Standard deviation, from the scatter over sixteenths and quarters of the flight; infinite below 16 pulses.
     contrast_db
-        Reflector above what surrounds it.
+        Reflector above its surroundings.
     pulses
-        How many it rests on.
+        Number of pulses used.
     flags
         Edge crossed → what was measured, in one line.
     """
@@ -71,7 +71,7 @@ def estimate_path_offset(
     search_m: float = 10.0,
     where: str = "calibration flight",
 ) -> PathOffset:
-    """Return the path offset under which a reflector appears where it stands.
+    """Return the path offset under which a reflector appears at its known place.
 
     Parameters
     ----------
@@ -85,12 +85,12 @@ def estimate_path_offset(
     search_m
         Offsets of either sign up to this are considered, metres.
     where
-        What to call the flight in errors.
+        Name of the flight in errors.
 
     Raises
     ------
     CampaignError
-        If nothing stands out within `search_m`.
+        If no reflector is detected within `search_m`.
 
     Notes
     -----
@@ -151,14 +151,14 @@ def _aligned(transfer: Complexes, frequency_hz: Floats, path_m: Floats) -> NDArr
 
 
 def _aligned_groups(transfer: Pulses, frequency_hz: Floats, path_m: Floats) -> NDArray[np.complex128]:
-    """Return (group, subcarrier): pulses turned to the predicted path, added within each part of the flight."""
+    """Return (group, subcarrier): pulses aligned to the predicted path, added within each part of the flight."""
     taper = np.hanning(frequency_hz.size + 2)[1:-1]
     edges = np.linspace(0, len(transfer), min(_GROUPS, len(transfer)) + 1).astype(int)
     return np.array([_mean(transfer, frequency_hz, path_m, *ends) * taper for ends in pairwise(edges)])
 
 
 def _mean(transfer: Pulses, frequency_hz: Floats, path_m: Floats, first: int, last: int) -> NDArray[np.complex128]:
-    """Return (subcarrier,) the mean of pulses first to last, turned to the predicted path, a block at a time."""
+    """Return (subcarrier,) the mean of pulses first to last, aligned to the predicted path, a block at a time."""
     total = np.zeros(len(frequency_hz), np.complex128)
     for start in range(first, last, AT_ONCE):
         part = slice(start, min(start + AT_ONCE, last))

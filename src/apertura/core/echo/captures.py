@@ -9,7 +9,7 @@ from apertura.common.arrays import Complexes, Floats
 from apertura.core.echo.demodulate import Numerology
 from apertura.core.interpolation import kaiser_beta, kaiser_sinc
 
-# ---- The captures of a pair, read in blocks of pulses, and what they tell before anything is computed: saturation
+# ---- Blocks of captures, and saturation
 
 Samples = NDArray[np.int16 | np.float32]
 Pulses = NDArray[np.int64]
@@ -18,10 +18,10 @@ Read = Callable[[Pulses], Mapping[str, Samples]]
 """Numbers of captures, ascending → channel → (capture, sample, 2), I and Q from the start of the prefix."""
 
 AT_ONCE = 64
-"""Captures in work at a time: the caches hold them."""
+"""Captures processed at a time: as many as fit into the caches."""
 
 SATURATED_SHARE = 1e-4
-"""Share of the samples at the converter's end stops; a symbol 12 dB below them reaches its extremes once or twice."""
+"""Share of the samples at the converter's end stops above which it clips; a symbol 12 dB below has one or two."""
 
 
 def blocks_of(pulses: Pulses, size: int = AT_ONCE) -> Iterator[Pulses]:
@@ -37,9 +37,9 @@ def blocks_of(pulses: Pulses, size: int = AT_ONCE) -> Iterator[Pulses]:
 
 
 def spread(count: int, *, groups: int, each: int) -> list[Pulses]:
-    """Return groups of neighbouring pulses, one amid each equal part of a flight; all pulses where that is no more.
+    """Return groups of neighbouring pulses, amid equal parts of a flight; all pulses where that is no more.
 
-    What a flight repeats in every pulse is known well from some thousand of them, however long it lasts.
+    Properties common to all pulses are estimated well from some thousand of them, however long the flight.
 
     Examples
     --------
@@ -57,8 +57,8 @@ class Saturation:
 
     Notes
     -----
-    A converter that clips piles samples up at its end stops, whatever its number of bits; without clipping the extreme
-    values occur once or twice.
+    A converter that clips accumulates samples at its end stops, whatever its number of bits; without clipping the
+    extreme values occur once or twice.
 
     Examples
     --------
@@ -116,19 +116,19 @@ class _Extreme:
         self.value, self.times = value, known + int(np.count_nonzero(samples == value))
 
 
-# ---- Captures of a clock that runs off, as a clock that runs true would have taken them ----------------------------
+# ---- Correction of clock offsets
 
 
 _REJECTION_DB = 100.0
 
 
 def correct_clock(samples: Complexes, numerology: Numerology, *, cfo_hz: Floats, sfo_ppm: float) -> Complexes:
-    """Return captures as a receiver with the transmitter's clock would have sampled them.
+    """Return captures resampled to the transmitter's clock.
 
     Parameters
     ----------
     samples
-        (pulse, sample) complex64 from the start of the cyclic prefix; radar and sidelink each in their turn.
+        (pulse, sample) complex64 from the start of the cyclic prefix; of radar or sidelink.
     numerology
         Of the symbol.
     cfo_hz
@@ -155,12 +155,12 @@ def correct_clock(samples: Complexes, numerology: Numerology, *, cfo_hz: Floats,
     """
     count = numerology.prefix_samples + numerology.dft_samples
     rate_hz = numerology.sample_rate_hz * (1 + sfo_ppm * 1e-6)
-    taken_s, wanted_s = np.arange(samples.shape[1]) / rate_hz, np.arange(count) / numerology.sample_rate_hz
-    place, taps = _fractional_taps(wanted_s * rate_hz, numerology)
-    # beyond the capture the symbol goes on as one period before
+    taken_s, resampled_s = np.arange(samples.shape[1]) / rate_hz, np.arange(count) / numerology.sample_rate_hz
+    place, taps = _fractional_taps(resampled_s * rate_hz, numerology)
+    # beyond the capture the symbol continues as one period before
     place = np.where(place >= samples.shape[1], place - numerology.dft_samples, place)
     place = np.where(place < 0, place + numerology.dft_samples, place)
-    back = np.exp(2j * np.pi * numerology.middle_hz * wanted_s)
+    back = np.exp(2j * np.pi * numerology.middle_hz * resampled_s)
     corrected = np.empty((len(samples), count), np.complex64)
     for pulse, capture in enumerate(samples):
         centred = capture * np.exp(2j * np.pi * (cfo_hz[pulse] - numerology.middle_hz) * taken_s)

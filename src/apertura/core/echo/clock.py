@@ -1,7 +1,7 @@
 """The receiver's clock against the transmitter's: measured on the sidelink, corrected in the samples where it matters.
 
-The symbol repeats itself after 1/Δf and lasts longer than that, so the beginning of a capture comes again at its
-end: turned by the carrier offset, and slid by the sampling offset. No code and no delay need be known.
+The symbol repeats itself after 1/Δf and lasts longer than that, so the beginning of a capture repeats at its
+end: rotated by the carrier offset, and shifted by the sampling offset. Neither code nor delay need be known.
 A pulse that is sent once repeats nothing: its clock is not measured, and division needs none (docs/theory/waveforms.md,
 "Clock").
 """
@@ -18,20 +18,20 @@ from apertura.core.echo.captures import AT_ONCE, spread
 from apertura.core.echo.demodulate import Numerology
 
 SIGMAS = 3.0
-"""A clock that is not this many standard deviations off is one that noise suggests; it is left alone."""
+"""Standard deviations: a smaller clock offset may be noise, and is not corrected."""
 
 AMBIGUOUS_SHARE = 0.4
-"""Offsets beyond this share of Δf could as well be of the other sign: half of Δf is where they wrap."""
+"""Share of Δf: offsets beyond it may be of the other sign, since they wrap at one half."""
 
 GROUPS = 16
-"""Parts of the flight whose scatter tells how well the clock is known."""
+"""Parts of the flight from whose scatter the standard deviation of the clock follows."""
 
-_SMALLEST_REPEAT = 32
+_SMALLEST_REPEAT = 32  # samples of a capture that repeat, at least
 
 
 @dataclass(frozen=True)
 class ClockOffset:
-    """How fast the receiver's oscillators run.
+    """Offsets of the receiver's oscillators.
 
     Attributes
     ----------
@@ -55,7 +55,7 @@ class ClockOffset:
     one_clock: bool
 
     def ppm(self, numerology: Numerology) -> tuple[float, float | None]:
-        """Return how fast the oscillator runs and the standard deviation of that, ppm; None where unknown."""
+        """Return the oscillator's offset and its standard deviation, ppm; None where unknown."""
         std_ppm = self.cfo_std_hz / numerology.carrier_hz * 1e6
         return self.cfo_hz / numerology.carrier_hz * 1e6, std_ppm if np.isfinite(std_ppm) else None
 
@@ -66,7 +66,7 @@ class ClockOffset:
 
 @dataclass(frozen=True)
 class ClockDecision:
-    """Whether to correct, why, and the level of the floor if left alone."""
+    """Whether to correct, why, and the level of the floor without correction."""
 
     correct: bool
     reason: str
@@ -106,7 +106,7 @@ def clock_of(groups: Iterable[Complexes], numerology: Numerology, *, pulses: int
     Raises
     ------
     ValueError
-        If captures hold too little of the repetition, or what was sent does not repeat itself.
+        If captures contain too little of the repetition, or the transmitted signal does not repeat.
 
     Notes
     -----
@@ -135,7 +135,7 @@ def clock_of(groups: Iterable[Complexes], numerology: Numerology, *, pulses: int
 
 
 def decide_clock(offset: ClockOffset, numerology: Numerology, *, accuracy_db: float) -> ClockDecision:
-    """Say whether a clock needs correction for images whose errors may reach `accuracy_db` below the peak.
+    """Decide whether a clock needs correction for images whose errors may reach `accuracy_db` below the peak.
 
     Examples
     --------
@@ -175,7 +175,7 @@ def decide_clock(offset: ClockOffset, numerology: Numerology, *, accuracy_db: fl
 
 
 def interference_floor_db(cfo_hz: float, sfo_ppm: float, numerology: Numerology) -> float:
-    """Return the floor that a clock leaves in a range profile, dB below its peak.
+    """Return the interference floor by a clock offset in a range profile, dB below its peak.
 
     Notes
     -----
@@ -230,9 +230,9 @@ def _phase_and_slope(
     off_hz = frequency_hz - centre_hz
     phase, slope = start
     for _ in range(6):
-        turned = cross * np.exp(-1j * (phase + slope * off_hz))
-        slope += float((off_hz * turned.imag).sum() / (off_hz**2 * turned.real).sum())
-        phase += float(np.angle(turned.sum()))
+        rotated = cross * np.exp(-1j * (phase + slope * off_hz))
+        slope += float((off_hz * rotated.imag).sum() / (off_hz**2 * rotated.real).sum())
+        phase += float(np.angle(rotated.sum()))
     return phase, slope, centre_hz
 
 

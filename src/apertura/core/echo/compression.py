@@ -9,11 +9,11 @@ from scipy import fft
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.interpolation import kaiser_window
 
-# ---- Phasors along a band of equal steps: exp(j2πφn) for many n, cheaper than so many exponentials -----------------
+# ---- Phasors along a band of equal steps
 
 
-def turned(values: NDArray[np.number], turns: NDArray[np.float64]) -> NDArray[np.complex64]:
-    """Return values·exp(j2π·turns), complex64; whole turns are taken off in float64."""
+def rotated(values: NDArray[np.number], turns: NDArray[np.float64]) -> NDArray[np.complex64]:
+    """Return values·exp(j2π·turns), complex64; integer turns are removed in float64."""
     return np.asarray(values * np.exp(2j * np.pi * (turns % 1.0)), np.complex64)
 
 
@@ -27,11 +27,11 @@ def phasors(turns: NDArray[np.float64], count: int, *, first: float = 0.0) -> ND
     count
         How many n.
     first
-        The first n, whole or not.
+        The first n, possibly fractional.
 
     Notes
     -----
-    Products of coarse and fine ones, right to the rounding of complex64: exponentials cost most.
+    Products of coarse and fine phasors, exact to the rounding of complex64, since exponentials cost most.
 
     Examples
     --------
@@ -39,18 +39,18 @@ def phasors(turns: NDArray[np.float64], count: int, *, first: float = 0.0) -> ND
     array([[ 1.+0.j,  0.+1.j, -1.+0.j,  0.-1.j]], dtype=complex64)
     """
     side = int(np.ceil(np.sqrt(count)))
-    fine = turned(np.ones(1), turns[:, None] * np.arange(side))
-    coarse = turned(np.ones(1), turns[:, None] * (first + side * np.arange(-(-count // side))))
+    fine = rotated(np.ones(1), turns[:, None] * np.arange(side))
+    coarse = rotated(np.ones(1), turns[:, None] * (first + side * np.arange(-(-count // side))))
     return (coarse[:, :, None] * fine[:, None]).reshape(len(turns), -1)[:, :count]
 
 
-# ---- Range compression: transfer functions to range profiles, referenced to band centre and cropped to a swath
+# ---- Range compression
 
-_PULSES_AT_ONCE = 32  # which the caches hold
+_PULSES_AT_ONCE = 32  # that fit into the caches
 
 _TAPS = 7
 _ROOM = 2.0
-"""A decimated profile spans this many times the swath; with seven taps its error is below that of complex64."""
+"""Span of a decimated profile over the swath; with seven taps its error is below that of complex64."""
 _LARGEST_FACTOR = 64
 
 WINDOWS: Mapping[str, Callable[[int], NDArray[np.float64]]] = {"hann": np.hanning, "none": np.ones}
@@ -118,7 +118,7 @@ def compress(
     weight
         (subcarrier,) float64.
     reference_delay_s
-        (pulse,) float64; put back here, so that profiles stand for absolute delays.
+        (pulse,) float64; added here, so that profiles are of absolute delays.
     start_m
         (pulse,) float64, total path of sample 0.
     count
@@ -138,8 +138,8 @@ def compress(
 
     Notes
     -----
-    Source: docs/theory.md, eq. 4. Referring the profile to band centre halves the bandwidth an interpolator
-    meets; exp(+j2πf_mid·ρ/c) remains for backprojection. Where the swath is a part of the unambiguous range, the
+    Source: docs/theory.md, eq. 4. Referring the profile to band centre halves the bandwidth of an
+    interpolator; exp(+j2πf_mid·ρ/c) remains for backprojection. Where the swath is a part of the unambiguous range, the
     subcarriers are decimated to it first (docs/theory.md, eq. 4a), at the accuracy of complex64.
 
     Examples
@@ -168,7 +168,7 @@ def compress(
         np.multiply(transfer[part], weight.astype(np.float32), out=here[:, : len(frequency_hz)])
         taps = filters * phasors(turns[part], factor)[:, :, None]
         sums = here.reshape(len(here), blocks, factor) @ taps
-        start = turned(carrier[part], -middle * turns[part])
+        start = rotated(carrier[part], -middle * turns[part])
         sums *= (phasors(factor * turns[part], blocks) * start[:, None])[:, :, None]
         spectrum = np.zeros((len(here), length // factor), np.complex64)
         for tap in range(filters.shape[1]):
@@ -179,15 +179,15 @@ def compress(
 
 
 def _decimation(subcarriers: int, length: int, count: int) -> tuple[NDArray[np.complex64], NDArray[np.complex64]]:
-    """Return taps (factor, tap) that sum `factor` subcarriers to one, and what undoes their response (count,).
+    """Return taps (factor, tap) that sum `factor` subcarriers to one, and the inverse of their response (count,).
 
-    The factor is the largest that leaves the swath room: 1 where it fills the range.
+    The factor is the largest whose range spans the swath `_ROOM` times: 1 where the swath fills the range.
     """
     after, middle = np.arange(count) - count // 2, subcarriers // 2
     factors = [factor for factor in range(4, _LARGEST_FACTOR + 1) if length % factor == 0]
     factors = [n for n in factors if length // n >= max(_ROOM * count, -(-subcarriers // n) + _TAPS - 1)]
     if not factors:
-        return np.ones((1, 1), np.complex64), turned(np.ones(count), -middle * after / length)
+        return np.ones((1, 1), np.complex64), rotated(np.ones(count), -middle * after / length)
     factor, reach = factors[-1], _TAPS // 2
     beta = np.pi * np.sqrt((_TAPS * (1 - 0.5 / _ROOM)) ** 2 - 0.8)  # Beatty's choice for this room
 
@@ -197,4 +197,4 @@ def _decimation(subcarriers: int, length: int, count: int) -> tuple[NDArray[np.c
     wave = np.cos(np.pi * _TAPS * np.outer(after * factor / length, nodes))
     response = 1 / (wave @ (weights * _TAPS / 2 * kaiser_window(nodes, beta)))
     delay = (factor - 1) / 2 - middle - factor * reach
-    return taps.astype(np.complex64), turned(response, delay * after / length)
+    return taps.astype(np.complex64), rotated(response, delay * after / length)

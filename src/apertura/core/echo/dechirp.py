@@ -16,33 +16,33 @@ Mixing = Literal["real", "complex", "conjugate"]
 
 _SWEEPS_AT_ONCE = 256
 _BEFORE_ZERO = 1 / 16
-"""Of the sample rate: what of a complex beat belongs to paths before zero, which leakage of the direct path reaches."""
+"""Share of the sample rate of a complex beat that is of paths before zero, which leakage of the direct path reaches."""
 
 _MOTION_WAVES = 1 / 8
-"""Of path within a sweep: an eighth of a resolution cell, lambda/16 flown by one antenna that sends and receives."""
+"""Wavelengths of path within a sweep that are tolerated: λ/16 flown by one antenna that sends and receives."""
 
 _FASTEST = 95.0
-"""Percentile of speeds between pulses: what single errors of a log make is not motion."""
+"""Percentile of speeds between pulses that counts as motion: single errors of a log do not."""
 
 
 @dataclass(frozen=True)
 class FrequencySweep:
-    """A linear sweep of frequency, and how its echoes are mixed and sampled.
+    """A linear frequency sweep, and the mixing and sampling of its echoes.
 
     Attributes
     ----------
     start_hz
         RF frequency at the first sample, or at the trigger, Hz.
     bandwidth_hz
-        What the frequency rises by in `sweep_s`, Hz; negative for one that falls.
+        Rise of the frequency in `sweep_s`, Hz; negative where it falls.
     sweep_s
-        How long the sweep is linear, seconds.
+        Length of the linear part, seconds.
     sample_rate_hz
         Of the beat signal.
     iq
-        real: one mixer; complex: echo times conjugate of the sweep; conjugate: the other way about.
+        real: one mixer; complex: echo times conjugate of the sweep; conjugate: the reverse.
     settle_s
-        What is left out at the beginning, seconds.
+        Time left out at the beginning, seconds.
     reference_path_m
         Path of the sweep to the mixer, metres.
 
@@ -67,7 +67,7 @@ class FrequencySweep:
         return self.bandwidth_hz / self.sweep_s
 
     @property
-    def whole(self) -> int:
+    def sweep_samples(self) -> int:
         """Samples of a sweep from its beginning."""
         return int(self.sweep_s * self.sample_rate_hz + 1e-6)
 
@@ -79,7 +79,7 @@ class FrequencySweep:
     @property
     def samples(self) -> int:
         """Samples used."""
-        return self.whole - self.first
+        return self.sweep_samples - self.first
 
     @property
     def middle_s(self) -> float:
@@ -94,13 +94,13 @@ class FrequencySweep:
     @property
     def frequency_hz(self) -> NDArray[np.float64]:
         """RF frequencies that the samples are those of, ascending, (subcarrier,) Hz (eq. 2)."""
-        time_s = np.arange(self.first, self.whole) / self.sample_rate_hz - self.reference_delay_s
+        time_s = np.arange(self.first, self.sweep_samples) / self.sample_rate_hz - self.reference_delay_s
         rising = self.start_hz + self.slope_hz_s * time_s
         return rising if self.bandwidth_hz > 0 else rising[::-1]
 
     @property
     def beats_hz(self) -> tuple[float, float]:
-        """Lowest and highest γΔ, Hz, that a beat is told apart by: of positive Δ, or of one sample rate (eq. 4)."""
+        """Lowest and highest unambiguous γΔ, Hz: of positive Δ, or of one sample rate (eq. 4)."""
         rate = self.sample_rate_hz
         if self.iq == "real":
             return 0.0, rate / 2
@@ -109,7 +109,7 @@ class FrequencySweep:
 
     @property
     def path_limit_m(self) -> float:
-        """Total path beyond which a beat is not told from another, or lacks half of its band, metres (eq. 4)."""
+        """Total path beyond which a beat is ambiguous, or lacks half of its band, metres (eq. 4)."""
         beyond_s = min(self.beats_hz[1] / abs(self.slope_hz_s), self.samples / self.sample_rate_hz / 2)
         return SPEED_OF_LIGHT_M_S * (self.reference_delay_s + beyond_s)
 
@@ -117,14 +117,14 @@ class FrequencySweep:
 def transfer_of(
     beat: NDArray[np.number], sweep: FrequencySweep, *, late_s: NDArray[np.float64] | None = None, deskewed: bool = True
 ) -> NDArray[np.complex64]:
-    """Return the transfer functions that beat signals are samples of, without residual video phase.
+    """Return transfer functions from beat signals, without residual video phase.
 
     Parameters
     ----------
     beat
-        (pulse, sample) real or complex, `sweep.whole` samples from the beginning of each sweep, or more.
+        (pulse, sample) real or complex, `sweep.sweep_samples` samples from the beginning of each sweep, or more.
     sweep
-        What was swept.
+        The sweep.
     late_s
         (pulse,) float64, seconds by which the first sample of each sweep was taken after its beginning; None: 0.
     deskewed
@@ -153,7 +153,7 @@ def transfer_of(
     kept, slope = sweep.samples, sweep.slope_hz_s
     low, high = sweep.beats_hz
     farthest = min(round((high - min(low, 0.0)) / abs(slope) * sweep.sample_rate_hz) + 1, kept)
-    length = fft.next_fast_len(kept + farthest)  # what is moved forward leaves at the beginning, and not into the end
+    length = fft.next_fast_len(kept + farthest)  # room for shifts, so that none wraps around
     bins = -np.sign(slope) * fft.fftfreq(length, 1 / sweep.sample_rate_hz)
     shift = (bins - low) % sweep.sample_rate_hz + low  # γΔ of each bin; f_b = -γΔ, eq. 1
     turn = np.exp(-1j * np.pi * shift**2 / slope) if deskewed else np.ones(length, np.complex128)
@@ -163,7 +163,7 @@ def transfer_of(
     transfer = np.empty((len(beat), kept), np.complex64)
     for begin in range(0, len(beat), _SWEEPS_AT_ONCE):
         part = slice(begin, begin + _SWEEPS_AT_ONCE)
-        some = np.asarray(beat[part, sweep.first : sweep.whole])
+        some = np.asarray(beat[part, sweep.first : sweep.sweep_samples])
         spectrum = fft.fft(some.conj() if sweep.iq == "conjugate" else some, length, axis=1) * turn
         if late_s is not None:
             spectrum = spectrum * np.exp(-2j * np.pi * late_s[part, None] * beat_hz)
@@ -178,7 +178,7 @@ def sweep_motion_flags(
     lasting_s: float,
     frequency_hz: NDArray[np.float64],
 ) -> dict[str, str]:
-    """Return a flag where the antennas move so far during a sweep that envelopes are elsewhere than phases say.
+    """Return a flag where the antennas move so far during a sweep that envelopes and phases disagree.
 
     Parameters
     ----------
@@ -187,7 +187,7 @@ def sweep_motion_flags(
     antennas
         Of transmitter and receiver, (pulse, 3) float64 metres each, one Cartesian frame.
     lasting_s
-        What of a sweep is used, seconds; 0: no sweep.
+        Length of the part of a sweep that is used, seconds; 0: no sweep.
     frequency_hz
         (subcarrier,) float64, ascending.
 

@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from apertura.core.echo.compression import phasors, turned
+from apertura.core.echo.compression import phasors, rotated
 
 _PULSES_AT_ONCE = 64
 
 
 @dataclass(frozen=True)
 class Numerology:
-    """How a receiver samples what was sent: an OFDM symbol that repeats itself, or a pulse that is sent once.
+    """Sampling of the transmitted signal: an OFDM symbol that repeats itself, or a pulse that is sent once.
 
     Attributes
     ----------
@@ -30,8 +30,8 @@ class Numerology:
     dft_samples
         f_s/Δf, the length of the DFT window.
     longest_samples
-        Of a pulse sent once: delay up to which captures hold its echoes whole. None: a symbol, which repeats itself
-        after 1/Δf, and whose echoes are held up to the prefix.
+        Of a pulse sent once: delay up to which captures contain its complete echoes. None: a symbol, which repeats
+        itself after 1/Δf, and whose echoes are complete up to the prefix.
     """
 
     carrier_hz: float
@@ -58,12 +58,12 @@ class Numerology:
 
     @property
     def repeats(self) -> bool:
-        """Whether what was sent comes again after 1/Δf."""
+        """Whether the transmitted signal repeats after 1/Δf."""
         return self.longest_samples is None
 
     @property
     def delay_cells(self) -> int:
-        """Delay cells of 1/B in which echoes are held whole: those inside the cyclic prefix, of a symbol."""
+        """Delay cells of 1/B with complete echoes: those inside the cyclic prefix, of a symbol."""
         samples = self.prefix_samples if self.longest_samples is None else self.longest_samples
         return round(samples * self.numbers.size / self.dft_samples)
 
@@ -123,7 +123,7 @@ def demodulate(captures: NDArray[np.complex64], numerology: Numerology) -> NDArr
 def remove_path(
     transfer: NDArray[np.complex64], frequency_hz: NDArray[np.float64], *, delay_s: NDArray[np.float64]
 ) -> NDArray[np.complex64]:
-    """Return (pulse, subcarrier) `transfer` with a delay per pulse taken off every echo: times exp(+j2πf·delay).
+    """Return (pulse, subcarrier) `transfer` with a delay per pulse removed from every echo: times exp(+j2πf·delay).
 
     Frequencies (subcarrier,) ascend in equal steps.
 
@@ -135,4 +135,4 @@ def remove_path(
     count = len(frequency_hz)
     spacing_hz = (frequency_hz[-1] - frequency_hz[0]) / max(count - 1, 1)
     along = phasors(delay_s * spacing_hz, count)
-    return transfer * along * turned(np.ones(1), delay_s * frequency_hz[0])[:, None]
+    return transfer * along * rotated(np.ones(1), delay_s * frequency_hz[0])[:, None]

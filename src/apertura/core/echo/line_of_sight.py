@@ -1,4 +1,4 @@
-"""The direct path inside a sidelink: its delay, phase and amplitude in every pulse, and whether it is there at all."""
+"""The direct path in a sidelink: its delay, phase and amplitude in every pulse, and its detection."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
@@ -11,11 +11,11 @@ from apertura.common.arrays import Complexes, Floats
 from apertura.core.echo.compression import phasors
 
 LOCK_FALSE_ALARM = 1e-3
-"""Chance that a pulse of pure noise passes for one with a sidelink."""
+"""Probability that a pulse of pure noise is detected as one with a sidelink."""
 
 _PULSES_AT_ONCE = 64
 _GROUPS = 32
-_NOISE_CELLS = 256  # whose median is good to 0.4 dB
+_NOISE_CELLS = 256  # whose median is accurate to 0.4 dB
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class LineOfSight:
     noise_power
         (pulse,) float64, per subcarrier.
     locked
-        (pulse,) bool, whether the path stands out of the noise.
+        (pulse,) bool, whether the path is detected above the noise.
     """
 
     delay_cells: Floats
@@ -66,7 +66,7 @@ def fit_line_of_sight(sidelink: Complexes) -> LineOfSight:
 
 
 def joined(paths: Sequence[LineOfSight]) -> LineOfSight:
-    """Return the paths of pulses that follow each other."""
+    """Return the concatenated paths of consecutive pulses."""
     return LineOfSight(*(np.concatenate([getattr(one, field.name) for one in paths]) for field in fields(LineOfSight)))
 
 
@@ -117,7 +117,7 @@ def _aligned(sidelink: Complexes, delay_cells: Floats) -> Complexes:
 
 
 def _residual_cells(sums: NDArray[np.complex128], number: Floats, subcarriers: int) -> Floats:
-    """Return (pulse,) the delay that is left in (pulse, group) sums, whose groups are centred on `number`."""
+    """Return (pulse,) the residual delay in (pulse, group) sums, whose groups are centred on `number`."""
     delay = np.zeros(len(sums))
     for _ in range(4):  # Newton's steps on the power |Σ S_n exp(+j2πn·delay/N)|²
         aligned = sums * np.exp(2j * np.pi / subcarriers * np.outer(delay, number))
@@ -130,12 +130,12 @@ def _residual_cells(sums: NDArray[np.complex128], number: Floats, subcarriers: i
 
 
 def _lock_threshold(subcarriers: int) -> float:
-    """Return how far above the mean noise of a delay cell the highest of pure noise rises once in 1/P_fa pulses.
+    """Return the threshold over the mean noise of a delay cell that pure noise exceeds once in 1/P_fa pulses.
 
     |h(τ)|² of noise of bandwidth B crosses T times its mean √(πT/3)·exp(-T) times per 1/B, and there are N of these.
     """
-    alone = float(np.log(subcarriers / LOCK_FALSE_ALARM))
-    threshold = alone
+    first_order = float(np.log(subcarriers / LOCK_FALSE_ALARM))
+    threshold = first_order
     for _ in range(5):
-        threshold = alone + 0.5 * float(np.log(np.pi * threshold / 3))
+        threshold = first_order + 0.5 * float(np.log(np.pi * threshold / 3))
     return threshold

@@ -1,4 +1,4 @@
-"""Checks of a node's own pulses: is the code the one that was sent, do the phases stand from one to the next."""
+"""Checks of a node's own pulses: their code, and the stability of their phase."""
 
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -8,27 +8,26 @@ from numpy.typing import NDArray
 from scipy import fft
 from scipy.special import gammainccinv
 
-# ---- Whether the code that is taken out of a node's own echoes is the one that it sent: by where their energy
-# gathers
+# ---- Code of a node's own pulses
 
 FALSE_ALARM = 1e-5
-"""Chance that a wrong code passes for the right one."""
+"""Probability that a wrong code is accepted as the right one."""
 
-_RUNS = 8, 32, 128  # pulses added coherently, at each Doppler
-_GUARD_CELLS = 8  # on both sides of the prefix, where sidelobes of what lies inside reach
-_FEWEST_CELLS = 32
-_NOISE_SIGMAS = 6.0  # beyond, cells outside the prefix may scatter as no noise does
-_SPREAD_SIGMAS = 10.0  # beyond, they do
+_COHERENT_PULSES = 8, 32, 128  # pulses added coherently, at each Doppler
+_GUARD_CELLS = 8  # on both sides of the prefix, within reach of sidelobes of echoes inside
+_FEWEST_CELLS = 32  # outside the prefix, to estimate the floor from
+_NOISE_SIGMAS = 6.0  # above it, cells outside the prefix may scatter more than noise
+_SPREAD_SIGMAS = 10.0  # above it, they do
 
 
 @dataclass(frozen=True)
 class CodeEvidence:
-    """What was found about a code.
+    """Evidence on a code.
 
     Attributes
     ----------
     carried
-        Whether the recording carries it; None where that cannot be told.
+        Whether the recording contains it; None without evidence.
     evidence
         One line with the numbers.
     """
@@ -38,7 +37,7 @@ class CodeEvidence:
 
     @property
     def report(self) -> dict[str, Any]:
-        """As it stands in the attributes of a stage."""
+        """Values for the attributes of a stage."""
         return asdict(self)
 
     @property
@@ -48,7 +47,7 @@ class CodeEvidence:
 
 
 def own_code(transfer: NDArray[np.complex64], *, prefix_cells: int) -> CodeEvidence:
-    """Return whether own echoes, the code removed, gather inside the prefix as those of the right code do.
+    """Return whether own echoes, the code removed, are compressed inside the prefix as with the right code.
 
     Parameters
     ----------
@@ -74,10 +73,10 @@ def own_code(transfer: NDArray[np.complex64], *, prefix_cells: int) -> CodeEvide
         return CodeEvidence(None, f"{prefix_cells} of {cells} delay cells may hold echoes: nothing to compare with")
     profile = fft.ifft(transfer, 2 * cells, axis=1)  # half cells, so that no echo falls between two
     scattered, beyond = -np.inf, slice(2 * outside.start, -2 * _GUARD_CELLS, 2)
-    for run in [run for run in _RUNS if run <= pulses] or [pulses]:
+    for run in [run for run in _COHERENT_PULSES if run <= pulses] or [pulses]:
         level, needed, scatter = _strongest(profile, run, 2 * prefix_cells, beyond)
         scattered = max(scattered, scatter)
-        line = f"the strongest echo held whole, {run} pulses added, is {_db(level):.1f} dB above what lies beyond"
+        line = f"the strongest complete echo, {run} pulses added, is {_db(level):.1f} dB above what lies beyond"
         if level >= needed:
             return CodeEvidence(True, line)
     if scattered > _SPREAD_SIGMAS:
@@ -91,7 +90,7 @@ def own_code(transfer: NDArray[np.complex64], *, prefix_cells: int) -> CodeEvide
 
 
 def _strongest(profile: NDArray[np.complex64], run: int, inside: int, beyond: slice) -> tuple[float, float, float]:
-    """Return the strongest cell inside the prefix, what is needed of it, and by how many σ the others are not noise.
+    """Return the strongest cell inside the prefix, its threshold, and the excess scatter of cells outside, in σ.
 
     Levels are ratios to the mean beyond the prefix at the same Doppler.
     """
@@ -99,12 +98,12 @@ def _strongest(profile: NDArray[np.complex64], run: int, inside: int, beyond: sl
     power = np.zeros((2 * run, profile.shape[1]), np.float32)
     for first in range(0, blocks * run, run):
         power += np.abs(fft.fft(profile[first : first + run], 2 * run, axis=0)) ** 2
-    others = power[:, beyond].astype(np.float64)
-    mean = np.maximum(others.mean(1), 1e-30)
-    scatter = others.std(1) / mean
+    floor = power[:, beyond].astype(np.float64)
+    mean = np.maximum(floor.mean(1), 1e-30)
+    scatter = floor.std(1) / mean
     chance = FALSE_ALARM / (inside * len(power))
-    sigmas = (blocks * scatter**2 - 1) / np.sqrt((2 + 6 / blocks) / others.shape[1])
-    # a wrong code's floor is the same in all pulses, no noise: exponential from cell to cell, however many are added
+    sigmas = (blocks * scatter**2 - 1) / np.sqrt((2 + 6 / blocks) / floor.shape[1])
+    # a wrong code's floor repeats in all pulses, unlike noise: exponential from cell to cell, however many are added
     noise = sigmas.max() < _NOISE_SIGMAS
     needed = gammainccinv(blocks, chance) / blocks if noise else 1 - scatter * (1 + np.log(chance))
     level = power[:, :inside].max(1) / mean
@@ -116,31 +115,31 @@ def _db(ratio: float) -> float:
     return 10 * float(np.log10(ratio))
 
 
-# ---- Whether a node's own pulses keep their phase from one to the next, as echoes of a scene that stands still do
+# ---- Phase stability of a node's own pulses
 
 LEAST_COHERENCE = 0.3
-"""Of second differences of phase: below it they scatter by 1.55 rad rms or more; white phase noise of 0.63 rad does."""
+"""Coherence of second differences of phase, at which they scatter by 1.55 rad rms, white phase noise by 0.63 rad."""
 
 STEADY = 0.93
-"""Least agreement of magnitudes from pulse to pulse: independent speckle has π/4, noise 10 dB below an echo 0.95."""
+"""Agreement of magnitudes from pulse to pulse at least: independent speckle has π/4, noise 10 dB below an echo 0.95."""
 
 ECHO_DB = 13.0
-"""Cells are looked at whose mean power is this far above the noise."""
+"""dB of mean power above the noise of the cells that are evaluated: phases of weaker ones scatter by noise."""
 
-_FEWEST_TRIPLES = 20
-_EVEN = 0.25  # of the usual interval: pulses further apart have others missing between them
+_FEWEST_TRIPLES = 20  # of consecutive pulses, to estimate a coherence from
+_EVEN = 0.25  # of the usual interval: tolerated deviation; larger ones mean missing pulses
 
 
 @dataclass(frozen=True)
 class PhaseStability:
-    """How the phase of echoes goes on from pulse to pulse.
+    """Stability of the phase of echoes from pulse to pulse.
 
     Attributes
     ----------
     coherence
         |mean exp(jφ'')| of the second differences φ'' of phase, weighted by power; 1 of smooth motion.
     steadiness
-        Agreement of magnitudes of neighbouring pulses, 1 where scatterers stay what they are.
+        Agreement of magnitudes of neighbouring pulses, 1 where scatterers do not change.
     """
 
     coherence: float
@@ -153,12 +152,12 @@ class PhaseStability:
 
     @property
     def report(self) -> dict[str, float]:
-        """As it stands in the attributes of a stage."""
+        """Values for the attributes of a stage."""
         return {"second_difference_rad": round(self.rms_rad, 3), "steadiness": round(self.steadiness, 3)}
 
     @property
     def flags(self) -> dict[str, str]:
-        """A flag if echoes that stay as strong as they are change their phase at random."""
+        """A flag if echoes of steady magnitude change their phase at random."""
         if self.steadiness < STEADY or self.coherence >= LEAST_COHERENCE:
             return {}
         line = (
@@ -171,14 +170,14 @@ class PhaseStability:
 def phase_stability(
     transfer: NDArray[np.complex64], time_s: NDArray[np.float64], *, prefix_cells: int
 ) -> PhaseStability | None:
-    """Return how steady the phase of own echoes is, or None where no echo stands out of the noise.
+    """Return the phase stability of own echoes, or None where no echo is above the noise.
 
     Parameters
     ----------
     transfer
         (pulse, subcarrier) complex64, the code removed; echoes lie in the first `prefix_cells` of 1/B.
     time_s
-        (pulse,) float64, when each was sent, seconds; triples of pulses with others missing between them are left out.
+        (pulse,) float64, when each was sent, seconds; triples with missing pulses between them are left out.
     prefix_cells
         Cells of 1/B inside the cyclic prefix, or inside the longest delay of a pulse sent once.
 
@@ -200,10 +199,10 @@ def phase_stability(
     profile = fft.ifft(transfer, axis=1)
     power = (np.abs(profile) ** 2).mean(0)
     # the median of an exponential variable's mean over many pulses is its mean
-    seen = np.flatnonzero(power[:prefix_cells] > 10 ** (ECHO_DB / 10) * np.median(power[prefix_cells:]))
-    if not seen.size:
+    strong = np.flatnonzero(power[:prefix_cells] > 10 ** (ECHO_DB / 10) * np.median(power[prefix_cells:]))
+    if not strong.size:
         return None
-    cells = profile[:, seen].astype(np.complex128)
+    cells = profile[:, strong].astype(np.complex128)
     before, here, after = cells[:-2][triples], cells[1:-1][triples], cells[2:][triples]
     products = after * here.conj() ** 2 * before
     both = (np.abs(here) ** 2 + np.abs(after) ** 2).sum() / 2

@@ -1,7 +1,7 @@
-"""The filter that takes a pulse out of its echoes: where its energy lies, whether to divide by it, and what that costs.
+"""The filter that removes a pulse from its echoes: its band, the choice between inverse and matched, and its loss.
 
-A pulse is sent once, so a capture that holds it and its echoes to their end is a linear convolution: a DFT as long as
-the capture turns it into a product, exactly, bin by bin (docs/theory/waveforms.md, eq. 1).
+A pulse is sent once, so a capture that contains it and its echoes to their end is a linear convolution: a DFT as long
+as the capture turns it into a product, exactly, bin by bin (docs/theory/waveforms.md, eq. 1).
 """
 
 from dataclasses import dataclass
@@ -14,34 +14,34 @@ from scipy import fft, ndimage
 from apertura.common.arrays import Floats
 
 BAND_FLOOR_DB = -10.0
-"""A band that nobody states ends where the power of the pulse falls this far below its highest."""
+"""dB below the highest power of the pulse, at which a band that is not stated ends."""
 
 NULL_DB = -20.0
-"""Bins this far below the mean are attenuated, not divided: none amplifies noise by more than a hundred."""
+"""dB below the mean, at which bins are attenuated, not divided: noise is amplified by a hundred at most."""
 
 FLAT_DB = -30.0
-"""A spectrum whose power is as even as this needs no division: all that it scatters in range lies below."""
+"""dB of ripple power below which a spectrum needs no division: its range sidelobes lie below."""
 
 SIDELOBES_DB = -25.0
-"""Higher sidelobes are flagged; those of the window, Hann, are -31.5 dB."""
+"""dB, sidelobes above which are flagged; those of the Hann window are -31.5 dB."""
 
 MOST_LOSS_DB = 6.0
-"""A division that loses more of the signal to noise ratio is not chosen, and flagged where it was asked for."""
+"""dB of signal to noise ratio, the largest loss of a chosen division; a requested one beyond it is flagged."""
 
 _SMOOTH = 64  # parts of the sampled band over which its level is averaged
 
 
 @dataclass(frozen=True)
 class PulseFilter:
-    """What echoes are multiplied by, and what it costs.
+    """The filter of echoes, and its loss.
 
     Attributes
     ----------
     inverse
         (bin,) complex64, by which the DFT of a capture is multiplied.
     report
-        Name of the filter, why it, loss_db (of signal to noise ratio against the matched filter) and sidelobes_db (the
-        highest beside a point in range, by a Hann window).
+        Name of the filter, its reason, loss_db (of signal to noise ratio against the matched filter) and sidelobes_db
+        (the highest beside a point in range, by a Hann window).
     flags
         Edge crossed → what was measured, in one line.
     """
@@ -52,14 +52,14 @@ class PulseFilter:
 
 
 def pulse_spectrum(pulse: NDArray[np.complexfloating], *, lead: float, length: int) -> NDArray[np.complex128]:
-    """Return the DFT of a capture that holds the pulse alone, (length,) complex128, in the units of `demodulate`.
+    """Return the DFT of a capture of the pulse alone, (length,) complex128, in the units of `demodulate`.
 
     Parameters
     ----------
     pulse
         (sample,) complex.
     lead
-        Samples, whole or not, that a capture begins before the pulse.
+        Samples, possibly fractional, that a capture begins before the pulse.
     length
         Samples of the capture.
 
@@ -97,24 +97,24 @@ def occupied_band(power: Floats) -> tuple[int, int]:
     top = int(level.argmax())
     first = int(below[below < top].max(initial=-1)) + 1
     last = int(below[below > top].min(initial=length)) - 1
-    loud = first + np.flatnonzero(ordered[first : last + 1] >= threshold)  # the mean runs over the edges of the band
-    return int(loud[0]) - length // 2, int(loud[-1]) - length // 2
+    strong = first + np.flatnonzero(ordered[first : last + 1] >= threshold)  # the mean runs over the edges of the band
+    return int(strong[0]) - length // 2, int(strong[-1]) - length // 2
 
 
-def pulse_filter(spectrum: NDArray[np.complexfloating], *, asked: str) -> PulseFilter:
+def pulse_filter(spectrum: NDArray[np.complexfloating], *, requested: str) -> PulseFilter:
     """Return the filter of a pulse.
 
     Parameters
     ----------
     spectrum
         (bin,) complex, S over the band.
-    asked
+    requested
         inverse, matched, or auto: matched for a flat spectrum, else inverse where it is adequate.
 
     Raises
     ------
     ValueError
-        If the band holds no energy.
+        If the band has no energy.
 
     Notes
     -----
@@ -123,7 +123,7 @@ def pulse_filter(spectrum: NDArray[np.complexfloating], *, asked: str) -> PulseF
     Examples
     --------
     >>> chirp = np.exp(1j * np.pi * np.arange(-50, 50) ** 2 / 125)
-    >>> pulse_filter(pulse_spectrum(chirp, lead=0, length=200)[:60], asked="auto").report["filter"]
+    >>> pulse_filter(pulse_spectrum(chirp, lead=0, length=200)[:60], requested="auto").report["filter"]
     'inverse'
     """
     power = np.abs(np.asarray(spectrum, np.complex128)) ** 2
@@ -133,8 +133,8 @@ def pulse_filter(spectrum: NDArray[np.complexfloating], *, asked: str) -> PulseF
     inverse = np.conj(spectrum) / np.maximum(power, mean * 10 ** (NULL_DB / 10))
     uneven_db, loss_db = float(10 * np.log10(max(power.var() / mean**2, 1e-10))), _loss_db(spectrum, inverse)
     sidelobes_db = _sidelobes_db(spectrum * inverse)
-    if asked != "auto":
-        name, reason = asked, "asked for"
+    if requested != "auto":
+        name, reason = requested, "asked for"
     elif uneven_db <= FLAT_DB:
         name, reason = "matched", f"a flat spectrum: matched scatters {uneven_db:.1f} dB in range"
     elif loss_db <= MOST_LOSS_DB and sidelobes_db <= SIDELOBES_DB:
@@ -155,21 +155,23 @@ def pulse_filter(spectrum: NDArray[np.complexfloating], *, asked: str) -> PulseF
     return PulseFilter(np.asarray(chosen, np.complex64), report, flags)
 
 
-def cut_pulses(delay_s: Floats, *, lead_s: float, pulse_s: float, listen_s: float, cell_s: float) -> dict[str, str]:
-    """Return the flag of captures that do not hold the direct pulse whole; none: {}.
+def truncation_flags(
+    delay_s: Floats, *, lead_s: float, pulse_s: float, listen_s: float, cell_s: float
+) -> dict[str, str]:
+    """Return the flag of captures that truncate the direct pulse; none: {}.
 
     Parameters
     ----------
     delay_s
         (pulse,) float64, of the direct path, seconds after `lead_s`, modulo the length of the capture; NaN: unknown.
     lead_s, pulse_s, listen_s
-        What a capture is made of.
+        Parts of a capture, seconds.
     cell_s
         1/B, by which a delay may err.
 
     Examples
     --------
-    >>> cut_pulses(np.array([0.1, -0.4, 1.1]), lead_s=0.2, pulse_s=1.0, listen_s=1.0, cell_s=0.05)
+    >>> truncation_flags(np.array([0.1, -0.4, 1.1]), lead_s=0.2, pulse_s=1.0, listen_s=1.0, cell_s=0.05)
     {'pulse_cut': 'captures of 2 of 3 pulses begin in the direct pulse, or end in it'}
     """
     known = delay_s[np.isfinite(delay_s)]
@@ -182,7 +184,7 @@ def cut_pulses(delay_s: Floats, *, lead_s: float, pulse_s: float, listen_s: floa
 
 
 def _loss_db(spectrum: NDArray[np.complexfloating], filtered: NDArray[np.complexfloating]) -> float:
-    """Return what of the signal to noise ratio a filter loses against the matched one, dB (Schwarz: 0 or more)."""
+    """Return the loss of signal to noise ratio of a filter against the matched one, dB (Schwarz: 0 or more)."""
     gain = abs(np.vdot(np.conj(filtered), spectrum)) ** 2
     kept = gain / ((np.abs(filtered) ** 2).sum() * (np.abs(spectrum) ** 2).sum())
     return float(-10 * np.log10(min(kept, 1.0))) + 0.0

@@ -1,4 +1,4 @@
-"""Taking out of an echo what the direct path went through too: clocks, phases, timing and transmit ripple.
+"""Corrections of an echo by the sidelink: clocks, phases, timing and transmit ripple common to both.
 
 Every method replaces the radar's transfer function R by R·A/S, S the sidelink or a model of it and A its amplitude
 in that pulse, so that images stay in the units of the radar channel, comparable with monostatic ones, and a
@@ -18,10 +18,16 @@ from apertura.core.echo.sidelink_state import ECHO_DB, GATE_CELLS, NULL_DB, Side
 __all__ = ["METHODS", "choose", "divide", "edges", "gated", "measure", "two_parameter", "wiener"]
 
 DIVIDE_SNR_DB = 10.0
+"""dB per subcarrier, least SNR for `divide` (docs/theory/echo_methods.md, "Which correction")."""
+
 WIENER_SNR_DB = 6.0
+"""dB per subcarrier, least SNR for `wiener` (same source)."""
+
 RIPPLE_DB = 0.5
+"""dB peak to peak, largest ripple that a method which does not remove it may leave (same source)."""
+
 FIT_SNR_DB = 13.4
-"""Of the whole pulse, N·SNR: below it the errors of the two fitted parameters cost more than 0.2 dB."""
+"""dB of the whole pulse, N·SNR: below it the errors of the two fitted parameters cost more than 0.2 dB."""
 
 _PULSES_AT_ONCE = 64
 _Inverse = Callable[[Complexes, LineOfSight], Complexes]
@@ -81,7 +87,7 @@ def wiener(radar: Complexes, sidelink: Complexes, path: LineOfSight | None = Non
 
 
 def gated(radar: Complexes, sidelink: Complexes, path: LineOfSight | None = None) -> Complexes:
-    """Return R·A/S with S cleaned of all that arrives more than 16 cells from the direct path.
+    """Return R·A/S with S gated to 16 cells on each side of the direct path.
 
     Parameters and result as `divide`.
 
@@ -94,7 +100,7 @@ def gated(radar: Complexes, sidelink: Complexes, path: LineOfSight | None = None
         subcarriers = symbols.shape[1]
         direct = phasor(path, subcarriers)
         profile = fft.ifft(symbols * direct.conj(), axis=1)
-        profile[:, GATE_CELLS + 1 : subcarriers - GATE_CELLS] = 0  # nothing to cut below 33 subcarriers
+        profile[:, GATE_CELLS + 1 : subcarriers - GATE_CELLS] = 0  # no cells to remove below 33 subcarriers
         clean = fft.fft(profile, axis=1) * direct
         return _bounded_inverse(clean, path.amplitude[:, None].astype(np.float32))
 
@@ -102,7 +108,7 @@ def gated(radar: Complexes, sidelink: Complexes, path: LineOfSight | None = None
 
 
 def two_parameter(radar: Complexes, sidelink: Complexes, path: LineOfSight | None = None) -> Complexes:
-    """Return R turned back by the delay and the phase of the direct path, one of each per pulse.
+    """Return R compensated for delay and phase of the direct path, one of each per pulse.
 
     Parameters and result as `divide`.
 
@@ -127,11 +133,11 @@ METHODS: Mapping[str, Callable[..., Complexes]] = {
 
 
 DIVIDING = "divide", "wiener"
-"""Those that take out what was sent, whatever its spectrum; the others take the sidelink for one path of a flat one."""
+"""Methods that remove the transmitted spectrum whatever it is; the others assume a flat one and a single path."""
 
 
 def edges(method: str, state: SidelinkState) -> dict[str, str]:
-    """Return the edges that a key of `METHODS` crosses on such a sidelink: flag → one line; empty if it is adequate.
+    """Return the limits that a key of `METHODS` crosses on such a sidelink: flag → one line; empty if it is adequate.
 
     Notes
     -----
@@ -171,24 +177,24 @@ def choose(state: SidelinkState) -> tuple[str, str]:
     """
     crossed = {method: edges(method, state) for method in METHODS}
     adequate = [method for method in METHODS if not crossed[method]]
-    seen = (
+    measured = (
         f"SNR {state.snr_db:.1f} dB per subcarrier, echoes {'of' if state.echo_cells else 'below'} "
         f"{state.echo_db:.1f} dB, ripple {max(state.ripple_db, state.fine_ripple_db):.1f} dB"
     )
     if adequate:
-        return adequate[0], f"{seen}: cheapest adequate"
+        return adequate[0], f"{measured}: cheapest adequate"
     # every pulse that locks is coherent after two_parameter: it can leave ghosts, it cannot lose the image
     fallback = "wiener" if "wrong_code" in state.flags else "two_parameter"
-    return fallback, f"{seen}: none adequate, least harm ({'; '.join(crossed[fallback].values())})"
+    return fallback, f"{measured}: none adequate, least harm ({'; '.join(crossed[fallback].values())})"
 
 
 def _gain_db(state: SidelinkState, cells: int) -> float:
-    """Return the SNR after all but `cells` delay cells are cut away."""
+    """Return the SNR with all but `cells` delay cells removed."""
     return state.snr_db + 10 * float(np.log10(state.subcarriers / min(cells, state.subcarriers)))
 
 
 def _amplitude(symbols: Complexes, path: LineOfSight) -> NDArray[np.float32]:
-    """Return (pulse, 1) amplitude of the direct path, or of all that arrives where it did not lock."""
+    """Return (pulse, 1) amplitude of the direct path, or of the whole sidelink where it did not lock."""
     rms = np.sqrt(np.mean(np.abs(symbols) ** 2, axis=1))
     return np.asarray(np.where(path.locked, path.amplitude, rms)[:, None], np.float32)
 

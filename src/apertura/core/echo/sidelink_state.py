@@ -13,7 +13,7 @@ from apertura.common.errors import CampaignError
 from apertura.core.echo.captures import AT_ONCE
 from apertura.core.echo.line_of_sight import LOCK_FALSE_ALARM, LineOfSight, fit_block, joined
 
-# ---- The pulses of a sidelink averaged, each aligned to its direct path: what they have in common and what changes
+# ---- Average of the pulses of a sidelink, aligned to the direct path
 
 
 class SidelinkAverage(NamedTuple):
@@ -51,8 +51,8 @@ class Averaging:
             return
         direct = path.select(locked)
         size = 1 / direct.amplitude
-        turned = (size * np.exp(-1j * direct.phase_rad)).astype(np.complex64)
-        unit = profile[locked] * turned[:, None]
+        inverse = (size * np.exp(-1j * direct.phase_rad)).astype(np.complex64)
+        unit = profile[locked] * inverse[:, None]
         power = np.square(unit.real) + np.square(unit.imag)
         self._power += power.sum(0)
         self._mean += unit.sum(0)
@@ -76,7 +76,7 @@ class Averaging:
         )
 
 
-# ---- What arrives beside the direct path of a sidelink: echoes, ripple, and what changes from pulse to pulse -------
+# ---- Echoes and ripple beside the direct path
 #
 # Source: docs/theory/echo_methods.md, "State of a sidelink".
 
@@ -94,25 +94,25 @@ def strongest_echo(average: SidelinkAverage) -> tuple[float, int]:
     one_sided = np.where(excess[cells] > 4 * np.abs(excess[-cells]), excess[cells] - excess[-cells], 0.0)
     best = int(np.argmax(one_sided))
     level, cell = float(one_sided[best]), int(cells[best])
-    # what the highest of N averages of exponential noise passes with the chance of a false lock
+    # threshold of the highest of N averages of exponential noise, at the probability of a false lock
     highest = gammainccinv(average.pulses, LOCK_FALSE_ALARM / average.power.size) / average.pulses
-    seen = average.noise * (float(highest) - 1)
-    # what moves from pulse to pulse drowns in the average: another transmitter with a clock of its own
+    threshold = average.noise * (float(highest) - 1)
+    # an arrival that moves from pulse to pulse averages out: another transmitter with a clock of its own
     highest_noise = average.noise * np.log(average.power.size / LOCK_FALSE_ALARM)
     if average.second_power > max(4 * average.power[average.second_cell], highest_noise, level):
         level, cell = average.second_power, average.second_cell
-    if level <= seen:
-        return decibels(seen), 0
+    if level <= threshold:
+        return decibels(threshold), 0
     return decibels(level), cell if cell < average.power.size / 2 else cell - average.power.size
 
 
 def ripple(average: SidelinkAverage, *, one_sided: bool) -> tuple[float, int, float]:
     """Return ripple (peak to peak, dB) inside the gate, its strongest cell, and ripple outside.
 
-    It is told by echoes that all pulses have in common:
+    It is measured by echoes that all pulses have in common:
 
     cos of amplitude a makes two echoes of a/2, a reflection in the transmitter one of a. Outside the gate, and
-    inside unless `one_sided`, an echo without a partner is taken for another path of the sidelink.
+    inside unless `one_sided`, an echo on one side only counts as another path of the sidelink.
     """
     power = np.abs(average.mean / average.mean[0]) ** 2
     cells = np.arange(1, power.size // 2)
@@ -128,12 +128,12 @@ def ripple(average: SidelinkAverage, *, one_sided: bool) -> tuple[float, int, fl
 
 
 def changing_near(average: SidelinkAverage) -> float:
-    """Return what changes from pulse to pulse within two cells of the direct path, dB; -300 where it is noise."""
+    """Return the power that changes between pulses within two cells of the direct path, dB; -300 where it is noise."""
     near = [1, 2, -1, -2]
     excess = average.power[near] - np.abs(average.mean[near]) ** 2 - average.noise
-    seen = 5 * average.noise * np.sqrt(len(near) / average.pulses)
+    threshold = 5 * average.noise * np.sqrt(len(near) / average.pulses)
     total = float(excess.sum())
-    return decibels(total) if total > seen and average.pulses > 1 else -300.0
+    return decibels(total) if total > threshold and average.pulses > 1 else -300.0
 
 
 def _peak_to_peak_db(amplitude: float) -> float:
@@ -145,33 +145,33 @@ def decibels(power: float) -> float:
     return float(10 * np.log10(max(power, 1e-30)))
 
 
-# ---- State of a sidelink: its SNR, echoes and ripple, and the pulses in which it locks -----------------------------
+# ---- State of a sidelink
 
 ECHO_DB = -20.0
-"""Ghosts this far below the image are tolerated; an echo of the sidelink makes one as strong as itself."""
+"""dB relative to the image of tolerated ghosts; an echo of the sidelink causes one as strong as itself."""
 
 SECOND_ARRIVAL_DB = -6.0
-"""An arrival this strong beside the direct path is another transmitter, or a reflection as good as one."""
+"""dB relative to the direct path: a stronger arrival beside it is another transmitter, or a reflection as strong."""
 
 NULL_DB = -20.0
-"""Subcarriers this far below the mean are nulls: divided, they would amplify noise by more than a hundred."""
+"""dB below the mean, at which subcarriers are nulls: divided, they would amplify noise by more than a hundred."""
 
 
 @dataclass(frozen=True)
 class SidelinkState:
-    """What decides which correction a sidelink of N `subcarriers` allows.
+    """Measures of a sidelink of N `subcarriers`, from which its correction is chosen.
 
     Attributes
     ----------
     snr_db
         Per subcarrier, median of the locked pulses.
     echo_db
-        Strongest arrival beside the direct path, relative to it; where `echo_cells` is 0, the level below
-        which none would have been seen.
+        Strongest arrival beside the direct path, relative to it; where `echo_cells` is 0, the detection
+        threshold.
     echo_cells
-        Delay of that arrival after the direct path, in cells of 1/B; 0 if none was seen.
-    echo_stays
-        Whether its phase against the direct path is the same in most pulses: then it may be the transmitter's, too.
+        Delay of that arrival after the direct path, in cells of 1/B; 0 if none was detected.
+    echo_steady
+        Whether its phase against the direct path is the same in most pulses: then it may also be the transmitter's.
     ripple_db
         Peak-to-peak ripple of the band that repeats in every pulse and fits into the gate, as of one sinusoid.
     ripple_cells
@@ -179,11 +179,12 @@ class SidelinkState:
     fine_ripple_db
         The same for ripple too fine for the gate.
     near_db
-        What changes from pulse to pulse within two cells of the direct path, relative to it; -300 where it is noise.
+        Power that changes from pulse to pulse within two cells of the direct path, relative to it; -300 where it is
+        noise.
     null_share
         Share of the subcarriers below `NULL_DB`.
     locked
-        (pulse,) bool, whether the direct path stands out of the noise.
+        (pulse,) bool, whether the direct path is detected above the noise.
     path
         The direct path as fitted to each pulse.
     flags
@@ -194,7 +195,7 @@ class SidelinkState:
     snr_db: float
     echo_db: float
     echo_cells: int
-    echo_stays: bool
+    echo_steady: bool
     ripple_db: float
     ripple_cells: int
     fine_ripple_db: float
@@ -239,8 +240,8 @@ def measure(sidelink: Complexes, *, where: str = "sidelink") -> SidelinkState:
 def measure_blocks(blocks: Callable[[], Iterable[Complexes]], where: str = "sidelink") -> SidelinkState:
     """Measure the sidelink of a flight, block by block.
 
-    `blocks` gives it from its beginning, (pulse, subcarrier) complex64 each, the code removed; it is asked once more
-    where no pulse locks. Errors call the recording `where`; CampaignError if it carries nothing.
+    `blocks` gives it from its beginning, (pulse, subcarrier) complex64 each, the code removed; it is called once more
+    where no pulse locks. Errors name the recording `where`; CampaignError if it has no signal.
 
     Notes
     -----
@@ -274,12 +275,12 @@ def _state_of(path: LineOfSight, average: SidelinkAverage) -> SidelinkState:
         snr_db=decibels(snr),
         echo_db=echo_db,
         echo_cells=echo_cells,
-        echo_stays=bool(np.abs(average.mean[echo_cells]) ** 2 > (average.power[echo_cells] - average.noise) / 2),
+        echo_steady=bool(np.abs(average.mean[echo_cells]) ** 2 > (average.power[echo_cells] - average.noise) / 2),
         ripple_db=ripple_db,
         ripple_cells=ripple_cells,
         fine_ripple_db=fine_ripple_db,
         near_db=changing_near(average),
-        # a null is seen only where the noise lies well below it
+        # a null is measurable only where the noise is well below it
         null_share=float(np.mean(flat < flat.mean() * 10 ** (NULL_DB / 10))) if snr > 10 else 0.0,
         locked=path.locked,
         path=path,
@@ -289,7 +290,7 @@ def _state_of(path: LineOfSight, average: SidelinkAverage) -> SidelinkState:
 
 
 def _measure_without_code(blocks: Callable[[], Iterable[Complexes]], path: LineOfSight, where: str) -> SidelinkState:
-    """Tell a sidelink of unknown code, whose neighbouring pulses still agree, from no sidelink at all."""
+    """Distinguish a sidelink of unknown code, whose neighbouring pulses still agree, from no sidelink."""
     pulses = path.locked.size
     common = joined([fit_block(products)[0] for products in _neighbours(blocks())] or [path.select(slice(0))])
     if not common.locked.size or common.locked.mean() < 0.5:
@@ -341,11 +342,11 @@ def _flags(state: SidelinkState) -> dict[str, str]:
     return flags
 
 
-# ---- A second path of the sidelink too close to the first to resolve: what it would do to an image if it is one
+# ---- A second path of the sidelink within a resolution cell
 
 
 def second_path_flags(state: SidelinkState, *, cell_m: float) -> dict[str, str]:
-    """Return a flag where what arrives near the direct path is an echo, or may be one and not the transmitter's ripple.
+    """Return a flag where an arrival near the direct path is an echo, or may be one and no ripple of the transmitter.
 
     Parameters
     ----------
@@ -359,12 +360,12 @@ def second_path_flags(state: SidelinkState, *, cell_m: float) -> dict[str, str]:
     Source: docs/theory/echo_methods.md, "Ripple or echo".
     """
     if state.near_db > ECHO_DB:
-        seen = (
+        measured = (
             f"an arrival of {state.near_db:.1f} dB within {2 * cell_m:.2f} m of the direct path changes over the flight"
         )
-        harm = _harm(10 ** (state.near_db / 20), 1, cell_m)
-        return {"sidelink_ripple_or_echo": f"{seen}, as an echo does: {harm}"}
-    if state.echo_db > ECHO_DB and 0 < abs(state.echo_cells) <= GATE_CELLS and state.echo_stays:
+        harm = _effect_of_echo(10 ** (state.near_db / 20), 1, cell_m)
+        return {"sidelink_ripple_or_echo": f"{measured}, as an echo does: {harm}"}
+    if state.echo_db > ECHO_DB and 0 < abs(state.echo_cells) <= GATE_CELLS and state.echo_steady:
         line = (
             f"an arrival of {state.echo_db:.1f} dB {state.echo_cells * cell_m:+.2f} m from the direct path stays over "
             "the flight: an echo, or the transmitter's ripple; what corrects one makes ghosts as strong of the other"
@@ -378,11 +379,11 @@ def second_path_flags(state: SidelinkState, *, cell_m: float) -> dict[str, str]:
         f"ripple of {state.ripple_db:.1f} dB in the sidelink is taken for the transmitter's; one channel cannot tell "
         f"it from a second path {state.ripple_cells * cell_m:.2f} m longer that stays so; if it is one, "
     )
-    return {"sidelink_ripple_or_echo": line + _harm(amplitude, state.ripple_cells, cell_m)}
+    return {"sidelink_ripple_or_echo": line + _effect_of_echo(amplitude, state.ripple_cells, cell_m)}
 
 
-def _harm(amplitude: float, cells: int, cell_m: float) -> str:
-    """Return what an echo of that amplitude does, in words; unresolved ones move what resolved ones repeat."""
+def _effect_of_echo(amplitude: float, cells: int, cell_m: float) -> str:
+    """Return the effect of an echo of that amplitude: unresolved ones shift targets, resolved ones repeat them."""
     if cells > 1:
         return f"it makes ghosts of {20 * np.log10(amplitude):.1f} dB"
     path_cm, phase_rad = 100 * amplitude * cells * cell_m / np.sqrt(2), amplitude / np.sqrt(2)

@@ -1,7 +1,7 @@
-"""Captures of a pair become transfer functions: by the code alone, or against the sidelink.
+"""Transfer functions from the captures of a pair: by the code alone, or against the sidelink.
 
-In two passes: the first finds what a flight's captures have in common and a few numbers per pulse, the second forms
-transfer functions, block by block. No more than a block of captures is held, however long the flight is.
+In two passes: the first measures clock, sidelink and a few numbers per pulse, the second forms
+transfer functions, block by block. No more than a block of captures is in memory, however long the flight is.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -23,30 +23,30 @@ from apertura.core.echo.own_pulses import CodeEvidence, own_code, phase_stabilit
 from apertura.core.echo.sidelink import DIVIDING, METHODS, choose, edges
 from apertura.core.echo.sidelink_state import SidelinkState, measure_blocks, second_path_flags
 
-_STRETCH = 128  # neighbouring pulses that own code and phase are looked for in
+_STRETCH = 128  # neighbouring pulses on which own code and phase are checked
 _CLOCK_STRETCH = 256
 
 
 @dataclass(frozen=True)
 class Transfer:
-    """What the captures of a pair measured.
+    """Transfer functions of a pair, with the measurements of its captures.
 
     Attributes
     ----------
     kept
-        (capture,) bool, the captures that measured something.
+        (capture,) bool, the captures that are used.
     flags
         Edge crossed → what was measured, in one line.
     report
-        What was decided on the way and why: clock, sidelink, code.
+        Decisions with reasons: clock, sidelink, code.
     sidelink_delay_m, sidelink_snr_db, sidelink_phase_rad
-        (pulse,) float64, what was measured of the sidelink in the captures kept: delay times c, metres, SNR per
+        (pulse,) float64, measures of the sidelink in the captures kept: delay times c, metres, SNR per
         subcarrier and phase at mid-band; NaN where it did not lock, None without a sidelink.
     form
         Numbers of a few captures, ascending → their transfer functions, (pulse, subcarrier) complex64. The code is
-        removed; electrical paths are still in them.
+        removed; electrical paths are not removed.
     saturation
-        Of the samples that transfer functions were formed from so far.
+        Of the samples of the transfer functions formed so far.
     """
 
     kept: NDArray[np.bool_]
@@ -60,20 +60,20 @@ class Transfer:
 
 
 def transfer_by_code(read: Read, inverse: Complexes, numerology: Numerology, *, time_s: Floats) -> Transfer:
-    """Return what a node received of its own pulses, whose clock is the transmitter's.
+    """Return the transfer functions of a node's own pulses, whose clock is the transmitter's.
 
     Parameters
     ----------
     read
         Reads `radar`.
     inverse, numerology
-        (subcarrier,) complex64 that takes out what was sent, 1/c_n of a symbol, and its grid.
+        (subcarrier,) complex64 that removes the transmitted signal, 1/c_n of a symbol, and its grid.
     time_s
         (capture,) float64, when each was sent, seconds of any origin.
 
     Notes
     -----
-    Code and phase are looked at in up to 2048 captures, 16 stretches spread over the flight.
+    Code and phase are checked on up to 2048 captures, 16 stretches spread over the flight.
 
     Examples
     --------
@@ -115,24 +115,24 @@ def transfer_by_sidelink(
     accuracy_db: float,
     where: str,
 ) -> Transfer:
-    """Return what a secondary node received, less all that its two channels share.
+    """Return the transfer functions of a secondary node, corrected for what its two channels have in common.
 
     Parameters
     ----------
     read
         Reads `radar` and `sidelink`.
     inverse, numerology
-        (subcarrier,) complex64 that takes out what was sent, 1/c_n of a symbol, and its grid.
+        (subcarrier,) complex64 that removes the transmitted signal, 1/c_n of a symbol, and its grid.
     symbol_samples
         (T_cp + T)·f_s, or all of a capture: nothing beyond is used.
     sidelink_m
-        (capture,) float64, distance between the antennas of the sidelink, metres; the path that comes off every echo.
+        (capture,) float64, distance between the antennas of the sidelink, metres; the path removed from every echo.
     method
         A key of `METHODS`, or auto.
     accuracy_db
-        Level below the peak that errors of the clock may reach, dB.
+        Tolerated level of clock errors relative to the peak, dB.
     where
-        What to call the recording in errors.
+        Name of the recording in errors.
 
     Raises
     ------
@@ -152,13 +152,13 @@ def transfer_by_sidelink(
     cell_m = SPEED_OF_LIGHT_M_S / (numerology.numbers.size * numerology.spacing_hz)
     delay_m = state.delay_cells * cell_m
     residual = baseline_residual(delay_m, sidelink_m)
-    suspect = detect_wrong_association(residual)
+    wrong = detect_wrong_association(residual)
     flags = Flags.merged(
         unclocked,
         state.flags,
         edges(chosen, state),
         second_path_flags(state, cell_m=cell_m),
-        {"association_suspect": suspect} if suspect else {},
+        {"association_suspect": wrong} if wrong else {},
     )
     quality = {"method": chosen, "reason": reason, **_sidelink_report(state, residual)}
     saturation = Saturation()
@@ -181,7 +181,7 @@ def as_complex(iq: Samples) -> Complexes:
 
 @dataclass(frozen=True)
 class _Receiver:
-    """How captures of a node with its own clock become symbols: as they are, or with its clock corrected."""
+    """Demodulation of captures of a node with its own clock, corrected in the samples if decided."""
 
     read: Read
     inverse: Complexes  # of the code

@@ -1,4 +1,4 @@
-"""Recordings that never stop: what is sent before each symbol, how it is detected, and the captures cut there."""
+"""Continuous recordings: framing, detection of preambles, and extraction of captures."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from scipy import fft
 from apertura.common.arrays import Complexes
 from apertura.core.echo.captures import Samples
 
-# ---- What is sent before each symbol: a preamble that triggers, and a payload that counts --------------------------
+# ---- Framing: preamble and frame counter
 
 ABSENT = -1
 """Frame number of a pulse whose payload was not read."""
@@ -98,12 +98,11 @@ class Framing:
         return np.asarray(np.exp(2j * np.pi * self.centre_hz / self.sample_rate_hz * sample), np.complex64)
 
 
-# ---- Finding the pulses in a recording that never stops: correlation with the preamble, at a set rate of false
-# alarms
+# ---- Detection of preambles at a set rate of false alarms
 
 
 _SMALLEST_TRANSFORM = 2**16
-_SILENT = 1e-10  # of the energy of a window, under a preamble: rounding of its transform
+_NO_SIGNAL = 1e-10  # of the energy of a window, within a preamble: below it is rounding of the transform
 
 
 @dataclass(frozen=True)
@@ -128,18 +127,18 @@ class Detection:
 def find_preambles(
     blocks: Iterable[Samples], framing: Framing, *, symbol_samples: int, false_alarms_per_s: float
 ) -> Iterator[Detection]:
-    """Yield the preambles of a recording in order, holding a bounded number of its samples at a time.
+    """Yield the preambles of a recording in order, with a bounded number of its samples in memory.
 
     Parameters
     ----------
     blocks
         (sample, 2) each, I and Q of the trigger's channel, one after the other, of any length.
     framing
-        What was sent before each symbol.
+        Framing of the symbols.
     symbol_samples
-        (T_cp + T)·f_s; from a preamble to the end of its symbol nothing else is looked for.
+        (T_cp + T)·f_s; from a preamble to the end of its symbol no other preamble is searched.
     false_alarms_per_s
-        How often noise alone may trigger.
+        Tolerated rate of triggers by noise alone.
 
     Raises
     ------
@@ -195,7 +194,7 @@ def _scores(blocks: Iterable[Samples], template: Complexes) -> Iterator[tuple[in
         matches = fft.ifft(fft.fft(window, size) * matched)[:fitting]
         energy[1 : window.size + 1] = np.cumsum(_power(window), dtype=np.float64)
         under = (energy[length : window.size + 1] - energy[:fitting]).astype(np.float32)
-        silence = np.float32(_SILENT * energy[window.size]) + np.finfo(np.float32).tiny  # samples may be of any unit
+        silence = np.float32(_NO_SIGNAL * energy[window.size]) + np.finfo(np.float32).tiny  # samples may be of any unit
         yield first, np.asarray(_power(matches) / np.maximum(under, silence), np.float32)
 
 
@@ -223,9 +222,9 @@ def _windows(blocks: Iterable[Samples], size: int, *, overlap: int) -> Iterator[
 
 
 class _PeakSearch:
-    """The highest score within one preamble's length of the first that passes, then silence for a frame.
+    """Search for the highest score within one preamble's length of the first that passes, then a dead time of a frame.
 
-    A strong preamble passes in its sidelobes already; its true place follows less than its own length later.
+    The sidelobes of a strong preamble pass already; its true place follows less than its own length later.
     """
 
     def __init__(self, threshold: float, reach: int, silence: int) -> None:
@@ -263,7 +262,7 @@ class _PeakSearch:
         yield Detection(sample, score, float(10 * np.log10(ratio)))
 
 
-# ---- Captures cut from a recording that never stopped, at the preamble before each symbol --------------------------
+# ---- Extraction of captures from a continuous recording
 
 _SAMPLES_AT_ONCE = 2**18
 
@@ -278,7 +277,7 @@ class SampleSource(Protocol):
 
 @dataclass(frozen=True)
 class TriggeredCaptures:
-    """What a triggered recorder would have captured of a recording.
+    """Captures of a continuous recording, as by a triggered recorder.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""What single pulses and blocks of pulses add at single places, in float64: for certificates and autofocus."""
+"""Contributions of pulses and of blocks of pulses at single places, in float64: for certificates and autofocus."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from apertura.core.focus.engines.native_binding import KERNEL, EchoJob, availabl
 from apertura.core.focus.inputs import Profiles
 from apertura.core.interpolation import kaiser_sinc
 
-# ---- The image of profiles by band-limited interpolation in float64: what engines answer to where there is no echo
+# ---- Image of profiles by band-limited interpolation in float64
 
 _HALF_TAPS = 24
 _KAISER_BETA = 22.0  # -190 dB with half the band free for the transition
@@ -52,10 +52,10 @@ def band_limited_image(
         part = slice(first, first + _PULSES_AT_ONCE)
         path = profiles.aperture[part].path(pixels)
         place = (path - profiles.start_m[part, None]) / profiles.step_m
-        whole = np.floor(place).astype(np.int64)
-        distance = (place - whole)[..., None] - taps
+        base = np.floor(place).astype(np.int64)
+        distance = (place - base)[..., None] - taps
         weights = kaiser_sinc(distance, half=_HALF_TAPS, beta=_KAISER_BETA)
-        index = np.clip(whole[..., None] + taps + _HALF_TAPS, 0, padded.shape[1] - 1)
+        index = np.clip(base[..., None] + taps + _HALF_TAPS, 0, padded.shape[1] - 1)
         samples = np.take_along_axis(padded[part, None], index, axis=2)
         value = (samples * weights).sum(-1) * np.exp(1j * np.remainder(k * path, 2 * np.pi))
         if beams is not None:
@@ -64,7 +64,7 @@ def band_limited_image(
     return image
 
 
-# ---- Echoes of single pulses at single places: how samples make them, and pulses read and laid out for that --------
+# ---- Echoes of single pulses at single places
 
 TAPS, DEGREE = KERNEL.echo_taps, KERNEL.echo_degree
 
@@ -74,7 +74,7 @@ _VALUES_AT_ONCE = 2**17  # pulses × places: of beams, and without the compiled 
 
 @lru_cache
 def tap_polynomials() -> NDArray[np.float64]:
-    """Return the weight of each sample about a place as a polynomial of where between its neighbours the place is.
+    """Return the weight of each sample about a place as a polynomial of the place between its neighbours.
 
     Returns
     -------
@@ -101,11 +101,11 @@ def tap_polynomials() -> NDArray[np.float64]:
     given = np.einsum("wt,un,u->wutn", np.exp(1j * omega[:, None] * tap), powers, root).reshape(
         -1, powers[0].size * TAPS
     )
-    wanted = (np.exp(1j * omega[:, None] * place) * root).ravel()
-    left, right = (np.concatenate([part.real, part.imag]) for part in (given, wanted))
+    ideal = (np.exp(1j * omega[:, None] * place) * root).ravel()
+    left, right = (np.concatenate([part.real, part.imag]) for part in (given, ideal))
     free = _joined()
-    found = free @ np.linalg.lstsq(left @ free, right, rcond=None)[0]
-    return np.ascontiguousarray(found.reshape(TAPS, DEGREE + 1).T)
+    coefficients = free @ np.linalg.lstsq(left @ free, right, rcond=None)[0]
+    return np.ascontiguousarray(coefficients.reshape(TAPS, DEGREE + 1).T)
 
 
 @lru_cache
@@ -114,7 +114,7 @@ def _rounded_taps() -> NDArray[np.float32]:
 
 
 def _joined() -> NDArray[np.float64]:
-    """Return (tap·power, free) the polynomials whose weights and slopes go on where the next sample becomes nearest."""
+    """Return (tap·power, free) the polynomials with weights and slopes continuous where the nearest sample changes."""
     power = np.arange(DEGREE + 1)
     joins: list[NDArray[np.float64]] = []
     for end in (0.5**power, power * 0.5 ** (power - 1.0)):
@@ -151,7 +151,7 @@ class Echoes:
 
     @classmethod
     def read(cls, profiles: Profiles, parts: list[slice]) -> "Echoes":
-        """Return the pulses of some slices one after the other, of which no others are read."""
+        """Return the pulses of some slices one after the other; no other pulses are read."""
         read = np.concatenate([np.asarray(profiles.samples[part]) for part in parts])
         samples = np.zeros((len(read), 2, read.shape[1] + 2 * TAPS), np.float32)
         samples[:, 0, TAPS:-TAPS], samples[:, 1, TAPS:-TAPS] = read.real, read.imag
@@ -172,7 +172,7 @@ class Echoes:
     def at(self, places_m: NDArray[np.float64]) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
         """Return s(R)·exp(j2πf_mid R/c) at some places and its derivative with respect to the path R.
 
-        What the compiled library computes, in float64.
+        The same as the compiled library, in float64.
 
         Parameters
         ----------
@@ -192,12 +192,12 @@ class Echoes:
         path = tx + rx
         at = (path - self.start_m[:, None]) / self.step_m
         at = np.clip(at, TAPS / 2 - 0.5, self.samples.shape[-1] - TAPS / 2 - 0.5)
-        whole = np.rint(at - 0.5)
-        first = np.nan_to_num(whole).astype(np.int64) - (TAPS // 2 - 1)
+        base = np.rint(at - 0.5)
+        first = np.nan_to_num(base).astype(np.int64) - (TAPS // 2 - 1)
         near = np.clip(first, 0, None)[..., None] + np.arange(TAPS)
         pulse = np.arange(len(self))[:, None, None]
         samples = self.samples[pulse, 0, near] + 1j * self.samples[pulse, 1, near]
-        u, taps = at - 0.5 - whole, tap_polynomials()
+        u, taps = at - 0.5 - base, tap_polynomials()
         powers = u[..., None] ** np.arange(DEGREE + 1)
         level = np.einsum("pxn,nt,pxt->px", powers, taps, samples)
         rate = np.einsum("pxn,nt,pxt->px", powers[..., :-1], taps[1:] * np.arange(1, DEGREE + 1)[:, None], samples)
@@ -206,12 +206,12 @@ class Echoes:
 
 
 def job_of(echoes: Echoes, places_m: NDArray[np.float64], weight: NDArray[np.float32]) -> EchoJob:
-    """Return the job of looking at some places, for the compiled library; what it shall give is still to be set.
+    """Return the job of some places for the compiled library; the caller sets the outputs.
 
     Parameters
     ----------
     echoes
-        Held by the caller while the job runs, as are the other arrays.
+        Kept alive by the caller while the job runs, as are the other arrays.
     places_m
         (place, 3) float64, contiguous.
     weight
@@ -235,13 +235,13 @@ def pulses_at_once(profiles: Profiles) -> int:
 
 
 def tiles(places: int, pulses: int) -> Iterator[slice]:
-    """Yield slices of places of which so few are looked at together that memory stays bounded."""
+    """Yield slices of places, computed together, that bound memory."""
     step = max(1, _VALUES_AT_ONCE // max(1, pulses))
     for first in range(0, places, step):
         yield slice(first, first + step)
 
 
-# ---- What blocks of pulses add at single places: the columns of an image of few pixels, which corrected tracks turn
+# ---- Contributions of blocks of pulses
 
 Piece = tuple[int, slice]
 """A block and some of its pulses."""
@@ -259,11 +259,11 @@ def block_contributions(
     Parameters
     ----------
     profiles
-        At least twice oversampled; samples beyond theirs count as zero. They may be read as they are asked for.
+        At least twice oversampled; samples beyond theirs count as zero. They may be read on access.
     places_m
         (place, 3) float64, metres, in the frame of the phase centres.
     edges
-        (block + 1,) int64, ascending: block b holds pulses edges[b] to edges[b + 1].
+        (block + 1,) int64, ascending: block b is pulses edges[b] to edges[b + 1].
     weights
         (pulse,) float64, of each pulse; 1 by default. Blocks without weight are not read.
 
@@ -307,7 +307,7 @@ def block_contributions(
 
 
 def _chunks(edges: NDArray[np.int64], weights: NDArray[np.float64], most: int) -> Iterator[list[Piece]]:
-    """Yield the blocks that weigh something, cut where one chunk has `most` pulses."""
+    """Yield the blocks with weight, cut where one chunk has `most` pulses."""
     chunk: list[Piece] = []
     room = most
     for block, (first, end) in enumerate(pairwise(edges.tolist())):
@@ -325,7 +325,7 @@ def _chunks(edges: NDArray[np.int64], weights: NDArray[np.float64], most: int) -
 
 
 def _borders(pieces: list[Piece]) -> NDArray[np.int64]:
-    """Return where pieces begin and end once they stand one after the other."""
+    """Return the offsets of pieces in their concatenation."""
     return np.cumsum([0, *(part.stop - part.start for _block, part in pieces)])
 
 

@@ -1,4 +1,4 @@
-"""How an objective of an image changes with each phase centre and each path: the exact adjoint of forming it."""
+"""Gradient of an objective of an image with respect to phase centres and paths: the exact adjoint of its formation."""
 
 from dataclasses import dataclass
 
@@ -21,7 +21,7 @@ class Gradient:
         (pulse, 3) float64, with respect to the phase centre of transmitter and receiver, in the frame of the phase
         centres. Where one node does both, its derivative is their sum.
     path_m
-        (pulse,) float64, with respect to how much further all echoes of a pulse lie (`Profiles.moved`).
+        (pulse,) float64, with respect to a path added to all echoes of a pulse (`Profiles.moved`).
     """
 
     tx_m: NDArray[np.float64]
@@ -37,18 +37,18 @@ def path_gradient(
     Parameters
     ----------
     profiles
-        At least twice oversampled; they may be read as they are asked for.
+        At least twice oversampled; they may be read on access.
     places_m
         (place, 3) float64, metres, in the frame of the phase centres.
     slope
-        (place,) complex, G = ∂J/∂Re + j·∂J/∂Im: what the objective gains as the sum changes, J + Re Σ G*·change.
+        (place,) complex, G = ∂J/∂Re + j·∂J/∂Im: the objective changes by Re Σ G*·change of the sum.
     beams
         Weight of each pulse at each place; that it changes with the phase centres is neglected. None by default.
 
     Returns
     -------
     Gradient
-        Exact for the sum as `block_contributions` forms it, rounded as float32 where a pulse and a place meet.
+        Exact for the sum as `block_contributions` forms it, rounded to float32 for each pulse and place.
 
     Raises
     ------
@@ -63,14 +63,14 @@ def path_gradient(
         raise ValueError(f"{places_m.shape=}, {slope.shape=}: must be (place, 3) and (place,)")
     if not (np.isfinite(places_m).all() and np.isfinite(slope).all()):
         raise ValueError("places and the objective's slopes there must be finite")
-    found, largest = np.zeros((7, len(profiles))), float(np.abs(slope).max(initial=0.0))
+    derivatives, largest = np.zeros((7, len(profiles))), float(np.abs(slope).max(initial=0.0))
     if largest:
         # The library takes float32: an objective's own unit must not push it out of range.
         places_m, slope = np.ascontiguousarray(places_m, np.float64), (slope / largest).astype(np.complex64)
         for first in range(0, len(profiles), pulses_at_once(profiles)):
             part = slice(first, min(first + pulses_at_once(profiles), len(profiles)))
-            found[:, part] = _of_pulses(profiles, part, places_m, slope, beams) * largest
-    return Gradient(found[:3].T.copy(), found[3:6].T.copy(), found[6])
+            derivatives[:, part] = _of_pulses(profiles, part, places_m, slope, beams) * largest
+    return Gradient(derivatives[:3].T.copy(), derivatives[3:6].T.copy(), derivatives[6])
 
 
 def _of_pulses(
@@ -82,14 +82,14 @@ def _of_pulses(
 ) -> NDArray[np.float64]:
     """Return (7, pulse): of transmitter, receiver and path."""
     echoes = Echoes.read(profiles, [part])
-    found = np.zeros((7, len(echoes)))
+    derivatives = np.zeros((7, len(echoes)))
     add = _add_compiled if available() else _add
     for tile in [slice(None)] if beams is None else tiles(len(places_m), len(echoes)):
         weight = np.ones((1, len(echoes)), np.float32)
         if beams is not None:
             weight = beams[part].weight(profiles.aperture[part], places_m[tile]).T.astype(np.float32, order="C")
-        add(echoes, places_m[tile], slope[tile], weight, found)
-    return found
+        add(echoes, places_m[tile], slope[tile], weight, derivatives)
+    return derivatives
 
 
 def _add_compiled(
@@ -97,10 +97,10 @@ def _add_compiled(
     places_m: NDArray[np.float64],
     slope: NDArray[np.complex64],
     weight: NDArray[np.float32],
-    found: NDArray[np.float64],
+    derivatives: NDArray[np.float64],
 ) -> None:
     job = job_of(echoes, places_m, weight)
-    job.objective, job.slopes = slope.ctypes.data, found.ctypes.data
+    job.objective, job.slopes = slope.ctypes.data, derivatives.ctypes.data
     call("apertura_differentiate", job)
 
 
@@ -109,13 +109,13 @@ def _add(
     places_m: NDArray[np.float64],
     slope: NDArray[np.complex64],
     weight: NDArray[np.float32],
-    found: NDArray[np.float64],
+    derivatives: NDArray[np.float64],
 ) -> None:
     weight = np.broadcast_to(weight, (len(places_m), len(echoes)))
     for tile in tiles(len(places_m), len(echoes)):
         of_path = (np.conj(slope[tile]) * echoes.at(places_m[tile])[1]).real * weight[tile].T
         for axis, leg in ((0, echoes.tx_m), (3, echoes.rx_m)):
-            apart = leg.T[:, None] - places_m[tile]
-            direction = apart / np.linalg.norm(apart, axis=-1, keepdims=True)
-            found[axis : axis + 3] += np.einsum("px,pxa->ap", of_path, direction)
-        found[6] -= of_path.sum(axis=1)
+            offset_m = leg.T[:, None] - places_m[tile]
+            direction = offset_m / np.linalg.norm(offset_m, axis=-1, keepdims=True)
+            derivatives[axis : axis + 3] += np.einsum("px,pxa->ap", of_path, direction)
+        derivatives[6] -= of_path.sum(axis=1)

@@ -1,4 +1,4 @@
-"""What an engine is given: the recorded history as plain arrays, without settings or files."""
+"""Inputs of engines: phase history and range profiles as plain arrays, without settings or files."""
 
 from dataclasses import dataclass, replace
 from typing import Any, cast
@@ -10,12 +10,12 @@ from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.geometry.aperture import Aperture
 
 
-class Turned:
-    """Samples of pulses, each times a factor of its own, as they are asked for.
+class PhaseRotated:
+    """Samples of pulses, each times a factor of its own, computed on access.
 
     Examples
     --------
-    >>> np.asarray(Turned(np.ones((3, 2), np.complex64), np.array([1, 1j, -1]))[1:])
+    >>> np.asarray(PhaseRotated(np.ones((3, 2), np.complex64), np.array([1, 1j, -1]))[1:])
     array([[ 0.+1.j,  0.+1.j],
            [-1.+0.j, -1.+0.j]], dtype=complex64)
     """
@@ -93,7 +93,7 @@ class PhaseHistory:
         )
 
     def moved(self, aperture: Aperture, further_m: NDArray[np.float64]) -> "PhaseHistory":
-        """Return the same echoes seen from other phase centres, over paths that are `further_m` longer.
+        """Return the same echoes with other phase centres and with paths longer by `further_m`.
 
         As `Profiles.moved`.
         """
@@ -166,7 +166,7 @@ class Profiles:
         Raises
         ------
         ValueError
-            If the profiles are oversampled less than 1.5 times or hold no pulse, or a position or start is not finite.
+            If the profiles are oversampled less than 1.5 times or have no pulse, or a position or start is not finite.
         """
         if not self.oversampling >= 1.5:
             raise ValueError(f"{self.oversampling=}: must be at least 1.5")
@@ -179,7 +179,7 @@ class Profiles:
         return np.ascontiguousarray(self.samples, np.complex64), start_m, places
 
     def moved(self, aperture: Aperture, further_m: NDArray[np.float64]) -> "Profiles":
-        """Return the same echoes seen from other phase centres, over paths that are `further_m` longer.
+        """Return the same echoes with other phase centres and with paths longer by `further_m`.
 
         Parameters
         ----------
@@ -193,6 +193,8 @@ class Profiles:
         Source: docs/theory/autofocus.md, eq. 3: an echo at path R lies at R + ∆ and has the phase of R + ∆.
         """
         wavenumber = 2 * np.pi * self.centre_frequency_hz / SPEED_OF_LIGHT_M_S
-        turned = Turned(self.samples, np.exp(-1j * wavenumber * further_m)) if np.any(further_m) else self.samples
-        samples = cast("NDArray[np.complex64]", turned)
+        rotated = (
+            PhaseRotated(self.samples, np.exp(-1j * wavenumber * further_m)) if np.any(further_m) else self.samples
+        )
+        samples = cast("NDArray[np.complex64]", rotated)
         return replace(self, samples=samples, start_m=self.start_m + further_m, aperture=aperture)

@@ -1,4 +1,4 @@
-"""An imaging job as numbers: what the planner and the engines' predictions look at before anything is formed."""
+"""An imaging job as numbers: the input of the planner and of the engines' predictions."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -17,7 +17,7 @@ from apertura.core.scene.terrain import GroundModels, Terrain
 
 @dataclass(frozen=True, eq=False)
 class Signal:
-    """What profiles hold.
+    """Signal of the profiles.
 
     Attributes
     ----------
@@ -54,15 +54,15 @@ class Integration:
     sector
         None: every pulse counts for every pixel.
     count
-        Pulses that 1 stands for: all, or the most that a place of the scene takes inside the sector.
+        Pulses that the sum is divided by: all, or the most that a place of the scene takes inside the sector.
     value, reason
         What was chosen, and why, in a few words.
     share
         Of pixels × pulses that are summed.
     report
-        What image.json says of it.
+        Section of image.json.
     flags
-        Limits crossed → what was found.
+        Limits crossed → what was measured.
     """
 
     sector: Sector | None
@@ -91,7 +91,7 @@ class Job:
     centre_hz, bandwidth_hz, subcarriers
         Of the waveform.
     signal
-        What the profiles hold.
+        Signal of the profiles.
     frame
         'ecef' or 'local'.
     tile_px, threads
@@ -103,18 +103,18 @@ class Job:
     memory_bytes
         What the imaging step may use.
     content_db
-        How much weaker the scene's pixels are than the incoherent sum of what the pulses add, from `content_loss_db`:
+        How much weaker the scene's pixels are than the incoherent sum of the contributions, from `content_loss_db`:
         errors of tables weigh that much more. None before anything was recorded.
     beams, illumination
         Of the antennas, where they have any, and of the sector integrated; over all pulses.
     integration
         Over how much of the flight; None: all of it.
     recorded
-        Whether the phase history is there, which the double sum reads.
+        Whether there is a phase history, which the double sum needs.
     patches_on
         Ground → places of the pixels of some windows of the scene, each (y, x, 3) float64, metres; None: unknown.
     patches_m
-        The same on the ground that is imaged on, once that is decided; none: a plane about points of `ground_m`.
+        The same on the decided model of the ground; none: planes about points of `ground_m`.
     """
 
     aperture: Aperture
@@ -171,7 +171,7 @@ class Job:
 
     @property
     def count(self) -> int:
-        """Pulses that 1 stands for."""
+        """Pulses that the sum is divided by."""
         return len(self.aperture) if self.integration is None else self.integration.count
 
     @property

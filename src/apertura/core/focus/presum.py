@@ -1,8 +1,8 @@
 """Fewer pulses for an oversampled aperture: a low-pass sum over neighbours, aligned to the middle of the scene.
 
-Leaving pulses out would fold noise and echoes from elsewhere into the image. Here every pulse is kept: what a
-pixel would read from a pulse is interpolated from what it reads at every k-th, so the sum over k times fewer
-virtual pulses equals the sum over all (docs/theory/planner.md, "Pulses").
+Leaving pulses out would fold noise and echoes from elsewhere into the image. Here every pulse is kept: the
+value of a pulse at a pixel is interpolated from its values at every k-th, so the sum over k times fewer virtual
+pulses equals the sum over all (docs/theory/planner.md, "Pulses").
 """
 
 from dataclasses import dataclass
@@ -28,7 +28,7 @@ _KAISER_BETA = 10.0
 
 @dataclass(frozen=True)
 class Presum:
-    """How pulses become fewer.
+    """A low-pass sum over pulses.
 
     Attributes
     ----------
@@ -45,7 +45,7 @@ class Presum:
     weight: "sparse.csr_array"
 
     def part(self, virtual: slice) -> tuple["Presum", slice]:
-        """Return what makes some of the virtual pulses, and the pulses that it is given."""
+        """Return the low-pass sum for some of the virtual pulses, and the pulses that it takes."""
         weight = self.weight[virtual]
         first, last = int(weight.indices.min(initial=weight.shape[1] - 1)), int(weight.indices.max(initial=0))
         at = self.at[virtual]
@@ -61,18 +61,18 @@ def design(pulses: int, factor: int, *, widest_cycles: float, error_db: float = 
     Parameters
     ----------
     pulses
-        How many there are.
+        Number of pulses.
     factor
         Pulses per virtual pulse.
     widest_cycles
         Largest phase rate of a pixel against the scene's middle, cycles per pulse.
     error_db
-        What the filter may err by.
+        Tolerated error of the filter.
 
     Examples
     --------
-    >>> found = design(1000, 4, widest_cycles=0.02)
-    >>> len(found.at) < 270, bool(np.allclose(found.weight.sum(axis=0), 1, atol=5e-4))
+    >>> presum = design(1000, 4, widest_cycles=0.02)
+    >>> len(presum.at) < 270, bool(np.allclose(presum.weight.sum(axis=0), 1, atol=5e-4))
     (True, True)
     >>> design(1000, 4, widest_cycles=0.2) is None
     True
@@ -90,16 +90,16 @@ def design(pulses: int, factor: int, *, widest_cycles: float, error_db: float = 
     pulse = np.arange(pulses)
     first = np.clip(np.searchsorted(at, pulse - half), 0, len(at))
     rows = first[:, None] + np.arange(2 * half // factor + 2)
-    apart = (at[np.minimum(rows, len(at) - 1)] - pulse[:, None]) / half
-    taps = np.sinc(apart * half / factor) * kaiser_window(apart, beta)
-    held = (np.abs(apart) <= 1) & (rows < len(at))
+    distance = (at[np.minimum(rows, len(at) - 1)] - pulse[:, None]) / half
+    taps = np.sinc(distance * half / factor) * kaiser_window(distance, beta)
+    inside = (np.abs(distance) <= 1) & (rows < len(at))
     columns = np.broadcast_to(pulse[:, None], rows.shape)
-    weight = sparse.csr_array((taps[held], (rows[held], columns[held])), shape=(len(at), pulses))
+    weight = sparse.csr_array((taps[inside], (rows[inside], columns[inside])), shape=(len(at), pulses))
     return Presum(factor, at, weight)
 
 
 def presum_error_db(presum: Presum, aperture: Aperture, place_m: NDArray[np.float64], *, highest_hz: float) -> float:
-    """Return the RMS error of interpolating what pixels read, over all pulses and a grid of points, dB.
+    """Return the RMS error of the interpolated values at pixels, over all pulses and a grid of points, dB.
 
     Parameters
     ----------
@@ -132,9 +132,9 @@ def _positions(position_m: NDArray[np.float64], at: NDArray[np.float64]) -> NDAr
     inside = np.clip(at, 0, last)
     lower = np.minimum(inside.astype(int), max(0, last - 1))
     part = (inside - lower)[:, None]
-    found = position_m[lower] * (1 - part) + position_m[np.minimum(lower + 1, last)] * part
+    between = position_m[lower] * (1 - part) + position_m[np.minimum(lower + 1, last)] * part
     slopes = (position_m[1] - position_m[0], position_m[-1] - position_m[-2]) if last else (np.zeros(3), np.zeros(3))
-    return np.asarray(found + np.minimum(at, 0)[:, None] * slopes[0] + np.maximum(at - last, 0)[:, None] * slopes[1])
+    return np.asarray(between + np.minimum(at, 0)[:, None] * slopes[0] + np.maximum(at - last, 0)[:, None] * slopes[1])
 
 
 def presummed(profiles: Profiles, presum: Presum, middle_m: NDArray[np.float64]) -> Profiles:
@@ -176,11 +176,11 @@ def presummed(profiles: Profiles, presum: Presum, middle_m: NDArray[np.float64])
 def _shifted(samples: NDArray[np.complex64], shift: NDArray[np.float64], count: int) -> NDArray[np.complex64]:
     """Return sample i + shift of each pulse, i = 0…count-1, by a windowed sinc; zero beyond the ends."""
     moved = np.zeros((len(samples), count), np.complex64)
-    whole = np.floor(shift).astype(int)
+    first = np.floor(shift).astype(int)
     taps = np.arange(1 - _HALF_TAPS, _HALF_TAPS + 1)
-    distance = (shift - whole)[:, None] - taps
+    distance = (shift - first)[:, None] - taps
     filters = kaiser_sinc(distance, half=_HALF_TAPS, beta=_KAISER_BETA).astype(np.float32)
-    for pulse, (row, start, weights) in enumerate(zip(samples, whole, filters, strict=True)):
+    for pulse, (row, start, weights) in enumerate(zip(samples, first, filters, strict=True)):
         padded = np.concatenate([np.zeros(_HALF_TAPS - 1, np.complex64), row, np.zeros(_HALF_TAPS, np.complex64)])
         refined = np.convolve(padded, weights[::-1], "valid")  # refined[i] = row at i + fraction
         begin, end = max(0, -start), min(count, len(refined) - start)

@@ -1,4 +1,4 @@
-"""Which pulses may add something to which pieces of a scene: the others are neither read, nor prepared, nor summed."""
+"""Which pulses may contribute to which pieces of a scene: no other is read, prepared or summed."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,26 +8,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.core.antenna.beam import Beams
-from apertura.core.antenna.illumination import reached
+from apertura.core.antenna.illumination import illumination_mask
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.swath import balls
 from apertura.core.scene.terrain import Terrain
 
 PULSES = 64
-"""What is decided about at once; engines sum in blocks of as many, so leaving out what adds nothing changes no bit."""
+"""Pulses of a block; engines sum in blocks of as many, so leaving out blocks that add nothing changes no bit."""
 
 
 @dataclass(frozen=True, eq=False)
 class Reach:
-    """Which blocks of 64 pulses may weigh anything in which pieces of a scene.
+    """Which blocks of 64 pulses may contribute to which pieces of a scene.
 
     Attributes
     ----------
-    lit
+    mask
         (block, piece) bool.
     pulses
-        How many there are.
+        Number of pulses.
 
     Examples
     --------
@@ -36,7 +36,7 @@ class Reach:
     (slice(64, 128, None), slice(0, 86, None), None)
     """
 
-    lit: NDArray[np.bool_]
+    mask: NDArray[np.bool_]
     pulses: int
 
     @classmethod
@@ -48,7 +48,7 @@ class Reach:
         terrain: Terrain,
         windows: Sequence[tuple[slice, slice]],
     ) -> "Reach":
-        """Return that of windows of a scene; without beams or sector every pulse reaches all of them.
+        """Return the reach over windows of a scene; without beams or sector every pulse contributes to all of them.
 
         Parameters
         ----------
@@ -61,42 +61,42 @@ class Reach:
         """
         if beams is None:
             return cls(np.ones((-(-len(aperture) // PULSES), len(windows)), bool), len(aperture))
-        return cls(reached(beams, aperture, *balls(grid, terrain, windows), pulses=PULSES), len(aperture))
+        return cls(illumination_mask(beams, aperture, *balls(grid, terrain, windows), pulses=PULSES), len(aperture))
 
     @property
-    def seen(self) -> NDArray[np.bool_]:
-        """(piece,) bool: whether any pulse may see it."""
-        return np.asarray(self.lit.any(axis=0))
+    def illuminated(self) -> NDArray[np.bool_]:
+        """(piece,) bool: whether any pulse may illuminate it."""
+        return np.asarray(self.mask.any(axis=0))
 
     def within(self, piece: int, block: slice) -> slice | None:
-        """Return the first to the last pulse of a block of pulses that may see a piece, counted from the block's start.
+        """Return the first to the last pulse of a block that may illuminate a piece, counted from the block's start.
 
-        None where none does. `block` begins at a multiple of 64, unless every pulse reaches the piece.
+        None where none does. `block` begins at a multiple of 64, unless every pulse contributes to the piece.
         """
-        if self.lit[:, piece].all():
+        if self.mask[:, piece].all():
             return slice(0, block.stop - block.start)
         first = block.start // PULSES
-        lit = np.flatnonzero(self.lit[first : -(-block.stop // PULSES), piece])
-        if not lit.size:
+        mask = np.flatnonzero(self.mask[first : -(-block.stop // PULSES), piece])
+        if not mask.size:
             return None
-        return slice(int(lit[0]) * PULSES, min(int(lit[-1] + 1) * PULSES, block.stop - block.start))
+        return slice(int(mask[0]) * PULSES, min(int(mask[-1] + 1) * PULSES, block.stop - block.start))
 
 
-def pulse_blocks_of(pulses: int, count: int, *, whole: bool) -> list[slice]:
+def pulse_blocks_of(pulses: int, count: int, *, any_start: bool) -> list[slice]:
     """Return consecutive blocks of pulses of about one length.
 
     Parameters
     ----------
     pulses, count
-        How many there are, and into how many blocks they go at most.
-    whole
-        Whether pieces are all reached by every pulse; else blocks begin at multiples of 64.
+        Number of pulses, and of blocks at most.
+    any_start
+        Blocks may begin at any pulse, since every pulse contributes to every piece; else at multiples of 64.
 
     Examples
     --------
-    >>> pulse_blocks_of(200, 2, whole=False)
+    >>> pulse_blocks_of(200, 2, any_start=False)
     [slice(0, 64, None), slice(64, 200, None)]
     """
-    step = 1 if whole else PULSES
+    step = 1 if any_start else PULSES
     ends = [number * pulses // count // step * step for number in range(count)] + [pulses]
     return [slice(*pair) for pair in pairwise(ends) if pair[0] < pair[1]]

@@ -1,4 +1,4 @@
-"""An image as a dask array of tiles: computed when asked for, each tile on its own, here or by workers of a cluster."""
+"""An image as a dask array of tiles: computed on request, each tile on its own, here or by workers of a cluster."""
 
 import os
 from collections import Counter
@@ -30,23 +30,23 @@ if TYPE_CHECKING:
     from dask.array.core import Array
 
 
-# ---- Tiles formed by the workers of a `distributed` scheduler, over TCP; they come back to whoever asked -----------
+# ---- Tiles formed by workers of a `distributed` scheduler
 
 KEY = "processing.scheduler"
 NAMED_BY = "DASK_SCHEDULER_ADDRESS"
-"""Environment variable, dask's own: who connects to a scheduler runs what that sends, and a config is a stranger's."""
+"""Environment variable, dask's own: who connects to a scheduler runs what that sends, and a config is untrusted."""
 
-_CONNECT_S = 5.0
-_WORKERS_S = 10.0
+_CONNECT_S = 5.0  # to wait for a scheduler
+_WORKERS_S = 10.0  # to wait for its first worker
 
 
-def formed_elsewhere(
+def cluster_tiles(
     graph: Any, keys: Sequence[tuple[Any, ...]], scheduler: str
 ) -> Iterator[tuple[int, NDArray[np.complex64]]]:
     """Yield each tile with its number as soon as a worker has formed it.
 
     Workers need this package and no file of the campaign: what they read is sent to them, and what they formed comes
-    back. A worker that dies is made up for by the others.
+    back. Tiles of a lost worker are formed again by the others.
 
     Parameters
     ----------
@@ -113,7 +113,7 @@ def _unusable(scheduler: str, found: str, remedy: str) -> CampaignError:
     return CampaignError(f"{scheduler}: {found}", KEY, "a dask scheduler with workers that have this apertura", remedy)
 
 
-# ---- Tiles in dask: a graph that is built again for the tiles that are asked for -----------------------------------
+# ---- Graph of the requested tiles
 
 Place = tuple[int, int]
 
@@ -122,7 +122,7 @@ class TilesLayer(MaterializedLayer):
     """The tasks of some tiles of an image.
 
     Blocks of pulses follow one another: the next one's tables are prepared when every tile has its part of the last.
-    dask would therefore compute all tiles for the sake of one; here whoever asks for some gets the graph of those.
+    dask would therefore compute all tiles for the sake of one; here the graph has the requested tiles only.
 
     Parameters
     ----------
@@ -141,11 +141,11 @@ class TilesLayer(MaterializedLayer):
     def cull(self, keys: set[Any], all_hlg_keys: Collection[Any]) -> tuple[MaterializedLayer, dict[Any, set[Any]]]:
         """Return the layer of the tiles among the keys, and the dependencies of its tasks."""
         places = [place for place in self.places if (self.name, *place) in keys]
-        asked = TilesLayer(self.name, self.graph, places)
-        return asked, {key: asked.get_dependencies(key, all_hlg_keys) for key in asked}
+        requested = TilesLayer(self.name, self.graph, places)
+        return requested, {key: requested.get_dependencies(key, all_hlg_keys) for key in requested}
 
 
-# ---- An image as a dask array whose chunks are the tiles of its grid: computed when asked for, each tile on its own
+# ---- An image as a dask array of tiles
 
 _NOTHING = np.complex64(complex(np.nan, np.nan))
 
@@ -162,8 +162,8 @@ def image_array(
     """Return an image, the mean over the pulses, as a dask array whose chunks are square tiles.
 
     Tables are prepared once per block of pulses and shared by all tiles; with several blocks each one's tables are
-    prepared when the tiles of the block before are done, so that one block's inputs and tables are held at a time. A
-    tile takes of a block the pulses that may add something to it, and of a block without any nothing. It is the
+    prepared when the tiles of the block before are done, so that one block's inputs and tables are in memory at a time.
+    A tile takes of a block the pulses that may add something to it, and of a block without any nothing. It is the
     same to the bit whichever others are computed, in whatever order, by threads, processes or a cluster.
 
     Parameters
@@ -182,7 +182,8 @@ def image_array(
     Returns
     -------
     dask.array.Array
-        (row, column) complex64; 1 is the amplitude of an echo that every pulse counted sees, 0 what none sees.
+        (row, column) complex64; 1 is the amplitude of an echo in every pulse counted; 0 where no pulse illuminates the
+        pixel.
     """
     from dask.array.core import Array
     from dask.highlevelgraph import HighLevelGraph
@@ -198,7 +199,7 @@ def image_array(
 
 @dataclass(frozen=True, eq=False)
 class Weighing:
-    """How pulses count.
+    """How pulses are weighted and summed.
 
     Attributes
     ----------
@@ -208,14 +209,14 @@ class Weighing:
         Low-pass sum over pulses and the point (3,) they are aligned to, metres; none by default.
     count
         Pulses that the sum is divided by; all of them by default.
-    ways
-        Way of the engine → pixels × pulses that went so in this process.
+    variant_counts
+        Variant of the engine's sum → pixels × pulses that took it in this process.
     """
 
     beams: Beams | None = None
     presum: tuple[Presum, NDArray[np.float64]] | None = None
     count: int | None = None
-    ways: Counter[str] = field(default_factory=Counter)
+    variant_counts: Counter[str] = field(default_factory=Counter)
 
 
 @dataclass(frozen=True, eq=False)
@@ -246,25 +247,27 @@ def _graph(forming: _Forming, inputs: PhaseHistory | Profiles, places: Collectio
     graph: dict[Any, Any] = {f"{name}-inputs": inputs, f"{name}-beams": beams}
     sums: dict[tuple[int, int], Any] = {}  # place → key of what the blocks so far add up to
     before: list[Any] = []  # what must be done before the next block's tables are prepared
-    for number, some in enumerate(pulse_blocks_of(pulses, forming.setting.pulse_blocks, whole=beams is None)):
+    for number, some in enumerate(pulse_blocks_of(pulses, forming.setting.pulse_blocks, any_start=beams is None)):
         parts = {place: forming.reach.within(forming.index(place), some) for place in places}
-        lit = {place: part for place, part in parts.items() if part is not None}
-        if not lit:
+        covering = {place: part for place, part in parts.items() if part is not None}
+        if not covering:
             continue
-        first, last = min(part.start for part in lit.values()), max(part.stop for part in lit.values())
+        first, last = min(part.start for part in covering.values()), max(part.stop for part in covering.values())
         block = slice(some.start + first, some.start + last)  # what no tile takes is not even read
         tables = f"{name}-tables-{number}"
         graph[tables] = (partial(_prepare, forming.setting, presum, block), f"{name}-inputs", before)
         before = []
-        for place, reached in lit.items():
-            part = slice(reached.start - first, reached.stop - first)
+        for place, covered in covering.items():
+            part = slice(covered.start - first, covered.stop - first)
             form, key = partial(_form, forming, place, block, part, count), (f"{name}-{number}", *place)
             graph[key] = (form, tables, f"{name}-beams", sums.get(place))
             graph[f"{name}-done-{number}", *place] = (_nothing, key)
             before.append((f"{name}-done-{number}", *place))
             sums[place] = key
     for place in places:
-        graph[name, *place] = sums[place] if place in sums else (partial(_unseen, forming.grid[forming.window(place)]),)
+        graph[name, *place] = (
+            sums[place] if place in sums else (partial(_empty_tile, forming.grid[forming.window(place)]),)
+        )
     return graph
 
 
@@ -292,22 +295,22 @@ def _form(  # noqa: PLR0917
     beams: Beams | None,
     sum_before: NDArray[np.complex64] | None,
 ) -> NDArray[np.complex64]:
-    """Return one tile of the image of a block of pulses, added to that of the blocks before."""
+    """Return one tile of the image of a block of pulses, added to the sum of the blocks before."""
     setting, grid = forming.setting, forming.grid[forming.window(place)]
     if part != slice(0, block.stop - block.start):
         tables = tables[part]
     some = beams and beams[block.start + part.start : block.start + part.stop]
     engine, pixels = load_engine(setting.engine), forming.terrain.positions(grid)
-    ways: tuple[str, ...] = getattr(engine, "WAYS", ())
-    counted = {"counts": np.zeros(len(ways), np.int64)} if ways else {}
+    variants: tuple[str, ...] = getattr(engine, "VARIANTS", ())
+    counted = {"counts": np.zeros(len(variants), np.int64)} if variants else {}
     image = engine.form(tables, pixels, beams=some, **setting.form_options, **counted)
-    forming.weighing.ways.update({way: int(counted["counts"][n]) for n, way in enumerate(ways)})
+    forming.weighing.variant_counts.update({name: int(counted["counts"][n]) for n, name in enumerate(variants)})
     tile = np.asarray(image / count, np.complex64)
     return tile if sum_before is None else sum_before + tile
 
 
-def _unseen(grid: SceneGrid) -> NDArray[np.complex64]:
-    """Return a tile that no pulse sees."""
+def _empty_tile(grid: SceneGrid) -> NDArray[np.complex64]:
+    """Return a tile that no pulse illuminates."""
     return np.zeros(grid.shape, np.complex64)
 
 
@@ -361,7 +364,7 @@ def compute_tiles(
     graph = image.dask.cull(set(keys))
     if scheduler != "threads":
         with progress("tiles", len(keys)) as done:
-            for number, tile in formed_elsewhere(graph, keys, scheduler):
+            for number, tile in cluster_tiles(graph, keys, scheduler):
                 _write(target, windows[number], tile)
                 done(1)
         return

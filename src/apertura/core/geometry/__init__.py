@@ -1,1 +1,1 @@
-"""Where things are on Earth, and what a pair of antennas sees from there."""
+"""Coordinates, tracks, phase centres and the synthetic aperture of a pair."""

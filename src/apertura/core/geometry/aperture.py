@@ -1,4 +1,4 @@
-"""The synthetic aperture of a pair: where both phase centres were at each pulse, and what follows from it."""
+"""The synthetic aperture of a pair: phase centres at each pulse, total paths, phase rates and resolution."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ Weigh = Callable[[slice, NDArray[np.float64]], NDArray[np.float64]]
 """Pulses and points (point, 3) → (pulse, point) float64."""
 
 _PULSES_AT_ONCE = 256
-_STEPS_IN_A_ROW = 63
+_STEPS_IN_A_ROW = 63  # of which the median is taken, so that missed pulses do not count
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,8 +114,8 @@ class Aperture:
         """
         gradient = np.zeros((len(self), *points_m.shape))
         for leg in self.legs:
-            apart = points_m - self._against(leg, points_m)
-            gradient += apart / np.linalg.norm(apart, axis=-1, keepdims=True)
+            offset_m = points_m - self._against(leg, points_m)
+            gradient += offset_m / np.linalg.norm(offset_m, axis=-1, keepdims=True)
         return gradient
 
     def phase_rates(self, points_m: NDArray[np.float64], *, wavelength_m: float) -> tuple[float, float]:
@@ -163,7 +163,8 @@ class Aperture:
         band_hz
             Lowest and highest frequency.
         weigh
-            Pulses and points → weights; points of which less than a half is left do not count. By default all count.
+            Pulses and points → weights; points whose summed weight is below one half do not count. By default all
+            count.
 
         Notes
         -----
@@ -173,8 +174,8 @@ class Aperture:
         gradient = self[some].path_gradient(points)
         if weigh is not None:
             gradient[weigh(some, points) < 0.5] = np.nan
-        seen = np.isfinite(gradient).all(axis=-1).any(axis=0)
-        gradient, widest = gradient[:, seen], 1e-9
+        finite = np.isfinite(gradient).all(axis=-1).any(axis=0)
+        gradient, widest = gradient[:, finite], 1e-9
         for side in (ground_m[0, -1] - ground_m[0, 0], ground_m[-1, 0] - ground_m[0, 0]):
             slope = gradient @ side / max(float(np.linalg.norm(side)), 1e-9)
             cycles = np.concatenate([slope * frequency / SPEED_OF_LIGHT_M_S for frequency in band_hz])
@@ -199,7 +200,7 @@ class Aperture:
         axes
             (axis, 3) float64, unit vectors.
         frequency_hz
-            (frequency,) float64, samples of the band, each counting alike.
+            (frequency,) float64, samples of the band, of equal weight.
         weigh
             As of `resolution_cell_m`.
 
@@ -227,9 +228,9 @@ class Aperture:
         >>> round(Aperture(track, track).wobble_m, 3)  # 0.1/√2
         0.071
         """
-        apart = self.middle_m - self.middle_m.mean(axis=0)
-        singular = np.linalg.svd(apart, compute_uv=False)
-        return float(np.sqrt((singular[1:] ** 2).sum() / len(apart)))
+        offset_m = self.middle_m - self.middle_m.mean(axis=0)
+        singular = np.linalg.svd(offset_m, compute_uv=False)
+        return float(np.sqrt((singular[1:] ** 2).sum() / len(offset_m)))
 
     @staticmethod
     def _against(leg_m: NDArray[np.float64], points_m: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,4 +1,4 @@
-"""Where things are on Earth: geodetic, projected and Earth-centred coordinates, and turning body axes.
+"""Geodetic, projected and Earth-centred coordinates, and rotations of body axes.
 
 Positions are computed in ECEF (EPSG:4978) float64: no zone, no scale factor, no curvature to model.
 """
@@ -74,7 +74,7 @@ def ecef_from_projected(crs: str, x: Positions, y: Positions, height_m: Position
     Raises
     ------
     CampaignError
-        If PROJ has no exact way from `crs` to ECEF or a position comes out infinite.
+        If PROJ has no exact transformation from `crs` to ECEF or a position becomes infinite.
 
     Examples
     --------
@@ -140,7 +140,7 @@ def map_from_frame(crs: str, position: Positions) -> Positions:
 
 @lru_cache(maxsize=64)
 def _transformer(source: str, target: str) -> Transformer:
-    """Return PROJ's way between two systems, kept: it takes milliseconds to find."""
+    """Return PROJ's transformer between two systems, cached: it takes milliseconds to create."""
     if GEODETIC in (source, target):
         return Transformer.from_crs(source, target)
     here, there = (system if system == ECEF else CRS(system).to_3d() for system in (source, target))
@@ -191,7 +191,7 @@ def body_axes(attitude_rad: Positions) -> NDArray[np.float64]:
     >>> (body_axes(np.radians([0.0, 0.0, 90.0])) @ [1.0, 0.0, 0.0]).round(12) + 0.0  # nose east
     array([0., 1., 0.])
     """
-    from scipy.spatial.transform import Rotation  # slow to import, and most steps turn no body
+    from scipy.spatial.transform import Rotation  # slow to import, and most steps rotate no body
 
     flat = np.reshape(attitude_rad, (-1, 3))
     matrices = Rotation.from_euler("ZYX", flat[:, ::-1]).as_matrix()

@@ -1,4 +1,4 @@
-"""Where each antenna was at each pulse: logged track, attitude, lever arms, and what refinement added."""
+"""Phase centres of antennas at each pulse: logged track, attitude, lever arms, and corrections by autofocus."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -15,12 +15,12 @@ if TYPE_CHECKING:
     from scipy.interpolate import BSpline
 
 
-# ---- What is added to the logged positions of a flight's nodes, and what paths of its pairs are longer by ----------
+# ---- Corrections of tracks and paths
 
 
 @dataclass(frozen=True, eq=False)
 class TrackCorrection:
-    """Corrections of the tracks of a flight's nodes; a node that is not named stays where its log has it.
+    """Corrections of the tracks of a flight's nodes; a node that is not named keeps its logged positions.
 
     Attributes
     ----------
@@ -30,8 +30,8 @@ class TrackCorrection:
     moved_m
         Node → (knot, 3) float64, metres to be added to each of its points, in the frame of the phase centres.
     further_m
-        Pair → (knot,) float64, metres of total path by which all its echoes lie further, wherever its nodes are; a pair
-        that is not named has none.
+        Pair → (knot,) float64, metres of total path added to all its echoes, whatever its nodes' positions; none for
+        a pair that is not named.
 
     Examples
     --------
@@ -45,7 +45,7 @@ class TrackCorrection:
     further_m: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
 
     def at(self, node: str, time_s: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return how far a node is moved at some times, (pulse, 3) float64, metres."""
+        """Return the correction of a node's positions at some times, (pulse, 3) float64, metres."""
         moved = self.moved_m.get(node)
         if moved is None:
             return np.zeros((len(time_s), 3))
@@ -59,7 +59,7 @@ class TrackCorrection:
     def longer_m(
         self, pair: str, time_s: NDArray[np.float64], between_m: NDArray[np.float64] | None
     ) -> NDArray[np.float64]:
-        """Return by how much all echoes of a pair lie further than from the logs: ∆ and what is its own.
+        """Return the path added to all echoes of a pair: ∆ of the sidelink, and the pair's own correction.
 
         Parameters
         ----------
@@ -69,7 +69,7 @@ class TrackCorrection:
             (pulse,) float64.
         between_m
             (pulse, 3) float64, metres: from the receiver's sidelink point to the transmitter's, as the logs have it;
-            None where echoes were not given back a sidelink's length.
+            None where no sidelink's length was added to the echoes.
 
         Returns
         -------
@@ -96,7 +96,7 @@ class TrackCorrection:
         return np.asarray(further_m + np.linalg.norm(corrected, axis=1) - np.linalg.norm(between_m, axis=1))
 
 
-# ---- Where each antenna was at each pulse and how the body was turned, from a logged track, attitude and lever arms
+# ---- Positions and attitude from a logged track
 
 _CUBIC = 3
 
@@ -134,7 +134,7 @@ def phase_centres(
     frame
         'ecef', or 'local': axes to east, north and up.
     smoothing_m
-        Noise of the logged positions that a smoothing spline takes off; None: the spline goes through all epochs.
+        Noise of the logged positions that a smoothing spline removes; None: the spline goes through all epochs.
 
     Returns
     -------
@@ -144,7 +144,7 @@ def phase_centres(
     Raises
     ------
     CampaignError
-        If the track does not cover `at`, or the lever arm needs an attitude that the log does not hold.
+        If the track does not cover `at`, or the lever arm needs an attitude that is not in the log.
 
     Notes
     -----
@@ -172,7 +172,7 @@ def attitude_axes(
     frame: str = "ecef",
     smoothing_m: float | None = None,
 ) -> NDArray[np.float64]:
-    """Return how the body is turned at given times; parameters as `phase_centres`.
+    """Return the attitude of the body at given times; parameters as `phase_centres`.
 
     Returns
     -------
@@ -182,7 +182,7 @@ def attitude_axes(
     Raises
     ------
     CampaignError
-        If the track does not cover `at`, or the log does not hold an attitude.
+        If the track does not cover `at`, or there is no attitude in the log.
     """
     _check_covered(track_time, at, where)
     spline = position_spline(_seconds(track_time - track_time[0]), position, smoothing_m=smoothing_m)
@@ -196,7 +196,7 @@ def attitude_axes(
 def position_spline(
     time_s: NDArray[np.float64], position: NDArray[np.float64], *, smoothing_m: float | None = None
 ) -> "BSpline":
-    """Return the cubic spline through the epochs of a log, or near them: what is said of positions between them.
+    """Return the cubic spline through the epochs of a log, or near them: the positions between epochs.
 
     Parameters
     ----------
@@ -210,8 +210,8 @@ def position_spline(
 
     Notes
     -----
-    Source: P. Dierckx, "Curve and Surface Fitting with Splines", Oxford 1993: the sum of squares of what the spline
-    leaves is 3·n·smoothing_m².
+    Source: P. Dierckx, "Curve and Surface Fitting with Splines", Oxford 1993: the sum of squares of the residuals is
+    3·n·smoothing_m².
 
     Examples
     --------
@@ -221,7 +221,7 @@ def position_spline(
     from scipy.interpolate import BSpline, make_interp_spline, splprep  # slow to import, and few steps need them
 
     if smoothing_m is not None and len(time_s) > _CUBIC:
-        middle = position.mean(axis=0)  # of ECEF: the fit works with what is left
+        middle = position.mean(axis=0)  # of ECEF: the fit is of the differences
         knots, coefficients, degree = splprep((position - middle).T, u=time_s, s=position.size * smoothing_m**2)[0]
         return BSpline(knots, np.stack(coefficients, axis=-1) + middle, degree)
     return make_interp_spline(time_s, position, k=min(_CUBIC, len(time_s) - 1))

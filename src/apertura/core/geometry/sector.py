@@ -1,4 +1,4 @@
-"""The sector a pixel is integrated over: which pulses of a long flight count for it, and how much."""
+"""The sector that a pixel is integrated over: weights of the pulses of a long flight at each pixel."""
 
 from dataclasses import dataclass, replace
 
@@ -8,24 +8,24 @@ from numpy.typing import NDArray
 from apertura.core.geometry.aperture import Aperture, Weigh
 
 TAPER = 0.1
-"""The weight falls from 1 to 0 between 1 - TAPER and 1 + TAPER times the half width."""
+"""Of the half width: the weight falls from 1 to 0 between 1 - TAPER and 1 + TAPER (docs/theory/integration.md)."""
 
 _SAMPLES = 4096  # of the window, and 64 times as many of its response
 
 
 @dataclass(frozen=True, eq=False)
 class Sector:
-    """How far from the direction of flight's normal a pulse still counts for a pixel.
+    """Interval of the direction cosine to the flight within which a pulse counts for a pixel.
 
-    With u_t, u_r the unit vectors from the antennas to the pixel, s = a_t·u_t + a_r·u_r is how much shorter the total
-    path becomes per metre that both antennas fly together: 0 at the closest approach, 1 straight ahead. A pulse counts
+    With u_t, u_r the unit vectors from the antennas to the pixel, s = a_t·u_t + a_r·u_r is the decrease of the total
+    path per metre that both antennas fly together: 0 at the closest approach, 1 straight ahead. A pulse counts
     for a pixel where s is within `half` of `centre`, with a smooth edge.
 
     Attributes
     ----------
     tx_axis, rx_axis
-        (pulse, 3) float64: what each antenna flies, of the way that both fly together; their lengths sum to 1, or are 0
-        where nothing flies and every pixel is at its closest approach.
+        (pulse, 3) float64: displacement of each antenna over that of both together; their lengths sum to 1, or are 0
+        where no antenna moves and every pixel is at its closest approach.
     centre, half
         Of s; at `centre` ± `half` the weight is one half.
 
@@ -67,7 +67,7 @@ class Sector:
         aperture
             In the frame of the pixels.
         chord_m
-            Way over which a direction is taken: longer than positions err, shorter than the flight turns.
+            Distance over which a direction is taken: longer than positions err, shorter than the flight turns.
         centre, half
             As of a `Sector`.
         """
@@ -77,8 +77,8 @@ class Sector:
         """Return the sector of some pulses."""
         return replace(self, tx_axis=self.tx_axis[pulses], rx_axis=self.rx_axis[pulses])
 
-    def turned(self, other: "Sector") -> NDArray[np.float64]:
-        """Return how far s may lie from that of a sector of as many other pulses for their axes alone, (pulse,)."""
+    def axis_change(self, other: "Sector") -> NDArray[np.float64]:
+        """Return the largest change of s by other axes, of a sector of as many pulses, (pulse,)."""
         axes = ((self.tx_axis, other.tx_axis), (self.rx_axis, other.rx_axis))
         return np.asarray(sum(np.linalg.norm(mine - theirs, axis=1) for mine, theirs in axes))
 
@@ -102,16 +102,16 @@ class Sector:
         """
         if len(self.tx_axis) != len(aperture):
             raise ValueError(f"{len(self.tx_axis)=}: must be one for each of {len(aperture)} pulses")
-        # Products of matrices, about a place so near that squares of distances lose nothing.
+        # Matrix products about a nearby origin, where squares of distances keep their precision.
         flat, middle = points_m.reshape(-1, 3), aperture.legs[0][:1].sum(axis=0)
-        seen = flat - middle
+        offset_m = flat - middle
         place = np.full((len(aperture), len(flat)), -self.centre)
         for axis, leg in zip((self.tx_axis, self.rx_axis), aperture.legs, strict=True):
             antenna = leg - middle
-            square = antenna @ (-2 * seen.T)
+            square = antenna @ (-2 * offset_m.T)
             square += (antenna**2).sum(axis=1)[:, None]
-            square += (seen**2).sum(axis=1)
-            along = axis @ seen.T
+            square += (offset_m**2).sum(axis=1)
+            along = axis @ offset_m.T
             along -= (antenna * axis).sum(axis=1)[:, None]
             along /= np.sqrt(square, out=square)
             place += along
@@ -122,13 +122,13 @@ class Sector:
         return edge((self.outer - np.abs(self.place(aperture, points_m))) / (self.outer - self.inner))
 
     def over(self, aperture: Aperture) -> Weigh:
-        """Return what weighs some pulses of an aperture at points."""
+        """Return the function that weights some pulses of an aperture at points."""
         return lambda pulses, points_m: self[pulses].weight(aperture[pulses], points_m)
 
     def slack(
         self, aperture: Aperture, points_m: NDArray[np.float64], radius_m: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return how far s may lie from its value at a point within some radius of it: as `place`.
+        """Return the largest change of s within some radius of a point: as `place`.
 
         Parameters
         ----------
@@ -139,10 +139,10 @@ class Sector:
         """
         slack = np.zeros((len(aperture), *points_m.shape[:-1]))
         for axis, leg in zip((self.tx_axis, self.rx_axis), aperture.legs, strict=True):
-            apart = points_m - leg.reshape(-1, *(1,) * (points_m.ndim - 1), 3)
+            leg_m = points_m - leg.reshape(-1, *(1,) * (points_m.ndim - 1), 3)
             length = np.linalg.norm(axis, axis=1).reshape(-1, *(1,) * (points_m.ndim - 1))
-            # a direction turns by asin(radius/range) at most; of two unit vectors so far apart the difference is less
-            turn = np.minimum(1.0, radius_m / np.linalg.norm(apart, axis=-1))
+            # a direction rotates by asin(radius/range) at most; the difference of the unit vectors is less
+            turn = np.minimum(1.0, radius_m / np.linalg.norm(leg_m, axis=-1))
             slack += length * np.where(turn < 1, np.pi / 2 * turn, 2.0)
         return slack
 
@@ -160,7 +160,7 @@ def edge(depth: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def flight_axes(aperture: Aperture, *, chord_m: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the axes of a `Sector`: of each pulse, over the way `chord_m` about it, clipped at the ends.
+    """Return the axes of a `Sector`: of each pulse, over the distance `chord_m` about it, clipped at the ends.
 
     Examples
     --------
@@ -180,7 +180,7 @@ def flight_axes(aperture: Aperture, *, chord_m: float) -> tuple[NDArray[np.float
 
 
 def response() -> tuple[float, float]:
-    """Return what the smooth edges make of a point across the flight: width and highest sidelobe.
+    """Return width and highest sidelobe of a point's response along the flight, by the smooth edges.
 
     Returns
     -------

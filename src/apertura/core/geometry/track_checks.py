@@ -1,4 +1,4 @@
-"""Which epochs of a flight log positions may rest on: no spikes, steps, frozen positions or rounded times."""
+"""Checks of a flight log's epochs: spikes, steps, frozen positions, rounded times and gaps."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -10,22 +10,22 @@ from numpy.typing import NDArray
 from apertura.common.arrays import Floats
 from apertura.core.geometry.phase_centres import position_spline
 
-# ---- What is wrong with single epochs of a flight log: spikes and steps --------------------------------------------
+# ---- Spikes and steps
 #
-# Each test asks the log itself. An epoch is compared with the cubic through two epochs on either side; a fault is
-# what, once it is taken out, leaves its neighbours smooth. Movement that the log samples badly does not become smooth
-# that way, and is left alone.
+# Thresholds follow from the log itself. An epoch is compared with the cubic through two epochs on either side; a fault
+# is what, once it is taken out, leaves its neighbours smooth. Movement that the log samples badly does not become
+# smooth that way, and is left alone.
 
 
-MATTERS_M = 5e-3
-"""Errors of single epochs below this are the log's noise, whatever it is."""
+LEAST_FAULT_M = 5e-3
+"""Metres: smaller errors of single epochs are taken as the log's noise; 5 mm is λ/48 at L-band."""
 
-GRAIN_M = 0.01
-"""Of the coarsest log that resolves centimetres."""
+FINEST_GRAIN_M = 0.01
+"""Metres, grain of the coarsest log that resolves centimetres: still epochs count as scattering by no more."""
 
-_SIGMA = 10.0  # a fault is as many times the log's own scatter
+_SIGMA = 10.0  # a fault is so many times the log's own scatter
 _SMOOTHER = {1: 7.0, 2: 12.0, 3: 20.0}  # epochs taken out → how many times smoother their neighbours must become
-_STEP_SMOOTHER = 10.0
+_STEP_SMOOTHER = 10.0  # times smoother the neighbours of a step must become without it
 _AGILE_M_S2 = 10.0  # a node may have flown a step that takes no more than this, forth and back within an interval
 _CHI3_MEDIAN = 1.538  # median length of a vector of three standard normal components
 _MOST_ROUNDS = 20
@@ -73,9 +73,9 @@ def misfits(time_s: Floats, position_m: Floats) -> Floats:
 
 
 def scatter_m(misfit_m: Floats) -> float:
-    """Return the robust scatter of an axis of `misfits`, metres; a log that mostly stands still does not hide it.
+    """Return the robust scatter of an axis of `misfits`, metres; also of a log that mostly repeats one position.
 
-    Where most epochs repeat a coarse position exactly, the few that move tell its grain.
+    Where most epochs repeat a coarse position exactly, its grain follows from the few that move.
 
     Examples
     --------
@@ -87,11 +87,11 @@ def scatter_m(misfit_m: Floats) -> float:
     moved = size[size > 1e-7]
     if not moved.size:
         return 0.0
-    return max(float(np.median(size)), min(float(np.median(moved)), GRAIN_M)) / _CHI3_MEDIAN
+    return max(float(np.median(size)), min(float(np.median(moved)), FINEST_GRAIN_M)) / _CHI3_MEDIAN
 
 
 def find_spikes(time_s: Floats, position_m: Floats) -> list[Fault]:
-    """Return one to three epochs in a row that stand out of their neighbours.
+    """Return spikes: one to three epochs in a row that deviate from their neighbours.
 
     Notes
     -----
@@ -105,22 +105,22 @@ def find_spikes(time_s: Floats, position_m: Floats) -> list[Fault]:
     >>> [(spike.first, spike.last, round(spike.size_m, 2)) for spike in find_spikes(time_s, flown)]
     [(30, 30, 0.2)]
     """
-    index, found = np.arange(len(time_s)), []
+    index, faults = np.arange(len(time_s)), []
     for _ in range(_MOST_ROUNDS):
         time, place = time_s[index], position_m[index]
         misfit = misfits(time, place)
         scatter = scatter_m(misfit)
-        here = [_spike(time, place, suspect, scatter) for suspect in _suspects(misfit, scatter)]
+        here = [_spike(time, place, epoch, scatter) for epoch in _outlying(misfit, scatter)]
         spikes = [spike for spike in here if spike is not None]
         if not spikes:
             break
-        found += [Fault(int(index[first]), int(index[last]), size) for first, last, size in spikes]
+        faults += [Fault(int(index[first]), int(index[last]), size) for first, last, size in spikes]
         index = np.delete(index, np.concatenate([np.arange(first, last + 1) for first, last, _ in spikes]))
-    return sorted(found)
+    return sorted(faults)
 
 
 def find_steps(time_s: Floats, position_m: Floats) -> list[Fault]:
-    """Return pairs of epochs between which all positions are shifted at once, as when a receiver fixes anew.
+    """Return pairs of epochs between which all positions are shifted at once, as when a receiver gets a new fix.
 
     Examples
     --------
@@ -130,13 +130,13 @@ def find_steps(time_s: Floats, position_m: Floats) -> list[Fault]:
     [(29, 30, 0.2)]
     """
     misfit = misfits(time_s, position_m)
-    scatter, found = scatter_m(misfit), []
-    for suspect in _suspects(misfit, scatter):
-        tried = [_step(time_s, misfit, before, scatter) for before in (suspect - 1, suspect)]
+    scatter, faults = scatter_m(misfit), []
+    for epoch in _outlying(misfit, scatter):
+        tried = [_step(time_s, misfit, before, scatter) for before in (epoch - 1, epoch)]
         steps = [step for step in tried if step is not None]
         if steps:
-            found.append(max(steps, key=lambda step: step.size_m))
-    return sorted(found)
+            faults.append(max(steps, key=lambda step: step.size_m))
+    return sorted(faults)
 
 
 def _lagrange(nodes: Floats, at: Floats) -> Floats:
@@ -149,30 +149,30 @@ def _lagrange(nodes: Floats, at: Floats) -> Floats:
     return weights
 
 
-def _suspects(misfit_m: Floats, scatter: float) -> list[int]:
+def _outlying(misfit_m: Floats, scatter: float) -> list[int]:
     """Return epochs whose misfit is large, and larger than within six epochs either way."""
     size = np.linalg.norm(misfit_m, axis=1)
     around = np.lib.stride_tricks.sliding_window_view(np.pad(size, 6), 13).max(axis=1)
-    return np.flatnonzero((size > max(0.6 * _SIGMA * scatter, 0.6 * MATTERS_M)) & (size >= around)).tolist()
+    return np.flatnonzero((size > max(0.6 * _SIGMA * scatter, 0.6 * LEAST_FAULT_M)) & (size >= around)).tolist()
 
 
-def _spike(time_s: Floats, position_m: Floats, suspect: int, scatter: float) -> Fault | None:
-    """Return the fewest epochs about a suspect without which its neighbours are smooth."""
+def _spike(time_s: Floats, position_m: Floats, epoch: int, scatter: float) -> Fault | None:
+    """Return the fewest epochs about an outlying one without which its neighbours are smooth."""
     for count, smoother in _SMOOTHER.items():
-        for first in range(suspect - count, suspect + 2):
+        for first in range(epoch - count, epoch + 2):
             last = first + count - 1
             if first < 6 or last > len(time_s) - 7:
                 continue
             near = np.r_[first - 6 : first, last + 1 : last + 7]
             group = np.arange(first, last + 1)
             nodes = np.tile([first - 2, first - 1, last + 1, last + 2], (count, 1))
-            apart = position_m[group] - np.einsum(
+            error_m = position_m[group] - np.einsum(
                 "ek,eka->ea", _lagrange(time_s[nodes], time_s[group]), position_m[nodes]
             )
-            worst = apart[np.argmax(np.linalg.norm(apart, axis=1))]
+            worst = error_m[np.argmax(np.linalg.norm(error_m, axis=1))]
             size = float(np.linalg.norm(worst))
             left = misfits(time_s[near], position_m[near])[4:8] @ (worst / max(size, 1e-12))
-            if size > max(_SIGMA * scatter, MATTERS_M, smoother * float(np.sqrt(np.mean(left**2)))):
+            if size > max(_SIGMA * scatter, LEAST_FAULT_M, smoother * float(np.sqrt(np.mean(left**2)))):
                 return Fault(first, last, size)
     return None
 
@@ -188,18 +188,18 @@ def _step(time_s: Floats, misfit_m: Floats, before: int, scatter: float) -> Faul
     left = misfit_m[near][2:-2] @ (step / max(size, 1e-12)) - size * pattern
     rough = _STEP_SMOOTHER * float(np.sqrt(np.mean(left**2) / power))
     flown = _AGILE_M_S2 * float(time_s[before + 1] - time_s[before]) ** 2 / 4
-    return Fault(before, before + 1, size) if size > max(_SIGMA * scatter, 3 * GRAIN_M, rough, flown) else None
+    return Fault(before, before + 1, size) if size > max(_SIGMA * scatter, 3 * FINEST_GRAIN_M, rough, flown) else None
 
 
-# ---- What is wrong with how a flight log was written: positions that stood still, times that were rounded ----------
+# ---- Frozen positions and rounded times
 
 
 def find_frozen(time_s: Floats, position_m: Floats) -> NDArray[np.bool_]:
     """Return (epoch,) bool: epochs that only repeat the position before them although the node flew on.
 
-    A node that stops comes to rest and starts from rest. One that was flying just before and just after, and is found
-    as far away as that takes it, did not stand where a log repeats to the last digit: if three repeats or more follow
-    each other, or every tenth epoch is one, since noise may repeat a coarse position by chance.
+    A node that stops decelerates to rest and starts from rest. One that flew just before and just after, and then is as
+    far away as that speed takes it, did not stand while its log repeated a position to the last digit: if three repeats
+    or more follow each other, or every tenth epoch is one, since noise may repeat a coarse position by chance.
 
     Examples
     --------
@@ -215,7 +215,7 @@ def find_frozen(time_s: Floats, position_m: Floats) -> NDArray[np.bool_]:
     jump = np.linalg.norm(np.diff(position_m[first], axis=0), axis=1)
     speed = np.concatenate([[np.inf], jump / np.diff(time_s[first]), [np.inf]])  # before, between and after the runs
     travel = np.minimum(speed[:-2], speed[2:]) * (time_s[last] - time_s[first])[:-1]
-    still = np.append((np.minimum(travel, jump) > 3 * GRAIN_M) & (jump > travel / 2), False)
+    still = np.append((np.minimum(travel, jump) > 3 * FINEST_GRAIN_M) & (jump > travel / 2), False)
     length = last - first
     still[-1] = length[-1] <= length[still].max(initial=-1)  # a landing is longer
     frozen = repeats & still[run]
@@ -223,17 +223,17 @@ def find_frozen(time_s: Floats, position_m: Floats) -> NDArray[np.bool_]:
 
 
 def rounded_time_m(time_s: Floats, position_m: Floats) -> float:
-    """Return how far times written too coarsely move positions along the flight, RMS metres; 0 where they do not.
+    """Return the RMS error of positions along the flight by coarsely written times, metres; 0 without.
 
     Parameters
     ----------
     time_s
-        (epoch,) float64, seconds, whole multiples of how finely they were written.
+        (epoch,) float64, seconds, integer multiples of the grain they were written with.
 
     Notes
     -----
     Times rounded to a grain g err by g/√12, positions by that times the speed, along the flight alone: this is
-    believed where intervals are unequal and positions scatter along the flight as much as that and three times as
+    accepted where intervals are unequal and positions scatter along the flight as much as that and three times as
     much as across. Source: docs/theory/tracks.md, "Rounded times".
 
     Examples
@@ -255,7 +255,7 @@ def rounded_time_m(time_s: Floats, position_m: Floats) -> float:
     across = np.sqrt(np.maximum((misfit[2:-2] ** 2).sum(axis=1) - along**2, 0)) / np.sqrt(2)
     expected = mean_m_s * grain / np.sqrt(12)
     typical = float(np.median(along))
-    believed = typical > max(0.5 * expected, 3 * float(np.median(across)), MATTERS_M)
+    believed = typical > max(0.5 * expected, 3 * float(np.median(across)), LEAST_FAULT_M)
     return float(expected) if believed else 0.0
 
 
@@ -264,17 +264,17 @@ def _multiples(time_s: Floats, grain_s: float) -> bool:
     return bool((np.abs(steps - np.round(steps)) < 1e-4).all())
 
 
-# ---- Which epochs of a flight log positions may rest on, and at which times no position can be had from it ---------
+# ---- Valid epochs and gaps
 
 LONG_GAP = 3.5
-"""Intervals between epochs, in the log's own median, from which on a gap is asked what it costs."""
+"""Gap in median intervals between epochs from which its interpolation error is estimated."""
 
-_TRIED = 40  # places of the log where a gap of the same length is made, to see how far the spline then errs
-_SUPPORT = 6  # epochs on either side that the spline of such a trial goes through
+_TRIED = 40  # places of the log where a gap of the same length is made, to measure the spline's error
+_SUPPORT = 6  # epochs on either side of the spline of such a trial
 
 
 class Hole(NamedTuple):
-    """A time without positions, seconds of the log: why, and how far a spline through it may err (metres)."""
+    """A time without positions, seconds of the log: its cause, and the error of a spline through it (metres)."""
 
     start_s: float
     end_s: float
@@ -284,18 +284,18 @@ class Hole(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class CheckedTrack:
-    """What may be used of a log.
+    """Valid epochs and holes of a log.
 
     Attributes
     ----------
     kept
-        (epoch,) bool, epochs that positions rest on.
+        (epoch,) bool, valid epochs.
     holes
         Times at which pulses have no position.
     faults
-        Flag → time (s) and size (m) of what was found, largest first.
+        Flag → times (s) and sizes (m) of faults, largest first.
     interpolation_m
-        RMS error of the spline between epochs, metres; None where the log is too short to tell.
+        RMS error of the spline between epochs, metres; None where the log is too short.
     """
 
     kept: NDArray[np.bool_]
@@ -303,7 +303,7 @@ class CheckedTrack:
     faults: Mapping[str, tuple[tuple[float, float], ...]]
     interpolation_m: float | None
 
-    def barred(self, at_s: Floats) -> dict[str, NDArray[np.bool_]]:
+    def excluded(self, at_s: Floats) -> dict[str, NDArray[np.bool_]]:
         """Return cause → (pulse,) bool, pulses that fall into its holes."""
         causes = dict.fromkeys(hole.cause for hole in self.holes)
         return {
@@ -320,7 +320,7 @@ def check_track(
     tolerated_m: float,
     longest_gap_s: float = np.inf,
 ) -> CheckedTrack:
-    """Return which epochs of a log are sound and where it has holes.
+    """Return the valid epochs and the holes of a log.
 
     Parameters
     ----------
@@ -329,11 +329,11 @@ def check_track(
     position_m
         (epoch, 3) float64, logged point, any Cartesian frame, metres.
     poor_fix
-        (epoch,) bool, epochs whose solution is worse than asked for.
+        (epoch,) bool, epochs whose solution is worse than required.
     tolerated_m
-        Error of the spline through a gap that an image bears, such as λ/16, metres.
+        Tolerated error of the spline through a gap, such as λ/16, metres.
     longest_gap_s
-        Between epochs, whatever a spline through it costs, seconds.
+        Between epochs, whatever the error of a spline through it, seconds.
 
     Notes
     -----
@@ -348,7 +348,7 @@ def check_track(
     [(3.9, 6.0, 'track_gap')]
     """
     place = position_m - position_m.mean(axis=0)
-    cause, size = _judged(time_s, place, poor_fix)
+    cause, size = _classified(time_s, place, poor_fix)
     steps = [
         Hole(float(time_s[part[step.first - 1]]), float(time_s[part[step.last + 1]]), "track_outlier", step.size_m)
         for part in _parts(time_s, cause)
@@ -368,8 +368,8 @@ def check_track(
     )
 
 
-def _judged(time_s: Floats, position_m: Floats, poor_fix: NDArray[np.bool_]) -> tuple[NDArray[np.str_], Floats]:
-    """Return (epoch,) the flag that keeps an epoch from being used, '' where it is sound, and by how much it is off."""
+def _classified(time_s: Floats, position_m: Floats, poor_fix: NDArray[np.bool_]) -> tuple[NDArray[np.str_], Floats]:
+    """Return (epoch,) the flag that excludes an epoch, '' where it is valid, and the size of its error."""
     cause, size = np.where(poor_fix, "fix_poor", "").astype("U16"), np.zeros(len(time_s))
     cause[find_frozen(time_s, position_m) & ~poor_fix] = "track_frozen"
     for part in _parts(time_s, cause):
@@ -380,7 +380,7 @@ def _judged(time_s: Floats, position_m: Floats, poor_fix: NDArray[np.bool_]) -> 
 
 
 def _parts(time_s: Floats, cause: NDArray[np.str_]) -> list[NDArray[np.intp]]:
-    """Return the sound epochs between gaps: no epoch is judged by its neighbours beyond one."""
+    """Return the valid epochs between gaps: no epoch is compared with neighbours beyond one."""
     sound = np.flatnonzero(cause == "")
     if sound.size < 2:
         return []
@@ -395,7 +395,7 @@ def _listed(time_s: Floats, size_m: Floats) -> list[tuple[float, float]]:
 def _holes(
     time_s: Floats, position_m: Floats, cause: NDArray[np.str_], tolerated_m: float, longest_gap_s: float
 ) -> list[Hole]:
-    """Return the times between sound epochs where the log is silent for too long, or its fix is poor."""
+    """Return the times between valid epochs where the log has no epochs for too long, or its fix is poor."""
     sound = np.flatnonzero(cause == "")
     if sound.size < 2:
         return [Hole(-np.inf, np.inf, str(cause[0]) or "track_gap", np.inf)]
@@ -419,21 +419,21 @@ def _holes(
 
 
 def _gap_error_m(time_s: Floats, position_m: Floats, missing: int) -> float:
-    """Return what the spline would miss without so many epochs in a row: tried where the log has them, metres.
+    """Return the error of the spline without so many epochs in a row, by trials where the log has them, metres.
 
-    The 90 % quantile over places of the largest error inside; inf where the log is nowhere whole for so long.
+    The 90 % quantile over places of the largest error inside; inf where the log is nowhere complete for so long.
     """
     width = missing + 2 * _SUPPORT
     interval_s = float(np.median(np.diff(time_s)))
     starts = np.arange(len(time_s) - width + 1)  # none where the log is shorter than the trial
-    whole = starts[time_s[starts + width - 1] - time_s[starts] < (width - 1) * interval_s * 1.2]
+    complete = starts[time_s[starts + width - 1] - time_s[starts] < (width - 1) * interval_s * 1.2]
     errors = []
-    for start in whole[:: max(1, len(whole) // _TRIED)]:
+    for start in complete[:: max(1, len(complete) // _TRIED)]:
         here = np.arange(start, start + width)
         out = here[_SUPPORT:-_SUPPORT]
         rest = np.setdiff1d(here, out)
-        apart = position_spline(time_s[rest], position_m[rest])(time_s[out]) - position_m[out]
-        errors.append(float(np.linalg.norm(apart, axis=1).max()))
+        error_m = position_spline(time_s[rest], position_m[rest])(time_s[out]) - position_m[out]
+        errors.append(float(np.linalg.norm(error_m, axis=1).max()))
     return float(np.quantile(errors, 0.9)) if errors else np.inf
 
 
@@ -441,6 +441,6 @@ def _interpolation_m(time_s: Floats, position_m: Floats) -> float | None:
     """Return the RMS error of the spline between epochs: that of every second epoch over 2⁴, one axis, metres."""
     if len(time_s) < 12:
         return None
-    apart = position_spline(time_s[::2], position_m[::2])(time_s[1:-1:2]) - position_m[1:-1:2]
-    inner = np.linalg.norm(apart, axis=1)[2:-2] / np.sqrt(3)
+    error_m = position_spline(time_s[::2], position_m[::2])(time_s[1:-1:2]) - position_m[1:-1:2]
+    inner = np.linalg.norm(error_m, axis=1)[2:-2] / np.sqrt(3)
     return float(np.sqrt(np.mean(inner**2))) / 16

@@ -1,4 +1,4 @@
-"""The front door from Python: one call from profiles or phase history to a planned, certified, lazy image."""
+"""Backprojection from Python: one call from profiles or phase history to a planned, certified, lazy image."""
 
 import json
 from collections.abc import Mapping
@@ -47,7 +47,7 @@ def backproject(  # noqa: PLR0913 - each choice is a keyword, so that an editor 
     tile_px: int = 256,
     engine_options: Mapping[str, Mapping[str, Any]] = MappingProxyType({}),
 ) -> "xr.DataArray":
-    """Return a focused image over a grid: planned for the accuracy asked, lazy until it is computed.
+    """Return a focused image over a grid: planned for the requested accuracy, lazy until it is computed.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ def backproject(  # noqa: PLR0913 - each choice is a keyword, so that an editor 
     grid
         Pixels; their frame is that of the phase centres: ECEF, or the local frame of a grid with ``crs="local"``.
     accuracy_db
-        Numerical error asked: RMS over all pixels relative to the exact sum, dB, -120 to -10.
+        Requested numerical error: RMS over all pixels relative to the exact sum, dB, -120 to -10.
     terrain
         Heights of the ground, or one height (m): above the ellipsoid of the grid's CRS; in a local frame z, and 0 by
         default.
@@ -66,33 +66,33 @@ def backproject(  # noqa: PLR0913 - each choice is a keyword, so that an editor 
     beams
         Of the antennas; isotropic by default.
     certified_pixels
-        Random pixels computed both ways at once, for the certificate; 0 for none. A setting that misses the accuracy
-        asked on them gives way to the plan's next.
+        Random pixels also computed exactly at once, for the certificate; 0 for none. A setting that misses the
+        accuracy on them is replaced by the plan's next.
     terrain_model
-        'auto', 'plane', 'tilted_plane' or 'dem': what stands for the ground.
+        'auto', 'plane', 'tilted_plane' or 'dem': model of the ground.
     window
         Weighting over the subcarriers of transfer functions; profiles have theirs.
     integration
-        How much of a pass a pixel is integrated over: 'auto', what the pixels' spacing carries; 'all';
+        How much of a pass a pixel is integrated over: 'auto', as much as the pixel spacing can represent; 'all';
         ``{"degrees": x}`` of a straight pass; ``{"resolution_m": x}`` along the flight.
     presum
-        Pulses that a low-pass sum makes one, where the aperture is oversampled; 1 keeps all.
+        Pulses that a low-pass sum combines into one, where the aperture is oversampled; 1 keeps all.
     pulse_blocks
         Blocks of pulses whose tables are in memory at once, one after the other; 1 takes them all.
     tile_px
         Side of a tile, pixels: a chunk of the array.
     engine_options
-        Options of engines that the planner shall not choose: engine → option → value.
+        Options of engines fixed by the caller: engine → option → value.
 
     Returns
     -------
     xarray.DataArray
-        (y, x) complex64, carrier kept, 1 is the amplitude of an echo seen by every pulse; a dask array on whatever
+        (y, x) complex64, carrier kept, 1 is the amplitude of an echo in every pulse; a dask array on whatever
         scheduler the caller has. Attributes: units; the plan: `setting`, `predicted_error_db`, and as JSON `models`
-        (choice → value and reason) and `flags` (limit crossed → what was found); the certificate: `numerical_error_db`,
-        an upper bound at `numerical_error_confidence` for the whole image, and `numerical_error_estimate_db`, against
-        the double sum over pulses and subcarriers, or from profiles alone against their band-limited interpolation in
-        float64.
+        (choice → value and reason) and `flags` (limit crossed → what was measured); the certificate:
+        `numerical_error_db`, an upper bound at `numerical_error_confidence` for the whole image, and
+        `numerical_error_estimate_db`, against the double sum over pulses and subcarriers, or from profiles alone
+        against their band-limited interpolation in float64.
 
     Raises
     ------
@@ -122,7 +122,7 @@ def backproject(  # noqa: PLR0913 - each choice is a keyword, so that an editor 
     """
     import xarray as xr
 
-    asked = validated(
+    choices = validated(
         ImagingChoices,
         {
             "accuracy_db": accuracy_db,
@@ -138,15 +138,15 @@ def backproject(  # noqa: PLR0913 - each choice is a keyword, so that an editor 
         where="backproject",
         expected="choices of ImagingChoices",
     )
-    inputs = inputs_of(profiles, asked.window)
+    inputs = inputs_of(profiles, choices.window)
     ground = ground_of(terrain, grid)
     flags = check_inputs(inputs, grid, ground)
     history = inputs if isinstance(inputs, PhaseHistory) else None
     models = GroundModels.of(ground, None, grid)
-    job = replace(_job(inputs, grid, models, beams, asked.integrated), tile_px=asked.tile_px)
+    job = replace(_job(inputs, grid, models, beams, choices.integrated), tile_px=choices.tile_px)
     compressed = _compressed(inputs, grid, ground, job.beams)
-    plan = make_plan(job, accuracy_db=accuracy_db, overrides=asked.planned, where="backproject")
-    formation = Formation(history, compressed, grid, plan, asked.tile_px)
+    plan = make_plan(job, accuracy_db=accuracy_db, overrides=choices.planned, where="backproject")
+    formation = Formation(history, compressed, grid, plan, choices.tile_px)
     attributes: dict[str, Any] = {}
     if certified_pixels:
         formation, error = _certified(formation, accuracy_db, certified_pixels)
@@ -172,7 +172,7 @@ def backproject(  # noqa: PLR0913 - each choice is a keyword, so that an editor 
 
 
 def _certified(formation: Formation, accuracy_db: float, count: int) -> tuple[Formation, ErrorBound]:
-    """Return the image by the first setting of the plan that meets the accuracy for sure, or by the last."""
+    """Return the formation by the plan's first setting whose error bound meets the accuracy, or by the last."""
     pixels = np.random.default_rng(0).integers(0, formation.grid.shape, (count, 2))
     exact = formation.exact(pixels)
     error = _error(formation, pixels, exact)
@@ -205,5 +205,5 @@ def _job(
     else:
         known = (inputs.aperture, inputs.frequency_hz, inputs.weight)
         job = imaging_job(*known, grid, ground, history=inputs, **weighed)
-    lit = None if job.beams is None else illuminate(job.beams, job.aperture, job.points_m)
-    return replace(job, illumination=lit, memory_bytes=memory_limit())
+    illumination = None if job.beams is None else illuminate(job.beams, job.aperture, job.points_m)
+    return replace(job, illumination=illumination, memory_bytes=memory_limit())

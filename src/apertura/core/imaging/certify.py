@@ -1,4 +1,4 @@
-"""What an image says of itself: its measured numerical error, and what its pixels and its brightest target tell."""
+"""Measures of a formed image: certified numerical error, statistics of its pixels, and its brightest target."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
@@ -11,15 +11,15 @@ from apertura.common.contracts import Window
 from apertura.core.focus.tiles import compute_tiles
 from apertura.core.imaging.formation import Formation
 from apertura.core.quality.error_check import CONFIDENCE, Brightness, Certificate, ErrorBound, random_pixels
-from apertura.core.quality.measures import coherence_factor, survey
+from apertura.core.quality.measures import coherence_factor, image_statistics
 from apertura.core.quality.point_targets import cut_through, find_peak
 from apertura.core.scene.grid import SceneGrid
 
 RANDOM_PIXELS, BRIGHT_PIXELS = 160, 112
-"""Recomputed by the reference: anywhere, a tile each as long as they last; and where the image is bright."""
+"""Pixels recomputed by the reference: drawn evenly over the tiles, and by brightness (docs/theory.md, eq. 6a)."""
 
 CUT_REACH_M = 3.0
-"""How far the cuts through the brightest target go to both sides."""
+"""Metres to both sides of the brightest target that its cuts span: main lobe and first sidelobes."""
 
 
 def certified(
@@ -31,24 +31,24 @@ def certified(
     scheduler: str = "threads",
     rewriting: Callable[[Sequence[Window]], None] = lambda _: None,
 ) -> dict[str, Any]:
-    """Return what bounds the error; form tiles that are worse than asked again with the next better settings first.
+    """Return the error bound of an image; tiles worse than requested are first formed again with better settings.
 
     Parameters
     ----------
     formation
-        What forms the image.
+        Formation of the image.
     target
-        The image where it was written: (y, x) complex64, read and written by blocks.
+        The image as written: (y, x) complex64, read and written by blocks.
     accuracy_db
-        Error asked.
+        Requested error.
     threads
         Tiles in work at once.
     scheduler
-        Who forms tiles again, as `compute_tiles` takes it.
+        Where tiles are formed again, as `compute_tiles` takes it.
     rewriting
-        Told of tiles before they are formed again, so that a run that is killed meanwhile begins them as planned.
+        Called with the tiles before they are formed again, so that a run killed meanwhile begins them as planned.
     """
-    certificate = _drawn(formation)
+    certificate = _random_certificate(formation)
     settings, redone = iter(formation.plan.fallbacks), []
     while True:
         brightness, setting = Brightness.of(target, formation.windows), next(settings, None)
@@ -57,7 +57,7 @@ def certified(
             error = _error(formation, certificate, target, brightness)
             if error.bound_db <= accuracy_db or setting is None:
                 break
-            worse = formation.windows  # each tile passes, all of them together do not
+            worse = formation.windows  # each tile passes, but the bound of the image does not
         print(f"{len(worse)} tiles are worse than {accuracy_db} dB: again with {setting.line}", flush=True)  # noqa: T201
         image = formation.image_by(setting)
         rewriting([*uncertified, *worse])
@@ -76,20 +76,20 @@ def certified(
     }
 
 
-def _drawn(formation: Formation) -> Certificate:
+def _random_certificate(formation: Formation) -> Certificate:
     pixels = random_pixels(formation.windows, RANDOM_PIXELS, np.random.default_rng(0))
     return Certificate(formation.windows, pixels, formation.exact(pixels))
 
 
 def _error(formation: Formation, certificate: Certificate, target: Any, brightness: Brightness) -> ErrorBound:
-    """Return the error of the image as it stands; which bright pixels it looks at follows from the image alone."""
+    """Return the error of the image as it is now; its bright pixels are drawn from the image alone."""
     bright = brightness.draw(target, formation.windows, BRIGHT_PIXELS, np.random.default_rng(1))
     return certificate.error(target, brightness, bright, formation.exact(bright))
 
 
 def measures(formation: Formation, target: Any) -> dict[str, Any]:
-    """Return what one pass over the pixels and a close look at the brightest target tell."""
-    overview, grid = survey(target, formation.windows), formation.grid
+    """Return entropy, noise floor and measures of the brightest target of an image."""
+    overview, grid = image_statistics(target, formation.windows), formation.grid
     peak = find_peak(target, overview.row, overview.column)
     x, y = map(float, grid.map_at(peak.row, peak.column))
     along = _direction(grid, _flown(formation, peak.row, peak.column), peak.row, peak.column)
@@ -117,8 +117,10 @@ def measures(formation: Formation, target: Any) -> dict[str, Any]:
 
 
 def _flown(formation: Formation, row: float, column: float) -> NDArray[np.float64]:
-    """Return the vector from the transmitter's first to its last place that may see a pixel, metres."""
-    blocks = [(pulses, parts) for pulses, parts in formation.seeing(formation.positions_at([row], [column]))]
+    """Return the vector between the transmitter's first and last positions that may illuminate a pixel, metres."""
+    blocks = [
+        (pulses, parts) for pulses, parts in formation.illuminating_pulses(formation.positions_at([row], [column]))
+    ]
     first, last = blocks[0][0].start + blocks[0][1][0][0].start, blocks[-1][0].start + blocks[-1][1][-1][0].stop - 1
     track = formation.profiles.aperture.tx_m
     return np.asarray(track[last] - track[first])

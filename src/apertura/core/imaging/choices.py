@@ -1,4 +1,4 @@
-"""What a person may ask of an image, from Python or in section `processing` of a campaign."""
+"""Choices of how an image is formed, from Python or in section `processing` of a campaign."""
 
 from typing import Annotated, Any, Literal, Self
 
@@ -8,7 +8,7 @@ from apertura.core.focus.engines import ENGINES, PATCH_PX, load_engine
 
 
 class Degrees(BaseModel):
-    """So much of a straight pass."""
+    """Integration angle of a straight pass."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -16,7 +16,7 @@ class Degrees(BaseModel):
 
 
 class Resolution(BaseModel):
-    """As much of a pass as a resolution needs."""
+    """Integration by the resolution along the flight."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -24,7 +24,7 @@ class Resolution(BaseModel):
 
 
 PLANNED = ("engine", "engine_options", "presum", "pulse_blocks", "terrain")
-"""Choices that are the planner's where they are 'auto'."""
+"""Choices that the planner makes where they are 'auto'."""
 
 
 def _options_of_each_engine(schema: dict[str, Any]) -> None:
@@ -77,12 +77,12 @@ class ImagingChoices(BaseModel):
 
     @property
     def planned(self) -> dict[str, Any]:
-        """What the planner is asked."""
+        """Overrides of the planner: choice → value."""
         return {name: getattr(self, name) for name in PLANNED}
 
     @property
     def integrated(self) -> Any:
-        """How much of a pass is asked for: 'auto', 'all', or a mapping."""
+        """Requested integration: 'auto', 'all', or a mapping."""
         return self.integration if isinstance(self.integration, str) else self.integration.model_dump()
 
     @field_validator("engine")

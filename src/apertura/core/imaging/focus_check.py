@@ -1,4 +1,4 @@
-"""How well an image is focused, measured on itself: bright points, parts of the aperture, noise, echo's place."""
+"""Focus of an image measured on itself: bright points, subapertures, noise, and echoes from elsewhere."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, replace
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.flags import Flags
 from apertura.core.antenna.beam import Beams
-from apertura.core.antenna.illumination import reached
+from apertura.core.antenna.illumination import illumination_mask
 from apertura.core.echo.compression import compress, range_step
 from apertura.core.focus.engines import ENGINES, load_engine
 from apertura.core.focus.engines.engine import Engine
@@ -26,13 +26,13 @@ from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.swath import swath
 from apertura.core.scene.terrain import FlatGround, Terrain
 
-# ---- Images of a few places by parts of the aperture, and by even and odd pulses of each ---------------------------
+# ---- Subaperture images of a few places
 
 PARTS = 8
-"""Parts of the aperture."""
+"""Subapertures (docs/theory/focus.md, "Parts of the aperture")."""
 
 PART_PX = 64
-"""Places along a side."""
+"""Places along a side of a patch: the size of a `BandLimitedPatch`."""
 
 _MARGIN_SAMPLES = 16  # that engines need beyond the places
 
@@ -40,7 +40,7 @@ _MARGIN_SAMPLES = 16  # that engines need beyond the places
 def part_images(
     profiles: Profiles, places: Sequence[NDArray[np.float64]], *, beams: Beams | None = None
 ) -> NDArray[np.complex64]:
-    """Return patches of the image by parts of the aperture; their sum over parts is the image.
+    """Return patches of the image by subapertures; their sum over subapertures is the image.
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ def part_images(
     Returns
     -------
     ndarray
-        (patch, 2, part, y, x) complex64: by even and by odd pulses of each part. Nothing is made of fewer than four
+        (patch, 2, part, y, x) complex64: by even and by odd pulses of each part. Zero with fewer than four
         pulses a part.
     """
     images = np.zeros((len(places), 2, PARTS, PART_PX, PART_PX), np.complex64)
@@ -63,10 +63,10 @@ def part_images(
         return images[:0]
     engine = table_engine()
     for patch, where in enumerate(places):
-        seen = _seeing(beams, aperture, where)
-        for number, block in enumerate(aperture[seen].blocks(PARTS)):
-            for first in range(seen.start + block.start, seen.start + block.stop, PULSES_READ):
-                last = min(first + PULSES_READ, seen.start + block.stop)
+        illuminating = _illuminating_pulses(beams, aperture, where)
+        for number, block in enumerate(aperture[illuminating].blocks(PARTS)):
+            for first in range(illuminating.start + block.start, illuminating.start + block.stop, PULSES_READ):
+                last = min(first + PULSES_READ, illuminating.start + block.stop)
                 read = _around(profiles[first:last], where)
                 for odd in range(min(2, last - first)):
                     tables = engine.prepare(read[odd::2])
@@ -75,12 +75,14 @@ def part_images(
     return np.nan_to_num(images)
 
 
-def _seeing(beams: Beams | None, aperture: Aperture, places: NDArray[np.float64]) -> slice:
-    """Return the first to the last pulse that may see a patch."""
+def _illuminating_pulses(beams: Beams | None, aperture: Aperture, places: NDArray[np.float64]) -> slice:
+    """Return the first to the last pulse that may illuminate a patch."""
     middle = places[PART_PX // 2, PART_PX // 2]
     radius = np.linalg.norm(places - middle, axis=-1).max()
-    lit = np.flatnonzero(reached(beams, aperture, middle[None], np.array([radius]), pulses=PULSES)[:, 0])
-    return slice(int(lit[0]) * PULSES, min(int(lit[-1] + 1) * PULSES, len(aperture))) if lit.size else slice(0, 0)
+    blocks = np.flatnonzero(illumination_mask(beams, aperture, middle[None], np.array([radius]), pulses=PULSES)[:, 0])
+    return (
+        slice(int(blocks[0]) * PULSES, min(int(blocks[-1] + 1) * PULSES, len(aperture))) if blocks.size else slice(0, 0)
+    )
 
 
 def table_engine() -> Engine:
@@ -90,7 +92,7 @@ def table_engine() -> Engine:
 
 
 def _around(profiles: Profiles, places: NDArray[np.float64]) -> Profiles:
-    """Return the samples of profiles that a patch needs."""
+    """Return the profiles cropped to the samples that a patch needs."""
     corners = places[:: PART_PX - 1, :: PART_PX - 1].reshape(-1, 3)
     at = (profiles.aperture.path(corners) - profiles.start_m[:, None]) / profiles.step_m
     reach = 2 * np.linalg.norm(places[1, 1] - places[0, 0]) * PART_PX / 2 / profiles.step_m  # nadir inside the patch
@@ -100,28 +102,28 @@ def _around(profiles: Profiles, places: NDArray[np.float64]) -> Profiles:
     return replace(profiles, samples=profiles.samples[:, first:last], start_m=start_m)
 
 
-# ---- Whether the strongest echo of the pulses comes from the scene at all ------------------------------------------
+# ---- Strongest echoes outside the scene
 
-ELSEWHERE_DB = 20.0
-"""An echo this much stronger than all from the scene says that the scene is not where the echo is."""
+OUTSIDE_ECHO_DB = 20.0
+"""dB above the strongest echo from the scene: an echo outside this strong means a misplaced scene, no sidelobe."""
 
-UNGATHERED_DB = 25.0
-"""An echo so far above the median of the scene's ranges is a point's, which some place must gather; speckle has 10."""
+UNFOCUSED_ECHO_DB = 25.0
+"""dB above the median of the scene's ranges: such an echo is a point's and must focus at some place; speckle has 10."""
 
 LEAST_PULSES = 64
-"""Fewer are not enough to tell whether a point dominates its cell."""
+"""Pulses: fewer cannot show whether a point dominates its cell (2 in each of the 32 blocks of `point_focus`)."""
 
-_MOST_PULSES = 64
+_MOST_PULSES = 64  # sampled to search echoes outside the scene
 _NEAR_CELLS = 4  # about the direct path and at the swath's edges, where responses have their sidelobes
 
 
 def echo_elsewhere(history: PhaseHistory, grid: SceneGrid, terrain: Terrain) -> str | None:
-    """Return one line where pulses hold a strong echo that an image without bright points does not gather; None if not.
+    """Return one line where pulses contain a strong echo that an image without bright points does not focus, else None.
 
     Parameters
     ----------
     history
-        Of every pulse; some of them are looked at.
+        Of every pulse; a sample of them is evaluated.
     grid, terrain
         The scene.
 
@@ -137,21 +139,21 @@ def echo_elsewhere(history: PhaseHistory, grid: SceneGrid, terrain: Terrain) -> 
     margin = _NEAR_CELLS * step_m
     beyond = (path_m - (nearest[:, None] - margin)) % span_m > (farthest - nearest)[:, None] + 2 * margin
     direct = np.linalg.norm(some.aperture.tx_m - some.aperture.rx_m, axis=1)
-    apart = (path_m - direct[:, None] + span_m / 2) % span_m - span_m / 2
-    beside = np.where(beyond & (np.abs(apart) > margin), power, 0.0)
+    offset_m = (path_m - direct[:, None] + span_m / 2) % span_m - span_m / 2
+    beside = np.where(beyond & (np.abs(offset_m) > margin), power, 0.0)
     outside = beside.max(axis=1)
     within = np.where(beyond, np.nan, power)
     inside = np.nanmax(within, axis=1)
     scene = f"the scene's are {nearest.min():.1f} to {farthest.max():.1f} m"
     above_db = _median_db(outside / np.maximum(inside, 1e-30))
-    if min(above_db, _median_db(outside / np.maximum(np.median(power, axis=1), 1e-30))) > ELSEWHERE_DB:
+    if min(above_db, _median_db(outside / np.maximum(np.median(power, axis=1), 1e-30))) > OUTSIDE_ECHO_DB:
         at_m = float(np.median(path_m[np.arange(len(some)), beside.argmax(axis=1)]))
         return (
             f"the strongest echo, {above_db:.0f} dB above all from the scene, has a total path of {at_m:.1f} m, while "
-            f"{scene}: heights, positions or path offsets are wrong, or something bright stands elsewhere"
+            f"{scene}: heights, positions or path offsets are wrong, or something bright is elsewhere"
         )
     alone_db = _median_db(inside / np.maximum(np.nanmedian(within, axis=1), 1e-30))
-    if len(history) >= LEAST_PULSES and alone_db > UNGATHERED_DB:
+    if len(history) >= LEAST_PULSES and alone_db > UNFOCUSED_ECHO_DB:
         return (
             f"pulses hold an echo {alone_db:.0f} dB above the median of the scene's ranges, and no place of the image "
             "gathers it: times, positions or heights are wrong, or it comes from beside the scene"
@@ -178,28 +180,28 @@ def _profiles(history: PhaseHistory, step_m: float, length: int) -> tuple[NDArra
     return path_m, np.abs(samples).astype(np.float64) ** 2
 
 
-# ---- How well several echoes gather at one place: what hypotheses about a campaign's geometry are compared by ------
+# ---- Joint focus of several pairs, to compare hypotheses
 
-_EVERY = 8  # points along a side that tell which paths a piece of ground spans
+_EVERY = 8  # points along a side that bound the paths of a piece of ground
 
 
-def gathered(histories: Sequence[PhaseHistory], grid: SceneGrid, height_m: float) -> float:
-    """Return how much of their echoes several pairs gather at the place where they do so best together.
+def joint_peak_power(histories: Sequence[PhaseHistory], grid: SceneGrid, height_m: float) -> float:
+    """Return the peak power of the joint image of several pairs, relative to that of perfectly focused echoes.
 
     Parameters
     ----------
     histories
-        Of pairs that see one scene.
+        Of pairs that image one scene.
     grid
-        Places to look at; level ground.
+        Places to image; level ground.
     height_m
         Of the ground above the ellipsoid (z in a local frame).
 
     Returns
     -------
     float
-        Power against that of an echo that holds all the energy of its pulses, half of it added pair by pair, half with
-        their phases; two hypotheses about one recording compare by its ratio.
+        0 to 1: mean of the non-coherent and of the coherent sum over pairs, relative to an echo with all the energy of
+        its pulses; two hypotheses about one recording compare by its ratio.
 
     Raises
     ------
@@ -218,7 +220,7 @@ def gathered(histories: Sequence[PhaseHistory], grid: SceneGrid, height_m: float
     >>> flown = Aperture(track, track)
     >>> echo = np.exp(-2j * np.pi * frequency * flown.path(np.zeros((1, 3))) / 299792458.0).astype(np.complex64)
     >>> history = PhaseHistory(echo, frequency, np.full(128, 1 / 128), np.zeros(64), flown)
-    >>> gathered([history], SceneGrid("local", -3.2, 3.2, 0.1, (64, 64)), 0.0) > 0.9
+    >>> joint_peak_power([history], SceneGrid("local", -3.2, 3.2, 0.1, (64, 64)), 0.0) > 0.9
     True
     """
     engine, ground = table_engine(), FlatGround(height_m)
@@ -233,7 +235,7 @@ def gathered(histories: Sequence[PhaseHistory], grid: SceneGrid, height_m: float
 
 
 def _window(history: PhaseHistory, places: NDArray[np.float64]) -> RangeWindow:
-    """Return total paths that hold those of a small piece of ground, from some of its points."""
+    """Return a window of total paths that covers a small piece of ground, from some of its points."""
     every = max(1, min(places.shape[:2]) // _EVERY)
     some = places[::every, ::every]
     paths = history.aperture.path(some).reshape(len(history), -1)
@@ -245,24 +247,23 @@ def _window(history: PhaseHistory, places: NDArray[np.float64]) -> RangeWindow:
 
 
 def _echo_power(history: PhaseHistory) -> float:
-    """Return the power of the profile of an echo that held all the energy of a pulse, mean over the pulses."""
+    """Return the profile's power of an echo with all the energy of a pulse, mean over the pulses."""
     power: NDArray[np.float64] = (np.abs(history.transfer) ** 2).astype(np.float64) @ history.weight
     return float(power.mean()) * float(history.weight.sum())
 
 
-# ---- How well an image is focused, measured on itself: bright points, parts of the aperture, and the echo's own
-# place
+# ---- Focus report of an image
 
-APART_CELLS = 6.0
-"""Bright points stand so many resolution cells apart."""
+POINT_SPACING_CELLS = 6.0
+"""Resolution cells between bright points at least: a maximum closer to a brighter one may be its sidelobe."""
 
 SPECKLE = 0.06
-"""Power about a bright point, against its own, above which it may be speckle: of 10⁶ cells the brightest has 0.07."""
+"""Power around a bright point relative to its own, above which it may be speckle: the brightest of 10⁶ has 0.07."""
 
-_PATCHES = 4
-_PLACES_PER_CELL = 2.5
-_CELL_POINTS = 5
-_BAND_SAMPLES = 9
+_PATCHES = 4  # imaged by subapertures: the brightest places
+_PLACES_PER_CELL = 2.5  # of a patch along a side
+_CELL_POINTS = 5  # along a side of the scene, at which the resolution cell is computed
+_BAND_SAMPLES = 9  # frequencies of the spatial spectrum
 _WINDOWED = 0.62  # a Hann window leaves a band as wide, in standard deviation, as this share of it without
 
 
@@ -297,21 +298,21 @@ def _spectrum(formation: Formation) -> NDArray[np.float64]:
 
 
 def focus_report(formation: Formation, target: Any) -> dict[str, Any]:
-    """Return what image.json says of the focus: verdict, loss, and each bright point.
+    """Return the focus section of image.json: verdict, loss, and each bright point.
 
     Parameters
     ----------
     formation
-        What forms the image; it must hold a phase history.
+        Formation of the image, with a phase history.
     target
-        (y, x) complex64, the image where it was written.
+        (y, x) complex64, the image as written.
 
     Notes
     -----
     Source: docs/theory/focus.md.
     """
     cell_m, grid = resolution_cell_m(formation), formation.grid
-    apart_px = max(8, int(np.ceil(APART_CELLS * cell_m / grid.spacing_m)))
+    apart_px = max(8, int(np.ceil(POINT_SPACING_CELLS * cell_m / grid.spacing_m)))
     points = bright_points(target, formation.windows, apart_px=apart_px)
     terms = formation.contributions([point.row for point in points], [point.column for point in points])
     measured = [
@@ -337,7 +338,7 @@ def focus_report(formation: Formation, target: Any) -> dict[str, Any]:
 
 
 def focus_flags(report: dict[str, Any], expected_db: float) -> Flags:
-    """Return the flags `defocused` where the bright points say so, and `echo_elsewhere`."""
+    """Return the flags `defocused`, by the verdict of the bright points, and `echo_elsewhere`."""
     flags = Flags({"echo_elsewhere": report["elsewhere"]} if "elsewhere" in report else {})
     if report["verdict"] == "defocused":
         flags["defocused"] = (
@@ -348,7 +349,7 @@ def focus_flags(report: dict[str, Any], expected_db: float) -> Flags:
 
 
 def _parts(formation: Formation, points: list[BrightPoint], cell_m: float) -> SubApertures:
-    """Return what images of parts of the aperture say about the brightest places."""
+    """Return the subaperture measures of the brightest places."""
     spacing_m = cell_m / _PLACES_PER_CELL
     places = [_places(formation, point, spacing_m / formation.grid.spacing_m) for point in points[:_PATCHES]]
     images = part_images(formation.profiles, places, beams=formation.beams)

@@ -1,4 +1,4 @@
-"""What forms one image, opened once: inputs, scene, antennas and plan, handed to tiles, certificate and measures."""
+"""Formation of one image: inputs, scene, antennas and plan, shared by tiles, certificate and measures."""
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from apertura.common.contracts import Window
 from apertura.core.antenna.beam import Beams
-from apertura.core.antenna.illumination import reached
+from apertura.core.antenna.illumination import illumination_mask
 from apertura.core.focus.contributions import band_limited_image
 from apertura.core.focus.engines import load_engine, pieces, reference
 from apertura.core.focus.engines.engine import Setting
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from dask.array.core import Array
 
 PULSES_READ = 1024
-"""Of a phase history at once, or of profiles where places are looked at closely."""
+"""Pulses read at once of a phase history, or of profiles at single places: bounds memory."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,13 +35,13 @@ class Formation:
     Attributes
     ----------
     history
-        What was recorded, which the double sum reads; None where there are only profiles.
+        Phase history for the double sum; None where there are only profiles.
     profiles
-        The same as range profiles, which table engines read.
+        The same as range profiles, for the engines that use tables.
     grid
         Of the image.
     plan
-        How it is formed, on which model of the ground, and how pulses are weighed.
+        Engine, model of the ground and weights of pulses.
     side_px
         Of a tile.
     """
@@ -54,12 +54,12 @@ class Formation:
 
     @property
     def beams(self) -> Beams | None:
-        """What weighs pulses: antennas and the sector integrated; None where every pulse counts alike."""
+        """Weights of pulses: antennas and the sector integrated; None where every pulse has weight 1."""
         return self.plan.beams
 
     @property
     def count(self) -> int:
-        """Pulses that 1 stands for."""
+        """Pulses that the sum is divided by."""
         return self.plan.count or len(self.profiles)
 
     @property
@@ -69,17 +69,17 @@ class Formation:
 
     @cached_property
     def windows(self) -> list[Window]:
-        """Every tile that a pulse may see, a whole one first if there is one; the others are not formed, and zero."""
+        """Every tile that a pulse may illuminate, a full-sized one first if any; the others are not formed: zero."""
         tiles = self.tiles
         reach = Reach.of(self.beams, self.profiles.aperture, self.grid, self.plan.terrain, tiles)
-        seen = [tile for tile, lit in zip(tiles, reach.seen, strict=True) if lit]
+        formed = [tile for tile, illuminated in zip(tiles, reach.illuminated, strict=True) if illuminated]
         side = tuple(min(self.side_px, size) for size in self.grid.shape)
-        whole = next((tile for tile in seen if tuple(part.stop - part.start for part in tile) == side), None)
-        return tiles if whole is None else [whole, *(tile for tile in seen if tile is not whole)]
+        full = next((tile for tile in formed if tuple(part.stop - part.start for part in tile) == side), None)
+        return tiles if full is None else [full, *(tile for tile in formed if tile is not full)]
 
     @cached_property
-    def ways(self) -> Counter[str]:
-        """Way of an engine → pixels × pulses that went so in this process; empty where an engine has one way."""
+    def variant_counts(self) -> Counter[str]:
+        """Variant of the engine's sum → pixels × pulses that took it in this process; empty where an engine has one."""
         return Counter()
 
     @cached_property
@@ -106,15 +106,15 @@ class Formation:
         """
         places = self.positions_at(*pixels.T)
         total = np.zeros(len(places), np.complex128)
-        for pulses, seen in self.seeing(places):
+        for pulses, parts_of in self.illuminating_pulses(places):
             some = (self.history or self.profiles)[pulses]
-            for part, lit in seen:
+            for part, inside in parts_of:
                 weights = self.beams and self.beams[pulses][part]
-                total[lit] += _exact_sum(some[part], places[lit], weights)
+                total[inside] += _exact_sum(some[part], places[inside], weights)
         return np.asarray(total / self.count)
 
     def values(self, pixels: NDArray[np.int64]) -> tuple[NDArray[np.complex64], NDArray[np.float64]]:
-        """Return the planned image at (pixel, 2) rows and columns, forming just what the engine needs for each.
+        """Return the planned image at (pixel, 2) rows and columns, forming only the piece that each needs.
 
         (pixel,) complex64, and mean |I|² over the pieces formed, (pixel,) float64.
         """
@@ -127,7 +127,7 @@ class Formation:
         return values, power
 
     def _piece(self, row: int, column: int) -> tuple[int, int, int, int]:
-        """Return first and last row, first and last column of what the planned engine forms a pixel with."""
+        """Return first and last row, first and last column of the piece that the planned engine forms a pixel in."""
         tile = [
             (at // self.side_px * self.side_px, size) for at, size in zip((row, column), self.grid.shape, strict=True)
         ]
@@ -152,7 +152,7 @@ class Formation:
         reach = Reach.of(beams, inputs.aperture, self.grid, self.plan.terrain, windows)
         places = [self.plan.terrain.positions(self.grid[window]) for window in windows]
         image = [np.zeros(place.shape[:2], np.complex64) for place in places]
-        for block in pulse_blocks_of(len(inputs), setting.pulse_blocks, whole=beams is None):
+        for block in pulse_blocks_of(len(inputs), setting.pulse_blocks, any_start=beams is None):
             tables = engine.prepare(inputs[block], **setting.options)
             for number, place in enumerate(places):
                 if (part := reach.within(number, block)) is not None:
@@ -162,7 +162,7 @@ class Formation:
         return image
 
     def contributions(self, row: ArrayLike, column: ArrayLike) -> list[NDArray[np.complex128]]:
-        """Return what each pulse that sees a fractional pixel adds to it, pixel by pixel, (pulse,) complex128.
+        """Return the contributions of the pulses that illuminate each fractional pixel, (pulse,) complex128 each.
 
         Raises
         ------
@@ -170,19 +170,21 @@ class Formation:
             If there are only profiles.
         """
         if self.history is None:
-            raise ValueError("profiles do not tell what each pulse adds")
+            raise ValueError("contributions of single pulses need a phase history, there are only profiles")
         places = self.positions_at(np.atleast_1d(row), np.atleast_1d(column))
         parts: list[list[NDArray[np.complex128]]] = [[np.empty(0, np.complex128)] for _ in places]
-        for pulses, seen in self.seeing(places):
+        for pulses, parts_of in self.illuminating_pulses(places):
             some = self.history[pulses]
-            for part, lit in seen:
-                terms = reference.terms(some[part], places[lit], self.beams and self.beams[pulses][part])
-                for place, column_of in zip(np.flatnonzero(lit), terms.T, strict=True):
+            for part, inside in parts_of:
+                terms = reference.terms(some[part], places[inside], self.beams and self.beams[pulses][part])
+                for place, column_of in zip(np.flatnonzero(inside), terms.T, strict=True):
                     parts[place].append(column_of[column_of != 0])
         return [np.concatenate(part) for part in parts]
 
-    def seeing(self, places: NDArray[np.float64]) -> Iterator[tuple[slice, list[tuple[slice, NDArray[np.bool_]]]]]:
-        """Yield blocks of pulses to be read, each with the parts of it that may see some places, and which.
+    def illuminating_pulses(
+        self, places: NDArray[np.float64]
+    ) -> Iterator[tuple[slice, list[tuple[slice, NDArray[np.bool_]]]]]:
+        """Yield blocks of pulses to read, each with its parts that may illuminate some places, and the mask of these.
 
         Parameters
         ----------
@@ -190,11 +192,11 @@ class Formation:
             (place, 3) float64, metres.
         """
         aperture, beams = self.profiles.aperture, self.beams
-        lit = reached(beams, aperture, places, np.zeros(len(places)), pulses=PULSES)
+        mask = illumination_mask(beams, aperture, places, np.zeros(len(places)), pulses=PULSES)
         for first in range(0, len(aperture), PULSES_READ):
             block = slice(first, min(first + PULSES_READ, len(aperture)))
             length = block.stop - block.start
-            rows = lit[first // PULSES : -(-block.stop // PULSES)]
+            rows = mask[first // PULSES : -(-block.stop // PULSES)]
             parts = [
                 (slice(number * PULSES, min(length, (number + 1) * PULSES)), row)
                 for number, row in enumerate(rows)
@@ -219,7 +221,7 @@ class Formation:
             self.grid,
             self.plan.terrain,
             side_px=self.side_px,
-            weighing=Weighing(self.beams, summed, self.plan.count, self.ways),
+            weighing=Weighing(self.beams, summed, self.plan.count, self.variant_counts),
         )
 
 

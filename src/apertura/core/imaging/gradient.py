@@ -1,4 +1,4 @@
-"""The differentiable front door: how one's own objective of an image changes with where its pulses were."""
+"""Gradient of a caller's objective of an image with respect to phase centres and paths."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -58,7 +58,7 @@ def gradient(
 
     Notes
     -----
-    Source: docs/theory/autofocus.md, eq. 6 to 8: the exact derivative of the interpolated, turned and summed samples.
+    Source: docs/theory/autofocus.md, eq. 6 to 8: the exact derivative of the interpolated, rotated and summed samples.
     Finite differences of images by `backproject` agree as far as their engine's error lets them.
 
     Examples
@@ -75,8 +75,8 @@ def gradient(
     >>> grid = ap.SceneGrid("local", -2.0, 2.0, 0.1, (40, 40))
     >>> image = ap.backproject(history, grid).values
     >>> profiles = ap.range_compress(history, grid, ap.FlatGround(0.0))
-    >>> found = ap.gradient(profiles, grid, 4 * np.abs(image) ** 2 * image)
-    >>> int(np.abs(found.rx_m[:, 2]).argmax()), bool(found.rx_m[64, 2] < 0), found.path_m.shape
+    >>> derivatives = ap.gradient(profiles, grid, 4 * np.abs(image) ** 2 * image)
+    >>> int(np.abs(derivatives.rx_m[:, 2]).argmax()), bool(derivatives.rx_m[64, 2] < 0), derivatives.path_m.shape
     (64, True, (128,))
     """
     if not isinstance(profiles, Profiles):

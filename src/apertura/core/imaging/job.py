@@ -1,4 +1,4 @@
-"""From what is known of a pair and a scene to the planner's job, checked before anything is planned."""
+"""The planner's job from the inputs of a pair and a scene, checked before planning."""
 
 from functools import partial
 from typing import Any
@@ -24,14 +24,14 @@ from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.map_crs import check_crs
 from apertura.core.scene.terrain import FlatGround, GroundModels, Terrain
 
-# ---- Whether what was recorded belongs to the scene asked for, before anything is planned --------------------------
+# ---- Checks of inputs against the scene
 
-_POINTS = 9
-_PULSES = 256
+_POINTS = 9  # along a side of the scene, sampled
+_PULSES = 256  # sampled for total paths
 
 
 def check_inputs(inputs: PhaseHistory | Profiles, grid: SceneGrid, terrain: Terrain) -> dict[str, str]:
-    """Return flags: limit that the inputs exceed on a scene → what was found, in one line.
+    """Return flags: limit that the inputs exceed on a scene → what was measured, in one line.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ def check_inputs(inputs: PhaseHistory | Profiles, grid: SceneGrid, terrain: Terr
     ------
     CampaignError
         If the grid's CRS is not one for a scene, a position, sample or height is not finite, an antenna is in the
-        ground, all samples are zero, or the scene lies where the inputs hold no echo.
+        ground, all samples are zero, or the scene lies beyond the samples of all pulses.
     """
     if grid.crs != LOCAL:
         check_crs(grid.crs, grid.bounds_m)
@@ -89,7 +89,7 @@ def _check_samples(inputs: PhaseHistory | Profiles) -> None:
 def _outside(inputs: PhaseHistory | Profiles, points: np.ndarray) -> float:
     """Return the share of total paths, from some pulses to some points, that lie beyond the samples.
 
-    A phase history repeats itself every c/Δf; beyond that to either side of its reference a scene is taken for wrong.
+    A phase history repeats itself every c/Δf; a scene farther than that to either side of its reference is refused.
     """
     some = inputs[inputs.aperture.sample(_PULSES)]
     path = some.aperture.path(points)
@@ -100,21 +100,21 @@ def _outside(inputs: PhaseHistory | Profiles, points: np.ndarray) -> float:
     return float(((place < 0) | (place > some.samples.shape[1] - 1)).mean())
 
 
-# ---- From what is known of a pair and a scene to the planner's job -------------------------------------------------
+# ---- The planner's job of a pair and a scene
 
-_PATCH_PX = 256
-_CONTENT_PIXELS = 128
-_CONTENT_PULSES = 16384  # of which the terms of so many pixels take 32 MB
+_PATCH_PX = 256  # side of the windows whose positions predictions use
+_CONTENT_PIXELS = 128  # random ones for `content_loss_db`
+_CONTENT_PULSES = 16384  # at most: their terms at so many pixels take 32 MB
 
 
-def settle(
+def decide_integration(
     aperture: Aperture,
     centre_hz: float,
     grid: SceneGrid,
     level: FlatGround,
     *,
     antennas: Beams | None = None,
-    asked: Any = "auto",
+    requested: Any = "auto",
 ) -> Integration:
     """Return over how much of a flight the pixels of a scene are integrated.
 
@@ -129,7 +129,7 @@ def settle(
     """
     points_m = grid.sample_points(_POINTS, level.height_m)
     geometry: dict[str, Any] = {"spacing_m": grid.spacing_m, "wavelength_m": SPEED_OF_LIGHT_M_S / centre_hz}
-    return integrate(aperture, points_m, **geometry, antennas=antennas, asked=asked)
+    return integrate(aperture, points_m, **geometry, antennas=antennas, requested=requested)
 
 
 def imaging_job(
@@ -152,13 +152,13 @@ def imaging_job(
     frequency_hz, weight
         (subcarrier,) float64, RF frequency and window.
     grid, ground
-        The scene: its pixels, its ground and that one's cheaper models.
+        The scene: its pixels, its ground and cheaper models of the ground.
     history
-        What was recorded, where it is there: it tells how much errors weigh between the scene's targets.
+        What was recorded, where there is a recording: gives the weight of errors between the scene's targets.
     beams
         Of the antennas, where they have any.
     integration
-        As `apertura.core.planning.decisions.integrate` is asked.
+        As `requested` of `apertura.core.planning.decisions.integrate`.
 
     Returns
     -------
@@ -167,8 +167,8 @@ def imaging_job(
     """
     centre, count = centre_frequency(frequency_hz), len(frequency_hz)
     ground_m = grid.sample_points(_POINTS, ground.level.height_m)
-    settled = settle(aperture, centre, grid, ground.level, antennas=beams, asked=integration)
-    beams = Beams.within(settled.sector, beams)
+    decided = decide_integration(aperture, centre, grid, ground.level, antennas=beams, requested=integration)
+    beams = Beams.within(decided.sector, beams)
     window = RangeWindow.of(aperture, grid, ground.full, frequency_hz, beams=beams)
     return Job(
         aperture=aperture,
@@ -184,14 +184,14 @@ def imaging_job(
         patches_on=partial(_patches, grid),
         content_db=None if history is None else _content_db(history, grid, ground.full, beams),
         beams=beams,
-        integration=settled,
+        integration=decided,
     )
 
 
 def profiles_job(
     profiles: Profiles, grid: SceneGrid, ground: GroundModels, *, beams: Beams | None = None, integration: Any = "auto"
 ) -> Job:
-    """Return the planner's job of range profiles alone: their band is taken as full and flat, their echo as unseen.
+    """Return the planner's job of range profiles alone: their band is taken as full and flat, their content as unknown.
 
     Parameters
     ----------
@@ -203,7 +203,7 @@ def profiles_job(
     bandwidth_hz = SPEED_OF_LIGHT_M_S / (profiles.step_m * profiles.oversampling)
     centre, samples = profiles.centre_frequency_hz, profiles.samples.shape[1]
     ground_m = grid.sample_points(_POINTS, ground.level.height_m)
-    settled = settle(profiles.aperture, centre, grid, ground.level, antennas=beams, asked=integration)
+    decided = decide_integration(profiles.aperture, centre, grid, ground.level, antennas=beams, requested=integration)
     return Job(
         aperture=profiles.aperture,
         ground_m=ground_m,
@@ -216,8 +216,8 @@ def profiles_job(
         frame=grid.frame,
         terrain=ground,
         patches_on=partial(_patches, grid),
-        beams=Beams.within(settled.sector, beams),
-        integration=settled,
+        beams=Beams.within(decided.sector, beams),
+        integration=decided,
         recorded=False,
     )
 

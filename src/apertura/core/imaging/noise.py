@@ -1,4 +1,4 @@
-"""How noisy a pulse is, measured where nothing of the scene turns as fast."""
+"""Noise power of a pulse, measured at the Doppler farthest from the scene's: by sums with alternating signs."""
 
 from dataclasses import replace
 
@@ -6,16 +6,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.core.antenna.beam import Beams
-from apertura.core.antenna.illumination import reached
+from apertura.core.antenna.illumination import illumination_mask
 from apertura.core.focus.contributions import band_limited_image
 from apertura.core.focus.inputs import Profiles
 from apertura.core.focus.reach import PULSES
 
 PLACES, BLOCKS = 64, 32
-"""At so many random places, by so many blocks of 64 pulses at most."""
+"""Random places, and blocks of 64 pulses at most, that the noise is measured at."""
 
-_FEWEST = 16  # pulses of a block
-_LIT = 0.1  # of the most that a block weighs at a place: places that weigh less do not count
+_FEWEST = 16  # pulses of a block at least
+_LEAST_WEIGHT = 0.1  # of the largest weight of a block at a place: places with less are left out
 
 
 def noise_power(profiles: Profiles, places_m: NDArray[np.float64], *, beams: Beams | None = None) -> float:
@@ -28,12 +28,12 @@ def noise_power(profiles: Profiles, places_m: NDArray[np.float64], *, beams: Bea
     places_m
         (place, 3) float64, metres: spread over the scene.
     beams
-        What weighs the pulses.
+        Weights of the pulses.
 
     Returns
     -------
     float
-        NaN where too few pulses see too little. An upper bound where pulses lie so wide that echoes of every other
+        NaN where no block illuminates a place. An upper bound where pulses are so sparse that echoes of every other
         pulse alias.
 
     Notes
@@ -41,26 +41,26 @@ def noise_power(profiles: Profiles, places_m: NDArray[np.float64], *, beams: Bea
     Source: docs/theory/layers.md, eq. 3.
     """
     starts, places = np.arange(0, len(profiles), PULSES), np.zeros(len(places_m))
-    lit = reached(beams, profiles.aperture, places_m, places, pulses=PULSES)
-    seeing = starts[lit.any(axis=1) & (np.minimum(starts + PULSES, len(profiles)) - starts >= _FEWEST)]
-    if not seeing.size:
+    illuminated = illumination_mask(beams, profiles.aperture, places_m, places, pulses=PULSES)
+    illuminating = starts[illuminated.any(axis=1) & (np.minimum(starts + PULSES, len(profiles)) - starts >= _FEWEST)]
+    if not illuminating.size:
         return float("nan")
-    chosen = seeing[np.unique(np.linspace(0, len(seeing) - 1, BLOCKS).round().astype(int))]
+    chosen = illuminating[np.unique(np.linspace(0, len(illuminating) - 1, BLOCKS).round().astype(int))]
     power, weight = np.empty((2, len(chosen), len(places_m)))
     for number, first in enumerate(chosen.tolist()):
         block = slice(first, min(first + PULSES, len(profiles)))
-        power[number], weight[number] = _silent(profiles[block], places_m, beams and beams[block])
-    enough = weight > _LIT * weight.max()
+        power[number], weight[number] = _alternating_power(profiles[block], places_m, beams and beams[block])
+    enough = weight > _LEAST_WEIGHT * weight.max()
     return float(np.median(power[enough] / weight[enough]) / np.log(2)) if enough.any() else float("nan")
 
 
-def _silent(
+def _alternating_power(
     profiles: Profiles, places_m: NDArray[np.float64], beams: Beams | None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return what pulses with alternating signs focus at places, as power, and Σ of their squared weights."""
+    """Return the power at places of the sum of pulses with alternating signs, and Σ of their squared weights."""
     count = len(profiles)
     taper = np.hanning(count + 2)[1:-1] * np.where(np.arange(count) % 2, -1.0, 1.0)
-    turned = replace(profiles, samples=np.asarray(profiles.samples * taper[:, None], np.complex64))
+    alternating = replace(profiles, samples=np.asarray(profiles.samples * taper[:, None], np.complex64))
     weight = np.ones((count, len(places_m))) if beams is None else beams.weight(profiles.aperture, places_m)
-    image = band_limited_image(turned, places_m, beams=beams)
+    image = band_limited_image(alternating, places_m, beams=beams)
     return np.abs(image) ** 2, taper**2 @ weight**2

@@ -1,4 +1,4 @@
-"""Range profiles of a scene: where each pulse's begins, how many samples it needs, stages as arrays."""
+"""Range profiles of a scene: start and length of each pulse's window, compression, and stages as arrays."""
 
 from dataclasses import dataclass
 from typing import Any, cast
@@ -15,7 +15,7 @@ from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.swath import swath
 from apertura.core.scene.terrain import Terrain
 
-# ---- Range profiles of a scene: where each pulse's begins, how many samples it needs, and how they are computed
+# ---- Range windows and compression
 
 GUARD_SAMPLES = 32
 """Samples beyond the swath on both sides, for the filters of the engines."""
@@ -39,7 +39,7 @@ class RangeWindow:
     unambiguous
         Samples after which the profile repeats itself.
     farthest_m
-        (pulse,) float64, longest total path to what the pulse may add to, metres; -inf where that is nothing.
+        (pulse,) float64, longest total path to a pixel that the pulse contributes to, metres; -inf without any.
     """
 
     start_m: NDArray[np.float64]
@@ -50,7 +50,7 @@ class RangeWindow:
 
     @property
     def contributing(self) -> NDArray[np.bool_]:
-        """(pulse,) bool: whether a pulse may add to anything; the profile of one that does not is never looked at."""
+        """(pulse,) bool: whether a pulse may contribute to a pixel; the profile of one that does not is never read."""
         return np.isfinite(self.farthest_m)
 
     @classmethod
@@ -74,7 +74,8 @@ class RangeWindow:
         frequency_hz
             (subcarrier,) float64, ascending in equal steps.
         beams
-            What weighs pulses: each pulse's window covers what it may add to. By default it covers all of the scene.
+            Weights of pulses: each pulse's window covers the pixels that it may contribute to. By default all of the
+            scene.
 
         Notes
         -----
@@ -153,13 +154,13 @@ def range_compress(
     )
 
 
-# ---- Stages as what the engines are given: plain arrays, without files ---------------------------------------------
+# ---- Stages as inputs of engines
 
-_APART = 64  # pulses: further apart they are read one by one
+_SPARSE_STEP = 64  # pulses: at larger steps they are read one by one
 
 
 class Rows:
-    """Samples of a stage that are read as pulses are asked for.
+    """Samples of a stage, read on access by pulse.
 
     Parameters
     ----------
@@ -182,9 +183,9 @@ class Rows:
         return int(self.shape[0])
 
     def __getitem__(self, pulses: slice) -> NDArray[Any]:
-        """Return the samples of some pulses; of pulses far apart no others are decoded."""
+        """Return the samples of some pulses; of sparse pulses no others are decoded."""
         first, last, step = pulses.indices(len(self))
-        if step > _APART:
+        if step > _SPARSE_STEP:
             return np.stack([self._array[number].values for number in range(first, last, step)])
         return np.asarray(self._array[first:last].values[::step])
 
@@ -194,7 +195,7 @@ class Rows:
 
 
 def phase_history_of(echo: xr.Dataset, window: str, *, lazy: bool = False) -> PhaseHistory:
-    """Return an echo stage as arrays, weighted by a window over the subcarriers; `lazy`: samples as they are asked."""
+    """Return an echo stage as arrays, weighted by a window over the subcarriers; `lazy`: samples read on access."""
     return PhaseHistory(
         cast("NDArray[np.complex64]", Rows(echo.transfer)) if lazy else echo.transfer.values,
         echo.frequency.values,
@@ -222,7 +223,7 @@ def aperture_of(stage: xr.Dataset) -> Aperture:
 
 
 def inputs_of(given: PhaseHistory | Profiles | xr.Dataset, window: str = "hann") -> PhaseHistory | Profiles:
-    """Return what an engine reads: arrays as they are, or those of a stage `echo` or `profile`.
+    """Return the inputs of an engine: arrays as they are, or those of a stage `echo` or `profile`.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""How a pair saw its scene: one figure each for direction, angles, distance and band, at the scene's middle."""
+"""Imaging geometry of a pair at the scene's middle: direction, angles, distance and band."""
 
 from typing import Any
 
@@ -10,27 +10,27 @@ from apertura.core.imaging.formation import Formation
 from apertura.core.scene.visibility import bistatic_angle_deg, incidence_deg
 
 _COUNTS = 0.5
-"""Weight from which a pulse counts as one that sees the middle."""
+"""Weight of a pulse at the middle from which it counts as illuminating it: half amplitude."""
 
 
 def view_report(formation: Formation, began: np.datetime64, time_s: NDArray[np.float64]) -> dict[str, Any]:
-    """Return what image.json says of the view of the scene's middle; angles and distance at closest approach.
+    """Return the imaging geometry for image.json, of the scene's middle; angles and distance at closest approach.
 
     Parameters
     ----------
     formation
-        What forms the image.
+        Formation of the image.
     began, time_s
         The first pulse, UTC; and (pulse,) float64, seconds from it.
 
     Returns
     -------
     dict
-        `first_utc`, `last_utc`: the pulses that see the middle, all of them where none does. `heading_deg`,
-        `look_deg`: where the antennas' midpoint flies and looks to, clockwise from grid north. `incidence_deg`: of the
-        transmitter, from the vertical. `bistatic_angle_deg`. `range_m`: half the total path. `height_m`: of the
-        midpoint above the ground. `centre_hz`, `band_hz`. `carrier_cycles_m`: the spatial frequency that the image's
-        band lies about, east and north (docs/theory/interferometry.md, eq. 1).
+        `first_utc`, `last_utc`: the pulses that illuminate the middle, all of them where none does. `heading_deg`,
+        `look_deg`: directions of flight and of view of the antennas' midpoint, clockwise from grid north.
+        `incidence_deg`: of the transmitter, from the vertical. `bistatic_angle_deg`. `range_m`: half the total path.
+        `height_m`: of the midpoint above the ground. `centre_hz`, `band_hz`. `carrier_cycles_m`: the spatial frequency
+        that the image's band lies about, east and north (docs/theory/interferometry.md, eq. 1).
     """
     here, (east, north) = ground_axes(formation, *((size - 1) / 2 for size in formation.grid.shape))
     profiles, beams = formation.profiles, formation.beams

@@ -1,4 +1,4 @@
-"""The simplest model that will do: accuracy, autofocus, ground and integration, each with its reason."""
+"""Decisions on accuracy, autofocus, model of the ground and integration, each with its reason."""
 
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
@@ -21,11 +21,11 @@ from apertura.core.quality.budget import (
 )
 from apertura.core.scene.terrain import FlatGround
 
-# ---- How exact arithmetic must be: well below what else is known to spoil the image, and no better -----------------
+# ---- Numerical accuracy
 
 
 def decide_accuracy(lines: Sequence[BudgetLine]) -> Decision:
-    """Return the numerical error to ask for, and the line of the error budget that it follows from.
+    """Return the numerical error to request, and the line of the error budget that it follows from.
 
     Examples
     --------
@@ -43,28 +43,27 @@ def decide_accuracy(lines: Sequence[BudgetLine]) -> Decision:
     return Decision("accuracy_db", value, f"auto: {ARITHMETIC_BELOW_DB:g} dB below {cause}")
 
 
-# ---- Whether the tracks of a flight are refined by its images: only where errors of position cost more than is
-# borne
+# ---- Autofocus
 
-BORNE_DB = 0.2
-"""Loss of a peak by errors of position that is borne.
+TOLERATED_LOSS_DB = 0.2
+"""dB, loss of a peak by errors of position that is tolerated without autofocus.
 
-RTK at its best, half a centimetre in each log, costs 0.3 dB at L-band; less than this shows in no image, and is not
-worth a job that reads all pairs of a flight together.
+RTK at its best, half a centimetre in each log, costs 0.3 dB at L-band; less than this is not visible in any image, and
+not worth a job that reads all pairs of a flight together.
 """
 
 
-def decide_autofocus(asked: str, loss_db: Mapping[str, float], silent: Collection[str]) -> Decision:
-    """Return whether tracks are refined, on or off, and why.
+def decide_autofocus(requested: str, loss_db: Mapping[str, float], unstated: Collection[str]) -> Decision:
+    """Decide whether tracks are refined, on or off.
 
     Parameters
     ----------
-    asked
+    requested
         auto, on or off.
     loss_db
-        Pair → what errors of position that somebody stated are expected to cost, 0 or less.
-    silent
-        Nodes of whose errors nobody said anything.
+        Pair → expected loss by stated errors of position, dB, 0 or less.
+    unstated
+        Nodes without stated errors of position.
 
     Examples
     --------
@@ -73,39 +72,42 @@ def decide_autofocus(asked: str, loss_db: Mapping[str, float], silent: Collectio
     >>> decide_autofocus("auto", {"a-a": 0.0}, ["a"]).value
     'off'
     """
-    if asked != "auto":
-        return Decision("autofocus", asked, "asked for")
-    if silent:
-        missing = f"auto: nobody said how well positions of {' and '.join(silent)} are known"
+    if requested != "auto":
+        return Decision("autofocus", requested, "asked for")
+    if unstated:
+        missing = f"auto: nobody said how well positions of {' and '.join(unstated)} are known"
         return Decision("autofocus", "off", f"{missing}; state nodes.<node>.position_std_m to have them refined")
     pair, worst_db = min(loss_db.items(), key=lambda one: one[1])
-    value, than = ("on", "more") if worst_db < -BORNE_DB else ("off", "no more")
+    value, than = ("on", "more") if worst_db < -TOLERATED_LOSS_DB else ("off", "no more")
     cost = f"errors of position that are stated cost {-worst_db:.2f} dB in {pair}"
-    return Decision("autofocus", value, f"auto: {cost}, {than} than the {BORNE_DB} dB borne")
+    return Decision("autofocus", value, f"auto: {cost}, {than} than the {TOLERATED_LOSS_DB} dB borne")
 
 
-# ---- The simplest model of the ground that keeps focus and place: a plane, a tilted plane, or the DEM --------------
+# ---- Model of the ground
 
 FOCUS_RAD = 0.4
+"""Phase error, radians rms, that a cheaper ground may add: 0.7 dB of a peak (docs/theory/planner.md, "Terrain")."""
+
 SHIFT_PIXELS = 0.5
+"""Shift of a pixel, in pixels, that a cheaper ground may add: a place stays in its own pixel."""
 
 
-def decide_terrain(job: Job, *, asked: str | None = None, where: str = "processing") -> Decision:
-    """Decide whether a plane, a tilted plane or the DEM stands for the ground.
+def decide_terrain(job: Job, *, requested: str | None = None, where: str = "processing") -> Decision:
+    """Decide whether the ground is modelled by a plane, a tilted plane or the DEM.
 
     Parameters
     ----------
     job
         What is to be imaged.
-    asked
-        What a person asks for; None: the rule decides.
+    requested
+        Requested model; None: the rule decides.
     where
-        Section of the config that asks, for messages.
+        Section of the config with the request, for messages.
 
     Raises
     ------
     CampaignError
-        If a DEM's model is asked for and there is none.
+        If a model other than a plane is requested without a DEM.
 
     Notes
     -----
@@ -113,16 +115,16 @@ def decide_terrain(job: Job, *, asked: str | None = None, where: str = "processi
     range and shifts the pixel by δh·H over it.
     """
     chosen = _by_rule(job)
-    if asked is None or asked == chosen.value:
+    if requested is None or requested == chosen.value:
         return chosen
     if isinstance(job.terrain.full, FlatGround):
         raise CampaignError(
-            f"terrain is {asked}",
+            f"terrain is {requested}",
             where=f"{where}.terrain",
             expected="plane or auto: the scene has no DEM",
             remedy="Name a DEM in scene.dem, or leave terrain to the planner.",
         )
-    return Decision("terrain", asked, f"asked for; the rule says {chosen.value}: {chosen.reason}")
+    return Decision("terrain", requested, f"asked for; the rule says {chosen.value}: {chosen.reason}")
 
 
 def _by_rule(job: Job) -> Decision:
@@ -137,9 +139,9 @@ def _by_rule(job: Job) -> Decision:
 
 def _tolerance(job: Job) -> tuple[float, str]:
     """Return how far heights may be wrong, metres, and why."""
-    apart = job.aperture.middle_m[job.aperture.sample(64)][:, None] - job.points_m
-    above = apart @ vertical(job.ground_m)
-    ground = np.sqrt(np.maximum((apart**2).sum(-1) - above**2, 1e-6))
+    offset_m = job.aperture.middle_m[job.aperture.sample(64)][:, None] - job.points_m
+    above = offset_m @ vertical(job.ground_m)
+    ground = np.sqrt(np.maximum((offset_m**2).sum(-1) - above**2, 1e-6))
     nearest, steepest = float(ground.min()), float((np.abs(above) / ground).max())
     wobble_m = job.aperture.wobble_m
     focus_m = FOCUS_RAD * job.wavelength_m * nearest / (4 * np.pi * max(wobble_m, 1e-9))
@@ -150,17 +152,16 @@ def _tolerance(job: Job) -> tuple[float, str]:
     )
 
 
-# ---- How much of a flight a pixel is integrated over: what the resolution asked for needs, and no more than was
-# flown
+# ---- Integration
 
 CHORD = 0.1
-"""Of the range to the scene: the way over which directions of flight are taken."""
+"""Share of the range to the scene over which directions of flight are taken: longer than position errors."""
 
-TURNED = 1.5
-"""Pixels seen under so many times the angle that a straight flight would give are flagged."""
+MOST_ASPECT = 1.5
+"""Aspect angle of a place over the integration angle above which `integration_turns` is raised: the track turns."""
 
-_PULSES = 256  # that tell the geometry
-_COUNTED = 16384  # that tell how many pulses a pixel takes
+_PULSES = 256  # sampled for the geometry
+_COUNTED = 16384  # pulses sampled to count those of a pixel
 
 
 def integrate(
@@ -170,7 +171,7 @@ def integrate(
     spacing_m: float,
     wavelength_m: float,
     antennas: Beams | None = None,
-    asked: Any = "auto",
+    requested: Any = "auto",
     where: str = "processing",
 ) -> Integration:
     """Return over how much of a flight the pixels of a scene are integrated.
@@ -184,47 +185,47 @@ def integrate(
     spacing_m, wavelength_m
         Of the pixels, and of the band's middle.
     antennas
-        Their beams, where they have any.
-    asked
+        Beams of the antennas, if any.
+    requested
         'auto', 'all', or a mapping with `degrees` or `resolution_m`.
     where
-        Section of the config that asks, for messages.
+        Section of the config with the request, for messages.
 
     Raises
     ------
     CampaignError
-        If no pulse sees any of the scene inside the sector.
+        If no pulse illuminates any of the scene inside the sector.
 
     Notes
     -----
     Source: docs/theory/integration.md.
     """
-    if asked == "all" or len(aperture) < 2:
+    if requested == "all" or len(aperture) < 2:
         return Integration(None, len(aperture), "all", "asked for: every pulse counts for every pixel")
     points = points_m.reshape(-1, 3)
     some = aperture[aperture.sample(_PULSES)]
     nearest_m = np.linalg.norm(some.middle_m[:, None] - points, axis=-1).min(axis=1)
-    whole = Sector.of(aperture, chord_m=CHORD * float(np.median(nearest_m)), centre=0.0, half=2.0)
-    straight = whole[aperture.sample(_PULSES)]
-    place, squint = straight.place(some, points), _squint(whole, antennas)
+    flight = Sector.of(aperture, chord_m=CHORD * float(np.median(nearest_m)), centre=0.0, half=2.0)
+    straight = flight[aperture.sample(_PULSES)]
+    place, squint = straight.place(some, points), _squint(flight, antennas)
     per_path = _gradient_per_path(some, straight, points)
-    if asked == "auto":
+    if requested == "auto":
         half, why = wavelength_m / (2 * per_path * spacing_m) / (1 + TAPER), f"pixels of {spacing_m:g} m carry no more"
         flown = float(np.ptp(place, axis=0).max())
         if flown <= 2 * half * (1 + TAPER):
             cell_m = wavelength_m / (per_path * flown) if flown else np.inf
-            carried = f"every pulse counts: pixels of {spacing_m:g} m carry the {cell_m:.3g} m that was flown"
-            return Integration(None, len(aperture), "all", carried)
+            reason = f"every pulse counts: pixels of {spacing_m:g} m carry the {cell_m:.3g} m that was flown"
+            return Integration(None, len(aperture), "all", reason)
     else:
-        why, half = "asked for", float(np.sin(np.radians(asked.get("degrees", 0)) / 2) * np.sqrt(1 - squint**2))
-        half = wavelength_m / (2 * per_path * asked["resolution_m"]) if "resolution_m" in asked else half
+        why, half = "asked for", float(np.sin(np.radians(requested.get("degrees", 0)) / 2) * np.sqrt(1 - squint**2))
+        half = wavelength_m / (2 * per_path * requested["resolution_m"]) if "resolution_m" in requested else half
     centre = _nearest_flown(squint, half * (1 + TAPER), place)
-    sector = Sector(whole.tx_axis, whole.rx_axis, centre, half)
-    return _described(sector, aperture, points_m, wavelength_m / (2 * per_path * half), why, where)
+    sector = Sector(flight.tx_axis, flight.rx_axis, centre, half)
+    return _integration_of(sector, aperture, points_m, wavelength_m / (2 * per_path * half), why, where)
 
 
 def _nearest_flown(squint: float, outer: float, place: NDArray[np.float64]) -> float:
-    """Return the centre nearest to `squint` about which most of the scene (pulse, place) was passed."""
+    """Return the centre nearest to `squint` about which most of the scene (pulse, place) was flown past."""
     first, last = place.min(axis=0), place.max(axis=0)
     middle = (first + last) / 2
     reach = np.maximum(last - middle - outer, 0)
@@ -232,31 +233,31 @@ def _nearest_flown(squint: float, outer: float, place: NDArray[np.float64]) -> f
     return centre if abs(centre - squint) > 1e-3 * outer else squint
 
 
-def _squint(whole: Sector, antennas: Beams | None) -> float:
+def _squint(flight: Sector, antennas: Beams | None) -> float:
     """Return s along the boresights, median over the pulses; 0 without beams."""
     if antennas is None:
         return 0.0
     stated = [beam.axes[:, 0] for beam in (antennas.transmit, antennas.receive) if beam is not None]
     tx, rx = stated[0], stated[-1]
-    return float(np.median((whole.tx_axis * tx).sum(axis=1) + (whole.rx_axis * rx).sum(axis=1)))
+    return float(np.median((flight.tx_axis * tx).sum(axis=1) + (flight.rx_axis * rx).sum(axis=1)))
 
 
-def _gradient_per_path(aperture: Aperture, whole: Sector, points: NDArray[np.float64]) -> float:
-    """Return how much the path's gradient along the flight changes per change of s: 2 where both antennas fly alike."""
-    flown = whole.tx_axis + whole.rx_axis
+def _gradient_per_path(aperture: Aperture, flight: Sector, points: NDArray[np.float64]) -> float:
+    """Return the change of the path's gradient along the flight per change of s: 2 for antennas flying in parallel."""
+    flown = flight.tx_axis + flight.rx_axis
     ahead = flown / np.maximum(np.linalg.norm(flown, axis=1, keepdims=True), 1e-9)
     along = np.einsum("pnx,px->pn", aperture.path_gradient(points), ahead)
-    moved, turned = (np.abs(np.diff(each, axis=0)).sum(axis=0) for each in (whole.place(aperture, points), along))
-    return float(np.median(turned / np.where(moved > 0, moved, np.inf))) or 2.0
+    moved, changed = (np.abs(np.diff(each, axis=0)).sum(axis=0) for each in (flight.place(aperture, points), along))
+    return float(np.median(changed / np.where(moved > 0, moved, np.inf))) or 2.0
 
 
-def _described(
+def _integration_of(
     sector: Sector, aperture: Aperture, points_m: NDArray[np.float64], resolution_m: float, why: str, where: str
 ) -> Integration:
-    """Return the integration by a sector, with what it makes of the scene."""
+    """Return the integration by a sector, with its pulses per place, resolution and flags."""
     points = points_m.reshape(-1, 3)
-    total, seen = _counted(sector, aperture, points)
-    if not seen.any():
+    total, pulses = _pulses_per_place(sector, aperture, points)
+    if not pulses.any():
         raise CampaignError(
             f"zero pulses see the scene inside the integration angle (s = {sector.centre:.3g} ± {sector.half:.3g})",
             where=f"{where}.integration",
@@ -264,7 +265,7 @@ def _described(
             remedy="Set processing.integration to all, or correct scene.bounds_m.",
         )
     degrees = float(np.degrees(2 * np.arcsin(min(1.0, sector.half))))
-    least, median, most = (round(float(np.quantile(seen, part))) for part in (0, 0.5, 1))
+    least, median, most = (round(float(np.quantile(pulses, part))) for part in (0, 0.5, 1))
     counted = f"of {len(aperture)} pulses a place takes {least} to {most} (median {median})"
     width, sidelobe_db = response()
     report = {
@@ -277,43 +278,43 @@ def _described(
         "pulses_per_pixel": {"least": least, "median": median, "most": most, "of": len(aperture)},
     }
     flags = {}
-    if not seen.all():
-        share = f"{100 * float((seen == 0).mean()):.1f} % of the scene"
+    if not pulses.all():
+        share = f"{100 * float((pulses == 0).mean()):.1f} % of the scene"
         flags["outside_swath"] = f"{share} is passed by no pulse inside the integration angle of {degrees:.3g}°"
-    under = _seen_under(sector, aperture, points[seen > 0], vertical(points_m))
-    if under > TURNED * degrees * (1 + TAPER):
+    under = _aspect_deg(sector, aperture, points[pulses > 0], vertical(points_m))
+    if under > MOST_ASPECT * degrees * (1 + TAPER):
         flags["integration_turns"] = (
             f"places are seen under {under:.0f}° in all, {degrees:.3g}° are integrated of a straight pass: the track "
             "turns, or passes them more than once"
         )
     value, count = f"{degrees:.3g}°, {resolution_m:.3g} m", max(1, round(float(total.max())))
-    summed = float(seen.mean()) / len(aperture)
+    summed = float(pulses.mean()) / len(aperture)
     return Integration(sector, count, value, f"{why}; {counted}", summed, report, flags)
 
 
-def _counted(
+def _pulses_per_place(
     sector: Sector, aperture: Aperture, points: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the sum of the weights at each point, and how many pulses have one; of many, spread ones stand in."""
+    """Return the sum of the weights and the number of pulses with weight at each point, from a sample if many."""
     every = slice(None, None, -(-len(aperture) // _COUNTED))
     few, some = aperture[every], sector[every]
-    total, seen = np.zeros((2, len(points)))
+    total, pulses = np.zeros((2, len(points)))
     for first in range(0, len(few), _PULSES):
         weight = some[first : first + _PULSES].weight(few[first : first + _PULSES], points)
-        total, seen = total + weight.sum(axis=0), seen + (weight > 0).sum(axis=0)
+        total, pulses = total + weight.sum(axis=0), pulses + (weight > 0).sum(axis=0)
     scale = len(aperture) / len(few)
-    return scale * total, scale * seen
+    return scale * total, scale * pulses
 
 
-def _seen_under(sector: Sector, aperture: Aperture, points: NDArray[np.float64], up: NDArray[np.float64]) -> float:
-    """Return the angle on the ground under which pulses inside the sector see a place, median over places, degrees."""
+def _aspect_deg(sector: Sector, aperture: Aperture, points: NDArray[np.float64], up: NDArray[np.float64]) -> float:
+    """Return the aspect angle of a place over the pulses inside the sector, median over places, degrees."""
     some = aperture.sample(4 * _PULSES)
     few, inside = aperture[some], sector[some]
-    lit, seen = inside.weight(few, points) >= 0.5, few.path_gradient(points)
+    counted, gradient = inside.weight(few, points) >= 0.5, few.path_gradient(points)
     east = np.cross(up, np.eye(3)[np.abs(up).argmin()])
-    turn = np.degrees(np.arctan2(seen @ np.cross(up, east), seen @ east))
+    turn = np.degrees(np.arctan2(gradient @ np.cross(up, east), gradient @ east))
     spans = []
-    for column, within in zip(turn.T, lit.T, strict=True):
+    for column, within in zip(turn.T, counted.T, strict=True):
         angles = np.sort(column[within])
         if len(angles) > 1:
             spans.append(360 - float(np.diff(angles, append=angles[0] + 360).max()))

@@ -1,4 +1,4 @@
-"""What the planner answers: how an image will be formed, why, what it takes, and the limits of imaging it meets."""
+"""The plan of an image: choices with reasons, memory and disk, and flags of crossed limits of imaging."""
 
 import os
 from collections.abc import Mapping
@@ -21,11 +21,11 @@ from apertura.core.focus.presum import Presum, presummed
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.scene.terrain import Terrain
 
-# ---- Limits of imaging: what a job may not do, and what it may but a person should be told about -------------------
+# ---- Limits of imaging
 
 
 def check_geometry(job: Job) -> dict[str, str]:
-    """Return flags: limit of imaging that the job exceeds → what was found, in one line.
+    """Return flags: limit of imaging that the job exceeds → what was measured, in one line.
 
     Parameters
     ----------
@@ -58,10 +58,10 @@ def check_geometry(job: Job) -> dict[str, str]:
     spread, _ = aperture.phase_rates(job.points_m, wavelength_m=SPEED_OF_LIGHT_M_S / job.band_hz[1])
     if spread > 1:
         flags["pulses_sparse"] = f"phase rates over the scene spread {spread:.2f} cycles per pulse, 1 is unambiguous"
-    unseen = _unseen(aperture, job.points_m, job.path_limit_m)
-    if unseen:
+    beyond = _share_beyond(aperture, job.points_m, job.path_limit_m)
+    if beyond:
         flags["beyond_cyclic_prefix"] = (
-            f"{100 * unseen:.0f} % of the scene arrives too late for all captures: after the cyclic prefix, or listen_s"
+            f"{100 * beyond:.0f} % of the scene arrives too late for all captures: after the cyclic prefix, or listen_s"
         )
     return flags
 
@@ -99,7 +99,7 @@ def _over(
     return over
 
 
-def _unseen(aperture: Aperture, points_m: NDArray[np.float64], path_limit_m: float) -> float:
+def _share_beyond(aperture: Aperture, points_m: NDArray[np.float64], path_limit_m: float) -> float:
     if not np.isfinite(path_limit_m):
         return 0.0
     shortest = aperture[aperture.sample(256)].path(points_m).min(axis=0)
@@ -131,9 +131,7 @@ def vertical(ground_m: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(normal / np.linalg.norm(normal))
 
 
-# ---- What the planner answers: how an image will be formed, with a reason for each choice, and what it takes -------
-
-# ---- What the planner answers: how an image will be formed, with a reason for each choice --------------------------
+# ---- The plan and its decisions
 
 
 @dataclass(frozen=True)
@@ -165,11 +163,11 @@ class Plan:
     setting
         Engine and options.
     fallbacks
-        Next better settings, for tiles whose certified error is worse than asked; the last one is `reference`.
+        Next better settings, for tiles whose certified error is worse than requested; the last one is `reference`.
     decisions
         Every choice with its reason.
     accuracy_db
-        The numerical error asked.
+        The requested numerical error.
     predicted_error_db
         RMS on random pixels: of the setting and of the models.
     predicted_seconds
@@ -177,9 +175,9 @@ class Plan:
     memory_bytes, disk_bytes
         Peak of the imaging step; what it leaves in the results folder.
     flags
-        Limits that the job exceeds: name → what was found, in one line.
+        Limits that the job exceeds: name → what was measured, in one line.
     presum, middle_m
-        The low-pass sum over pulses, and the point they are aligned to; settings of `fallbacks` go without.
+        The low-pass sum over pulses, and the point they are aligned to; settings of `fallbacks` do not use it.
     terrain
         The ground that is imaged on: as it is, a plane through it, or level.
     beams, integration, illumination
@@ -219,7 +217,7 @@ class Plan:
 
     @property
     def count(self) -> int | None:
-        """Pulses that 1 stands for; None: all of them."""
+        """Pulses that the sum is divided by; None: all of them."""
         return None if self.integration is None or self.integration.sector is None else self.integration.count
 
     @property
@@ -248,14 +246,14 @@ class Plan:
         )
 
     def inputs(self, profiles: Profiles) -> Profiles:
-        """Return the profiles that the plan's setting is given: the image's sum over pulses stays the same."""
+        """Return the profiles for the plan's setting, presummed if planned: the image's sum over pulses is the same."""
         return profiles if self.presumming is None else presummed(profiles, *self.presumming)
 
 
-# ---- What a plan takes: bytes of memory and disk, and the blocks of pulses that are in memory at once --------------
+# ---- Memory, disk and blocks of pulses
 
 BLOCK_BYTES = 512 << 20
-"""Of a block of pulses in memory at most, read and as tables: longer flights go block by block."""
+"""Bytes of a block of pulses at most, read and as tables, so that memory does not grow with the flight."""
 
 _BASE_BYTES = 350_000_000  # the interpreter and its libraries
 _PULSE_BYTES = 500  # of a pulse whose samples are not in memory: phase centres, axes, copies of them
@@ -267,25 +265,25 @@ _LEAST_PULSES = 64  # of a block: the kernel sums that many at a time
 _PRODUCT_BYTES = 76  # per pixel: image, its part of the cube, three rasters with overviews, before compression
 
 
-def pulse_blocks(setting: Setting, job: Job, presum: Presum | None, *, asked: int | None = None) -> int:
-    """Return into how many blocks pulses are split: as few as fit into the job's memory, or those asked for.
+def pulse_blocks(setting: Setting, job: Job, presum: Presum | None, *, requested: int | None = None) -> int:
+    """Return into how many blocks pulses are split: as few as fit into the job's memory, or as many as requested.
 
     Where not even the smallest blocks fit, those are taken, and the plan's bytes say that the job does not fit.
     """
     pulses = len(job.aperture) if presum is None else len(presum.at)
-    held = _held_bytes(setting, job, presum)
+    resident = _resident_bytes(setting, job, presum)
     room = min(BLOCK_BYTES, max(1.0, job.memory_bytes - _forming_bytes(job)))
-    if asked is None and held <= room:
+    if requested is None and resident <= room:
         return 1
     less = min(BLOCK_BYTES, max(1.0, job.memory_bytes - _forming_bytes(job) - _SUM_BYTES * job.pixels))
-    wanted = asked or -(-held // less)
-    return int(min(wanted, max(1, pulses // _LEAST_PULSES)))
+    count = requested or -(-resident // less)
+    return int(min(count, max(1, pulses // _LEAST_PULSES)))
 
 
-def block_decision(chosen: Setting, job: Job, presum: Presum | None, *, asked: bool) -> Decision:
-    """Return the choice of pulse blocks with its reason; that of one block does not depend on the machine."""
-    size = f"{decimal(int(_held_bytes(chosen, job, presum)))} of samples and tables"
-    if asked:
+def block_decision(chosen: Setting, job: Job, presum: Presum | None, *, requested: bool) -> Decision:
+    """Return the choice of pulse blocks with its reason; the reason of one block does not depend on the machine."""
+    size = f"{decimal(int(_resident_bytes(chosen, job, presum)))} of samples and tables"
+    if requested:
         why = f"asked for, in blocks of {_LEAST_PULSES} pulses or more; {size} in all"
     elif chosen.pulse_blocks > 1:
         room = decimal(int(min(job.memory_bytes, BLOCK_BYTES)))
@@ -299,14 +297,14 @@ def bytes_needed(job: Job, chosen: Setting, presum: Presum | None) -> tuple[int,
     """Return peak memory of the imaging step, and what the pair leaves on disk, bytes."""
     pulses = len(job.aperture)
     sums = _SUM_BYTES * job.pixels if chosen.pulse_blocks > 1 else 0
-    forming = sums + _held_bytes(chosen, job, presum) // chosen.pulse_blocks
+    forming = sums + _resident_bytes(chosen, job, presum) // chosen.pulse_blocks
     checking = _CHECKED_BYTES * min(pulses, _CHECKED_PULSES) * job.subcarriers
     stages = 8 * pulses * (job.subcarriers + job.signal.samples)
     return _forming_bytes(job) + max(forming, checking), stages + _PRODUCT_BYTES * job.pixels
 
 
-def _held_bytes(setting: Setting, job: Job, presum: Presum | None) -> int:
-    """Return what all pulses would hold in memory at once, as they are read and as tables."""
+def _resident_bytes(setting: Setting, job: Job, presum: Presum | None) -> int:
+    """Return the bytes of all pulses in memory at once, as read and as tables."""
     samples = job.signal.samples if setting.table_bytes else job.subcarriers
     virtual = 0 if presum is None else 16 * (len(job.aperture) + len(presum.at)) * samples
     return _READ_BYTES * 8 * len(job.aperture) * samples + virtual + setting.table_bytes
@@ -346,6 +344,6 @@ def memory_limit(*, groups: Path = Path("/proc/self/cgroup"), root: Path = Path(
             top = root / controllers if controllers else root
             own = top / path.lstrip("/")
             stated = [folder / name for folder in (own, *own.parents) if folder.is_relative_to(top)]
-            found = [file.read_text(encoding="utf-8").strip() for file in stated if file.is_file()]
-            limits += [int(text) for text in found if text.isdecimal()]  # 'max': none
+            texts = [file.read_text(encoding="utf-8").strip() for file in stated if file.is_file()]
+            limits += [int(text) for text in texts if text.isdecimal()]  # 'max': none
     return min(limits)

@@ -15,37 +15,37 @@ from apertura.core.focus.presum import PRESUM_S, Presum, design, presum_error_db
 from apertura.core.planning.decisions import decide_terrain
 from apertura.core.planning.plan import Decision, Plan, block_decision, bytes_needed, check_geometry, pulse_blocks
 
-# ---- The search among the settings of all engines for the cheapest that is exact enough ----------------------------
+# ---- Search among the settings of all engines
 
-UNSEEN_DB = 3.0
-"""Set aside before the echo is there: at random pixels of a sparse scene errors weigh more."""
+UNKNOWN_CONTENT_DB = 3.0
+"""dB reserved before an echo is recorded: at random pixels of a sparse scene errors weigh more (`content_loss_db`)."""
 
-NEAR = 1.3
-"""A setting that costs no more than this times the cheapest may be taken for what the scene's content may cost."""
+CONTENT_COST = 1.3
+"""Cost relative to the cheapest setting up to which the margin for content is paid; beyond, tiles are redone."""
 
-EQUAL = 1.05
-"""Settings that cost no more than this times the chosen one are as cheap: the most exact of them is taken."""
+EQUAL_COST = 1.05
+"""Cost relative to the chosen setting that counts as equal; the most exact of equals is taken."""
 
 _PLACE_S = {"ecef": 2.0e-8, "local": 2.7e-9}  # per pixel position
-_TILE_S = 4.0e-3
+_TILE_S = 4.0e-3  # per tile: task and write
 
 
 @dataclass(frozen=True, eq=False)
 class SettingSearch:
-    """What every choice of a setting looks at.
+    """Search for settings of a job.
 
     Attributes
     ----------
     job
         What is to be imaged.
     engine
-        The one that a person asks for; None: any.
+        Requested engine; None: any.
     options
-        Engine → option → value that a person asks for.
+        Engine → option → requested value.
     pulse_blocks
-        Asked for; None: as few as fit.
+        Requested number; None: as few as fit.
     where
-        Section of the config that asks, for messages.
+        Section of the config with the request, for messages.
     """
 
     job: Job
@@ -57,57 +57,57 @@ class SettingSearch:
     @property
     def content_db(self) -> float:
         """How much more errors may weigh at the scene's pixels than at those of a flat, incoherent one."""
-        return UNSEEN_DB if self.job.content_db is None else max(0.0, self.job.content_db)
+        return UNKNOWN_CONTENT_DB if self.job.content_db is None else max(0.0, self.job.content_db)
 
     @property
     def tile_seconds(self) -> float:
-        """What tiles cost apart from their sums: placing pixels, and writing."""
+        """Seconds of tiles apart from their sums: placing pixels, and writing."""
         return self.job.pixels * _PLACE_S[self.job.frame] + self.job.tiles * _TILE_S
 
     def cheapest(self, pulses: int, target_db: float) -> Setting:
         """Return the cheapest setting that meets the target, or the best there is.
 
-        What the content may cost is paid for as long as it is cheap: beyond that the certificate decides, and tiles
-        that need it are formed again.
+        The margin for the scene's content is applied as long as it is cheap: beyond that the certificate decides, and
+        tiles that need it are formed again.
 
         Raises
         ------
         CampaignError
-            If the engine asked for cannot run here.
+            If the requested engine cannot run here.
         """
         options = self.settings(pulses)
         exact = [setting for setting in options if setting.error_db <= target_db]
         if not exact:
             return min(options, key=lambda setting: setting.error_db)
-        near = [setting for setting in exact if setting.seconds <= NEAR * exact[0].seconds]
+        near = [setting for setting in exact if setting.seconds <= CONTENT_COST * exact[0].seconds]
         sure = (setting for setting in near if setting.error_db <= target_db - self.content_db)
         chosen = next(sure, min(near, key=lambda setting: setting.error_db))
-        equal = (setting for setting in exact if setting.seconds <= EQUAL * chosen.seconds)
+        equal = (setting for setting in exact if setting.seconds <= EQUAL_COST * chosen.seconds)
         return min(equal, key=lambda setting: setting.error_db)
 
     def settings(self, pulses: int) -> list[Setting]:
-        """Return every setting that can run here and that what is asked for leaves, cheapest first.
+        """Return every setting that can run here and fits the request, cheapest first.
 
         Of equal costs the most exact comes first. Placing pixels and writing tiles is in `form_seconds`.
 
         Raises
         ------
         CampaignError
-            If the engine asked for cannot run here, or cannot form this image.
+            If the requested engine cannot run here, or cannot form this image.
         """
         options = [
             replace(setting, form_seconds=setting.form_seconds + self.tile_seconds)
             for name in self._engines()
-            for setting in load_engine(name).candidates(self.job, pulses=pulses, asked=self.options.get(name, {}))
+            for setting in load_engine(name).candidates(self.job, pulses=pulses, requested=self.options.get(name, {}))
         ]
         if not options:
             able = sorted({setting.engine for setting in replace(self, engine=None, options={}).settings(pulses)})
             weighed = ", whose pulses are weighed by antennas or a sector of the flight" if self.job.weights else ""
-            raise self._unfit(f"cannot form this image{weighed}", able)
+            raise self._unsuitable(f"cannot form this image{weighed}", able)
         return sorted(options, key=lambda setting: (setting.seconds, setting.error_db))
 
     def fallbacks(self, chosen: Setting) -> tuple[Setting, ...]:
-        """Return the cheapest setting per 6 dB gained, whatever was asked for, ending with the double sum."""
+        """Return the cheapest setting per 6 dB gained, whatever was requested, ending with the double sum."""
         if chosen.engine == "reference":
             return ()
         options = replace(self, engine=None, options={}).settings(len(self.job.aperture))
@@ -125,25 +125,25 @@ class SettingSearch:
 
     def fitted(self, setting: Setting, presum: Presum | None) -> Setting:
         """Return the setting in as many pulse blocks as fit into memory; each one places the tiles once more."""
-        blocks = pulse_blocks(setting, self.job, presum, asked=self.pulse_blocks)
+        blocks = pulse_blocks(setting, self.job, presum, requested=self.pulse_blocks)
         more = (blocks - 1) * self.tile_seconds
         return replace(setting, pulse_blocks=blocks, form_seconds=setting.form_seconds + more)
 
     def decisions(self, chosen: Setting, accuracy_db: float) -> Iterator[Decision]:
         """Yield the choices that make up a setting, with their reasons."""
-        asked = {name for name, value in self.options.get(chosen.engine, {}).items() if value is not None}
-        met = "meets" if chosen.error_db <= accuracy_db else "does not meet"
-        rank = "what was asked for" if asked or self.engine else "cheapest of every engine and setting, to 5 %"
+        requested = {name for name, value in self.options.get(chosen.engine, {}).items() if value is not None}
+        verdict = "meets" if chosen.error_db <= accuracy_db else "does not meet"
+        rank = "what was asked for" if requested or self.engine else "cheapest of every engine and setting, to 5 %"
         why = "asked for; " if self.engine else ""
-        yield Decision("engine", chosen.engine, f"{why}{rank}, {met} {accuracy_db:.0f} dB", chosen.error_db)
+        yield Decision("engine", chosen.engine, f"{why}{rank}, {verdict} {accuracy_db:.0f} dB", chosen.error_db)
         for name, reason in chosen.reasons.items():
-            why = "asked for; " if name in asked else ""
+            why = "asked for; " if name in requested else ""
             yield Decision(name, chosen.all_options[name], why + reason)
 
     def _engines(self) -> list[str]:
-        """Return the engines that can run here and that what is asked for leaves; untimed ones where they are named.
+        """Return the engines that can run here and fit the request; untimed ones only where they are named.
 
-        Seconds that nobody has measured are no reason to prefer an engine.
+        Seconds that were not measured are no reason to prefer an engine.
         """
         reads = {"profiles", "phase_history"} if self.job.recorded else {"profiles"}
         runnable = [name for name in ENGINES if load_engine(name).available() and load_engine(name).READS in reads]
@@ -153,63 +153,66 @@ class SettingSearch:
                 "cannot run here" if engine.READS in reads else f"reads the {engine.READS.replace('_', ' ')}: none here"
             )
             needs = getattr(engine, "NEEDS", None)
-            raise self._unfit(what, runnable, f"It needs {needs}. " if needs and engine.READS in reads else "")
+            raise self._unsuitable(what, runnable, f"It needs {needs}. " if needs and engine.READS in reads else "")
         if self.engine is not None:
             return [self.engine]
         stated = [name for name in runnable if any(v is not None for v in self.options.get(name, {}).values())]
         return stated or [name for name in runnable if getattr(load_engine(name), "TIMED", True)]
 
-    def _unfit(self, what: str, others: list[str], remedy: str = "") -> CampaignError:
+    def _unsuitable(self, what: str, alternatives: list[str], remedy: str = "") -> CampaignError:
         return CampaignError(
             f"engine {self.engine or ', '.join(self._engines())} {what}",
             where=f"{self.where}.engine",
-            expected=f"an engine that can: {', '.join(others)}",
+            expected=f"an engine that can: {', '.join(alternatives)}",
             remedy=f"{remedy}Choose one of these, or auto.",
         )
 
 
-# ---- The planner: how an image will be formed, why, how exact and how costly, before anything runs -----------------
+# ---- The planner
 
 MARGIN_DB = 3.0
-"""Predicted errors lie this far below what is asked."""
+"""dB of predicted errors below the requested accuracy: what predictions may be too low by (benchmarks/planner.py)."""
 
 PRESUM_FACTORS = (16, 12, 8, 6, 5, 4, 3, 2)
+"""Pulses per virtual pulse that are tried, the largest first."""
 
 
 def make_plan(
     job: Job, *, accuracy_db: float, overrides: Mapping[str, Any] | None = None, where: str = "processing"
 ) -> Plan:
-    """Choose the cheapest setting and models that meet the accuracy asked. The same job gives the same plan.
+    """Choose the cheapest setting and models that meet the requested accuracy. The same job gives the same plan.
 
     Parameters
     ----------
     job
         What is to be imaged.
     accuracy_db
-        Numerical error asked.
+        Requested numerical error.
     overrides
-        Choice → value that a person asks for: engine, engine_options (engine → option → value), presum, pulse_blocks,
+        Choice → requested value: engine, engine_options (engine → option → value), presum, pulse_blocks,
         terrain. 'auto' or None leaves the choice to the planner.
     where
-        Section of the config that asks, for messages.
+        Section of the config with the request, for messages.
 
     Raises
     ------
     CampaignError
-        If the job holds no pulse, or what is asked cannot run here.
+        If the job has no pulse, or the request cannot run here.
 
     Notes
     -----
     Source: docs/theory/planner.md.
     """
-    asked = {name: value for name, value in (overrides or {}).items() if value not in (None, "auto")}
+    requested = {name: value for name, value in (overrides or {}).items() if value not in (None, "auto")}
     flags = check_geometry(job)
-    terrain = decide_terrain(job, asked=asked.get("terrain"), where=where)
+    terrain = decide_terrain(job, requested=requested.get("terrain"), where=where)
     if job.patches_on is not None:
-        job = replace(job, patches_m=job.patches_on(job.terrain.called(str(terrain.value))))
-    search = SettingSearch(job, asked.get("engine"), asked.get("engine_options", {}), asked.get("pulse_blocks"), where)
+        job = replace(job, patches_m=job.patches_on(job.terrain.model(str(terrain.value))))
+    search = SettingSearch(
+        job, requested.get("engine"), requested.get("engine_options", {}), requested.get("pulse_blocks"), where
+    )
     every_pulse = search.cheapest(len(job.aperture), accuracy_db - MARGIN_DB)
-    presumming, presum, chosen = _decide_presum(search, every_pulse, accuracy_db, asked.get("presum"))
+    presumming, presum, chosen = _decide_presum(search, every_pulse, accuracy_db, requested.get("presum"))
     antennas, missed = decide_antennas(job.beams, job.illumination)
     chosen = search.fitted(chosen, presum)
     expected_db = power_sum_db(chosen.error_db, *([] if presumming.error_db is None else [presumming.error_db]))
@@ -219,7 +222,7 @@ def make_plan(
         )
     integrated = job.integration or Integration(None, len(job.aperture), "all", "every pulse counts for every pixel")
     memory, disk = bytes_needed(job, chosen, presum)
-    blocks = block_decision(chosen, job, presum, asked="pulse_blocks" in asked)
+    blocks = block_decision(chosen, job, presum, requested="pulse_blocks" in requested)
     return Plan(
         setting=chosen,
         fallbacks=search.fallbacks(chosen),
@@ -237,7 +240,7 @@ def make_plan(
         memory_bytes=memory,
         disk_bytes=disk,
         flags=Flags.merged(flags, missed, integrated.flags),
-        terrain=job.terrain.called(str(terrain.value)),
+        terrain=job.terrain.model(str(terrain.value)),
         presum=presum,
         middle_m=job.points_m[len(job.points_m) // 2],
         beams=job.beams,
@@ -247,7 +250,7 @@ def make_plan(
 
 
 def _decide_presum(
-    search: SettingSearch, every_pulse: Setting, accuracy_db: float, asked: int | None
+    search: SettingSearch, every_pulse: Setting, accuracy_db: float, requested: int | None
 ) -> tuple[Decision, Presum | None, Setting]:
     """Return the decision, the low-pass sum over pulses, and the setting with it."""
     job, pulses = search.job, len(search.job.aperture)
@@ -257,19 +260,19 @@ def _decide_presum(
     def keep(why: str) -> tuple[Decision, None, Setting]:
         return Decision("presum", 1, f"{oversampled}; {why}"), None, every_pulse
 
-    if asked == 1:
+    if requested == 1:
         return keep("asked for")
     if job.beams is not None:
-        if asked is not None:
-            raise _no_presum(asked, search.where)
+        if requested is not None:
+            raise _no_presum(requested, search.where)
         return keep(f"{'the antennas weigh' if job.antennas else 'the sector weighs'} every pulse for itself")
     if every_pulse.engine == "reference":
         return keep("the double sum takes every pulse")
     limit_db = accuracy_db - MARGIN_DB - search.content_db - 3
-    best = _best_presum(job, (asked,) if asked else PRESUM_FACTORS, widest, limit_db)
-    if best is None and asked:
+    best = _best_presum(job, (requested,) if requested else PRESUM_FACTORS, widest, limit_db)
+    if best is None and requested:
         raise CampaignError(
-            f"presum is {asked}",
+            f"presum is {requested}",
             where=f"{search.where}.presum",
             expected=f"at most {0.3 / max(widest, 1e-9):.1f} pulses made one: {oversampled}",
             remedy="Use a smaller factor or auto.",
@@ -282,16 +285,16 @@ def _decide_presum(
     presum, error_db = best
     spent = PRESUM_S * pulses * job.signal.samples
     less = search.cheapest(len(presum.at), accuracy_db - MARGIN_DB - 1)
-    if not asked and spent + less.seconds > 0.9 * every_pulse.seconds:
+    if not requested and spent + less.seconds > 0.9 * every_pulse.seconds:
         return keep(f"a low-pass sum {presum.factor}:1 costs more than it saves")
     line = f"{oversampled}; a low-pass sum makes {len(presum.at)} of {pulses} pulses"
     chosen = replace(less, table_seconds=less.table_seconds + spent)
     return Decision("presum", presum.factor, f"{line} and errs by {error_db:.1f} dB", error_db), presum, chosen
 
 
-def _no_presum(asked: int, where: str) -> CampaignError:
+def _no_presum(requested: int, where: str) -> CampaignError:
     return CampaignError(
-        f"presum is {asked}, and the antennas have beams or only a part of the flight is integrated",
+        f"presum is {requested}, and the antennas have beams or only a part of the flight is integrated",
         where=f"{where}.presum",
         expected="1 or auto: every pulse is weighed for itself, by the antennas and by its place in the sector",
         remedy="Leave presum to the planner, or set the nodes' antennas to null and processing.integration to all.",

@@ -1,4 +1,4 @@
-"""What two images of one scene say of each other: place, phase and amplitude of the bright points they share."""
+"""Agreement of two images of one scene: shift, phase and amplitude of their common bright points."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,28 +11,28 @@ from apertura.core.quality.measures import BlockRaster
 from apertura.core.quality.point_targets import BandLimitedPatch
 
 REACH_M = 4.0
-"""Shifts between two images up to this, or a dozen cells, are looked for."""
+"""Metres, largest shift between two images that is searched, or a dozen cells: more would match other points."""
 
 SHIFTED = 0.18
-"""Images further apart than this, in units of eq. 6, and than their uncertainty allows, show different places: a tenth
-of the resolution cell."""
+"""Shift of two images in units of eq. 6, a tenth of the resolution cell, above which, and beyond their uncertainty,
+they show different places."""
 
 OUT_OF_PHASE_RAD = 0.6
-"""Two images so far apart in phase lose 0.4 dB when they are added."""
+"""Radians: two images with this phase difference lose 0.4 dB when they are added."""
 
 _POINT = 0.09  # in units of eq. 6: neighbours pull each peak by about half a tenth of a cell
-_POINT_RAD = 0.05
-_TOLD_RAD = 0.4  # a phase less certain than this is none
+_POINT_RAD = 0.05  # neighbours turn the phase of a peak by about as much
+_LARGEST_PHASE_STD_RAD = 0.4  # a phase less certain than this is not used
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """How a second image lies against a first; place and phase are of the second less the first.
+    """Differences of a second image from a first: shift and phase, second less first.
 
     Attributes
     ----------
     points
-        Bright points that both show.
+        Number of common bright points.
     shift_east_m, shift_north_m, shift_std_m
         Median over the points, and its standard deviation along one axis, metres.
     shift_units, shift_std_units
@@ -40,9 +40,9 @@ class Agreement:
     phase_rad, phase_std_rad
         Mean over the points, and its standard deviation.
     coherence
-        Length of the mean phasor: 1 where all points say the same phase, 1/√points by chance.
+        Length of the mean phasor: 1 where all points have the same phase, 1/√points by chance.
     amplitude_db, amplitude_std_db
-        Mean ratio of amplitudes, and how much it scatters from point to point.
+        Mean ratio of amplitudes, and its scatter from point to point.
     """
 
     points: int
@@ -59,19 +59,19 @@ class Agreement:
 
     @property
     def shift_m(self) -> float:
-        """Distance between both images of a point."""
+        """Distance between the images of a point, metres."""
         return float(np.hypot(self.shift_east_m, self.shift_north_m))
 
     @property
     def shifted(self) -> bool:
-        """Whether the images show different places, as far as their points can tell."""
+        """Whether the images show different places, by more than the uncertainty of their points."""
         return self.shift_units > SHIFTED + 3 * self.shift_std_units
 
     @property
     def out_of_phase(self) -> bool:
-        """Whether adding the images would lose power, as far as their points can tell."""
-        told = self.phase_std_rad < _TOLD_RAD
-        return told and abs(self.phase_rad) > OUT_OF_PHASE_RAD + 2 * self.phase_std_rad
+        """Whether adding the images would lose power, by more than the uncertainty of their points."""
+        certain = self.phase_std_rad < _LARGEST_PHASE_STD_RAD
+        return certain and abs(self.phase_rad) > OUT_OF_PHASE_RAD + 2 * self.phase_std_rad
 
 
 def agreement(
@@ -83,7 +83,7 @@ def agreement(
     spectrum: NDArray[np.float64],
     alone: bool = False,
 ) -> Agreement | None:
-    """Return how two images agree; None where they do not share two bright points and half of those of either.
+    """Return the agreement of two images; None where fewer than two bright points, or half of either's, are common.
 
     Parameters
     ----------
@@ -98,7 +98,7 @@ def agreement(
     spectrum
         (2, 2) float64, covariance of a point's spatial spectrum east and north, cycles² per m².
     alone
-        Neither image has anything else that is bright: one point of each is then enough.
+        Neither image has another bright point: one point of each is then enough.
 
     Notes
     -----
@@ -111,24 +111,24 @@ def agreement(
     >>> image = (np.sinc((y - 30) / 4) * np.sinc((x - 33) / 4)).astype(np.complex64)
     >>> point = [BrightPoint(30.0, 33.0, 1.0)]
     >>> wide = np.diag([0.5, 0.5])
-    >>> found = agreement((image, 1j * image), (point, point), spacing_m=0.1, cell_m=0.4, spectrum=wide, alone=True)
-    >>> round(found.shift_m, 3), round(found.phase_rad, 3), found.out_of_phase
+    >>> result = agreement((image, 1j * image), (point, point), spacing_m=0.1, cell_m=0.4, spectrum=wide, alone=True)
+    >>> round(result.shift_m, 3), round(result.phase_rad, 3), result.out_of_phase
     (0.0, 1.571, True)
     """
     lists = [[(point.column * spacing_m, -point.row * spacing_m, point.amplitude) for point in some] for some in points]
     reach = max(REACH_M, 12 * cell_m)
-    _, met = common_shift(lists[0], lists[1], reach=reach, gate=cell_m)
-    if len(met) < max(1 if alone else 2, min(map(len, points)) / 2):
+    _, matched = common_shift(lists[0], lists[1], reach=reach, gate=cell_m)
+    if len(matched) < max(1 if alone else 2, min(map(len, points)) / 2):
         return None
-    apart = np.array([np.subtract(lists[1][j][:2], lists[0][i][:2]) for i, j in met])
-    values = np.array([_between(images, points[0][i], points[1][j]) for i, j in met])
-    shift, count = np.median(apart, axis=0), len(met)
+    shifts = np.array([np.subtract(lists[1][j][:2], lists[0][i][:2]) for i, j in matched])
+    values = np.array([_between(images, points[0][i], points[1][j]) for i, j in matched])
+    shift, count = np.median(shifts, axis=0), len(matched)
     unit = 2 * np.pi * np.linalg.cholesky(spectrum)  # metres to units of eq. 6
-    units = (apart - shift) @ unit
-    background = float(np.median([points[0][i].background + points[1][j].background for i, j in met])) / 2
+    units = (shifts - shift) @ unit
+    background = float(np.median([points[0][i].background + points[1][j].background for i, j in matched])) / 2
     std = np.hypot(1.2533 * 1.4826 * np.median(np.abs(units)), np.sqrt(background / 2 + _POINT**2)) / np.sqrt(count)
     phasor = _mean_phasor(values)
-    ratio_db = 20 * np.log10([points[1][j].amplitude / points[0][i].amplitude for i, j in met])
+    ratio_db = 20 * np.log10([points[1][j].amplitude / points[0][i].amplitude for i, j in matched])
     return Agreement(
         points=count,
         shift_east_m=float(shift[0]),

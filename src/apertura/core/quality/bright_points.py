@@ -10,12 +10,12 @@ from apertura.common.contracts import Window
 from apertura.core.quality.measures import BlockRaster
 from apertura.core.quality.point_targets import PATCH_PX, find_peak
 
-MOST_POINTS = 16
+MOST_POINTS = 16  # of an image that are measured, at most
 DEEPEST_DB = -12.0
-"""Points further below the brightest may be its sidelobes."""
+"""dB below the brightest point: weaker points may be its sidelobes."""
 
 
-_SHOWN = 10.0  # power of a point against speckle about it
+_POINT_CONTRAST = 10.0  # power of a point relative to the speckle around it: 10 dB
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class BrightPoint:
     amplitude
         Magnitude there.
     background
-        Power of what lies about it, against its own: the median over a patch, as of speckle.
+        Power of its surroundings relative to its own: mean of speckle, from the median over a patch.
     carrier
         Spatial frequency of its carrier down and right, cycles per pixel; None: as the pixels fold it.
     """
@@ -42,7 +42,7 @@ class BrightPoint:
 
 
 def bright_points(image: BlockRaster, windows: Iterable[Window], *, apart_px: int) -> list[BrightPoint]:
-    """Return the brightest local maxima that stand apart, brightest first.
+    """Return the brightest isolated local maxima, brightest first.
 
     Parameters
     ----------
@@ -62,28 +62,28 @@ def bright_points(image: BlockRaster, windows: Iterable[Window], *, apart_px: in
     >>> [(round(p.row, 1), round(p.column, 1)) for p in bright_points(image, [whole], apart_px=16)]
     [(30.2, 33.5), (20.0, 90.0)]
     """
-    found: list[tuple[float, int, int]] = []
+    maxima: list[tuple[float, int, int]] = []
     for window in windows:
         magnitude = np.abs(np.nan_to_num(np.asarray(image[window])))
-        found += _cell_maxima(magnitude, window, apart_px)
-    found.sort(key=lambda one: (-one[0], one[1], one[2]))
+        maxima += _cell_maxima(magnitude, window, apart_px)
+    maxima.sort(key=lambda one: (-one[0], one[1], one[2]))
     kept: list[tuple[float, int, int]] = []
-    for one in found:
-        if not one[0] > found[0][0] * 10 ** (DEEPEST_DB / 20) or len(kept) == MOST_POINTS:
+    for one in maxima:
+        if not one[0] > maxima[0][0] * 10 ** (DEEPEST_DB / 20) or len(kept) == MOST_POINTS:
             break
         if all(np.hypot(one[1] - row, one[2] - column) >= apart_px for _, row, column in kept):
             kept.append(one)
     return [_bright_point(image, row, column) for _, row, column in kept]
 
 
-def shows_point(image: BlockRaster, row: int, column: int, *, reach: int) -> bool:
-    """Return whether an image has a pixel 10 dB above what lies about it within `reach` pixels of a place.
+def has_point(image: BlockRaster, row: int, column: int, *, reach: int) -> bool:
+    """Return whether an image has a pixel 10 dB above its surroundings within `reach` pixels of a place.
 
     Examples
     --------
     >>> image = np.ones((64, 64), np.complex64)
     >>> image[30, 31] = 5
-    >>> shows_point(image, 31, 31, reach=2), shows_point(image, 20, 31, reach=2)
+    >>> has_point(image, 31, 31, reach=2), has_point(image, 20, 31, reach=2)
     (True, False)
     """
     here, about = (
@@ -92,7 +92,7 @@ def shows_point(image: BlockRaster, row: int, column: int, *, reach: int) -> boo
         )
         for far in (reach, PATCH_PX // 2)
     )
-    return bool(here.size and here.max() ** 2 > _SHOWN * np.median(about.astype(np.float64) ** 2) / np.log(2))
+    return bool(here.size and here.max() ** 2 > _POINT_CONTRAST * np.median(about.astype(np.float64) ** 2) / np.log(2))
 
 
 def _bright_point(image: BlockRaster, row: int, column: int) -> BrightPoint:
@@ -125,7 +125,7 @@ def common_shift(
     reach: float,
     gate: float,
 ) -> tuple[tuple[float, float], list[tuple[int, int]]]:
-    """Return the shift from one list of points to another that most of their brightness agrees on, and who meets whom.
+    """Return the common shift between two lists of points, weighted by brightness, and the pairs that match under it.
 
     Parameters
     ----------
@@ -139,42 +139,42 @@ def common_shift(
     Returns
     -------
     tuple
-        (Δx, Δy), second less first, and indices of the points that meet under it. Without any within reach, zero and
-        no pairs.
+        (Δx, Δy), second less first, and pairs of indices of the points that match under it. Without any within reach,
+        zero and no pairs.
 
     Examples
     --------
     >>> here = [(0, 0, 1.0), (5, 1, 0.8), (2, 7, 0.5)]
     >>> there = [(x + 0.3, y - 0.1, a) for x, y, a in here]
-    >>> shift, met = common_shift(here, there, reach=4, gate=0.2)
-    >>> np.round(shift, 3).tolist(), met
+    >>> shift, matched = common_shift(here, there, reach=4, gate=0.2)
+    >>> np.round(shift, 3).tolist(), matched
     ([0.3, -0.1], [(0, 0), (1, 1), (2, 2)])
     """
     a, b = (np.array(points, np.float64).reshape(-1, 3) for points in (first, second))
-    apart = b[None, :, :2] - a[:, None, :2]
+    difference = b[None, :, :2] - a[:, None, :2]
     weight = np.minimum(a[:, None, 2] / a[:, 2].max(initial=1e-30), b[None, :, 2] / b[:, 2].max(initial=1e-30))
-    weight = np.where(np.hypot(apart[..., 0], apart[..., 1]) <= reach, weight, 0.0)
+    weight = np.where(np.hypot(difference[..., 0], difference[..., 1]) <= reach, weight, 0.0)
     best, votes = np.zeros(2), 0.0
     for i, j in zip(*np.nonzero(weight), strict=True):
-        near = np.hypot(*np.moveaxis(apart - apart[i, j], -1, 0)) <= gate
+        near = np.hypot(*np.moveaxis(difference - difference[i, j], -1, 0)) <= gate
         total = float((weight * near).max(axis=1).sum())
-        total -= 1e-3 * float(np.hypot(*apart[i, j]) / reach)  # of equals the nearer
+        total -= 1e-3 * float(np.hypot(*difference[i, j]) / reach)  # of equal shifts the smaller
         if total > votes:
-            best, votes = apart[i, j], total
-    met = _met(apart - best, weight, gate)
-    if met:
-        best = np.median([apart[i, j] for i, j in met], axis=0)
-    return (float(best[0]), float(best[1])), met
+            best, votes = difference[i, j], total
+    matched = _matched(difference - best, weight, gate)
+    if matched:
+        best = np.median([difference[i, j] for i, j in matched], axis=0)
+    return (float(best[0]), float(best[1])), matched
 
 
-def _met(apart: NDArray[np.float64], weight: NDArray[np.float64], gate: float) -> list[tuple[int, int]]:
+def _matched(difference: NDArray[np.float64], weight: NDArray[np.float64], gate: float) -> list[tuple[int, int]]:
     """Return pairs of points that lie within the gate, each point at most once, nearest first."""
-    distance = np.where(weight > 0, np.hypot(apart[..., 0], apart[..., 1]), np.inf)
-    met: list[tuple[int, int]] = []
+    distance = np.where(weight > 0, np.hypot(difference[..., 0], difference[..., 1]), np.inf)
+    matched: list[tuple[int, int]] = []
     for flat in np.argsort(distance, axis=None):
         i, j = (int(at) for at in np.unravel_index(flat, distance.shape))
         if distance[i, j] > gate:
             break
-        if all(i != one and j != other for one, other in met):
-            met.append((i, j))
-    return sorted(met)
+        if all(i != one and j != other for one, other in matched):
+            matched.append((i, j))
+    return sorted(matched)

@@ -1,4 +1,4 @@
-"""The error budget of an image: what is known to spoil it, and what each cause is expected to cost."""
+"""The error budget of an image: stated causes of error, and the expected effect of each."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -11,30 +11,30 @@ from numpy.typing import NDArray
 from apertura.core.quality.path_errors import Effect, PointPaths
 
 ARITHMETIC_BELOW_DB = 10.0
-"""How far arithmetic stays below the largest other error."""
+"""dB of numerical error below the largest other error: it then adds 0.4 dB to the sum."""
 
 LEAST_ACCURACY_DB, MOST_ACCURACY_DB = -40.0, -60.0
-"""Between them `accuracy_db: auto` stays: sidelobes show down to the first, nothing shows below the second."""
+"""dB, range of `accuracy_db: auto`: errors above the first show as sidelobes, errors below the second are invisible."""
 
-NOTHING = Effect(0.0, 0.0, 0.0)
+NO_EFFECT = Effect(0.0, 0.0, 0.0)  # of a cause without error
 
 _NOT_STATED = "not stated"
 
 
 @dataclass(frozen=True)
 class BudgetLine:
-    """One cause.
+    """One cause of error.
 
     Attributes
     ----------
     cause
         Its name.
     stated
-        What is stated or measured of it, in a few words; None where nobody said: then the effect is that of `unit`.
+        Its stated or measured size, in a few words; None if unstated: the effect is then that of `unit`.
     unit
-        The size that the effect is of where nothing is stated.
+        Size that the effect is computed for where none is stated.
     effect
-        What it is expected to do.
+        Expected effect.
     """
 
     cause: str
@@ -65,16 +65,16 @@ def is_stated(report: Mapping[str, Any]) -> bool:
 
 @dataclass(frozen=True)
 class NodePositions:
-    """What is known of a node's positions.
+    """Stated errors of a node's positions.
 
     Attributes
     ----------
     std_m
-        East, north, up, metres; None: nobody said.
+        Standard deviation east, north, up, metres; None: unstated.
     correlation_s
-        How long an error lasts.
+        Correlation time, seconds, as `autocorrelation`.
     stated_by
-        Who said so.
+        Source of the statement: config or log.
     drift_m
         Of a slow error over the whole flight, in each axis.
     """
@@ -86,14 +86,14 @@ class NodePositions:
 
 
 def position_lines(paths: PointPaths, nodes: Sequence[NodePositions], *, sidelink: bool) -> list[BudgetLine]:
-    """Return what errors of the logs do: of those that are stated, and what a centimetre in the others would do.
+    """Return the effect of position errors: of those stated, and of a centimetre where none is stated.
 
     Parameters
     ----------
     paths
         Of a point in the middle of the scene.
     nodes
-        One for a node that does both, or transmitter and receiver, whose errors do not know of each other.
+        One for a node that does both, or transmitter and receiver, whose errors are independent.
     sidelink
         As `PointPaths.by_node`.
     """
@@ -104,12 +104,12 @@ def position_lines(paths: PointPaths, nodes: Sequence[NodePositions], *, sidelin
         if some:
             sizes = [np.sqrt((slope**2 * np.square(node.std_m or (0.01,) * 3)).sum(axis=1)) for slope, node in some]
             effect = paths.of_noise(*((size, node.correlation_s) for size, (_, node) in zip(sizes, some, strict=True)))
-            words = "; ".join(_said(node) for _, node in some) if stated else None
+            words = "; ".join(_stated(node) for _, node in some) if stated else None
             lines.append(BudgetLine("positions", words, effect, "1 cm in each axis of what nobody stated"))
     return lines
 
 
-def _said(node: NodePositions) -> str:
+def _stated(node: NodePositions) -> str:
     sizes = " ".join(f"{100 * std:.2g}" for std in node.std_m or ())
     return f"{sizes} cm east north up for {node.correlation_s:g} s, said by the {node.stated_by}"
 
@@ -117,7 +117,7 @@ def _said(node: NodePositions) -> str:
 def offset_line(
     paths: PointPaths, cause: str, slope: NDArray[np.float64], std: float | None, *, unit: str, common: bool = False
 ) -> BudgetLine:
-    """Return what a constant error does.
+    """Return the effect of a constant error.
 
     Parameters
     ----------
@@ -128,7 +128,7 @@ def offset_line(
     slope
         (pulse,) float64, metres of path per unit of the cause.
     std
-        Its standard deviation in that unit; None: nobody said.
+        Its standard deviation in that unit; None: unstated.
     unit
         Name of the unit.
     common
@@ -139,7 +139,7 @@ def offset_line(
 
 
 def summed(effects: Iterable[Effect]) -> Effect:
-    """Return independent effects together: losses add in dB, shifts and phases by their squares.
+    """Return the sum of independent effects: losses add in dB, shifts and phases by their squares.
 
     Examples
     --------
@@ -155,32 +155,32 @@ def summed(effects: Iterable[Effect]) -> Effect:
 
 
 def expected(lines: Iterable[BudgetLine]) -> Effect:
-    """Return what all causes that somebody stated are expected to do together."""
+    """Return the expected effect of all stated causes together."""
     return summed(line.effect for line in lines if line.stated is not None)
 
 
 def noise_loss(variance_rad2: float) -> Effect:
-    """Return what phase noise that forgets itself from pulse to pulse does: exp(-σ²) of the peak's power."""
+    """Return the effect of phase noise that is independent from pulse to pulse: exp(-σ²) of the peak's power."""
     return Effect(-10 * math.log10(math.e) * variance_rad2, 0.0, 0.0)
 
 
-def strictest_accuracy_db(asked: float | Literal["auto"]) -> float:
-    """Return the smallest numerical error that an image may ask for: what an echo, formed before images, must serve.
+def strictest_accuracy_db(requested: float | Literal["auto"]) -> float:
+    """Return the smallest numerical error that an image may request, for which the echo is formed.
 
     Examples
     --------
     >>> strictest_accuracy_db("auto"), strictest_accuracy_db(-45.0)
     (-60.0, -45.0)
     """
-    return MOST_ACCURACY_DB if asked == "auto" else asked
+    return MOST_ACCURACY_DB if requested == "auto" else requested
 
 
 def accuracy_for(lines: Iterable[BudgetLine]) -> float:
-    """Return the numerical error to ask for: below the largest other error by `ARITHMETIC_BELOW_DB`.
+    """Return the numerical error to request: below the largest other error by `ARITHMETIC_BELOW_DB`.
 
     Notes
     -----
-    Source: docs/theory/focus.md, eq. 5: a peak that lost a share of its power has spread that share around it.
+    Source: docs/theory/focus.md, eq. 5: the power that a peak loses is spread around it.
 
     Examples
     --------

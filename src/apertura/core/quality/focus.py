@@ -1,4 +1,4 @@
-"""How well an image is focused, measured without truth: by single pulses and by parts of the aperture."""
+"""Focus of an image, measured without truth: by contributions of pulses and by subapertures."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from apertura.core.quality.measures import coherence_factor
 
-# ---- What images of parts of the aperture say of an image: noise, drift from part to part, sharpness against chance
+# ---- Subapertures: noise, drift and entropy
 
-_CHANCES = 8
+_RANDOM_DRAWS = 8  # of random phases, averaged
 
 
 @dataclass(frozen=True)
@@ -23,10 +23,10 @@ class SubApertures:
     snr_db
         SNR of a pixel, by images of even and of odd pulses.
     drift_m, drift_std_m
-        RMS of where the parts of the aperture show the patch against each other, and how uncertain that is.
+        RMS of the shifts of the patch between subapertures, and its uncertainty.
     entropy, entropy_by_chance
-        Shannon entropy of the patch, nats, and that of the same parts added with random phases: where both are alike
-        the phases of the parts do nothing for the patch.
+        Shannon entropy of the patch, nats, and that of the same parts added with random phases: where both are equal
+        the phases of the subapertures do not focus the patch.
     """
 
     snr_db: float
@@ -37,7 +37,7 @@ class SubApertures:
 
 
 def compare_parts(parts: NDArray[np.complex64], *, spacing_m: float, generator: np.random.Generator) -> SubApertures:
-    """Return what images of the parts of the aperture say.
+    """Return the measures of subaperture images.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ def compare_parts(parts: NDArray[np.complex64], *, spacing_m: float, generator: 
     """
     if not len(parts):
         return SubApertures(*(float("nan"),) * 5)
-    whole = parts.sum(axis=(1, 2))
+    full = parts.sum(axis=(1, 2))
     drifts = np.array([_drift_px(patch.sum(axis=0)) for patch in parts]) * spacing_m
     common = np.median(drifts, axis=0)
     spread = 1.4826 * np.median(np.abs(drifts - common), axis=0)
@@ -72,7 +72,7 @@ def compare_parts(parts: NDArray[np.complex64], *, spacing_m: float, generator: 
         snr_db=float(np.median([_snr_of_halves_db(*patch.sum(axis=1)) for patch in parts])),
         drift_m=float(np.sqrt((common**2).sum(axis=-1).mean())),
         drift_std_m=float(np.sqrt((spread**2).sum(axis=-1).mean() / len(parts))),
-        entropy=float(np.median([_entropy(patch) for patch in whole])),
+        entropy=float(np.median([_entropy(patch) for patch in full])),
         entropy_by_chance=float(np.median([_entropy_by_chance(patch.sum(axis=0), generator) for patch in parts])),
     )
 
@@ -85,12 +85,12 @@ def _snr_of_halves_db(even: NDArray[np.complex64], odd: NDArray[np.complex64]) -
 
 
 def _drift_px(parts: NDArray[np.complex64]) -> NDArray[np.float64]:
-    """Return (part, 2) where each part shows the patch against the mean over all parts, pixels down and right."""
+    """Return (part, 2) shifts of the patch in each part against the mean over all parts, pixels down and right."""
     power = np.abs(parts).astype(np.float64) ** 2
     power /= np.maximum(power.sum(axis=(-2, -1), keepdims=True), 1e-30)
     mean = np.fft.rfft2(power.mean(axis=0) - power.mean())
-    found = np.array([_peak(np.fft.irfft2(np.fft.rfft2(one) * mean.conj(), one.shape)) for one in power])
-    return np.asarray(found - found.mean(axis=0))
+    shifts = np.array([_peak(np.fft.irfft2(np.fft.rfft2(one) * mean.conj(), one.shape)) for one in power])
+    return np.asarray(shifts - shifts.mean(axis=0))
 
 
 def _peak(correlation: NDArray[np.float64]) -> list[float]:
@@ -112,27 +112,27 @@ def _entropy(patch: NDArray[np.complexfloating]) -> float:
 
 
 def _entropy_by_chance(parts: NDArray[np.complex64], generator: np.random.Generator) -> float:
-    phases = np.exp(2j * np.pi * generator.random((_CHANCES, len(parts))))
-    return float(np.mean([_entropy(np.tensordot(turned, parts, 1)) for turned in phases]))
+    phases = np.exp(2j * np.pi * generator.random((_RANDOM_DRAWS, len(parts))))
+    return float(np.mean([_entropy(np.tensordot(phasors, parts, 1)) for phasors in phases]))
 
 
-# ---- How well an image is focused, told without truth: what each pulse adds at isolated bright points --------------
+# ---- Focus of isolated bright points, from contributions of pulses
 
 LEAST_BLOCKS = 32
-"""Parts of the aperture that a point must dominate."""
+"""Blocks of pulses that a point must dominate each: enough to separate phase errors from noise."""
 
 MOST_INTERFERENCE = 0.08
-"""Variance of the logarithm of a point's amplitude over the aperture, above which it does not dominate its cell."""
+"""Log-amplitude variance of a point over the aperture, above which it does not dominate its cell."""
 
-LEAST_HERE = 0.35
-"""Amplitude at the point itself of the most that a place near it has: less is a sidelobe of an echo elsewhere."""
+LEAST_PEAK_SHARE = 0.35
+"""Amplitude at the point over the largest that a linear phase gives: less is a sidelobe of an echo elsewhere."""
 
 DEFOCUSED_DB = -1.0
-"""A point that lost more is called defocused."""
+"""dB, loss of a peak beyond which an image is called defocused."""
 
-_TREND = 5  # degree of the polynomial that patterns, range and aspect draw into log-amplitude
-_PADDING = 8
-_SURE = 5.0
+_TREND = 5  # degree of the polynomial that models patterns, range and aspect in the log-amplitude
+_PADDING = 8  # of the spectrum of blocks, whose maximum removes a linear phase
+_SIGMAS = 5.0  # by which a drift must exceed a cell to be called defocused
 
 
 @dataclass(frozen=True)
@@ -142,15 +142,16 @@ class PointFocus:
     Attributes
     ----------
     loss_db
-        Peak power against that of the same contributions in phase, 0 or less, what noise and neighbours cost taken out.
+        Peak power against that of the same contributions in phase, 0 or less, with the loss by noise and neighbours
+        removed.
     interference
-        Power of noise and neighbours against the point's, as its amplitude's unrest tells.
+        Power of noise and neighbours over the point's: the log-amplitude variance.
     pulses
-        Of a block; phase errors faster than that are not seen.
+        Pulses of a block; phase errors faster than that are not measured.
     snr_db
         Of the point in the image, from its even and its odd pulses; NaN with fewer than four.
     coherence, coherence_allowed
-        |Σ s|²/(M Σ|s|²) of what the M pulses add, and what their noise alone would leave of it.
+        |Σ s|²/(M Σ|s|²) of the contributions of M pulses, and its value with their noise alone.
     """
 
     loss_db: float
@@ -162,18 +163,18 @@ class PointFocus:
 
 
 def point_focus(contributions: NDArray[np.complex128]) -> PointFocus | None:
-    """Return how well a point is focused; None where none dominates its range cell over the whole aperture.
+    """Return the focus of a point; None where none dominates its range cell over the whole aperture.
 
     Parameters
     ----------
     contributions
-        (pulse,) complex128, what each pulse adds at the point, in the order in which they were sent.
+        (pulse,) complex128, contribution of each pulse at the point, in the order in which they were sent.
 
     Notes
     -----
-    Source: docs/theory/focus.md, eq. 1. Phase errors leave the amplitude of a contribution alone, noise and neighbours
-    turn it as much as they change it: the unrest of the amplitude says how much of the phase's is theirs. Pulses are
-    averaged in blocks, as long as it takes for the point to dominate them.
+    Source: docs/theory/focus.md, eq. 1. Phase errors do not change the amplitude of a contribution, noise and
+    neighbours change phase and amplitude alike: the log-amplitude variance gives their part of the phase variance.
+    Pulses are averaged in blocks, as long as it takes for the point to dominate them.
 
     Examples
     --------
@@ -191,21 +192,21 @@ def point_focus(contributions: NDArray[np.complex128]) -> PointFocus | None:
         blocks = contributions[: count * pulses].reshape(count, pulses).mean(axis=1)
         amplitude = np.abs(blocks)
         if amplitude.min() > 0:
-            unrest = _unrest(np.log(amplitude))
-            if unrest <= MOST_INTERFERENCE:
+            variance = _log_amplitude_variance(np.log(amplitude))
+            if variance <= MOST_INTERFERENCE:
                 best = float(np.abs(np.fft.fft(blocks, _PADDING * count)).max())
-                if abs(complex(blocks.sum())) < LEAST_HERE * best:
+                if abs(complex(blocks.sum())) < LEAST_PEAK_SHARE * best:
                     return None
-                loss = (best / amplitude.sum()) ** 2 * (1 + unrest * (1 - 2.5 * unrest) / 2) ** 2
+                loss = (best / amplitude.sum()) ** 2 * (1 + variance * (1 - 2.5 * variance) / 2) ** 2
                 snr_db = _snr_db(contributions)
                 allowed = 1 / (1 + len(contributions) * 10 ** (-snr_db / 10))
                 loss_db = 10 * float(np.log10(min(1.0, loss)))
-                return PointFocus(loss_db, unrest, pulses, snr_db, coherence_factor(contributions), allowed)
+                return PointFocus(loss_db, variance, pulses, snr_db, coherence_factor(contributions), allowed)
         pulses *= 2
     return None
 
 
-def _unrest(log_amplitude: NDArray[np.float64]) -> float:
+def _log_amplitude_variance(log_amplitude: NDArray[np.float64]) -> float:
     along = np.linspace(-1, 1, len(log_amplitude))
     trend = np.polynomial.legendre.Legendre.fit(along, log_amplitude, _TREND)(along)
     return float(((log_amplitude - trend) ** 2).sum() / (len(along) - _TREND - 1))
@@ -226,7 +227,7 @@ def _snr_db(contributions: NDArray[np.complex128]) -> float:
 
 @dataclass(frozen=True)
 class Focus:
-    """What an image's bright points say of its focus.
+    """Verdict of an image's bright points on its focus.
 
     Attributes
     ----------
@@ -237,7 +238,7 @@ class Focus:
     points
         How many were measured.
     why
-        One line: what the verdict rests on.
+        One line: reason for the verdict.
     """
 
     verdict: Literal["focused", "defocused", "cannot tell"]
@@ -248,7 +249,7 @@ class Focus:
 
 
 def judge(points: Sequence[tuple[float, PointFocus | None]]) -> Focus:
-    """Return what bright points say together.
+    """Return the joint verdict of bright points.
 
     Parameters
     ----------
@@ -262,24 +263,24 @@ def judge(points: Sequence[tuple[float, PointFocus | None]]) -> Focus:
     >>> judge([(1.0, None)]).verdict
     'cannot tell'
     """
-    seen = [(amplitude, focus) for amplitude, focus in points if focus is not None]
-    if not seen:
+    measured = [(amplitude, focus) for amplitude, focus in points if focus is not None]
+    if not measured:
         return Focus("cannot tell", float("nan"), float("nan"), 0, "no bright point")
-    losses = np.array([focus.loss_db for _, focus in seen])
-    own = np.array([_std_db(focus) for _, focus in seen])
-    weights = np.array([amplitude for amplitude, _ in seen])
+    losses = np.array([focus.loss_db for _, focus in measured])
+    stds = np.array([_std_db(focus) for _, focus in measured])
+    weights = np.array([amplitude for amplitude, _ in measured])
     loss = _weighted_median(losses, weights)
     spread = 1.4826 * _weighted_median(np.abs(losses - loss), weights)
-    std = float(np.hypot(spread, np.median(own)) / np.sqrt(len(seen)))
+    std = float(np.hypot(spread, np.median(stds)) / np.sqrt(len(measured)))
     bad = loss < DEFOCUSED_DB - 2 * std
-    line = f"{len(seen)} bright points lost {abs(loss):.2f} ± {std:.2f} dB of their peak to phase errors"
+    line = f"{len(measured)} bright points lost {abs(loss):.2f} ± {std:.2f} dB of their peak to phase errors"
     if not bad and loss < DEFOCUSED_DB:
         line += f", not more than {-DEFOCUSED_DB:g} dB by two standard deviations"
-    return Focus("defocused" if bad else "focused", loss, std, len(seen), line)
+    return Focus("defocused" if bad else "focused", loss, std, len(measured), line)
 
 
 def judge_parts(parts: SubApertures, *, cell_m: float) -> Focus:
-    """Return what images of parts of the aperture say where no bright point says anything.
+    """Return the verdict of subaperture images where no bright point can be measured.
 
     Parameters
     ----------
@@ -297,7 +298,7 @@ def judge_parts(parts: SubApertures, *, cell_m: float) -> Focus:
     """
     nothing = float("nan"), float("nan"), 0
     line = "no bright point dominates its range cell"
-    if parts.drift_m - _SURE * parts.drift_std_m > cell_m and parts.drift_std_m > 0:
+    if parts.drift_m - _SIGMAS * parts.drift_std_m > cell_m and parts.drift_std_m > 0:
         drift = f"{parts.drift_m:.2f} ± {parts.drift_std_m:.2f} m"
         return Focus("defocused", *nothing, f"{line}, and parts of the aperture show the scene {drift} apart")
     if np.isfinite(parts.entropy):
@@ -306,7 +307,7 @@ def judge_parts(parts: SubApertures, *, cell_m: float) -> Focus:
 
 
 def _std_db(focus: PointFocus) -> float:
-    """Return how far noise and neighbours may move the loss of one point."""
+    """Return the standard deviation of the loss of one point by noise and neighbours, dB."""
     return 10 / float(np.log(10)) * focus.interference * float(np.sqrt(2 / LEAST_BLOCKS)) + 0.02
 
 

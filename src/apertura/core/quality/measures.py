@@ -1,4 +1,4 @@
-"""How good an image is as a whole: numerical error, entropy, coherence, noise floor; and sums of several images."""
+"""Measures of an image: numerical error, entropy, coherence, noise floor."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -7,7 +7,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-# ---- How good an image is as a whole: numerical error, entropy, coherence, noise floor -----------------------------
+# ---- Measures of one image
 
 
 class BlockRaster(Protocol):
@@ -74,19 +74,19 @@ def _ratio_db(amplitude: float, against: float) -> float:
 
 
 @dataclass(frozen=True)
-class Survey:
-    """What one pass over an image's pixels tells.
+class ImageStatistics:
+    """Statistics of an image's pixels.
 
     Attributes
     ----------
     entropy
         Shannon entropy −Σ q ln q of the shares q of power, nats: the lower, the better focused.
     noise_floor_db
-        Median power over peak power, to 0.01 dB: what lies between the targets.
+        Median power over peak power, to 0.01 dB: the level between the targets.
     peak
         Largest magnitude.
     row, column
-        Where it is.
+        Its pixel.
     """
 
     entropy: float
@@ -99,7 +99,7 @@ class Survey:
 _BINS_PER_DB, _LOWEST_DB, _HIGHEST_DB = 100, -300, 300
 
 
-def survey(image: BlockRaster, windows: Iterable[tuple[slice, slice]]) -> Survey:
+def image_statistics(image: BlockRaster, windows: Iterable[tuple[slice, slice]]) -> ImageStatistics:
     """Return entropy, noise floor and peak of an image, one window at a time.
 
     Parameters
@@ -116,8 +116,9 @@ def survey(image: BlockRaster, windows: Iterable[tuple[slice, slice]]) -> Survey
 
     Examples
     --------
-    >>> found = survey(np.ones((10, 10), np.complex64), [(slice(0, 5), slice(0, 10)), (slice(5, 10), slice(0, 10))])
-    >>> round(found.entropy, 4), found.peak, found.noise_floor_db
+    >>> halves = [(slice(0, 5), slice(0, 10)), (slice(5, 10), slice(0, 10))]
+    >>> statistics = image_statistics(np.ones((10, 10), np.complex64), halves)
+    >>> round(statistics.entropy, 4), statistics.peak, statistics.noise_floor_db
     (4.6052, 1.0, 0.0)
     """
     total = weighted = peak = 0.0
@@ -142,13 +143,13 @@ def survey(image: BlockRaster, windows: Iterable[tuple[slice, slice]]) -> Survey
         raise ValueError("no pixel of the image has power")
     median_bin = int(np.searchsorted(empty + np.cumsum(counts), (empty + counts.sum()) / 2))
     floor = _LOWEST_DB + median_bin / _BINS_PER_DB - 10 * np.log10(peak)
-    return Survey(
+    return ImageStatistics(
         float(np.log(total) - weighted / total), min(0.0, round(float(floor), 2)), float(np.sqrt(peak)), *place
     )
 
 
 def coherence_factor(contributions: NDArray[np.complex128]) -> float:
-    """Return Γ = |Σ s_m|² / (M Σ |s_m|²) of what each pulse adds at a pixel: 1 in phase, 1/M at random.
+    """Return Γ = |Σ s_m|² / (M Σ |s_m|²) of the contributions of pulses at a pixel: 1 in phase, 1/M at random.
 
     Notes
     -----
@@ -164,10 +165,10 @@ def coherence_factor(contributions: NDArray[np.complex128]) -> float:
 
 
 def content_loss_db(terms: NDArray[np.complex128]) -> float:
-    """Return how much weaker pixels are than the incoherent sum of what each pulse adds to them, dB.
+    """Return how much weaker pixels are than the incoherent sum of their contributions, dB.
 
-    Errors of tables and paths differ from pulse to pulse and add incoherently; pixels between a few bright targets hold
-    what is left where echoes cancel, so the same errors weigh more there.
+    Errors of tables and paths differ from pulse to pulse and add incoherently; pixels between a few bright targets are
+    the rest of echoes that cancel, so the same errors weigh more there.
 
     Parameters
     ----------
@@ -187,7 +188,7 @@ def content_loss_db(terms: NDArray[np.complex128]) -> float:
     return float(10 * np.log10(incoherent / coherent)) if coherent > 0 and incoherent > 0 else 0.0
 
 
-# ---- Measures of what several images of one scene add up to --------------------------------------------------------
+# ---- Sums of images as amplitudes
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What an error of the total path does to a point: how much peak it costs, where it moves, how it turns the phase."""
+"""Effect of an error of the total path on a point: loss of the peak, shift and phase."""
 
 from dataclasses import dataclass
 
@@ -11,20 +11,20 @@ _MOST_PULSES = 200
 
 
 def autocorrelation(lag_s: NDArray[np.float64], correlation_s: float) -> NDArray[np.float64]:
-    """Return how alike errors of position are so far apart in time: what `position_correlation_s` means everywhere.
+    """Return the autocorrelation of position errors at a time lag: the definition of `position_correlation_s`.
 
     Parameters
     ----------
     lag_s
         Any shape, float64, seconds; not negative.
     correlation_s
-        How long an error lasts, seconds: the length of the moving average that makes it from white noise; 0: each
-        epoch errs for itself.
+        Correlation time, seconds: the length of the moving average that forms the errors from white noise; 0: errors of
+        epochs are independent.
 
     Returns
     -------
     ndarray
-        As `lag_s`; 1 at once, falling in a straight line to 0 at `correlation_s`.
+        As `lag_s`; 1 at lag 0, falling linearly to 0 at `correlation_s`.
 
     Notes
     -----
@@ -44,14 +44,14 @@ def autocorrelation(lag_s: NDArray[np.float64], correlation_s: float) -> NDArray
 
 @dataclass(frozen=True)
 class Effect:
-    """What an error does to the image of a point.
+    """Effect of an error on the image of a point.
 
     Attributes
     ----------
     loss_db
-        Of the peak's power, 0 or less.
+        Loss of the peak's power, 0 or less.
     shift_m
-        Over ground, metres.
+        Shift over ground, metres.
     phase_rad
         At a place on the ground, against a pair without that error; NaN where that is not predicted.
     """
@@ -119,7 +119,7 @@ class PointPaths:
         return np.gradient(self.aperture.path(self.point_m), self.time_s)
 
     def by_node(self, *, same: bool, sidelink: bool) -> tuple[NDArray[np.float64], ...]:
-        """Return how the path measured grows per metre that a log is wrong, (pulse, 3) east, north, up of each node.
+        """Return the growth of the measured path per metre of position error, (pulse, 3) east, north, up of each node.
 
         Parameters
         ----------
@@ -134,8 +134,8 @@ class PointPaths:
         """
         legs = []
         for leg in self.aperture.legs:
-            apart = leg - self.point_m
-            legs.append(apart / np.linalg.norm(apart, axis=1, keepdims=True))
+            offset_m = leg - self.point_m
+            legs.append(offset_m / np.linalg.norm(offset_m, axis=1, keepdims=True))
         if same:
             return ((legs[0] + legs[1]) @ self.axes.T,)
         if sidelink:
@@ -145,19 +145,20 @@ class PointPaths:
         return tuple(leg @ self.axes.T for leg in legs)
 
     def of_offset(self, error_m: NDArray[np.float64], *, common: bool = False) -> Effect:
-        """Return what an error of the path does.
+        """Return the effect of an error of the path.
 
         Parameters
         ----------
         error_m
             (pulse,) float64, metres by which paths are longer than the image takes them for.
         common
-            All pairs share its cause, which moves their images nearly alike: what that leaves between their phases is
-            not predicted.
+            All pairs share its cause, which moves their images nearly alike: the remaining phase between them is not
+            predicted.
 
         Notes
         -----
-        Source: docs/theory/focus.md, eq. 2: what a move over ground explains moves the point, the rest defocuses it.
+        Source: docs/theory/focus.md, eq. 2: the part that fits a shift over ground moves the point, the rest defocuses
+        it.
         """
         ground = self.gradient[:, :2]
         moved = np.linalg.pinv(ground) @ error_m
@@ -168,13 +169,13 @@ class PointPaths:
         return Effect(float(loss_db), float(np.linalg.norm(moved)), phase_rad)
 
     def of_noise(self, *parts: tuple[NDArray[np.float64], float]) -> Effect:
-        """Return what random errors of the path that do not know of each other do on average.
+        """Return the mean effect of independent random errors of the path.
 
         Parameters
         ----------
         *parts
-            Standard deviation at each pulse, (pulse,) float64 metres, and how long an error lasts, seconds, as
-            `autocorrelation` takes it.
+            Standard deviation at each pulse, (pulse,) float64 metres, and correlation time, seconds, as
+            `autocorrelation`.
 
         Notes
         -----

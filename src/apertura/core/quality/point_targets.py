@@ -1,4 +1,4 @@
-"""Point targets in an image: where they peak, how wide they are, what lies beside them."""
+"""Point targets in an image: peak, width and sidelobes."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from apertura.core.quality.measures import BlockRaster
 
-PATCH_PX = 64
+PATCH_PX = 64  # side of a patch, pixels
 
 _REFINEMENTS = 7
 """From one pixel to a grid of 6e-5 pixel in steps of four."""
@@ -25,11 +25,11 @@ class BandLimitedPatch:
         The pixel at its middle.
     carrier
         Spatial frequency down and right, cycles per pixel, that the band lies about; by default the middle of the band
-        as the pixels fold it, with which phases between pixels are right but for a constant turn per pixel.
+        as the pixels fold it, with which phases between pixels are right up to a constant phase step per pixel.
 
     Notes
     -----
-    The patch's discrete Fourier transform is moved so that the signal's band, wherever the carrier folded
+    The patch's discrete Fourier transform is moved so that the signal's band, wherever the carrier aliased
     it, lies in the middle; between pixels the trigonometric polynomial is evaluated exactly. A spline on
     real and imaginary parts would not do: the carrier turns by more than a radian per pixel.
     """

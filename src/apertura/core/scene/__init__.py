@@ -1,1 +1,1 @@
-"""The scene: its grid, its ground, and what can be seen of it."""
+"""The scene: its grid, its ground, and visibility."""

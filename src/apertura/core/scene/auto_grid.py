@@ -1,4 +1,4 @@
-"""Where `auto` puts the scene: UTM zone, bounds and spacing from the flight and the waveform."""
+"""Automatic scene: UTM zone, bounds and spacing from the flight and the waveform."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,7 @@ from apertura.core.geometry.geodesy import geodetic_from_ecef, map_from_frame
 from apertura.core.scene.grid import SceneGrid
 
 GRAZING_LIMIT_DEG = 10.0
-"""Ground seen at a lower grazing angle than this is left out of automatic bounds."""
+"""Degrees: ground at a lower grazing angle is left out of automatic bounds; backscatter and terrain accuracy fade."""
 
 CELLS_PER_PIXEL = 3.0
 """Pixels per finest resolution cell; 2 would be Nyquist for a band-limited magnitude."""
@@ -41,7 +41,7 @@ def auto_bounds(
     height_m: float,
     path_limit_m: float,
 ) -> tuple[float, float, float, float]:
-    """Return bounds of the ground that every pulse sees inside the prefix and above the grazing limit.
+    """Return bounds of the ground that every pulse illuminates inside the prefix and above the grazing limit.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Antennas against the ground: the one place that says which heights cannot be."""
+"""Clearance of antennas above the ground, and errors for impossible heights."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,7 @@ _BLOCKS = 33
 def clearance(
     grid: SceneGrid, terrain: Terrain, antenna: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return how high each phase centre is above the pixel under it, and how high that pixel is.
+    """Return the height of each phase centre above the pixel under it, and the height of that pixel.
 
     Parameters
     ----------
@@ -27,7 +27,8 @@ def clearance(
     Returns
     -------
     tuple of ndarray
-        (pulse,) float64 metres each. Beside the scene flat ground goes on; what lies beside a DEM is not known: NaN.
+        (pulse,) float64 metres each. Beside the scene flat ground is continued; beside a DEM the height is unknown:
+        NaN.
 
     Examples
     --------
@@ -55,12 +56,12 @@ def check_antennas(grid: SceneGrid, terrain: Terrain, aperture: Aperture, *, whe
     Returns
     -------
     dict
-        Name of the flag → what was measured, in one line: from beside a DEM a radar may look up a hillside.
+        Name of the flag → what was measured, in one line: from beside a DEM a radar may image a hillside above it.
 
     Raises
     ------
     CampaignError
-        If an antenna is in or below the ground under it; it names what said how high the ground is.
+        If an antenna is in or below the ground under it; it names the source of the ground's height.
     """
     flags = Flags()
     for antenna, which in zip(aperture.legs, ("transmitter", "receiver"), strict=True):

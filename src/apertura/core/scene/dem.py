@@ -14,23 +14,23 @@ from apertura.common.arrays import Floats
 from apertura.common.errors import CampaignError, shown
 from apertura.common.raster import opened_raster
 from apertura.core.geometry.geodesy import LOCAL
-from apertura.core.scene.geoid import carried_datum, geoid_file, grid_names, undulation
+from apertura.core.scene.geoid import declared_datum, geoid_file, grid_names, undulation
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import Terrain, bilinear
 
-# ---- A DEM in any CRS becomes ellipsoidal heights at the pixels of a grid ------------------------------------------
+# ---- Ellipsoidal heights of a DEM at the pixels of a grid
 
 LATTICE_M = 50.0
-"""Between nodes this far apart, coordinates of another CRS are bilinear to a tenth of a millimetre."""
+"""Metres between nodes, within which coordinates of another CRS are bilinear to a tenth of a millimetre."""
 
 COVER_NODES = 129
-"""Nodes along each side of the scene at which coverage is looked at."""
+"""Nodes along each side of the scene at which coverage is checked."""
 
 LOWEST_M, HIGHEST_M = -500.0, 9000.0
-"""Land on Earth lies between (Dead Sea −430 m, Everest 8849 m), above whichever datum."""
+"""Metres, range of land heights on Earth above any datum: Dead Sea −430 m, Everest 8849 m."""
 
 MOST_POSTS = 100_000_000
-"""Posts of a DEM that are held in memory at once."""
+"""Posts of a DEM in memory at once, at most: 0.8 GB of float64."""
 
 _TILE_PX = 512
 _SAME_RASTER = "the raster that was opened before"
@@ -38,12 +38,12 @@ _SAME_RASTER = "the raster that was opened before"
 
 @dataclass(frozen=True)
 class Dem(Terrain):
-    """A DEM and what its heights count from; `ap.open_dem` opens one.
+    """A DEM and its vertical datum; `ap.open_dem` opens one.
 
     Attributes
     ----------
     path
-        A GeoTIFF; band 1 holds heights.
+        A GeoTIFF; heights in band 1.
     shape
         Rows and columns of the raster.
     pixel_from_map
@@ -76,7 +76,7 @@ class Dem(Terrain):
         Parameters
         ----------
         grid
-            Pixels; each comes out the same whatever window it is asked with.
+            Pixels; the result of each does not depend on the window.
 
         Returns
         -------
@@ -100,7 +100,7 @@ class Dem(Terrain):
         return np.asarray(self._sample(row, column) + shift)
 
     def check_cover(self, grid: SceneGrid) -> None:
-        """Raise CampaignError unless the DEM reaches over the whole grid; say how much is missing and where."""
+        """Raise CampaignError unless the DEM covers the whole grid, with the missing share and its place."""
         place = grid.map_at(*np.rint(grid.sample_pixels(COVER_NODES)))
         column, row = self._posts(grid.crs, place[..., 0], place[..., 1])
         outside = ~self._inside(row, column)
@@ -135,7 +135,7 @@ class Dem(Terrain):
         return np.asarray(a * x + b * y + c - 0.5), np.asarray(d * x + e * y + f - 0.5)
 
     def _shift(self, crs: str, place: Floats) -> Floats:
-        """Return what turns heights of the DEM into heights above the ellipsoid of `crs`."""
+        """Return the shift from heights of the DEM to heights above the ellipsoid of `crs`, metres."""
         if crs == LOCAL:
             return np.zeros(place.shape[:-1])
         longitude, latitude = _transformer(crs, CRS(self.geodetic).to_2d()).transform(place[..., 0], place[..., 1])
@@ -171,17 +171,21 @@ class Dem(Terrain):
             posts = posts.astype(np.float64).filled(np.nan) * raster.scales[0] + raster.offsets[0]
         posts *= self.metres_per_unit
         place = (at[0] - first[0], at[1] - first[1])
-        wild = (posts < LOWEST_M) | (posts > HIGHEST_M)
-        if self.horizontal and wild.any() and np.isnan(bilinear(np.where(wild, np.nan, 0.0)[None], *place)).any():
-            raise self._unearthly(posts, wild, first)
+        impossible = (posts < LOWEST_M) | (posts > HIGHEST_M)
+        if (
+            self.horizontal
+            and impossible.any()
+            and np.isnan(bilinear(np.where(impossible, np.nan, 0.0)[None], *place)).any()
+        ):
+            raise self._impossible_heights(posts, impossible, first)
         sampled[inside] = bilinear(posts[None], *place)[0]
         return sampled
 
-    def _unearthly(self, posts: Floats, wild: NDArray[np.bool_], start: list[int]) -> CampaignError:
-        values, counts = np.unique(posts[wild], return_counts=True)
+    def _impossible_heights(self, posts: Floats, impossible: NDArray[np.bool_], start: list[int]) -> CampaignError:
+        values, counts = np.unique(posts[impossible], return_counts=True)
         (top, left), (rows, columns) = start, posts.shape
         return CampaignError(
-            f"{wild.sum()} of the {wild.size} posts in rows {top} to {top + rows - 1}, columns {left} to "
+            f"{impossible.sum()} of the {impossible.size} posts in rows {top} to {top + rows - 1}, columns {left} to "
             f"{left + columns - 1} have no height on Earth, most often {values[counts.argmax()]:g} m",
             where=self.path,
             expected=f"heights between {LOWEST_M:g} m and {HIGHEST_M:g} m",
@@ -192,7 +196,7 @@ class Dem(Terrain):
 
 @dataclass(frozen=True)
 class UncheckedDem(Terrain):
-    """A DEM under a scene before the stage `terrain` is made of it: a void is refused as the stage will refuse it.
+    """A DEM under a scene before the stage `terrain`: voids raise the same error as in that stage.
 
     Attributes
     ----------
@@ -259,11 +263,11 @@ def _transformer(source: str | CRS, target: str | CRS) -> Transformer:
         ) from error
 
 
-# ---- A DEM file opened: where its posts lie and what its heights count from, or what is wrong with it --------------
+# ---- Opening a DEM file
 
 _EXPECTED = "the DEM of scene.dem, a GeoTIFF of heights"
 NAMES_FILES = re.compile(r'\+proj=|grids=|init=|"PROJ4"|PARAMETERFILE\["[^"]*","[^"]*[/\\:~]', re.IGNORECASE)
-"""What in a CRS (WKT) leads PROJ to a file other than the grids in its own folders."""
+"""Parts of a CRS (WKT) that make PROJ open files other than the grids in its own folders."""
 
 _REMEDY = "Correct the DEM, or scene.dem and scene.dem_datum (from Python: path and datum)."
 
@@ -276,19 +280,19 @@ def open_dem(
     Parameters
     ----------
     path
-        A GeoTIFF, heights in band 1; files beside it (.aux.xml, .ovr, .tfw) count for nothing.
+        A GeoTIFF, heights in band 1; files beside it (.aux.xml, .ovr, .tfw) are ignored.
     scene
         The grid that the DEM must reach over; or the CRS alone, what pyproj reads or 'local', of whatever grid is read.
     datum
-        What the heights count from: 'ellipsoid', 'egm96', 'egm2008', or 'carried' (the raster's CRS says it; in a local
+        Datum of the heights: 'ellipsoid', 'egm96', 'egm2008', or 'carried' (declared by the raster's CRS; in a local
         scene: z of the frame).
     geoid
-        Grid of undulations; looked for on PROJ's search path if None.
+        Grid of undulations; searched on PROJ's path if None.
 
     Raises
     ------
     CampaignError
-        If the file is no DEM, its CRS says otherwise than `datum` or nothing, the grid of undulations is not here, or
+        If the file is no DEM, its CRS contradicts `datum` or declares none, the grid of undulations is missing, or
         the DEM ends inside the scene.
 
     Examples
@@ -359,7 +363,7 @@ def _header(path: Path) -> tuple[tuple[float, ...], tuple[int, int], str, CRS | 
     inverse = ~place
     coefficients = (inverse.a, inverse.b, inverse.c, inverse.d, inverse.e, inverse.f)
     if not np.isfinite(coefficients).all():
-        raise _wrong(path, f"pixels of {sides[0]:g} × {sides[1]:g} units", "pixels that can be told apart")
+        raise _wrong(path, f"pixels of {sides[0]:g} × {sides[1]:g} units", "pixels of distinct position")
     return coefficients, shape, unit, system
 
 
@@ -373,7 +377,7 @@ def _wrong(path: Path, found: str, expected: str) -> CampaignError:
 
 
 def _datum(path: Path, system: CRS, stated: str) -> str:
-    carried = carried_datum(system)
+    carried = declared_datum(system)
     if stated == "carried":
         if carried is None:
             raise _wrong(

@@ -1,4 +1,4 @@
-"""From heights above a geoid to heights above the ellipsoid, through a grid file that must be there and be whole."""
+"""From heights above a geoid to heights above the ellipsoid, through a checked grid file."""
 
 import os
 import struct
@@ -18,16 +18,15 @@ from apertura.common.errors import CampaignError, quoted
 from apertura.common.raster import LARGEST_BLOCK, opened_raster
 from apertura.core.scene.terrain import bilinear
 
-# ---- Grids of undulations in files: what their headers promise is checked before PROJ trusts it, and TIFF is read
-# here
+# ---- Grids of undulations: checked headers and values
 #
-# PROJ reads .gtx; of a damaged TIFF its reader divides by zero, so that GDAL reads those, as it does DEMs.
+# PROJ reads .gtx; its TIFF reader divides by zero on a damaged file, so GDAL reads those, as it does DEMs.
 
 HIGHEST_M = 150.0
-"""No geoid lies farther above or below the ellipsoid: −107 m south of India, +86 m in New Guinea."""
+"""Metres, largest undulation either way: it is −107 m south of India, +86 m in New Guinea."""
 
 MOST_POSTS = 300_000_000
-"""Posts of a grid: one minute all round the Earth."""
+"""Posts of a grid at most: a grid of one arc minute over the Earth has 233 million."""
 
 _GTX = struct.Struct(">4d2i")
 """Latitude and longitude of the first post, steps of both, degrees; rows, columns."""
@@ -37,7 +36,7 @@ _REMEDY = "Get that file again, or correct scene.geoid."
 
 
 def check_grid(path: Path) -> None:
-    """Raise CampaignError unless a file is as large as the grid that its header promises."""
+    """Raise CampaignError unless the size of a file is that of the grid in its header."""
     wrong = None
     if path.suffix.lower() == ".tif":
         with opened_raster(path, expected=_EXPECTED, remedy=_REMEDY) as raster:
@@ -60,7 +59,7 @@ def check_grid(path: Path) -> None:
 
 
 def undulation(grid: Path, longitude_deg: Floats, latitude_deg: Floats) -> Floats:
-    """Return how high the geoid lies above the ellipsoid.
+    """Return the height of the geoid above the ellipsoid.
 
     Parameters
     ----------
@@ -77,7 +76,7 @@ def undulation(grid: Path, longitude_deg: Floats, latitude_deg: Floats) -> Float
     Raises
     ------
     CampaignError
-        If the grid cannot be read or does not reach a place.
+        If the grid cannot be read or does not cover a place.
 
     Notes
     -----
@@ -100,9 +99,9 @@ def undulation(grid: Path, longitude_deg: Floats, latitude_deg: Floats) -> Float
 
 
 def _of_gtx(grid: Path, longitude: Floats, latitude: Floats) -> Floats:
-    """Return what PROJ reads; the grid is named in the operation itself, because PROJ skips one that it does not find.
+    """Return undulations read by PROJ; the operation names the grid, because PROJ skips a missing grid.
 
-    A bare name would be looked for elsewhere.
+    A bare name would be searched elsewhere.
     """
     steps = f'+step +proj=vgridshift +grids="{grid.absolute()}" +multiplier=1'
     try:
@@ -113,7 +112,7 @@ def _of_gtx(grid: Path, longitude: Floats, latitude: Floats) -> Floats:
 
 
 def _of_tif(grid: Path, longitude: Floats, latitude: Floats) -> Floats:
-    """Return band 1 between posts, NaN beyond them; a grid all round the Earth has no last column."""
+    """Return band 1 between posts, NaN beyond them; a grid around the Earth wraps in longitude."""
     from rasterio.windows import Window
 
     with opened_raster(grid, expected=_EXPECTED, remedy=_REMEDY) as raster:
@@ -121,25 +120,25 @@ def _of_tif(grid: Path, longitude: Floats, latitude: Floats) -> Floats:
         turn = 360 / abs(place.a)
         column = np.mod((longitude - place.c) / place.a - 0.5 + 1e-6, turn) - 1e-6  # the first post is inside
         row = (latitude - place.f) / place.e - 0.5
-        whole = columns >= round(turn)
+        around_earth = columns >= round(turn)
         inside = (row >= -1e-6) & (row <= rows - 1 + 1e-6) & (column >= -1e-6)
-        inside &= whole | (column <= columns - 1 + 1e-6)
-        found = np.full(row.shape, np.nan)
+        inside &= around_earth | (column <= columns - 1 + 1e-6)
+        undulations = np.full(row.shape, np.nan)
         if not inside.any():
-            return found
+            return undulations
         first = int(np.clip(np.floor(row[inside].min()), 0, max(rows - 2, 0)))
         last = int(np.clip(np.floor(row[inside].max()) + 2, 1, rows))
         if (last - first) * columns > LARGEST_BLOCK:
             raise ValueError(f"{last - first} rows of {columns} posts are needed at once")
         values = raster.read(1, window=Window(0, first, columns, last - first), masked=True)
         values = values.astype(np.float64).filled(np.nan) * raster.scales[0] + raster.offsets[0]
-    if whole:
+    if around_earth:
         values = np.concatenate([values, values[:, :1]], axis=1)
-    found[inside] = bilinear(values[None], row[inside] - first, column[inside])[0]
-    return found
+    undulations[inside] = bilinear(values[None], row[inside] - first, column[inside])[0]
+    return undulations
 
 
-# ---- From heights above a geoid to heights above the ellipsoid, through a grid file that must be there -------------
+# ---- Vertical datums and their grids
 
 GRIDS = {"egm96": ("us_nga_egm96_15.tif", "egm96_15.gtx"), "egm2008": ("us_nga_egm08_25.tif", "egm08_25.gtx")}
 """Datum → names of its grid of undulations, as PROJ ships them."""
@@ -153,7 +152,7 @@ def geoid_file(datum: str, given: Path | None, *, names: Sequence[str] = ()) -> 
     Parameters
     ----------
     datum
-        What heights count from, for the message and to check that the file is not another datum's.
+        Datum of the heights, for the message and to check that the file is not another datum's.
     given
         What scene.geoid says, as a path that opens here.
     names
@@ -162,7 +161,7 @@ def geoid_file(datum: str, given: Path | None, *, names: Sequence[str] = ()) -> 
     Raises
     ------
     CampaignError
-        If there is no such file: a height is never taken for ellipsoidal for want of a grid.
+        If there is no such file: heights are never taken as ellipsoidal because a grid is missing.
 
     Examples
     --------
@@ -172,7 +171,7 @@ def geoid_file(datum: str, given: Path | None, *, names: Sequence[str] = ()) -> 
     apertura.common.errors.CampaignError: nowhere.gtx: no such file; expected the undulations of egm96, such as ...
     """
     names = tuple(names) or GRIDS.get(datum, ())
-    wanted = f"the undulations of {datum}" + (f", such as {' or '.join(names)}" if names else "")
+    expected = f"the undulations of {datum}" + (f", such as {' or '.join(names)}" if names else "")
     if given is None:
         paths = [folder / name for folder in grid_folders() for name in names if (folder / name).is_file()]
         if paths:
@@ -180,7 +179,7 @@ def geoid_file(datum: str, given: Path | None, *, names: Sequence[str] = ()) -> 
         raise CampaignError(
             f"heights count from {datum}, but its geoid grid is not here",
             where="scene.geoid",
-            expected=wanted,
+            expected=expected,
             remedy=f"Get {names[0] if names else 'that grid'} from PROJ's grid collection (`projsync`), "
             "put it beside the DEM, and name it in scene.geoid.",
         )
@@ -191,23 +190,23 @@ def geoid_file(datum: str, given: Path | None, *, names: Sequence[str] = ()) -> 
     if any(mark in str(given.absolute()) for mark in '",'):
         wrong = "a path with a comma or a quotation mark, which PROJ cannot open"
     if wrong:
-        raise CampaignError(wrong, where=given, expected=wanted, remedy="Get that file, or correct scene.geoid.")
+        raise CampaignError(wrong, where=given, expected=expected, remedy="Get that file, or correct scene.geoid.")
     check_grid(given)
     return given
 
 
 def grid_folders() -> list[Path]:
-    """Return the folders in which grids of undulations are looked for: PROJ's."""
+    """Return the folders in which grids of undulations are searched: PROJ's."""
     listed = [*os.environ.get("PROJ_DATA", "").split(os.pathsep), *get_data_dir().split(os.pathsep)]
     return [Path(folder) for folder in [*listed, get_user_data_dir()] if folder]
 
 
-def carried_datum(crs: CRS) -> str | None:
-    """Return what a CRS says of its heights: 'ellipsoid', 'egm96', 'egm2008', the name of another datum, or None.
+def declared_datum(crs: CRS) -> str | None:
+    """Return the vertical datum of a CRS: 'ellipsoid', 'egm96', 'egm2008', the name of another datum, or None.
 
     Examples
     --------
-    >>> [carried_datum(CRS(code)) for code in ("EPSG:4326", "EPSG:4979", "EPSG:4326+5773", "EPSG:25832+7837")]
+    >>> [declared_datum(CRS(code)) for code in ("EPSG:4326", "EPSG:4979", "EPSG:4326+5773", "EPSG:25832+7837")]
     [None, 'ellipsoid', 'egm96', 'DHHN2016 height']
     """
     vertical = next((part for part in crs.sub_crs_list if part.is_vertical), None)
@@ -218,7 +217,7 @@ def carried_datum(crs: CRS) -> str | None:
 
 
 def grid_names(system: CRS) -> list[str]:
-    """Return the grid file that PROJ would want for the heights of a compound CRS."""
+    """Return the grid files that PROJ needs for the heights of a compound CRS."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         group = TransformerGroup(system, "EPSG:4979", always_xy=True, allow_ballpark=False)

@@ -15,7 +15,7 @@ from apertura.core.scene.map_crs import BLOCK_PX, axis_attributes, block, check_
 
 @dataclass(frozen=True)
 class SceneGrid:
-    """North-up pixels on a map; `apertura.core.scene.terrain` says how high each one lies.
+    """North-up pixels on a map; `apertura.core.scene.terrain` gives their heights.
 
     Attributes
     ----------
@@ -71,7 +71,7 @@ class SceneGrid:
         Raises
         ------
         CampaignError
-            If the CRS is unknown, is not in metres, or its area of use does not hold the bounds.
+            If the CRS is unknown, is not in metres, or its area of use does not contain the bounds.
         """
         xmin, ymin, xmax, ymax = bounds_m
         shape = (max(1, round((ymax - ymin) / spacing_m)), max(1, round((xmax - xmin) / spacing_m)))
@@ -183,7 +183,7 @@ class SceneGrid:
         return positions
 
     def _blocks(self) -> Iterator[tuple[slice, slice]]:
-        """Yield the parts of blocks of the whole grid that this window holds."""
+        """Yield the parts of blocks of the whole grid inside this window."""
         rows, columns = (
             [slice(*cuts) for cuts in pairwise([0, *range(BLOCK_PX - first % BLOCK_PX, size, BLOCK_PX), size])]
             for first, size in zip(self.first, self.shape, strict=True)

@@ -1,4 +1,4 @@
-"""Which pulses make a pixel: how many looks it has and where its aperture is centred, on a lattice over the scene."""
+"""Looks of each pixel and the centre of its aperture, computed on a lattice over the scene."""
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from apertura.common.arrays import Floats
 from apertura.common.contracts import Window
 from apertura.core.antenna.beam import Beams
-from apertura.core.antenna.illumination import reached
+from apertura.core.antenna.illumination import illumination_mask
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.swath import balls
 from apertura.core.scene.terrain import Terrain
 
-# ---- Nodes at every so many pixels of a raster, and what changes slowly interpolated between them ------------------
+# ---- Lattice of nodes over a raster, and interpolation between them
 
 BLOCK_PX = 256
 """Side of the pieces in which a raster is computed."""
@@ -89,14 +89,14 @@ class Lattice:
         smooth = np.asarray(top + up * (bottom - top), np.float64)
         if farthest is None:
             return smooth
-        apart = np.max([np.linalg.norm(corner - corners[0], axis=-1) for corner in corners[1:]], axis=0)
-        jumps = (apart > farthest).any(axis=tuple(range(2, apart.ndim)))
+        distance = np.max([np.linalg.norm(corner - corners[0], axis=-1) for corner in corners[1:]], axis=0)
+        jumps = (distance > farthest).any(axis=tuple(range(2, distance.ndim)))
         if jumps.any():
             near = values[np.ix_(np.where(up.ravel() < 0.5, low, high), np.where(across.ravel() < 0.5, left, right))]
             smooth[jumps] = near[jumps]
         return smooth
 
-    def amid_positive(self, values: NDArray[Any], window: Window) -> NDArray[np.bool_]:
+    def inside_positive(self, values: NDArray[Any], window: Window) -> NDArray[np.bool_]:
         """Return which pixels of a window, (row, column), lie among corners that are all positive."""
         (low, high, _), (left, right, _) = (_cells(at, part) for at, part in zip(self.nodes, window, strict=True))
         corners = [values[np.ix_(row, column)] > 0 for row in (low, high) for column in (left, right)]
@@ -126,32 +126,31 @@ def _cells(nodes: NDArray[np.int64], part: slice) -> tuple[NDArray[np.int64], ND
     return before, after, (at - nodes[before]) / np.maximum(1, nodes[after] - nodes[before])
 
 
-# ---- Which pulses make a pixel: how many looks it has, and where its aperture is centred, on a lattice over the
-# scene
+# ---- Looks, and centre of the aperture of each pixel
 
 SPREAD = 17
-"""Pulses, evenly spread over those that make a pixel, from which shadow is decided."""
+"""Pulses, evenly spread over those that illuminate a pixel, from which shadow is decided."""
 
-_PULSES = 1024  # that tell the sums of a block of the lattice, or up to twice as many
-_AT_ONCE = 64  # pulses of which reach is decided together
-_EXACT = (64, 8, 1)  # a pulse of so many is asked, until one sees the pixel
-_DARK_PULSES = 64  # that tell the centres of a block that no pulse reaches, for its neighbours
-_UNLIT = 1e6  # how much worse a pulse without weight is as a centre
-_JUMP_PITCHES = 4.0  # between nodes a centre moves less, unless it goes over to another pass
+_PULSES = 1024  # summed for a block of the lattice, or up to twice as many
+_AT_ONCE = 64  # pulses of a block whose illumination is decided together
+_EXACT = (64, 8, 1)  # steps between the pulses tried, coarse first, until one illuminates the pixel
+_DARK_PULSES = 64  # evaluated for the centres of a block that no pulse reaches: its neighbours interpolate with them
+_NO_WEIGHT_PENALTY = 1e6  # added to the distance of a pulse without weight: it is a centre only where none has weight
+_JUMP_PITCHES = 4.0  # node pitches: centres of neighbouring nodes further apart belong to different passes
 
 
 @dataclass(frozen=True, eq=False)
 class Looks:
-    """What the pulses of an image make of each place; windows are read tile by tile.
+    """Looks and aperture centre of each place of an image; windows are read tile by tile.
 
     Attributes
     ----------
     grid, terrain
         The scene.
     aperture, beams
-        Every pulse, and what weighs it; None: all count alike.
+        Every pulse, and its weights; None: all count alike.
     lattice
-        Nodes at which the following are known.
+        Nodes at which the following are computed.
     total, squares
         (node row, node column) float32, Σ|w| and Σw² over the pulses.
     centres
@@ -173,13 +172,13 @@ class Looks:
     squares: NDArray[np.float32]
     centres: Floats
     pulses: NDArray[np.int32]
-    _asked: dict[tuple[int, int], NDArray[np.uint8] | bool] = field(default_factory=dict)
+    _masks: dict[tuple[int, int], NDArray[np.uint8] | bool] = field(default_factory=dict)
 
     @classmethod
     def of(
         cls, grid: SceneGrid, terrain: Terrain, aperture: Aperture, beams: Beams | None, *, threads: int = 1
     ) -> "Looks":
-        """Return those of a scene.
+        """Return the looks of a scene.
 
         Parameters
         ----------
@@ -211,28 +210,28 @@ class Looks:
             np.zeros((*lattice.shape, SPREAD), np.int32),
         )
         tiles = list(grid.tiles(BLOCK_PX))
-        lit = reached(beams, aperture, *balls(grid, terrain, tiles), pulses=_AT_ONCE)
+        blocks = illumination_mask(beams, aperture, *balls(grid, terrain, tiles), pulses=_AT_ONCE)
         with ThreadPoolExecutor(threads) as pool:
-            list(pool.map(looks._fill, lattice.blocks, lit.T))
+            list(pool.map(looks._fill, lattice.blocks, blocks.T))
         return looks
 
-    def _fill(self, block: Window, lit: NDArray[np.bool_]) -> None:
-        """Compute the nodes of a block of the lattice from the pulses that may reach it."""
+    def _fill(self, block: Window, reaching: NDArray[np.bool_]) -> None:
+        """Compute the nodes of a block of the lattice from the pulses that may illuminate it."""
         rows, columns = (at[part] for at, part in zip(self.lattice.nodes, block, strict=True))
         points = self.terrain.positions_at(self.grid, *np.meshgrid(rows, columns, indexing="ij")).reshape(-1, 3)
-        some = _reaching(lit, len(self.aperture))
-        every = max(1, (some.stop - some.start) // (_PULSES if lit.any() else _DARK_PULSES))
+        some = _pulses_of(reaching, len(self.aperture))
+        every = max(1, (some.stop - some.start) // (_PULSES if reaching.any() else _DARK_PULSES))
         few = slice(some.start, some.stop, every)
         aperture, beams = self.aperture[few], self.beams and self.beams[few]
         weight = np.ones((len(aperture), len(points))) if beams is None else beams.weight(aperture, points)
-        shape, stands_for = (len(rows), len(columns)), (some.stop - some.start) / len(aperture)
-        self.total[block] = (np.abs(weight).sum(axis=0) * stands_for).reshape(shape)
-        self.squares[block] = ((weight**2).sum(axis=0) * stands_for).reshape(shape)
+        shape, pulses_each = (len(rows), len(columns)), (some.stop - some.start) / len(aperture)
+        self.total[block] = (np.abs(weight).sum(axis=0) * pulses_each).reshape(shape)
+        self.squares[block] = ((weight**2).sum(axis=0) * pulses_each).reshape(shape)
         self.centres[block] = _centres(aperture, beams, points, weight).reshape(*shape, 2, 3)
         self.pulses[block] = (some.start + every * _spread(weight)).reshape(*shape, SPREAD)
 
-    def seen(self, tile: Window) -> NDArray[np.bool_]:
-        """Return whether any pulse makes the pixels of a tile, exactly, (row, column).
+    def illuminated(self, tile: Window) -> NDArray[np.bool_]:
+        """Return whether any pulse illuminates the pixels of a tile, exactly, (row, column) bool.
 
         Parameters
         ----------
@@ -243,43 +242,43 @@ class Looks:
         if self.beams is None:
             return np.ones(shape, bool)
         key = (tile[0].start, tile[1].start)
-        if key not in self._asked:
-            seen = self.lattice.amid_positive(self.total, tile)
-            self._ask(seen, tile)
-            self._asked[key] = bool(seen[0, 0]) if (seen == seen[0, 0]).all() else np.packbits(seen)
-        known = self._asked[key]
+        if key not in self._masks:
+            mask = self.lattice.inside_positive(self.total, tile)
+            self._fill_mask(mask, tile)
+            self._masks[key] = bool(mask[0, 0]) if (mask == mask[0, 0]).all() else np.packbits(mask)
+        known = self._masks[key]
         if isinstance(known, bool):
             return np.full(shape, known)
         return np.unpackbits(known, count=shape[0] * shape[1]).reshape(shape).astype(bool)
 
-    def _ask(self, seen: NDArray[np.bool_], tile: Window) -> None:
-        """Ask every pulse that may reach them of the pixels of a tile that are not known to be seen, cell by cell."""
+    def _fill_mask(self, mask: NDArray[np.bool_], tile: Window) -> None:
+        """Set the pixels of a tile that a pulse illuminates, cell by cell, from every pulse that may reach them."""
         part, pitch = self.grid[tile], self.lattice.pitch_px
-        cells = [cell for cell in part.tiles(pitch) if not seen[cell].all()]
+        cells = [cell for cell in part.tiles(pitch) if not mask[cell].all()]
         if not cells or self.beams is None:
             return
-        lit = reached(self.beams, self.aperture, *balls(part, self.terrain, cells), pulses=_AT_ONCE)
+        reaching = illumination_mask(self.beams, self.aperture, *balls(part, self.terrain, cells), pulses=_AT_ONCE)
         positions = self.terrain.positions(part)
-        for cell, blocks in zip(cells, lit.T, strict=True):
-            unseen = ~seen[cell]
+        for cell, blocks in zip(cells, reaching.T, strict=True):
+            undecided = ~mask[cell]
             mine = np.flatnonzero(np.repeat(blocks, _AT_ONCE)[: len(self.aperture)])
-            seen[cell][unseen] = _any(self.beams, self.aperture, positions[cell][unseen], mine)
+            mask[cell][undecided] = _any(self.beams, self.aperture, positions[cell][undecided], mine)
 
     @cached_property
-    def _lit(self) -> NDArray[np.float32]:
+    def _has_pulses(self) -> NDArray[np.float32]:
         return (self.total > 0).astype(np.float32)
 
     def _sums(self, tile: Window) -> list[Floats]:
         """Return Σ|w| and Σw² at the pixels of a tile, between those nodes that have pulses; 0 where none has."""
-        lit = self.lattice.between(self._lit, tile)
-        lit[lit == 0] = np.inf
-        return [self.lattice.between(values, tile) / lit for values in (self.total, self.squares)]
+        share = self.lattice.between(self._has_pulses, tile)
+        share[share == 0] = np.inf
+        return [self.lattice.between(values, tile) / share for values in (self.total, self.squares)]
 
     def effective(self, tile: Window) -> NDArray[np.float32]:
-        """Return the looks of the pixels of a tile, (row, column) float32; 0 where none makes them."""
+        """Return the looks of the pixels of a tile, (row, column) float32; 0 where no pulse illuminates them."""
         total, squares = self._sums(tile)
         looks = np.maximum(1.0, total**2 / np.where(squares > 0, squares, np.inf))
-        return np.where(self.seen(tile), looks, 0).astype(np.float32)
+        return np.where(self.illuminated(tile), looks, 0).astype(np.float32)
 
     def centre(self, tile: Window) -> tuple[Floats, Floats]:
         """Return transmitter and receiver at each pixel's closest approach, (row, column, 3) float64 metres each."""
@@ -288,9 +287,9 @@ class Looks:
         return centre[..., 0, :], centre[..., 1, :]
 
 
-def _reaching(lit: NDArray[np.bool_], pulses: int) -> slice:
-    """Return the first to the last pulse of blocks that are lit; all where none is."""
-    blocks = np.flatnonzero(lit)
+def _pulses_of(reaching: NDArray[np.bool_], pulses: int) -> slice:
+    """Return the first to the last pulse of the blocks marked; all pulses where none is."""
+    blocks = np.flatnonzero(reaching)
     if not blocks.size:
         return slice(0, pulses)
     return slice(int(blocks[0]) * _AT_ONCE, min(int(blocks[-1] + 1) * _AT_ONCE, pulses))
@@ -298,31 +297,31 @@ def _reaching(lit: NDArray[np.bool_], pulses: int) -> slice:
 
 def _any(beams: Beams, aperture: Aperture, points: Floats, pulses: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Return at which points (point, 3) any of some pulses has a weight."""
-    seen = np.zeros(len(points), bool)
+    illuminated = np.zeros(len(points), bool)
     for every in _EXACT:
         for first in range(0, len(pulses), _AT_ONCE * every):
-            some, left = pulses[first : first + _AT_ONCE * every : every], np.flatnonzero(~seen)
+            some, left = pulses[first : first + _AT_ONCE * every : every], np.flatnonzero(~illuminated)
             if not left.size:
-                return seen
-            seen[left] = (beams[some].weight(aperture[some], points[left]) != 0).any(axis=0)
-    return seen
+                return illuminated
+            illuminated[left] = (beams[some].weight(aperture[some], points[left]) != 0).any(axis=0)
+    return illuminated
 
 
 def _centres(aperture: Aperture, beams: Beams | None, points: Floats, weight: Floats) -> Floats:
     """Return both antennas (point, 2, 3) where each point is passed closest, between pulses too."""
     sector = None if beams is None else beams.sector
-    apart = aperture.path(points) if sector is None else sector.place(aperture, points) ** 2
+    distance = aperture.path(points) if sector is None else sector.place(aperture, points) ** 2
     dark = weight == 0
-    apart = apart + _UNLIT * dark
-    column, best = np.arange(len(points)), apart.argmin(axis=0)
+    distance = distance + _NO_WEIGHT_PENALTY * dark
+    column, best = np.arange(len(points)), distance.argmin(axis=0)
     legs = np.stack(aperture.legs, axis=1)
     if len(aperture) < 3:
         return np.asarray(legs[best])
     inner = np.clip(best, 1, len(aperture) - 2)
-    before, here, after = (apart[inner + step, column] for step in (-1, 0, 1))
-    alike = (dark[inner - 1, column] == dark[inner, column]) & (dark[inner, column] == dark[inner + 1, column])
+    before, here, after = (distance[inner + step, column] for step in (-1, 0, 1))
+    same_weighting = (dark[inner - 1, column] == dark[inner, column]) & (dark[inner, column] == dark[inner + 1, column])
     bend = before - 2 * here + after
-    fit = (inner == best) & (bend > 0) & alike
+    fit = (inner == best) & (bend > 0) & same_weighting
     shift = np.where(fit, (before - after) / np.where(fit, 2 * bend, 1.0), 0.0)  # in pulses, within a half
     beside = best + np.where(fit, np.sign(shift), 0).astype(np.int64)
     return np.asarray(legs[best] + np.abs(shift)[:, None, None] * (legs[beside] - legs[best]))
@@ -332,5 +331,5 @@ def _spread(weight: Floats) -> NDArray[np.int64]:
     """Return pulses (point, `SPREAD`) evenly spread over those that weigh half or more of the most, of all if none."""
     size = np.abs(weight)
     count = np.cumsum(size >= size.max(axis=0) / 2, axis=0)
-    wanted = 1 + np.round(np.linspace(0, 1, SPREAD)[:, None] * (count[-1] - 1))
-    return np.stack([(count >= number).argmax(axis=0) for number in wanted], axis=-1)
+    ranks = 1 + np.round(np.linspace(0, 1, SPREAD)[:, None] * (count[-1] - 1))
+    return np.stack([(count >= number).argmax(axis=0) for number in ranks], axis=-1)

@@ -1,4 +1,4 @@
-"""The CRS of a scene: what it must be, and where on Earth the pixels of a grid in it are."""
+"""The CRS of a scene: its checks, and positions on Earth of the pixels of a grid in it."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -12,13 +12,13 @@ from pyproj.exceptions import ProjError
 from apertura.common.errors import CampaignError
 from apertura.core.geometry.geodesy import ecef_from_geodetic, ecef_from_projected, projected_from_ecef
 
-# ---- What a scene's CRS must be: known to PROJ, projected in metres, and usable where the scene lies ---------------
+# ---- Checks of a scene's CRS
 
 MARGIN_DEG = 3.0
-"""How far beyond its area of use a projection may be used: half a UTM zone, where distances grow by half a per cent."""
+"""Degrees that a projection may be used beyond its area: half a UTM zone, where scale grows by half a per cent."""
 
 RETURN_M = 1e-3
-"""Places that do not come back to their coordinates this closely are beyond a projection."""
+"""Metres of error of a place projected and back, above which it is outside the domain of the projection."""
 
 _WHERE = "scene"
 
@@ -107,7 +107,7 @@ def check_crs(crs: str, bounds_m: tuple[float, float, float, float]) -> None:
     try:
         _check_usable(system, bounds_m)
         projected_from_ecef(crs, ecef_from_geodetic(*(np.array(angle) for angle in (0.0, 0.0, 0.0))))
-    except ProjError as error:  # such as a datum that only a grid of shifts leads to
+    except ProjError as error:  # such as a datum that needs a grid of shifts
         raise CampaignError(
             f"PROJ knows no exact way here from {crs} ({system.name}) to WGS 84",
             where=_WHERE,
@@ -117,7 +117,7 @@ def check_crs(crs: str, bounds_m: tuple[float, float, float, float]) -> None:
 
 
 def _check_usable(system: CRS, bounds_m: tuple[float, float, float, float]) -> None:
-    """Refuse corners from which the projection does not lead back, or that lie far from its area of use."""
+    """Refuse corners outside the domain of the projection, or far from its area of use."""
     area = system.area_of_use
     inverse = Transformer.from_crs(system, system.geodetic_crs, always_xy=True)
     xmin, ymin, xmax, ymax = bounds_m
@@ -148,7 +148,7 @@ def _check_usable(system: CRS, bounds_m: tuple[float, float, float, float]) -> N
 def _near(
     area_deg: tuple[float, float, float, float], longitude: NDArray[np.float64], latitude: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
-    """Return which places lie within `MARGIN_DEG` of west, south, east, north, also across the 180th meridian."""
+    """Return which places are within `MARGIN_DEG` of west, south, east, north, also across the 180th meridian."""
     west, south, east, north = area_deg
     width = (east - west) % 360 or 360.0
     longitude = np.where(np.isfinite(longitude), longitude, np.nan)  # nowhere: near nothing
@@ -156,19 +156,19 @@ def _near(
     return np.asarray(inside & (latitude >= south - MARGIN_DEG) & (latitude <= north + MARGIN_DEG))
 
 
-# ---- Where the pixels of a projected grid are: PROJ at a few nodes of each block, polynomials in between -----------
+# ---- Positions of the pixels of a projected grid
 #
 # PROJ takes as long for a pixel as the sum of hundreds of pulses; Earth is so smooth that over a block of pixels
-# polynomials of degree four are as exact as float64 holds positions (docs/theory/planner.md, "Pixel positions").
+# polynomials of degree four are as exact as positions in float64 (docs/theory/planner.md, "Pixel positions").
 
 BLOCK_PX = 256
 
 DEGREE = 4
 
 TOLERANCE_M = 3e-8
-"""Blocks whose polynomials miss PROJ by more than this between the nodes are placed by PROJ, pixel by pixel."""
+"""Metres of error of a block's polynomials between nodes, above which PROJ computes each pixel: float64 has 1e-9 m."""
 
-_CLIMB_M = 1e4  # ECEF is exactly linear in ellipsoidal height: positions at two heights tell all
+_CLIMB_M = 1e4  # ECEF is exactly linear in ellipsoidal height: positions at two heights suffice
 _NODES = np.cos(np.pi * (np.arange(DEGREE + 1) + 0.5) / (DEGREE + 1))
 _BETWEEN = np.array([-1.0, -0.5, 0.45, 1.0])
 

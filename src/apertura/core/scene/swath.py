@@ -7,14 +7,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.core.antenna.beam import Beams
-from apertura.core.antenna.illumination import reached
+from apertura.core.antenna.illumination import illumination_mask
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import Terrain
 
 _BLOCKS = 33
 _PULSES_AT_ONCE = 256
-_MOST_PULSES = 4096  # whose paths are taken each
+_MOST_PULSES = 4096  # whose paths are computed; others are bounded
 
 
 def swath(
@@ -22,9 +22,9 @@ def swath(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the shortest and longest total path from each pulse to the scene.
 
-    About 33 × 33 blocks of pixels, each a point and a radius that holds its pixels at all their heights; the
-    total path changes by at most twice the radius. Of a long flight some pulses stand for those about them: a path
-    changes by at most what both antennas move.
+    About 33 × 33 blocks of pixels, each a point and a radius that bounds its pixels at all their heights; the
+    total path changes by at most twice the radius. In a long flight a sample of pulses bounds those between: a path
+    changes by at most the movement of both antennas.
 
     Parameters
     ----------
@@ -33,13 +33,13 @@ def swath(
     aperture
         In the grid's processing frame.
     beams
-        What weighs pulses: blocks of pixels to which a pulse cannot add do not count.
+        Weights of pulses: blocks of pixels that a pulse cannot illuminate do not count.
 
     Returns
     -------
     tuple of ndarray
         (pulse,) float64 metres each; never longer, never shorter than any pixel's path. Infinite and minus infinite for
-        a pulse that adds to none.
+        a pulse that illuminates none.
 
     Examples
     --------
@@ -69,7 +69,7 @@ def _spans(
     radius_m: NDArray[np.float64],
     every: int,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the swath of some pulses, `every` so many of which one stands for those about it."""
+    """Return the swath of some pulses; each bounds the `every` pulses about it."""
     block = np.arange(len(aperture)) // every
     middle = aperture[np.minimum(np.arange(0, len(aperture), every) + every // 2, len(aperture) - 1)]
     moved = sum(
@@ -78,7 +78,7 @@ def _spans(
     path = middle.path(middle_m)
     near, far = path - 2 * radius_m, path + 2 * radius_m
     if beams is not None:
-        dark = ~reached(beams, aperture, middle_m, radius_m, pulses=every)
+        dark = ~illumination_mask(beams, aperture, middle_m, radius_m, pulses=every)
         near[dark], far[dark] = np.inf, -np.inf
     return near.min(axis=1)[block] - moved, far.max(axis=1)[block] + moved
 
@@ -86,7 +86,7 @@ def _spans(
 def balls(
     grid: SceneGrid, terrain: Terrain, windows: Sequence[tuple[slice, slice]]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return middles (window, 3) and radii (window,), metres, of balls that hold the pixels of windows of a scene."""
+    """Return middles (window, 3) and radii (window,), metres, of balls that contain the pixels of windows."""
     centre = np.array([[(part.start + part.stop - 1) / 2 for part in window] for window in windows])
     half_m = np.array([[(part.stop - part.start - 1) / 2 * grid.spacing_m for part in window] for window in windows])
     low, high = np.array([[(height := terrain.heights(grid[window])).min(), height.max()] for window in windows]).T

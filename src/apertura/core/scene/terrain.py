@@ -10,16 +10,16 @@ from apertura.common.arrays import Floats
 from apertura.common.errors import CampaignError
 from apertura.core.scene.grid import SceneGrid
 
-# ---- The ground under a scene, told in one way: at one height, a plane, or heights from a DEM ----------------------
+# ---- Ground models: flat, a plane, heights of a grid
 #
-# Whoever needs heights holds a `Terrain` and asks it for those of a grid, of a window of it, or of single pixels.
+# A `Terrain` gives the heights of a grid, of a window of it, or of single pixels.
 
 
 _TILE_PX = 512  # heights at single pixels are read by such tiles
 
 
 class Terrain(Protocol):
-    """Heights of the ground; a subclass gives `heights`, the rest follows from it."""
+    """Heights of the ground; a subclass defines `heights`, the rest follows from it."""
 
     def heights(self, grid: SceneGrid) -> Floats:
         """Return the height of each pixel of a grid or of a window of it.
@@ -27,7 +27,7 @@ class Terrain(Protocol):
         Parameters
         ----------
         grid
-            Pixels; each one has the same height, to the bit, in whatever window it is asked for.
+            Pixels; each one has the same height, to the bit, in any window.
 
         Returns
         -------
@@ -60,7 +60,7 @@ class Terrain(Protocol):
 
     @property
     def spec(self) -> dict[str, Any]:
-        """Numbers that tell the ground, as JSON values for provenance; none where a file or stage tells it."""
+        """Parameters of the ground, as JSON values for provenance; none where a file or stage defines it."""
         return {}
 
 
@@ -83,15 +83,15 @@ class FlatGround(Terrain):
     height_m: float
 
     def heights(self, grid: SceneGrid) -> Floats:
-        """Return the one height at every pixel; no memory is spent on it."""
+        """Return the height at every pixel, as a broadcast without memory."""
         return np.broadcast_to(np.float64(self.height_m), grid.shape)
 
     def heights_at(self, grid: SceneGrid, row: ArrayLike, column: ArrayLike) -> Floats:  # noqa: ARG002
-        """Return the one height; flat ground goes on beside the grid."""
+        """Return the height; flat ground is continued beside the grid."""
         return np.full(np.broadcast_shapes(np.shape(row), np.shape(column)), self.height_m)
 
     def positions(self, grid: SceneGrid) -> Floats:
-        """Return the pixels' positions: one height takes one polynomial."""
+        """Return the pixels' positions: one polynomial for one height."""
         return grid.positions(self.height_m)
 
     @property
@@ -145,7 +145,7 @@ class Plane(Terrain):
         return self._over(grid.x_m, grid.y_m[:, None])
 
     def heights_at(self, grid: SceneGrid, row: ArrayLike, column: ArrayLike) -> Floats:
-        """Return the plane's heights; it goes on beside the grid."""
+        """Return the plane's heights; it is continued beside the grid."""
         place = grid.map_at(*np.broadcast_arrays(row, column))
         return self._over(place[..., 0], place[..., 1])
 
@@ -159,7 +159,7 @@ class Plane(Terrain):
 
 
 def ground_of(terrain: Terrain | float | None, grid: SceneGrid) -> Terrain:
-    """Return the ground that was given, flat where it is one height; in a local frame it may be left out, and is at 0.
+    """Return the given ground, flat where it is one height; 0 where it is left out in a local frame.
 
     Raises
     ------
@@ -187,7 +187,7 @@ class _Array(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class GridHeights(Terrain):
-    """Heights known at the pixels of one grid, such as the stage `terrain`.
+    """Heights at the pixels of one grid, such as the stage `terrain`.
 
     Attributes
     ----------
@@ -217,14 +217,14 @@ class GridHeights(Terrain):
 
 
 def bilinear(values: Floats, row: Floats, column: Floats) -> Floats:
-    """Return (layer, ...) values between pixels; one that has no weight does not count, even if it is NaN.
+    """Return (layer, ...) values between pixels; one without weight does not count, even if it is NaN.
 
     Parameters
     ----------
     values
         (layer, row, column) float64.
     row, column
-        Fractional indices, broadcast against each other; beyond the edges the slope of the last two goes on.
+        Fractional indices, broadcast against each other; beyond the edges by linear extrapolation.
     """
     first = [
         np.clip(np.floor(axis), 0, max(0, size - 2)).astype(np.int64)
@@ -245,14 +245,14 @@ def _within(part: slice, at: Floats) -> NDArray[np.bool_]:
     return np.asarray((at >= part.start - 0.5) & (at < part.stop - 0.5))
 
 
-# ---- The ground of a scene and its two cheaper models: level, and a plane through it -------------------------------
+# ---- The ground of a scene and its two cheaper models
 
 _BLOCKS = 33
 
 
 @dataclass(frozen=True)
 class GroundModels:
-    """The ground of a scene and its two cheaper models, with how far they are off.
+    """The ground of a scene and its two cheaper models, with their largest errors.
 
     Attributes
     ----------
@@ -292,10 +292,10 @@ class GroundModels:
 
     @classmethod
     def flat(cls, height_m: float = 0.0) -> "GroundModels":
-        """Return the models of flat ground, which is its own."""
+        """Return the models of flat ground: all three are the same."""
         level = FlatGround(height_m)
         return cls(level, level, Plane(0.0, 0.0, height_m, 0.0, 0.0), 0.0, 0.0)
 
-    def called(self, name: str) -> Terrain:
+    def model(self, name: str) -> Terrain:
         """Return the model that a decision names: 'plane' (level), 'tilted_plane' or 'dem'."""
         return {"plane": self.level, "tilted_plane": self.plane, "dem": self.full}[name]

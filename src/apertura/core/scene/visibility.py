@@ -1,4 +1,4 @@
-"""How the scene is seen: incidence, bistatic angle, and where terrain casts shadow or is laid over."""
+"""Visibility of the scene: incidence, bistatic angle, shadow and layover."""
 
 from dataclasses import dataclass
 
@@ -12,7 +12,7 @@ from apertura.core.geometry.geodesy import LOCAL
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import Terrain
 
-# ---- Walks over a relief along lines of sight: what lies in shadow, and what shares its range with other ground
+# ---- Shadow and layover along lines of sight
 #
 # Kernels (docs/theory/terrain.md, sections 3 and 4). `legs` is (pulse, leg, 3): row, column and height of each phase
 # centre; `ground` is heights (row, column) float32, spacing of the pixels and 1/2R of the Earth (metres, 1/m). Every
@@ -22,13 +22,13 @@ SHADOW, LAYOVER = 1, 2
 """Bits of the mask."""
 
 BLOCK = 16
-"""Side of the blocks of pixels whose highest ground is known beforehand."""
+"""Pixels, side of the blocks whose highest ground is computed beforehand."""
 
 TOLERANCE_M = 1e-3
-"""Ground that rises no more than this above a line of sight does not block it."""
+"""Metres that ground may rise above a line of sight without blocking it: float32 rounding of a relief."""
 
 STRAIGHT_BELOW = 0.05
-"""Where the path's slope over the ground is less than this, the antenna is overhead and has no side to look from."""
+"""Slope of the path over the ground, m/m, below which the antenna is overhead and layover is undefined."""
 
 
 @numba.njit(cache=True, nogil=True)
@@ -54,7 +54,7 @@ def _interpolated(height, row, column):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _steps_left(index, step):  # type: ignore[no-untyped-def]
-    """How many whole steps stay inside the block that `index` is in, along one axis."""
+    """Whole steps that remain inside the block of `index`, along one axis."""
     if step == 0:
         return 1 << 30
     block = np.floor(index / BLOCK) * BLOCK
@@ -79,12 +79,12 @@ def _blocked(antenna, row, column, highest, top, ground):  # type: ignore[no-unt
     while t < steps:
         r, c = row + t * dr, column + t * dc
         there = _interpolated(height, r, c)
-        if np.isnan(there):  # the line has left the scene: what is beside it blocks nothing
+        if np.isnan(there):  # the line has left the scene: ground outside it blocks nothing
             return False
         line = own + up * t / steps - bend * t * (steps - t)
         if there > line + TOLERANCE_M:
             return True
-        # From here on a rising line comes no lower than this. Above all ground of the scene it is free; above all of
+        # From here on a rising line is no lower than this. Above all ground of the scene it is free; above all of
         # this block (known with one pixel around it) the walk leaps to the last step inside the block.
         leap, least = 1, line - bend * steps
         if up > 0 and least > top:
@@ -117,34 +117,34 @@ def mark_shadow(mask, first, legs, highest, ground):  # type: ignore[no-untyped-
 
 @numba.njit(cache=True, nogil=True)
 def _total_path(legs, pixel, height_m, ground):  # type: ignore[no-untyped-def]
-    """Length of the way from one antenna to a pixel (row, column) at a height and on to the other antenna."""
+    """Total path from one antenna to a pixel (row, column) at a height and to the other antenna."""
     _, spacing, curvature = ground
     path = 0.0
     for leg in range(2):
         south, east = (pixel[0] - legs[leg, 0]) * spacing, (pixel[1] - legs[leg, 1]) * spacing
         flat = south * south + east * east
-        # Seen from the antenna's horizontal the ground falls away by d²/2R.
+        # Below the antenna's horizontal the ground falls by d²/2R.
         up = legs[leg, 2] - height_m + curvature * flat
         path += np.sqrt(flat + up * up)
     return path
 
 
 @numba.njit(cache=True, nogil=True)
-def _laid_over(way, legs, pixel, extreme, ground):  # type: ignore[no-untyped-def]
-    """Whether ground along `way` (rows and columns per step, sign) shares the path of the pixel.
+def _in_layover(direction, legs, pixel, extreme, ground):  # type: ignore[no-untyped-def]
+    """Whether ground along `direction` (rows and columns per step, sign) shares the path of the pixel.
 
-    Behind the pixel (sign +1) paths should be longer, before it (−1) shorter. `extreme` is the height that could break
-    that from farthest away: the highest ground behind, the lowest before.
+    Behind the pixel (sign +1) paths should be longer, before it (−1) shorter. `extreme` is the height that could
+    violate this from farthest away: the highest ground behind, the lowest before.
     """
-    height, sign = ground[0], way[2]
+    height, sign = ground[0], direction[2]
     own = _total_path(legs, pixel, height[pixel[0], pixel[1]], ground)
     t = 1
     while True:
-        there = (pixel[0] + t * way[0] * sign, pixel[1] + t * way[1] * sign)
+        there = (pixel[0] + t * direction[0] * sign, pixel[1] + t * direction[1] * sign)
         height_m = _interpolated(height, there[0], there[1])
         if np.isnan(height_m):  # the end of the scene
             return False
-        # Not even the most extreme ground of the scene could share the path from here on.
+        # Not even the most extreme ground of the scene can share the path from here on.
         if sign * (_total_path(legs, there, extreme, ground) - own) > 0:
             return False
         if sign * (_total_path(legs, there, height_m, ground) - own) <= 0:
@@ -180,17 +180,17 @@ def mark_layover(mask, first, legs, extremes, ground):  # type: ignore[no-untype
                     nearest, least = pulse, path
             down, right = _path_gradient(legs[nearest], pixel, own, spacing)
             steep = max(abs(down), abs(right))
-            if steep < STRAIGHT_BELOW:  # overhead: every way leads away
+            if steep < STRAIGHT_BELOW:  # overhead: every direction leads away
                 continue
             # One pixel per step along the longer axis, as for shadow; away from the antenna, then towards it.
             dr, dc = down / steep, right / steep
-            if _laid_over((dr, dc, 1), legs[nearest], pixel, extremes[1], ground) or _laid_over(
+            if _in_layover((dr, dc, 1), legs[nearest], pixel, extremes[1], ground) or _in_layover(
                 (dr, dc, -1), legs[nearest], pixel, extremes[0], ground
             ):
                 mask[i, j] |= LAYOVER
 
 
-# ---- How the scene is seen: incidence, bistatic angle, and where terrain casts shadow or is laid over --------------
+# ---- Incidence, bistatic angle, and visibility of a window
 
 EARTH_RADIUS_M = 6371e3
 
@@ -221,7 +221,7 @@ def surface_normals(position: Floats) -> Floats:
 
 
 def incidence_deg(position: Floats, normal: Floats, antenna: Floats) -> Floats:
-    """Return the angle between the way to an antenna and the surface normal.
+    """Return the angle between the direction to an antenna and the surface normal.
 
     Parameters
     ----------
@@ -244,7 +244,7 @@ def incidence_deg(position: Floats, normal: Floats, antenna: Floats) -> Floats:
 
 
 def bistatic_angle_deg(position: Floats, tx: Floats, rx: Floats) -> Floats:
-    """Return the angle (degrees) at each position (..., 3) between the ways to two antennas (3,), metres.
+    """Return the angle (degrees) at each position (..., 3) between the directions to two antennas (3,), metres.
 
     Examples
     --------
@@ -261,12 +261,12 @@ def _angle(one: Floats, other: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class Relief:
-    """The heights of a whole scene, ready to be walked over.
+    """The heights of a whole scene, with block maxima for the search along lines of sight.
 
     Attributes
     ----------
     grid, base_m
-        The scene, and the height that the others count from.
+        The scene, and the height that other heights are relative to.
     height_m
         (row, column) float32, metres above `base_m`.
     highest_m
@@ -283,7 +283,7 @@ class Relief:
 
     @classmethod
     def of(cls, grid: SceneGrid, terrain: Terrain, base_m: float) -> "Relief":
-        """Return the relief of a scene above a height (m) amid its ground: float32 then holds it to micrometres."""
+        """Return the relief of a scene above a height (m) amid its ground: float32 then is exact to micrometres."""
         relative = np.empty(grid.shape, np.float32)
         for row in range(0, grid.shape[0], _STRIP):
             strip = (slice(row, min(row + _STRIP, grid.shape[0])), slice(0, grid.shape[1]))
@@ -313,12 +313,12 @@ class Relief:
 
 
 def visibility(relief: Relief, tx: Floats, rx: Floats, window: Window) -> NDArray[np.uint8]:
-    """Return where one pair sees the ground of a window in shadow or in layover.
+    """Return the mask of shadow and layover of a window, for one pair.
 
     Shadow: at more than half of the pulses given the straight line to the transmitter or to the receiver runs through
     ground of the scene. Layover: at the pulse with the shortest total path, the path does not grow along the line of
     sight from all ground before the pixel to all behind, so that another place shares its range. Ground outside the
-    scene hides nothing and is not laid over.
+    scene causes neither shadow nor layover.
 
     Parameters
     ----------
@@ -327,7 +327,7 @@ def visibility(relief: Relief, tx: Floats, rx: Floats, window: Window) -> NDArra
     tx, rx
         (pulse, 3) float64 from `Relief.above`: some pulses, evenly spread over the aperture.
     window
-        Rows and columns asked for.
+        Rows and columns requested.
 
     Returns
     -------

@@ -145,7 +145,7 @@ def joined_sweeps(read: Sequence[Sweeps], *, pair: str, described: Mapping[str, 
         began = _regular(one, described, alone=len(read) == 1) if one.time is None else one.time
         if len(began) != len(one.beat):
             raise _error(f"{len(began)} times for {len(one.beat)} sweeps", one.path)
-        sound = one.beat[:, sweep.first : sweep.whole].any(axis=1)
+        sound = one.beat[:, sweep.first : sweep.sweep_samples].any(axis=1)
         left_out = {**(one.dropped or {}), "silent": int((~sound).sum())}
         dropped = {why: dropped.get(why, 0) + left_out.get(why, 0) for why in {**dropped, **left_out}}
         late_s = None if one.late_s is None else one.late_s[sound]
@@ -155,7 +155,7 @@ def joined_sweeps(read: Sequence[Sweeps], *, pair: str, described: Mapping[str, 
     if not len(time):
         raise _error("no sweep with a signal", read[0].path)
     steps_s = np.diff(time) / np.timedelta64(1, "s")
-    early = np.flatnonzero(steps_s < _LEAST_STEP * sweep.whole / sweep.sample_rate_hz)
+    early = np.flatnonzero(steps_s < _LEAST_STEP * sweep.sweep_samples / sweep.sample_rate_hz)
     if early.size:
         found = (
             f"sweep {int(early[0]) + 1} begins {steps_s[early[0]]:.6g} s after another that lasts {sweep.sweep_s:g} s"
@@ -180,8 +180,8 @@ def joined_sweeps(read: Sequence[Sweeps], *, pair: str, described: Mapping[str, 
 
 def _check(one: Sweeps, sweep: FrequencySweep) -> None:
     beat = one.beat
-    if beat.ndim != 2 or beat.dtype.kind not in "fiuc" or beat.shape[1] < sweep.whole or not len(beat):
-        raise _error(f"{beat.dtype} of shape {beat.shape}: a sweep has {sweep.whole} samples", one.path)
+    if beat.ndim != 2 or beat.dtype.kind not in "fiuc" or beat.shape[1] < sweep.sweep_samples or not len(beat):
+        raise _error(f"{beat.dtype} of shape {beat.shape}: a sweep has {sweep.sweep_samples} samples", one.path)
     if (beat.dtype.kind == "c") != (sweep.iq != "real"):
         raise _error(f"{beat.dtype} samples where waveform.iq is {sweep.iq}", one.path)
     with np.errstate(invalid="ignore"):
@@ -294,10 +294,10 @@ def cut_sweeps(path: Path, found: Mapping[str, NDArray[Any]], described: Mapping
     starts = trigger_starts(-sync if falling else sync, threshold=trigger["threshold"])
     first, whole = np.ceil(starts).astype(np.int64), _whole(starts, sweep, len(samples))
     if not whole.any():
-        raise _bad(f"{len(starts)} triggers, none with a whole sweep of {sweep.whole} samples after it", path)
+        raise _bad(f"{len(starts)} triggers, none with a whole sweep of {sweep.sweep_samples} samples after it", path)
     if samples.dtype == np.uint8:
         beat -= 128  # of 8 bits that is zero
-    rows = np.lib.stride_tricks.sliding_window_view(beat, sweep.whole)[first[whole]]
+    rows = np.lib.stride_tricks.sliding_window_view(beat, sweep.sweep_samples)[first[whole]]
     time = beginning(described, path) + np.round(starts[whole] * (1e9 / rate)).astype("timedelta64[ns]")
     return Sweeps(path, rows, time, (first - starts)[whole] / rate, {"incomplete": int((~whole).sum())})
 
@@ -332,7 +332,7 @@ def trigger_starts(sync: NDArray[np.float64], *, threshold: float) -> NDArray[np
 
 def _whole(starts: NDArray[np.float64], sweep: FrequencySweep, count: int) -> NDArray[np.bool_]:
     """Return which sweeps end before the next trigger and the file do."""
-    ends = np.ceil(starts).astype(np.int64) + sweep.whole
+    ends = np.ceil(starts).astype(np.int64) + sweep.sweep_samples
     following = np.append(np.ceil(starts[1:]), count)
     return np.asarray(ends <= following)
 

@@ -9,7 +9,7 @@ import numpy as np
 from apertura.common.arrays import Complexes, Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.flags import Flags
-from apertura.core.echo.compression import phasors, turned
+from apertura.core.echo.compression import phasors, rotated
 from apertura.methods.autofocus.motion import Logged, Recorded, plausible_offsets
 
 # ---- Offset and path by coherent sum at a known point ---------------------------------------------------------------
@@ -83,7 +83,7 @@ class PointResponse:
         frequency = self.echo.frequency_hz
         spacing_hz = float(frequency[-1] - frequency[0]) / (frequency.size - 1)
         weight = speed / max(float(speed.sum()), 1e-30)
-        start = turned(weight, paths_s * frequency[0])[:, None]
+        start = rotated(weight, paths_s * frequency[0])[:, None]
         taper = np.hanning(frequency.size + 2)[1:-1]
         summed: Complexes = (some.transfer * (start * phasors(paths_s * spacing_hz, frequency.size))).sum(0)
         return np.asarray(summed * (taper / taper.sum()), np.complex64)

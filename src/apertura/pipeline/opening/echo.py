@@ -14,7 +14,7 @@ from apertura.common.flags import Flags
 from apertura.core.echo.association import Association, missing_flags, tag_jitter_s
 from apertura.core.echo.captures import Pulses, Saturation, blocks_of
 from apertura.core.echo.demodulate import remove_path
-from apertura.core.echo.pulse_filter import cut_pulses
+from apertura.core.echo.pulse_filter import truncation_flags
 from apertura.core.echo.sidelink import DIVIDING
 from apertura.core.echo.transfer import Transfer, transfer_by_code, transfer_by_sidelink
 from apertura.core.quality.budget import strictest_accuracy_db
@@ -195,7 +195,7 @@ def _of_what_was_sent(measured: Transfer, sent: Transmitted) -> Transfer:
     if isinstance(waveform, PulseWaveform) and measured.sidelink_delay_m is not None:
         window = {name: getattr(waveform, name) for name in ("lead_s", "pulse_s", "listen_s")}
         cell_s = 1 / (sent.numerology.numbers.size * sent.numerology.spacing_hz)
-        cut = cut_pulses(measured.sidelink_delay_m / SPEED_OF_LIGHT_M_S, cell_s=cell_s, **window)
+        cut = truncation_flags(measured.sidelink_delay_m / SPEED_OF_LIGHT_M_S, cell_s=cell_s, **window)
         flags = Flags.merged(flags, cut)
     report = {**measured.report, **({"waveform": sent.report} if sent.report else {})}
     return replace(measured, flags=Flags.merged(measured.flags, flags), report=report)

@@ -13,7 +13,7 @@ from apertura.common.errors import CampaignError
 from apertura.common.provenance import sha256_file
 from apertura.common.raster import opened_raster
 from apertura.core.quality.agreement import Agreement, agreement
-from apertura.core.quality.bright_points import BrightPoint, shows_point
+from apertura.core.quality.bright_points import BrightPoint, has_point
 from apertura.core.quality.measures import BlockRaster
 from apertura.core.scene.grid import SceneGrid
 from apertura.pipeline.campaign import Campaign
@@ -106,7 +106,7 @@ def shows_points_of(first: "xr.Dataset", second: "xr.Dataset", grid: SceneGrid) 
     """Return whether a second image has a bright pixel where a first has one of its bright points."""
     reach = max(1, round(_focus(first)["cell_m"] / grid.spacing_m))
     points = _points(_focus(first), grid)
-    return any(shows_point(second.image, round(point.row), round(point.column), reach=reach) for point in points)
+    return any(has_point(second.image, round(point.row), round(point.column), reach=reach) for point in points)
 
 
 def _focus(image: "xr.Dataset") -> dict[str, Any]:

@@ -122,7 +122,7 @@ def scene_illumination(
         return None
     points = scene.grid.sample_points(_POINTS, scene.level.height_m)
     illumination = illuminate(beams, aperture, points.reshape(-1, 3))
-    if illumination.unseen == 1:
+    if illumination.unilluminated == 1:
         _refuse(campaign, pair, beams, points[points.shape[0] // 2, points.shape[1] // 2], aperture)
     return illumination
 

@@ -14,7 +14,7 @@ from apertura.common.flags import Flags
 from apertura.core.antenna.beam import Beams
 from apertura.core.echo.compression import centre_frequency
 from apertura.core.focus.job import Job
-from apertura.core.imaging.job import imaging_job, settle
+from apertura.core.imaging.job import decide_integration, imaging_job
 from apertura.core.planning.decisions import decide_accuracy
 from apertura.core.planning.plan import Decision, Plan, memory_limit
 from apertura.core.planning.planner import make_plan
@@ -237,7 +237,9 @@ def weighing(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> Beams | No
     As in `job_of`, but without the echo: the ranges that profiles must cover follow from it.
     """
     centre_hz, requested = centre_frequency(pair.frequency_hz), campaign.settings.processing.integrated
-    settled = settle(pair.aperture, centre_hz, scene.grid, scene.level, antennas=pair.beams, asked=requested)
+    settled = decide_integration(
+        pair.aperture, centre_hz, scene.grid, scene.level, antennas=pair.beams, requested=requested
+    )
     return Beams.within(settled.sector, pair.beams)
 
 

@@ -93,7 +93,7 @@ def place(tx: NodeLog, rx: NodeLog, at: Times) -> PulsePositions:
     """
     good, reasons, flags = np.ones(len(at), bool), dict[str, int](), Flags()
     for node in {one.name: one for one in (tx, rx)}.values():
-        barred = node.checked.barred(node.log_seconds(at))
+        barred = node.checked.excluded(node.log_seconds(at))
         flags = Flags.merged(flags, _flags(node, at, barred))
         for cause, out in barred.items():
             reasons[cause] = reasons.get(cause, 0) + int((out & good).sum())

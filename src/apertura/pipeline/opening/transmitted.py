@@ -135,7 +135,7 @@ def _pulse_sent(path: Path, waveform: PulseWaveform) -> Transmitted:
             expected=f"at least {_FEWEST_BINS} bins and {_LEAST_INSIDE} of the energy, as {CONFIG}: waveform.band_hz",
             remedy="Correct band_hz (baseband: what the carrier is subtracted from), or the file.",
         )
-    chosen = pulse_filter(spectrum[numbers % length], asked=waveform.filter)
+    chosen = pulse_filter(spectrum[numbers % length], requested=waveform.filter)
     longest = length - round((waveform.lead_s + waveform.pulse_s) * waveform.sample_rate_hz)
     numerology = Numerology(waveform.carrier_hz, waveform.sample_rate_hz, numbers, 0, length, longest)
     band_hz = [float(number * numerology.spacing_hz) for number in (first, last)]

@@ -15,7 +15,7 @@ from apertura.common.flags import Flags
 from apertura.common.provenance import chained_sha256
 from apertura.core.combination.sums import choose_fusion
 from apertura.core.focus.inputs import PhaseHistory
-from apertura.core.imaging.focus_check import gathered
+from apertura.core.imaging.focus_check import joint_peak_power
 from apertura.core.quality.agreement import Agreement
 from apertura.core.scene.grid import SceneGrid
 from apertura.pipeline.campaign import Campaign
@@ -81,12 +81,12 @@ def hypotheses(
     if track.correction is not None:
         found = moved_evidence(nodes, found)
     scene = open_scene(campaign)
-    now = gathered([one.history for one in found], _around(scene, brightest, cell_m), scene.level.height_m)
+    now = joint_peak_power([one.history for one in found], _around(scene, brightest, cell_m), scene.level.height_m)
     named: list[tuple[float, Hypothesis]] = []
     for hypothesis in chain(hypotheses_of(nodes, found), _other_echoes(campaign, flight, nodes, found, sent=sent)):
         grid = _around(scene, _moved(scene.grid, brightest, found, hypothesis.histories), cell_m)
         try:
-            then = gathered(hypothesis.histories, grid, scene.level.height_m + hypothesis.height_m)
+            then = joint_peak_power(hypothesis.histories, grid, scene.level.height_m + hypothesis.height_m)
         except ValueError:  # the places are too far apart for one pulse: rejected
             continue
         gain_db = 10 * float(np.log10(max(then, 1e-12) / now))

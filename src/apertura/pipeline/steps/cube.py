@@ -13,7 +13,7 @@ from apertura.common.contracts import MEASURED, QUOTED, RASTERS, STAGES, Window
 from apertura.common.documents import undamaged
 from apertura.common.flags import Flags
 from apertura.core.combination.sums import clutter_reduction_db, coherent_sum, magnitude_sum, noncoherent_sum
-from apertura.core.quality.measures import survey
+from apertura.core.quality.measures import image_statistics
 from apertura.core.scene.grid import SceneGrid
 from apertura.methods.interferometry.coherence import chance, coherence, common_band, window_px
 from apertura.pipeline.campaign import Campaign
@@ -249,7 +249,7 @@ def cube(campaign: Campaign) -> Path:
             single_db = [
                 images[flight, pair].attrs["quality"]["noise_floor_db"] for pair in one["fusion"]["phases_rad"]
             ]
-            sum_db = survey(arrays.plane("coherent", flight), windows).noise_floor_db
+            sum_db = image_statistics(arrays.plane("coherent", flight), windows).noise_floor_db
             arrays.plane("coherent_noise_floor", flight)[()] = sum_db
             arrays.plane("clutter_reduction", flight)[()] = clutter_reduction_db(single_db, sum_db)
         _compare(images, {flight: one["reference"] for flight, one in assessed.items()}, arrays, grid, side=side)

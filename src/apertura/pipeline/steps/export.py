@@ -12,7 +12,7 @@ from rasterio import Affine
 from apertura.common.atomic import write_json
 from apertura.common.flags import Flags
 from apertura.common.provenance import Provenance, canonical_json, chained_sha256
-from apertura.core.quality.measures import Amplitude, BlockRaster, survey
+from apertura.core.quality.measures import Amplitude, BlockRaster, image_statistics
 from apertura.core.quality.point_targets import find_peak
 from apertura.core.scene.grid import SceneGrid
 from apertura.formats.export import write_exports
@@ -137,19 +137,19 @@ def _divided(images: Mapping[str, xr.Dataset], fusion: Mapping[str, Any]) -> dic
 def _measures(
     grid: SceneGrid, tile_px: int, sums: Mapping[str, BlockRaster], radiometry: Mapping[str, Radiometry]
 ) -> dict[str, Any]:
-    """Return measures of the pixels of the sums."""
+    """Return the image statistics of the sums."""
     windows = list(grid.tiles(tile_px))
-    surveys = {source: survey(layer, windows) for source, layer in sums.items()}
-    top = surveys["coherent"]
+    statistics = {source: image_statistics(layer, windows) for source, layer in sums.items()}
+    top = statistics["coherent"]
     peak = find_peak(sums["coherent"], top.row, top.column)
     x, y = map(float, grid.map_at(peak.row, peak.column))
-    peaks = {source: one.peak for source, one in surveys.items()} | {"coherent": float(abs(peak.value))}
-    measured = {
-        source: radiometry[source].measured(peaks[source], one.noise_floor_db) for source, one in surveys.items()
+    peaks = {source: one.peak for source, one in statistics.items()} | {"coherent": float(abs(peak.value))}
+    levels = {
+        source: radiometry[source].measured(peaks[source], one.noise_floor_db) for source, one in statistics.items()
     }
     return {
-        "radiometry": {source: one.report for source, one in {**radiometry, **measured}.items()},
-        "entropy": {source: round(one.entropy, 6) for source, one in surveys.items()},
+        "radiometry": {source: one.report for source, one in {**radiometry, **levels}.items()},
+        "entropy": {source: round(one.entropy, 6) for source, one in statistics.items()},
         "noise_floor_db": top.noise_floor_db,
         "brightest": {"x_m": round(x, 4), "y_m": round(y, 4), "amplitude": float(abs(peak.value))},
     }

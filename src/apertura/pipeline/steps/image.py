@@ -144,9 +144,9 @@ class _Work:
         if windows:
             image = self.formation.image
             compute_tiles(image, windows, target, threads=self.threads, scheduler=self.scheduler)
-        if ways := self.formation.ways:
-            went = ", ".join(f"{100 * count / ways.total():.3g} % {way}" for way, count in ways.items())
-            print(f"of pixels × pulses went {went}", flush=True)
+        if variants := self.formation.variant_counts:
+            shares = ", ".join(f"{100 * count / variants.total():.3g} % {name}" for name, count in variants.items())
+            print(f"of pixels × pulses went {shares}", flush=True)
 
 
 def _open(campaign: Campaign, flight: str, pair: str, *, threads: int) -> _Work:

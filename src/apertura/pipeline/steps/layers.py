@@ -130,7 +130,7 @@ def _rasters(scene: OpenScene, looks: Looks, noise: float, *, threads: int) -> d
 
 
 def _inside(looks: Looks, window: Window, values: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.where(looks.seen(window), values, np.nan)
+    return np.where(looks.illuminated(window), values, np.nan)
 
 
 def _mask(scene: OpenScene, looks: Looks) -> Callable[[Window], NDArray[np.uint8]]:
@@ -139,15 +139,15 @@ def _mask(scene: OpenScene, looks: Looks) -> Callable[[Window], NDArray[np.uint8
     relief = None if level else Relief.of(scene.grid, scene.terrain, scene.level.height_m)
 
     def mask(window: Window) -> NDArray[np.uint8]:
-        visible = looks.seen(window)
-        marked = np.where(visible, 0, OUTSIDE).astype(np.uint8)
-        if relief is None or not visible.any():
+        illuminated = looks.illuminated(window)
+        marked = np.where(illuminated, 0, OUTSIDE).astype(np.uint8)
+        if relief is None or not illuminated.any():
             return marked
         for node, part in looks.lattice.nearest(window):
             here = tuple(slice(at.start - by.start, at.stop - by.start) for at, by in zip(part, window, strict=True))
-            if visible[here].any():
+            if illuminated[here].any():
                 tx, rx = (relief.above(leg) for leg in looks.aperture[looks.pulses[node].astype(np.int64)].legs)
-                marked[here] = np.where(visible[here], visibility(relief, tx, rx, part), OUTSIDE)
+                marked[here] = np.where(illuminated[here], visibility(relief, tx, rx, part), OUTSIDE)
         return marked
 
     return mask

@@ -15,7 +15,7 @@ ENGINES: dict[str, str] = {
     "cuda": "apertura.core.focus.engines.cuda",
     "reference": "apertura.core.focus.engines.reference",
 }
-"""Name → module that is an `Engine`; a module is imported when its engine is asked for."""
+"""Name → module that is an `Engine`; a module is imported when its engine is loaded."""
 
 PATCH_PX = 16
 """Tiles begin at multiples of this: an engine may work in patches of it and give the same bits in every tiling."""
@@ -38,7 +38,7 @@ def load_engine(name: str) -> "Engine":
 
 
 def pieces(name: str, shape: tuple[int, ...], form_options: Mapping[str, Any]) -> "list[Window]":
-    """Return windows of a tile that an engine gives the same bits when it forms them alone.
+    """Return windows of a tile for which an engine gives the same bits when they are formed alone.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ def pieces(name: str, shape: tuple[int, ...], form_options: Mapping[str, Any]) -
 
 
 def instruction_set(name: str) -> str:
-    """Return the instructions that an engine's sums run with on this machine; 'unknown' where it does not say.
+    """Return the instructions that an engine's sums run with on this machine; 'unknown' where it states none.
 
     Parameters
     ----------

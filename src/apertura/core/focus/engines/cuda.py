@@ -21,11 +21,10 @@ from apertura.core.focus.engines.engine import EngineOptions, checked_pixels
 from apertura.core.focus.engines.native_tables import PHASE_POLYNOMIALS, TableDesign, design_table
 from apertura.core.focus.inputs import Profiles
 
-# ---- The GPU itself: whether there is one, what it is, and arrays there and back; numba.cuda is imported when one
-# is used
+# ---- The device, and arrays on it
 #
-# One call is on the device at a time: threads that form tiles take turns at its lock, and wait for it without the
-# GIL.
+# numba.cuda is imported when a device is used. One call is on the device at a time: threads that form tiles wait for
+# its lock without the GIL.
 
 _LOCK = Lock()
 _THREADS = 128  # of a block that fills tables
@@ -33,7 +32,7 @@ _THREADS = 128  # of a block that fills tables
 
 @cache
 def available() -> bool:
-    """Return whether a device can be used, or numba's simulator is asked for; never raises.
+    """Return whether a device can be used, or numba's simulator is enabled; never raises.
 
     Examples
     --------
@@ -46,7 +45,7 @@ def available() -> bool:
         from numba import cuda
 
         return bool(cuda.is_available())
-    except Exception:  # whatever of driver, toolkit and package is missing or does not fit the others
+    except Exception:  # driver, toolkit or package missing or incompatible
         return False
 
 
@@ -64,7 +63,7 @@ def instruction_set() -> str:
 
     try:
         by = f"numba-cuda {version('numba-cuda')}"
-    except PackageNotFoundError:  # numba brought a numba.cuda of its own
+    except PackageNotFoundError:  # numba's own numba.cuda
         by = f"numba {version('numba')}"
     if simulated():
         return f"cuda: simulator of {by}"
@@ -74,7 +73,7 @@ def instruction_set() -> str:
 
 
 class Resident:
-    """What all slices of one engine's tables have on the device, once the first tile is formed; it is not pickled."""
+    """Arrays on the device, shared by all slices of one engine's tables from the first tile on; not pickled."""
 
     def __init__(self) -> None:
         self.arrays: tuple[Any, ...] | None = None
@@ -83,7 +82,7 @@ class Resident:
         return Resident, ()
 
 
-def sum_there(tables: "ResidentTables", pixels: NDArray[np.float64], tolerance_rad: float) -> NDArray[np.complex64]:
+def sum_on_device(tables: "ResidentTables", pixels: NDArray[np.float64], tolerance_rad: float) -> NDArray[np.complex64]:
     """Return what `apertura.core.focus.engines.cuda.form` returns, of one or more pixels.
 
     Raises
@@ -95,12 +94,12 @@ def sum_there(tables: "ResidentTables", pixels: NDArray[np.float64], tolerance_r
         from apertura.core.focus.engines.cuda_kernels import ROWS, form
 
         if tables.resident.arrays is None:
-            tables.resident.arrays = _tables_there(cuda, tables)
+            tables.resident.arrays = _tables_on_device(cuda, tables)
         places, start_m, cells = (array[tables.pulses] for array in tables.resident.arrays)
         scales = (1 / tables.cell_m, tables.wavenumber_rad_m, tolerance_rad, cells.shape[2])
         numbers = np.array([*scales, *tables.design.phase_coefficients], np.float64)
         if not PHASE_POLYNOMIALS[tables.design.phase_polynomial][2]:
-            numbers[-1] = 0  # no half turns are taken off
+            numbers[-1] = 0  # no half turns are removed
         rows, columns = pixels.shape[:2]
         image = cuda.device_array((rows, columns), np.complex64)
         patches = (-(-columns // SIDE), -(-rows // SIDE))
@@ -108,7 +107,7 @@ def sum_there(tables: "ResidentTables", pixels: NDArray[np.float64], tolerance_r
         return np.asarray(image.copy_to_host())
 
 
-def _tables_there(cuda: Any, tables: "ResidentTables") -> tuple[Any, ...]:
+def _tables_on_device(cuda: Any, tables: "ResidentTables") -> tuple[Any, ...]:
     """Return phase centres, starts and cells of all pulses on the device."""
     from apertura.core.focus.engines.cuda_kernels import expand
 
@@ -125,20 +124,20 @@ def _tables_there(cuda: Any, tables: "ResidentTables") -> tuple[Any, ...]:
 
 @contextmanager
 def _device() -> Iterator[Any]:
-    """Give numba.cuda while nobody else uses the device; what it fails by becomes one message."""
+    """Yield numba.cuda under the device's lock; its failures become one message."""
     if not available():
-        raise _unfit("no device can be used")
+        raise _unusable("no device can be used")
     from numba import cuda
     from numba.cuda.cudadrv.driver import CudaAPIError, LinkerError
 
     with _LOCK:
         try:
             yield cuda
-        except (CudaAPIError, LinkerError, ImportError) as error:  # the last: driver or compiler is not to be found
-            raise _unfit(f"the device failed: {' '.join(str(error).split())}") from error
+        except (CudaAPIError, LinkerError, ImportError) as error:  # ImportError: driver or compiler missing
+            raise _unusable(f"the device failed: {' '.join(str(error).split())}") from error
 
 
-def _unfit(found: str) -> CampaignError:
+def _unusable(found: str) -> CampaignError:
     return CampaignError(
         f"engine cuda: {found}",
         where="processing.engine",
@@ -147,20 +146,19 @@ def _unfit(found: str) -> CampaignError:
     )
 
 
-# ---- Backprojection on an NVIDIA GPU: range tables, a block of threads per patch of pixels; the extra ``cuda``
+# ---- The engine
 #
-# What runs on the device is in `cuda_cells` and `cuda_kernels`, how it gets there in `cuda_device`, what it is
-# predicted to do in `cuda_prediction`. Nothing of numba.cuda is imported before a device is asked for.
+# Kernels are in `cuda_kernels`, predictions in `cuda_prediction`.
 
 __all__ = ["NEEDS", "READS", "TIMED", "available", "candidates", "form", "instruction_set", "prepare"]
 
 READS: Literal["profiles"] = "profiles"
-TIMED = False  # no device was at hand: the seconds of cuda_prediction are others', and auto compares measured ones
+TIMED = False  # the seconds of cuda_prediction are published ones of others, auto compares measured ones
 NEEDS = "an NVIDIA GPU with its driver, and apertura[cuda] (docs/howto/gpu.md)"
 
 
 class Options(EngineOptions):
-    """What may be asked of the engine."""
+    """Options of the engine."""
 
     oversampling: Annotated[int, Field(ge=2, le=64)] | None = Field(
         None, description="table cells per resolution cell c/B of total path"
@@ -172,7 +170,7 @@ class Options(EngineOptions):
 
 @dataclass(frozen=True, eq=False)
 class ResidentTables:
-    """Profiles, and what they become on the device: polynomials per cell, carrier folded in.
+    """Profiles, and their tables on the device: polynomials per cell, carrier folded in.
 
     Attributes
     ----------
@@ -187,13 +185,13 @@ class ResidentTables:
     wavenumber_rad_m
         2πf_mid/c.
     design
-        How samples become cells.
+        Filters from samples to cells.
     error_db
         Predicted RMS error on random pixels of a profile with a flat spectrum.
     pulses
-        Those that count.
+        Pulses of these tables.
     resident
-        What is on the device.
+        Arrays on the device.
     """
 
     samples: NDArray[np.complex64]
@@ -214,14 +212,14 @@ class ResidentTables:
 
 
 def prepare(profiles: Profiles, *, oversampling: int = 6) -> ResidentTables:
-    """Return what tables are made from; they are made on the device when the first tile is formed there.
+    """Return the inputs of tables; the tables are made on the device with the first tile.
 
     Parameters
     ----------
     profiles
         Band-limited profiles with eight samples or more beyond the scene at both ends.
     oversampling
-        Table cells per Nyquist cell c/B of total path; `ResidentTables.error_db` predicts what that errs by.
+        Table cells per Nyquist cell c/B of total path; `ResidentTables.error_db` predicts their error.
 
     Returns
     -------
@@ -231,7 +229,7 @@ def prepare(profiles: Profiles, *, oversampling: int = 6) -> ResidentTables:
     Raises
     ------
     ValueError
-        If the profiles are oversampled less than 1.5 times or hold no pulse, or a position or start is not finite.
+        If the profiles are oversampled less than 1.5 times or have no pulse, or a position or start is not finite.
 
     Notes
     -----
@@ -264,9 +262,9 @@ def form(
         From `prepare`.
     pixels
         (y, x, 3) float64, metres, in the frame of the phase centres: any surface. A tile of a larger grid that begins
-        at multiples of 16 pixels gets the same bits as in the whole.
+        at multiples of 16 pixels gets the same bits as in the larger grid.
     beams
-        Must be None: this engine weighs no pulses.
+        Must be None: this engine does not weight pulses.
     tolerance_rad
         Largest phase error that the path series may make anywhere in a patch of 16 × 16 pixels; patches and pulses that
         would exceed it take exact paths, pixel by pixel in float64.
@@ -293,4 +291,4 @@ def form(
         raise ValueError("engine cuda does not weigh pulses by antennas or a sector")
     if not pixels.size:
         return np.zeros(pixels.shape[:2], np.complex64)
-    return sum_there(tables, pixels, tolerance_rad)
+    return sum_on_device(tables, pixels, tolerance_rad)

@@ -8,16 +8,16 @@ from numba import cuda
 
 from apertura.core.focus.engines.cuda_prediction import (
     CHUNK,
-    DOUBT,
     FARTHEST,
     FLOAT32_ERROR,
     LAST_ORDER,
     LAST_TERM,
+    MOST_CELLS,
     SIDE,
     TAPS,
 )
 
-# ---- What makes tables of profiles on a GPU; imported only where that is done, as `cuda_kernels` -------------------
+# ---- Tables of profiles on a GPU
 
 
 @cuda.jit
@@ -45,16 +45,16 @@ def expand(samples, taps, lead, down, carrier, turn, cells):  # type: ignore[no-
     cells[p, 4, i], cells[p, 5, i] = curvature.real, curvature.imag
 
 
-# ---- What sums tables over patches on a GPU; imported only where that is done --------------------------------------
+# ---- Sums of tables over patches on a GPU
 #
 # numba compiles these functions for the device, or its simulator runs them as Python (NUMBA_ENABLE_CUDASIM=1).
-# Literals are float64 to numba: float32 constants stand in names, or one literal would slow every pixel down.
+# Literals are float64 to numba: float32 constants have names, since one literal would slow every pixel down.
 # Equations are those of docs/theory/engine.md, "A GPU".
 
-warnings.filterwarnings("ignore", "Grid size .* low occupancy")  # the certificate's patches: no news to anybody
+warnings.filterwarnings("ignore", "Grid size .* low occupancy")  # expected of the certificate's patches
 
 ROWS = 4
-"""Rows of threads of a patch: each thread sums every fourth pixel of a column, and reads what they share but once."""
+"""Rows of threads of a patch: each thread sums every fourth pixel of a column, and reads their common values once."""
 
 _PIXELS, _EACH = SIDE * SIDE, SIDE // ROWS
 _SKIPPED, _SERIES, _EXACT = 0, 1, 2
@@ -62,7 +62,7 @@ _NO_CELL = 2**32 - 1
 _ROUNDER = np.float32(1.5 * 2**23)  # adding and subtracting it rounds
 _ONE, _NONE = np.float32(1), np.float32(0)
 _B1, _B2, _B3, _B4 = np.float32(-1 / 4), np.float32(1 / 8), np.float32(-5 / 64), np.float32(7 / 128)  # of (8)
-_LEG, _MIDDLE, _WORDS = 5, 10, 11  # what a pulse has in shared memory: five numbers of each leg, and the origin's place
+_LEG, _MIDDLE, _WORDS = 5, 10, 11  # of a pulse in shared memory: five numbers of each leg, and the origin's place
 _PER_CELL, _WAVENUMBER, _TOLERANCE, _CELLS, _TURN = range(5)  # places in `numbers`
 
 
@@ -84,7 +84,7 @@ def form(pixels, antennas, start_m, cells, numbers, image):  # type: ignore[no-u
     for first in range(0, len(start_m), CHUNK):
         count = min(CHUNK, len(start_m) - first)
         if lane < count:
-            _look(antennas[first + lane], start_m[first + lane], patch, numbers, (words[lane], steps[lane]))
+            _view(antennas[first + lane], start_m[first + lane], patch, numbers, (words[lane], steps[lane]))
         cuda.syncthreads()
         _chunk(first, count, (lane, place, near, total), (words, steps), (antennas, start_m, cells, turn, numbers))
         cuda.syncthreads()
@@ -97,7 +97,7 @@ def form(pixels, antennas, start_m, cells, numbers, image):  # type: ignore[no-u
 
 @cuda.jit(device=True)
 def _carrier(numbers):  # type: ignore[no-untyped-def]
-    """Return what `_turned` takes, in float32: four coefficients of the cosine, four of the sine, half turns a cell."""
+    """Return float32 arguments of `_carrier_at`: four coefficients of cosine, four of sine, half turns a cell."""
     a, b, c, d = numbers[_TURN], numbers[_TURN + 1], numbers[_TURN + 2], numbers[_TURN + 3]
     e, f, g, h = numbers[_TURN + 4], numbers[_TURN + 5], numbers[_TURN + 6], numbers[_TURN + 7]
     cosine = (np.float32(a), np.float32(b), np.float32(c), np.float32(d))
@@ -141,7 +141,7 @@ def _fit(lane, place, patch):  # type: ignore[no-untyped-def]
 
 @cuda.jit(device=True)
 def _offsets(lane, place, patch, near, total):  # type: ignore[no-untyped-def]
-    """Fill what a thread keeps of its pixels; a pixel without a position is summed at the origin, and not written."""
+    """Fill the offsets of a thread's pixels; a pixel without a position is summed at the origin, and not written."""
     for n in range(_EACH):
         at = lane + n * ROWS * SIDE
         squared = _NONE
@@ -155,8 +155,8 @@ def _offsets(lane, place, patch, near, total):  # type: ignore[no-untyped-def]
 
 
 @cuda.jit(device=True)
-def _look(antennas, start_m, patch, numbers, shared):  # type: ignore[no-untyped-def]
-    """Put into shared memory how a patch is seen by one pulse, (8), and which way its pixels go."""
+def _view(antennas, start_m, patch, numbers, shared):  # type: ignore[no-untyped-def]
+    """Put into shared memory the series of one pulse's paths over a patch, (8), and the path variant of its pixels."""
     words, step = shared
     reach, per_cell = patch[3], numbers[_PER_CELL]
     path, error = 0.0, 2 * FLOAT32_ERROR * reach
@@ -179,7 +179,7 @@ def _look(antennas, start_m, patch, numbers, shared):  # type: ignore[no-untyped
     middle, spread = (path - start_m) * per_cell, 2 * reach * per_cell
     if not (middle + spread > -1 and middle - spread < numbers[_CELLS]):
         step[0] = _SKIPPED
-    elif numbers[_WAVENUMBER] * error <= numbers[_TOLERANCE] and spread < DOUBT:
+    elif numbers[_WAVENUMBER] * error <= numbers[_TOLERANCE] and spread < MOST_CELLS:
         nearest = math.floor(middle + 0.5)
         step[0] = _SERIES
         step[1] = int(nearest)
@@ -190,7 +190,7 @@ def _look(antennas, start_m, patch, numbers, shared):  # type: ignore[no-untyped
 
 @cuda.jit(device=True)
 def _chunk(first, count, mine, shared, given):  # type: ignore[no-untyped-def]
-    """Add to a thread's pixels what some pulses have there; they are summed in float32 first."""
+    """Add some pulses to a thread's pixels; they are summed in float32 first."""
     lane, place, near, total = mine
     words, steps = shared
     antennas, start_m, cells, turn, numbers = given
@@ -255,14 +255,14 @@ def _add(rows, i, u, turn, part):  # type: ignore[no-untyped-def]
         return
     re = rows[0][i] + u * (rows[2][i] + u * rows[4][i])
     im = rows[1][i] + u * (rows[3][i] + u * rows[5][i])
-    cosine, sine = _turned(turn, u)
+    cosine, sine = _carrier_at(turn, u)
     part[0] = part[0] + re * cosine - im * sine
     part[1] = part[1] + re * sine + im * cosine
 
 
 @cuda.jit(device=True)
-def _turned(turn, u):  # type: ignore[no-untyped-def]
-    """Return cosine and sine of the carrier at place u of a cell; where it turns often, half turns are taken off."""
+def _carrier_at(turn, u):  # type: ignore[no-untyped-def]
+    """Return cosine and sine of the carrier at place u of a cell; where it turns often, half turns are removed."""
     sign = _ONE
     if turn[8] != _NONE:
         scaled = u * turn[8]

@@ -1,4 +1,4 @@
-"""What the GPU engine is predicted to do, from its sizes and error bounds; its seconds are not timed."""
+"""Prediction of the GPU engine's error and cost, from its sizes and error bounds; its seconds are not timed."""
 
 import os
 from collections.abc import Iterator, Mapping
@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from apertura.core.focus.engines.engine import Setting, asked_or, power_sum_db
+from apertura.core.focus.engines.engine import Setting, option_values, power_sum_db
 from apertura.core.focus.engines.native_binding import KERNEL
 from apertura.core.focus.engines.native_prediction import OVERSAMPLINGS, TOLERANCES_RAD, View, view_of
 from apertura.core.focus.engines.native_tables import design_table, ratio
 from apertura.core.focus.job import Job
 
-# ---- Sizes and error bounds of the GPU's kernel, which its prediction counts with too ------------------------------
+# ---- Sizes and error bounds of the GPU's kernel
 #
 # Errors are of one leg's path. D is the largest distance of a pixel from the middle of its patch, s as in
 # docs/theory/engine.md, (8).
@@ -21,28 +21,28 @@ SIDE = KERNEL.patch_side
 """Pixels along a patch, which one block of threads sums; tiles begin at multiples of it."""
 
 TAPS = KERNEL.taps
-"""Of a table's filters."""
+"""Taps of a table's filters."""
 
 DEGREE = 2
-"""Of the polynomials in a cell: linear ones would spare two look-ups of six, and need tables 1.7 times as fine."""
+"""Degree of the polynomials in a cell: linear ones save two look-ups of six, and need tables 1.7 times as fine."""
 
 CHUNK = 64
-"""Pulses that a patch looks at together, and whose sum is float32; their sums add up in float64."""
+"""Pulses of a patch that are summed in float32; these sums add up in float64."""
 
 LAST_ORDER, LAST_TERM = 6, 21 / 1024
 """The first order of √(1 + s) that (8) neglects, and its coefficient: at most that over 1 − |s| is neglected."""
 
 FARTHEST = 0.5
-"""Largest |s| of which the series is asked at all."""
+"""Largest |s| at which the series is used: beyond, its error bound is of no use."""
 
 FLOAT32_ERROR, FLOAT32_RMS = 2.5e-7, 3.2e-8
-"""Of D: what float32 makes (8) err by, at worst and in the RMS of 20 000 random pixels at each of five ranges."""
+"""Error of (8) by float32, relative to D: at worst, and RMS over 20 000 random pixels at each of five ranges."""
 
-DOUBT = 2.0**20
-"""Cells across a patch beyond which float32 could not tell one from the next."""
+MOST_CELLS = 2.0**20
+"""Cells across a patch beyond which float32 cannot separate neighbours."""
 
 
-# ---- What the GPU engine is predicted to do: how exactly, and at what cost: the seconds are not measured -----------
+# ---- Error and cost of settings
 
 _WORST_TO_RMS = 0.105  # of a sixth power over a square patch along its diagonal, √(2/13 − 2/14)
 _FLOAT32_RAD = 2e-6  # tables and their look-ups, as native
@@ -57,7 +57,7 @@ _SIMULATED_S = 1e-4  # per pixel and pulse, in Python: this one is measured
 
 
 def simulated() -> bool:
-    """Return whether numba's simulator stands for the device: for tests, thousands of times slower.
+    """Return whether numba's simulator replaces the device: for tests, thousands of times slower.
 
     Examples
     --------
@@ -67,10 +67,10 @@ def simulated() -> bool:
     return os.environ.get("NUMBA_ENABLE_CUDASIM", "0") not in ("", "0")
 
 
-def candidates(job: Job, *, pulses: int, asked: Mapping[str, Any]) -> Iterator[Setting]:
+def candidates(job: Job, *, pulses: int, requested: Mapping[str, Any]) -> Iterator[Setting]:
     """Yield settings of the GPU engine, as `apertura.core.focus.engines.engine.Engine` describes.
 
-    None where antennas or a sector weigh the pulses: it does not know how to.
+    None where antennas or a sector weight the pulses: the engine cannot.
 
     Notes
     -----
@@ -79,18 +79,18 @@ def candidates(job: Job, *, pulses: int, asked: Mapping[str, Any]) -> Iterator[S
     if job.weights:
         return
     view = view_of(job)
-    for oversampling in asked_or(asked, "oversampling", OVERSAMPLINGS[DEGREE]):
-        for tolerance_rad in asked_or(asked, "tolerance_rad", TOLERANCES_RAD):
+    for oversampling in option_values(requested, "oversampling", OVERSAMPLINGS[DEGREE]):
+        for tolerance_rad in option_values(requested, "tolerance_rad", TOLERANCES_RAD):
             yield _setting(job, view, pulses, oversampling, tolerance_rad)
 
 
 def series(view: View, *, wavenumber_rad_m: float, tolerance_rad: float) -> tuple[float, float]:
-    """Return which part of pulses × patches takes exact paths, and the phase error of the paths of all.
+    """Return the share of pulses × patches with exact paths, and the phase error of all paths.
 
     Parameters
     ----------
     view
-        How the scene is seen.
+        Imaging geometry of the scene.
     wavenumber_rad_m
         2πf_mid/c.
     tolerance_rad
@@ -99,7 +99,7 @@ def series(view: View, *, wavenumber_rad_m: float, tolerance_rad: float) -> tupl
     Returns
     -------
     exact : float
-        Part of patches × pulses.
+        Share of patches × pulses.
     error_rad : float
         RMS over patches, pulses and pixels.
 

@@ -1,4 +1,4 @@
-"""What every engine offers, and what one of its settings is predicted to give."""
+"""Interface of an engine, and a setting of one with its predicted error and cost."""
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
@@ -15,14 +15,14 @@ BEAM_S = 1.2e-7
 
 
 class EngineOptions(BaseModel):
-    """What a person may ask of an engine in ``processing.engine_options.<engine>``; None leaves it to the planner."""
+    """Options of an engine in ``processing.engine_options.<engine>``; None leaves one to the planner."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 @dataclass(frozen=True)
 class Setting:
-    """An engine and how it is set, with what that is predicted to give.
+    """An engine with its options, predicted error and cost.
 
     Attributes
     ----------
@@ -33,12 +33,12 @@ class Setting:
     error_db
         Predicted RMS error on random pixels.
     form_seconds, table_seconds
-        Predicted for all pixels, and for what all tiles share: of one core of a server of 2023 with AVX-512. Other
-        machines take longer, in about the same ratios: a choice depends on the job alone.
+        Predicted for all pixels, and for the tables that all tiles share: of one core of a server of 2023 with AVX-512.
+        Other machines take longer, in about the same ratios: a choice depends on the job alone.
     table_bytes
         What `prepare` returns for all pulses.
     reasons
-        Option → why it has its value, in one line.
+        Option → reason of its value, in one line.
     pulse_blocks
         Into how many blocks pulses are split, so that the tables of one fit into memory; their images add up.
     """
@@ -81,29 +81,29 @@ class Engine(Protocol):
     Attributes
     ----------
     Options
-        What a person may ask for; its fields are options of `prepare` or `form`.
+        Options of the config; its fields are options of `prepare` or `form`.
     READS
-        What it is given: a `PhaseHistory` or `Profiles`.
+        Its input: a `PhaseHistory` or `Profiles`.
     available
         Whether it can run here.
     NEEDS
-        What it needs to run, in a few words; an engine that runs everywhere leaves it out.
+        Requirements, in a few words; an engine that runs everywhere leaves it out.
     TIMED
-        False where nobody has measured its seconds: it is taken where it is asked for, and never by the planner alone.
+        False where its seconds were not measured: it is taken on request only, never by the planner alone.
     candidates
-        (job, pulses=, asked=) → settings with predicted error and cost; `pulses` may be fewer than the job's, `asked`
-        holds options that a person asks for.
+        (job, pulses=, requested=) → settings with predicted error and cost; `pulses` may be fewer than the job's,
+        `requested` are options fixed by the config.
     prepare
-        (inputs, **options) → what all tiles share; ``[pulses]`` of it, a slice from a multiple of 64 on, is that of
-        some pulses.
+        (inputs, **options) → tables that all tiles share; ``[pulses]`` of it, a slice from a multiple of 64 on, is that
+        of some pulses.
     instruction_set
         Which instructions its sums run with here; an engine may leave it out.
     pieces
         (shape of a block of pixels, form_options) → windows of it that get the same bits when formed alone; an engine
         whose pixels are formed in patches of `PATCH_PX` leaves it out.
-    WAYS
-        Names of the ways that pixels × pulses may go, whose numbers `form` adds to an int64 array `counts`; an engine
-        with one way leaves it out.
+    VARIANTS
+        Names of the variants of its sum; `form` adds the pixels × pulses that took each to an int64 array `counts`. An
+        engine with one variant leaves it out.
     form
         (prepared, pixels (y, x, 3) float64, beams=None, **form_options) → (y, x) complex, the sum over the pulses;
         releases the GIL, starts no threads.
@@ -116,11 +116,11 @@ class Engine(Protocol):
     form: Callable[..., Any]
 
     @staticmethod
-    def candidates(job: Job, *, pulses: int, asked: Mapping[str, Any]) -> Iterable[Setting]: ...  # noqa: D102
+    def candidates(job: Job, *, pulses: int, requested: Mapping[str, Any]) -> Iterable[Setting]: ...  # noqa: D102
 
 
 def checked_pixels(pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the places of pixels as an engine's `form` is given them, contiguous.
+    """Return the places of pixels as contiguous float64, checked for an engine's `form`.
 
     Parameters
     ----------
@@ -161,6 +161,6 @@ def power_sum_db(*parts_db: float) -> float:
     return float(10 * np.log10(sum(10 ** (part / 10) for part in parts_db)))
 
 
-def asked_or(asked: Mapping[str, Any], name: str, otherwise: Iterable[Any]) -> tuple[Any, ...]:
-    """Return the values of an option to consider: the one asked for, or all that the engine offers."""
-    return (asked[name],) if asked.get(name) is not None else tuple(otherwise)
+def option_values(requested: Mapping[str, Any], name: str, offered: Iterable[Any]) -> tuple[Any, ...]:
+    """Return the values of an option to consider: the one requested, or all that the engine offers."""
+    return (requested[name],) if requested.get(name) is not None else tuple(offered)

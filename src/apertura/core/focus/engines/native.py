@@ -35,7 +35,7 @@ NEEDS = "a C++ compiler when apertura is installed"
 
 
 class Options(EngineOptions):
-    """What may be asked of the engine."""
+    """Options of the engine."""
 
     degree: Annotated[int, Field(ge=1, le=2)] | None = Field(None, description="of the polynomials in a table cell")
     oversampling: Annotated[int, Field(ge=2, le=64)] | None = Field(
@@ -68,7 +68,7 @@ def prepare(profiles: Profiles, *, oversampling: int = 6, degree: int = 2) -> Ta
     Raises
     ------
     ValueError
-        If `degree` is neither 1 nor 2, the profiles are oversampled less than 1.5 times or hold no pulse,
+        If `degree` is neither 1 nor 2, the profiles are oversampled less than 1.5 times or have no pulse,
         or a position or start is not finite.
 
     Notes
@@ -113,7 +113,7 @@ def form(
         From `prepare`.
     pixels
         (y, x, 3) float64, metres, in the frame of the phase centres (ECEF or local): any surface. A tile of
-        a larger grid that begins at multiples of 16 pixels gets the same bits as in the whole.
+        a larger grid that begins at multiples of 16 pixels gets the same bits as in the larger grid.
     beams
         Weight of each pulse at each pixel; none by default. A beam or sector that misses a patch costs little.
     accumulate
@@ -148,7 +148,7 @@ def form(
     image = np.empty(pixels.shape[:2], np.complex64)
     tally = np.zeros(4, np.int64)
     padded = tables.first_path_m.size
-    antennas, sector, _held = weights_of(beams, len(tables.cells), padded)
+    antennas, sector, _kept = weights_of(beams, len(tables.cells), padded)
     job = ApertureJob(
         *(array.ctypes.data for array in (tables.cells, tables.transmitter_m, tables.receiver_m, tables.first_path_m)),
         pixels.ctypes.data, image.ctypes.data, tally.ctypes.data,

@@ -1,4 +1,4 @@
-"""The compiled library: where it lies, the structures it takes, its sizes and error bounds, its instruction sets."""
+"""Binding of the compiled library: structures, sizes and error bounds, instruction sets."""
 
 import ctypes
 import os
@@ -16,14 +16,14 @@ from apertura.common.errors import CampaignError, quoted, shown
 from apertura.core.antenna.beam import Beam, Beams
 from apertura.core.geometry.sector import Sector
 
-# ---- Sizes and error bounds of the compiled kernel, each once in Python as in native/bounds.hpp once in C++ --------
+# ---- Sizes and error bounds of the compiled kernel
 #
 # The engine may not be compiled where a plan is made, so they are not read from the library; a test compares the two.
 
 
 @dataclass(frozen=True)
 class KernelConstants:
-    """What the kernel is built on.
+    """Sizes and error bounds of the kernel.
 
     D is the largest distance of a block from its patch's origin, δ of a pixel from its block's centre, R the range;
     errors are of one leg's path, in the unit of D, δ and R.
@@ -35,7 +35,7 @@ class KernelConstants:
     batch
         Pulses whose paths are computed together: phase centres are padded to a multiple of it.
     taps
-        Of a table's filters.
+        Taps of a table's filters.
     window
         Table cells that one look-up can reach; tables have as many empty cells at both ends.
     echo_taps, echo_degree
@@ -86,7 +86,7 @@ class KernelConstants:
 KERNEL = KernelConstants()
 
 
-# ---- What the compiled library takes, field by field as in native/job.hpp and native/tree_job.hpp ------------------
+# ---- Structures of the compiled library
 
 _pointer = ctypes.c_void_p
 _int64 = ctypes.c_int64
@@ -95,7 +95,7 @@ _double = ctypes.c_double
 TREE_NODES, TREE_SLOTS, TREE_LEVELS, TREE_GROUP, TREE_SIDE, TREE_DELAYS, TREE_FEWER = 128, 136, 4, 64, 256, 12, 28
 TREE_TERMS, TREE_MORE, TREE_WEIGHTS = 21, 4, 16
 """As in native/tree_job.hpp: nodes along an axis; places of them and of pixels; levels; pulses of
-a leaf; pixels along a tile; taps that align a pulse; pulses that stand for those of a leaf, at most."""
+a leaf; pixels along a tile; taps that align a pulse; pulses that replace those of a leaf, at most."""
 
 
 class BeamJob(ctypes.Structure):
@@ -184,21 +184,21 @@ STRUCTS = (BeamJob, SectorJob, ApertureJob, TableJob, EchoJob, TreeTile, TreeJob
 """All of them."""
 
 
-# ---- The compiled library: where it lies, what it takes, and which instruction set it uses -------------------------
+# ---- Loading the compiled library
 #
 # Bound with ctypes: the GIL is released during a call, and one wheel serves every Python version. The library says
-# how its structs are laid out; where that differs from the mirrors here it is refused when it is loaded.
+# the layout of its structs; a library whose layout differs from the mirrors here is refused when it is loaded.
 
 INSTRUCTION_SETS = ("avx512", "avx2", "portable")
 
 NAMED_BY = "APERTURA_KERNEL"
 """Environment variable: another library than the one installed."""
 
-_BUILT = str(files("apertura.core.focus.engines") / "_backprojection.so")  # found once: calls may be short
+_BUILT = str(files("apertura.core.focus.engines") / "_backprojection.so")  # resolved once: calls may be short
 
 
 def layout() -> dict[str, str]:
-    """Return the layout of the structs as this module lays them out: field → where it lies, struct → its size.
+    """Return the layout of the structs of this module: field → offset and size, struct → its size.
 
     Examples
     --------
@@ -263,29 +263,31 @@ def instruction_set() -> str:
     RuntimeError
         If the kernel was not compiled.
     CampaignError
-        If APERTURA_ISA names none, or one that this machine lacks.
+        If APERTURA_ISA is unknown, or one that this machine lacks.
 
     Examples
     --------
     >>> not available() or instruction_set() in INSTRUCTION_SETS
     True
     """
-    asked = os.environ.get("APERTURA_ISA", "")
-    if asked and asked not in INSTRUCTION_SETS:
-        raise _unfit(asked, f"one of {', '.join(INSTRUCTION_SETS)}, or unset")
-    chosen = library().apertura_isa(asked.encode())
+    requested = os.environ.get("APERTURA_ISA", "")
+    if requested and requested not in INSTRUCTION_SETS:
+        raise _unfit(requested, f"one of {', '.join(INSTRUCTION_SETS)}, or unset")
+    chosen = library().apertura_isa(requested.encode())
     if chosen is None:
-        raise _unfit(asked, "instructions that this machine has")
+        raise _unfit(requested, "instructions that this machine has")
     return str(chosen.decode())
 
 
-def runs(isa: str) -> bool:
+def supports(isa: str) -> bool:
     """Return whether the kernel was compiled and this machine has the instruction set of that name."""
     return available() and library().apertura_isa(isa.encode()) is not None
 
 
-def _unfit(asked: str, expected: str) -> CampaignError:
-    return CampaignError(f"{asked!r}", where="environment variable APERTURA_ISA", expected=expected, remedy="Unset it.")
+def _unfit(requested: str, expected: str) -> CampaignError:
+    return CampaignError(
+        f"{requested!r}", where="environment variable APERTURA_ISA", expected=expected, remedy="Unset it."
+    )
 
 
 def call(function: str, job: ctypes.Structure) -> None:
@@ -333,7 +335,7 @@ def library() -> ctypes.CDLL:
     RuntimeError
         If it was not compiled.
     CampaignError
-        If its structs are laid out otherwise than here.
+        If the layout of its structs differs from that of this module.
     """
     path = library_path()
     if not path.is_file():
@@ -373,14 +375,14 @@ def _lines(function: Callable[[], bytes]) -> list[list[str]]:
     return [line.split() for line in function().decode().splitlines()]
 
 
-# ---- Beams and sectors as the compiled engine reads them -----------------------------------------------------------
+# ---- Beams and sectors as structures
 
-Held = list[NDArray[np.generic]]
-"""Arrays that a struct points into: they must live as long as it is used."""
+KeptArrays = list[NDArray[np.generic]]
+"""Arrays that a struct points into, kept alive as long as the struct is used."""
 
 
-def weights_of(beams: Beams | None, pulses: int, padded: int) -> tuple[Any, Any, Held]:
-    """Return the pointers `beam` and `sector` of an `ApertureJob`, and what they point into.
+def weights_of(beams: Beams | None, pulses: int, padded: int) -> tuple[Any, Any, KeptArrays]:
+    """Return the pointers `beam` and `sector` of an `ApertureJob`, and the arrays that they point into.
 
     Parameters
     ----------
@@ -395,19 +397,19 @@ def weights_of(beams: Beams | None, pulses: int, padded: int) -> tuple[Any, Any,
         If a beam or the sector is of other pulses.
     """
     beams = beams or Beams()
-    pointers, held = (ctypes.POINTER(BeamJob) * 2)(), Held()
+    pointers, kept = (ctypes.POINTER(BeamJob) * 2)(), KeptArrays()
     for leg, beam in enumerate((beams.transmit, beams.receive)):
         if beam is not None:
             job, arrays = _beam(beam, pulses, padded)
             pointers[leg] = ctypes.pointer(job)
-            held += arrays
+            kept += arrays
     if beams.sector is None:
-        return pointers, None, held
+        return pointers, None, kept
     sector, arrays = _sector(beams.sector, pulses, padded)
-    return pointers, ctypes.pointer(sector), held + arrays
+    return pointers, ctypes.pointer(sector), kept + arrays
 
 
-def _beam(beam: Beam, pulses: int, padded: int) -> tuple[BeamJob, Held]:
+def _beam(beam: Beam, pulses: int, padded: int) -> tuple[BeamJob, KeptArrays]:
     if len(beam.axes) != pulses:
         raise ValueError(f"{len(beam.axes)=}: must be one for each of {pulses} pulses")
     axes = np.pad(beam.axes, [(0, padded - pulses), (0, 0), (0, 0)], mode="edge")
@@ -425,7 +427,7 @@ def _beam(beam: Beam, pulses: int, padded: int) -> tuple[BeamJob, Held]:
     return job, [axes, *gains]
 
 
-def _sector(sector: Sector, pulses: int, padded: int) -> tuple[SectorJob, Held]:
+def _sector(sector: Sector, pulses: int, padded: int) -> tuple[SectorJob, KeptArrays]:
     if len(sector.tx_axis) != pulses:
         raise ValueError(f"{len(sector.tx_axis)=}: must be one for each of {pulses} pulses")
     filling = [(0, padded - pulses), (0, 0)]

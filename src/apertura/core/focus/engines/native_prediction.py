@@ -1,4 +1,4 @@
-"""What the compiled engine is predicted to do: path variants, polynomials of weights, errors, and what that costs."""
+"""Prediction of the compiled engine: path variants, polynomials of weights, error and cost."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -9,29 +9,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.core.antenna.beam import Beams
-from apertura.core.focus.engines.engine import Setting, asked_or, power_sum_db
+from apertura.core.focus.engines.engine import Setting, option_values, power_sum_db
 from apertura.core.focus.engines.native_binding import KERNEL
 from apertura.core.focus.engines.native_tables import MARGIN, TAPS, design_table, ratio
 from apertura.core.focus.job import Job
 from apertura.core.geometry.aperture import Aperture
 
-# ---- How the compiled engine will take the weights of antennas over a scene, and what their polynomials err by
+# ---- Weights of antennas over patches
 
 
 @dataclass(frozen=True)
 class PatchWeights:
-    """How the weights of antennas over patches × pulses are taken.
+    """Shares of patches × pulses by how antenna weights are computed.
 
     Attributes
     ----------
     smooth, pixelwise, dark
-        Parts that are weighted by a polynomial, pixel by pixel, and not at all; they sum to 1.
+        Shares that are weighted by a polynomial, pixel by pixel, and not at all; they sum to 1.
     error
         RMS error of the polynomials, relative to the RMS of the weights.
     antennas
-        How many beams there are.
+        Number of beams.
     edge
-        Part at the smooth edge of the sector, of what is not outside of it.
+        Share at the smooth edge of the sector, of that not outside of it.
     """
 
     smooth: float = 1.0
@@ -51,7 +51,7 @@ def patch_weights(
     steps_m: NDArray[np.float64],
     place_m: NDArray[np.float64],
 ) -> PatchWeights:
-    """Return how the weights of patches about places of the scene will be taken.
+    """Return the shares of patches about places of the scene by how their weights are computed.
 
     Parameters
     ----------
@@ -72,8 +72,8 @@ def patch_weights(
     across = half_patch * np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1], indexing="ij"), -1).reshape(9, 2)
     nodes = place_m + np.einsum("ns,spc->npc", across, steps_m)
     weight = None if beams.sector is None else beams.sector.weight(aperture, place_m)
-    lit = np.array([]) if weight is None else weight > 0
-    edge = float((weight[lit] < 1).mean()) if weight is not None and lit.any() else 0.0
+    illuminated = np.array([]) if weight is None else weight > 0
+    edge = float((weight[illuminated] < 1).mean()) if weight is not None and illuminated.any() else 0.0
     if beams.antennas is None:
         return PatchWeights(edge=edge)
     gain = beams.antennas.weight(aperture, nodes.reshape(-1, 3)).reshape(len(aperture), 3, 3, len(place_m))
@@ -83,8 +83,13 @@ def patch_weights(
     smooth = everywhere & (np.maximum(*change) <= KERNEL.weight_change)
     smooth &= np.maximum(*curvature) <= KERNEL.weight_curvature
     beta = np.where(smooth, np.hypot(*curvature), 0.0)
-    if lit.any():
-        gain, beta, smooth, dark = np.moveaxis(gain, -1, 1)[lit], beta[lit], smooth[lit], dark[lit]
+    if illuminated.any():
+        gain, beta, smooth, dark = (
+            np.moveaxis(gain, -1, 1)[illuminated],
+            beta[illuminated],
+            smooth[illuminated],
+            dark[illuminated],
+        )
     error = np.hypot((3 / 16) ** 2 / 2 * beta, 1.4 / (9 * np.sqrt(3)) * beta**1.5)  # inside a block, between nodes
     strength = float((gain**2).mean())
     return PatchWeights(
@@ -97,7 +102,7 @@ def patch_weights(
     )
 
 
-# ---- What the compiled engine is predicted to do: which path variants it takes, how exactly, and what that costs
+# ---- Error and cost of settings
 
 OVERSAMPLINGS: Mapping[int, tuple[int, ...]] = {
     1: (4, 5, 6, 8, 10, 12, 16, 20, 24, 32),
@@ -106,14 +111,15 @@ OVERSAMPLINGS: Mapping[int, tuple[int, ...]] = {
 """Degree of the polynomials → cells per resolution cell that are considered."""
 
 TOLERANCES_RAD = (1.5e-3, 1e-3, 7e-4, 5e-4, 3e-4, 1.5e-4, 5e-5, 1.5e-5)
+"""Phase errors of the path series that are considered, rad."""
 
 WIDE_SUM_DB = -105.0
 """Below this error the sum over pulses is float64; in float32 it errs by about -115 dB."""
 
-_PULSES, _PULSES_OF_SECTOR = 48, 512  # from which the scene is looked at
-_WORST_TO_RMS = 1 / 3
-_FLOAT32_RAD = 2e-6
-_SILENT = 1e-20
+_PULSES, _PULSES_OF_SECTOR = 48, 512  # sampled for the geometry
+_WORST_TO_RMS = 1 / 3  # RMS phase error over the largest in a patch
+_FLOAT32_RAD = 2e-6  # of tables and look-ups
+_NO_ERROR = 1e-20  # added before a logarithm
 
 # Seconds on one core: per pulse, cell and coefficient; per pixel and pulse by degree, for each path variant; with beams
 # per pixel and pulse that antennas weigh smoothly (on top), pixel by pixel (instead), and not at all.
@@ -131,7 +137,7 @@ _PIXEL_REACH = np.sqrt(2) * (KERNEL.block_side - 1) / 2
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """How the scene is seen: points in it from some of the pulses.
+    """Imaging geometry: points of the scene from some of the pulses.
 
     Attributes
     ----------
@@ -153,19 +159,21 @@ class View:
 
 @lru_cache(maxsize=8)
 def view_of(job: Job) -> View:
-    """Return how a job's scene is seen."""
+    """Return the imaging geometry of a job's scene."""
     some = job.aperture.sample(_PULSES if job.sector is None else _PULSES_OF_SECTOR)
     aperture, points = job.aperture[some], job.points_m
     right, down = (pixel_steps(job.ground_m, axis, job.spacing_m).reshape(-1, 3) for axis in (1, 0))
     range_m = np.stack([np.linalg.norm(points - leg[:, None], axis=-1) for leg in aperture.legs])
     gradient = aperture.path_gradient(points)
     slope = np.stack([(gradient * step).sum(-1) for step in (right, down)])
-    seen = NO_BEAMS if job.beams is None else patch_weights(job.beams[some], aperture, np.stack([right, down]), points)
+    weights = (
+        NO_BEAMS if job.beams is None else patch_weights(job.beams[some], aperture, np.stack([right, down]), points)
+    )
     if job.sector is not None:
-        lit = job.sector[some].weight(aperture, points) > 0
-        if lit.any():
-            range_m, slope = range_m[:, lit][..., None], slope[:, lit][..., None]
-    return View(range_m, slope, job.spacing_m, seen)
+        illuminated = job.sector[some].weight(aperture, points) > 0
+        if illuminated.any():
+            range_m, slope = range_m[:, illuminated][..., None], slope[:, illuminated][..., None]
+    return View(range_m, slope, job.spacing_m, weights)
 
 
 def pixel_steps(ground_m: NDArray[np.float64], axis: int, spacing_m: float) -> NDArray[np.float64]:
@@ -179,12 +187,12 @@ def pixel_steps(ground_m: NDArray[np.float64], axis: int, spacing_m: float) -> N
 def path_variants(
     view: View, *, cell_m: float, wavenumber_rad_m: float, tolerance_rad: float
 ) -> tuple[tuple[float, float, float], float]:
-    """Return which parts of pulses × patches take which path variant, and the phase error of their paths.
+    """Return the share of pulses × patches of each path variant, and the phase error of their paths.
 
     Parameters
     ----------
     view
-        How the scene is seen.
+        Imaging geometry of the scene.
     cell_m
         Total path across one cell of the table.
     wavenumber_rad_m
@@ -221,15 +229,15 @@ def path_variants(
     block_cells = ((KERNEL.block_side - 1) * step + 2 * curvature) / cell_m + 1
     group_cells = block_cells + KERNEL.block_side * step / cell_m  # of the 2 × 2 blocks that a narrow window serves
     window_cells = KERNEL.window - KERNEL.window_margin
-    shares_curvature = (block_cells <= window_cells) & (shared_rad <= tolerance_rad)
-    has_own = (block_cells <= window_cells) & (shared_rad > tolerance_rad) & (own_rad <= tolerance_rad)
-    narrow = shares_curvature & (group_cells <= window_cells)
-    parts = (float(narrow.mean()), float((shares_curvature & ~narrow).mean() + has_own.mean()))
-    error = np.where(shares_curvature, shared_rad, np.where(has_own, own_rad, 0.0))
+    has_shared_curvature = (block_cells <= window_cells) & (shared_rad <= tolerance_rad)
+    has_own_curvature = (block_cells <= window_cells) & (shared_rad > tolerance_rad) & (own_rad <= tolerance_rad)
+    narrow = has_shared_curvature & (group_cells <= window_cells)
+    parts = (float(narrow.mean()), float((has_shared_curvature & ~narrow).mean() + has_own_curvature.mean()))
+    error = np.where(has_shared_curvature, shared_rad, np.where(has_own_curvature, own_rad, 0.0))
     return (*parts, float(1 - sum(parts))), float(np.sqrt((error**2).mean()))
 
 
-def candidates(job: Job, *, pulses: int, asked: Mapping[str, Any]) -> Iterator[Setting]:
+def candidates(job: Job, *, pulses: int, requested: Mapping[str, Any]) -> Iterator[Setting]:
     """Yield settings of the compiled engine, as `apertura.core.focus.engines.engine.Engine` describes.
 
     Notes
@@ -237,10 +245,10 @@ def candidates(job: Job, *, pulses: int, asked: Mapping[str, Any]) -> Iterator[S
     Source: docs/theory/planner.md, "Error" and "Cost".
     """
     view = view_of(job)
-    for degree in asked_or(asked, "degree", OVERSAMPLINGS):
-        for oversampling in asked_or(asked, "oversampling", OVERSAMPLINGS[degree]):
-            for tolerance_rad in asked_or(asked, "tolerance_rad", TOLERANCES_RAD):
-                yield _setting(job, view, pulses, degree, oversampling, tolerance_rad, asked.get("accumulate"))
+    for degree in option_values(requested, "degree", OVERSAMPLINGS):
+        for oversampling in option_values(requested, "oversampling", OVERSAMPLINGS[degree]):
+            for tolerance_rad in option_values(requested, "tolerance_rad", TOLERANCES_RAD):
+                yield _setting(job, view, pulses, degree, oversampling, tolerance_rad, requested.get("accumulate"))
 
 
 def _setting(  # noqa: PLR0917
@@ -254,7 +262,7 @@ def _setting(  # noqa: PLR0917
         view, cell_m=signal.step_m * down / up, wavenumber_rad_m=k, tolerance_rad=tolerance_rad
     )
     paths_db = 20 * np.log10(_WORST_TO_RMS * path_rad + _FLOAT32_RAD)
-    beams_db = 20 * np.log10(view.weights.error + _SILENT)
+    beams_db = 20 * np.log10(view.weights.error + _NO_ERROR)
     error_db = power_sum_db(table_db, paths_db, beams_db)
     coefficients = pulses * -(-((signal.samples - 1) * up // down + 1 + 2 * MARGIN) // TAPS) * TAPS * (degree + 1)
     return Setting(
@@ -272,14 +280,14 @@ def _setting(  # noqa: PLR0917
     )
 
 
-def pixel_seconds(shares: tuple[float, float, float], degree: int, seen: PatchWeights) -> float:
+def pixel_seconds(shares: tuple[float, float, float], degree: int, weights: PatchWeights) -> float:
     """Return the seconds per pixel and pulse."""
     each = (_SHARED_S[degree], _WIDE_S[degree], _EXACT_S[degree])
     plain = sum(share * seconds for share, seconds in zip(shares, each, strict=True))
-    if not seen.antennas:
-        return plain + seen.edge * (1 - shares[2]) * _SECTOR_S
+    if not weights.antennas:
+        return plain + weights.edge * (1 - shares[2]) * _SECTOR_S
     weighed = plain + (1 - shares[2]) * _BEAM_S + shares[2] * (_EDGE_S - each[2])
-    return seen.smooth * weighed + seen.pixelwise * _EDGE_S + seen.dark * _DARK_S
+    return weights.smooth * weighed + weights.pixelwise * _EDGE_S + weights.dark * _DARK_S
 
 
 def _reasons(

@@ -1,7 +1,7 @@
-"""Range tables of the compiled engine: which polynomials stand for the profile inside one cell, and how well.
+"""Range tables of the compiled engine: polynomials of the profile inside each cell, and their error.
 
-A cell holds the least-squares polynomial of the profile over itself, multiplied by the carrier at its
-middle; what is left of the carrier inside the cell is a short polynomial too (docs/theory/engine.md).
+A cell has the coefficients of the least-squares polynomial of the profile over itself, multiplied by the carrier at its
+middle; the rest of the carrier inside the cell is a short polynomial too (docs/theory/engine.md).
 """
 
 from dataclasses import dataclass, replace
@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from apertura.core.focus.engines.native_binding import KERNEL
 
 TAPS = KERNEL.taps
-MARGIN = KERNEL.window  # empty cells at both ends, so that a look-up window may hang over
-# Sine terms, cosine terms, half turns taken off first: the polynomials of native/phase.hpp, cheapest first.
+MARGIN = KERNEL.window  # empty cells at both ends, so that a look-up window may extend beyond
+# Sine terms, cosine terms, half turns removed first: the polynomials of native/phase.hpp, cheapest first.
 PHASE_POLYNOMIALS = ((2, 3, False), (3, 4, False), (4, 4, False), (3, 4, True))
 
 BAND = np.cos(np.pi * (np.arange(160) + 0.5) / 160)
-"""Where errors over the band are looked at, its edges at ±1: Chebyshev nodes, dense at the edges."""
+"""Places over the band at which errors are evaluated, its edges at ±1: Chebyshev nodes, dense at the edges."""
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(24)
 _WITHIN = _NODES / 2  # places inside a cell, in cells
@@ -76,7 +76,7 @@ class Tables:
 
 @dataclass(frozen=True)
 class TableDesign:
-    """How samples become cells.
+    """Filters from samples to cells.
 
     Attributes
     ----------
@@ -106,7 +106,7 @@ class TableDesign:
 
 
 def band_error_db(squared_error: NDArray[np.float64], window: NDArray[np.float64]) -> float:
-    """Return the RMS error of a white echo under a window over its subcarriers, relative to what the window leaves.
+    """Return the RMS error of a white echo under a window over its subcarriers, relative to the echo under the window.
 
     Parameters
     ----------
@@ -180,26 +180,26 @@ def design_table(
     """
     up, down = ratio(profile_oversampling, oversampling)
     starts = np.arange(up) * down / up
-    whole = np.floor(starts)
+    first_sample = np.floor(starts)
     omega = np.pi / profile_oversampling * BAND
-    ideal = np.exp(1j * omega * (starts - whole)[:, None])[:, None] * _coefficients(omega * down / up, degree)
+    ideal = np.exp(1j * omega * (starts - first_sample)[:, None])[:, None] * _coefficients(omega * down / up, degree)
     before = taps // 2 - 1
     basis = np.exp(1j * omega[:, None] * (np.arange(taps) - before))
-    wanted = ideal.reshape(-1, omega.size).T
-    filters = np.linalg.lstsq(_stacked(basis), _stacked(wanted), rcond=1e-9)[0].T.reshape(up, degree + 1, taps)
+    target = ideal.reshape(-1, omega.size).T
+    filters = np.linalg.lstsq(_stacked(basis), _stacked(target), rcond=1e-9)[0].T.reshape(up, degree + 1, taps)
     given = np.einsum("pkt,wt->pkw", filters, basis)
     carrier_rad_per_cell = carrier_rad_per_sample * down / up
     polynomial, phase = _phase(carrier_rad_per_cell)
     error = _squared_error(
         given,
         omega,
-        starts - whole,
+        starts - first_sample,
         samples_per_cell=down / up,
         carrier_rad_per_cell=carrier_rad_per_cell,
         polynomial=polynomial,
         phase=phase,
     )
-    lead = whole.astype(np.int32) - before
+    lead = first_sample.astype(np.int32) - before
     return TableDesign(up, down, np.ascontiguousarray(filters, np.float32), lead, polynomial, phase, error)
 
 
@@ -218,7 +218,7 @@ def _coefficients(omega: NDArray[np.float64], degree: int) -> NDArray[np.complex
 
 
 def _phase(carrier_rad_per_cell: float) -> tuple[int, NDArray[np.float32]]:
-    """Return the cheapest phase polynomial that holds the carrier inside a cell, and its coefficients."""
+    """Return the cheapest phase polynomial that models the carrier inside a cell, and its coefficients."""
     u = 0.5 * np.cos(np.pi * (np.arange(200) + 0.5) / 200)
     for sines, cosines, reduced in PHASE_POLYNOMIALS:
         scale = np.pi if reduced else carrier_rad_per_cell

@@ -15,8 +15,8 @@ from apertura.core.focus.engines.engine import (
     BEAM_S,
     EngineOptions,
     Setting,
-    asked_or,
     compiled_for,
+    option_values,
     power_sum_db,
 )
 from apertura.core.focus.engines.native_tables import BAND, band_error_db
@@ -33,12 +33,12 @@ _SAMPLE_S = 3.1e-8  # per pulse and fine sample
 _PIXEL_S = 3.2e-8  # per pixel and pulse
 _REFINED_DB = -98.0  # the sinc filter of the table
 _HALF_TAPS = 10
-_PIXELS_AT_ONCE = 1024  # whose weights are held at once
+_PIXELS_AT_ONCE = 1024  # whose weights are in memory at once
 _KAISER_BETA = 10.0  # -100 dB, with half the band free for the transition
 
 
 class Options(EngineOptions):
-    """What may be asked of the engine."""
+    """Options of the engine."""
 
     oversampling: Annotated[int, Field(ge=2, le=64)] | None = Field(
         None, description="table samples per resolution cell c/B of total path"
@@ -50,17 +50,17 @@ def available() -> bool:
     return True
 
 
-def candidates(job: Job, *, pulses: int, asked: Mapping[str, Any]) -> Iterator[Setting]:
+def candidates(job: Job, *, pulses: int, requested: Mapping[str, Any]) -> Iterator[Setting]:
     """Yield a setting per oversampling, as `apertura.core.focus.engines.engine.Engine` describes.
 
     Notes
     -----
     Source: docs/theory/planner.md, "Error" and "Cost".
     """
-    signal, wanted = job.signal, asked_or(asked, "oversampling", OVERSAMPLINGS)
+    signal, considered = job.signal, option_values(requested, "oversampling", OVERSAMPLINGS)
     form_s = job.pixels * pulses * job.share * (_PIXEL_S + job.weights * BEAM_S)
-    for oversampling in wanted:
-        if oversampling < signal.oversampling and len(wanted) > 1:
+    for oversampling in considered:
+        if oversampling < signal.oversampling and len(considered) > 1:
             continue
         factor = max(1, round(oversampling / signal.oversampling))
         samples = pulses * signal.samples * factor

@@ -1,4 +1,4 @@
-"""The double sum over pulses and subcarriers in float64: slow, and what every other engine answers to."""
+"""The double sum over pulses and subcarriers in float64: slow, the reference of every other engine."""
 
 from collections.abc import Mapping
 from typing import Any, Literal
@@ -30,7 +30,7 @@ def available() -> bool:
     return True
 
 
-def candidates(job: Job, *, pulses: int, asked: Mapping[str, Any]) -> list[Setting]:  # noqa: ARG001
+def candidates(job: Job, *, pulses: int, requested: Mapping[str, Any]) -> list[Setting]:  # noqa: ARG001
     """Return its one setting, as `apertura.core.focus.engines.engine.Engine` describes."""
     each = job.subcarriers * _SUBCARRIER_S + job.weights * BEAM_S
     return [Setting("reference", {}, {}, _ERROR_DB, job.pixels * pulses * job.share * each)]
@@ -81,7 +81,7 @@ def form(history: PhaseHistory, pixels: NDArray[np.float64], *, beams: Beams | N
 
 
 def terms(history: PhaseHistory, pixels: NDArray[np.float64], beams: Beams | None = None) -> NDArray[np.complex128]:
-    """Return what each pulse adds at each pixel: the sum over subcarriers alone.
+    """Return the contribution of each pulse at each pixel: the sum over subcarriers alone.
 
     Parameters
     ----------
@@ -121,7 +121,7 @@ def _polynomial(coefficients, argument):  # type: ignore[no-untyped-def]
         for n in range(coefficients.shape[1] - 1, -1, -1):
             c_real, c_imag = coefficients[p, n].real, coefficients[p, n].imag
             for i in range(count):
-                turned = real[p, i] * z_real[i] - imag[p, i] * z_imag[i] + c_real
+                real_part = real[p, i] * z_real[i] - imag[p, i] * z_imag[i] + c_real
                 imag[p, i] = real[p, i] * z_imag[i] + imag[p, i] * z_real[i] + c_imag
-                real[p, i] = turned
+                real[p, i] = real_part
     return real + 1j * imag

@@ -1,7 +1,7 @@
-"""Backprojection by subaperture trees on Cartesian tiles: faster by the order of things for large images.
+"""Backprojection by subaperture trees on Cartesian tiles: of lower order of cost for large images.
 
 A tile's tree sums few pulses at few nodes, and merges subapertures on ever more nodes until the pixels themselves are
-the nodes (docs/theory/tree.md). Tiles depend on nothing but their own pixels. Pulses and tiles that a tree cannot take
+the nodes (docs/theory/tree.md). Tiles depend on nothing but their own pixels. Pulses and tiles that a tree cannot sum
 go through the direct kernel.
 """
 
@@ -26,15 +26,15 @@ from apertura.core.focus.engines.tree_nodes import DIRECTLY, surfaces_of, window
 from apertura.core.focus.engines.tree_prediction import candidates
 from apertura.core.focus.engines.tree_view import MOST_SHEETS, Sheets, SurfaceResidual, sheets_for, subaperture_sizes
 
-__all__ = ["READS", "WAYS", "available", "candidates", "form", "instruction_set", "pieces", "prepare"]
+__all__ = ["READS", "VARIANTS", "available", "candidates", "form", "instruction_set", "pieces", "prepare"]
 
 READS: Literal["profiles"] = "profiles"
 
-WAYS = ("by tree", "directly", "without an echo")
+VARIANTS = ("by tree", "directly", "without an echo")
 
 
 class Options(EngineOptions):
-    """What may be asked of the engine."""
+    """Options of the engine."""
 
     oversampling: Annotated[int, Field(ge=8, le=64)] | None = Field(
         None, description="table cells per resolution cell c/B of total path"
@@ -77,17 +77,17 @@ def form(
     beams
         Weight of each pulse at each pixel; none by default.
     nodes_db
-        What one interpolation between nodes may err by, dB.
+        Tolerated error of one interpolation between nodes, dB.
     presum_db
-        What pulses may err by for which fewer stand, of what their track leaves a smooth curve, dB RMS.
+        Tolerated error of pulses replaced by fewer, by deviations of their track from a smooth curve, dB RMS.
     side_px
-        Of the tiles that the block is cut into, at most; each gets the same bits with or without the others.
+        Largest side of the tiles that the block is cut into; the bits of each do not depend on the others.
     chunk
         Pulses of the largest subaperture.
     sheets
-        Between which a tile of rough ground is read, at most; where more are needed it goes directly.
+        Most sheets between which a tile of rough ground is interpolated; where more are needed it is summed directly.
     counts
-        (3,) int64 to which the number of pixels × pulses is added that went by tree, directly, or had no echo.
+        (3,) int64 to which the number of pixels × pulses is added that were summed by tree, directly, or had no echo.
 
     Returns
     -------
@@ -106,8 +106,8 @@ def form(
     -----
     Source: docs/theory/tree.md.
     """
-    asked = {"nodes_db": nodes_db, "presum_db": presum_db, "side_px": side_px, "chunk": chunk, "sheets": sheets}
-    Options.model_validate(asked)
+    requested = {"nodes_db": nodes_db, "presum_db": presum_db, "side_px": side_px, "chunk": chunk, "sheets": sheets}
+    Options.model_validate(requested)
     if beams is not None and any(b is not None and len(b.axes) != len(trees) for b in (beams.transmit, beams.receive)):
         raise ValueError(f"beams must be of {len(trees)} pulses")
     pixels = checked_pixels(pixels)
@@ -115,19 +115,19 @@ def form(
     block = partial(_Block, trees, nodes_db, presum_db, chunk)
     flat = block(pixels, image)
     tiles = flat.tiles(list(windows(pixels.shape[:2], side_px)))
-    raised = {tile: found for tile in tiles if not tile.by_tree and (found := flat.sheets(tile, sheets))}
+    raised = {tile: sheeting for tile in tiles if not tile.by_tree and (sheeting := flat.sheets(tile, sheets))}
     flat.sum(beams, [tile for tile in tiles if tile not in raised])
-    tally = flat.counts
-    for tile, found in raised.items():
-        places = found.pixels
+    total = flat.counts
+    for tile, sheeting in raised.items():
+        places = sheeting.pixels
         on_sheets = block(places, np.zeros(places.shape[:2], np.complex64))
-        on_sheets.sum(beams, on_sheets.tiles(found.windows))
-        image[tile.window] = found.read(on_sheets.image, trees.middle, trees.wavenumber_rad_m)
-        way = on_sheets.counts // len(found.heights_m)
-        tally += way
-        tally[0] += image[tile.window].size * len(trees) - way.sum()
+        on_sheets.sum(beams, on_sheets.tiles(sheeting.windows))
+        image[tile.window] = sheeting.read(on_sheets.image, trees.middle, trees.wavenumber_rad_m)
+        variant = on_sheets.counts // len(sheeting.heights_m)
+        total += variant
+        total[0] += image[tile.window].size * len(trees) - variant.sum()
     if counts is not None:
-        counts += tally
+        counts += total
     return image
 
 
@@ -138,7 +138,7 @@ def pieces(shape: tuple[int, ...], form_options: Mapping[str, Any]) -> Iterator[
 
 @dataclass(eq=False)
 class _Block:
-    """A block of pixels and all pulses, its image, how trees are to err, how many pixels × pulses went which way."""
+    """A block of pixels and all pulses: its image, tolerated errors, and pixels × pulses of each variant."""
 
     trees: Trees
     nodes_db: int
@@ -146,11 +146,11 @@ class _Block:
     chunk: int
     pixels: NDArray[np.float64]
     image: NDArray[np.complex64]
-    counts: NDArray[np.int64] = field(default_factory=lambda: np.zeros(len(WAYS), np.int64))
+    counts: NDArray[np.int64] = field(default_factory=lambda: np.zeros(len(VARIANTS), np.int64))
     _quarters: dict[JobTile, list[JobTile]] = field(default_factory=dict)
 
     def tiles(self, parts: list[Window]) -> list[JobTile]:
-        """Return tiles of the block; those that are small or rough do not go by tree."""
+        """Return tiles of the block; small and rough ones are not summed by tree."""
         limit = 2 * 10 ** (self.nodes_db / 10)
         return [
             JobTile(
@@ -160,7 +160,7 @@ class _Block:
         ]
 
     def sheets(self, tile: JobTile, most: int) -> Sheets | None:
-        """Return the sheets that a rough tile is read between; None where more are needed, or it is no relief."""
+        """Return the sheets between which a rough tile is interpolated; None where too many are needed."""
         trees, limit = self.trees, 10 ** (self.nodes_db / 20)
         pixels = self.pixels[tile.window]
         if not most or not np.isfinite(tile.surface.rough_m) or pixels.size < 3 * LEAST_PIXELS:
@@ -181,25 +181,27 @@ class _Block:
                 self.add(some, beams and beams[pulses], [(tile, every) for tile in tiles])
 
     def add(self, trees: Trees, beams: Beams | None, tasks: list[Task]) -> None:
-        """Add groups of some pulses to tiles; what the tree of a tile cannot take goes to its quarters, or directly."""
+        """Add groups of some pulses to tiles; those that a tree cannot sum go to quarters of the tile, or directly."""
         chunk = Chunk(
             trees, beams, self.nodes_db, self.presum_db, subaperture_sizes(self.chunk), self.pixels, self.image
         )
         pulses_of = np.minimum(TREE_GROUP, len(trees) - TREE_GROUP * np.arange(-(-len(trees) // TREE_GROUP)))
         left: list[Task] = []
-        for (tile, wanted), way in zip(tasks, chunk.add(tasks), strict=True):
-            direct = wanted & (way == DIRECTLY)
+        for (tile, selected), variant in zip(tasks, chunk.add(tasks), strict=True):
+            direct = selected & (variant == DIRECTLY)
             smaller = self._quartered(tile) if direct.any() else []
             left += [(quarter, direct) for quarter in smaller]
-            done = wanted & ~direct if smaller else wanted
-            self.counts += self.image[tile.window].size * np.bincount(way[done], pulses_of[done], 3).astype(np.int64)
+            done = selected & ~direct if smaller else selected
+            self.counts += self.image[tile.window].size * np.bincount(variant[done], pulses_of[done], 3).astype(
+                np.int64
+            )
             for run in () if smaller else _runs(direct, len(trees)):
-                self._add_directly(trees.direct(self.nodes_db)[run], beams and beams[run], tile.window)
+                self._add_directly(trees.direct_tables(self.nodes_db)[run], beams and beams[run], tile.window)
         if left:
             self.add(trees, beams, left)
 
     def _quartered(self, tile: JobTile) -> list[JobTile]:
-        """Return the quarters of a tile, none of one too small: it sees less of what is not smooth."""
+        """Return the quarters of a tile, over which geometry is smoother; none of a tile too small."""
         rows, columns = tile.window
         if min(rows.stop - rows.start, columns.stop - columns.start) < 2 * LEAST_QUARTER_PX:
             return []
@@ -212,7 +214,7 @@ class _Block:
         return self._quarters[tile]
 
     def _add_directly(self, tables: Tables, beams: Beams | None, window: Window) -> None:
-        tolerance_rad = self.trees.directly(self.nodes_db).tolerance_rad
+        tolerance_rad = self.trees.direct_setting(self.nodes_db).tolerance_rad
         self.image[window] += native.form(tables, self.pixels[window], beams=beams, tolerance_rad=tolerance_rad)
 
 

@@ -1,4 +1,4 @@
-"""What trees of all tiles share, what goes by the direct kernel, and the trees of one chunk of pulses."""
+"""Inputs of trees: filters and tracks of all tiles, tables of the direct kernel, and jobs of chunks of pulses."""
 
 import ctypes
 from collections.abc import Iterator
@@ -30,7 +30,7 @@ from apertura.core.focus.engines.native_tables import BAND, TableDesign, Tables,
 from apertura.core.focus.engines.tree_nodes import (
     BY_TREE,
     DIRECTLY,
-    SILENTLY,
+    UNWEIGHTED,
     Surface,
     matrices,
     nodes,
@@ -38,15 +38,15 @@ from apertura.core.focus.engines.tree_nodes import (
     supports,
     weights_over,
 )
-from apertura.core.focus.engines.tree_view import LEAF, curve, leaf_roughness, leaves_of, stray, tracks
+from apertura.core.focus.engines.tree_view import LEAF, curve, leaf_roughness, leaves_of, parabola_deviation, tracks
 from apertura.core.focus.inputs import Profiles
 from apertura.core.geometry.aperture import Aperture
 
-# ---- How the direct kernel takes what a tree cannot: its setting, and tables that are made when they are needed
+# ---- The direct kernel beside trees
 
 
-class Directly(NamedTuple):
-    """How the direct kernel takes what a tree cannot."""
+class DirectSetting(NamedTuple):
+    """Setting of the direct kernel beside trees."""
 
     oversampling: int
     tolerance_rad: float
@@ -56,12 +56,12 @@ _TOLERANCES_RAD = {-74: 1.5e-3, -80: 7e-4, -86: 3e-4, -92: 1.5e-4, -98: 1e-4}
 
 
 @lru_cache
-def directly(nodes_db: int, profile_oversampling: float, carrier_rad_per_sample: float) -> Directly:
-    """Return how the direct kernel takes what trees of such nodes cannot: it errs less than they do.
+def direct_setting(nodes_db: int, profile_oversampling: float, carrier_rad_per_sample: float) -> DirectSetting:
+    """Return the setting of the direct kernel beside trees of such nodes: its error is below theirs.
 
     Examples
     --------
-    >>> [directly(nodes_db, 2.0, 1.5).oversampling for nodes_db in (-50, -74, -98)]
+    >>> [direct_setting(nodes_db, 2.0, 1.5).oversampling for nodes_db in (-50, -74, -98)]
     [4, 5, 12]
     """
     least: tuple[float, int] = (np.inf, 0)
@@ -70,7 +70,7 @@ def directly(nodes_db: int, profile_oversampling: float, carrier_rad_per_sample:
         least = min(least, (design.error_db(np.ones(64)), oversampling))
         if least[0] <= nodes_db + 5:
             break
-    return Directly(least[1], _TOLERANCES_RAD.get(nodes_db, 1.5e-3))
+    return DirectSetting(least[1], _TOLERANCES_RAD.get(nodes_db, 1.5e-3))
 
 
 class DirectTables:
@@ -86,35 +86,36 @@ class DirectTables:
             return self._tables[oversampling]
 
 
-# ---- What trees of all tiles share: profiles, and the filters that expand them -------------------------------------
+# ---- Inputs that all tiles share
 
 CELLS_AT_ONCE = 4
-"""Cells per sample are a multiple of it: what a vector of AVX-512 holds."""
+"""Cells per sample are a multiple of it: the lanes of an AVX-512 vector."""
 
 LEAST_PIXELS = 32**2
-"""Of a tile: fewer go directly."""
+"""Pixels of a tile at least: the overhead of a tree is larger than the direct sum of fewer."""
 
 LEAST_QUARTER_PX = 64
-"""Side of the quarter of a tile: smaller ones are not worth a tree of their own."""
+"""Pixels, side of the quarter of a tile at least: smaller ones are cheaper by the direct sum."""
 
-_SAMPLED = 64  # pulses at which a rough tile is looked at
+_SAMPLED = 64  # pulses at which roughness is evaluated
 _DELAY_DEGREE = 9
 
 
 @dataclass(frozen=True, eq=False)
 class Trees:
-    """Pulses as trees read them.
+    """Pulses as inputs of trees.
 
     Attributes
     ----------
     profiles
         The pulses, contiguous.
     design
-        Of the cells: which filters make them.
-    stray_m
-        (leaf,) float32, metres by which pulses of a leaf leave the parabola through its first, middle and last one.
+        Filters of the cells.
+    deviation_m
+        (leaf,) float32, deviation of the pulses of a leaf from the parabola through its first, middle and last one,
+        metres.
     rough_m
-        (leaf, 4) float32, metres by which they leave curves of growing degree, RMS.
+        (leaf, 4) float32, deviation from curves of growing degree, metres RMS.
     tracks_m
         (leaf, antenna, term, 3) float64, phase centres over each leaf as polynomials.
     first
@@ -125,7 +126,7 @@ class Trees:
 
     profiles: Profiles
     design: TableDesign
-    stray_m: NDArray[np.float32]
+    deviation_m: NDArray[np.float32]
     rough_m: NDArray[np.float32]
     tracks_m: NDArray[np.float64]
     first: int
@@ -136,7 +137,7 @@ class Trees:
         return len(self.profiles)
 
     def __getitem__(self, pulses: slice) -> "Trees":
-        """Return those of pulses from a multiple of a leaf on.
+        """Return the trees of pulses from a multiple of a leaf on.
 
         Raises
         ------
@@ -150,30 +151,30 @@ class Trees:
         return replace(
             self,
             profiles=self.profiles[first:last],
-            stray_m=self.stray_m[leaves],
+            deviation_m=self.deviation_m[leaves],
             rough_m=self.rough_m[leaves],
             tracks_m=self.tracks_m[leaves],
             first=self.first + first,
         )
 
     def chunks(self, size: int) -> Iterator[slice]:
-        """Yield slices of `size` pulses; they end at the same pulses whichever tile takes them."""
+        """Yield slices of `size` pulses; they end at the same pulses for every tile."""
         first = 0
         while first < len(self):
             last = min(len(self), first + size - (self.first + first) % size)
             yield slice(first, last)
             first = last
 
-    def direct(self, nodes_db: int) -> Tables:
+    def direct_tables(self, nodes_db: int) -> Tables:
         """Return the direct kernel's tables for these pulses."""
-        return self.tables[self.directly(nodes_db).oversampling][self.first : self.first + len(self)]
+        return self.tables[self.direct_setting(nodes_db).oversampling][self.first : self.first + len(self)]
 
-    def directly(self, nodes_db: int) -> Directly:
+    def direct_setting(self, nodes_db: int) -> DirectSetting:
         """Return the direct kernel's setting beside trees of such nodes."""
-        return directly(nodes_db, self.profiles.oversampling, self.wavenumber_rad_m * self.profiles.step_m)
+        return direct_setting(nodes_db, self.profiles.oversampling, self.wavenumber_rad_m * self.profiles.step_m)
 
     def roughness(self, surface: Surface) -> float:
-        """Return the error that pixels off the surface of a tile make, as the function of that name."""
+        """Return the error by pixels off the surface of a tile, as the function of that name."""
         aperture = self.profiles.aperture
         some = aperture[aperture.sample(_SAMPLED)]
         return roughness(some, surface, wavenumber_rad_m=self.wavenumber_rad_m, band_rad_m=self.band_rad_m)
@@ -195,7 +196,7 @@ class Trees:
 
 
 def roughness(aperture: Aperture, surface: Surface, *, wavenumber_rad_m: float, band_rad_m: float) -> float:
-    """Return the mean squared error by pixels that do not lie on the surface of their tile, relative.
+    """Return the relative mean squared error by pixels off the surface of their tile.
 
     Parameters
     ----------
@@ -213,7 +214,7 @@ def roughness(aperture: Aperture, surface: Surface, *, wavenumber_rad_m: float, 
     if not np.isfinite(surface.rough_m):
         return np.inf
     rate = aperture.path_gradient(surface.centre_m[None])[:, 0] @ surface.up
-    against = rate[len(rate) // 2]  # the pulse of m, nearly: that of the whole flight, not of each chunk
+    against = rate[len(rate) // 2]  # the middle pulse of the flight, not of each chunk
     of_phase, of_delay = wavenumber_rad_m**2 * ((rate - against) ** 2).mean(), band_rad_m**2 / 3 * (rate**2).mean()
     return float(surface.rough_m**2 * (of_phase + of_delay))
 
@@ -239,12 +240,12 @@ def cells(profile_oversampling: float, carrier_rad_per_sample: float, oversampli
 
 @lru_cache
 def delay_filter(profile_oversampling: float) -> NDArray[np.float32]:
-    """Return the filter that gives a profile between two samples, as polynomials of where between them.
+    """Return the filter that gives a profile between two samples, as polynomials of the place between them.
 
     Returns
     -------
     ndarray
-        (degree + 1, tap) float32, constant term first; of 0…1 from the sample before to the one behind. The first tap
+        (degree + 1, tap) float32, constant term first; of 0…1 from the sample before to the one after. The first tap
         is that of the sample `tap / 2 - 1` before.
 
     Notes
@@ -261,14 +262,14 @@ def delay_filter(profile_oversampling: float) -> NDArray[np.float32]:
     omega = np.pi / profile_oversampling * BAND
     basis = np.exp(1j * omega[:, None] * (np.arange(TREE_DELAYS) - TREE_DELAYS // 2 + 1))
     u = 0.5 - 0.5 * np.cos(np.pi * (np.arange(24) + 0.5) / 24)
-    wanted = np.exp(1j * omega[:, None] * u)
-    left, right = (np.concatenate([part.real, part.imag]) for part in (basis, wanted))
+    selected = np.exp(1j * omega[:, None] * u)
+    left, right = (np.concatenate([part.real, part.imag]) for part in (basis, selected))
     taps = np.linalg.lstsq(left, right, rcond=1e-9)[0].T
     return np.ascontiguousarray(np.linalg.lstsq(np.vander(u, _DELAY_DEGREE + 1, increasing=True), taps)[0], np.float32)
 
 
 def prepare(profiles: Profiles, *, oversampling: int = 24, taps: int = 8) -> Trees:
-    """Return what trees of all tiles share; pulses are expanded to cells later, tile by tile.
+    """Return the inputs that trees of all tiles share; pulses are expanded to cells later, tile by tile.
 
     Parameters
     ----------
@@ -282,28 +283,36 @@ def prepare(profiles: Profiles, *, oversampling: int = 24, taps: int = 8) -> Tre
     Raises
     ------
     ValueError
-        If the profiles are oversampled less than 1.5 times or hold no pulse, or a position or start is not finite.
+        If the profiles are oversampled less than 1.5 times or have no pulse, or a position or start is not finite.
 
     Notes
     -----
     Source: docs/theory/tree.md, "Leaves"; the cells are those of docs/theory/engine.md, "Cells".
     """
     samples, start_m, places = profiles.for_tables()
-    held = replace(profiles, samples=samples, start_m=start_m)
+    contiguous = replace(profiles, samples=samples, start_m=start_m)
     legs = [leaves_of(leg) for leg in places]
-    strayed, rough = stray(legs[0]) + stray(legs[1]), leaf_roughness(*legs)
+    deviation, rough = parabola_deviation(legs[0]) + parabola_deviation(legs[1]), leaf_roughness(*legs)
     turn = 2 * np.pi * profiles.centre_frequency_hz / SPEED_OF_LIGHT_M_S * profiles.step_m
-    found = cells(profiles.oversampling, turn, float(oversampling), taps)
-    bent = np.stack([tracks(leg) for leg in legs], axis=1)
-    return Trees(held, found, strayed.astype(np.float32), rough.astype(np.float32), bent, 0, DirectTables(held))
+    design = cells(profiles.oversampling, turn, float(oversampling), taps)
+    polynomials = np.stack([tracks(leg) for leg in legs], axis=1)
+    return Trees(
+        contiguous,
+        design,
+        deviation.astype(np.float32),
+        rough.astype(np.float32),
+        polynomials,
+        0,
+        DirectTables(contiguous),
+    )
 
 
-# ---- The trees of one chunk of pulses over the tiles of a block, as the compiled library runs them -----------------
+# ---- Trees of one chunk of pulses over the tiles of a block
 
 
 @dataclass(frozen=True, eq=False)
 class JobTile:
-    """Which part of a block it is, where its pixels lie, and whether they lie smoothly enough for a tree."""
+    """A part of a block: its window, the surface of its pixels, and whether that is smooth enough for a tree."""
 
     window: Window
     surface: Surface
@@ -311,11 +320,11 @@ class JobTile:
 
 
 Task = tuple[JobTile, NDArray[np.bool_]]
-"""A tile, and which groups of 64 pulses are to be added to it."""
+"""A tile, and the groups of 64 pulses to add to it, (group,) bool."""
 
-_Taken = tuple[
+_Weighting = tuple[
     NDArray[np.float32] | None, NDArray[np.uint8], NDArray[np.uint8]
-]  # weights, ways, which go by themselves
+]  # weights, variant of each group, groups whose pulses are summed one by one
 
 
 @dataclass(eq=False)
@@ -327,7 +336,7 @@ class Chunk:
     trees, beams
         Of the pulses.
     nodes_db, presum_db
-        What one interpolation may err by, dB, and what pulses of a leaf may that leave a smooth track.
+        Tolerated error of one interpolation, dB, and of pulses of a leaf off a smooth track.
     sizes
         Pulses of the subapertures of each level.
     pixels, image
@@ -341,59 +350,62 @@ class Chunk:
     sizes: tuple[int, ...]
     pixels: NDArray[np.float64]
     image: NDArray[np.complex64]
-    _held: list[NDArray[np.generic]] = field(default_factory=list)  # what the structs point into
+    _kept: list[NDArray[np.generic]] = field(default_factory=list)  # arrays that the structs point into
     _counts: list[NDArray[np.uint8]] = field(default_factory=list)  # numbers of nodes of each tile
-    _fewer: list[NDArray[np.uint8]] = field(default_factory=list)  # numbers of pulses that stand for those of a leaf
+    _fewer: list[NDArray[np.uint8]] = field(default_factory=list)  # numbers of pulses that replace those of a leaf
 
     def add(self, tasks: list[Task]) -> list[NDArray[np.uint8]]:
-        """Add what goes by tree, of the groups of 64 pulses given for each tile; return how groups are taken."""
-        seen = [self._taken(*task) for task in tasks]
-        ways = [way for _, way, _ in seen]
-        self._fewer = [fewer for *_, fewer in seen]
+        """Add by tree the groups of 64 pulses given for each tile; return the variant of each group."""
+        weightings = [self._weighting(*task) for task in tasks]
+        variants = [variant for _, variant, _ in weightings]
+        self._fewer = [fewer for *_, fewer in weightings]
         array = (TreeTile * len(tasks))(
-            *(self._struct(tile, *taken) for (tile, _), taken in zip(tasks, seen, strict=True))
+            *(self._struct(tile, *weighting) for (tile, _), weighting in zip(tasks, weightings, strict=True))
         )
         job = self._job(array)
         call("apertura_plan_tree", job)
-        for struct, way in zip(array, ways, strict=True):
+        for struct, variant in zip(array, variants, strict=True):
             if struct.top < 0:
-                way[way == BY_TREE] = DIRECTLY
+                variant[variant == BY_TREE] = DIRECTLY
         self._fill(job, array)
         call("apertura_form_tree", job)
-        return ways
+        return variants
 
-    def _hold(self, array: NDArray[np.generic]) -> int:
-        self._held.append(array)
+    def _pointer_to(self, array: NDArray[np.generic]) -> int:
+        self._kept.append(array)
         return array.ctypes.data
 
-    def _taken(self, tile: JobTile, wanted: NDArray[np.bool_]) -> _Taken:
-        """Return the weights of the pulses over a tile, how groups of them are taken, and which go by themselves."""
-        way, each = np.where(wanted, BY_TREE if tile.by_tree else DIRECTLY, SILENTLY), np.zeros(len(wanted), np.uint8)
+    def _weighting(self, tile: JobTile, selected: NDArray[np.bool_]) -> _Weighting:
+        """Return the weights of the pulses over a tile, the variant of each group, and groups summed pulse by pulse."""
+        variant, each = (
+            np.where(selected, BY_TREE if tile.by_tree else DIRECTLY, UNWEIGHTED),
+            np.zeros(len(selected), np.uint8),
+        )
         if self.beams is None or not tile.by_tree:
-            return None, way.astype(np.uint8), each
-        first, last = np.flatnonzero(wanted)[[0, -1]]
+            return None, variant.astype(np.uint8), each
+        first, last = np.flatnonzero(selected)[[0, -1]]
         groups, pulses = slice(first, last + 1), slice(first * TREE_GROUP, (last + 1) * TREE_GROUP)
         weight = np.zeros((len(self.trees), TREE_WEIGHTS), np.float32)
         aperture = self.trees.profiles.aperture[pulses]
-        weight[pulses], found, each[groups] = weights_over(self.beams[pulses], aperture, tile.surface, self.nodes_db)
-        way[groups] = np.where(wanted[groups], found, SILENTLY)
-        return weight, way.astype(np.uint8), each
+        weight[pulses], by_group, each[groups] = weights_over(self.beams[pulses], aperture, tile.surface, self.nodes_db)
+        variant[groups] = np.where(selected[groups], by_group, UNWEIGHTED)
+        return weight, variant.astype(np.uint8), each
 
     def _struct(
-        self, tile: JobTile, weight: NDArray[np.float32] | None, way: NDArray[np.uint8], fewer: NDArray[np.uint8]
+        self, tile: JobTile, weight: NDArray[np.float32] | None, variant: NDArray[np.uint8], fewer: NDArray[np.uint8]
     ) -> TreeTile:
         rows, columns = tile.window
         surface, at = tile.surface, rows.start * self.image.shape[1] + columns.start
         counts = np.zeros(sum(2 * -(-len(self.trees) // size) for size in self.sizes), np.uint8)
         self._counts.append(counts)
         struct = TreeTile(
-            surface=self._hold(np.ascontiguousarray(surface.coefficients)),
+            surface=self._pointer_to(np.ascontiguousarray(surface.coefficients)),
             pixels=self.pixels.ctypes.data + 24 * at,
             image=self.image.ctypes.data + 8 * at,
-            weight=None if weight is None else self._hold(weight),
-            way=self._hold(way),
-            nodes=self._hold(counts),
-            fewer=self._hold(fewer),
+            weight=None if weight is None else self._pointer_to(weight),
+            way=self._pointer_to(variant),
+            nodes=self._pointer_to(counts),
+            fewer=self._pointer_to(fewer),
             degree=len(surface.coefficients) - 1,
             rows=rows.stop - rows.start,
             columns=columns.stop - columns.start,
@@ -408,16 +420,16 @@ class Chunk:
         delay = delay_filter(profiles.oversampling)
         taps = np.repeat(design.taps.transpose(2, 0, 1)[..., None], 2, axis=-1)
         job = TreeJob(
-            samples=self._hold(np.ascontiguousarray(profiles.samples)),
-            start=self._hold(np.ascontiguousarray(profiles.start_m)),
-            transmitter=self._hold(tx),
-            receiver=self._hold(rx),
-            stray=self._hold(self.trees.stray_m),
-            rough=self._hold(self.trees.rough_m),
-            track=self._hold(self.trees.tracks_m),
-            delay=self._hold(delay),
-            taps=self._hold(np.ascontiguousarray(taps, np.float32)),
-            supports=self._hold(supports(self.nodes_db)),
+            samples=self._pointer_to(np.ascontiguousarray(profiles.samples)),
+            start=self._pointer_to(np.ascontiguousarray(profiles.start_m)),
+            transmitter=self._pointer_to(tx),
+            receiver=self._pointer_to(rx),
+            stray=self._pointer_to(self.trees.deviation_m),
+            rough=self._pointer_to(self.trees.rough_m),
+            track=self._pointer_to(self.trees.tracks_m),
+            delay=self._pointer_to(delay),
+            taps=self._pointer_to(np.ascontiguousarray(taps, np.float32)),
+            supports=self._pointer_to(supports(self.nodes_db)),
             tiles=ctypes.addressof(tiles),
             pulses=len(profiles),
             length=profiles.samples.shape[1],
@@ -440,7 +452,7 @@ class Chunk:
         return job
 
     def _fill(self, job: TreeJob, tiles: "ctypes.Array[TreeTile]") -> None:
-        """Give the job the nodes and matrices that its plan asks for."""
+        """Fill in the nodes and matrices that the plan of the job needs."""
         places = np.zeros(TREE_SLOTS, np.uintp)
         spread, mix = (np.zeros((TREE_NODES + 1, TREE_SLOTS), np.uintp) for _ in range(2))
         slots: dict[int, int] = {}  # pixels along a side → slot
@@ -458,17 +470,19 @@ class Chunk:
         sizes = {slot: size for size, slot in slots.items()}
         for child, slot in steps:
             one, other = matrices(child, sizes.get(slot, slot), self.nodes_db, pixels=slot in sizes)
-            spread[child, slot], mix[child, slot] = self._hold(one), self._hold(other)
+            spread[child, slot], mix[child, slot] = self._pointer_to(one), self._pointer_to(other)
         for slot in {slot for step in steps for slot in step}:
             at = pixel_places(sizes[slot]) if slot in sizes else nodes(slot, self.nodes_db)
-            places[slot] = self._hold(np.ascontiguousarray(at))
+            places[slot] = self._pointer_to(np.ascontiguousarray(at))
         presum, curves = (np.zeros(TREE_FEWER + 1, np.uintp) for _ in range(2))
         for fewer in {int(n) for counts in self._fewer for n in counts if n > 1}:
-            presum[fewer] = self._hold(np.ascontiguousarray(matrices(fewer, LEAF, self.nodes_db, pixels=True)[1].T))
-            places[fewer] = self._hold(np.ascontiguousarray(nodes(fewer, self.nodes_db)))
-            curves[fewer] = self._hold(curve(fewer, self.nodes_db))
-        job.places, job.spread, job.mix = map(self._hold, (places, spread, mix))
-        job.presum, job.curve = map(self._hold, (presum, curves))
+            presum[fewer] = self._pointer_to(
+                np.ascontiguousarray(matrices(fewer, LEAF, self.nodes_db, pixels=True)[1].T)
+            )
+            places[fewer] = self._pointer_to(np.ascontiguousarray(nodes(fewer, self.nodes_db)))
+            curves[fewer] = self._pointer_to(curve(fewer, self.nodes_db))
+        job.places, job.spread, job.mix = map(self._pointer_to, (places, spread, mix))
+        job.presum, job.curve = map(self._pointer_to, (presum, curves))
 
     @property
     def _ratios(self) -> list[int]:

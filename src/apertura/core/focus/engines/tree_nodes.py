@@ -1,4 +1,4 @@
-"""What stands for the pixels of a tile: nodes along its axes, the surface through them, polynomials of weights."""
+"""Nodes along the axes of a tile, the surface through its pixels, and polynomials of weights over it."""
 
 import ctypes
 from collections.abc import Iterator
@@ -12,25 +12,24 @@ from numpy.typing import NDArray
 
 from apertura.common.contracts import Window
 from apertura.core.antenna.beam import Beams
-from apertura.core.antenna.illumination import reached
+from apertura.core.antenna.illumination import illumination_mask
 from apertura.core.focus.engines.native_binding import TREE_GROUP, TreeJob, TreeTile, call
 from apertura.core.geometry.aperture import Aperture
 
-# ---- Nodes along an axis of a tile: where they lie, how wide a band they hold, and weights that interpolate between
-# them
+# ---- Nodes along an axis of a tile, and interpolation between them
 #
 # docs/theory/tree.md, "Nodes".
 
 MOST_NODES = 128
-"""Along an axis."""
+"""Nodes along an axis: native/tree_job.hpp."""
 
 COUNTS = (*range(2, 9), *range(10, 65, 2), *range(68, MOST_NODES + 1, 4))
 """Numbers of nodes that are used."""
 
 NODES_DB = (-44, -50, -56, -62, -68, -74, -80, -86, -92, -98)
-"""RMS errors of one interpolation that nodes are made for."""
+"""dB, RMS errors of one interpolation that nodes are designed for."""
 
-_NOISE_DB = -20.0  # white noise that weights are made for, beside the error they are made for
+_NOISE_DB = -20.0  # white noise in the design of weights, relative to the error they are designed for
 
 _GAUSS, _SHARE = np.polynomial.legendre.leggauss(160)
 
@@ -44,7 +43,7 @@ def nodes(count: int, error_db: int) -> NDArray[np.float64]:
     count
         At least 1.
     error_db
-        What one interpolation may err by.
+        Tolerated error of one interpolation.
 
     Notes
     -----
@@ -86,8 +85,8 @@ def weights(count: int, places: NDArray[np.float64], error_db: int, band_rad: fl
     Examples
     --------
     >>> at = np.array([-0.3, 0.8])
-    >>> found = weights(12, at, -62, 6.0) @ np.exp(5j * nodes(12, -62))
-    >>> bool(np.abs(found - np.exp(5j * at)).max() < 1e-3)
+    >>> surfaces = weights(12, at, -62, 6.0) @ np.exp(5j * nodes(12, -62))
+    >>> bool(np.abs(surfaces - np.exp(5j * at)).max() < 1e-3)
     True
     """
     here = nodes(count, error_db)
@@ -111,7 +110,7 @@ def interpolation_error_db(count: int, error_db: int, band_rad: float) -> float:
 
 @lru_cache
 def supports(error_db: int) -> NDArray[np.float64]:
-    """Return the widest band that the largest of `COUNTS` up to each number holds, (MOST_NODES + 1,) rad per half tile.
+    """Return the widest band of the largest of `COUNTS` up to each number, (MOST_NODES + 1,) rad per half tile.
 
     Examples
     --------
@@ -120,15 +119,15 @@ def supports(error_db: int) -> NDArray[np.float64]:
     """
     text = (files("apertura.core.focus.engines") / "tree_supports.csv").read_text(encoding="utf-8").splitlines()[1:]
     column = text[0].split(",").index(str(error_db))
-    found = np.zeros(MOST_NODES + 1)
+    surfaces = np.zeros(MOST_NODES + 1)
     for line in text[1:]:
         values = line.split(",")
-        found[int(values[0]) :] = float(values[column])
-    return found
+        surfaces[int(values[0]) :] = float(values[column])
+    return surfaces
 
 
 def widest_band(count: int, error_db: int) -> float:
-    """Return the widest band that nodes hold, rad per half tile, by bisection: what tree_supports.csv was made with."""
+    """Return the widest band that nodes support, rad per half tile, by bisection: tree_supports.csv is made with it."""
     low, high = 0.0, np.pi / 2 * count
     while high - low > 1e-3:
         middle = (low + high) / 2
@@ -140,7 +139,7 @@ def widest_band(count: int, error_db: int) -> float:
 def matrices(
     count: int, target: int, error_db: int, *, pixels: bool
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return the weights of nodes at others or at pixels, as the compiled tree reads them.
+    """Return the weights of nodes at other nodes or at pixels, in the layout of the compiled tree.
 
     Parameters
     ----------
@@ -181,18 +180,18 @@ def _sinc(band_rad: float, a: NDArray[np.float64], b: NDArray[np.float64]) -> ND
     return np.asarray(np.sinc(band_rad / np.pi * (a[:, None] - b)))
 
 
-# ---- Tiles of a tree: their sides, and the smooth surface through their pixels -------------------------------------
+# ---- Tiles, and the smooth surface through their pixels
 
 DEGREE = 6
-"""Of a surface that is no plane."""
+"""Degree of a surface that is no plane."""
 
-_PLANE_M = 2e-5
-_THIN = 20
+_PLANE_M = 2e-5  # RMS distance of pixels from a plane that counts as one
+_THIN = 20  # pixels along a side that a surface is fitted to, at most
 
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Where the pixels of a tile lie.
+    """Smooth surface through the pixels of a tile.
 
     Attributes
     ----------
@@ -204,7 +203,7 @@ class Surface:
     up
         (3,) float64, unit vector across the surface there.
     rough_m
-        RMS distance of the pixels from it; infinite if one has no finite place.
+        RMS distance of the pixels from it; infinite if a pixel has no finite position.
     """
 
     coefficients: NDArray[np.float64]
@@ -214,7 +213,7 @@ class Surface:
 
 
 def windows(shape: tuple[int, ...], side_px: int) -> Iterator[Window]:
-    """Yield windows of at most `side_px` pixels a side that share a block of pixels as evenly as whole pixels do.
+    """Yield windows of at most `side_px` pixels a side that divide a block of pixels as evenly as possible.
 
     Examples
     --------
@@ -231,7 +230,7 @@ def windows(shape: tuple[int, ...], side_px: int) -> Iterator[Window]:
 
 
 def surfaces_of(pixels: NDArray[np.float64], parts: list[Window]) -> list[Surface]:
-    """Return the surfaces through the pixels of tiles: planes where they will do.
+    """Return the surfaces through the pixels of tiles: planes where these are close enough.
 
     Parameters
     ----------
@@ -250,19 +249,19 @@ def surfaces_of(pixels: NDArray[np.float64], parts: list[Window]) -> list[Surfac
     >>> surfaces_of(np.stack([x, y, 0.001 * x * x], -1), [(slice(0, 30), slice(0, 40))])[0].rough_m < 1e-9
     True
     """
-    found = [Surface(np.zeros((1, 1, 3)), np.zeros(3), np.zeros(3), np.inf)] * len(parts)
+    surfaces = [Surface(np.zeros((1, 1, 3)), np.zeros(3), np.zeros(3), np.inf)] * len(parts)
     left = list(range(len(parts)))
     for degree in (1, DEGREE):
         fitted = [_fit(pixels[parts[number]], degree) for number in left]
-        rests = _rests(pixels, [parts[number] for number in left], fitted)
+        rests = _residuals(pixels, [parts[number] for number in left], fitted)
         for number, coefficients, rest in zip(left, fitted, rests, strict=True):
             if np.isfinite(rest):
                 centre = _value(coefficients, 0.0)
-                found[number] = Surface(coefficients, centre, _across(coefficients), float(np.sqrt(rest)))
-        left = [number for number in left if _PLANE_M < found[number].rough_m < np.inf]
+                surfaces[number] = Surface(coefficients, centre, _across(coefficients), float(np.sqrt(rest)))
+        left = [number for number in left if _PLANE_M < surfaces[number].rough_m < np.inf]
         if not left:
             break
-    return found
+    return surfaces
 
 
 def _fit(pixels: NDArray[np.float64], degree: int) -> NDArray[np.float64]:
@@ -270,12 +269,12 @@ def _fit(pixels: NDArray[np.float64], degree: int) -> NDArray[np.float64]:
     middle = pixels[pixels.shape[0] // 2, pixels.shape[1] // 2]
     (rows, fit_rows), (columns, fit_columns) = (_fitting(size, degree) for size in pixels.shape[:2])
     offsets = pixels[np.ix_(rows, columns)] - middle  # places may be those of the Earth's centre
-    found = np.tensordot(fit_rows, fit_columns @ offsets, 1)
-    found[0, 0] += middle
-    return np.ascontiguousarray(found)
+    coefficients = np.tensordot(fit_rows, fit_columns @ offsets, 1)
+    coefficients[0, 0] += middle
+    return np.ascontiguousarray(coefficients)
 
 
-def _rests(
+def _residuals(
     pixels: NDArray[np.float64], parts: list[Window], surfaces: list[NDArray[np.float64]]
 ) -> NDArray[np.float64]:
     """Return the mean squared distance of the pixels of tiles from surfaces; NaN where one has no place."""
@@ -310,22 +309,22 @@ def _across(coefficients: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(across / length if length else np.array([0.0, 0.0, 1.0]))
 
 
-# ---- Weights of antennas and sectors over the tiles of a tree: a polynomial for each pulse, where that will do
+# ---- Weights of antennas and sectors over tiles, as polynomials
 
-BY_TREE, DIRECTLY, SILENTLY = range(3)
-"""How a group of pulses is taken over a tile: native/tree_job.hpp, TreeWay."""
+BY_TREE, DIRECTLY, UNWEIGHTED = range(3)
+"""Variant by which a group of pulses is summed over a tile: native/tree_job.hpp, TreeWay."""
 
 _TERMS = 4  # of ξ and of η
 _PLACES = np.cos(np.pi * (np.arange(_TERMS) + 0.5) / _TERMS)
 _BETWEEN = np.array([-1.0, -0.65, 0.0, 0.65, 1.0])
 _CURVE = 5  # degree of weights over the pulses of a leaf
-_CHECKED = 8  # pulses of which one is looked at between the places
+_CHECKED = 8  # of so many pulses one is evaluated between the places
 
 
 def weights_over(
     beams: Beams, aperture: Aperture, surface: Surface, error_db: float
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.uint8]]:
-    """Return the weight of each pulse over a tile, how groups of pulses are taken, and which cannot be made fewer.
+    """Return the weight of each pulse over a tile, the variant of each group, and the groups that fewer cannot replace.
 
     Parameters
     ----------
@@ -334,17 +333,17 @@ def weights_over(
     surface
         Of the tile.
     error_db
-        What polynomials may err by, relative to the largest weight.
+        Tolerated error of the polynomials, relative to the largest weight.
 
     Returns
     -------
     weights
         (pulse, 16) float32: factor of ξ^a η^b at 4·b + a.
-    way
-        (group of 64 pulses,) uint8: by tree where polynomials hold, silently where no pulse weighs anything.
+    variant
+        (group of 64 pulses,) uint8: by tree where polynomials are exact enough, unweighted where no pulse has weight.
     each
-        (group,) uint8: 1 where weights change from pulse to pulse otherwise than smoothly, so that no pulse can stand
-        for others.
+        (group,) uint8: 1 where weights do not change smoothly from pulse to pulse, so that fewer pulses cannot replace
+        them.
 
     Notes
     -----
@@ -356,20 +355,20 @@ def weights_over(
     limit = 10 ** (error_db / 20) * 3  # the largest of an error is about three times its RMS
     groups = -(-len(values) // TREE_GROUP)
     largest, each = _by_group(values.max(axis=1)), np.zeros(groups, bool)
-    full = len(values) // TREE_GROUP  # of a group not full each pulse goes for itself anyway
+    full = len(values) // TREE_GROUP  # pulses of an incomplete group are summed one by one anyway
     each[:full] = _jumps(values[: full * TREE_GROUP]) > limit * largest[:full]
     each[full:] = True
-    # Where weights jump every pulse is looked at: one between two that hold need not.
+    # Where weights jump every pulse is evaluated: polynomials may fail at one between two where they are exact.
     some = np.flatnonzero(each[np.arange(len(values)) // TREE_GROUP] | (np.arange(len(values)) % _CHECKED == 0))
     error, checked = np.zeros(len(values)), beams[some].weight(aperture[some], _positions(surface, between))
     error[some] = np.abs(terms[some] @ terms_between.T - checked).max(axis=1)
     radius_m = np.linalg.norm(_positions(surface, _BETWEEN) - surface.centre_m, axis=-1).max(keepdims=True)
-    lit = reached(beams, aperture, surface.centre_m[None], radius_m, pulses=TREE_GROUP)[:, 0]
+    illuminated = illumination_mask(beams, aperture, surface.centre_m[None], radius_m, pulses=TREE_GROUP)[:, 0]
     # A beam may be narrower than what lies between the places, and end between two of them.
-    whole = _by_group(((values == 0).any(axis=1) & (values != 0).any(axis=1)).astype(float)) == 0
-    holds = whole & (largest > 0) & (_by_group(error) <= limit * largest)
-    way = np.where(lit, np.where(holds, BY_TREE, DIRECTLY), SILENTLY)
-    return np.ascontiguousarray(terms, np.float32), way.astype(np.uint8), each.astype(np.uint8)
+    all_or_none = _by_group(((values == 0).any(axis=1) & (values != 0).any(axis=1)).astype(float)) == 0
+    exact = all_or_none & (largest > 0) & (_by_group(error) <= limit * largest)
+    variant = np.where(illuminated, np.where(exact, BY_TREE, DIRECTLY), UNWEIGHTED)
+    return np.ascontiguousarray(terms, np.float32), variant.astype(np.uint8), each.astype(np.uint8)
 
 
 def _by_group(values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -378,7 +377,7 @@ def _by_group(values: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _jumps(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return by how much the weights of groups of pulses leave a curve over them, at most: (group,)."""
+    """Return the largest deviation of the weights of groups of pulses from a curve over them, (group,)."""
     grouped = values.reshape(len(values) // TREE_GROUP, TREE_GROUP, values.shape[1])
     return np.asarray(np.abs(grouped - _curve() @ (_curve().T @ grouped)).max(axis=(1, 2)))
 

@@ -1,4 +1,4 @@
-"""What a tree is predicted to do: how exactly, which pulses and tiles it cannot take, and what that costs."""
+"""Prediction of trees: error, share of pixels and pulses that are summed directly, and cost."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.core.focus.engines import native_prediction
-from apertura.core.focus.engines.engine import BEAM_S, Setting, asked_or, power_sum_db
+from apertura.core.focus.engines.engine import BEAM_S, Setting, option_values, power_sum_db
 from apertura.core.focus.engines.native_binding import TREE_DELAYS
 from apertura.core.focus.engines.native_prediction import pixel_steps
-from apertura.core.focus.engines.tree_inputs import LEAST_QUARTER_PX, cells, cells_per_sample, directly, roughness
-from apertura.core.focus.engines.tree_nodes import DIRECTLY, SILENTLY, Surface, surfaces_of, weights_over
+from apertura.core.focus.engines.tree_inputs import LEAST_QUARTER_PX, cells, cells_per_sample, direct_setting, roughness
+from apertura.core.focus.engines.tree_nodes import DIRECTLY, UNWEIGHTED, Surface, surfaces_of, weights_over
 from apertura.core.focus.engines.tree_view import (
     LEAF,
     MOST_SHEETS,
@@ -22,48 +22,50 @@ from apertura.core.focus.engines.tree_view import (
     SurfaceResidual,
     TileView,
     counts_of,
-    look,
     sheets_for,
     subaperture_sizes,
+    view_of_tile,
 )
 from apertura.core.focus.job import Job, Signal
 
-# ---- A few tiles of a job, each seen from a few chunks of its pulses: what a tree is predicted from ----------------
+# ---- Sample of tiles and chunks
 
-_TILES, _CHUNKS_SEEN = 5, 3  # that are looked at
+_TILES, _CHUNKS = 5, 3  # sampled for a prediction
 
 
 @dataclass(frozen=True, eq=False)
 class SampledTiles:
-    """A few tiles of one side, each seen from a few chunks."""
+    """A few tiles of one side, and their views from a few chunks of pulses."""
 
     surfaces: tuple[Surface, ...]
-    looks: tuple[tuple[TileView, ...], ...]
+    views: tuple[tuple[TileView, ...], ...]
     rough: tuple[float, ...]  # mean squared error by pixels off their surface
-    sheets_rad: tuple[tuple[float, float], ...]  # band along heights, and phase of what leaves the surface otherwise
+    sheets_rad: tuple[tuple[float, float], ...]  # band along heights, and phase of the deviation across them
     groups: tuple[NDArray[np.int64], ...]  # some pulses of each chunk
 
     @property
     def phase_rad(self) -> float:
-        """RMS over them, of places of a tile against its centre."""
-        phases = [look.phase_rad for looks in self.looks for look in looks]
+        """RMS phase over the views, of places of a tile against its centre."""
+        phases = [view.phase_rad for views in self.views for view in views]
         return float(np.sqrt(np.mean(np.square(phases)))) if phases else 1.0
 
 
 @lru_cache(maxsize=64)
-def seen_of(job: Job, pulses: int, side_px: int, chunk: int) -> SampledTiles:
-    """Return some tiles, and how they are seen from some chunks."""
+def sample_tiles(job: Job, pulses: int, side_px: int, chunk: int) -> SampledTiles:
+    """Return some tiles, and their views from some chunks."""
     side = min(side_px, job.tile_px, *job.shape)
-    whole = [(slice(0, side), slice(0, side))]
-    patches = [np.ascontiguousarray(patch[whole[0]]) for patch in _patches(job, side)]
-    surfaces = tuple(surfaces_of(patch, whole)[0] for patch in patches)
+    seconds_of_image = [(slice(0, side), slice(0, side))]
+    patches = [np.ascontiguousarray(patch[seconds_of_image[0]]) for patch in _patches(job, side)]
+    surfaces = tuple(surfaces_of(patch, seconds_of_image)[0] for patch in patches)
     places = np.linspace(0, len(job.aperture) - 1, pulses).astype(int)
     starts = np.arange(0, pulses, chunk)
-    starts = starts[np.unique(np.linspace(0, len(starts) - 1, _CHUNKS_SEEN).astype(int))]
+    starts = starts[np.unique(np.linspace(0, len(starts) - 1, _CHUNKS).astype(int))]
     k, b = job.signal.wavenumber_rad_m, np.pi / (job.signal.step_m * job.signal.oversampling)
     chunks = [job.aperture[places[start : start + chunk]] for start in starts]
-    looks = tuple(
-        tuple(look(part, surface, subaperture_sizes(chunk), wavenumber_rad_m=k, band_rad_m=b) for part in chunks)
+    views = tuple(
+        tuple(
+            view_of_tile(part, surface, subaperture_sizes(chunk), wavenumber_rad_m=k, band_rad_m=b) for part in chunks
+        )
         for surface in surfaces
         if np.isfinite(surface.rough_m)
     )
@@ -74,13 +76,13 @@ def seen_of(job: Job, pulses: int, side_px: int, chunk: int) -> SampledTiles:
         _sheets(job, surface, patch, wavenumber_rad_m=k, band_rad_m=b)
         for surface, patch in zip(surfaces, patches, strict=True)
     )
-    return SampledTiles(surfaces, looks, rough, sheets, tuple(group for group in groups if len(group)))
+    return SampledTiles(surfaces, views, rough, sheets, tuple(group for group in groups if len(group)))
 
 
 def _sheets(
     job: Job, surface: Surface, patch: NDArray[np.float64], *, wavenumber_rad_m: float, band_rad_m: float
 ) -> tuple[float, float]:
-    """Return what `SampledTiles` says of the sheets of a tile."""
+    """Return `SampledTiles.sheets_rad` of a tile."""
     if not np.isfinite(surface.rough_m):
         return np.inf, np.inf
     relief = SurfaceResidual.of(surface, patch)
@@ -89,18 +91,18 @@ def _sheets(
 
 
 @lru_cache(maxsize=256)
-def weighed_directly(job: Job, seen: SampledTiles, nodes_db: int) -> float:
-    """Return the part of the groups of pulses that see a tile whose weights no polynomial follows."""
+def unsmooth_share(job: Job, sampled: SampledTiles, nodes_db: int) -> float:
+    """Return the share of the groups of pulses illuminating a tile whose weights are not polynomial over it."""
     if job.beams is None:
         return 0.0
-    smooth = [surface for surface in seen.surfaces if np.isfinite(surface.rough_m)]
-    ways = [
+    smooth = [surface for surface in sampled.surfaces if np.isfinite(surface.rough_m)]
+    variants = [
         weights_over(job.beams[group], job.aperture[group], surface, nodes_db)[1]
         for surface in smooth
-        for group in seen.groups
+        for group in sampled.groups
     ]
-    taken = np.concatenate([*ways, np.empty(0, np.uint8)])
-    taken = taken[taken != SILENTLY]
+    taken = np.concatenate([*variants, np.empty(0, np.uint8)])
+    taken = taken[taken != UNWEIGHTED]
     return float((taken == DIRECTLY).mean()) if len(taken) else 0.0
 
 
@@ -117,28 +119,28 @@ def _patches(job: Job, side: int) -> list[NDArray[np.float64]]:
     ]
 
 
-# ---- What a tree is predicted to do: how exactly, which pulses and tiles it cannot take, and what that costs -------
+# ---- Error and cost of settings
 
 SETTINGS: Mapping[int, tuple[int, int]] = {
     -50: (8, 8), -56: (16, 8), -62: (16, 8), -68: (24, 8), -74: (24, 8), -80: (32, 16),
     -86: (64, 16), -92: (64, 16), -98: (64, 16),
 }  # fmt: skip
-"""Error of one interpolation, dB → table cells per resolution cell, and taps, that err less than nodes do."""
+"""Error of one interpolation, dB → table cells per resolution cell, and taps, whose error is below that of nodes."""
 
 PRESUMS_DB = (0, 6, 12)
-"""By how much pulses for which fewer stand may err more than an interpolation does."""
+"""dB above the error of an interpolation that replacing pulses by fewer may err by."""
 
 SIDES_PX, CHUNKS = (64, 128, 256), (256, 1024, 2048)
 """Sides of tiles and pulses of the largest subaperture that are considered."""
 
-_FLOAT32_DB = -92.0
+_FLOAT32_DB = -92.0  # error of float32 sums
 _FLOAT32 = 2e-7  # of a phase of so many radians: path lengths, and places of cells
 
 # Seconds on one core, of the same machine as the direct kernel's in native_prediction.py.
-_NODE_S = 7e-10  # a node that looks a pulse up
+_NODE_S = 7e-10  # a look-up of a pulse at a node
 _EXPAND_S = 2.6e-9  # sixteen taps of a cell's filters
-_EACH_EXPAND_S = 4.6e-9  # of pulses that go for themselves, whose cells tiles side by side share
-_ALIGN_S = 8e-11  # a sample and a tap or pulse, aligned to a tile and made fewer
+_EACH_EXPAND_S = 4.6e-9  # of pulses that no fewer replace, whose cells neighbouring tiles share
+_ALIGN_S = 8e-11  # a sample and a tap or pulse, aligned to a tile and replaced by fewer
 _MIX_S = 5e-12  # a complex multiply-add of merges and pixels
 _SHEET_BYTES = 64  # a pixel's on one sheet
 _READ_S = 5e-8  # a pixel read from one of its sheets
@@ -146,37 +148,37 @@ _PIXEL_S = 4.5e-9  # a pixel of a subaperture's
 _LEAF_S = 6e-6  # a leaf over a tile: its plan
 _SURFACE_S = 1.6e-8  # a pixel's place, fitted
 _TILE_S = 4e-5  # a tile of a chunk
-_APART = 1.1  # times as long as in one go for pixels and pulses that go directly, tile by tile and chunk by chunk
+_PIECEWISE = 1.1  # cost of direct sums tile by tile and chunk by chunk, relative to one call
 _WEIGHTS = 18  # of a pulse over a tile, each as `Beams.weight` takes it
 _FORM_S = 4e-4  # a block of pixels
-_SMALL = 1e8  # pixels × pulses that the direct kernel takes in less than that
+_SMALL = 1e8  # pixels × pulses that the direct kernel sums in less than that
 _START_S = 0.03  # the weights of all numbers of nodes that a job takes, once
 
 
-def candidates(job: Job, *, pulses: int, asked: Mapping[str, Any]) -> Iterator[Setting]:
+def candidates(job: Job, *, pulses: int, requested: Mapping[str, Any]) -> Iterator[Setting]:
     """Yield settings of trees, as `apertura.core.focus.engines.engine.Engine` describes.
 
     Notes
     -----
     Source: docs/theory/tree.md, "Error" and "Cost".
     """
-    for side_px, chunk in _cuts(job, pulses, asked):
-        seen = seen_of(job, pulses, side_px, chunk)
-        for nodes_db in asked_or(asked, "nodes_db", SETTINGS):
+    for side_px, chunk in _cuts(job, pulses, requested):
+        sampled = sample_tiles(job, pulses, side_px, chunk)
+        for nodes_db in option_values(requested, "nodes_db", SETTINGS):
             oversampling, taps = SETTINGS[nodes_db]
-            oversampling = asked.get("oversampling") or oversampling
+            oversampling = requested.get("oversampling") or oversampling
             quickest = np.inf
-            for presum_db in asked_or(asked, "presum_db", [nodes_db + more for more in PRESUMS_DB]):
-                options = _Options(oversampling, taps, nodes_db, presum_db, side_px, chunk, asked.get("sheets"))
-                setting = _setting(job, seen, pulses, options)
-                if setting.seconds < quickest:  # what may err more takes less time, or is not worth it
+            for presum_db in option_values(requested, "presum_db", [nodes_db + more for more in PRESUMS_DB]):
+                options = _Options(oversampling, taps, nodes_db, presum_db, side_px, chunk, requested.get("sheets"))
+                setting = _setting(job, sampled, pulses, options)
+                if setting.seconds < quickest:  # a larger tolerated error must save time
                     quickest = setting.seconds
                     yield setting
 
 
-def _cuts(job: Job, pulses: int, asked: Mapping[str, Any]) -> list[tuple[int, int]]:
-    """Return sides of tiles and pulses of chunks to look at; one where the job is not worth a look at more."""
-    cuts = list(product(asked_or(asked, "side_px", SIDES_PX), asked_or(asked, "chunk", CHUNKS)))
+def _cuts(job: Job, pulses: int, requested: Mapping[str, Any]) -> list[tuple[int, int]]:
+    """Return sides of tiles and pulses of chunks to predict; one where the job is too small to gain by more."""
+    cuts = list(product(option_values(requested, "side_px", SIDES_PX), option_values(requested, "chunk", CHUNKS)))
     most_px, most_pulses = 2 * min(job.tile_px, max(job.shape)), 8 * max(pulses, LEAF)
     fitting = [(side, chunk) for side, chunk in cuts if side < most_px and chunk < most_pulses] or cuts[:1]
     return fitting if job.pixels * pulses > _SMALL else fitting[-1:]
@@ -202,18 +204,18 @@ class _Work:
     beside: float
 
 
-def _setting(job: Job, seen: SampledTiles, pulses: int, options: _Options) -> Setting:
+def _setting(job: Job, sampled: SampledTiles, pulses: int, options: _Options) -> Setting:
     signal, nodes_db = job.signal, options.nodes_db
     carrier_rad = signal.wavenumber_rad_m * signal.step_m
     design = cells(signal.oversampling, carrier_rad, float(options.oversampling), options.taps)
     table_db, levels = design.error_db(signal.window), len(subaperture_sizes(options.chunk))
-    asked = {"degree": 2, **directly(nodes_db, signal.oversampling, carrier_rad)._asdict()}
-    direct = next(iter(native_prediction.candidates(job, pulses=pulses, asked=asked)))
-    direct_s = _APART * direct.form_seconds / (job.pixels * pulses * job.share)
+    requested = {"degree": 2, **direct_setting(nodes_db, signal.oversampling, carrier_rad)._asdict()}
+    direct = next(iter(native_prediction.candidates(job, pulses=pulses, requested=requested)))
+    direct_s = _PIECEWISE * direct.form_seconds / (job.pixels * pulses * job.share)
     cost = _cost(job, pulses, options, direct_s)
     presum_db = float(10 * np.log10(cost.presum_rad2 + 1e-30))
     interpolated_db = nodes_db + 10 * float(np.log10(2 * levels + 1 + (cost.layers > 1)))
-    phase_db = 20 * float(np.log10(_FLOAT32 * seen.phase_rad + 1e-9))
+    phase_db = 20 * float(np.log10(_FLOAT32 * sampled.phase_rad + 1e-9))
     tree_db = power_sum_db(table_db, interpolated_db, presum_db, _FLOAT32_DB, phase_db)
     powers = 10 ** (np.array([tree_db, direct.error_db]) / 10)
     error_db = 10 * np.log10(powers @ [1 - cost.directly, cost.directly])
@@ -222,7 +224,7 @@ def _setting(job: Job, seen: SampledTiles, pulses: int, options: _Options) -> Se
         {"oversampling": options.oversampling, "taps": options.taps},
         {name: getattr(options, name) for name in ("nodes_db", "presum_db", "side_px", "chunk")}
         | {"sheets": cost.sheets},
-        float(np.ceil(2 * error_db) / 2),  # or tiles of half the side are taken for a hundredth of a dB
+        float(np.ceil(2 * error_db) / 2),  # else a hundredth of a dB would select tiles of half the side
         cost.seconds,
         table_seconds=_START_S + (direct.table_seconds if cost.directly else 0.0),
         table_bytes=8 * pulses * signal.samples
@@ -242,20 +244,20 @@ def _setting(job: Job, seen: SampledTiles, pulses: int, options: _Options) -> Se
 
 @dataclass(frozen=True)
 class _Cost:
-    """Of an image, or of the tiles of one side.
+    """Cost of an image, or of the tiles of one side.
 
     Attributes
     ----------
     seconds
-        Of the whole; of tiles: if they took it all.
+        Of the image; of tiles: if they summed all of it.
     directly
-        Part that no tree takes.
+        Share that no tree sums.
     presum_rad2
-        What pulses made fewer err by.
+        Mean squared phase error of pulses replaced by fewer.
     sheets
-        Between which a tile may be read, at most.
+        Most sheets between which a tile may be interpolated.
     layers
-        Sheets that tiles looked at are read between, at most.
+        Most sheets that a sampled tile needs.
     """
 
     seconds: float
@@ -266,61 +268,64 @@ class _Cost:
 
 
 def _cost(job: Job, pulses: int, options: _Options, direct_s: float) -> _Cost:
-    """Return what the image costs if a pixel and pulse takes `direct_s` directly."""
+    """Return the cost of the image where the direct sum takes `direct_s` per pixel and pulse."""
     side = min(options.side_px, job.tile_px, *job.shape)
     first = part = _by_tree(job, pulses, options, side, direct_s)
-    whole = _SURFACE_S * job.pixels + _FORM_S * job.tiles
-    left, presum = 1.0, 0.0  # what larger tiles did not take
+    seconds_of_image = _SURFACE_S * job.pixels + _FORM_S * job.tiles
+    left, presum = 1.0, 0.0  # share that larger tiles did not sum
     while True:
         weighed_s = job.weights * job.share * job.pixels / side**2 * pulses * _WEIGHTS * BEAM_S
         taken = max(0.0, left - part.directly)
-        whole, presum = whole + taken * part.seconds + left * weighed_s, max(presum, part.presum_rad2)
+        seconds_of_image, presum = (
+            seconds_of_image + taken * part.seconds + left * weighed_s,
+            max(presum, part.presum_rad2),
+        )
         left, side = left - taken, side // 2
         if not left or side < LEAST_QUARTER_PX:
             break
         part = _by_tree(job, pulses, options, side, None)
-    whole += left * pulses * job.share * job.pixels * direct_s
-    return _Cost(whole, left, presum, first.sheets, first.layers)
+    seconds_of_image += left * pulses * job.share * job.pixels * direct_s
+    return _Cost(seconds_of_image, left, presum, first.sheets, first.layers)
 
 
 def _by_tree(job: Job, pulses: int, options: _Options, side: int, direct_s: float | None) -> _Cost:
-    """Return what tiles of one side take and cost; they are read between sheets where `direct_s` is given."""
-    seen, chunks = seen_of(job, pulses, side, options.chunk), -(-pulses // options.chunk)
+    """Return the cost of tiles of one side; sheets are considered where `direct_s` is given."""
+    sampled, chunks = sample_tiles(job, pulses, side, options.chunk), -(-pulses // options.chunk)
     work = _Work(min(pulses, options.chunk), side, min(job.tile_px, *job.shape) / side)
-    edge, limit = weighed_directly(job, seen, options.nodes_db), 10 ** (options.nodes_db / 20)
+    edge, limit = unsmooth_share(job, sampled, options.nodes_db), 10 ** (options.nodes_db / 20)
     counted = partial(counts_of, nodes_db=options.nodes_db, presum_db=options.presum_db, weighted=job.beams is not None)
-    counts = [[counted(one) for one in here] for here in seen.looks]
+    counts = [[counted(one) for one in here] for here in sampled.views]
     costs = [
         [
-            chunks * sum(cost * amount for cost, amount in features(one, found, options, job.signal, work))
-            for one, found in zip(here, founds, strict=True)
-            if found.nodes
+            chunks * sum(cost * amount for cost, amount in features(one, one_count, options, job.signal, work))
+            for one, one_count in zip(here, node_counts, strict=True)
+            if one_count.nodes
         ]
-        for here, founds in zip(seen.looks, counts, strict=True)
+        for here, node_counts in zip(sampled.views, counts, strict=True)
     ]
     once, read_s = float(np.mean([one for each in costs for one in each] or [np.inf])), _READ_S * side**2
     pay = min(MOST_SHEETS, int(pulses * side**2 * direct_s / (once + read_s))) if direct_s else 0
     sheets = pay if options.sheets is None or not direct_s else options.sheets
     spent, share, presum, most, tiles = list[float](), list[float](), [0.0], 1, iter(zip(counts, costs, strict=True))
-    for surface, rough, (band, aside) in zip(seen.surfaces, seen.rough, seen.sheets_rad, strict=True):
-        founds, cost = next(tiles) if np.isfinite(surface.rough_m) else ([], [])
+    for surface, rough, (band, aside) in zip(sampled.surfaces, sampled.rough, sampled.sheets_rad, strict=True):
+        node_counts, cost = next(tiles) if np.isfinite(surface.rough_m) else ([], [])
         layers = 1 if rough <= 2 * limit**2 else sheets_for(band, options.nodes_db) if aside <= limit else sheets + 1
         if layers > max(1, sheets):
             cost = []
         most = max(most, layers) if cost else most
-        share.append((1 - edge) * len(cost) / max(1, len(founds)))
+        share.append((1 - edge) * len(cost) / max(1, len(node_counts)))
         spent += [layers * (one + (read_s if layers > 1 else 0.0)) for one in cost]
-        presum += [found.presum_rad**2 for found in founds if found.nodes and cost]
+        presum += [one_count.presum_rad**2 for one_count in node_counts if one_count.nodes and cost]
     seconds = job.share * job.pixels / side**2 * float(np.mean(spent or [0.0]))
     return _Cost(seconds, 1 - float(np.mean(share)), float(np.mean(presum)), sheets, most)
 
 
 def features(
-    looks: TileView, counts: Counts, options: _Options, signal: Signal, work: "_Work"
+    view: TileView, counts: Counts, options: _Options, signal: Signal, work: "_Work"
 ) -> list[tuple[float, float]]:
-    """Return what one tile and one chunk take by tree: seconds each, and how many."""
+    """Return the operations of a tree over one tile and one chunk: seconds of each, and their number."""
     leaves = [-(-work.pulses // size) for size in subaperture_sizes(options.chunk)]
-    samples = looks.span_m / signal.step_m + 6
+    samples = view.span_m / signal.step_m + 6
     looked_up = leaves[0] * counts.fewer if counts.fewer else work.pulses
     cells_of = cells_per_sample(signal.oversampling, options.oversampling)
     aligned = work.pulses * (samples + options.taps) * (TREE_DELAYS + counts.fewer) if counts.fewer else 0.0

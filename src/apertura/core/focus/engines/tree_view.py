@@ -1,4 +1,4 @@
-"""How a tree divides a job: leaves of its track, nodes and pulses of tiles and chunks, sheets over rough ground."""
+"""Division of a job by a tree: leaves of its track, nodes and pulses of tiles and chunks, sheets over rough ground."""
 
 from dataclasses import dataclass
 from functools import cache, lru_cache
@@ -11,13 +11,13 @@ from apertura.core.focus.engines.native_binding import TREE_FEWER, TREE_GROUP, T
 from apertura.core.focus.engines.tree_nodes import MOST_NODES, Surface, nodes, pixel_places, supports, weights
 from apertura.core.geometry.aperture import Aperture
 
-# ---- How pulses are grouped into leaves and larger subapertures of a tree, and how smooth the track over a leaf is
+# ---- Leaves and larger subapertures
 
 LEAF = TREE_GROUP
-"""Pulses that a leaf makes fewer, and sums at its nodes."""
+"""Pulses of a leaf, which fewer may replace, and which are summed at its nodes."""
 
 DEGREES = (5, 9, 14, 20)
-"""Of curves over a leaf that fewer pulses may follow: native/tree_plan.hpp, kCurves."""
+"""Degrees of curves over a leaf on which fewer pulses may replace it: native/tree_plan.hpp, kCurves."""
 
 _SECOND = 256  # pulses of a subaperture of leaves
 
@@ -34,14 +34,14 @@ def subaperture_sizes(chunk: int) -> tuple[int, ...]:
 
 
 def leaves_of(places_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (leaf, pulse, 3) places; the last one fills its leaf up."""
+    """Return (leaf, pulse, 3) places; the last place is repeated to fill its leaf."""
     count = -(-len(places_m) // LEAF)
     filling = np.repeat(places_m[-1:], count * LEAF - len(places_m), axis=0)
     return np.concatenate([places_m, filling]).reshape(count, LEAF, 3)
 
 
-def stray(leaves_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (leaf,) how far pulses lie from the parabola through the first, middle and last one, metres."""
+def parabola_deviation(leaves_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return (leaf,) largest distance of pulses from the parabola through the first, middle and last one, metres."""
     x, three = np.linspace(-1, 1, LEAF), [0, (LEAF - 1) // 2, LEAF - 1]
     to_all = np.vander(x, 3) @ np.linalg.inv(np.vander(x[three], 3))
     rest = leaves_m - np.einsum("pt,ntc->npc", to_all, leaves_m[:, three])
@@ -54,7 +54,7 @@ def tracks(leaves_m: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def leaf_roughness(one_m: NDArray[np.float64], other_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return by how much the legs of pulses leave curves of growing degree through them, along the worst direction.
+    """Return the deviation of legs from curves of growing degree through them, along the worst direction.
 
     Parameters
     ----------
@@ -69,16 +69,16 @@ def leaf_roughness(one_m: NDArray[np.float64], other_m: NDArray[np.float64]) -> 
     Examples
     --------
     >>> jitter = 1e-3 * np.random.default_rng(1).standard_normal((2, 1, 64, 3))
-    >>> apart, together = (leaf_roughness(jitter[0], other)[0, 0] for other in (jitter[1], jitter[0]))
-    >>> bool(1.2e-3 < apart < 1.8e-3 < together < 2.4e-3)
+    >>> variance, together = (leaf_roughness(jitter[0], other)[0, 0] for other in (jitter[1], jitter[0]))
+    >>> bool(1.2e-3 < variance < 1.8e-3 < together < 2.4e-3)
     True
     """
-    apart = _widest(one_m) + _widest(other_m)
-    return np.asarray(np.sqrt(np.maximum(apart, _widest(one_m + other_m))))
+    variance = _widest(one_m) + _widest(other_m)
+    return np.asarray(np.sqrt(np.maximum(variance, _widest(one_m + other_m))))
 
 
 def _widest(leaves_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (leaf, curve) the largest variance along any direction, of what leaves curves of growing degree."""
+    """Return (leaf, curve) the largest variance along any direction of deviations from curves of growing degree."""
     shifted, widest = leaves_m - leaves_m[:, :1], np.empty((len(leaves_m), len(DEGREES)))
     terms = tracks(shifted)
     for number, degree in enumerate(DEGREES):
@@ -89,7 +89,7 @@ def _widest(leaves_m: NDArray[np.float64]) -> NDArray[np.float64]:
 
 @cache
 def curve(fewer: int, nodes_db: int) -> NDArray[np.float64]:
-    """Return the polynomials of `tracks` at the pulses that stand for those of a leaf, (pulse, term) float64.
+    """Return the polynomials of `tracks` at the pulses that replace those of a leaf, (pulse, term) float64.
 
     Examples
     --------
@@ -98,41 +98,40 @@ def curve(fewer: int, nodes_db: int) -> NDArray[np.float64]:
     >>> bool(np.abs(smooth[:, 0] - nodes(9, -74) ** 3).max() < 1e-12)
     True
     """
-    seen = np.polynomial.legendre.legvander(nodes(fewer, nodes_db), TREE_TERMS - 1)
-    return np.ascontiguousarray(seen @ _polynomials()[1])
+    samples = np.polynomial.legendre.legvander(nodes(fewer, nodes_db), TREE_TERMS - 1)
+    return np.ascontiguousarray(samples @ _polynomials()[1])
 
 
 @cache
 def _polynomials() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return (pulse, term) orthonormal polynomials, and what makes them of Legendre's."""
+    """Return (pulse, term) orthonormal polynomials, and their coefficients in Legendre's."""
     basis, triangle = np.linalg.qr(np.polynomial.legendre.legvander(np.linspace(-1, 1, LEAF), TREE_TERMS - 1))
     return basis, np.linalg.inv(triangle)
 
 
-# ---- How a tree would see a job: numbers of nodes, samples and pulses of some tiles and chunks, before anything is
-# formed
+# ---- Views of tiles from chunks of pulses: numbers of nodes and pulses
 #
 # The same counts as native/tree_plan.hpp makes for every tile, taken at a few.
 
-_FEW, _MANY = 4, 8  # places along an axis at which a tile is looked at
+_FEW, _MANY = 4, 8  # places along an axis at which a tile is evaluated
 _NEARBY = 0.5  # of the nearest antenna's distance that a plane tile's half diagonal may be for few
 _AIRY = 3.0  # units of eq. 4b
 _WEIGHTED = 1.5  # rad that weights add to a band: native/tree_job.hpp
-_LOOKED_AT = 3  # subapertures of a level, at most
+_SAMPLED_SUBAPERTURES = 3  # subapertures of a level, at most
 
 
 @dataclass(frozen=True, eq=False)
 class TileView:
-    """One tile seen from one chunk of pulses.
+    """Geometry of one tile from one chunk of pulses.
 
     Attributes
     ----------
     bands_rad
-        (2,) float64 of each level that can be held: half width of the band along columns and rows, rad per half tile.
+        (2,) float64 of each level: half width of the band along columns and rows, rad per half tile.
     turn_rad
-        By how much the carrier turns within half a leaf, at most, against the tile's centre.
+        Largest phase change of the carrier within half a leaf against the tile's centre.
     rough_rad
-        (curve,) RMS phase by which pulses leave curves of growing degree.
+        (curve,) RMS phase of deviations from curves of growing degree.
     span_m
         Total path across the tile.
     phase_rad
@@ -146,10 +145,10 @@ class TileView:
     phase_rad: float
 
 
-def look(
+def view_of_tile(
     aperture: Aperture, surface: Surface, sizes: tuple[int, ...], *, wavenumber_rad_m: float, band_rad_m: float
 ) -> TileView:
-    """Return how one tile is seen from one chunk of pulses.
+    """Return the geometry of one tile from one chunk of pulses.
 
     Parameters
     ----------
@@ -175,22 +174,22 @@ def look(
     bands: list[NDArray[np.float64]] = []
     for size in sizes:
         starts, most = np.arange(0, len(aperture), size), np.zeros(2)
-        for start in starts[np.unique(np.linspace(0, len(starts) - 1, _LOOKED_AT).astype(int))]:
+        for start in starts[np.unique(np.linspace(0, len(starts) - 1, _SAMPLED_SUBAPERTURES).astype(int))]:
             part = aperture[start : start + size]
             some = np.unique(np.linspace(0, len(part) - 1, 3 if size == LEAF else 9).astype(int))
             here, _ = slopes.of(part[some])
             _, reference = slopes.of(part[(len(part) - 1) // 2 : (len(part) - 1) // 2 + 1])
             width = k * np.abs(here - reference - mixed) + b * np.abs(here)
-            most = np.maximum(most, highest(width.max(axis=0)))
+            most = np.maximum(most, peak_band(width.max(axis=0)))
         bands.append(most)
     turn, rough = _leaf(aperture, slopes, k + b)
     return TileView(tuple(bands), turn, rough, 2 * float(np.abs(here).sum(axis=1).max()), phase_rad)
 
 
-def highest(band_rad: NDArray[np.float64]) -> NDArray[np.float64]:
+def peak_band(band_rad: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the widest bands along columns and rows of any place, (2,), from those at some places, (2, row, column).
 
-    Where one peaks between places a parabola tells how high; along its own axis such a peak has content beyond it.
+    A peak between places is estimated by a parabola; along its own axis such a peak has content beyond it.
 
     Notes
     -----
@@ -199,7 +198,7 @@ def highest(band_rad: NDArray[np.float64]) -> NDArray[np.float64]:
     Examples
     --------
     >>> flat = np.tile([1.0, 5.0, 5.0, 1.0], (4, 1))
-    >>> highest(np.stack([flat, flat])).round(2)
+    >>> peak_band(np.stack([flat, flat])).round(2)
     array([10.45,  5.5 ])
     """
     most = band_rad.copy()
@@ -225,10 +224,10 @@ def _slopes(aperture: Aperture, surface: Surface) -> "_Slopes":
 
 
 def _leaf(aperture: Aperture, slopes: "_Slopes", wavenumber_rad_m: float) -> tuple[float, NDArray[np.float64]]:
-    """Return how far the carrier turns within half a leaf, and by what pulses leave smooth curves."""
+    """Return the phase change of the carrier within half a leaf, and deviations of pulses from smooth curves, rad."""
     starts = np.arange(0, max(1, len(aperture) - LEAF + 1), LEAF)
     turn, rough = 0.0, 0.0
-    for start in starts[np.unique(np.linspace(0, len(starts) - 1, _LOOKED_AT).astype(int))]:
+    for start in starts[np.unique(np.linspace(0, len(starts) - 1, _SAMPLED_SUBAPERTURES).astype(int))]:
         leaf = aperture[start : start + LEAF]
         three = leaf[np.array([0, (len(leaf) - 1) // 2, len(leaf) - 1])]
         first, middle, last = three.path(slopes.places_m) - three.path(slopes.centre_m[None])
@@ -240,7 +239,7 @@ def _leaf(aperture: Aperture, slopes: "_Slopes", wavenumber_rad_m: float) -> tup
 
 @lru_cache(maxsize=64)
 def _roughest(aperture: Aperture) -> NDArray[np.float64]:
-    """Return (curve,) by how much the pulses of any leaf leave curves of growing degree."""
+    """Return (curve,) the largest deviation of a leaf from curves of growing degree."""
     return np.asarray(leaf_roughness(*(leaves_of(leg) for leg in aperture.legs)).max(axis=0))
 
 
@@ -249,9 +248,9 @@ class _Slopes:
 
     def __init__(self, surface: Surface, side: int):
         degree, self._side = len(surface.coefficients) - 1, side
-        seen = np.append(np.linspace(-1, 1, side), 0.0)
-        basis = np.polynomial.legendre.legvander(seen, degree)
-        rate = np.stack([_derivative(seen, n) for n in range(degree + 1)], -1)
+        samples = np.append(np.linspace(-1, 1, side), 0.0)
+        basis = np.polynomial.legendre.legvander(samples, degree)
+        rate = np.stack([_derivative(samples, n) for n in range(degree + 1)], -1)
 
         def at(eta: NDArray[np.float64], xi: NDArray[np.float64]) -> NDArray[np.float64]:
             return np.asarray(np.einsum("ia,abk,jb->ijk", eta, surface.coefficients, xi))
@@ -277,7 +276,7 @@ def _derivative(place: NDArray[np.float64], order: int) -> NDArray[np.float64]:
 
 
 def nodes_for(band_rad: NDArray[np.float64], error_db: int) -> NDArray[np.int64]:
-    """Return the least numbers of nodes that hold bands; more than `MOST_NODES` where none does.
+    """Return the least numbers of nodes that support bands; more than `MOST_NODES` where none does.
 
     Examples
     --------
@@ -289,16 +288,16 @@ def nodes_for(band_rad: NDArray[np.float64], error_db: int) -> NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Counts:
-    """What one tile takes of one chunk.
+    """Numbers of nodes and pulses of one tile and one chunk.
 
     Attributes
     ----------
     nodes
-        (2,) of each level, along columns and rows; fewer levels where the higher ones hold too many. None: no tree.
+        (2,) of each level, along columns and rows; fewer levels where the higher ones need too many. None: no tree.
     fewer
-        Pulses that stand for those of a leaf; 0: each for itself.
+        Pulses that replace those of a leaf; 0: none do.
     presum_rad
-        What those of a leaf err by for which fewer stand, RMS.
+        RMS error by replacing the pulses of a leaf.
     """
 
     nodes: tuple[tuple[int, int], ...]
@@ -306,49 +305,49 @@ class Counts:
     presum_rad: float
 
 
-def counts_of(looks: TileView, *, nodes_db: int, presum_db: float, weighted: bool) -> Counts:
-    """Return the numbers of nodes of each level, and of pulses that stand for those of a leaf."""
+def counts_of(view: TileView, *, nodes_db: int, presum_db: float, weighted: bool) -> Counts:
+    """Return the numbers of nodes of each level, and of pulses that replace those of a leaf."""
     more = _WEIGHTED if weighted else 0.0
     levels: list[tuple[int, int]] = []
-    for band in looks.bands_rad:
+    for band in view.bands_rad:
         along, across = nodes_for(band + more, nodes_db)
         if max(along, across) > MOST_NODES:
             break
         levels.append((int(along), int(across)))
-    smooth = np.flatnonzero(looks.rough_rad <= 10 ** (presum_db / 20))
+    smooth = np.flatnonzero(view.rough_rad <= 10 ** (presum_db / 20))
     if len(smooth):
-        turned = int(nodes_for(np.array([looks.turn_rad + more]), nodes_db)[0])
-        fewer = max(DEGREES[smooth[0]] + TREE_MORE, turned)
+        for_carrier = int(nodes_for(np.array([view.turn_rad + more]), nodes_db)[0])
+        fewer = max(DEGREES[smooth[0]] + TREE_MORE, for_carrier)
         if fewer <= TREE_FEWER:
-            followed = np.searchsorted(DEGREES, fewer - TREE_MORE, "right") - 1
-            return Counts(tuple(levels), fewer, float(looks.rough_rad[followed]))
+            curve_followed = np.searchsorted(DEGREES, fewer - TREE_MORE, "right") - 1
+            return Counts(tuple(levels), fewer, float(view.rough_rad[curve_followed]))
     return Counts(tuple(levels), 0, 0.0)
 
 
-# ---- Ground that no polynomial follows: a tile formed on several sheets, one above the other, and read between them
+# ---- Rough ground: a tile formed on several sheets, interpolated between them
 #
 # docs/theory/tree.md, "Sheets".
 
-MOST_SHEETS = 32
+MOST_SHEETS = 32  # of a tile: more cost more than the direct sum
 
-_TABLE = 8192  # heights between the sheets for which weights are there
-_SAMPLED = 64  # pulses that are looked at
+_TABLE = 8192  # heights between the sheets with tabulated weights
+_SAMPLED = 64  # pulses that are evaluated
 
 
 @dataclass(frozen=True, eq=False)
 class SurfaceResidual:
-    """How the pixels of a tile lie off its surface.
+    """Deviation of the pixels of a tile from its surface.
 
     Attributes
     ----------
     pixels
         (y, x, 3) float64, their places, metres.
     up
-        (3,) unit vector along which they leave the surface.
+        (3,) unit vector across the surface.
     off_m
-        (y, x) float64, by how much.
+        (y, x) float64, deviation along `up`, metres.
     aside_m
-        RMS of what they leave it by across that.
+        RMS deviation across `up`, metres.
     """
 
     pixels: NDArray[np.float64]
@@ -358,7 +357,7 @@ class SurfaceResidual:
 
     @classmethod
     def of(cls, surface: Surface, pixels: NDArray[np.float64]) -> "SurfaceResidual":
-        """Return that of pixels with places.
+        """Return the deviation of pixels with positions.
 
         Examples
         --------
@@ -378,7 +377,7 @@ class SurfaceResidual:
 
     @property
     def span_m(self) -> tuple[float, float]:
-        """Middle and half of the heights."""
+        """Middle and half span of the heights, metres."""
         low, high = float(self.off_m.min()), float(self.off_m.max())
         return (low + high) / 2, (high - low) / 2
 
@@ -398,7 +397,7 @@ class SurfaceResidual:
 
 @dataclass(frozen=True, eq=False)
 class Sheets:
-    """Sheets between which a tile is read.
+    """Sheets between which a tile is interpolated.
 
     Attributes
     ----------
@@ -407,7 +406,7 @@ class Sheets:
     heights_m
         (sheet,) float64, above the surface.
     error_db
-        What reading between them may err by.
+        Tolerated error of the interpolation between them.
     """
 
     relief: SurfaceResidual
@@ -416,7 +415,7 @@ class Sheets:
 
     @classmethod
     def of(cls, relief: SurfaceResidual, band_rad: float, error_db: int) -> "Sheets":
-        """Return as few sheets as hold a band."""
+        """Return the fewest sheets that support a band."""
         middle, half = relief.span_m
         return cls(relief, middle + half * nodes(sheets_for(band_rad, error_db), error_db), error_db)
 
@@ -458,7 +457,7 @@ class Sheets:
 
 
 def sheets_for(band_rad: float, error_db: int) -> int:
-    """Return how many sheets hold a band."""
+    """Return the number of sheets that support a band."""
     return int(nodes_for(np.array([band_rad]), error_db)[0])
 
 
