@@ -305,7 +305,7 @@ _ROWS = (
         "terrain",
         Scope.CAMPAIGN,
         "Resample the DEM to the campaign's grid, terrain.zarr.",
-        f"{_STEPS}.terrain:terrain",
+        f"{_STEPS}.scene:terrain",
         sources=("scene", inputs.heights),
         settings=("scene.dem", "scene.dem_datum", "scene.geoid"),
         needed=lambda campaign: bool(campaign.settings.scene.dem),

@@ -57,7 +57,7 @@ def is_stated(report: Mapping[str, Any]) -> bool:
 
     Examples
     --------
-    >>> is_stated(BudgetLine("heights", None, NOTHING, unit="1 m").report)
+    >>> is_stated(BudgetLine("heights", None, NO_EFFECT, unit="1 m").report)
     False
     """
     return not report["stated"].startswith(_NOT_STATED)
