@@ -18,9 +18,7 @@ def parts(study, names):
 
 
 wildcard_constraints:
-    part="|".join(
-        [*PAPER_PARTS, *(part for study in STUDY.values() for part in study.parts)]
-    ),
+    part="|".join([*PAPER_PARTS, *(part for study in STUDY.values() for part in study.parts)]),
     figure="|".join(PAPER_FIGURES),
     experiment="lab|static|uav",
     study="|".join(STUDY),
@@ -41,16 +39,8 @@ rule paper:
 
 rule stability:
     input:
-        [
-            f"results/study/{name}/{chart}.png"
-            for name, study in STUDY.items()
-            for chart in study.charts
-        ],
-        [
-            f"results/study/{name}/{table}"
-            for name, study in STUDY.items()
-            for table in study.summaries
-        ],
+        [f"results/study/{name}/{chart}.png" for name, study in STUDY.items() for chart in study.charts],
+        [f"results/study/{name}/{table}" for name, study in STUDY.items() for table in study.summaries],
         expand("results/study/autofocus/{scene}.png", scene=KINDS),
 
 
@@ -82,9 +72,7 @@ rule paper_campaign:
 
 rule paper_part:
     input:
-        lambda wildcards: expand(
-            f"{CAMPAIGN}.done", experiment=PAPER_READS.get(wildcards.part, ())
-        ),
+        lambda wildcards: expand(f"{CAMPAIGN}.done", experiment=PAPER_READS.get(wildcards.part, ())),
     output:
         "results/study/paper/parts/{part}.csv",
     log:
@@ -97,9 +85,7 @@ rule paper_part:
     resources:
         mem_mb=lambda wildcards, attempt: 1500 * attempt,
     params:
-        code=lambda wildcards: code_sha256(
-            "apertura_research.paper." + PAPER_PARTS[wildcards.part].split(":")[0]
-        ),
+        code=lambda wildcards: code_sha256("apertura_research.paper." + PAPER_PARTS[wildcards.part].split(":")[0]),
     message:
         "claims of the paper: {wildcards.part}"
     shell:
@@ -130,9 +116,7 @@ rule paper_claims:
 
 rule paper_figure:
     input:
-        lambda wildcards: expand(
-            f"{CAMPAIGN}.done", experiment=PAPER_FIGURES[wildcards.figure]
-        ),
+        lambda wildcards: expand(f"{CAMPAIGN}.done", experiment=PAPER_FIGURES[wildcards.figure]),
     output:
         "results/study/paper/{figure}.png",
     log:
@@ -145,9 +129,7 @@ rule paper_figure:
     resources:
         mem_mb=lambda wildcards, attempt: 1500 * attempt,
     params:
-        code=code_sha256(
-            "apertura_research.paper.figures", "apertura_research.paper.figures"
-        ),
+        code=code_sha256("apertura_research.paper.figures", "apertura_research.paper.figures"),
     message:
         "drawing the paper's figure {wildcards.figure}"
     shell:
@@ -176,9 +158,7 @@ rule sweep:
 
 rule chart:
     input:
-        lambda wildcards: parts(
-            wildcards.study, STUDY[wildcards.study].charts[wildcards.chart]
-        ),
+        lambda wildcards: parts(wildcards.study, STUDY[wildcards.study].charts[wildcards.chart]),
     output:
         "results/study/{study}/{chart}.csv",
         "results/study/{study}/{chart}.png",
