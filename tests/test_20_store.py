@@ -18,7 +18,6 @@ from apertura.common.errors import CampaignError, ContractError
 from apertura.common.provenance import sha256_tree
 from apertura.pipeline.steps.stamping import stamp
 from apertura.pipeline.store import (
-    chunks,
     finish,
     manifest_of,
     mark_rewritten,
@@ -29,6 +28,7 @@ from apertura.pipeline.store import (
     save_document,
     save_stage,
     sharing,
+    stages,
     write_blocks,
     writing,
 )
@@ -92,8 +92,8 @@ def test_a_chunk_in_the_place_of_another_is_refused_when_it_is_read(tmp_path):
 
 
 def test_an_array_is_the_same_on_the_disk_however_its_blocks_are_cut(tmp_path, monkeypatch):
-    monkeypatch.setattr(chunks, "_CHUNK_BYTES", 3 * 4 * 8)
-    monkeypatch.setattr(chunks, "_FEWEST_ROWS", 1)
+    monkeypatch.setattr(stages, "_CHUNK_BYTES", 3 * 4 * 8)
+    monkeypatch.setattr(stages, "_FEWEST_ROWS", 1)
     values = np.random.default_rng(1).normal(size=(11, 4))
     stage = xr.Dataset({"profile": (("pulse", "range"), np.broadcast_to(0.0, values.shape))})
     trees = []

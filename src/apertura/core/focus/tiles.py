@@ -2,7 +2,7 @@
 
 import os
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import product
@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 from uuid import uuid4
 
 import numpy as np
-from dask.highlevelgraph import MaterializedLayer
 from numpy.typing import NDArray
 
 from apertura.common.contracts import Window
@@ -113,38 +112,6 @@ def _unusable(scheduler: str, found: str, remedy: str) -> CampaignError:
     return CampaignError(f"{scheduler}: {found}", KEY, "a dask scheduler with workers that have this apertura", remedy)
 
 
-# ---- Graph of the requested tiles
-
-Place = tuple[int, int]
-
-
-class TilesLayer(MaterializedLayer):
-    """The tasks of some tiles of an image.
-
-    Blocks of pulses follow one another: the next one's tables are prepared when every tile has its part of the last.
-    dask would therefore compute all tiles for the sake of one; here the graph has the requested tiles only.
-
-    Parameters
-    ----------
-    name
-        Of the array.
-    graph
-        Rows and columns of tiles → key → task.
-    places
-        Row and column of every tile.
-    """
-
-    def __init__(self, name: str, graph: Callable[[Collection[Place]], dict[Any, Any]], places: Iterable[Place]):
-        self.name, self.graph, self.places = name, graph, list(places)
-        super().__init__(graph(self.places))
-
-    def cull(self, keys: set[Any], all_hlg_keys: Collection[Any]) -> tuple[MaterializedLayer, dict[Any, set[Any]]]:
-        """Return the layer of the tiles among the keys, and the dependencies of its tasks."""
-        places = [place for place in self.places if (self.name, *place) in keys]
-        requested = TilesLayer(self.name, self.graph, places)
-        return requested, {key: requested.get_dependencies(key, all_hlg_keys) for key in requested}
-
-
 # ---- An image as a dask array of tiles
 
 _NOTHING = np.complex64(complex(np.nan, np.nan))
@@ -187,6 +154,8 @@ def image_array(
     """
     from dask.array.core import Array
     from dask.highlevelgraph import HighLevelGraph
+
+    from apertura.core.focus.layer import TilesLayer
 
     name, weighing = f"image-{uuid4().hex}", weighing or Weighing()
     chunks = tuple(tuple(min(side_px, size - at) for at in range(0, size, side_px)) for size in grid.shape)

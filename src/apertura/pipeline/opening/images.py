@@ -7,11 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rasterio.enums import Resampling
 
 from apertura.common.errors import CampaignError
 from apertura.common.provenance import sha256_file
-from apertura.common.raster import opened_raster
 from apertura.core.quality.agreement import Agreement, agreement
 from apertura.core.quality.bright_points import BrightPoint, has_point
 from apertura.core.quality.measures import BlockRaster
@@ -40,6 +38,8 @@ def opened_layer(campaign: Campaign, flight: str, pair: str, file: str) -> Itera
     CampaignError
         If it is not there as the step wrote it.
     """
+    from apertura.common.raster import opened_raster
+
     path = campaign.result(flight, pair, file)
     manifest = campaign.root / campaign.manifest("layers", flight, pair)
     remedy = f"Delete {manifest} and run the workflow again."
@@ -64,6 +64,8 @@ def averaged(raster: Any, dots: int) -> NDArray[np.float32]:
     ndarray
         (row, column) float32.
     """
+    from rasterio.enums import Resampling
+
     fewer = max(1.0, max(raster.shape) / dots)
     shape = tuple(max(1, round(size / fewer)) for size in raster.shape)
     values: NDArray[np.float32] = raster.read(1, out_shape=shape, resampling=Resampling.average)

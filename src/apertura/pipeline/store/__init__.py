@@ -5,7 +5,6 @@ A stage is written as ``<stage>.zarr.wip`` under a kernel lock, finished by a re
 products have manifests of the same kind. Each names its files with their hashes and what they were made from.
 """
 
-from apertura.pipeline.store.chunks import blocks_of_rows, write_blocks
 from apertura.pipeline.store.manifest import (
     check_listed,
     compare,
@@ -31,7 +30,7 @@ from apertura.pipeline.store.progress import (
     sharing,
     writing,
 )
-from apertura.pipeline.store.stages import open_stage, save_stage
+from apertura.pipeline.store.stages import blocks_of_rows, open_stage, save_stage, write_blocks
 
 __all__ = [
     "blocks_of_rows",

@@ -1,17 +1,15 @@
-"""Chunks on disk: written block by block, brought to the disk before they are renamed, checked by their sum."""
+"""Chunks on disk: brought to the disk before they are renamed, checked by their sum when they are read."""
 
 import asyncio
 import hashlib
 import json
 import warnings
-from collections.abc import Hashable, Iterable, Iterator, Mapping
+from collections.abc import Hashable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import google_crc32c
-import numpy as np
 import zarr
-from numpy.typing import NDArray
 from zarr.abc.store import ByteRequest
 from zarr.codecs import Crc32cCodec, ZstdCodec
 from zarr.core.buffer import Buffer, BufferPrototype
@@ -21,87 +19,11 @@ from zarr.storage import LocalStore, MemoryStore
 from apertura.common.atomic import write_beside
 from apertura.common.documents import other_codec
 from apertura.common.errors import CampaignError
-from apertura.common.progress import progress
 from apertura.pipeline.store.manifest import manifest_of
-from apertura.pipeline.store.progress import create, open_array
 
 if TYPE_CHECKING:
     import xarray as xr
 
-
-# ---- Arrays written block by block along their first dimension ------------------------------------------------------
-
-_CHUNK_BYTES = 8 << 20
-_FEWEST_ROWS = 16
-
-
-def write_blocks(wip: Path, stage: "xr.Dataset", name: str, blocks: Iterable[NDArray[Any]]) -> None:
-    """Write a stage whose array `name` comes in blocks; earlier content of `wip` is discarded.
-
-    Parameters
-    ----------
-    wip
-        Work in progress, from `writing`.
-    stage
-        The stamped stage; of array `name` only dims, shape, dtype and attributes count, so it may be a broadcast zero.
-    name
-        The array.
-    blocks
-        It, some rows at a time, in order. On the disk it lies in chunks of some 8 MB, however blocks are cut, not
-        compressed: echoes are mostly noise. A chunk of nothing but zeros is left out.
-
-    Raises
-    ------
-    ValueError
-        If the blocks have more or fewer rows than the array.
-    """
-    rows, *rest = stage[name].shape
-    chunk = rows_of_chunk(stage[name].dtype.itemsize * int(np.prod(rest, dtype=int)))
-    create(wip, stage, {name: (max(1, min(chunk, rows)), *rest)}, packed=False)
-    array, buffer, written = open_array(wip, name), np.empty((chunk, *rest), stage[name].dtype), 0
-    filled = 0
-    for block in _counted(blocks, stage[name]):
-        taken = 0
-        while taken < len(block):
-            count = min(chunk - filled, len(block) - taken)
-            buffer[filled : filled + count] = block[taken : taken + count]
-            filled, taken = filled + count, taken + count
-            if filled == chunk or written + filled == rows:
-                if buffer[:filled].any():
-                    array[written : written + filled] = buffer[:filled]
-                written, filled = written + filled, 0
-    if written + filled != rows:
-        raise ValueError(f"{written + filled} rows of {name}: must be {rows}")
-
-
-def _counted(blocks: Iterable[NDArray[Any]], array: "xr.DataArray") -> Iterator[NDArray[Any]]:
-    """Yield blocks, and report how many rows are done."""
-    with progress(f"{array.dims[0]}s", len(array)) as done:
-        for block in blocks:
-            yield block
-            done(len(block))
-
-
-def blocks_of_rows(stage: "xr.Dataset", name: str) -> Iterator[slice]:
-    """Yield rows of an array of a stage, as many at a time as one of its chunks holds."""
-    rows = len(stage[name])
-    size = int(stage[name].encoding.get("chunks", (rows,))[0]) or rows
-    for first in range(0, rows, size):
-        yield slice(first, min(first + size, rows))
-
-
-def rows_of_chunk(row_bytes: int) -> int:
-    """Return how many rows a chunk holds, a power of two.
-
-    Examples
-    --------
-    >>> rows_of_chunk(8 * 1024), rows_of_chunk(1 << 30)
-    (1024, 16)
-    """
-    return max(_FEWEST_ROWS, 1 << (max(1, _CHUNK_BYTES // max(1, row_bytes)).bit_length() - 1))
-
-
-# ---- Chunks on disk: written through, renamed, checked on reading ---------------------------------------------------
 
 # What a user has set for zarr (ZARR_…, ~/.config/zarr) changes no byte of ours: one order of arrays and of sums.
 zarr.config.update(zarr.config.defaults[0], priority="new")
