@@ -38,8 +38,8 @@ def changes(copied, file, *modules):
     [
         ("core/focus/engines/numba.py", "image", True),
         ("core/focus/engines/numba.py", "echo", False),
-        ("core/combination/sums.py", "cube", True),
-        ("core/combination/sums.py", "image", False),
+        ("core/combination.py", "cube", True),
+        ("core/combination.py", "image", False),
         ("core/echo/sidelink.py", "echo", True),
         ("core/echo/sidelink.py", "image", False),
         ("formats/export/__init__.py", "export", True),

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from apertura.core.combination.sums import clutter_reduction_db, coherent_sum, magnitude_sum, noncoherent_sum
+from apertura.core.combination import clutter_reduction_db, coherent_sum, magnitude_sum, noncoherent_sum
 
 
 def test_images_in_phase_keep_their_peak_and_images_out_of_phase_cancel():

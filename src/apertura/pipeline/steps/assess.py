@@ -13,7 +13,7 @@ import xarray as xr
 from apertura.common.errors import CampaignError
 from apertura.common.flags import Flags
 from apertura.common.provenance import chained_sha256
-from apertura.core.combination.sums import choose_fusion
+from apertura.core.combination import choose_fusion
 from apertura.core.focus.inputs import PhaseHistory
 from apertura.core.imaging.focus_check import joint_peak_power
 from apertura.core.quality.agreement import Agreement

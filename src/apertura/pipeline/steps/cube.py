@@ -12,7 +12,7 @@ import xarray as xr
 from apertura.common.contracts import MEASURED, QUOTED, RASTERS, STAGES, Window
 from apertura.common.documents import undamaged
 from apertura.common.flags import Flags
-from apertura.core.combination.sums import clutter_reduction_db, coherent_sum, magnitude_sum, noncoherent_sum
+from apertura.core.combination import clutter_reduction_db, coherent_sum, magnitude_sum, noncoherent_sum
 from apertura.core.quality.measures import image_statistics
 from apertura.core.scene.grid import SceneGrid
 from apertura.methods.interferometry.coherence import chance, coherence, common_band, window_px
