@@ -15,8 +15,8 @@ from scipy.ndimage import gaussian_filter
 from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
 from apertura.core.focus.inputs import Profiles
 from apertura.core.geometry.aperture import Aperture
+from apertura.simulation.echoes import transfer
 from apertura.simulation.scene import Scatterers
-from apertura.simulation.transfer import transfer
 
 SUBCARRIERS, SPACING_HZ, CENTRE_HZ = 4096, 100e3, 1.2e9
 GUARD = 16

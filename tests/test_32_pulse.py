@@ -12,8 +12,8 @@ from apertura.core.echo.transfer import transfer_by_sidelink
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import PulseWaveform, validated
 from apertura.pipeline.opening.transmitted import read_pulse, transmitted
+from apertura.simulation.echoes import Paths
 from apertura.simulation.synthesis import Channel, samples
-from apertura.simulation.transfer import Paths
 from apertura.simulation.waveform import TransmitPulse, pulse_samples
 
 RATE = 256e6

@@ -17,8 +17,8 @@ from apertura.methods.autofocus.inputs import NodePrior, PairRecord, Prior, Trac
 from apertura.methods.autofocus.objective import Blocks
 from apertura.methods.autofocus.solve import Gauge, minimise
 from apertura.methods.autofocus.speckle import SpeckleTiles, refined_by_speckle, tiles
+from apertura.simulation.echoes import transfer
 from apertura.simulation.scene import Scatterers
-from apertura.simulation.transfer import transfer
 
 FREQUENCY_HZ = 1.2e9 + 3.2e6 * np.arange(128)
 TIME_S = 0.05 * np.arange(600)

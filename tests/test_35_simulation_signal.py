@@ -7,6 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from apertura.simulation.continuous import Framing
+from apertura.simulation.echoes import Paths
 from apertura.simulation.impairments import (
     Adc,
     Blockage,
@@ -33,7 +34,6 @@ from apertura.simulation.synthesis import (
     samples,
     transfer_functions,
 )
-from apertura.simulation.transfer import Paths
 from apertura.simulation.waveform import TransmitWaveform, qpsk_codes
 
 C = 299_792_458.0

@@ -14,8 +14,8 @@ from apertura.formats.export.cphd import CphdCollection, write_cphd
 from apertura.formats.reading import read_phase_history
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.check import problems
-from apertura.pipeline.check.stale import stale_results
 from apertura.pipeline.lineage import on_demand, results_of
+from apertura.pipeline.stale import stale_results
 from apertura.pipeline.steps import cphd, echo
 from apertura.pipeline.store import open_stage
 

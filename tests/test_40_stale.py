@@ -12,10 +12,10 @@ from folders import copy_writable
 from apertura.common.errors import CampaignError
 from apertura.common.processes import hold
 from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.check.stale import damaged_results, make_again, stale_lines, stale_results
 from apertura.pipeline.digests import Sources, digest_of
 from apertura.pipeline.lineage import modules_of, results_of
 from apertura.pipeline.rules import RESULTS
+from apertura.pipeline.stale import damaged_results, make_again, stale_lines, stale_results
 from apertura.views.summary import print_summary
 
 LOG = "raw/f01/uav2.track.pos"

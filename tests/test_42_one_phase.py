@@ -15,12 +15,12 @@ from apertura.core.imaging.range_profiles import profiles_of
 from apertura.methods.autofocus.one_phase import METHODS, MOST_LOSS_DB, SpaceVariance
 from apertura.methods.autofocus.patches import Candidates
 from apertura.methods.autofocus.path_offsets import refine_one_phase
-from apertura.pipeline.check.stale import stale_results
 from apertura.pipeline.config.processing import Processing
 from apertura.pipeline.opening.autofocus import ONE_PHASE, autofocus_of, clock_s, decide_method, open_refined
 from apertura.pipeline.opening.pair import open_pair
 from apertura.pipeline.opening.scene import open_scene
 from apertura.pipeline.opening.sightings import refinement_inputs
+from apertura.pipeline.stale import stale_results
 from apertura.pipeline.steps import refine
 from apertura.pipeline.store import open_stage
 from apertura.simulation import ImageGrid, PointTarget, SimulatedFlight, Straight, preset, simulate

@@ -19,7 +19,6 @@ from apertura.core.planning.plan import Decision
 from apertura.methods.autofocus.inputs import PairRecord, Refinement
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.check import as_line, problems
-from apertura.pipeline.check.stale import stale_results
 from apertura.pipeline.opening.acquisition import open_acquisition
 from apertura.pipeline.opening.autofocus import RefinedTrack, clock_s, open_refined
 from apertura.pipeline.opening.diagnosis import evidence_of, moved_evidence
@@ -28,6 +27,7 @@ from apertura.pipeline.opening.results import open_campaign
 from apertura.pipeline.opening.scene import open_scene
 from apertura.pipeline.opening.sightings import RefinementInputs, reference_points
 from apertura.pipeline.opening.transmitted import transmitted
+from apertura.pipeline.stale import stale_results
 from apertura.pipeline.steps import echo, image, profile, refine, scene
 from apertura.pipeline.steps.stamping import stamped
 from apertura.pipeline.store import open_stage, save_stage

@@ -28,7 +28,7 @@ from apertura.formats.export import exports_in, mosaics, product_files, write_ex
 from apertura.formats.export.mosaic import write_mosaic
 from apertura.formats.export.radiometry import ECHO
 from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.check.stale import damaged_results
+from apertura.pipeline.stale import damaged_results
 from apertura.pipeline.steps import mosaic
 
 FLOWN = {"f01": ("uav1-uav1", "uav1-uav2")}

@@ -7,8 +7,8 @@ from folders import complaint, contents, copy_writable, edit_config
 
 from apertura.core.focus.tiles import NAMED_BY
 from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.check.stale import stale_results
 from apertura.pipeline.lineage import result_of
+from apertura.pipeline.stale import stale_results
 from apertura.pipeline.steps.image import image
 
 distributed = pytest.importorskip("distributed")

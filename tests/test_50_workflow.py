@@ -13,7 +13,7 @@ from folders import copy_writable
 
 from apertura.common.processes import hold
 from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.check.stale import stale_results
+from apertura.pipeline.stale import stale_results
 
 ROOT = Path(__file__).parents[1]
 

@@ -11,6 +11,7 @@ from scipy.signal import CZT
 
 from apertura.common.arrays import Complexes
 from apertura.core.echo.demodulate import subcarrier_numbers
+from apertura.simulation.echoes import spectrum
 from apertura.simulation.impairments import Impairments
 from apertura.simulation.observation import Observation, observe
 from apertura.simulation.presets import paper_scene, paper_waveform
@@ -24,7 +25,6 @@ from apertura.simulation.synthesis import (
     sampling_rate,
     transfer_functions,
 )
-from apertura.simulation.transfer import spectrum
 from apertura.simulation.waveform import TransmitWaveform, newman_codes, qpsk_codes
 
 LENGTH_M = 30.0

@@ -22,11 +22,11 @@ from apertura.common.processes import INTERRUPTED, STATUS_FILE, given, hold, iso
 from apertura.common.progress import RUN
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.check import print_problems
-from apertura.pipeline.check.stale import forms_results, stale_lines, stale_results
 from apertura.pipeline.lineage import on_demand
 from apertura.pipeline.runs.journal import JOURNAL, NAME, RECORDER, JournalReader, failures, note
 from apertura.pipeline.runs.outlook import Outlook
 from apertura.pipeline.runs.screen import NOTHING, Screen, listed
+from apertura.pipeline.stale import forms_results, stale_lines, stale_results
 
 Show = Literal["errors", "steps", "snakemake"]
 

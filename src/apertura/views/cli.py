@@ -187,7 +187,7 @@ def run(
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="all that snakemake says")] = False,
 ) -> None:
     """Run the workflow on a campaign folder; further options go to snakemake."""
-    from apertura.pipeline.check.stale import forms_results
+    from apertura.pipeline.stale import forms_results
     from apertura.pipeline.workflow import Show, run_workflow
 
     show: Show = "snakemake" if verbose else "errors" if quiet else "steps"

@@ -120,7 +120,7 @@ def print_findings(root: str | Path, *, products: bool = False, paranoid: bool =
     campaign, _ = load(Path(root))
     if campaign is None or count:
         return count
-    from apertura.pipeline.check.stale import damaged_results, stale_lines, stale_results
+    from apertura.pipeline.stale import damaged_results, stale_lines, stale_results
 
     lines = list(stale_lines(stale_results(campaign, paranoid=paranoid)))
     if products:

@@ -15,8 +15,8 @@ from apertura.common.paths import inside
 from apertura.common.processes import hold
 from apertura.common.progress import RUN
 from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.check.stale import stale_results
 from apertura.pipeline.lineage import on_demand, results_of
+from apertura.pipeline.stale import stale_results
 from apertura.pipeline.store import read_manifest
 
 _HEADINGS = ("flight", "of", "finished", "stale", "missing", "size")
