@@ -8,10 +8,10 @@ import time
 import numpy as np
 from scipy.signal import max_len_seq
 
-from apertura.core.echo.trigger import Framing, find_preambles
+from apertura.core.echo.trigger import PulseFraming, find_preambles
 
 RATE_HZ = 1.024e9
-FRAMING = Framing(2 * max_len_seq(10)[0].astype(np.int64) - 1, 4, 204.8e6, RATE_HZ, guard_samples=256)
+FRAMING = PulseFraming(2 * max_len_seq(10)[0].astype(np.int64) - 1, 4, 204.8e6, RATE_HZ, guard_samples=256)
 SYMBOL = 16000
 
 

@@ -7,12 +7,12 @@ import pytest
 from scipy.signal import max_len_seq
 from scipy.stats import ncx2
 
-from apertura.core.echo.trigger import Framing, find_preambles, score_threshold
+from apertura.core.echo.trigger import PulseFraming, find_preambles, score_threshold
 
 RATE_HZ = 100e6
 SYMBOL = 1600
 CHIPS = 2 * max_len_seq(8)[0].astype(np.int64) - 1
-FRAMING = Framing(CHIPS, 4, 20e6, RATE_HZ, counter_bits=8, bit_chips=7, guard_samples=64)
+FRAMING = PulseFraming(CHIPS, 4, 20e6, RATE_HZ, counter_bits=8, bit_chips=7, guard_samples=64)
 SIGMA = 100.0  # noise of I and of Q, ADC counts
 ALARMS_PER_S = 1e-3
 

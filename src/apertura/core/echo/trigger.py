@@ -18,7 +18,7 @@ ABSENT = -1
 
 
 @dataclass(frozen=True)
-class Framing:
+class PulseFraming:
     """preamble | counter bits, most significant first, then inverted | guard | cyclic prefix, symbol.
 
     Attributes
@@ -71,7 +71,7 @@ class Framing:
 
         Examples
         --------
-        >>> framing = Framing(np.array([1, 1, -1, 1, -1]), 2, 0.0, 1e6, counter_bits=2, bit_chips=3)
+        >>> framing = PulseFraming(np.array([1, 1, -1, 1, -1]), 2, 0.0, 1e6, counter_bits=2, bit_chips=3)
         >>> chips = np.concatenate([framing.preamble, np.repeat([1, -1, -1, 1], 3)])
         >>> capture = np.stack([np.repeat(chips, 2) * 100, np.zeros(34, int)], -1).astype(np.int16)
         >>> framing.read_counter(capture), framing.read_counter(capture[:-8])
@@ -125,7 +125,7 @@ class Detection:
 
 
 def find_preambles(
-    blocks: Iterable[Samples], framing: Framing, *, symbol_samples: int, false_alarms_per_s: float
+    blocks: Iterable[Samples], framing: PulseFraming, *, symbol_samples: int, false_alarms_per_s: float
 ) -> Iterator[Detection]:
     """Yield the preambles of a recording in order, with a bounded number of its samples in memory.
 
@@ -152,7 +152,7 @@ def find_preambles(
 
     Examples
     --------
-    >>> framing = Framing(np.array([1, 1, 1, -1, 1, -1, -1] * 9), 2, 0.0, 1e6, counter_bits=0, bit_chips=0)
+    >>> framing = PulseFraming(np.array([1, 1, 1, -1, 1, -1, -1] * 9), 2, 0.0, 1e6, counter_bits=0, bit_chips=0)
     >>> noise = np.random.default_rng(1).normal(0, 50, (5000, 2))
     >>> noise[1234 : 1234 + 126, 0] += 100 * framing.template().real
     >>> detections = find_preambles([noise.astype(np.int16)], framing, symbol_samples=200, false_alarms_per_s=0.1)
@@ -295,7 +295,12 @@ class TriggeredCaptures:
 
 
 def trigger_captures(
-    samples: SampleSource, framing: Framing, *, symbol_samples: int, false_alarms_per_s: float, sample_bits: int = 32
+    samples: SampleSource,
+    framing: PulseFraming,
+    *,
+    symbol_samples: int,
+    false_alarms_per_s: float,
+    sample_bits: int = 32,
 ) -> TriggeredCaptures:
     """Return the symbols of a continuous recording that follow a preamble and end inside it.
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from apertura.common.errors import CampaignError
 from apertura.core.echo.demodulate import Numerology, subcarrier_numbers
 from apertura.core.echo.pulse_filter import occupied_band, pulse_filter, pulse_spectrum
-from apertura.core.echo.trigger import Framing
+from apertura.core.echo.trigger import PulseFraming
 from apertura.formats.npy import read_npy
 from apertura.formats.recordings.sample_file import SampleFile
 from apertura.pipeline.campaign import Campaign
@@ -205,7 +205,7 @@ def read_codes(path: Path, subcarriers: int) -> NDArray[np.complex64]:
     return codes
 
 
-def read_framing(path: Path, described: Mapping[str, Any], *, sample_rate_hz: float, where: Path) -> Framing:
+def read_framing(path: Path, described: Mapping[str, Any], *, sample_rate_hz: float, where: Path) -> PulseFraming:
     """Return what was sent before each symbol.
 
     Parameters
@@ -237,7 +237,9 @@ def read_framing(path: Path, described: Mapping[str, Any], *, sample_rate_hz: fl
         found = f"{chips.dtype} of shape {chips.shape}, {int((~np.isin(chips, (-1, 1))).sum())} neither 1 nor -1"
         raise CampaignError(found, where=path, expected=expected, remedy="Save the preamble that was sent.")
     keys = ("chip_samples", "centre_hz", "counter_bits", "bit_chips", "guard_samples")
-    framing = Framing(chips.astype(np.int64), sample_rate_hz=sample_rate_hz, **{key: described[key] for key in keys})
+    framing = PulseFraming(
+        chips.astype(np.int64), sample_rate_hz=sample_rate_hz, **{key: described[key] for key in keys}
+    )
     if framing.lead_samples > MOST_LEAD_SAMPLES:
         raise CampaignError(
             f"{framing.lead_samples} samples of preamble, counter and guard before each symbol",
