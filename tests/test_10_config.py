@@ -14,20 +14,12 @@ import apertura
 from apertura.common import documents
 from apertura.common.errors import CampaignError
 from apertura.pipeline.config import Processing, Scene, Settings, validated
-from apertura.pipeline.config.template import WAVEFORMS, config_schema, config_template, flights_template
+from apertura.pipeline.config.template import WAVEFORMS, config_schema, config_template
 from apertura.pipeline.lineage import result_of
 from apertura.views.cli import app
 
 ROOT = Path(__file__).parents[1]
 CONDA_NAMES = {"dask": "dask-core", "matplotlib": "matplotlib-base", "snakemake": "snakemake-minimal"}
-
-
-@pytest.mark.parametrize(
-    ("file", "generate"),
-    [("config.yaml", config_template), ("schema.json", config_schema), ("flights.tsv", flights_template)],
-)
-def test_generated_files_are_in_step_with_the_model(file, generate):
-    assert (ROOT / "config" / file).read_text(encoding="utf-8") == generate()
 
 
 def test_the_template_is_a_valid_config_and_comments_every_key():

@@ -1,8 +1,9 @@
-"""Write the pages of docs/ that come from the code: `python -m website.pages`."""
+"""Write the files that come from the code, pages of docs/ and the config's template: `python -m website.pages`."""
 
 from collections.abc import Callable
 from pathlib import Path
 
+from apertura.pipeline.config.template import config_schema, config_template, flights_template
 from website.api import api_page
 from website.cli import cli_page
 from website.flags import flags_page
@@ -10,6 +11,9 @@ from website.flags import flags_page
 ROOT = Path(__file__).parents[1]
 
 PAGES: dict[str, Callable[[], str]] = {
+    "config/config.yaml": config_template,
+    "config/flights.tsv": flights_template,
+    "config/schema.json": config_schema,
     "docs/api.md": api_page,
     "docs/cli.md": cli_page,
     "docs/flags.md": flags_page,
