@@ -21,7 +21,8 @@ from collections.abc import Iterator
 from itertools import cycle, islice
 from pathlib import Path
 
-from tests.attack.faults_campaign import MODULES, STEPS, TARGETS, make_campaign
+from apertura.pipeline.rules import RULES
+from tests.attack.faults_campaign import TARGETS, make_campaign
 from tests.attack.faults_control import (
     ENVIRONMENT,
     FAIL,
@@ -89,8 +90,9 @@ def _campaign_of_faults(asked: argparse.Namespace) -> int:
         "dask.array",
     ):
         importlib.import_module(module)
-    for step in {step.split()[0] for step in STEPS} - {"tiles", "calibrate"}:
-        importlib.import_module(f"apertura.pipeline.steps.{MODULES.get(step, step)}")
+    for rule in RULES.values():
+        if rule.step:
+            importlib.import_module(rule.step.partition(":")[0])
     with tempfile.TemporaryDirectory() as folder:
         bench, began = Bench(make_campaign(Path(folder).resolve()), shared_page()), time.perf_counter()
         bench.prepare(tuple(asked.steps))

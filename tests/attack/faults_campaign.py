@@ -45,9 +45,6 @@ STEPS = (
 )
 """Every command of a run in its order."""
 
-MODULES = {"map": "webmap", "ro-crate": "ro_crate"}
-"""Command → module of `apertura.pipeline.steps`, where the names differ."""
-
 TARGETS = (
     "ingest f01 uav2",
     "echo f01 uav1-uav2",

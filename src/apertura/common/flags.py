@@ -1,12 +1,17 @@
 """Flags that were raised: name → what was measured; one way to merge those of several parts.
 
-Apart from `apertura.common.flag_table`, which no code hash counts: other words there make no image again.
+Apart from `apertura.common.flag_table`, which only pages and summaries import: other words there make no image again.
 """
 
 from collections.abc import Iterable, Mapping
-from typing import Self
+from functools import cache
+from pkgutil import resolve_name
+from typing import Any, Self
 
-from apertura.common.flag_table import FLAGS
+
+@cache
+def _rows() -> Any:
+    return resolve_name(f"{__package__}.flag_table:FLAGS")  # by name: their texts are no code of what raises a flag
 
 
 class Flags(dict[str, str]):
@@ -35,7 +40,7 @@ class Flags(dict[str, str]):
             self[name] = line
 
     def __setitem__(self, name: str, line: str) -> None:
-        if name not in FLAGS:
+        if name not in _rows():
             raise KeyError(f"{name} is no row of apertura.common.flag_table.FLAGS")
         super().__setitem__(name, line)
 

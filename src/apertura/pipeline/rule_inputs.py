@@ -227,8 +227,8 @@ def imaging(place: JobPlace) -> Mapping[str, Any]:
 
 
 def two_images(place: JobPlace) -> Mapping[str, Any]:
-    """Return flight and pair of the images compared."""
-    return {"images": place.pairs}
+    """Return the images compared, as flight/pair."""
+    return {"images": ["/".join(pair) for pair in place.pairs]}
 
 
 def charted_pair(place: JobPlace) -> Mapping[str, Any]:
