@@ -121,7 +121,8 @@ def slow(*cases):
 
 def leaves():
     """Every command there is, as it is typed."""
-    commands = get_command(app).commands
+    root = get_command(app)
+    commands = {name: root.get_command(None, name) for name in root.list_commands(None)}
     for name, command in commands.items():
         yield from (f"{name} {one}" for one in command.commands) if hasattr(command, "commands") else [name]
 

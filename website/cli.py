@@ -31,7 +31,8 @@ def _sections(command: Any, context: typer.Context, level: int) -> Iterator[str]
         return
     if level == 2:
         yield f"\n## {context.command_path}\n\n{_told(command.help)}\n\n    {_usage(command, context)}\n"
-    commands = getattr(command, "commands", {})
+    names = command.list_commands(context) if hasattr(command, "list_commands") else ()
+    commands = {name: command.get_command(context, name) for name in names}
     if level == 2 and commands:
         yield "\nOptions: `--help` of each.\n\n| command | what it does |\n|---|---|\n"
     rows = [] if commands else [_row(one, context) for one in command.params if not getattr(one, "hidden", False)]

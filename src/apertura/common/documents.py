@@ -47,7 +47,7 @@ def read_text(path: Path, *, expected: str, remedy: str, largest: int) -> str:
     path
         The file.
     expected, remedy
-        Remedy of the message where there is no such file.
+        Of the message where there is no such file.
     largest
         Bytes that it may have.
 
@@ -79,7 +79,7 @@ def read_yaml(path: Path, *, expected: str, remedy: str) -> object:
     path
         The file.
     expected, remedy
-        Remedy of the message where there is no such file.
+        Of the message where there is no such file.
 
     Raises
     ------
@@ -172,7 +172,7 @@ def read_json(path: Path, *, expected: str, remedy: str, largest: int = LARGEST_
     path
         The file.
     expected, remedy
-        Remedy of the message where there is no such file.
+        Of the message where there is no such file.
     largest
         Bytes that it may have.
 

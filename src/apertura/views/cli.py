@@ -5,14 +5,13 @@ Commands import what they run when they run: help and mistakes in the command li
 
 import os
 import sys
-from collections.abc import Iterable
 from contextlib import suppress
-from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from typer.core import TyperCommand
+from typer.core import TyperCommand, TyperGroup
+from typer.main import get_group
 
 from apertura import __version__
 from apertura.common.errors import CampaignError, explained
@@ -23,34 +22,42 @@ from apertura.views.step_commands import app as step
 if TYPE_CHECKING:
     from apertura.pipeline.campaign import Campaign
 
-app = typer.Typer(no_args_is_help=True, help="SAR images from campaign folders.")
-app.add_typer(step, name="step")
-
-
 PASS_ON = {"allow_extra_args": True, "ignore_unknown_options": True}
 """Options that are not known go to snakemake."""
 
 
-def add_installed_commands(to: typer.Typer, installed: Iterable[EntryPoint]) -> None:
-    """Add the commands of other distributions; without apertura-research, `study` is an error that says what to do."""
-    names = set()
-    for point in installed:
-        to.add_typer(point.load(), name=point.name)
-        names.add(point.name)
-    if "study" not in names:
-        to.command("study", hidden=True, context_settings=PASS_ON, add_help_option=False)(_no_study)
+class Commands(TyperGroup):
+    """Commands of apertura, and of other distributions: these are looked up only where no own command has the name."""
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """Return a command by its name, None where there is none."""
+        if cmd_name not in self.commands:
+            self._add_installed()
+        if cmd_name == "study" and "study" not in self.commands:
+            raise CampaignError(
+                "the studies are not installed",
+                where="apertura study",
+                expected="the distribution apertura-research beside apertura",
+                remedy="Install it from the source of apertura: `pip install ./research`.",
+            )
+        return super().get_command(ctx, cmd_name)
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """Return the names of all commands."""
+        self._add_installed()
+        return super().list_commands(ctx)
+
+    def _add_installed(self) -> None:
+        from importlib.metadata import entry_points  # 20 ms, which every job of a run would pay
+
+        for point in entry_points(group="apertura.commands"):
+            if point.name not in self.commands:
+                self.commands[point.name] = group = get_group(point.load())
+                group.name = point.name
 
 
-def _no_study() -> None:
-    raise CampaignError(
-        "the studies are not installed",
-        where="apertura study",
-        expected="the distribution apertura-research beside apertura",
-        remedy="Install it from the source of apertura: `pip install ./research`.",
-    )
-
-
-add_installed_commands(app, entry_points(group="apertura.commands"))
+app = typer.Typer(cls=Commands, no_args_is_help=True, help="SAR images from campaign folders.")
+app.add_typer(step, name="step")
 
 
 CampaignFolder = Annotated[Path, typer.Argument(help="campaign folder")]
