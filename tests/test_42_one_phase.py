@@ -19,9 +19,9 @@ from apertura.pipeline.config.processing import Processing
 from apertura.pipeline.opening.autofocus import ONE_PHASE, autofocus_of, clock_s, decide_method, open_refined
 from apertura.pipeline.opening.pair import open_pair
 from apertura.pipeline.opening.scene import open_scene
-from apertura.pipeline.opening.sightings import refinement_inputs
 from apertura.pipeline.stale import stale_results
 from apertura.pipeline.steps import refine
+from apertura.pipeline.steps.refine import refinement_inputs
 from apertura.pipeline.store import open_stage
 from apertura.simulation import ImageGrid, PointTarget, SimulatedFlight, Straight, preset, simulate
 from apertura.views.score import score

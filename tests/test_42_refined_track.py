@@ -25,10 +25,10 @@ from apertura.pipeline.opening.diagnosis import evidence_of, moved_evidence
 from apertura.pipeline.opening.pair import open_pair
 from apertura.pipeline.opening.results import open_campaign
 from apertura.pipeline.opening.scene import open_scene
-from apertura.pipeline.opening.sightings import RefinementInputs, reference_points
 from apertura.pipeline.opening.transmitted import transmitted
 from apertura.pipeline.stale import stale_results
 from apertura.pipeline.steps import echo, image, profile, refine, scene
+from apertura.pipeline.steps.refine import RefinementInputs, reference_points
 from apertura.pipeline.steps.stamping import stamped
 from apertura.pipeline.store import open_stage, save_stage
 from apertura.simulation import ImageGrid, preset, simulate

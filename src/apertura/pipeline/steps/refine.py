@@ -1,6 +1,7 @@
-"""Rule `refine`: corrections of a flight's tracks by the images of all its pairs, or why there are none."""
+"""Rule `refine`: errors of a flight's tracks as its images show them, all pairs together, or why they are left."""
 
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -10,21 +11,79 @@ from numpy.typing import NDArray
 
 from apertura.common.flags import Flags
 from apertura.common.provenance import merged
+from apertura.core.focus.inputs import Profiles
+from apertura.core.geometry.geodesy import frame_from_map
 from apertura.core.geometry.phase_centres import TrackCorrection
 from apertura.core.imaging.range_profiles import profiles_of
 from apertura.core.planning.plan import Decision
-from apertura.methods.autofocus.inputs import PairRecord, Refinement
+from apertura.methods.autofocus.inputs import PairRecord, ReferencePoint, Refinement, TrackErrors
 from apertura.methods.autofocus.patches import Candidates
 from apertura.methods.autofocus.path_offsets import refine_one_phase
 from apertura.methods.autofocus.refine import refine as refine_tracks
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.lineage import result_of
-from apertura.pipeline.opening.autofocus import autofocus_of
-from apertura.pipeline.opening.pair import open_pair, pattern_digests
+from apertura.pipeline.opening.autofocus import autofocus_of, clock_s, errors_of
+from apertura.pipeline.opening.pair import OpenPair, open_pair, pattern_digests
+from apertura.pipeline.opening.plan import weighing
 from apertura.pipeline.opening.scene import OpenScene, open_scene
-from apertura.pipeline.opening.sightings import RefinementInputs, refinement_inputs
 from apertura.pipeline.steps.stamping import stamped
 from apertura.pipeline.store import open_stage, save_stage
+
+# ---- Inputs of a refinement of tracks from an open flight: profiles of each pair, errors of the logs ---------------
+
+
+@dataclass(frozen=True, eq=False)
+class RefinementInputs:
+    """Inputs of the refinement of a flight's tracks.
+
+    Attributes
+    ----------
+    records
+        One for each pair, by the flight's clock.
+    errors
+        Node → error statistics of its log.
+    points
+        Points of the scene whose places are known.
+    began
+        Zero of the clock, UTC.
+    """
+
+    records: tuple[PairRecord, ...]
+    errors: Mapping[str, TrackErrors]
+    points: tuple[ReferencePoint, ...]
+    began: np.datetime64
+
+
+def refinement_inputs(campaign: Campaign, pairs: Mapping[OpenPair, Profiles], scene: OpenScene) -> RefinementInputs:
+    """Return the inputs of the refinement of a flight's tracks.
+
+    Parameters
+    ----------
+    campaign
+        With its settings.
+    pairs
+        Every pair of the flight, as the logs have it, and its range profiles.
+    scene
+        The campaign's.
+    """
+    began = min(pair.began for pair in pairs)
+    records = [
+        PairRecord(pair.name, profiles, clock_s(pair, began), pair.sidelink_m, weighing(campaign, pair, scene))
+        for pair, profiles in pairs.items()
+    ]
+    return RefinementInputs(tuple(records), errors_of(list(pairs)), reference_points(campaign), began)
+
+
+def reference_points(campaign: Campaign) -> tuple[ReferencePoint, ...]:
+    """Return the reference points of the config, in the frame of the phase centres."""
+    requested, points = campaign.settings.scene, []
+    for point in requested.reference_points:
+        x, y, z = frame_from_map(requested.crs, *point.position_m).tolist()
+        points.append(ReferencePoint(point.name, (x, y, z), point.std_m))
+    return tuple(points)
+
+
+# ---- Rule `refine`: corrections of a flight's tracks by the images of all its pairs, or why there are none ---------
 
 
 def refine(campaign: Campaign, flight: str) -> Path:

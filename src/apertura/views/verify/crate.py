@@ -5,7 +5,7 @@ from pathlib import Path
 from apertura.common.errors import CampaignError, shown
 from apertura.common.provenance import sha256_file
 from apertura.formats.catalog import CATALOG, CRATE
-from apertura.formats.catalog.crate_check import recorded_files
+from apertura.formats.catalog.crate import recorded_files
 from apertura.formats.catalog.validation import stac_problems
 from apertura.pipeline.store import compare
 
