@@ -65,6 +65,8 @@ def _rows(number: int, drawn: Drawn, outcome: Outcome, root: Path) -> Iterator[R
     said |= {"verdict": "", "texts": "{}", "seconds": round(outcome.seconds, 1)}
     if outcome.error:
         yield known | said
+    untold = any(verdict_of(report) == "cannot tell" for report in outcome.reports.values())
+    true_flags = {*drawn.true_flags, *(["phase_unmeasured"] if untold else [])}  # of an image without a point: so it is
     for image, report in outcome.reports.items():
         flags = report["flags"]
         yield (
@@ -75,7 +77,7 @@ def _rows(number: int, drawn: Drawn, outcome: Outcome, root: Path) -> Iterator[R
                 "coherence": round(report["brightest"].get("coherence_factor", float("nan")), 4),
                 "shift_cells": _shift_cells(outcome, image, root, drawn.parameters["cell_m"]),
                 "flags": ",".join(flags),
-                "false": ",".join(flag for flag in flags if flag not in drawn.true_flags),
+                "false": ",".join(flag for flag in flags if flag not in true_flags),
                 "verdict": verdict_of(report),
                 "texts": json.dumps(flags, ensure_ascii=False),
             }

@@ -103,7 +103,9 @@ def _round(formed: Formation, target: Any) -> list[float]:
     def agree() -> Any:
         rows, columns = formed.grid.pixel_of(*([one[axis] for one in report["points"]] for axis in ("x_m", "y_m")))
         points = [BrightPoint(float(r), float(c), 1.0) for r, c in zip(rows, columns, strict=True)]
-        return agreement((target, target), (points, points), spacing_m=SPACING_M, cell_m=report["cell_m"])
+        spectrum = np.array(report["spectrum_cycles2_m2"])
+        images = target, target
+        return agreement(images, (points,) * 2, spacing_m=SPACING_M, cell_m=report["cell_m"], spectrum=spectrum)
 
     works = (
         lambda: compute_tiles(formed.image, formed.windows, target, threads=1),

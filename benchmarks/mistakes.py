@@ -7,6 +7,7 @@ it is wrong and neither an error nor a flag says so that the right campaign has 
 
 import argparse
 import csv
+import json
 import math
 from collections.abc import Iterator
 from dataclasses import astuple, dataclass, fields
@@ -21,6 +22,13 @@ from spoiling.folder import Folder
 from spoiling.table import MISTAKES
 
 _RIGHT = "right"
+
+_NAMES = {"arm": "lever arm", "tracks": "tracks swapped", "prefix": "range", "attitude": "offset"}
+"""Cause of a mistake → kind of the hypothesis that names it, where the words differ."""
+
+_OFFSETS = {"offset", "range", "prefix", "arm", "attitude", "time"}
+"""Causes that may add a constant to the paths of a pair, so that a hypothesis of kind `offset` names them rightly: a
+time does along a straight track, a wrong attitude or arm while the attitude stays."""
 
 
 @dataclass(frozen=True)
@@ -148,6 +156,13 @@ def _table(rows: list[Row]) -> Table:
     return table
 
 
+def _named_rightly(row: Row) -> bool:
+    kind = json.loads(row.hypothesis)["kind"].replace("prefix", "range")
+    return bool(row.cause) and (
+        kind == _NAMES.get(row.cause, row.cause) or (kind == "offset" and row.cause in _OFFSETS)
+    )
+
+
 def _totals(rows: list[Row]) -> str:
     """Return how many mistakes there are of each kind, and the names of those that matter."""
     kinds = {
@@ -159,6 +174,9 @@ def _totals(rows: list[Row]) -> str:
         "controls with a flag or an error": [row for row in rows if row.control and (row.flags or row.error)],
         "controls that are wrong": [row for row in rows if row.control and row.wrong],
     }
+    named = {(row.base, row.mistake): row for row in rows if row.hypothesis}
+    kinds["hypotheses that name the cause"] = [row for row in named.values() if _named_rightly(row)]
+    kinds["hypotheses that do not"] = [row for row in named.values() if not _named_rightly(row)]
     lines = []
     for kind, some in kinds.items():
         names = list(dict.fromkeys(f"{row.base}/{row.mistake}" for row in some))

@@ -32,6 +32,7 @@ from apertura.pipeline.steps import (
     ro_crate,
     scene,
     stac,
+    tracks,
 )
 from apertura.pipeline.store import open_stage
 from apertura.simulation import (
@@ -96,6 +97,16 @@ STAND_ON_ALL = frozenset({"mosaic", "map", "stac", "ro_crate"})
 """Results that stand on every image of a campaign."""
 
 
+def export_flight(campaign: Campaign, flight: str) -> None:
+    """Write what the images of a flight are for others: rasters, and tracks where samples were recorded."""
+    for pair in campaign.flight(flight).pairs:
+        layers.layers(campaign, flight, pair, threads=2)
+        export.export(campaign, flight, pair)
+    export.export_fused(campaign, flight)
+    if isinstance(campaign.settings.waveform, SampledWaveform):
+        tracks.tracks(campaign, flight)
+
+
 def run_steps(root: Path, *, exports: bool = True) -> Campaign:
     """Run every step of a campaign in this process, as the workflow would."""
     campaign = Campaign.load(root)
@@ -112,10 +123,7 @@ def run_steps(root: Path, *, exports: bool = True) -> Campaign:
     cube.cube(campaign)
     if exports:
         for flight in campaign.image_flights:
-            for pair in flight.pairs:
-                layers.layers(campaign, flight.name, pair, threads=2)
-                export.export(campaign, flight.name, pair)
-            export.export_fused(campaign, flight.name)
+            export_flight(campaign, flight.name)
         coverage.coverage(campaign)
         for name in campaign.settings.interferometry.pairs:
             interferogram.interferogram(campaign, name)

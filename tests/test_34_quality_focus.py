@@ -4,13 +4,16 @@ import numpy as np
 import pytest
 
 from apertura.core.geometry.aperture import Aperture
+from apertura.core.imaging.focus_check import focus_flags
 from apertura.core.quality.agreement import agreement
-from apertura.core.quality.bright_points import BrightPoint, bright_points, common_shift
+from apertura.core.quality.bright_points import BrightPoint, PointResponse, bright_points, common_shift
 from apertura.core.quality.budget import (
     BudgetLine,
     NodePositions,
     accuracy_for,
     expected,
+    is_counted,
+    is_stated,
     position_lines,
     strictest_accuracy_db,
 )
@@ -125,6 +128,53 @@ def test_a_constant_path_error_turns_the_phase_between_pairs():
     assert effect.phase_rad == pytest.approx(2 * np.pi * 0.05 / WAVELENGTH_M)
 
 
+def test_unstated_positions_count_with_what_their_receiver_does():
+    """As if somebody had stated it, but for the arithmetic; a float solution errs more and for longer."""
+    paths = straight()
+    (fixed,) = position_lines(paths, [NodePositions(None, 1.0, receiver="fix")], sidelink=False)
+    (stated,) = position_lines(paths, [NodePositions((0.01,) * 3, 1.0, "config")], sidelink=False)
+    (floating,) = position_lines(paths, [NodePositions(None, 1.0, receiver="float")], sidelink=False)
+    (strange,) = position_lines(paths, [NodePositions(None)], sidelink=False)
+    assert expected([fixed]) == expected([stated]) == stated.effect
+    assert floating.effect.loss_db < 3 * fixed.effect.loss_db < -2
+    assert expected([strange]).loss_db == 0
+    assert is_counted(fixed.report)
+    assert not is_stated(fixed.report)
+    assert not is_counted(strange.report)
+    assert accuracy_for([fixed]) == -60.0
+
+
+def test_the_loss_by_random_errors_scatters_as_is_stated():
+    """Standard deviation of the loss over 200 draws of 5 mm in each axis."""
+    paths, generator = straight(), np.random.default_rng(8)
+    (slope,), count, losses = paths.by_node(same=True, sidelink=False), len(paths.time_s), []
+    ground = paths.gradient[:, :2]
+    for _ in range(200):
+        drawn = np.stack([moving_average_noise(generator, count, round(count / 30)) for _ in range(3)], -1)
+        error = (slope * 0.005 * drawn).sum(axis=1)
+        rest = error - ground @ np.linalg.pinv(ground) @ error
+        losses.append(20 * np.log10(abs(np.exp(2j * np.pi / WAVELENGTH_M * rest).mean())))
+    effect = position_lines(paths, [NodePositions((0.005,) * 3)], sidelink=False)[0].effect
+    assert effect.loss_std_db == pytest.approx(np.std(losses), rel=0.3)
+
+
+@pytest.mark.parametrize(
+    ("loss_db", "std_db", "expected", "raised"),
+    [
+        (-0.7, 0.05, Effect(-0.1, 0, 0, 0.05), True),  # told to be worse than stated, though less than 1 dB
+        (-0.7, 0.3, Effect(-0.1, 0, 0, 0.05), False),  # within three deviations of the measurement
+        (-0.9, 0.05, Effect(-0.5, 0, 0, 0.2), False),  # within three deviations from flight to flight
+        (-0.15, 0.01, Effect(0.0, 0, 0, 0.0), False),  # less than images tell
+    ],
+)
+def test_a_loss_beyond_the_expected_one_is_a_flag_also_below_a_decibel(loss_db, std_db, expected, raised):
+    report = {"verdict": "focused", "why": "points lost", "loss_db": loss_db, "std_db": std_db}
+    assert ("loss_unexpected" in focus_flags(report, expected)) == raised
+    bad = focus_flags(report | {"verdict": "defocused"}, expected)
+    assert "defocused" in bad
+    assert "loss_unexpected" not in bad
+
+
 def test_what_nobody_stated_is_not_summed_and_does_not_set_the_arithmetic():
     silent = BudgetLine("heights", None, Effect(-3.0, 1.0, 0.0), "1 m")
     stated = BudgetLine("positions", "1 cm", Effect(-0.0001, 0.02, 0.1))
@@ -148,6 +198,11 @@ def lobes(places, *, turned=0.0, carrier=1.1):
     return (image * np.exp(1j * (carrier * y + turned))).astype(np.complex64)
 
 
+def sinc_response(one, others):
+    """What a point of `lobes` shows at other pixels."""
+    return np.abs(np.sinc((others - one) / 4)).prod(axis=1)
+
+
 PLACES = [(60.0, 70.0, 1.0), (150.3, 90.2, 0.8), (200.7, 190.1, 0.5)]
 SHIFT_PX = (0.8, -0.6)
 WIDE = np.diag([0.52, 0.52])  # a square band 2.5 cycles per metre wide
@@ -157,7 +212,8 @@ WIDE = np.diag([0.52, 0.52])  # a square band 2.5 cycles per metre wide
 def two_images():
     moved = [(row + SHIFT_PX[0], column + SHIFT_PX[1], amplitude) for row, column, amplitude in PLACES]
     images = lobes(PLACES), lobes(moved, turned=-1.2)
-    points = [bright_points(image, [(slice(0, 256), slice(0, 256))], apart_px=24) for image in images]
+    whole = [(slice(0, 256), slice(0, 256))]
+    points = [bright_points(image, whole, cell_px=8, shown=sinc_response) for image in images]
     return images, [some[:3] for some in points]
 
 
@@ -188,12 +244,17 @@ def test_images_without_a_point_in_common_say_nothing(two_images):
     assert agreement(images, (points[0], []), spacing_m=0.1, cell_m=0.4, spectrum=WIDE) is None
 
 
-def test_one_point_in_common_is_evidence_only_where_there_is_no_other(two_images):
+def test_one_point_in_common_is_evidence_where_it_is_the_brightest_of_both_or_the_only_one(two_images):
     images, points = two_images
-    one = (points[0][:1], points[1][:1])
     where = {"spacing_m": 0.1, "cell_m": 0.4, "spectrum": WIDE}
-    assert agreement(images, one, **where) is None
-    assert agreement(images, one, **where, alone=True).points == 1
+    brightest = (points[0][:1], points[1])
+    assert agreement(images, brightest, **where).points == 1
+    second = (points[0][1:2], points[1])
+    assert agreement(images, (points[0][:2], points[1][1:]), **where) is None
+    assert agreement(images, second, **where) is None
+    assert agreement(images, (points[0][:1], points[1][:1]), **(where | {"cell_m": 0.05})) is None
+    alone = agreement(images, (points[0][1:2], points[1][1:2]), **where, alone=True)
+    assert alone.points == 1
 
 
 def test_the_shift_is_the_one_that_most_brightness_agrees_on():
@@ -203,6 +264,37 @@ def test_the_shift_is_the_one_that_most_brightness_agrees_on():
     shift, met = common_shift(here, there, reach=4.0, gate=0.3)
     assert shift == pytest.approx((2.5, -1.5))
     assert met == [(number, number) for number in range(6)]
+
+
+def coarse_range(pulses=512):
+    """The response of a straight flight 100 m away: cells of 1.3 m across the line of sight and of 6 m along it."""
+    track = np.stack([np.linspace(-5, 5, pulses), np.full(pulses, -100.0), np.full(pulses, 0.0)], -1)
+    along_m = 0.1 * np.arange(-600, 600)
+    return PointResponse(Aperture(track, track), np.sinc(along_m / 12), 0.1, 0.26)
+
+
+def test_a_point_shows_at_another_place_what_aperture_and_band_give():
+    """Along range the response of the band at twice the distance; aside sin(x)/x, once beyond what errors may smear."""
+    response = coarse_range()
+    behind = np.column_stack([np.zeros(50), np.linspace(0.5, 25, 50), np.zeros(50)])
+    np.testing.assert_allclose(response.at(np.zeros(3), behind), np.abs(np.sinc(behind[:, 1] / 6)), atol=5e-3)
+    cells = np.array([6.5, 7.5, 9.5])
+    aside = np.column_stack([1.3 * cells, np.zeros(3), np.zeros(3)])
+    np.testing.assert_allclose(response.at(np.zeros(3), aside), 1 / (np.pi * cells), rtol=0.12)
+
+
+@pytest.mark.parametrize("cells", [1.5, 3.5, 5.5])
+def test_what_phase_errors_may_smear_is_no_point_of_its_own(cells):
+    aside = np.array([[1.3 * cells, 0.0, 0.0]])
+    assert coarse_range().at(np.zeros(3), aside) == pytest.approx(1.0, abs=0.01)
+
+
+def test_a_response_that_few_pulses_do_not_follow_has_no_false_lobes():
+    """Sampled pulses would fold the phase of far places: 100 cells aside a sum over 512 of 8192 repeats the peak."""
+    few, all_of_them = coarse_range(512), coarse_range(8192)
+    aside = np.column_stack([np.linspace(60, 1500, 400), np.zeros(400), np.zeros(400)])
+    for response in (few, all_of_them):
+        assert response.at(np.zeros(3), aside).max() < 0.02
 
 
 def test_parts_that_drift_apart_are_seen():

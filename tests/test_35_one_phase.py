@@ -212,8 +212,15 @@ def test_patches_of_one_range_do_not_speak_for_each_other():
     assert not found.accepted
 
 
-def test_three_patches_are_too_few():
+def test_three_patches_are_judged_by_what_they_gain():
     record, _ = seen(FAR, FAR_POINTS_M[:3])
     found = refine_one_phase([record], patches_at(FAR_POINTS_M[:3], 5.0, 0.8), FAR_ERRORS, method="phase_gradient")
-    assert list(found.flags) == ["refinement_too_few_patches"]
+    assert found.accepted
+    assert found.report["gain_held_out_db"] - 2 * found.report["gain_std_db"] > 0.1
+
+
+def test_without_a_bright_place_there_is_nothing_to_judge_by():
+    record, _ = seen(FAR, FAR_POINTS_M[:3])
+    found = refine_one_phase([record], Candidates([], 0, np.eye(3)), FAR_ERRORS, method="phase_gradient")
+    assert list(found.flags) == ["refinement_no_bright_place"]
     assert not found.correction.further_m

@@ -14,12 +14,13 @@ from apertura.core.focus.engines import reference
 from apertura.core.focus.inputs import PhaseHistory
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.phase_centres import TrackCorrection
+from apertura.core.quality.focus import MOST_INTERFERENCE
 from apertura.core.quality.path_errors import autocorrelation
 from apertura.core.scene.terrain import FlatGround
-from apertura.methods.autofocus.evidence import range_shifts
+from apertura.methods.autofocus.evidence import range_shifts, steadiness
 from apertura.methods.autofocus.inputs import NodePrior, Prior, ReferencePoint, TrackErrors
 from apertura.methods.autofocus.objective import Sharpness
-from apertura.methods.autofocus.patches import LEAST_RATIO, bright_places
+from apertura.methods.autofocus.patches import LEAST_RATIO, bright_places, looks_of
 from apertura.methods.autofocus.refine import TrackSearch, refine
 from apertura.methods.autofocus.solve import effects
 from apertura.pipeline.config import Node
@@ -74,7 +75,7 @@ def search(two_centimetres):
 
 def test_points_are_found_where_they_are_whatever_blurs_them():
     one = case("five", "straight", "joint", 0.03, 10.0, 2)
-    places, ratio = bright_places(one.records, GRID, FlatGround(0.0), correlation_s=1.0)
+    places, ratio = bright_places(one.records, GRID, FlatGround(0.0), looks=looks_of(one.records, one.errors)[0])
     found = places[ratio > LEAST_RATIO]
     apart = np.linalg.norm(found[:, None] - one.targets_m, axis=2)
     assert apart.shape == (5, 5)
@@ -224,5 +225,43 @@ def test_speckle_is_refused(two_centimetres):
         noisy.append(replace(one, profiles=replace(one.profiles, samples=noise)))
     rejected = refine(noisy, GRID, FlatGround(0.0), two_centimetres.errors)
     assert not rejected.accepted
-    assert "refinement_too_few_patches" in rejected.flags
+    assert "refinement_no_bright_place" in rejected.flags
     assert not any(moved.any() for moved in rejected.correction.moved_m.values())
+
+
+@pytest.mark.parametrize(("points", "pairs", "sigma_m"), [(1, "mono", 0.02), (2, "bi", 0.02), (3, "joint", 0.04)])
+def test_a_first_flight_past_few_points_is_mended(points, pairs, sigma_m):
+    """150 pulses in 7.5 s: places are judged by others, or, where there are none, by steady amplitudes."""
+    one = case(f"points-{points}", "short", pairs, sigma_m, 10.0, 0)
+    found = refine(one.records, GRID, FlatGround(0.0), one.errors)
+    before, after = judge(one), judge(one, found.correction)
+    assert found.accepted, found.why
+    assert before.target_loss_db < -2
+    assert after.target_loss_db > -0.5
+    assert after.target_shift_cm < before.target_shift_cm + 1  # what no image tells stays with the log
+
+
+def test_right_logs_are_left_alone():
+    one = case("points-4", "short", "mono", 0.0, 10.0, 3, stated_m=0.02)
+    found = refine(one.records, GRID, FlatGround(0.0), one.errors)
+    assert not found.accepted
+    assert not found.flags.keys() - {"prior_inconsistent"}  # which is true of logs that state 2 cm and have none
+    assert "the logs are as good" in found.why
+
+
+def test_a_slip_of_the_tracks_is_found_by_delays_and_taken_back():
+    """4 cm in 7.5 s: the sharpest tracks are a wavelength off over parts of the flight until delays are compared."""
+    one = case("points-4", "short", "mono", 0.04, 10.0, 13)
+    found = refine(one.records, GRID, FlatGround(0.0), one.errors)
+    assert found.accepted, found.why
+    assert judge(one, found.correction).target_shift_cm < 8
+    assert judge(one).target_shift_cm > 20
+
+
+def test_speckle_has_no_steady_amplitude_whatever_phases_are_fitted():
+    generator = np.random.default_rng(8)
+    for _ in range(20):
+        speckle = generator.standard_normal((150, 2)).view(complex)[:, 0]
+        assert steadiness(np.abs(speckle) + 0j) > MOST_INTERFERENCE or steadiness(speckle) > MOST_INTERFERENCE
+    noisy = np.exp(1j * np.linspace(0, 3, 150)) + 0.2 * generator.standard_normal((150, 2)).view(complex)[:, 0]
+    assert steadiness(noisy) < MOST_INTERFERENCE

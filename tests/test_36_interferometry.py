@@ -191,6 +191,29 @@ def test_heights_of_a_ramp_lie_within_their_deviation(rise_m):
     assert interferogram_flags(found.measured) == {}
 
 
+def test_heights_carry_the_deviation_of_the_point_that_they_count_from():
+    """One offset of all heights: σ_h² grows by (σ₀/a)², with four equal points by a quarter and a median's π/2."""
+    first, second, told = two_tracks(1.0)
+    free = form_interferogram(first, second, ground_of(told, []), GRID.tiles(64), window=WINDOW)
+    row, column = np.argwhere(np.isfinite(free.panels["unwrapped"]))[500]
+    one = KnownHeight("mast", int(row), int(column), 0.0)
+    tied = form_interferogram(first, second, ground_of(told, [one]), GRID.tiles(64), window=WINDOW)
+    assert free.level.std_rad is None
+    assert 0.02 < tied.level.std_rad < 1.0
+    wider, there = (
+        tied.panels["height_std"],
+        np.isfinite(free.panels["unwrapped"]) & np.isfinite(tied.panels["height_std"]),
+    )
+    offset_m = tied.level.std_rad / np.abs(np.median(told.slope))
+    assert wider[there].min() > 0.7 * offset_m
+    flat = Unwrapped(np.zeros((1, 4), np.float32), np.ones((1, 4), np.uint32), "", 0, 0, 0)
+    four = [KnownHeight(str(place), 0, place, 0.0, measured_rad=0.0, std_rad=0.2) for place in range(4)]
+    assert level(flat, four[:1]).std_rad == pytest.approx(0.2)
+    assert level(flat, four).std_rad == pytest.approx(0.2 / 2 * np.sqrt(np.pi / 2), abs=1e-6)
+    apart = [replace(one, measured_rad=value) for one, value in zip(four, (-0.9, -0.3, 0.3, 0.9), strict=True)]
+    assert level(flat, apart).std_rad > 2 * level(flat, four).std_rad
+
+
 @pytest.mark.slow
 def test_what_has_changed_between_the_flights_lowers_coherence_and_widens_the_deviation():
     still, changed = (parts(1.0, common=common)[0] for common in (1.0, 0.6))

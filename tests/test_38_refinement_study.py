@@ -45,7 +45,7 @@ def test_what_the_product_said_is_one_of_four_things():
         verdict_of(answer(True)),
         verdict_of(answer(True, "prior_inconsistent")),
         verdict_of(answer(False, "refinement_rejected", "cycle_slip_suspected")),
-        verdict_of(answer(False, "refinement_too_few_patches")),
+        verdict_of(answer(False, "refinement_no_bright_place")),
     ]
     assert said == [ACCEPTED, FLAGGED, REFUSED, TOO_FEW] == list(VERDICTS)
 

@@ -4,12 +4,23 @@ import numpy as np
 import pytest
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.core.focus.engines import reference
 from apertura.core.focus.inputs import PhaseHistory
 from apertura.core.geometry.aperture import Aperture
-from apertura.core.imaging.focus_check import PART_PX, PARTS, echo_elsewhere, joint_peak_power, part_images
+from apertura.core.imaging.focus_check import (
+    PART_PX,
+    PARTS,
+    echo_elsewhere,
+    focus_report,
+    joint_peak_power,
+    part_images,
+)
+from apertura.core.imaging.formation import Formation
+from apertura.core.imaging.job import imaging_job
 from apertura.core.imaging.range_profiles import range_compress
+from apertura.core.planning.planner import make_plan
 from apertura.core.scene.grid import SceneGrid
-from apertura.core.scene.terrain import FlatGround
+from apertura.core.scene.terrain import FlatGround, GroundModels
 
 FREQUENCY_HZ = 1.2e9 + 1e6 * np.arange(256)
 PULSES = 128
@@ -39,6 +50,18 @@ def test_a_strong_echo_that_no_place_gathers_is_said_to_be():
     """Asked only where no bright point was found: a point in the scene's own ranges is then at no place."""
     line = echo_elsewhere(echo_of(np.zeros((1, 3))), GRID, GROUND)
     assert "no place of the image gathers it" in line
+
+
+def test_points_that_share_a_range_cell_are_no_echo_from_elsewhere():
+    """Three equal points 2.6 m apart on one cell of 0.6 m: each gathers its third of the echo."""
+    east = np.array([-2.6, 0.0, 2.6])
+    places = np.column_stack([east, np.sqrt(400 - east**2) - 20, 0 * east])
+    history = echo_of(places)
+    assert "no place of the image gathers it" in echo_elsewhere(history, GRID, GROUND)
+    terms = list(reference.terms(history, places).T)
+    assert echo_elsewhere(history, GRID, GROUND, points=terms) is None
+    elsewhere = list(reference.terms(history, places + [1.5, 0.0, 0.0]).T)
+    assert "no place of the image gathers it" in echo_elsewhere(history, GRID, GROUND, points=elsewhere)
 
 
 @pytest.mark.parametrize("noise", [1e-3, 30.0])
@@ -85,3 +108,60 @@ def test_echoes_gather_best_where_the_antennas_were():
     right, less = (joint_peak_power([one], GRID, 0.0) for one in (history, moved))
     assert 0.8 < right < 1.3
     assert less < 0.7 * right
+
+
+# ---- Focus of points along coarse range cells
+
+COARSE_HZ = 1.2e9 + 100e6 / 256 * np.arange(256)
+"""Cells of 3 m along the line of sight, and of 0.16 m across it from 50 m of track 67 m away."""
+
+
+ALONG = np.linspace(-1, 1, 512)
+LOGGED = np.stack([25 * ALONG, np.full(512, -60.0), np.full(512, 30.0)], -1)
+
+
+def coarse_report(targets, *, seed, bow_m=0.0):
+    """The focus report of an image of points, and where they are; the antennas flew off the log by a bow."""
+    generator = np.random.default_rng(seed)
+    places = np.column_stack([generator.uniform(-17, 17, (targets, 2)), np.zeros(targets)])
+    flown = Aperture(*[LOGGED + bow_m * np.cos(2 * np.pi * ALONG)[:, None] * [0, 1, 0]] * 2)
+    path, echo = flown.path(places), np.zeros((512, 256), np.complex64)
+    for number, amplitude in enumerate(generator.uniform(0.5, 1, targets) * np.exp(2j * np.pi * generator.random())):
+        echo += amplitude * np.exp(-2j * np.pi * COARSE_HZ * path[:, number, None] / SPEED_OF_LIGHT_M_S)
+    echo += 0.1 * (generator.standard_normal(echo.shape) + 1j * generator.standard_normal(echo.shape))
+    window = np.hanning(258)[1:-1]
+    history = PhaseHistory(echo, COARSE_HZ, window / window.sum(), np.zeros(512), Aperture(LOGGED, LOGGED))
+    grid, ground = SceneGrid("local", -20.0, 20.0, 0.08, (500, 500)), FlatGround(0.0)
+    models = GroundModels.of(ground, None, grid)
+    job = imaging_job(history.aperture, COARSE_HZ, history.weight, grid, models, history=history)
+    plan = make_plan(job, accuracy_db=-50.0)
+    formation = Formation(history, range_compress(history, grid, ground), grid, plan, 256)
+    return focus_report(formation, formation.image.compute()), places, flown
+
+
+@pytest.mark.quick("1-5", "2-30")
+@pytest.mark.parametrize("targets", [5, 12, 30])
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_sidelobes_along_a_coarse_range_cell_are_no_points(targets, seed):
+    """What is told to be a point is one, and sound images of 5 to 30 of them lose nothing."""
+    report, places, _ = coarse_report(targets, seed=seed)
+    told = np.array([[point["x_m"], point["y_m"]] for point in report["points"]])
+    distance = np.linalg.norm(told[:, None] - places[:, :2], axis=-1)
+    assert distance.min(axis=1).max() < 0.5
+    assert len(set(distance.argmin(axis=1))) == len(told)
+    assert report["verdict"] == "focused"
+    assert report["loss_db"] == pytest.approx(0.0, abs=0.2)
+
+
+@pytest.mark.parametrize("targets", [5, 12])
+def test_the_loss_of_points_along_a_coarse_range_cell_is_told(targets):
+    """Truth: the phases between the paths flown to a target and those of the log to where the image has it."""
+    report, places, flown = coarse_report(targets, seed=3, bow_m=0.018)
+    wavenumber, losses = 2 * np.pi * COARSE_HZ.mean() / SPEED_OF_LIGHT_M_S, []
+    for point in report["points"]:
+        told = np.array([[point["x_m"], point["y_m"], 0.0]])
+        nearest = np.linalg.norm(places - told, axis=1).argmin()
+        error_m = (Aperture(LOGGED, LOGGED).path(told) - flown.path(places[[nearest]]))[:, 0]
+        losses.append(20 * np.log10(np.abs(np.fft.fft(np.exp(1j * wavenumber * error_m), 4096)).max() / 512))
+    assert -2.0 < np.median(losses) < -1.0
+    assert report["loss_db"] == pytest.approx(np.median(losses), abs=0.2)

@@ -38,14 +38,39 @@ def test_no_pulses_and_pulses_without_a_place_are_refused():
     assert "beyond_cyclic_prefix" in plan(path_limit_m=55.0).flags
 
 
-@pytest.mark.parametrize(("spread", "flagged"), [(0.97, False), (1.03, True)])
-def test_an_aperture_sampled_below_the_scenes_doppler_band_is_flagged(spread, flagged):
+@pytest.mark.parametrize(
+    ("spread", "bandwidth_hz", "flagged"),
+    [
+        (0.97, 400e6, False),
+        (1.15, 400e6, False),  # the edges fold in a part of the pulses, ghosts are at -34 dB
+        (1.03, 2e6, False),  # ghosts as bright as the points, in the last corners
+        (1.4, 2e6, True),  # of a third of the scene
+        (2.5, 400e6, True),  # ghosts are weak, but as much folds onto each place as is there
+    ],
+)
+def test_an_aperture_is_flagged_where_its_ambiguities_show(spread, bandwidth_hz, flagged):
     fine, _ = monostatic(straight_track()).phase_rates(ground_points().reshape(-1, 3), wavelength_m=C / 1.4e9)
     apart = straight_track(300, length_m=6.0 * spread / fine)
     for _ in range(3):  # a longer track sees steeper angles too
         rate, _ = monostatic(apart).phase_rates(ground_points().reshape(-1, 3), wavelength_m=C / 1.4e9)
         apart[:, 0] *= spread / rate
-    assert ("pulses_sparse" in plan(aperture=monostatic(apart)).flags) == flagged
+    job = planning_job(aperture=monostatic(apart), centre_hz=1.4e9 - bandwidth_hz / 2, bandwidth_hz=bandwidth_hz)
+    assert ("pulses_sparse" in check_geometry(job)) == flagged
+
+
+def test_the_ghost_of_a_point_walks_through_its_range_cell():
+    """150 of the 300 pulses a scene needs; the best of all places half the scene away shows 2f/BM of the peak."""
+    track, half = straight_track(150, length_m=30.0), 8.0
+    frequency = 1.2e9 + 400e6 * (np.arange(256) / 256 - 0.5)
+    window = np.hanning(258)[1:-1] / np.hanning(258).sum()
+    aperture, point = monostatic(track), np.array([[-7.6, 12.8, 0.0]])
+    east, north = np.meshgrid(np.arange(0, half, 0.05), 20 + np.arange(-half, half, 0.08))
+    farther_m = aperture.path(np.stack([east, north, 0 * east], -1).reshape(-1, 3)) - aperture.path(point)
+    along_m = np.linspace(-4, 4, 801)
+    response = (np.exp(2j * np.pi * np.outer(along_m, frequency - 1.2e9) / C) @ window).real
+    of_range = np.interp(farther_m, along_m, response, left=0.0, right=0.0)
+    ghost = np.abs((of_range * np.exp(2j * np.pi * 1.2e9 / C * farther_m)).mean(axis=0)).max()
+    assert ghost == pytest.approx(2 * 1.2e9 / 400e6 / 150, rel=0.3)
 
 
 def test_missed_pulses_and_gaps_do_not_undersample_an_aperture():

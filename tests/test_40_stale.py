@@ -52,7 +52,7 @@ def names(stale):
 
 def test_every_result_records_what_it_was_made_from_and_none_is_stale(finished_tiny):
     results = list(results_of(finished_tiny))
-    assert len(results) == 22 + 4 + 6
+    assert len(results) == 23 + 4 + 6
     for name, result in results:
         if RESULTS[name].on_demand:
             continue
@@ -231,7 +231,7 @@ def test_products_without_their_manifest_are_stale_and_their_report_is_not_belie
     for path in finished.rglob("*.manifest.json"):
         path.unlink()
     campaign = Campaign.load(finished)
-    assert names(stale_results(campaign)) == {"export", "layers", "coverage", "map", "stac", "ro_crate"}
+    assert names(stale_results(campaign)) == {"export", "layers", "tracks", "coverage", "map", "stac", "ro_crate"}
     with pytest.raises(CampaignError, match=r"export\.manifest\.json: no such file"):
         print_summary(campaign)
 

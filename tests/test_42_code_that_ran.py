@@ -61,7 +61,7 @@ def test_every_module_that_a_step_calls_is_code_of_its_result(tiny):
 
 EVERY = frozenset(RESULTS)
 FOCUSED = {"refined_track", "image", "assessment", "pictures", "speed_accuracy", "whole"}
-READ = FOCUSED | {"raw", "track", "echo", "profile", "layers"}
+READ = FOCUSED | {"raw", "track", "echo", "profile", "layers", "tracks"}
 
 
 CHANGES = [

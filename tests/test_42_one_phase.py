@@ -158,4 +158,4 @@ def test_every_method_may_be_asked_for_and_makes_again_what_stands_on_it(finishe
     root = copy_writable(finished_tiny.root, tmp_path / "campaign")
     campaign = state(root, "processing", autofocus_method="tracks")
     stale = {name.rsplit("/", 1)[1].split(".")[0] for name in stale_results(campaign)}
-    assert stale == {"refined_track", "image", "assessment", "export", "cube"} | STAND_ON_ALL
+    assert stale == {"refined_track", "tracks", "image", "assessment", "export", "cube"} | STAND_ON_ALL

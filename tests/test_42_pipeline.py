@@ -172,7 +172,7 @@ def test_two_runs_give_the_same_bytes(tiny, finished_tiny):
         other = tiny / "results" / product.relative_to(finished_tiny.results)
         assert other.read_bytes() == product.read_bytes(), product.name
     manifests = sorted(finished_tiny.results.rglob("*.manifest.json"))
-    assert len(manifests) == 24  # two nodes, two pairs, what they add up to, and the campaign
+    assert len(manifests) == 25  # two nodes, two pairs, the flight, what they add up to, and the campaign
     for manifest in manifests:
         assert (tiny / "results" / manifest.relative_to(finished_tiny.results)).read_bytes() == manifest.read_bytes()
 

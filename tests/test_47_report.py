@@ -36,7 +36,7 @@ def test_every_picture_and_the_page_are_written_and_listed_with_what_they_are_ma
     assert set(listed["files"]) == {f"pictures/{name}.png" for name in PICTURES}
     assert "results/f01/uav1/raw.manifest.json" in listed["sources"]
     listed = read_manifest(reported.result("f01", "page.manifest.json"))
-    assert set(listed["files"]) == {"report.html", "fused/panels.png"}
+    assert set(listed["files"]) == {"report.html", "fused/panels.png", "fused/cuts.png"}
     assert "results/f01/uav1-uav1/pictures.manifest.json" in listed["sources"]
 
 
@@ -54,7 +54,7 @@ def test_every_picture_says_what_it_was_made_from(reported, manifest):
 def test_the_page_holds_every_picture_every_decision_and_the_campaigns_name_as_text(reported):
     html = reported.result("f01", "report.html").read_text()
     report = reported.result("f01", "uav1-uav2", "image.json")
-    assert html.count('src="data:image/png;base64,') == 2 * (len(PICTURES) + 1) + 1
+    assert html.count('src="data:image/png;base64,') == 2 * (len(PICTURES) + 1) + 2
     assert "http" not in html.replace("http-equiv", "")
     assert "{{ 7*7 }}" in html
     assert "{{ 49 }}" not in html

@@ -87,6 +87,7 @@ def test_a_finished_campaign_has_nothing_to_do_and_a_new_setting_redoes_what_it_
         "refine",
         "ro_crate",
         "stac",
+        "tracks",
     }
 
 
@@ -277,15 +278,15 @@ def test_a_signal_ends_a_run_with_all_its_steps_within_five_seconds(tiny, number
 def test_a_run_tells_each_step_and_ends_with_what_its_images_say(tiny):
     code, output = finished(apertura("run", tiny, "-n"))
     assert code == 0
-    assert output.startswith("22 steps to do: ")
+    assert output.startswith("23 steps to do: ")
     assert output.count("\n") == 1
     assert not (tiny / "results/.run").exists()
     code, output = finished(apertura("run", tiny))
     assert code == 0, output
     told = [line.split("  ") for line in output.splitlines()]
-    for word, count in (("begun", 22), ("done", 22), ("failed", 0)):
+    for word, count in (("begun", 23), ("done", 23), ("failed", 0)):
         assert sum(len(cells) > 2 and cells[1].strip() == word for cells in told) == count
-    assert "22 steps done in " in output
+    assert "23 steps done in " in output
     assert "f01 uav1-uav2" in output
     assert "results/f01/fused/coherent_db.tif" in output
     assert "\x1b" not in output

@@ -16,7 +16,7 @@ from time import process_time
 from typing import Any
 
 import numpy as np
-from apertura_research.autofocus.cases import GRID, AutofocusCase, case
+from apertura_research.autofocus.cases import ERRORS, GRID, AutofocusCase, case
 from apertura_research.autofocus.outcomes import UNCORRECTED, image_seconds, judge
 
 from apertura.core.scene.terrain import FlatGround
@@ -73,10 +73,20 @@ def keys(asked: str) -> Iterator[Key]:
     yield from product(*(part.split(",") for part in parts), drawn)
 
 
-def row(key: Key, attempt: Callable[[AutofocusCase], Refinement], *, drift_m: float) -> dict[str, Any]:
+def row(
+    key: Key,
+    attempt: Callable[[AutofocusCase], Refinement],
+    *,
+    drift_m: float,
+    kind: str,
+    stated_m: float | None,
+    correlation_s: float,
+) -> dict[str, Any]:
     """Return one row of the table: loss and shift before and after, accepted or not, and what it cost."""
     scene, geometry, pairs, sigma_cm, snr_db, seed = key
-    one = case(scene, geometry, pairs, float(sigma_cm) / 100, float(snr_db), int(seed), drift_m=drift_m)
+    sigma_m = float(sigma_cm) / 100
+    how = {"drift_m": drift_m, "kind": kind, "stated_m": stated_m, "correlation_s": correlation_s}
+    one = case(scene, geometry, pairs, sigma_m, float(snr_db), int(seed), **how)
     begun = process_time()
     found = attempt(one)
     seconds = process_time() - begun
@@ -100,13 +110,25 @@ def main() -> None:
     )
     parser.add_argument("--attempt", choices=ATTEMPTS, default="refine")
     parser.add_argument("--drift-cm", type=float, default=0.0, help="of the logs, over the whole flight")
+    parser.add_argument("--errors", choices=ERRORS, default="smooth", help="what the errors of the logs are like")
+    parser.add_argument("--stated-cm", type=float, help="what the logs state, where it is not what they err by")
+    parser.add_argument("--correlation-s", type=float, default=1.0, help="how long an error lasts")
     asked = parser.parse_args()
     done = set()
     if asked.out.exists():
         with asked.out.open(newline="", encoding="utf-8") as table:
             done = {tuple(one[name] for name in NAMED) for one in csv.DictReader(table)}
     for key in (key for request in asked.cases for key in keys(request) if key not in done):
-        values = row(key, ATTEMPTS[asked.attempt], drift_m=asked.drift_cm / 100)
+        stated_m = None if asked.stated_cm is None else asked.stated_cm / 100
+        drift_m = asked.drift_cm / 100
+        values = row(
+            key,
+            ATTEMPTS[asked.attempt],
+            drift_m=drift_m,
+            kind=asked.errors,
+            stated_m=stated_m,
+            correlation_s=asked.correlation_s,
+        )
         with asked.out.open("a", newline="", encoding="utf-8") as table:
             writer = csv.DictWriter(table, list(values))
             if not table.tell():

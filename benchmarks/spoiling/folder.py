@@ -101,4 +101,4 @@ class Mistake:
     alike: tuple[str, ...] = ()
 
 
-CAUSES = ("time", "height", "arm", "channels", "tracks", "range", "prefix", "carrier_is", "attitude")
+CAUSES = ("offset", "time", "height", "arm", "channels", "tracks", "range", "prefix", "carrier_is", "attitude")

@@ -192,14 +192,14 @@ MISTAKES = {
         "heights of both logs above a geoid", logs(lambda log: log.moved((0, 0, 47.0)), *BOTH), "height"
     ),
     "logs_0m3_high": Mistake("height of the base wrong", logs(lambda log: log.moved((0, 0, 0.3)), *BOTH), "height"),
-    "rx_log_0m3_high": Mistake("height of one base wrong", logs(lambda log: log.moved((0, 0, 0.3)), RX)),
+    "rx_log_0m3_high": Mistake("height of one base wrong", logs(lambda log: log.moved((0, 0, 0.3)), RX), "offset"),
     "logs_shifted_0m7": Mistake(
         "ETRS89 taken for WGS 84 in both logs",
         logs(lambda log: log.moved((0.5, 0.5, 0)), *BOTH),
         alike=("sample", "curved"),
     ),
-    "rx_log_shifted_0m7": Mistake("one log in another datum", logs(lambda log: log.moved((0.5, 0.5, 0)), RX)),
-    "rx_log_shifted_0m1": Mistake("base of one log 10 cm off", logs(lambda log: log.moved((0.1, 0, 0)), RX)),
+    "rx_log_shifted_0m7": Mistake("one log in another datum", logs(lambda log: log.moved((0.5, 0.5, 0)), RX), "offset"),
+    "rx_log_shifted_0m1": Mistake("base of one log 10 cm off", logs(lambda log: log.moved((0.1, 0, 0)), RX), "offset"),
     "tracks_swapped": Mistake("each node has the other's log", swap_tracks, "tracks"),
     "tracks_late_0s5": Mistake("both logs 0.5 s late", logs(late(0.5), *BOTH), "time", alike=("sample",)),
     "tx_track_late_0s5": Mistake("log of the transmitter 0.5 s late", logs(late(0.5), TX), "time"),
@@ -228,6 +228,7 @@ MISTAKES = {
     "logs_1hz_cut_times": Mistake(
         "one epoch a second, its time cut to whole seconds",
         logs(lambda log: retimed(np.floor)(every(10)(log.picked(slice(5, None)))), TX),
+        "time",  # each by the same half second
     ),
     "tx_times_rounded_1s": Mistake("times of a 10 Hz log rounded to 1 s", logs(retimed(np.round), TX)),
     "tx_times_jitter": Mistake(

@@ -151,8 +151,10 @@ MISTAKES = {
     "start_1_late_tx": Mistake("captures of the transmitter one sample late", starts(1, TX), "prefix"),
     "start_1_late_rx": Mistake("captures of the receiver one sample late", starts(1, RX), control=True),
     "start_20_late_tx": Mistake("captures of the transmitter 20 samples late", starts(20, TX), "prefix"),
-    "rx_phase_quarter": Mistake("radar of the receiver off by π/2", samples(lambda s: 1j * s, RX, channels=RADAR)),
-    "rx_phase_half": Mistake("radar of the receiver off by π", samples(lambda s: -s, RX, channels=RADAR)),
+    "rx_phase_quarter": Mistake(
+        "radar of the receiver off by π/2", samples(lambda s: 1j * s, RX, channels=RADAR), "offset"
+    ),
+    "rx_phase_half": Mistake("radar of the receiver off by π", samples(lambda s: -s, RX, channels=RADAR), "offset"),
     "rx_channel_skew": Mistake(
         "radar of the receiver one sample late", samples(lambda s: np.roll(s, 1, axis=1), RX, channels=RADAR), "range"
     ),

@@ -418,7 +418,7 @@ ASSESSED = {
     "reference": "uav1-uav1",
     "hypotheses": {},
     "code_sha256": "0f",
-    "fusion": {"phases_rad": {"uav1-uav1": 0.0}, "left_out": {"uav1-uav2": "why"}, "why": {}},
+    "fusion": {"phases_rad": {"uav1-uav1": 0.0}, "left_out": {"uav1-uav2": "why"}, "unmeasured": {}, "why": {}},
     "pairs": {"uav1-uav1": AGREED, "uav1-uav2": AGREED},
 }
 REPORTED = {

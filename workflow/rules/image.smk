@@ -99,6 +99,36 @@ rule refine:
         "apertura step refine {wildcards.flight} > {log} 2>&1"
 
 
+rule tracks:
+    input:
+        header["tracks"].sources,
+    output:
+        [
+            report(
+                file, caption="../report/tracks.rst", category="{flight}", labels={"image": "all", "shows": "tracks"}
+            )
+            for file in header["tracks"].pictured
+        ],
+        header["tracks"].output,
+    log:
+        header["tracks"].log,
+    benchmark:
+        header["tracks"].benchmark
+    conda:
+        "../../environment.yml"
+    threads: header["tracks"].threads
+    resources:
+        mem_mb=header["tracks"].mem_mb,
+        runtime=header["tracks"].runtime,
+    params:
+        settings=header["tracks"].settings,
+        code=header["tracks"].code,
+    message:
+        "{wildcards.flight}: writing the tracks as refined"
+    shell:
+        "apertura step tracks {wildcards.flight} > {log} 2>&1"
+
+
 rule tiles:
     input:
         header["tiles"].sources,

@@ -48,6 +48,12 @@ rule page:
             category="{flight}",
             labels={"image": "all", "shows": "pairs and their sums"},
         ),
+        report(
+            f"results/{{flight}}/fused/{SUM_CUTS}",
+            caption="../report/sum_cuts.rst",
+            category="{flight}",
+            labels={"image": "fused", "shows": "cuts of the coherent sum"},
+        ),
         header["page"].output,
     log:
         header["page"].log,

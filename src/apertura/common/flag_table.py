@@ -211,8 +211,8 @@ _OF_IMAGES = {
         "spacing of pixels, and the finest resolution cell", "pixels are wider than the finest resolution cell",
         "scene.spacing_m", "core/planning/plan.py"),
     "pulses_sparse": Flag(
-        "spread of phase rates over the scene, cycles per pulse; 1 is unambiguous",
-        "the aperture is undersampled: azimuth ambiguities", "scene.bounds_m; speed and waveform.prf_hz",
+        "spread of phase rates over the scene, cycles per pulse; share of it that folds, and dB of what does",
+        "azimuth ambiguities show: the aperture is undersampled", "scene.bounds_m; speed and waveform.prf_hz",
         "core/planning/plan.py"),
     "pulses_missing": Flag(
         "missing pulses, of all in the aperture, and dB of the sidelobes they raise",
@@ -233,13 +233,13 @@ _OF_IMAGES = {
         "error predicted and accuracy asked, dB", "the plan is expected to miss the accuracy asked",
         "engine and options asked for", "core/planning/planner.py"),
     "refinement_rejected": Flag(
-        "dB of contrast gained on places that were not fitted, and the share of them that got sharper",
+        "dB of contrast gained on places that were not fitted and its uncertainty, and what is required",
         "tracks, or phases of pulses, refined by the images are not believed: places that were not fitted did "
-        "not get sharper; images are formed from the logs",
+        "not get sharper beyond doubt, or parts of the tracks are a wavelength off; images are formed from the logs",
         "position_std_m of the nodes; SNR; docs/howto/refine_tracks.md", "methods/autofocus/evidence.py"),
-    "refinement_too_few_patches": Flag(
-        "bright places found, and those needed",
-        "too few bright places to refine tracks by; images are formed from the logs",
+    "refinement_no_bright_place": Flag(
+        "how far places would have to stand out, and what speckle shows",
+        "no bright place to refine tracks by; images are formed from the logs",
         "reflectors in the scene; processing.autofocus off", "methods/autofocus/patches.py"),
     "prior_inconsistent": Flag(
         "how large the motions are against the errors stated",
@@ -253,6 +253,11 @@ _OF_IMAGES = {
         "dB lost at bright points, and dB that the budget expects",
         "bright points lost more than 1 dB of their peak to phase errors",
         "the hypothesis named behind it; positions, lever arms, heights, times", "core/imaging/focus_check.py"),
+    "loss_unexpected": Flag(
+        "dB lost at bright points, and dB that the budget expects, both with their deviation",
+        "bright points lost less than 1 dB or hardly more, yet more than the budget expects by three deviations",
+        "nodes.<n>.position_std_m, scene.height_std_m, time_tag_std_s: is what they state true?",
+        "core/imaging/focus_check.py"),
     "echo_elsewhere": Flag(
         "where the pulses hold the strong echo",
         "nothing bright in the image, and pulses hold a strong echo: at ranges that the scene does not have, or "
@@ -260,15 +265,25 @@ _OF_IMAGES = {
         "heights and datum of log and scene; scene.bounds_m; path offsets", "core/imaging/focus_check.py"),
     "pairs_apart": Flag(
         "cm between the places of the points, with its uncertainty, east and north",
-        "two pairs of a flight show the same points at different places",
+        "a pair shows the same points at other places than most, or as many say one place as the other",
         "the hypothesis named behind it; path offsets, lever arms, scene.height_m", "pipeline/steps/assess.py"),
     "pairs_out_of_phase": Flag(
-        "phase between the pairs, with its uncertainty",
-        "two pairs show the same points in different phase: one is left out of the coherent sum",
+        "phase against the pairs that agree, with its uncertainty",
+        "a pair shows the same points in another phase than most, or as many say one phase as the other: it is left "
+        "out of the coherent sum",
         "path offsets; processing.fusion.align_phase", "pipeline/steps/assess.py"),
     "pair_left_out": Flag(
-        "the pair, and why", "the coherent sum is without a pair that shows other places, or another phase",
+        "the pair, why, and the phase that would align it",
+        "the coherent sum is without a pair that shows other places, or another phase",
         "the flags of that pair; processing.fusion.align_phase", "pipeline/steps/export.py"),
+    "phase_unmeasured": Flag(
+        "the pair, why nothing tells its phase, and dB that a wrong one costs",
+        "the coherent sum holds a pair whose phase nothing in the images tells: where it is wrong, targets are split",
+        "a reflector in the scene; a calibration flight for the path offsets", "pipeline/steps/export.py"),
+    "sum_incoherent": Flag(
+        "share of their power that the pairs keep in phase at bright points, and dB lost",
+        "the pairs of the coherent sum are not in phase where it shows points: its peaks are weaker than theirs",
+        "pairs_out_of_phase, phase_unmeasured; positions; processing.fusion.align_phase", "pipeline/steps/export.py"),
     "flights_apart": Flag(
         "cm between the places of the points, with its uncertainty, east and north",
         "two flights show the same points at different places", "base station, datum, time system of one flight",

@@ -2,9 +2,11 @@
 
 import hashlib
 import json
+import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -126,27 +128,44 @@ def write_recording(
 def write_csv_log(
     path: Path,
     time_utc: NDArray[np.datetime64],
-    geodetic: NDArray[np.float64],
+    position: NDArray[np.float64],
     attitude_rad: NDArray[np.float64] | None,
+    *,
+    local: bool = False,
+    further: Mapping[str, NDArray[Any]] = MappingProxyType({}),
 ) -> None:
-    """Write a flight controller's log as .csv.
+    """Write a flight controller's log as .csv, by the names that `read_csv_track` knows.
 
     Parameters
     ----------
     time_utc
         (epoch,) datetime64, UTC, written to its unit.
-    geodetic
+    position
         (epoch, 3) float64: latitude and longitude (degrees), metres above the ellipsoid.
     attitude_rad
-        (epoch, 3) float64: roll, pitch, yaw (clockwise from north); None: not logged.
+        (epoch, 3) float64: roll, pitch, yaw (clockwise from north); None: not logged. Cells are empty where one is NaN.
+    local
+        Whether positions are metres to east, north and up in axes of the campaign's own.
+    further
+        Column → (epoch,): more of them; whole numbers as such, others to 10 µm, and empty cells where one is NaN.
     """
-    columns = ["time_utc", "latitude_deg", "longitude_deg", "height_m"]
+    axes = ("east_m", "north_m", "up_m") if local else ("latitude_deg", "longitude_deg", "height_m")
+    columns = ["time_utc", *axes]
     cells = [[f"{text}Z" for text in np.datetime_as_string(time_utc)]]
-    cells += [[f"{one:.{digits}f}" for one in column] for column, digits in zip(geodetic.T, (11, 11, 5), strict=True)]
+    digits = (5, 5, 5) if local else (11, 11, 5)
+    cells += [[f"{one:.{few}f}" for one in column] for column, few in zip(position.T, digits, strict=True)]
     if attitude_rad is not None:
         columns += ["roll_deg", "pitch_deg", "yaw_deg"]
         turned = np.degrees(attitude_rad)
         turned[:, 2] %= 360
-        cells += [[f"{one:.4f}" for one in column] for column in turned.T]
+        cells += [[_cell(one, 4) for one in column] for column in turned.T]
+    columns += further
+    cells += [[_cell(one, 5) for one in column.tolist()] for column in further.values()]
     lines = [",".join(columns), *map(",".join, zip(*cells, strict=True))]
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _cell(value: float, digits: int) -> str:
+    if isinstance(value, int):
+        return str(value)
+    return "" if math.isnan(value) else f"{value:.{digits}f}"

@@ -48,6 +48,18 @@ def utc_times(texts: Sequence[str]) -> NDArray[np.datetime64]:
     return np.array(plain, "datetime64[ns]")
 
 
+def coarsened(times: NDArray[np.datetime64]) -> NDArray[np.datetime64]:
+    """Return times in the coarsest of milli-, micro- and nanoseconds that holds them exactly, to be written.
+
+    Examples
+    --------
+    >>> coarsened(np.array(["2025-05-14T09:30:00.1", "2025-05-14T09:30:00.0002"], "datetime64[ns]")).dtype
+    dtype('<M8[us]')
+    """
+    units = ("datetime64[ms]", "datetime64[us]")
+    return next((times.astype(unit) for unit in units if (times.astype(unit) == times).all()), times)
+
+
 def outside(times: NDArray[np.datetime64]) -> NDArray[np.int64]:
     """Return the indices of times that are none, or are before 1980 or after 2199."""
     first, last = (bound.astype(times.dtype) for bound in (FIRST, LAST))  # nanoseconds would not hold all others

@@ -185,6 +185,12 @@ def log_settings(place: JobPlace) -> Mapping[str, Any]:
     return {name: value for name, value in stated.items() if name not in {"longest_gap_s", "smoothing_m"}}
 
 
+def stated_errors(place: JobPlace) -> Mapping[str, Any]:
+    """Return what the config states of the errors of a flight's logs."""
+    nodes = place.campaign.values["nodes"]
+    return {"position_std_m": {node: nodes[node]["position_std_m"] for (_, node) in place.below(Scope.NODE)}}
+
+
 def antennas(place: JobPlace) -> Mapping[str, Any]:
     """Return the beams of the pairs' antennas."""
     beams = {point: beam.model_dump(mode="json") for point, (_, beam) in _beams(place).items()}

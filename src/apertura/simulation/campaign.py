@@ -11,9 +11,10 @@ from numpy.random import Generator, default_rng
 from numpy.typing import NDArray
 
 from apertura.common.arrays import Floats
-from apertura.common.leap_seconds import gps_from_utc
 from apertura.core.geometry.geodesy import geodetic_from_ecef, projected_from_ecef
 from apertura.formats.campaign_files import new_folder, write_config, write_csv_log, write_recording
+from apertura.formats.tracks.rtklib import write_rtklib_pos
+from apertura.formats.tracks.track import FIXES
 from apertura.simulation.continuous import continuous_blocks, pulse_samples, recording_start_s
 from apertura.simulation.impairments import Adc, independent_streams
 from apertura.simulation.observation import Observation, fly
@@ -28,6 +29,7 @@ from apertura.simulation.specification import (
 from apertura.simulation.synthesis import digitize, full_scale, periodic_samples, samples
 
 _LOG_MARGIN_S = 2.0
+_RTK_STD_M = 0.005, 0.005, 0.01  # north, east, up: what a receiver states of a fixed solution
 _PULSES_AT_ONCE = 16
 
 
@@ -92,6 +94,7 @@ def _node_section(node: SimulatedNode) -> dict[str, Any]:
         "lever_arms_m": {name: list(arm) for name, arm in node.lever_arms_m.items()},
         "path_offset_m": dict(stated),
         "attitude": node.attitude,
+        **({} if node.position_std_m is None else {"position_std_m": node.position_std_m}),
     }
 
 
@@ -176,8 +179,17 @@ def _write_log(stem: Path, campaign: DrawnCampaign, flight: SimulatedFlight) -> 
         logged = stem.with_name(f"{stem.name}.track.csv")
         write_csv_log(logged, _to_us(_utc(flight, time_s)), geodetic, path.attitude(time_s))
     else:
-        system = "GPST" if node.log_format == "pos" else "UTC"
-        write_pos_log(stem.with_name(f"{stem.name}.track.pos"), _utc(flight, time_s), geodetic, system=system)
+        write_rtklib_pos(
+            stem.with_name(f"{stem.name}.track.pos"),
+            _utc(flight, time_s).astype("datetime64[ms]"),  # as RTKLIB writes them
+            geodetic,
+            fix=np.full(len(time_s), FIXES["fix"]),
+            std_m=np.tile(_RTK_STD_M, (len(time_s), 1)),
+            satellites=18,
+            ratio=100.0,
+            system="GPST" if node.log_format == "pos" else "UTC",
+            header=("program   : RTKPOST ver.2.4.3", "pos mode  : Kinematic", ""),
+        )
 
 
 def _utc(flight: SimulatedFlight, time_s: NDArray[np.float64]) -> NDArray[np.datetime64]:
@@ -187,32 +199,6 @@ def _utc(flight: SimulatedFlight, time_s: NDArray[np.float64]) -> NDArray[np.dat
 def _to_us(times: NDArray[np.datetime64]) -> NDArray[np.datetime64]:
     """Return times as recorders and flight controllers write them, to microseconds."""
     return times.astype("datetime64[us]")
-
-
-_POS_HEADER = """\
-% program   : RTKPOST ver.2.4.3
-% pos mode  : Kinematic
-%
-% (lat/lon/height=WGS84/ellipsoidal,Q=1:fix,2:float,3:sbas,4:dgps,5:single,6:ppp,ns=# of satellites)
-%  {system:<22}latitude(deg) longitude(deg)  height(m)   Q  ns   sdn(m)   sde(m)   sdu(m)  sdne(m)  sdeu(m)  sdun(m) \
-age(s)  ratio
-"""
-_POS_QUALITY = "   1  18   0.0050   0.0050   0.0100   0.0000   0.0000   0.0000   0.00  100.0"
-
-
-def write_pos_log(path: Path, time_utc: NDArray[np.datetime64], geodetic: Floats, *, system: str = "GPST") -> None:
-    """Write an RTKLIB solution, .pos, of latitude, longitude and ellipsoidal height, in `system` GPST or UTC.
-
-    Notes
-    -----
-    Source: RTKLIB manual 2.4.2, appendix B.1 "Positioning solution file".
-    """
-    stated = gps_from_utc(time_utc) if system == "GPST" else time_utc
-    lines = []
-    for time, (latitude, longitude, height) in zip(stated, geodetic, strict=True):
-        text = np.datetime_as_string(time, "ms").replace("-", "/").replace("T", " ")
-        lines.append(f"{text}   {latitude:14.11f} {longitude:15.11f} {height:11.5f}{_POS_QUALITY}")
-    path.write_text(_POS_HEADER.format(system=system) + "\n".join(lines) + "\n", encoding="utf-8")
 
 
 def targets_truth(origin: Origin, targets: tuple[Target, ...], crs: str) -> dict[str, Any]:

@@ -10,7 +10,16 @@ from dataclasses import replace
 import numpy as np
 
 from apertura.simulation.continuous import Framing
-from apertura.simulation.impairments import Adc, Clock, Impairments, Leakage, TimeTag, Timing, UniformPhase
+from apertura.simulation.impairments import (
+    Adc,
+    Clock,
+    Impairments,
+    Leakage,
+    Localization,
+    TimeTag,
+    Timing,
+    UniformPhase,
+)
 from apertura.simulation.scene import Clutter, Line, Origin, PointTarget, Scatterers, Straight, Target, Vector, Wobble
 from apertura.simulation.specification import CampaignSpecification, ImageGrid, SimulatedFlight, SimulatedNode
 from apertura.simulation.synthesis import Geometry, straight_pair
@@ -148,6 +157,19 @@ def demo(*, pulses: int = 300) -> CampaignSpecification:
     return _over_the_demo_scene("tandem_demo", nodes, SimulatedFlight("f01", "uav1", tracks, pulses))
 
 
+def first_flight(*, pulses: int = 150) -> CampaignSpecification:
+    """Return a first flight over the demo's targets, half as long, whose logs err by 2 cm and say so.
+
+    Its images are out of focus from the logs, and sharp from the tracks that step `refine` finds.
+    """
+    flown = demo(pulses=pulses)
+    nodes = {
+        name: replace(node, position_std_m=0.02, impairments=replace(node.impairments, localization=Localization(0.02)))
+        for name, node in flown.nodes.items()
+    }
+    return replace(flown, campaign="first_flight", nodes=nodes)
+
+
 def swarm(*, pulses: int = 240) -> CampaignSpecification:
     """Return one transmitter and three more receivers, each with a clock of its own, over the demo's targets."""
     nodes = {"uav1": _PRIMARY}
@@ -226,7 +248,7 @@ def flight(*, pulses: int = 300_000) -> CampaignSpecification:
 
 PRESETS: dict[str, Callable[..., CampaignSpecification]] = {
     made.__name__.replace("_", "-"): made
-    for made in (demo, paper, swarm, continuous, flight, paper_lab, paper_static, paper_uav)
+    for made in (demo, first_flight, paper, swarm, continuous, flight, paper_lab, paper_static, paper_uav)
 }
 
 

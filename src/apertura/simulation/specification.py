@@ -49,6 +49,9 @@ class SimulatedNode:
         default="csv", description="csv with attitude, pos (RTKLIB in GPST) or pos_utc"
     )
     log_rate_hz: float = Field(default=10.0, gt=0, description="epochs of the log per second, Hz")
+    position_std_m: float | None = Field(
+        default=None, gt=0, description="what the config says of the log's errors, per axis, m; null: nothing"
+    )
     impairments: Impairments = Field(default=Impairments(), description="what is wrong with it")
     antennas: Mapping[RadarPoint, GaussianBeam] = Field(
         default_factory=dict, description="beams of the radar antennas; missing: the same in all directions"

@@ -406,7 +406,9 @@ def simulate(
     paths: Annotated[list[Path] | None, typer.Argument(metavar="[SPEC.yaml] DIR", help="what, and where to")] = None,
     preset: Annotated[
         str | None,
-        typer.Option(help="demo (the default), paper, swarm, continuous, paper-lab, paper-static, paper-uav"),
+        typer.Option(
+            help="demo (the default), first-flight, paper, swarm, continuous, paper-lab, paper-static, paper-uav"
+        ),
     ] = None,
     seed: Annotated[int, typer.Option(help="of the random generator")] = 1,
     print_spec: Annotated[str | None, typer.Option(metavar="PRESET", help="print a preset to start from")] = None,

@@ -7,7 +7,7 @@ from typing import Any
 from apertura.common.documents import undamaged
 from apertura.common.errors import shown
 from apertura.common.flag_table import FLAGS
-from apertura.core.quality.budget import is_stated
+from apertura.core.quality.budget import is_counted, is_stated
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.store import open_listed
 
@@ -66,7 +66,7 @@ class ImageValues:
         """Return the values in an image.json."""
         focus, pulses, coherence, fusion = (report.get(key) or {} for key in ("focus", "pulses", "coherence", "fusion"))
         budget = report.get("budget", ())
-        worst = min((line for line in budget if is_stated(line)), key=lambda line: line["loss_db"], default=None)
+        worst = min((line for line in budget if is_counted(line)), key=lambda line: line["loss_db"], default=None)
         used = pulses.get("used")
         return cls(
             str(focus.get("verdict", "")),
@@ -159,13 +159,31 @@ def sentences(name: str, report: Report) -> Iterator[str]:
     agreement = report.get("agreement")
     if agreement and report.get("reference") != report.get("pair"):
         yield (
-            f"Against {report['reference']}, {agreement['points']:.0f} bright points lie "
+            f"Against {report['reference']}, {agreement['points']:.0f} {agreement['by']} lie "
             f"{100 * _length(agreement):.1f} cm apart and "
             f"{_signed(agreement['phase_rad'], 3)} ± {agreement['phase_std_rad']:.3f} rad out of phase."
         )
     coherence = report.get("coherence") or {}
     if coherence.get("mean") is not None:
         yield f"The pairs add up with {coherence['mean']:.3f} of full coherence ({coherence['chance']:.2f} by chance)."
+    if gain := report.get("gain"):
+        over_db = gain["over_best_pair_db"]
+        yield (
+            f"Between the targets it is {abs(over_db):.1f} dB {'lower' if over_db >= 0 else 'higher'} against the peak "
+            f"than {gain['best_pair']}, its best pair; the number of pairs allows {gain['allowed_db']:.1f} dB."
+        )
+        yield _cut_sentence(report["brightest"])
+
+
+def _cut_sentence(brightest: Mapping[str, Any]) -> str:
+    """Return widths and sidelobes of a target, where its cuts hold them."""
+    parts = []
+    for name, words in (("cross_range", "along the flight"), ("ground_range", "across it")):
+        width, pslr = brightest.get(f"{name}_width_m"), brightest.get(f"{name}_pslr_db")
+        if width is not None:
+            lobe = "" if pslr is None else f", its highest sidelobe {_signed(pslr, 1)} dB"
+            parts.append(f"{100 * width:.1f} cm wide {words}{lobe}")
+    return f"Its brightest target is {' and '.join(parts) or 'wider than its cuts'}."
 
 
 def _length(agreement: Mapping[str, float]) -> float:
@@ -217,7 +235,7 @@ def shared_rows(reports: Mapping[str, Report]) -> list[Cells]:
 
 
 def budget_rows(lines: Sequence[Report]) -> list[Cells]:
-    """Return the rows of an error budget, under `BUDGET`; in brackets what a size assumed would do.
+    """Return the rows of an error budget, under `BUDGET`; in brackets what is not expected, as nobody stated it.
 
     Examples
     --------
@@ -227,7 +245,7 @@ def budget_rows(lines: Sequence[Report]) -> list[Cells]:
     """
     rows: list[Cells] = []
     for line in lines:
-        bracket = "{}" if is_stated(line) else "({})"
+        bracket = "{}" if is_counted(line) else "({})"
         sizes = (
             "" if line[name] is None else bracket.format(_size(abs(line[name]), unit))
             for name, unit in (("loss_db", "dB"), ("shift_m", "m"), ("phase_rad", "rad"))

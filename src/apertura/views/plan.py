@@ -90,7 +90,7 @@ def _budget_table(lines: list[BudgetLine]) -> "Table":
         report = line.report
         table.add_row(report["cause"], report["stated"], *_effect(line.effect))
     table.add_section()
-    table.add_row("all that is stated", "", *_effect(expected(lines)))
+    table.add_row("all that is expected", "", *_effect(expected(lines)))
     return table
 
 

@@ -1,7 +1,7 @@
 """Cases by which autofocus is judged: a scene, a flight with errors in its logs, echoes and the truth."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,10 +88,37 @@ def _dense(generator: np.random.Generator) -> TargetScene:
     return _clutter(40_000, generator)
 
 
+def _few(count: int) -> Callable[[np.random.Generator], TargetScene]:
+    def scene(generator: np.random.Generator) -> TargetScene:
+        """Points within 6 dB at the receiver in 14 by 14 m, 1.5 m apart at least."""
+        places: list[Floats] = []
+        while len(places) < count:
+            place = generator.uniform((-7, 8, 0), (7, 22, 0))
+            if all(np.linalg.norm(place - other) > 1.5 for other in places):
+                places.append(place)
+        level = 10 ** (generator.uniform(-6, 0, count) / 20) * (np.hypot(np.array(places)[:, 1], 10) / 18) ** 2
+        return TargetScene(np.array(places), level * _phases(count, generator), np.arange(count))
+
+    return scene
+
+
+def _thirty(generator: np.random.Generator) -> TargetScene:
+    """Thirty points 15 to 25 dB above the clutter of one cell."""
+    clutter, places = _clutter(6000, generator), _spread(30, generator)
+    level = 10 ** (generator.uniform(15, 25, 30) / 20) * np.sqrt(CELL_M2 * 6000 / _area_m2())
+    return TargetScene(
+        np.vstack([clutter.position_m, places]),
+        np.append(clutter.amplitude, level * _phases(30, generator)),
+        6000 + np.arange(30),
+    )
+
+
 SCENES: Mapping[str, Callable[[np.random.Generator], TargetScene]] = {
     "five": _five,
     "forty": _forty,
     "texture": _texture,
+    "thirty": _thirty,
+    **{f"points-{count}": _few(count) for count in range(1, 9)},
     "clutter+10": _points_over_clutter(10.0),
     "clutter+20": _points_over_clutter(20.0),
     "dense": _dense,
@@ -150,6 +177,13 @@ def _straight() -> LoggedFlight:
     return LoggedFlight(time_s, dict(zip(NODES, (first, first + [_APART_M, 0, 0]), strict=True)))
 
 
+def _short() -> LoggedFlight:
+    """Return a first flight: 20 m in 7.5 s, 150 pulses."""
+    time_s = np.arange(150) / 20
+    first = np.stack([20 / 7.5 * (time_s - 3.725), 0 * time_s, np.full(150, 10.0)], -1)
+    return LoggedFlight(time_s, dict(zip(NODES, (first, first + [_APART_M, 0, 0]), strict=True)))
+
+
 def _wobble() -> LoggedFlight:
     plain = _straight()
     swing = [np.sin(2 * np.pi * plain.time_s / period) for period in (4.3, 7.3, 2.9, 6.1, 8.3)]
@@ -181,6 +215,7 @@ def _far() -> LoggedFlight:
 
 FLIGHTS: Mapping[str, Callable[[], LoggedFlight]] = {
     "straight": _straight,
+    "short": _short,
     "wobble": _wobble,
     "circle": _circle,
     "far": _far,
@@ -194,6 +229,48 @@ def drawn_errors(time_s: Floats, errors: TrackErrors, generator: np.random.Gener
     total = np.cumsum(np.vstack([np.zeros(3), generator.standard_normal((len(time_s) + width, 3))]), axis=0)
     noise = (total[width:] - total[:-width])[: len(time_s)] / np.sqrt(width)
     return np.asarray(noise * errors.std_m + _drift(time_s) @ generator.standard_normal((4, 3)) * errors.drift_std_m)
+
+
+_STEP_BESIDE_M = 0.005  # what errs beside a step
+
+
+def _step(time_s: Floats, errors: TrackErrors, generator: np.random.Generator) -> Floats:
+    """Return (pulse, 3) metres: half a centimetre of noise, and a step of the stated size, as where a fix changes."""
+    noise = drawn_errors(time_s, replace(errors, std_m=(_STEP_BESIDE_M,) * 3), generator)
+    at_s = time_s[0] + generator.uniform(0.35, 0.65) * (time_s[-1] - time_s[0])
+    way = generator.standard_normal(3)
+    return noise + np.where(time_s[:, None] > at_s, np.array(errors.std_m) * way / np.linalg.norm(way), 0.0)
+
+
+def _walk(time_s: Floats, errors: TrackErrors, generator: np.random.Generator) -> Floats:
+    """Return (pulse, 3) metres: a random walk of the stated size in a second."""
+    steps = generator.standard_normal((len(time_s), 3)) * np.sqrt(time_s[1] - time_s[0]) * np.array(errors.std_m)
+    walk = np.cumsum(steps, axis=0)
+    return np.asarray(walk - walk.mean(axis=0))
+
+
+_LOG_HZ, _WOBBLE_HZ = 2.0, (0.3, 1.5)
+
+
+def _sparse(time_s: Floats, errors: TrackErrors, generator: np.random.Generator) -> Floats:
+    """Return (pulse, 3) metres: what a spline through a log at 2 Hz misses of a platform that wobbles up to 1.5 Hz."""
+    from scipy.interpolate import CubicSpline
+
+    logged_s = np.arange(time_s[0], time_s[-1] + 1 / _LOG_HZ, 1 / _LOG_HZ)
+    at_s = np.concatenate([time_s, logged_s])[:, None, None]
+    frequency_hz = generator.uniform(*_WOBBLE_HZ, (3, 12))
+    wobble = np.cos(2 * np.pi * (frequency_hz * at_s + generator.random((3, 12)))).sum(axis=-1)
+    missed = wobble[: len(time_s)] - CubicSpline(logged_s, wobble[len(time_s) :])(time_s)
+    return np.asarray(missed / missed.std(axis=0) * errors.std_m)
+
+
+ERRORS: Mapping[str, Callable[[Floats, TrackErrors, np.random.Generator], Floats]] = {
+    "smooth": drawn_errors,
+    "step": _step,
+    "walk": _walk,
+    "sparse": _sparse,
+}
+"""Kinds of errors of the logs."""
 
 
 def _drift(time_s: Floats) -> Floats:
@@ -241,7 +318,17 @@ class AutofocusCase:
 
 
 def case(
-    scene: str, geometry: str, pairs: str, sigma_m: float, snr_db: float | None, seed: int, *, drift_m: float = 0.0
+    scene: str,
+    geometry: str,
+    pairs: str,
+    sigma_m: float,
+    snr_db: float | None,
+    seed: int,
+    *,
+    drift_m: float = 0.0,
+    correlation_s: float = 1.0,
+    kind: str = "smooth",
+    stated_m: float | None = None,
 ) -> AutofocusCase:
     """Return a case; tracks, scene and noise of a seed are drawn apart, so that each stays when another is changed.
 
@@ -256,18 +343,25 @@ def case(
         None is without noise.
     seed
         Of everything random.
+    correlation_s
+        How long an error lasts.
+    kind
+        Row of `ERRORS`.
+    stated_m
+        What logs state instead of `sigma_m`.
     """
     of_tracks, of_scene, of_noise, of_probes = np.random.default_rng(seed).spawn(4)
     flight, scatterers = FLIGHTS[geometry](), SCENES[scene](of_scene)
-    errors = TrackErrors((sigma_m,) * 3, drift_std_m=drift_m)
+    errors = TrackErrors((sigma_m,) * 3, correlation_s, drift_m)
     streams = zip(NODES, of_tracks.spawn(len(NODES)), strict=True)
-    truth = TrackCorrection(flight.time_s, {node: drawn_errors(flight.time_s, errors, one) for node, one in streams})
+    truth = TrackCorrection(flight.time_s, {node: ERRORS[kind](flight.time_s, errors, one) for node, one in streams})
+    stated = errors if stated_m is None else replace(errors, std_m=(stated_m,) * 3)
     probes = _probes(of_probes)
     noises = dict(zip(PAIRS["joint"], of_noise.spawn(2), strict=True))
     return AutofocusCase(
         (scene, geometry, pairs, sigma_m, snr_db, seed),
         tuple(record(pair, flight, truth, scatterers, snr_db, noises[pair]) for pair in PAIRS[pairs]),
-        dict.fromkeys(sorted({node for pair in PAIRS[pairs] for node in pair.split("-")}), errors),
+        dict.fromkeys(sorted({node for pair in PAIRS[pairs] for node in pair.split("-")}), stated),
         truth,
         scatterers.position_m[scatterers.targets],
         tuple(record(pair, flight, truth, probes, None, noises[pair]) for pair in PAIRS[pairs]),

@@ -129,7 +129,7 @@ SNR_DB = 10.0
 LEAST_STATED_M = 0.005
 """Logs without error are stated to have this: with less no refinement is requested."""
 
-ACCEPTED, FLAGGED, REFUSED, TOO_FEW = "accepted", "accepted with a flag", "refused", "refused: too few points"
+ACCEPTED, FLAGGED, REFUSED, TOO_FEW = "accepted", "accepted with a flag", "refused", "refused: no bright place"
 VERDICTS = (ACCEPTED, FLAGGED, REFUSED, TOO_FEW)
 
 
@@ -217,4 +217,4 @@ def verdict_of(result: Refinement) -> str:
     """
     if result.accepted:
         return FLAGGED if result.flags else ACCEPTED
-    return TOO_FEW if "refinement_too_few_patches" in result.flags else REFUSED
+    return TOO_FEW if "refinement_no_bright_place" in result.flags else REFUSED

@@ -18,10 +18,12 @@ from apertura.core.imaging.focus_check import focus_flags, focus_report
 from apertura.core.imaging.formation import Formation
 from apertura.core.imaging.job import imaging_job
 from apertura.core.imaging.range_profiles import range_compress
+from apertura.core.imaging.view import carriers_of
 from apertura.core.planning.planner import make_plan
+from apertura.core.quality.budget import NO_EFFECT
 from apertura.core.quality.point_targets import locate_maximum
 from apertura.core.scene.terrain import GroundModels
-from apertura.pipeline.opening.images import agreement_by_focus
+from apertura.pipeline.opening.images import ComparedImage, agreement_of
 from apertura.pipeline.opening.plan import arithmetic_line
 from apertura_research.error_atlas.causes import CAUSES
 from apertura_research.error_atlas.flight import GRID, PAIRS, AssumedFlight, Received, TrueFlight
@@ -47,6 +49,8 @@ class PairImage:
         Rows and columns, (n, m) float64 each → the image there, formed there by the same engine.
     focus, flags
         As image.json has them.
+    carriers
+        Of points over the image, `carriers_of`.
     peaks
         (target, 3) float64: row, column, amplitude.
     error_db
@@ -56,6 +60,7 @@ class PairImage:
     image: NDArray[np.complex64]
     at: Callable[[Floats, Floats], NDArray[np.complex64]]
     focus: dict[str, Any]
+    carriers: Floats
     flags: dict[str, str]
     peaks: Floats
     error_db: float
@@ -85,9 +90,10 @@ def _pair_image(flown: TrueFlight, assumed: AssumedFlight, pair: str, received: 
         certificate = certified(formation, image, accuracy_db=ACCURACY_DB, threads=1)
     focus = focus_report(formation, image)
     flags = {**assumed.flags, **assumed.sidelink_flags(pair, received), **formation.plan.flags, **certificate["flags"]}
-    flags |= focus_flags(focus, 0.0)
+    flags |= focus_flags(focus, NO_EFFECT)
     at = _interpolator(formation)
-    return PairImage(image, at, focus, flags, _peaks(image, at, flown.targets_m), certificate["numerical_error_db"])
+    peaks = _peaks(image, at, flown.targets_m)
+    return PairImage(image, at, focus, carriers_of(formation), flags, peaks, certificate["numerical_error_db"])
 
 
 def _formation(assumed: AssumedFlight, pair: str, history: Any) -> Formation:
@@ -135,7 +141,9 @@ def _peaks(image: NDArray[np.complex64], at: Callable[..., NDArray[np.complex64]
 def _between(images: dict[str, PairImage]) -> dict[str, str]:
     """Return the flags that step assess raises on two images."""
     two = [images[pair] for pair in PAIRS]
-    agreement = agreement_by_focus((two[0].image, two[1].image), (two[0].focus, two[1].focus), GRID)
+    windows = list(GRID.tiles(_TILE_PX))
+    first, second = (ComparedImage.found(one.image, one.focus, one.carriers, GRID, windows) for one in two)
+    agreement = agreement_of(first, second, GRID, windows)
     if agreement is None:
         sure = any(point["snr_db"] > 20.0 for point in two[0].focus["points"])
         return {"pair_unconfirmed": "no point in common"} if sure else {}

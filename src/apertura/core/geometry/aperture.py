@@ -13,6 +13,7 @@ Weigh = Callable[[slice, NDArray[np.float64]], NDArray[np.float64]]
 """Pulses and points (point, 3) → (pulse, point) float64."""
 
 _PULSES_AT_ONCE = 256
+_STRETCHES = 64  # of the aperture, in which phase rates are compared
 _STEPS_IN_A_ROW = 63  # of which the median is taken, so that missed pulses do not count
 
 
@@ -150,6 +151,43 @@ class Aperture:
             widest = max(widest, float(np.abs(rate - rate[:, [len(points_m) // 2]]).max()))
         in_a_row = np.lib.stride_tricks.sliding_window_view(spread, min(_STEPS_IN_A_ROW, len(spread)))
         return float(np.median(in_a_row, axis=1).max()) / wavelength_m, widest / wavelength_m
+
+    def ambiguities(self, points_m: NDArray[np.float64], *, wavelength_m: float) -> NDArray[np.float64]:
+        """Return how much of the scene's echo folds onto each of its points, relative to the point's surroundings.
+
+        Parameters
+        ----------
+        points_m
+            (point, 3) float64, metres: spread over the scene, corners included.
+        wavelength_m
+            Of the highest frequency.
+
+        Returns
+        -------
+        ndarray
+            (point,) float64: mean over the pulses of the orders n ≠ 0 for which the scene has a phase rate n cycles per
+            pulse from the point's. 0: unambiguous; 1: as much comes from elsewhere as from the place itself.
+
+        Notes
+        -----
+        Source: docs/theory/planner.md, eq. 4. Rates are medians of 63 steps in a row, as in `phase_rates`.
+
+        Examples
+        --------
+        >>> track = np.stack([0.3 * np.arange(50.0), np.zeros(50), np.full(50, 10.0)], -1)
+        >>> points = np.array([[-5.0, 10, 0], [1.25, 10, 0], [7.5, 10, 0]])
+        >>> aperture = Aperture(track, track)
+        >>> aperture.ambiguities(points, wavelength_m=1.0), aperture.ambiguities(points, wavelength_m=0.4).round(1)
+        (array([0., 0., 0.]), array([1., 0., 1.]))
+        """
+        if len(self) < 2:
+            return np.zeros(len(points_m))
+        steps = min(_STEPS_IN_A_ROW, len(self) - 1)
+        starts = np.unique(np.linspace(0, len(self) - 1 - steps, _STRETCHES).astype(int))
+        stretches = (self[first : first + steps + 1].path(points_m) for first in starts)
+        rate = np.array([np.median(np.diff(path, axis=0), axis=0) for path in stretches]) / wavelength_m
+        lowest, highest = rate.min(axis=1, keepdims=True), rate.max(axis=1, keepdims=True)
+        return np.asarray((np.floor(highest - rate) + np.floor(rate - lowest)).mean(axis=0))
 
     def resolution_cell_m(
         self, ground_m: NDArray[np.float64], *, band_hz: tuple[float, float], weigh: Weigh | None = None

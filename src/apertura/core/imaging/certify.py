@@ -1,7 +1,6 @@
 """Measures of a formed image: certified numerical error, statistics of its pixels, and its brightest target."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -12,14 +11,11 @@ from apertura.core.focus.tiles import compute_tiles
 from apertura.core.imaging.formation import Formation
 from apertura.core.quality.error_check import CONFIDENCE, Brightness, Certificate, ErrorBound, random_pixels
 from apertura.core.quality.measures import coherence_factor, image_statistics
-from apertura.core.quality.point_targets import cut_through, find_peak
+from apertura.core.quality.point_targets import CUT_REACH_M, cuts_report, find_peak
 from apertura.core.scene.grid import SceneGrid
 
 RANDOM_PIXELS, BRIGHT_PIXELS = 160, 112
 """Pixels recomputed by the reference: drawn evenly over the tiles, and by brightness (docs/theory.md, eq. 6a)."""
-
-CUT_REACH_M = 3.0
-"""Metres to both sides of the brightest target that its cuts span: main lobe and first sidelobes."""
 
 
 def certified(
@@ -69,7 +65,6 @@ def certified(
         "numerical_error_db": round(error.bound_db, 2),
         "numerical_error_confidence": CONFIDENCE,
         "numerical_error_estimate_db": round(error.estimate_db, 2),
-        "peak_error_db": round(error.peak_db, 2),
         "certified_pixels": RANDOM_PIXELS + BRIGHT_PIXELS,
         "redone": redone,
         "flags": {"accuracy_missed": line} if error.bound_db > accuracy_db else {},
@@ -93,10 +88,6 @@ def measures(formation: Formation, target: Any) -> dict[str, Any]:
     peak = find_peak(target, overview.row, overview.column)
     x, y = map(float, grid.map_at(peak.row, peak.column))
     along = _direction(grid, _flown(formation, peak.row, peak.column), peak.row, peak.column)
-    cuts = {
-        name: cut_through(target, peak, direction=way, spacing_m=grid.spacing_m, reach_m=CUT_REACH_M)
-        for name, way in (("cross_range", along), ("ground_range", (along[1], -along[0])))
-    }
     (terms,) = formation.contributions(peak.row, peak.column)
     return {
         "entropy": round(overview.entropy, 6),
@@ -107,11 +98,7 @@ def measures(formation: Formation, target: Any) -> dict[str, Any]:
             "amplitude": float(abs(peak.value)),
             "coherence_factor": coherence_factor(terms),
             "cross_range_direction": [round(part / (float(np.hypot(*along)) or 1.0), 6) for part in along],
-            **{
-                f"{name}_{measure}": None if np.isnan(value) else round(value, 4)
-                for name, cut in cuts.items()
-                for measure, value in asdict(cut).items()
-            },
+            **cuts_report(target, peak, cross_range=along, spacing_m=grid.spacing_m, reach_m=CUT_REACH_M),
         },
     }
 

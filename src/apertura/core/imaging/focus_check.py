@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import asdict, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -20,8 +21,10 @@ from apertura.core.geometry.aperture import Aperture, Weigh
 from apertura.core.imaging.formation import PULSES_READ, Formation
 from apertura.core.imaging.range_profiles import GUARD_SAMPLES, OVERSAMPLING, RangeWindow, range_compress
 from apertura.core.imaging.view import ground_axes
-from apertura.core.quality.bright_points import BrightPoint, bright_points
+from apertura.core.quality.bright_points import BrightPoint, PointResponse, bright_points
 from apertura.core.quality.focus import Focus, PointFocus, SubApertures, compare_parts, judge, judge_parts, point_focus
+from apertura.core.quality.measures import coherence_factor
+from apertura.core.quality.path_errors import Effect
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.swath import swath
 from apertura.core.scene.terrain import FlatGround, Terrain
@@ -117,8 +120,23 @@ _MOST_PULSES = 64  # sampled to search echoes outside the scene
 _NEAR_CELLS = 4  # about the direct path and at the swath's edges, where responses have their sidelobes
 
 
-def echo_elsewhere(history: PhaseHistory, grid: SceneGrid, terrain: Terrain) -> str | None:
-    """Return one line where pulses contain a strong echo that an image without bright points does not focus, else None.
+LEAST_GATHERED = 0.2
+"""Power of an image's points over that of the strongest echo in its pulses: where points share a range cell they add
+up to a pulse's echo and half of it may miss the count; an image 7 dB out of focus has less."""
+
+_BY_CHANCE = 2.0  # times ln(pixels)/pulses, the largest coherence factor of contributions with random phases
+
+
+def echo_elsewhere(
+    history: PhaseHistory,
+    grid: SceneGrid,
+    terrain: Terrain,
+    *,
+    points: Sequence[NDArray[np.complex128]] = (),
+) -> str | None:
+    """Return one line where pulses contain a strong echo that an image does not focus, else None.
+
+    To be asked where no point of the image dominates its range cell.
 
     Parameters
     ----------
@@ -126,6 +144,8 @@ def echo_elsewhere(history: PhaseHistory, grid: SceneGrid, terrain: Terrain) -> 
         Of every pulse; a sample of them is evaluated.
     grid, terrain
         The scene.
+    points
+        `Formation.contributions` at each bright point of the image, (pulse,) complex128.
 
     Notes
     -----
@@ -153,12 +173,27 @@ def echo_elsewhere(history: PhaseHistory, grid: SceneGrid, terrain: Terrain) -> 
             f"{scene}: heights, positions or path offsets are wrong, or something bright is elsewhere"
         )
     alone_db = _median_db(inside / np.maximum(np.nanmedian(within, axis=1), 1e-30))
-    if len(history) >= LEAST_PULSES and alone_db > UNFOCUSED_ECHO_DB:
-        return (
-            f"pulses hold an echo {alone_db:.0f} dB above the median of the scene's ranges, and no place of the image "
-            "gathers it: times, positions or heights are wrong, or it comes from beside the scene"
-        )
-    return None
+    if len(history) < LEAST_PULSES or alone_db <= UNFOCUSED_ECHO_DB:
+        return None
+    gathered = _gathered(points, pixels=grid.shape[0] * grid.shape[1]) / max(float(np.median(inside)), 1e-30)
+    if gathered >= LEAST_GATHERED:
+        return None
+    found = (
+        f"the image's points gather {100 * gathered:.0f} % of it" if gathered else "no place of the image gathers it"
+    )
+    return (
+        f"pulses hold an echo {alone_db:.0f} dB above the median of the scene's ranges, and {found}: times, positions "
+        "or heights are wrong, or it comes from beside the scene"
+    )
+
+
+def _gathered(points: Sequence[NDArray[np.complex128]], *, pixels: int) -> float:
+    """Return the power of the points at which contributions add up more than by chance at the best of all pixels."""
+    return sum(
+        abs(complex(terms.mean())) ** 2
+        for terms in points
+        if terms.size and coherence_factor(terms) > _BY_CHANCE * np.log(pixels) / terms.size
+    )
 
 
 def _median_db(ratio: NDArray[np.float64]) -> float:
@@ -234,6 +269,16 @@ def joint_peak_power(histories: Sequence[PhaseHistory], grid: SceneGrid, height_
     return float((power / len(histories) + np.abs(total / len(histories)) ** 2).max() / 2)
 
 
+def strongest_echo(history: PhaseHistory, grid: SceneGrid, height_m: float) -> float:
+    """Return the amplitude of the strongest echo from some places, mean over the pulses, relative to all their energy.
+
+    What a focused image has at most at its brightest place, whatever its geometry; parameters as `joint_peak_power`.
+    """
+    window = _window(history, FlatGround(height_m).positions(grid))
+    profiles = range_compress(history, grid, FlatGround(height_m), window=window)
+    return float(np.abs(profiles.samples).max(axis=1).mean() / np.sqrt(_echo_power(history)))
+
+
 def _window(history: PhaseHistory, places: NDArray[np.float64]) -> RangeWindow:
     """Return a window of total paths that covers a small piece of ground, from some of its points."""
     every = max(1, min(places.shape[:2]) // _EVERY)
@@ -254,16 +299,17 @@ def _echo_power(history: PhaseHistory) -> float:
 
 # ---- Focus report of an image
 
-POINT_SPACING_CELLS = 6.0
-"""Resolution cells between bright points at least: a maximum closer to a brighter one may be its sidelobe."""
-
 SPECKLE = 0.06
 """Power around a bright point relative to its own, above which it may be speckle: the brightest of 10⁶ has 0.07."""
 
+_SQUARE_CELLS, _LEAST_PX = 2.0, 4  # side of the squares of which the brightest maximum is looked at
 _PATCHES = 4  # imaged by subapertures: the brightest places
+_PATCHES_APART = PART_PX / 2  # places between two at least: what both show twice is no second measurement
 _PLACES_PER_CELL = 2.5  # of a patch along a side
 _CELL_POINTS = 5  # along a side of the scene, at which the resolution cell is computed
 _BAND_SAMPLES = 9  # frequencies of the spatial spectrum
+_UNEXPECTED_SIGMAS = 3.0  # by which a loss must exceed the expected one to be flagged
+_RESPONSE_OVERSAMPLING = 8.0  # of the response of a pulse: between samples it is taken as linear
 _WINDOWED = 0.62  # a Hann window leaves a band as wide, in standard deviation, as this share of it without
 
 
@@ -285,6 +331,37 @@ def _sector_of(formation: Formation) -> Weigh | None:
 
 def _half_band_hz(profiles: Profiles) -> float:
     return SPEED_OF_LIGHT_M_S / (profiles.step_m * profiles.oversampling) / 2
+
+
+def _response(formation: Formation) -> PointResponse:
+    """Return what of one point the image shows at other places."""
+    history, profiles = formation.history, formation.profiles
+    if history is None:
+        raise ValueError("the response of a point needs a phase history, there are only profiles")
+    step_m, length = range_step(history.frequency_hz, oversampling=_RESPONSE_OVERSAMPLING)
+    envelope = compress(
+        np.ones((1, len(history.frequency_hz)), np.complex64),
+        history.frequency_hz,
+        weight=history.weight / history.weight.sum(),
+        reference_delay_s=np.zeros(1),
+        start_m=np.array([-step_m * (length // 2)]),
+        count=length,
+        oversampling=_RESPONSE_OVERSAMPLING,
+    )[0]
+    wavelength_m, aperture, beams = (
+        SPEED_OF_LIGHT_M_S / profiles.centre_frequency_hz,
+        profiles.aperture,
+        formation.beams,
+    )
+    weigh = None if beams is None else lambda some, points_m: beams[some].weight(aperture[some], points_m)
+    return PointResponse(aperture, envelope, step_m, wavelength_m, weigh)
+
+
+def _shown(
+    formation: Formation, response: PointResponse, pixel: NDArray[np.int64], others: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Return what a point at a pixel shows at others."""
+    return response.at(formation.positions_at(*pixel), formation.positions_at(*others.T))
 
 
 def _spectrum(formation: Formation) -> NDArray[np.float64]:
@@ -312,8 +389,10 @@ def focus_report(formation: Formation, target: Any) -> dict[str, Any]:
     Source: docs/theory/focus.md.
     """
     cell_m, grid = resolution_cell_m(formation), formation.grid
-    apart_px = max(8, int(np.ceil(POINT_SPACING_CELLS * cell_m / grid.spacing_m)))
-    points = bright_points(target, formation.windows, apart_px=apart_px)
+    cell_px = max(_LEAST_PX, round(_SQUARE_CELLS * cell_m / grid.spacing_m))
+    points = bright_points(
+        target, formation.windows, cell_px=cell_px, shown=partial(_shown, formation, _response(formation))
+    )
     terms = formation.contributions([point.row for point in points], [point.column for point in points])
     measured = [
         point_focus(each) if point.background <= SPECKLE else None for point, each in zip(points, terms, strict=True)
@@ -323,7 +402,7 @@ def focus_report(formation: Formation, target: Any) -> dict[str, Any]:
     elsewhere = None
     if verdict.points == 0 and formation.history is not None:
         verdict = judge_parts(parts, cell_m=cell_m)
-        elsewhere = echo_elsewhere(formation.history, grid, formation.plan.terrain)
+        elsewhere = echo_elsewhere(formation.history, grid, formation.plan.terrain, points=terms)
     return {
         **_verdict_report(verdict),
         **({"elsewhere": elsewhere} if elsewhere else {}),
@@ -337,21 +416,47 @@ def focus_report(formation: Formation, target: Any) -> dict[str, Any]:
     }
 
 
-def focus_flags(report: dict[str, Any], expected_db: float) -> Flags:
-    """Return the flags `defocused`, by the verdict of the bright points, and `echo_elsewhere`."""
+UNEXPECTED_DB = 0.2
+"""dB of loss beyond the expected that are flagged at least: the accuracy to which images of many points tell it."""
+
+
+def focus_flags(report: dict[str, Any], expected: Effect) -> Flags:
+    """Return the flags `defocused`, `loss_unexpected` and `echo_elsewhere`.
+
+    Parameters
+    ----------
+    report
+        From `focus_report`.
+    expected
+        Effect that the budget expects of all causes.
+
+    Notes
+    -----
+    Source: docs/theory/focus.md, "Focus of a point". Both losses have a deviation: the measured one by its points, the
+    expected one from flight to flight.
+    """
     flags = Flags({"echo_elsewhere": report["elsewhere"]} if "elsewhere" in report else {})
+    told = f"{abs(expected.loss_db):.1f} ± {expected.loss_std_db:.1f} dB are expected by the budget"
     if report["verdict"] == "defocused":
         flags["defocused"] = (
-            f"{report['why']}; {abs(expected_db):.1f} dB are expected of what is stated in the budget: positions, "
-            "lever arms, heights or times are worse, or not stated"
+            f"{report['why']}; {told}: positions, lever arms, heights or times are worse, or not stated"
         )
+    elif "loss_db" in report:
+        beyond_db = expected.loss_db - report["loss_db"]
+        if beyond_db > max(UNEXPECTED_DB, _UNEXPECTED_SIGMAS * float(np.hypot(report["std_db"], expected.loss_std_db))):
+            flags["loss_unexpected"] = f"{report['why']}; {told}: something is worse than the budget states"
     return flags
 
 
 def _parts(formation: Formation, points: list[BrightPoint], cell_m: float) -> SubApertures:
     """Return the subaperture measures of the brightest places."""
     spacing_m = cell_m / _PLACES_PER_CELL
-    places = [_places(formation, point, spacing_m / formation.grid.spacing_m) for point in points[:_PATCHES]]
+    step_px, some = spacing_m / formation.grid.spacing_m, list[BrightPoint]()
+    for point in points:
+        near = any(np.hypot(point.row - one.row, point.column - one.column) < _PATCHES_APART * step_px for one in some)
+        if not near and len(some) < _PATCHES:
+            some.append(point)
+    places = [_places(formation, point, step_px) for point in some]
     images = part_images(formation.profiles, places, beams=formation.beams)
     return compare_parts(images, spacing_m=spacing_m, generator=np.random.default_rng(0))
 
@@ -364,18 +469,6 @@ def _places(formation: Formation, point: BrightPoint, step_px: float) -> NDArray
         indexing="ij",
     )
     return formation.positions_at(rows, columns)
-
-
-def _carrier(formation: Formation, point: BrightPoint) -> list[float]:
-    """Return the spatial frequency of a point, east and north, at the middle of aperture and band, cycles per metre."""
-    profiles = formation.profiles
-    here, axes = ground_axes(formation, max(1.0, point.row), min(point.column, formation.grid.shape[1] - 2.0))
-    weigh, some = _sector_of(formation), profiles.aperture.sample(64 if _sector_of(formation) is None else 1024)
-    gradient = profiles.aperture[some].path_gradient(here)
-    weight = np.ones(len(gradient)) if weigh is None else weigh(some, here[None])[:, 0]
-    slope = np.average(gradient, axis=0, weights=weight) @ axes.T
-    cycles = slope * profiles.centre_frequency_hz / SPEED_OF_LIGHT_M_S
-    return [float(f"{value:.8g}") for value in cycles]
 
 
 def _verdict_report(verdict: Focus) -> dict[str, Any]:
@@ -394,7 +487,6 @@ def _point_report(formation: Formation, point: BrightPoint, focus: PointFocus) -
         "pulses": focus.pulses,
         "snr_db": round(focus.snr_db, 2),
         "background": float(f"{point.background:.4g}"),
-        "carrier_cycles_m": _carrier(formation, point),
         "coherence": round(focus.coherence, 5),
         "coherence_allowed": round(focus.coherence_allowed, 5),
     }

@@ -12,6 +12,8 @@ from apertura.core.scene.visibility import bistatic_angle_deg, incidence_deg
 _COUNTS = 0.5
 """Weight of a pulse at the middle from which it counts as illuminating it: half amplitude."""
 
+_PULSES = 1024  # sampled for the carriers: they are means over the aperture, and it has few bends
+
 
 def view_report(formation: Formation, began: np.datetime64, time_s: NDArray[np.float64]) -> dict[str, Any]:
     """Return the imaging geometry for image.json, of the scene's middle; angles and distance at closest approach.
@@ -31,6 +33,7 @@ def view_report(formation: Formation, began: np.datetime64, time_s: NDArray[np.f
         `incidence_deg`: of the transmitter, from the vertical. `bistatic_angle_deg`. `range_m`: half the total path.
         `height_m`: of the midpoint above the ground. `centre_hz`, `band_hz`. `carrier_cycles_m`: the spatial frequency
         that the image's band lies about, east and north (docs/theory/interferometry.md, eq. 1).
+        `carriers_cycles_m`: the same at three rows times three columns from corner to corner (`carrier_at`).
     """
     here, (east, north) = ground_axes(formation, *((size - 1) / 2 for size in formation.grid.shape))
     profiles, beams = formation.profiles, formation.beams
@@ -58,7 +61,58 @@ def view_report(formation: Formation, began: np.datetime64, time_s: NDArray[np.f
         "carrier_cycles_m": [
             float(f"{part:.8g}") for part in slope * profiles.centre_frequency_hz / SPEED_OF_LIGHT_M_S
         ],
+        "carriers_cycles_m": [
+            [[float(f"{x:.8g}") for x in place] for place in line] for line in carriers_of(formation)
+        ],
     }
+
+
+def carrier_at(carriers: NDArray[np.float64], shape: tuple[int, int], row: float, column: float) -> tuple[float, float]:
+    """Return the spatial frequency that a point's band lies about, east and north, cycles per metre.
+
+    Parameters
+    ----------
+    carriers
+        (3, 3, 2) float64, `carriers_cycles_m` of a view: rows, columns, east and north.
+    shape
+        Rows and columns of the image.
+    row, column
+        Fractional pixel.
+
+    Notes
+    -----
+    By the parabolas through the nine places. The direction to an antenna turns by a small share of the angle under
+    which the scene is seen from it, so its third order is what is left out.
+
+    Examples
+    --------
+    >>> bent = np.array([[[c * c, r] for c in (-1, 0, 1)] for r in (-1, 0, 1)], float)
+    >>> carrier_at(bent, (101, 101), 75, 75)
+    (0.25, 0.5)
+    """
+    weights = []
+    for at, size in zip((row, column), shape, strict=True):
+        along = 2 * at / max(size - 1, 1) - 1
+        weights.append(np.array([along * (along - 1) / 2, 1 - along**2, along * (along + 1) / 2]))
+    east, north = np.einsum("r,c,rcx->x", *weights, np.asarray(carriers, np.float64))
+    return float(east), float(north)
+
+
+def carriers_of(formation: Formation) -> NDArray[np.float64]:
+    """Return the carriers of points at corners, edges and middle of the scene, (3, 3, 2) as `carrier_at` takes them.
+
+    Means over the pulses that illuminate a place, and over all where none does.
+    """
+    profiles, beams, shape = formation.profiles, formation.beams, formation.grid.shape
+    some = profiles.aperture.sample(_PULSES)
+    aperture, found = profiles.aperture[some], np.zeros((3, 3, 2))
+    for row, column in np.ndindex(3, 3):
+        at = row * (shape[0] - 1) / 2, column * (shape[1] - 1) / 2
+        here, axes = ground_axes(formation, max(1.0, at[0]), min(at[1], shape[1] - 2.0))  # axes point up and right
+        weight = np.ones(len(aperture)) if beams is None else beams[some].weight(aperture, here[None])[:, 0]
+        slope = np.average(aperture.path_gradient(here), axis=0, weights=weight if weight.any() else None)
+        found[row, column] = axes @ slope * profiles.centre_frequency_hz / SPEED_OF_LIGHT_M_S
+    return found
 
 
 def ground_axes(formation: Formation, row: float, column: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

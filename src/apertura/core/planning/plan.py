@@ -55,15 +55,47 @@ def check_geometry(job: Job) -> dict[str, str]:
         flags["spacing_coarse"] = (
             f"spacing {job.spacing_m:g} m, finest resolution cell {cell_m:.3g} m: targets fall between"
         )
-    spread, _ = aperture.phase_rates(job.points_m, wavelength_m=SPEED_OF_LIGHT_M_S / job.band_hz[1])
-    if spread > 1:
-        flags["pulses_sparse"] = f"phase rates over the scene spread {spread:.2f} cycles per pulse, 1 is unambiguous"
+    if sparse := _sparse(job):
+        flags["pulses_sparse"] = sparse
     beyond = _share_beyond(aperture, job.points_m, job.path_limit_m)
     if beyond:
         flags["beyond_cyclic_prefix"] = (
             f"{100 * beyond:.0f} % of the scene arrives too late for all captures: after the cyclic prefix, or listen_s"
         )
     return flags
+
+
+GHOST_DB, REACHED = -20.0, 0.1
+"""dB of a point's ghosts against it, and share of the scene, mean over the pulses, above which they show."""
+
+FOLDED_DB = 1.0
+"""dB by which echoes that fold brighten the scene on average, above which they show between its targets."""
+
+
+def _sparse(job: Job) -> str | None:
+    """Return one line where the aperture is undersampled so far that its ambiguities show, else None.
+
+    Notes
+    -----
+    Source: docs/theory/planner.md, eq. 4 and 5.
+    """
+    wavelength_m, (lowest_hz, highest_hz) = SPEED_OF_LIGHT_M_S / job.band_hz[1], job.band_hz
+    spread, _ = job.aperture.phase_rates(job.points_m, wavelength_m=wavelength_m)
+    if spread <= 1:
+        return None
+    folded = job.aperture.ambiguities(job.points_m, wavelength_m=wavelength_m)
+    pulses = len(job.aperture) if job.integration is None else job.integration.count
+    # a ghost walks a wavelength of path per pulse: through the response of a windowed band in twice f/B pulses
+    walked = (lowest_hz + highest_hz) / max(highest_hz - lowest_hz, 1.0) / max(pulses, 1)
+    ghost_db = 20 * np.log10(max(min(1.0, walked, float(folded.max())), 1e-6))
+    reached, brighter_db = float(np.minimum(folded, 1).mean()), 10 * np.log10(1 + float(folded.mean()))
+    if not (brighter_db > FOLDED_DB or (ghost_db > GHOST_DB and reached > REACHED)):
+        return None
+    return (
+        f"phase rates over the scene spread {spread:.2f} cycles per pulse, 1 is unambiguous: echoes fold onto "
+        f"{100 * reached:.0f} % of it and brighten it by {brighter_db:.1f} dB on average, ghosts of points are at "
+        f"{ghost_db:.0f} dB"
+    )
 
 
 def check_positions(aperture: Aperture) -> None:

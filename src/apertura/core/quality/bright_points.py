@@ -1,20 +1,195 @@
 """Isolated bright points of an image: where focus, place and phase can be measured without truth."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apertura.common.contracts import Window
+from apertura.core.geometry.aperture import Aperture, Weigh
 from apertura.core.quality.measures import BlockRaster
 from apertura.core.quality.point_targets import PATCH_PX, find_peak
 
+# ---- What of one point an image shows at another place
+
+SMEARED_CELLS = 6.0
+"""Cells across the line of sight over which phase errors may spread a point: within, the bound of eq. 1b counts."""
+
+OVER_RESPONSE = 2.0
+"""Amplitude of a point over what brighter ones show there: 6 dB, as tapers and phase errors move and raise lobes."""
+
+_RESPONSE_PULSES = 512  # sampled; they follow a phase that turns up to a quarter as often
+
+
+@dataclass(frozen=True, eq=False)
+class PointResponse:
+    """The response of an image to a point: how bright one point alone makes the places about it.
+
+    Attributes
+    ----------
+    aperture
+        Phase centres of the pair, every pulse.
+    envelope
+        (sample,) complex, response of a pulse over a whole period of total path, referred to the band's middle; 1 at
+        the sample in the middle, where the path is that of the point.
+    step_m
+        Total path from sample to sample.
+    wavelength_m
+        Of the band's middle.
+    weigh
+        Pulses and points → weights, of antennas or of the sector integrated; by default all count alike.
+
+    Notes
+    -----
+    Source: docs/theory/focus.md, eq. 1a and 1b.
+
+    Examples
+    --------
+    Four cells aside are within what phase errors may smear, eight are not; a range cell farther nothing is left:
+
+    >>> track = np.stack([np.linspace(-5, 5, 512), np.full(512, -100.0), np.full(512, 0.0)], -1)
+    >>> response = PointResponse(Aperture(track, track), np.sinc(np.arange(-600, 600) / 120), 0.1, 0.26)
+    >>> aside, behind = [[5.2, 0, 0], [11.05, 0, 0]], [[0, 3.0, 0], [0, 6.0, 0]]
+    >>> response.at(np.zeros(3), np.array(aside)).round(2).tolist()
+    [1.0, 0.04]
+    >>> response.at(np.zeros(3), np.array(behind)).round(2).tolist()
+    [0.64, 0.0]
+    """
+
+    aperture: Aperture
+    envelope: NDArray[np.complexfloating]
+    step_m: float
+    wavelength_m: float
+    weigh: Weigh | None = None
+
+    def at(self, place_m: NDArray[np.float64], others_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the amplitude that a point shows at other places, relative to its own, at most.
+
+        Parameters
+        ----------
+        place_m
+            (3,) float64, metres, in the frame of the phase centres: the point.
+        others_m
+            (place, 3) float64, metres.
+
+        Returns
+        -------
+        ndarray
+            (place,) float64, 0 to 1.
+        """
+        some = self.aperture.sample(_RESPONSE_PULSES)
+        weight = np.ones(len(self.aperture[some])) if self.weigh is None else self.weigh(some, place_m[None])[:, 0]
+        if not weight.any():
+            return np.zeros(len(others_m))
+        lit, weight = weight > 0, weight[weight > 0, None] / weight.sum()
+        flown = self.aperture[some][lit]
+        farther_m = flown.path(others_m) - flown.path(place_m[None])
+        range_part = self._of_range(farther_m)
+        bound = (weight * np.abs(range_part)).sum(axis=0)
+        turns = np.ptp(farther_m, axis=0) / self.wavelength_m
+        lobe = np.abs((weight * range_part * np.exp(2j * np.pi / self.wavelength_m * farther_m)).sum(axis=0))
+        # where samples do not follow the phase the sum would fold: the envelope of a far sidelobe stands for it
+        followed = turns < len(flown) / 4
+        lobe = np.where(followed, lobe, bound / np.maximum(np.pi * turns, 1.0))
+        return np.asarray(np.where(turns < SMEARED_CELLS, bound, lobe))
+
+    def _of_range(self, farther_m: NDArray[np.float64]) -> NDArray[np.complex128]:
+        """Return the response of a pulse at places whose path is longer than the point's, periodic, linear between."""
+        count = len(self.envelope)
+        at = farther_m / self.step_m + count // 2
+        below = np.floor(at)
+        first, second = (self.envelope[(below + step).astype(np.int64) % count] for step in (0, 1))
+        return np.asarray(first + (at - below) * (second - first))
+
+
+def separated(
+    amplitude: NDArray[np.floating], shown: Callable[[int, NDArray[np.int64]], NDArray[np.float64]], *, most: int
+) -> list[int]:
+    """Return which of some maxima are points of their own and no sidelobes or skirts of brighter ones.
+
+    Parameters
+    ----------
+    amplitude
+        (maximum,) float, brightest first.
+    shown
+        A maximum and some others → (other,) float64, what a point at the first shows there: `PointResponse.at`.
+    most
+        Points to return.
+
+    Returns
+    -------
+    list of int
+        Brightest first. Each exceeds what all brighter ones together show at its place by `OVER_RESPONSE`.
+
+    Notes
+    -----
+    Source: docs/theory/focus.md, "Bright points".
+
+    Examples
+    --------
+    >>> at = np.array([0.0, 1.4, 40.0, 50.0])
+    >>> separated(np.array([1, 0.22, 0.2, 0.1]), lambda one, others: np.abs(np.sinc(at[others] - at[one])), most=9)
+    [0, 2, 3]
+    """
+    explained, points = np.zeros(len(amplitude)), list[int]()
+    for number in range(len(amplitude)):
+        if len(points) == most:
+            break
+        if amplitude[number] > OVER_RESPONSE * explained[number]:
+            points.append(number)
+            rest = np.arange(number + 1, len(amplitude))
+            explained[rest] += amplitude[number] * shown(number, rest)
+    return points
+
+
+_LOBE_CELLS = 2.0
+_CELL_UNITS = 1.8  # a resolution cell in units of docs/theory/focus.md, eq. 6, in every direction
+
+
+def near(
+    spectrum: NDArray[np.float64], spacing_m: float, cell_m: float
+) -> Callable[[NDArray[np.int64], NDArray[np.int64]], NDArray[np.float64]]:
+    """Return what a point of an image shows at most, where only the covariance of its spatial spectrum is known.
+
+    Parameters
+    ----------
+    spectrum
+        (2, 2) float64, east and north, cycles² per m².
+    spacing_m
+        Of the pixels; row 0 in the north.
+    cell_m
+        Finest resolution cell.
+
+    Returns
+    -------
+    callable
+        As `shown` of `bright_points`: 1 within two resolution cells of their direction, beyond which sidelobes are
+        weaker than `DEEPEST_DB`, and within `SMEARED_CELLS` of the finest, which errors smear; 0 beyond.
+
+    Examples
+    --------
+    >>> shown = near(np.diag([1.0, 0.01]), 0.1, 0.2)
+    >>> shown(np.array([0, 0]), np.array([[0, 10], [0, 20], [50, 0], [60, 0]]))
+    array([1., 0., 1., 0.])
+    """
+    unit = 2 * np.pi * spacing_m * np.linalg.cholesky(spectrum)
+
+    def shown(one: NDArray[np.int64], others: NDArray[np.int64]) -> NDArray[np.float64]:
+        down, right = (others - one).T
+        lobe = np.linalg.norm(np.stack([right, -down], axis=1) @ unit, axis=1) < _LOBE_CELLS * _CELL_UNITS
+        return np.asarray(lobe | (np.hypot(down, right) < SMEARED_CELLS * cell_m / spacing_m), np.float64)
+
+    return shown
+
+
+# ---- Bright points of an image
+
 MOST_POINTS = 16  # of an image that are measured, at most
 DEEPEST_DB = -12.0
-"""dB below the brightest point: weaker points may be its sidelobes."""
+"""dB below the brightest point: weaker points may be what defocus leaves of it."""
 
-
+_MOST_MAXIMA = 1024  # of an image that are compared with brighter points' responses
 _POINT_CONTRAST = 10.0  # power of a point relative to the speckle around it: 10 dB
 
 
@@ -41,8 +216,14 @@ class BrightPoint:
     carrier: tuple[float, float] | None = None
 
 
-def bright_points(image: BlockRaster, windows: Iterable[Window], *, apart_px: int) -> list[BrightPoint]:
-    """Return the brightest isolated local maxima, brightest first.
+def bright_points(
+    image: BlockRaster,
+    windows: Iterable[Window],
+    *,
+    cell_px: int,
+    shown: Callable[[NDArray[np.int64], NDArray[np.int64]], NDArray[np.float64]],
+) -> list[BrightPoint]:
+    """Return the brightest local maxima that are points of their own, brightest first.
 
     Parameters
     ----------
@@ -50,8 +231,11 @@ def bright_points(image: BlockRaster, windows: Iterable[Window], *, apart_px: in
         (y, x) complex64, carrier kept; NaN is left out.
     windows
         Windows that cover it once.
-    apart_px
-        Of two maxima closer than this only the brighter one is taken: a few resolution cells.
+    cell_px
+        Of the maxima in a square of this side only the brightest is looked at.
+    shown
+        (2,) int64 pixel of a point and (n, 2) int64 pixels → (n,) float64, what the point shows there, as
+        `PointResponse.at`.
 
     Examples
     --------
@@ -59,21 +243,22 @@ def bright_points(image: BlockRaster, windows: Iterable[Window], *, apart_px: in
     >>> lobe = lambda row, column: np.sinc((y - row) / 4) * np.sinc((x - column) / 4)
     >>> whole = (slice(0, 64), slice(0, 128))
     >>> image = (lobe(30.25, 33.5) + 0.5 * lobe(20, 90)).astype(np.complex64)
-    >>> [(round(p.row, 1), round(p.column, 1)) for p in bright_points(image, [whole], apart_px=16)]
+    >>> shown = lambda one, others: np.abs(np.sinc((others - one) / 4)).prod(axis=1)
+    >>> [(round(p.row, 1), round(p.column, 1)) for p in bright_points(image, [whole], cell_px=8, shown=shown)]
     [(30.2, 33.5), (20.0, 90.0)]
     """
-    maxima: list[tuple[float, int, int]] = []
+    found: list[tuple[float, int, int]] = []
     for window in windows:
         magnitude = np.abs(np.nan_to_num(np.asarray(image[window])))
-        maxima += _cell_maxima(magnitude, window, apart_px)
-    maxima.sort(key=lambda one: (-one[0], one[1], one[2]))
-    kept: list[tuple[float, int, int]] = []
-    for one in maxima:
-        if not one[0] > maxima[0][0] * 10 ** (DEEPEST_DB / 20) or len(kept) == MOST_POINTS:
-            break
-        if all(np.hypot(one[1] - row, one[2] - column) >= apart_px for _, row, column in kept):
-            kept.append(one)
-    return [_bright_point(image, row, column) for _, row, column in kept]
+        found += _cell_maxima(magnitude, window, cell_px)
+    found.sort(key=lambda one: (-one[0], one[1], one[2]))
+    found = [one for one in found[:_MOST_MAXIMA] if one[0] > found[0][0] * 10 ** (DEEPEST_DB / 20)]
+    found = [one for one in found if _stands_out(image, *one)]
+    pixels = np.array([one[1:] for one in found], np.int64).reshape(-1, 2)
+    kept = separated(
+        np.array([one[0] for one in found]), lambda one, others: shown(pixels[one], pixels[others]), most=MOST_POINTS
+    )
+    return [_bright_point(image, int(row), int(column)) for row, column in pixels[kept]]
 
 
 def has_point(image: BlockRaster, row: int, column: int, *, reach: int) -> bool:
@@ -104,10 +289,16 @@ def _bright_point(image: BlockRaster, row: int, column: int) -> BrightPoint:
 
 
 def _cell_maxima(magnitude: NDArray[np.float32], window: Window, cell_px: int) -> list[tuple[float, int, int]]:
-    """Return (magnitude, row, column) of the largest pixel of each square cell of a block."""
+    """Return (magnitude, row, column) of the largest local maximum in each square cell of a block, where there is one.
+
+    Pixels at the block's edges are compared with their neighbours inside it.
+    """
+    about = np.pad(magnitude, 1)
+    rows, columns = magnitude.shape
+    highest = np.max([about[d : d + rows, r : r + columns] for d in range(3) for r in range(3)], axis=0)
     rows, columns = (-(-size // cell_px) * cell_px for size in magnitude.shape)
     padded = np.zeros((rows, columns), magnitude.dtype)
-    padded[: magnitude.shape[0], : magnitude.shape[1]] = magnitude
+    padded[: magnitude.shape[0], : magnitude.shape[1]] = np.where(magnitude == highest, magnitude, 0)
     cells = padded.reshape(rows // cell_px, cell_px, columns // cell_px, cell_px).swapaxes(1, 2)
     flat = cells.reshape(*cells.shape[:2], -1)
     best = flat.argmax(axis=-1)
@@ -116,6 +307,12 @@ def _cell_maxima(magnitude: NDArray[np.float32], window: Window, cell_px: int) -
     column = window[1].start + right * cell_px + best % cell_px
     top = flat.max(axis=-1)
     return [(float(a), int(r), int(c)) for a, r, c in zip(top.flat, row.flat, column.flat, strict=True) if a > 0]
+
+
+def _stands_out(image: BlockRaster, magnitude: float, row: int, column: int) -> bool:
+    """Return whether no pixel about a maximum of its block exceeds it, across the blocks' edges too."""
+    about = image[max(0, row - 1) : row + 2, max(0, column - 1) : column + 2]
+    return bool(np.abs(np.nan_to_num(np.asarray(about))).max() <= magnitude)
 
 
 def common_shift(

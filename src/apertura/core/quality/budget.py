@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -18,7 +18,16 @@ LEAST_ACCURACY_DB, MOST_ACCURACY_DB = -40.0, -60.0
 
 NO_EFFECT = Effect(0.0, 0.0, 0.0)  # of a cause without error
 
-_NOT_STATED = "not stated"
+_NOT_STATED, _ASSUMED = "not stated", "assumed"
+
+RECEIVER_STD_M = {"fix": 0.01, "float": 0.3, "sbas": 1.0, "dgps": 0.5, "single": 1.0, "ppp": 0.1, "unknown": 0.01}
+"""Metres in each axis that positions of a receiver's class err where nobody states it: a fixed RTK solution within a
+centimetre or two, a float one by decimetres, without RTK by metres; a log that does not say is taken as fixed, as
+positions must be for a radar image."""
+
+_FIXED = frozenset({"fix", "unknown"})
+_SLOW_S = 100.0
+"""Correlation time of what is not a fixed solution: ambiguities, orbits and the atmosphere change over minutes."""
 
 
 @dataclass(frozen=True)
@@ -35,12 +44,20 @@ class BudgetLine:
         Size that the effect is computed for where none is stated.
     effect
         Expected effect.
+    assumed
+        What is taken for it where nothing is stated, and why; it counts as expected. None: nothing is.
     """
 
     cause: str
     stated: str | None
     effect: Effect
     unit: str = ""
+    assumed: str | None = None
+
+    @property
+    def counts(self) -> bool:
+        """Whether its effect is expected: stated, measured or assumed."""
+        return self.stated is not None or self.assumed is not None
 
     @property
     def report(self) -> dict[str, Any]:
@@ -48,8 +65,10 @@ class BudgetLine:
         expected = {
             name: float(f"{value:.3g}") + 0.0 if np.isfinite(value) else None
             for name, value in asdict(self.effect).items()
+            if name != "loss_std_db"
         }
-        return {"cause": self.cause, "stated": self.stated or f"{_NOT_STATED}; {self.unit} would do this", **expected}
+        otherwise = f"{self.unit} would do this" if self.assumed is None else f"{_ASSUMED} {self.assumed}"
+        return {"cause": self.cause, "stated": self.stated or f"{_NOT_STATED}; {otherwise}", **expected}
 
 
 def is_stated(report: Mapping[str, Any]) -> bool:
@@ -61,6 +80,17 @@ def is_stated(report: Mapping[str, Any]) -> bool:
     False
     """
     return not report["stated"].startswith(_NOT_STATED)
+
+
+def is_counted(report: Mapping[str, Any]) -> bool:
+    """Return whether the effect of a cause is expected: its size is stated, measured or assumed.
+
+    Examples
+    --------
+    >>> is_counted(BudgetLine("positions", None, NO_EFFECT, assumed="1 cm of an RTK fix").report)
+    True
+    """
+    return is_stated(report) or report["stated"].startswith(f"{_NOT_STATED}; {_ASSUMED}")
 
 
 @dataclass(frozen=True)
@@ -77,16 +107,27 @@ class NodePositions:
         Source of the statement: config or log.
     drift_m
         Of a slow error over the whole flight, in each axis.
+    receiver
+        Class of the receiver, a key of `RECEIVER_STD_M`; None where positions come from no receiver's log.
     """
 
     std_m: tuple[float, float, float] | None
     correlation_s: float = 1.0
     stated_by: str = "nobody"
     drift_m: float = 0.0
+    receiver: str | None = None
+
+    @property
+    def assumed(self) -> "NodePositions":
+        """The same with the error of its receiver's class where none is stated."""
+        if self.std_m is not None or self.receiver is None:
+            return self
+        correlation_s = self.correlation_s if self.receiver in _FIXED else max(self.correlation_s, _SLOW_S)
+        return replace(self, std_m=(RECEIVER_STD_M[self.receiver],) * 3, correlation_s=correlation_s)
 
 
 def position_lines(paths: PointPaths, nodes: Sequence[NodePositions], *, sidelink: bool) -> list[BudgetLine]:
-    """Return the effect of position errors: of those stated, and of a centimetre where none is stated.
+    """Return the effect of position errors: those stated, those of a receiver's class, a centimetre where neither is.
 
     Parameters
     ----------
@@ -99,19 +140,41 @@ def position_lines(paths: PointPaths, nodes: Sequence[NodePositions], *, sidelin
     """
     slopes = paths.by_node(same=len(nodes) == 1, sidelink=sidelink)
     lines = []
-    for stated in (True, False):
-        some = [(slope, node) for slope, node in zip(slopes, nodes, strict=True) if (node.std_m is not None) == stated]
+    for kind in ("stated", "assumed", "nothing"):
+        some = [(slope, node) for slope, node in zip(slopes, nodes, strict=True) if _known(node) == kind]
         if some:
-            sizes = [np.sqrt((slope**2 * np.square(node.std_m or (0.01,) * 3)).sum(axis=1)) for slope, node in some]
-            effect = paths.of_noise(*((size, node.correlation_s) for size, (_, node) in zip(sizes, some, strict=True)))
-            words = "; ".join(_stated(node) for _, node in some) if stated else None
-            lines.append(BudgetLine("positions", words, effect, "1 cm in each axis of what nobody stated"))
+            taken = [node.assumed for _, node in some]
+            sizes = [
+                np.sqrt((slope**2 * np.square(node.std_m or (0.01,) * 3)).sum(axis=1))
+                for (slope, _), node in zip(some, taken, strict=True)
+            ]
+            effect = paths.of_noise(*((size, node.correlation_s) for size, node in zip(sizes, taken, strict=True)))
+            stated = "; ".join(f"{_sizes(node)}, said by the {node.stated_by}" for node in taken)
+            assumed = "; ".join(f"{_sizes(node)}, {_CLASSES[node.receiver]}" for node in taken if node.receiver)
+            lines.append(
+                BudgetLine(
+                    "positions",
+                    stated if kind == "stated" else None,
+                    effect,
+                    "1 cm in each axis of what nobody stated",
+                    assumed=assumed if kind == "assumed" else None,
+                )
+            )
     return lines
 
 
-def _stated(node: NodePositions) -> str:
+_CLASSES = {name: f"a solution of kind {name}" for name in RECEIVER_STD_M} | {
+    "fix": "an RTK fix", "unknown": "as an RTK fix: the log does not say"
+}  # fmt: skip
+
+
+def _known(node: NodePositions) -> Literal["stated", "assumed", "nothing"]:
+    return "stated" if node.std_m is not None else "assumed" if node.receiver is not None else "nothing"
+
+
+def _sizes(node: NodePositions) -> str:
     sizes = " ".join(f"{100 * std:.2g}" for std in node.std_m or ())
-    return f"{sizes} cm east north up for {node.correlation_s:g} s, said by the {node.stated_by}"
+    return f"{sizes} cm east north up for {node.correlation_s:g} s"
 
 
 def offset_line(
@@ -135,6 +198,7 @@ def offset_line(
         As `PointPaths.of_offset`.
     """
     effect = paths.of_offset(slope * (1.0 if std is None else std), common=common)
+    effect = replace(effect, loss_std_db=math.sqrt(2) * -effect.loss_db)  # of the square of one Gaussian number
     return BudgetLine(cause, None if std is None else f"{std:.3g} {unit}", effect, f"1 {unit}")
 
 
@@ -143,20 +207,21 @@ def summed(effects: Iterable[Effect]) -> Effect:
 
     Examples
     --------
-    >>> summed([Effect(-1.0, 0.03, 0.0), Effect(-0.5, 0.04, 0.1)])
-    Effect(loss_db=-1.5, shift_m=0.05, phase_rad=0.1)
+    >>> summed([Effect(-1.0, 0.03, 0.0, 0.3), Effect(-0.5, 0.04, 0.1, 0.4)])
+    Effect(loss_db=-1.5, shift_m=0.05, phase_rad=0.1, loss_std_db=0.5)
     """
     parts = list(effects)
     return Effect(
         sum(effect.loss_db for effect in parts),
         float(np.hypot.reduce([0.0, *(effect.shift_m for effect in parts)])),
         float(np.hypot.reduce([0.0, *(np.nan_to_num(effect.phase_rad) for effect in parts)])),
+        float(np.hypot.reduce([0.0, *(effect.loss_std_db for effect in parts)])),
     )
 
 
 def expected(lines: Iterable[BudgetLine]) -> Effect:
-    """Return the expected effect of all stated causes together."""
-    return summed(line.effect for line in lines if line.stated is not None)
+    """Return the expected effect of all causes together that are stated, measured or assumed."""
+    return summed(line.effect for line in lines if line.counts)
 
 
 def noise_loss(variance_rad2: float) -> Effect:

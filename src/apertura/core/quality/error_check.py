@@ -26,13 +26,10 @@ class ErrorBound:
         Upper bound with a confidence of 95 %, dB.
     estimate_db
         Unbiased estimate, dB.
-    peak_db
-        Largest difference at the drawn pixels over the image's peak, dB.
     """
 
     bound_db: float
     estimate_db: float
-    peak_db: float
 
 
 def error_bound(
@@ -41,7 +38,6 @@ def error_bound(
     density: NDArray[np.float64],
     *,
     power: float | NDArray[np.float64],
-    peak: float | None = None,
 ) -> ErrorBound:
     """Return the error of a whole image from pixels drawn at random, after one complex gain.
 
@@ -53,8 +49,6 @@ def error_bound(
         (draw,) float64, how often a draw like this takes that pixel on average.
     power
         Σ|I|² over all pixels of the image; or (draw,) float64, |I|² around each draw.
-    peak
-        Largest magnitude of the image; by default of the draws.
 
     Notes
     -----
@@ -81,12 +75,11 @@ def error_bound(
     error = float(errors.sum())
     if not error or total <= largest:
         nothing = _db(0.0 if not error else np.inf)
-        return ErrorBound(nothing, nothing, nothing)
+        return ErrorBound(nothing, nothing)
     spread = np.sqrt(errors.size) * float((errors - error / total * levels).std())
     # the draws may have missed an error as large as the largest, and may have hit the brightest pixel by chance
     above = (error + float(errors.max())) / (total - largest) * np.exp(_SIGMAS * spread / error)
-    top = abs(gain) * (peak if peak is not None else float(np.abs(values).max()))
-    return ErrorBound(_db(above), _db(error / total), _db(float(difference.max()) / top**2))
+    return ErrorBound(_db(above), _db(error / total))
 
 
 def _db(power: float) -> float:
@@ -133,15 +126,12 @@ class Brightness:
     ----------
     power, level
         (tile,) float64, Σ|I|² and Σ|I| over the pixels of each.
-    peak
-        Largest |I|.
     pixels
         Of the whole image.
     """
 
     power: NDArray[np.float64]
     level: NDArray[np.float64]
-    peak: float
     pixels: int
 
     @classmethod
@@ -150,9 +140,9 @@ class Brightness:
         sums = []
         for window in windows:
             level = _level(image[window])
-            sums.append((float((level**2).sum()), float(level.sum()), float(level.max())))
-        power, level, peak = np.array(sums).T
-        return cls(power, level, float(peak.max()), int(np.prod(image.shape)))
+            sums.append((float((level**2).sum()), float(level.sum())))
+        power, level = np.array(sums).T
+        return cls(power, level, int(np.prod(image.shape)))
 
     @property
     def mean_power(self) -> float:
@@ -250,7 +240,7 @@ class Certificate:
         values = values_at(image, pixels)
         density = brightness.density(pixels, values, self.windows, random=len(self.pixels))
         sums = np.concatenate([self.exact, exact])
-        return error_bound(values, sums, density, power=float(brightness.power.sum()), peak=brightness.peak)
+        return error_bound(values, sums, density, power=float(brightness.power.sum()))
 
 
 def _inside(pixels: NDArray[np.int64], window: Window) -> NDArray[np.bool_]:

@@ -192,7 +192,7 @@ def point_focus(contributions: NDArray[np.complex128]) -> PointFocus | None:
         blocks = contributions[: count * pulses].reshape(count, pulses).mean(axis=1)
         amplitude = np.abs(blocks)
         if amplitude.min() > 0:
-            variance = _log_amplitude_variance(np.log(amplitude))
+            variance = log_amplitude_variance(np.log(amplitude))
             if variance <= MOST_INTERFERENCE:
                 best = float(np.abs(np.fft.fft(blocks, _PADDING * count)).max())
                 if abs(complex(blocks.sum())) < LEAST_PEAK_SHARE * best:
@@ -206,7 +206,8 @@ def point_focus(contributions: NDArray[np.complex128]) -> PointFocus | None:
     return None
 
 
-def _log_amplitude_variance(log_amplitude: NDArray[np.float64]) -> float:
+def log_amplitude_variance(log_amplitude: NDArray[np.float64]) -> float:
+    """Return the variance of the log-amplitudes of blocks about their smooth trend: patterns, range and aspect."""
     along = np.linspace(-1, 1, len(log_amplitude))
     trend = np.polynomial.legendre.Legendre.fit(along, log_amplitude, _TREND)(along)
     return float(((log_amplitude - trend) ** 2).sum() / (len(along) - _TREND - 1))

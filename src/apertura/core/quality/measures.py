@@ -27,29 +27,22 @@ class NumericalError:
     ----------
     rms_db
         RMS of the difference over RMS of the reference at those pixels, dB.
-    peak_db
-        Largest difference over the image's peak, dB.
     """
 
     rms_db: float
-    peak_db: float
 
 
-def numerical_error(
-    computed: NDArray[np.complex64], reference: NDArray[np.complex128], *, peak: float | None = None
-) -> NumericalError:
+def numerical_error(computed: NDArray[np.complex64], reference: NDArray[np.complex128]) -> NumericalError:
     """Return the error of pixel values against the reference's.
 
     Parameters
     ----------
     computed, reference
         (pixel,) complex.
-    peak
-        Largest magnitude of the whole image; by default of these pixels.
 
     Notes
     -----
-    Source: docs/theory.md, "Image" (numerical_error_db, peak_error_db).
+    Source: docs/theory.md, "Image" (numerical_error_db).
 
     Examples
     --------
@@ -61,11 +54,7 @@ def numerical_error(
     power = np.vdot(values, values).real
     gain = complex(np.vdot(values, reference) / power) if power else 0j
     difference = np.abs(gain * values - reference)
-    top = abs(gain) * peak if peak is not None else np.abs(reference).max()
-    return NumericalError(
-        _ratio_db(np.sqrt((difference**2).mean()), np.sqrt((np.abs(reference) ** 2).mean())),
-        _ratio_db(difference.max(), top),
-    )
+    return NumericalError(_ratio_db(np.sqrt((difference**2).mean()), np.sqrt((np.abs(reference) ** 2).mean())))
 
 
 def _ratio_db(amplitude: float, against: float) -> float:

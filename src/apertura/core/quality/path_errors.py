@@ -54,11 +54,14 @@ class Effect:
         Shift over ground, metres.
     phase_rad
         At a place on the ground, against a pair without that error; NaN where that is not predicted.
+    loss_std_db
+        Standard deviation of the loss from flight to flight, where the error is random.
     """
 
     loss_db: float
     shift_m: float
     phase_rad: float
+    loss_std_db: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,4 +199,7 @@ class PointPaths:
         kept = np.exp(-(wavenumber**2) * power)
         loss_db = 10 * np.log10(kept + (1 - kept) ** 2 / max(independent, 1.0))
         shift = np.sqrt(max(0.0, float(np.trace(inverse @ covariance @ inverse.T))))
-        return Effect(float(loss_db), float(shift), float(wavenumber * np.sqrt(covariance.mean())))
+        # q is a sum of `independent` squares of equal weight: its deviation is √(2/N) of itself
+        scatter_db = 10 / np.log(10) * wavenumber**2 * power * np.sqrt(2 / max(independent, 1.0))
+        phase_rad = float(wavenumber * np.sqrt(covariance.mean()))
+        return Effect(float(loss_db), float(shift), phase_rad, float(min(scatter_db, -loss_db)))

@@ -1,7 +1,7 @@
 """Point targets in an image: peak, width and sidelobes."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -9,6 +9,9 @@ from numpy.typing import ArrayLike, NDArray
 from apertura.core.quality.measures import BlockRaster
 
 PATCH_PX = 64  # side of a patch, pixels
+
+CUT_REACH_M = 3.0
+"""Metres to both sides of an image's brightest target that its cuts span: main lobe and first sidelobes."""
 
 _REFINEMENTS = 7
 """From one pixel to a grid of 6e-5 pixel in steps of four."""
@@ -198,7 +201,7 @@ def cut_through(
     (0.89, -13.3)
     """
     along, line = line_through(image, peak, direction=direction, spacing_m=spacing_m, reach_m=reach_m)
-    middle = len(along) // 2
+    middle = _summit(line)
     left, right = _first_minimum(line[middle::-1]), _first_minimum(line[middle:])
     lobe = slice(middle - left, middle + right + 1)
     beyond = np.concatenate([line[: lobe.start], line[lobe.stop :]])
@@ -207,6 +210,32 @@ def cut_through(
         10 * float(np.log10(beyond.max() / line[middle])) if beyond.size else float("nan"),
         10 * float(np.log10(beyond.sum() / line[lobe].sum())) if beyond.size else float("nan"),
     )
+
+
+def cuts_report(
+    image: BlockRaster, peak: Peak, *, cross_range: tuple[float, float], spacing_m: float, reach_m: float
+) -> dict[str, float | None]:
+    """Return the cuts through a peak along and across the flight for image.json; None where a line does not hold them.
+
+    Parameters as `cut_through`; `cross_range` is the (east, north) direction of the flight.
+
+    Examples
+    --------
+    >>> x = np.arange(64) - 32.0
+    >>> image = np.outer(np.sinc(x / 8), np.sinc(x / 5)).astype(np.complex64)
+    >>> report = cuts_report(image, Peak(32, 32, 1), cross_range=(1, 0), spacing_m=0.1, reach_m=2.5)
+    >>> [round(report[f"{name}_range_width_m"], 2) for name in ("cross", "ground")]
+    [0.44, 0.71]
+    """
+    cuts = {
+        name: cut_through(image, peak, direction=way, spacing_m=spacing_m, reach_m=reach_m)
+        for name, way in (("cross_range", cross_range), ("ground_range", (cross_range[1], -cross_range[0])))
+    }
+    return {
+        f"{name}_{measure}": None if np.isnan(value) else round(value, 4)
+        for name, cut in cuts.items()
+        for measure, value in asdict(cut).items()
+    }
 
 
 def line_through(
@@ -229,6 +258,15 @@ def line_through(
     east, north = np.array(direction) / np.hypot(*direction)
     line = np.abs(patch.at(peak.row - along * north / spacing_m, peak.column + along * east / spacing_m)) ** 2
     return along, line
+
+
+def _summit(line: NDArray[np.float64]) -> int:
+    """Return the maximum that rises from the middle of a line: a wide lobe is flat there to the last digits."""
+    middle = len(line) // 2
+    for step in (-1, 1):
+        while 0 < middle < len(line) - 1 and line[middle + step] > line[middle]:
+            middle += step
+    return middle
 
 
 def _first_minimum(line: NDArray[np.float64]) -> int:

@@ -1,9 +1,10 @@
-"""RTKLIB solutions (.pos): positions of any of its formats against GPS time, UTC or Japan's time."""
+"""RTKLIB solutions (.pos): read in any of its formats, by GPS time, UTC or Japan's time; written in the usual one."""
 
 import re
+from collections.abc import Sequence
 from itertools import accumulate
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -11,12 +12,12 @@ from numpy.typing import NDArray
 
 from apertura.common.documents import read_text
 from apertura.common.errors import CampaignError, quoted
-from apertura.common.leap_seconds import GPS_EPOCH, utc_from_gps
+from apertura.common.leap_seconds import GPS_EPOCH, gps_from_utc, utc_from_gps
 from apertura.core.geometry.geodesy import ecef_from_geodetic, ned_axes
-from apertura.formats.times import utc_times
+from apertura.formats.times import coarsened, utc_times
 from apertura.formats.tracks.csv_track import LARGEST_LOG, number
 from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions
-from apertura.formats.tracks.track import contradicted, make_track, unstated
+from apertura.formats.tracks.track import FIXES, contradicted, make_track, unstated
 
 _POSITIONS = {
     "geodetic": ("latitude(deg)", "longitude(deg)", "height(m)"),
@@ -257,3 +258,73 @@ def _fix(quality: NDArray[np.float64], path: Path) -> NDArray[np.int8]:
 
 def _error(found: str, path: Path) -> CampaignError:
     return CampaignError(found, where=path, expected=_EXPECTED, remedy=_REMEDY)
+
+
+# ---- Written as RTKLIB itself does by default -----------------------------------------------------------------------
+
+_COLUMNS = """\
+% (lat/lon/height=WGS84/ellipsoidal,Q=1:fix,2:float,3:sbas,4:dgps,5:single,6:ppp,ns=# of satellites)
+{remarks}%  {system:<22}latitude(deg) longitude(deg)  height(m)   Q  ns   sdn(m)   sde(m)   sdu(m)  sdne(m)  sdeu(m)  \
+sdun(m) age(s)  ratio
+"""
+_LEAST_STD_M = 1e-4
+"""Metres, the last digit of a standard deviation: less would be written as 0, which means that none is stated."""
+
+
+def write_rtklib_pos(
+    path: Path,
+    time_utc: NDArray[np.datetime64],
+    geodetic: NDArray[np.float64],
+    *,
+    fix: NDArray[np.integer],
+    std_m: NDArray[np.float64],
+    satellites: int = 0,
+    ratio: float = 0.0,
+    system: Literal["GPST", "UTC"] = "GPST",
+    header: Sequence[str] = (),
+    remarks: Sequence[str] = (),
+) -> None:
+    """Write latitude, longitude and ellipsoidal height as an RTKLIB solution, .pos.
+
+    RTKLIB takes its columns by their places: all of them are written, and what is not known has the value that stands
+    for it.
+
+    Parameters
+    ----------
+    path
+        ``….pos``.
+    time_utc
+        (epoch,) datetime64, UTC; written in `system`, to whole milliseconds or as finely as they are.
+    geodetic
+        (epoch, 3) float64: latitude and longitude (degrees), metres above the ellipsoid; written to micrometres of arc
+        and 10 µm of height.
+    fix
+        (epoch,) of `FIXES`; 0, not known, is written as 5, single: RTKLIB's 0 is an epoch without a solution.
+    std_m
+        (epoch, 3) float64, metres: standard deviations to north, east and up; NaN, not known, is written as 0.
+        Covariances are 0, too.
+    satellites, ratio
+        Of every epoch; 0: not known.
+    header, remarks
+        Lines without their %: the first of the file, and those before the names of the columns. Neither may name
+        columns or time systems.
+
+    Notes
+    -----
+    Source: RTKLIB manual 2.4.2, appendix B.1 "Positioning solution file".
+    """
+    stated = coarsened(gps_from_utc(time_utc) if system == "GPST" else time_utc)
+    known = np.where(std_m > 0, std_m.clip(_LEAST_STD_M), 0.0)  # NaN is not above 0
+    kinds = np.where(fix == 0, FIXES["single"], fix)
+    rest = f"{0:9.4f}{0:9.4f}{0:9.4f}{0:7.2f}{ratio:7.1f}"
+    lines = [f"% {line}".rstrip() for line in header]
+    told = "".join(f"% {line}\n" for line in remarks)
+    lines.append(_COLUMNS.format(remarks=told, system=system).rstrip("\n"))
+    texts = (text.replace("-", "/").replace("T", " ") for text in np.datetime_as_string(stated))
+    for text, place, kind, std in zip(texts, geodetic, kinds, known, strict=True):
+        latitude, longitude, height = place
+        deviations = "".join(f"{one:9.4f}" for one in std)
+        lines.append(
+            f"{text}   {latitude:14.11f} {longitude:15.11f} {height:11.5f} {kind:3d} {satellites:3d}{deviations}{rest}"
+        )
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from apertura.common.arrays import Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.quality.budget import noise_loss
+from apertura.core.quality.focus import LEAST_BLOCKS, MOST_INTERFERENCE, log_amplitude_variance
 from apertura.methods.autofocus.objective import Blocks, PatchEcho, PatchImage, Tracks
 from apertura.methods.autofocus.patches import Patch, bandwidth_hz
 from apertura.methods.autofocus.solve import Problem, State
@@ -86,8 +87,18 @@ def remaining(problem: Problem, state: State) -> Remaining:
 
 # ---- Acceptance of refined tracks -----------------------------------------------------------------------------------
 
-LEAST_GAIN_DB, LEAST_BETTER = 0.3, 0.75
-"""Least contrast (dB) gained by patches that were not fitted, and least share of them that gains, to be accepted."""
+LEAST_GAIN_DB = 0.1
+"""Contrast that places which were not fitted must have gained beyond doubt, dB: less shows in no image."""
+
+DOUBT = 2.0
+"""Standard deviations of the mean gain that are taken off it."""
+
+_SCATTER, _SCATTER_DB, _DEGREES = 0.5, 0.5, 2
+"""Scatter of the gains before it is measured: half of their mean and half a dB, as certain as two places make it. Few
+places are judged by it, many by their own."""
+
+LEAST_FITTED_DB = 0.3
+"""Contrast that places which are points by themselves must gain, dB: a fit to noise at 10 dB a pulse gains 0.1."""
 
 MOST_APART_SIGMA = 4.0
 """Standard deviations of their places by which pairs may disagree on points: more means slipped tracks."""
@@ -99,7 +110,11 @@ _BY_CHANCE = 1e-3  # false alarm rate of the test against the log's stated error
 _SLACK = 1.5  # factor on the variance: the image determines its modes not wholly
 _REACH_CELLS, _STEPS = 3.0, 37  # of the line in range on which a point is searched: cells on either side, samples
 _SLIP_SIGMA = 4.0  # standard deviations from which a shift in range is a slip
-_LEAST_POINTS = 3  # that must agree on the shift of a part of the aperture
+_NEARER, _NEARER_OF_FEW = 0.6, 0.75
+"""Wavelengths: from here a shift is nearer to a whole turn than to none; noise is allowed for, more of few points."""
+_SCATTERING_POINTS, _POINT_STD_CELLS = 3, 0.055
+"""Points from which their scatter says how well a shift is known; and that of one of fewer, in cells c/B of path: a
+point some 20 dB out of the noise of a part."""
 _DOMINATES = 4.0  # peak power of a part's image of a point against the median of a line through it
 _LEAST_SLOPE = 0.05  # of the path over ground: a point illuminated from all sides has no direction of range
 
@@ -119,6 +134,9 @@ class Evidence:
         Shifts of points in range between parts of the aperture.
     wavelength_m
         Of the band's middle.
+    steady
+        Variance of the log-amplitude along the aperture, in the pair where it is least, of the place where it is most:
+        noise of a point that dominates its cell; speckle has 0.4. Infinite where blocks are too few to tell.
     apart_sigma
         How far pairs show points apart that tracks within the log's errors do not bring together, rms, in standard
         deviations of their places.
@@ -130,34 +148,50 @@ class Evidence:
     before: "RangeShifts"
     after: "RangeShifts"
     wavelength_m: float
+    steady: float
     apart_sigma: float
 
     @property
-    def gain_db(self) -> float:
-        """Contrast gained by the patches that were not fitted, mean, dB."""
-        return float(self.held_out_db.mean())
+    def gain(self) -> "MeanGain":
+        """Contrast gained by the patches that were not fitted."""
+        return mean_gain(self.held_out_db)
 
     @property
-    def better(self) -> float:
-        """Share of their images that gained."""
-        return float((self.held_out_db > 0).mean())
+    def believed(self) -> bool:
+        """Whether what was not fitted, or a place that nothing else can explain, shows that the tracks are better."""
+        points = self.steady <= MOST_INTERFERENCE and float(self.fitted_db.mean()) > LEAST_FITTED_DB
+        return self.gain.certain or points
 
     @property
     def accepted(self) -> bool:
         """Whether the tracks are used."""
-        return self.gain_db >= LEAST_GAIN_DB and self.better >= LEAST_BETTER and not self.slip
+        return self.believed and not self.slip
+
+    @property
+    def promising(self) -> bool:
+        """Whether there was anything to gain: where even places that were fitted gained nothing, logs are as good."""
+        return bool(self.slip) or float(self.fitted_db.mean()) > LEAST_GAIN_DB
 
     @property
     def why(self) -> str:
         """In one line."""
+        places = self.fitted_db.shape[1]
         line = (
-            f"{self.held_out_db.size} images of patches that were not fitted gained {self.gain_db:.2f} dB of contrast, "
-            f"{self.better:.0%} of them gained"
+            f"{places} bright {'place' if places == 1 else 'places'} gained {self.fitted_db.mean():.2f} dB of contrast"
         )
+        if self.held_out_db.size:
+            line += f", {self.gain.mean_db:.2f} ± {self.gain.std_db:.2f} dB while they were not fitted"
+        if np.isfinite(self.steady):
+            line += f"; log-amplitudes along the aperture vary by {self.steady:.2f}"
         if self.accepted:
             return line
-        return f"{line}; {LEAST_GAIN_DB:g} dB and {LEAST_BETTER:.0%} are required" + (
-            ", and no slip" if self.slip else ""
+        if self.slip:
+            return f"{line}; {self.slip}"
+        if not self.promising:
+            return f"{line}: the logs are as good"
+        return (
+            f"{line}; required are {LEAST_GAIN_DB:g} dB beyond {DOUBT:g} standard deviations, or places that are "
+            f"points, {MOST_INTERFERENCE:g} at most, and gained {LEAST_FITTED_DB:g} dB"
         )
 
     @cached_property
@@ -174,7 +208,7 @@ class Evidence:
         off_m = float(np.abs(self.after.shift_m[slipped]).max())
         return (
             f"{int(slipped.sum())} of {slipped.size} parts of the apertures see the points up to {off_m:.2f} m of path "
-            f"from where the whole has them; the wavelength is {self.wavelength_m:.2f} m"
+            f"from where most have them; the wavelength is {self.wavelength_m:.2f} m"
         )
 
     @cached_property
@@ -197,7 +231,7 @@ class Evidence:
     @property
     def flags(self) -> dict[str, str]:
         """Edges crossed."""
-        flags = {} if self.accepted else {"refinement_rejected": self.why}
+        flags = {} if self.accepted or not self.promising else {"refinement_rejected": self.why}
         if self.inconsistent:
             flags["prior_inconsistent"] = self.inconsistent
         if self.slip:
@@ -209,14 +243,85 @@ class Evidence:
         """As JSON values."""
         return {
             "gain_fitted_db": round(float(self.fitted_db.mean()), 3),
-            "gain_held_out_db": round(self.gain_db, 3),
-            "held_out_better": round(self.better, 3),
+            **(
+                {"gain_held_out_db": round(self.gain.mean_db, 3), "gain_std_db": round(self.gain.std_db, 3)}
+                if self.held_out_db.size
+                else {"steady": round(self.steady, 4) if np.isfinite(self.steady) else None}
+            ),
             "settled": {"modes": len(self.settled), "power": round(float((self.settled**2).mean()), 3)}
             if len(self.settled)
             else None,
             "apart_sigma": self.apart_sigma,
             "range_shift_m": {"before": self.before.rms_m, "after": self.after.rms_m},
         }
+
+
+@dataclass(frozen=True)
+class MeanGain:
+    """Mean gain of contrast of patches that were not fitted, and its standard deviation, dB; NaN without any."""
+
+    mean_db: float
+    std_db: float
+
+    @property
+    def certain(self) -> bool:
+        """Whether it exceeds what shows, beyond doubt."""
+        return self.mean_db - DOUBT * self.std_db > LEAST_GAIN_DB
+
+
+def mean_gain(held_out_db: Floats) -> MeanGain:
+    """Return the mean of (pair, patch) gains.
+
+    Notes
+    -----
+    Source: docs/theory/autofocus.md, eq. 16a. Pairs of a patch share its neighbours and are one sample.
+
+    Examples
+    --------
+    >>> mean_gain(np.array([[4.0, 5.0, 4.4]])).certain, mean_gain(np.array([[0.6, 0.7]])).certain
+    (True, False)
+    """
+    if not held_out_db.size:
+        return MeanGain(float("nan"), float("nan"))
+    by_patch = held_out_db.mean(axis=0)
+    mean, count = float(by_patch.mean()), by_patch.size
+    expected = _SCATTER_DB**2 + (_SCATTER * mean) ** 2
+    squares = float(((by_patch - mean) ** 2).sum()) + _DEGREES * expected
+    return MeanGain(mean, float(np.sqrt(squares / (count - 1 + _DEGREES) / count)))
+
+
+def unsteady(initial: State, state: State) -> float:
+    """Return the variance of the log-amplitude along the aperture at patches' peaks: least of pairs, most of patches.
+
+    Parameters
+    ----------
+    initial, state
+        Along the logs, and as solved.
+
+    Notes
+    -----
+    Source: docs/theory/focus.md, eq. 1. Blocks are averaged as the logs have them, as `point_focus` averages pulses:
+    phases that are fitted would make averages of speckle steady, whose amplitudes no fit changes.
+    """
+    worst = []
+    for number in range(len(state.images[0])):
+        by_pair = []
+        for logged, images in zip(initial.cached, state.images, strict=True):
+            along = logged[number].values[int(np.abs(images[number]).argmax())].astype(np.complex128)
+            by_pair.append(steadiness(along))
+        worst.append(min(by_pair))
+    return max(worst)
+
+
+def steadiness(along: NDArray[np.complex128]) -> float:
+    """Return the least variance of the log-amplitude of contributions (block,), over averages of 1, 2, 4 … blocks."""
+    least = float("inf")
+    while len(along) >= LEAST_BLOCKS:
+        amplitude = np.abs(along)
+        if amplitude.min() > 0:
+            least = min(least, log_amplitude_variance(np.log(amplitude)))
+        along = along[: len(along) // 2 * 2].reshape(-1, 2).mean(axis=1)
+    return least
 
 
 def gains_db(before: Sequence[Sequence[PatchImage]], after: Sequence[Sequence[PatchImage]]) -> Floats:
@@ -233,20 +338,39 @@ def gains_db(before: Sequence[Sequence[PatchImage]], after: Sequence[Sequence[Pa
 
 @dataclass(frozen=True, eq=False)
 class RangeShifts:
-    """Shifts of points in range between images of parts of the aperture and of the whole.
+    """Shifts of points in range between images of parts of the aperture, from where most parts have them.
 
     Attributes
     ----------
-    shift_m, std_m
-        (pair, part) float64, metres of total path: median over points and its standard deviation; NaN where no
-        point was measured.
-    points
-        (pair, part) int64, how many were measured.
+    by_point_m
+        (pair, patch, part) float64, metres of total path; NaN where the part does not show the point.
+    cell_m
+        Range cell of the pairs, c/B of total path.
     """
 
-    shift_m: Floats
-    std_m: Floats
-    points: NDArray[np.int64]
+    by_point_m: Floats
+    cell_m: float
+
+    @cached_property
+    def points(self) -> NDArray[np.int64]:
+        """(pair, part) int64, how many were measured."""
+        return np.asarray(np.isfinite(self.by_point_m).sum(axis=1), np.int64)
+
+    @cached_property
+    def shift_m(self) -> Floats:
+        """(pair, part) float64, metres of total path: median over points; NaN where no point was measured."""
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # a part without a measured point is NaN
+            return np.asarray(np.nanmedian(self.by_point_m, axis=1), np.float64)
+
+    @cached_property
+    def std_m(self) -> Floats:
+        """(pair, part) float64, its standard deviation, by the scatter of points; of one or two as stated."""
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)
+            spread = 1.4826 * np.nanmedian(np.abs(self.by_point_m - self.shift_m[:, None]), axis=1)
+        few = self.points < _SCATTERING_POINTS
+        return np.where(few, _POINT_STD_CELLS * self.cell_m, spread) / np.sqrt(np.maximum(self.points, 1))
 
     @property
     def rms_m(self) -> float | None:
@@ -257,11 +381,12 @@ class RangeShifts:
     def slipped(self, wavelength_m: float) -> NDArray[np.bool_]:
         """Return (pair, part) bool: parts whose shift is significantly nearer to a whole turn than to none."""
         off = np.abs(self.shift_m)
-        agreed = (self.points >= _LEAST_POINTS) & (self.std_m < wavelength_m / 3 / np.sqrt(np.maximum(self.points, 1)))
-        return np.asarray(agreed & (off > 0.6 * wavelength_m) & (off > _SLIP_SIGMA * self.std_m))
+        nearer = np.where(self.points < _SCATTERING_POINTS, _NEARER_OF_FEW, _NEARER)
+        agreed = (self.points > 0) & (self.std_m < wavelength_m / 2 / np.sqrt(np.maximum(self.points, 1)))
+        return np.asarray(agreed & (off > nearer * wavelength_m) & (off > _SLIP_SIGMA * self.std_m))
 
 
-def range_shifts(problem: Problem, state: State, axes: Floats) -> RangeShifts:
+def range_shifts(problem: Problem, state: State, axes: Floats, *, parts: int = PARTS) -> RangeShifts:
     """Return shifts in range of the brightest point of every patch, by part of the aperture.
 
     Parameters
@@ -270,6 +395,8 @@ def range_shifts(problem: Problem, state: State, axes: Floats) -> RangeShifts:
         As solved.
     axes
         (3, 3) float64, rows are east, north, up.
+    parts
+        Of the aperture.
 
     Notes
     -----
@@ -278,31 +405,38 @@ def range_shifts(problem: Problem, state: State, axes: Floats) -> RangeShifts:
     """
     pairs = zip(problem.pairs, problem.echoes, state.images, strict=True)
     by_part = [
-        [_by_part(blocks, echo, image, state.tracks, axes) for echo, image in zip(echoes, images, strict=True)]
+        [_by_part(blocks, echo, image, state.tracks, axes, parts) for echo, image in zip(echoes, images, strict=True)]
         for blocks, echoes, images in pairs
     ]
-    shifts = np.array(by_part).reshape(len(problem.pairs), -1, PARTS)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # a part without a measured point is NaN
-        middle = np.nanmedian(shifts, axis=1)
-        spread = 1.4826 * np.nanmedian(np.abs(shifts - middle[:, None]), axis=1)
-    count = np.isfinite(shifts).sum(axis=1)
-    return RangeShifts(middle, np.where(count > 2, spread / np.sqrt(np.maximum(count, 1)), np.inf), count)
+    cell_m = max(SPEED_OF_LIGHT_M_S / bandwidth_hz(blocks.record.profiles) for blocks in problem.pairs)
+    wavelength_m = SPEED_OF_LIGHT_M_S / problem.pairs[0].record.profiles.centre_frequency_hz
+    shifts_m = np.array(by_part).reshape(len(problem.pairs), -1, parts)
+    return RangeShifts(shifts_m - _of_most(shifts_m, wavelength_m / 4), cell_m)
 
 
-def _by_part(blocks: Blocks, echo: PatchEcho, image: NDArray[np.complex64], tracks: Tracks, axes: Floats) -> Floats:
+def _of_most(shifts_m: Floats, within_m: float) -> Floats:
+    """Return (pair, patch, 1), the mean of the most parts that agree; a pixel, and the phase, lie off the delay."""
+    near = np.abs(shifts_m[..., None] - shifts_m[..., None, :]) < within_m
+    most = np.take_along_axis(near, near.sum(axis=-1).argmax(axis=-1)[..., None, None], axis=-2)[..., 0, :]
+    total = np.where(most, shifts_m, 0.0).sum(axis=-1, keepdims=True)
+    return np.asarray(total / np.maximum(most.sum(axis=-1, keepdims=True), 1), np.float64)
+
+
+def _by_part(
+    blocks: Blocks, echo: PatchEcho, image: NDArray[np.complex64], tracks: Tracks, axes: Floats, parts: int
+) -> Floats:
     """Return (part,) float64, metres of total path by which each part's image shows a point farther; NaN if not."""
-    nothing = np.full(PARTS, np.nan)
+    nothing = np.full(parts, np.nan)
     place = echo.patch.pixels_m[int(np.abs(image).argmax())]
     slope = blocks.aperture.path_gradient(place).mean(axis=0)
     level = axes[:2].T @ (axes[:2] @ slope)
     steep = float(level @ slope)
-    if steep < _LEAST_SLOPE or len(echo.profiles) < PARTS:
+    if steep < _LEAST_SLOPE or len(echo.profiles) < parts:
         return nothing
     further = np.linspace(-_REACH_CELLS, _REACH_CELLS, _STEPS) * SPEED_OF_LIGHT_M_S / bandwidth_hz(echo.profiles)
     line = Patch(echo.patch.place_m, place + further[:, None] / steep * level)
     values = blocks.contribution(replace(echo, patch=line), blocks.moves(tracks)).values
-    ends = np.linspace(0, values.shape[1], PARTS + 1).astype(np.int64)[:-1]
+    ends = np.linspace(0, values.shape[1], parts + 1).astype(np.int64)[:-1]
     power = np.abs(np.add.reduceat(values, ends, axis=1)).astype(np.float64) ** 2
     peak = np.clip(power.argmax(axis=0), 1, _STEPS - 2)
     left, middle, right = (np.take_along_axis(power, (peak + step)[None], 0)[0] for step in (-1, 0, 1))

@@ -1,7 +1,7 @@
 """Patches of the scene about bright places: which places may be points, and the pixels about each."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -22,9 +22,6 @@ from apertura.methods.autofocus.inputs import PairRecord, Refinement, TrackError
 
 MOST_PATCHES, CLEAR = 32, 20.0
 """Most patches; and peak to surroundings, power: patches are taken until their sum is that of a dozen such points."""
-
-LEAST_PATCHES = 4
-"""With fewer, none would be left for validation."""
 
 MOST_VALUES = 2**27
 """Complex values, a gigabyte, of what blocks add to patches: with more, fewer patches are used."""
@@ -136,7 +133,7 @@ def count_in_memory(values: Sequence[int]) -> int:
     >>> count_in_memory([2**24] * 32)
     8
     """
-    return max(int((np.cumsum(values) <= MOST_VALUES).sum()), min(LEAST_PATCHES, len(values)))
+    return max(int((np.cumsum(values) <= MOST_VALUES).sum()), min(1, len(values)))
 
 
 def bandwidth_hz(profiles: Profiles) -> float:
@@ -173,13 +170,17 @@ LEAST_RATIO = 5.0
 HELPFUL_RATIO = 3.5
 """The same of weaker places that are used as well where there are points."""
 
-_LEAST_RATIO_SUM = 40.0  # sum over all points, each up to CLEAR: a few faint ones may be speckle
 _SHARE_OF_CLEAREST = 0.05  # beside clear points faint places are their sidelobes
 _APART = 0.6  # least distance of patches, in halves of a patch
 
-MOST_LOOKS = 24
-"""Parts of the aperture: each as long as an error lasts, or longer."""
+MOST_LOOKS = 128
+"""Parts of the aperture, at most: the shorter, the coarser their images."""
 
+REFINED_LOOKS = 4
+"""Parts of the aperture once tracks are refined: long parts separate neighbours, several average their sidelobes."""
+
+_BLURRED_RAD2 = 3.0  # growth of the phase errors' variance over a part: its image keeps most of a point's power
+_BY_CHANCE = 1e-3  # that speckle anywhere in the scene passes for a point
 _SIDE_PX = 512  # of parts of the image formed at once
 _ABOUT_CELLS = 12  # of range: radius of the surroundings
 _SIDELOBES = 1e-3  # of the brightest: fainter places may be its sidelobes
@@ -206,37 +207,96 @@ class Candidates:
 
     @classmethod
     def of(
-        cls, records: Sequence[PairRecord], grid: SceneGrid, terrain: Terrain, errors: Mapping[str, TrackErrors]
+        cls,
+        records: Sequence[PairRecord],
+        grid: SceneGrid,
+        terrain: Terrain,
+        errors: Mapping[str, TrackErrors],
+        *,
+        looks: int | None = None,
     ) -> "Candidates":
-        """Return those of a scene, from all pairs and the error statistics of each node's log."""
+        """Return those of a scene.
+
+        Parameters
+        ----------
+        records
+            Of every pair.
+        grid, terrain
+            The scene.
+        errors
+            Node → error statistics of its log.
+        looks
+            Parts of the aperture; by default of those that the logs' errors may require the shortest that show half as
+            many bright places as any.
+        """
         correlation_s = min(one.correlation_s for one in errors.values())
-        places_m, ratio = bright_places(records, grid, terrain, correlation_s=correlation_s)
-        axes, points = east_north_up(grid, places_m), int((ratio > LEAST_RATIO).sum())
-        information = float(np.minimum(ratio[ratio > LEAST_RATIO], CLEAR).sum())
-        if points < LEAST_PATCHES or information < _LEAST_RATIO_SUM:
-            return cls([], points, axes)
+        seen = [
+            (
+                *bright_places(records, grid, terrain, looks=some),
+                least_ratio(some * len(records), grid.shape[0] * grid.shape[1]),
+            )
+            for some in ([looks] if looks else looks_of(records, errors))
+        ]
+        clear = [float(np.minimum(ratio[ratio > least], CLEAR).sum()) for _, ratio, least in seen]
+        places_m, ratio, least = next(one for one, sum_ in zip(seen, clear, strict=True) if 2 * sum_ >= max(clear))
+        axes = east_north_up(grid, places_m)
+        points = int((ratio > least).sum())
+        if not points:
+            return cls([], 0, axes)
         typical = patch_at(places_m[0], records, axes, correlation_s=correlation_s)
         apart_m = _APART * float(np.abs((typical.pixels_m - typical.place_m) @ axes[:2].T).max())
-        helpful = ratio > max(HELPFUL_RATIO, _SHARE_OF_CLEAREST * float(ratio.max()))
+        helpful = ratio > max(min(HELPFUL_RATIO, least), _SHARE_OF_CLEAREST * float(ratio.max()))
         chosen = separated(places_m[helpful], ratio[helpful], axes, apart_m=apart_m)
         return cls([patch_at(place, records, axes, correlation_s=correlation_s) for place in chosen], points, axes)
 
     def rejected(self, errors: Mapping[str, TrackErrors], by_speckle: Refinement | None = None) -> Refinement:
-        """Return a rejected refinement: too few points, and why speckle does not do; no node is moved."""
-        line = (
-            f"{self.points} places of the scene stand {10 * np.log10(LEAST_RATIO):.0f} dB out of what lies about them; "
-            f"{LEAST_PATCHES} are needed, twice as many where none stands out more"
-        )
+        """Return a rejected refinement: no bright place, and why speckle does not do; no node is moved."""
+        line = f"no place of the scene stands {10 * np.log10(LEAST_RATIO):.0f} dB out of what lies about it"
         report: dict[str, Any] = {"patches": self.points}
         if by_speckle is not None:
             line, report = f"{line}; {by_speckle.why}", {**report, "speckle": dict(by_speckle.report)}
         still = TrackCorrection(np.zeros(1), {node: np.zeros((1, 3)) for node in errors})
         std_m = {node: one.along(self.axes)[None] for node, one in errors.items()}
-        return Refinement(still, std_m, False, line, report, {"refinement_too_few_patches": line})
+        return Refinement(still, std_m, False, line, report, {"refinement_no_bright_place": line})
+
+
+def looks_of(records: Sequence[PairRecord], errors: Mapping[str, TrackErrors]) -> list[int]:
+    """Return into how many parts the aperture may be cut, shortest parts first.
+
+    Notes
+    -----
+    Source: docs/theory/autofocus.md, eq. 10a: from parts over which the variance of the errors' phase grows by three,
+    and whose images nothing blurs, to parts as long as an error lasts, whose images hold more of a point against
+    clutter.
+    """
+    spans_s, shortest_s, longest_s = [], [], []
+    for one in records:
+        wavenumber = 2 * np.pi * one.profiles.centre_frequency_hz / SPEED_OF_LIGHT_M_S
+        of_nodes = [errors[node] for node in one.nodes]
+        turned = 2 * wavenumber * max(max(error.std_m) for error in of_nodes)
+        longest_s.append(min(error.correlation_s for error in of_nodes))
+        shortest_s.append(longest_s[-1] * min(1.0, _BLURRED_RAD2 / (2 * turned**2)))
+        spans_s.append(float(one.time_s[-1] - one.time_s[0]))
+    most, least = (int(np.clip(max(spans_s) / max(min(one), 1e-9), 1, MOST_LOOKS)) for one in (shortest_s, longest_s))
+    steps = max(1, int(np.ceil(np.log2(most / least)))) if most > least else 0
+    return [round(most * (least / most) ** (step / max(steps, 1))) for step in range(steps + 1)]
+
+
+def least_ratio(looks: int, cells: int) -> float:
+    """Return the power over the mean that speckle, averaged over looks, exceeds in one scene of a thousand.
+
+    Examples
+    --------
+    >>> [round(least_ratio(looks, 10_000), 1) for looks in (1, 4, 30)]
+    [16.1, 6.0, 5.0]
+    """
+    from scipy.stats import gamma  # slow to import
+
+    return max(LEAST_RATIO, float(gamma.isf(_BY_CHANCE / cells, looks)) / looks)
 
 
 def bright_places(
-    records: Sequence[PairRecord], grid: SceneGrid, terrain: Terrain, *, correlation_s: float
+    records: Sequence[PairRecord], grid: SceneGrid, terrain: Terrain, *, looks: int
 ) -> tuple[Floats, Floats]:
     """Return places brighter than their surroundings in the images of all pairs, and by how much.
 
@@ -246,8 +306,8 @@ def bright_places(
         Of every pair.
     grid, terrain
         The scene.
-    correlation_s
-        How long an error of the tracks lasts.
+    looks
+        Parts of the aperture whose images are summed.
 
     Returns
     -------
@@ -259,7 +319,8 @@ def bright_places(
     Notes
     -----
     Source: docs/theory/autofocus.md, "Patches". Power is summed over images of parts of the aperture, on every
-    so many-th pixel of the grid; a part as long as an error lasts is focused whatever the error.
+    so many-th pixel of the grid; a part that is short against the errors is focused whatever they are. Pulses of a part
+    have Hann weights: sidelobes across the line of sight, which would pass for points, fall below −31 dB.
     """
     from scipy.ndimage import maximum_filter, median_filter  # slow to import
 
@@ -272,7 +333,7 @@ def bright_places(
         for part in _parts(len(rows), len(columns)):
             row, column = np.meshgrid(rows[part[0]], columns[part[1]], indexing="ij")
             places = terrain.positions_at(grid, row, column)
-            image[part] = sum(np.abs(look).astype(np.float64) ** 2 for look in _looks(one, places, correlation_s))
+            image[part] = sum(np.abs(look).astype(np.float64) ** 2 for look in _looks(one, places, looks))
         power += image / max(float(np.nanmean(image)), 1e-300)
     power = np.nan_to_num(power)
     reach = max(3, round(_ABOUT_CELLS * cell_m / (step * grid.spacing_m)))
@@ -301,13 +362,15 @@ def _parts(rows: int, columns: int) -> Iterator[tuple[slice, slice]]:
             yield slice(row, row + _SIDE_PX), slice(column, column + _SIDE_PX)
 
 
-def _looks(one: PairRecord, places: Floats, correlation_s: float) -> Iterator[NDArray[np.complex64]]:
-    """Yield the image of each part of the aperture."""
+def _looks(one: PairRecord, places: Floats, looks: int) -> Iterator[NDArray[np.complex64]]:
+    """Yield the image of each part of the aperture: parts of equal length, half of each in the next, Hann weights."""
     engine = load_engine("native")
     if not engine.available():
         engine = load_engine("numba")
-    spans_s = float(one.time_s[-1] - one.time_s[0])
-    count = int(np.clip(spans_s / max(correlation_s, 1e-9), 1, MOST_LOOKS))
-    for pulses in one.profiles.aperture.blocks(count):
-        beams = None if one.beams is None else one.beams[pulses]
-        yield engine.form(engine.prepare(one.profiles[pulses]), places, beams=beams)
+    ends = np.linspace(0, len(one.time_s), looks + 2 if looks > 1 else 2).astype(int)
+    for first, last in zip(ends, ends[2:] if looks > 1 else ends[1:], strict=False):
+        pulses = slice(int(first), int(last))
+        part = one.profiles[pulses]
+        taper = np.hanning(last - first + 2)[1:-1, None].astype(np.float32)
+        part = replace(part, samples=np.asarray(part.samples) * taper)
+        yield engine.form(engine.prepare(part), places, beams=None if one.beams is None else one.beams[pulses])

@@ -12,13 +12,15 @@ from apertura.core.focus.contributions import block_contributions
 from apertura.core.geometry.phase_centres import TrackCorrection
 from apertura.core.quality.budget import NodePositions, position_lines
 from apertura.core.quality.path_errors import Effect, PointPaths
-from apertura.methods.autofocus.evidence import LEAST_BETTER, LEAST_GAIN_DB, MOST_RATIO, gains_db
+from apertura.methods.autofocus.evidence import MOST_RATIO, gains_db, mean_gain
 from apertura.methods.autofocus.inputs import PairRecord, Refinement, TrackErrors
 from apertura.methods.autofocus.objective import PatchImage
 from apertura.methods.autofocus.one_phase import METHODS, Patches
-from apertura.methods.autofocus.patches import LEAST_PATCHES, Candidates, Patch, bandwidth_hz, count_in_memory
+from apertura.methods.autofocus.patches import Candidates, Patch, bandwidth_hz, count_in_memory
 
-_FOLDS = 4  # of cross-validation: each part of the patches is left out of one fit
+FOLDS = 4
+"""Of cross-validation: each part of the patches is left out of one fit. Tracks are refined where there are fewer."""
+
 _APART_CELLS = 2.0  # of range, c/B of total path: patches nearer than that share noise
 _BLOCKS_PER_CORRELATION_TIME = 10  # at least
 _BETWEEN_BLOCKS_RAD2 = 0.1  # by which an error grows from block to block: linear between them, an eighth is left
@@ -50,15 +52,14 @@ def refine_one_phase(
     are returned.
     No node is moved: its position errors remain those of its log.
     """
-    if len(found.patches) < LEAST_PATCHES:
+    if not found.patches:
         return found.rejected(errors)
     fits = [_Pair.of(record, found.patches, errors).fitted(method) for record in records]
     gain_db = np.concatenate([fit.gain_db for fit in fits])
-    better = float((gain_db > 0).mean())
-    accepted = bool(gain_db.mean() >= LEAST_GAIN_DB and better >= LEAST_BETTER)
+    gain = mean_gain(gain_db[None])
     why = (
-        f"{gain_db.size} images of patches, each while it was not fitted, gained {gain_db.mean():.2f} dB of contrast, "
-        f"{better:.0%} of them gained"
+        f"{gain_db.size} images of patches, each while it was not fitted, gained {gain.mean_db:.2f} ± "
+        f"{gain.std_db:.2f} dB of contrast"
     )
     knots_s = np.unique(np.concatenate([fit.time_s for fit in fits]))  # each pair's own: nothing is smoothed
     correction = TrackCorrection(
@@ -70,11 +71,13 @@ def refine_one_phase(
     report = {
         "method": method,
         "patches": len(found.patches),
-        "gain_held_out_db": round(float(gain_db.mean()), 3),
-        "held_out_better": round(better, 3),
+        "gain_held_out_db": round(gain.mean_db, 3),
+        "gain_std_db": round(gain.std_db, 3),
         **_left(fits, [_of_logs(record, found, errors) for record in records]),
     }
-    return Refinement(correction, std_m, accepted, why, report, {} if accepted else {"refinement_rejected": why})
+    return Refinement(
+        correction, std_m, gain.certain, why, report, {} if gain.certain else {"refinement_rejected": why}
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,8 +140,8 @@ class _Pair:
 
         Of offsets fitted to all patches and to parts of them those are taken that all patches gain most by.
         """
-        folds, before = np.arange(len(self.cached)) % _FOLDS, self.statistics()
-        parts = [self.apart(folds == fold) for fold in range(_FOLDS)]
+        folds, before = np.arange(len(self.cached)) % FOLDS, self.statistics()
+        parts = [self.apart(folds == fold) for fold in range(FOLDS)]
         phases = [self.phases(method, fitted) for fitted in (*parts, np.ones_like(parts[0]))]
         gain_db = np.array([gains_db([before], [self.statistics(phase)])[0] for phase in phases])
         phase = phases[int(gain_db.mean(axis=1).argmax())]

@@ -11,25 +11,35 @@ from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import Terrain
 from apertura.methods.autofocus.evidence import (
-    MOST_APART_SIGMA,
     MOST_RATIO,
+    PARTS,
     Evidence,
     gains_db,
+    mean_gain,
     range_shifts,
     remaining,
+    unsteady,
 )
 from apertura.methods.autofocus.inputs import NodePrior, PairRecord, Prior, ReferencePoint, Refinement, TrackErrors
 from apertura.methods.autofocus.objective import Blocks, PatchEcho, PatchImage, Tracks
 from apertura.methods.autofocus.patches import (
-    LEAST_PATCHES,
     MOST_VALUES,
+    REFINED_LOOKS,
     Candidates,
     Patch,
     bandwidth_hz,
     count_in_memory,
     patch_at,
 )
-from apertura.methods.autofocus.solve import Gauge, Problem, State, effects, find_gauge, prominent_point_start
+from apertura.methods.autofocus.solve import (
+    Gauge,
+    Problem,
+    State,
+    effects,
+    find_gauge,
+    prominent_point_start,
+    unslipped_start,
+)
 from apertura.methods.autofocus.speckle import SpeckleTiles, refined_by_speckle, tiles
 
 # ---- Gauge fixed by points common to pairs and by reference points --------------------------------------------------
@@ -38,6 +48,7 @@ from apertura.methods.autofocus.speckle import SpeckleTiles, refined_by_speckle,
 _LEAST_RATIO = 30.0  # peak power of a point over its surroundings, for a measured place
 _LEAST_STD_M = 0.01  # of a point's place between pairs: bistatic scattering centres differ
 _ZOOMS, _SIDE = 3, 9  # of the search for a point's place: rounds, samples along a side
+_MEDIAN_OF_TWO = 2 * np.log(2)  # of the sum of two squared standard normal values
 _ROUNDS = 3  # of least squares in the gauge, linearised anew
 
 
@@ -80,7 +91,7 @@ def fix_gauge(
         matrix, residuals = _pair_residuals(problem, tracks, axes)
         rows, errors_sigma, measured = _reference_residuals(problem, points, echoes, tracks, axes)
         if not number:
-            report = {"pairs_apart_sigma": _rms(residuals)} | ({"reference_points": measured} if points else {})
+            report = {"pairs_apart_sigma": _apart(residuals)} | ({"reference_points": measured} if points else {})
         matrix, residuals = np.concatenate([matrix, rows]), np.concatenate([residuals, errors_sigma])
         normal = matrix.T @ matrix + np.eye(len(step))
         step = np.asarray(np.linalg.solve(normal, matrix.T @ (matrix @ step - residuals)), np.float64)
@@ -93,12 +104,12 @@ def pair_disagreement(problem: Problem, tracks: Tracks, axes: Floats) -> tuple[f
     Returns
     -------
     tuple
-        Half of it, as an objective; and the rms of what pairs are still apart, in standard deviations.
+        Half of it, as an objective; and how far pairs are still apart, in standard deviations.
     """
     matrix, residuals = _pair_residuals(problem, tracks, axes)
     step = np.linalg.solve(matrix.T @ matrix + np.eye(matrix.shape[1]), -matrix.T @ residuals)
     left = residuals + matrix @ step
-    return 0.5 * float(step @ step + left @ left), _rms(left)
+    return 0.5 * float(step @ step + left @ left), _apart(left)
 
 
 def _pair_residuals(problem: Problem, tracks: Tracks, axes: Floats) -> tuple[Floats, Floats]:
@@ -177,9 +188,15 @@ def _cell_m(echo: PatchEcho) -> float:
     return SPEED_OF_LIGHT_M_S / bandwidth_hz(echo.profiles) / 2
 
 
-def _rms(residuals: Floats) -> float:
-    """Return the rms of how far pairs are apart, in standard deviations; 0 where there is nothing to compare."""
-    return round(float(np.sqrt((residuals**2).sum() / max(residuals.size, 1))), 3)
+def _apart(residuals: Floats) -> float:
+    """Return how far pairs are apart, in standard deviations, from two residuals a point; 0 where there is none.
+
+    By the median over points: two neighbours in a patch, of which either pair shows another, are one point.
+    """
+    if not residuals.size:
+        return 0.0
+    squared = (residuals.reshape(-1, 2) ** 2).sum(axis=1)
+    return round(float(np.sqrt(np.median(squared) / _MEDIAN_OF_TWO)), 3)
 
 
 # ---- Refinement of a flight's tracks --------------------------------------------------------------------------------
@@ -192,7 +209,19 @@ _KNOTS_PER_CORRELATION_TIME = 10  # of corrections, by the shortest correlation 
 _LEAST_KNOTS = 64  # of a flight
 _FEW = 8  # patches: with fewer, each quarter is left out of one fit
 _LOST_TO_TIES_DB = 0.1  # contrast that fixing the gauge may cost
+_SLIPS = 3  # searches from delays where parts of the tracks are a wavelength off
 _STAGES = 3  # of caching contributions and sharpening
+
+MOST_ROUNDS = 4
+"""Of searching the refined image for bright places, which errors may have hidden, and refining with them all."""
+
+LEAST_FURTHER_DB = 0.05
+"""Contrast that places which were not fitted must gain on the round before, for another round."""
+
+_BETWEEN_KNOTS_RAD2 = 0.05
+"""Variance of the phase that errors make between knots: 0.2 dB."""
+
+_MOST_KNOTS_PER_CORRELATION_TIME = 32  # which 4 cm at L-band want; what errors beyond leave is said in the budget
 
 
 def refine(
@@ -220,29 +249,67 @@ def refine(
     -----
     Source: docs/theory/autofocus.md. A rejected refinement keeps its corrections; images are formed without them.
     """
-    search = TrackSearch.begin(records, grid, terrain, errors)
-    if len(search.problem.patches) < LEAST_PATCHES:
-        by_speckle = search.by_speckle(grid, terrain, errors)
-        return (
-            by_speckle
-            if by_speckle is not None and by_speckle.accepted
-            else search.candidates.rejected(errors, by_speckle)
-        )
-    state, evidence = search.solve()
+    begun = TrackSearch.begin(records, grid, terrain, errors)
+    best = begun.rounds(grid, terrain, errors) if begun.problem.patches else None
+    if best is None or not (best.evidence.accepted or len(best.search.problem.patches) >= _FEW):
+        by_speckle = begun.by_speckle(grid, terrain, errors)
+        if by_speckle is not None and by_speckle.accepted:
+            return by_speckle
+        if best is None:
+            return begun.candidates.rejected(errors, by_speckle)
+    search, state, evidence = best.search, best.state, best.evidence
     left = remaining(search.problem, state)
     unknowns, ties = search.fix_gauge(state, reference_points, apart_sigma=evidence.apart_sigma)
-    report = {**evidence.report, **left.report, **ties, "patches": len(search.problem.patches)}
+    report = {**evidence.report, **left.report, **ties, "patches": len(search.problem.patches), "rounds": best.number}
     correction = search.problem.correction(unknowns)
     return Refinement(correction, left.std_m, evidence.accepted, evidence.why, report, evidence.flags)
 
 
 @dataclass(frozen=True, eq=False)
+class Round:
+    """Tracks fitted to the bright places that were visible from the tracks of the round before.
+
+    Attributes
+    ----------
+    search
+        The problem of these places.
+    state, evidence
+        Tracks fitted to all of them; what those show that were not fitted.
+    further_db
+        Contrast that places gained, while they were not fitted, on the tracks of the round before; 0 in the first.
+    number
+        Of rounds so far.
+    """
+
+    search: "TrackSearch"
+    state: State
+    evidence: Evidence
+    further_db: float
+    number: int = 1
+
+
+@dataclass(frozen=True, eq=False)
 class TrackSearch:
-    """The problem, and its initial state along the logs."""
+    """The problem, its state along the logs, and that of the round before.
+
+    Attributes
+    ----------
+    problem
+        Pairs, patches, prior.
+    candidates
+        Bright places.
+    initial
+        The patches imaged along the logs.
+    before
+        The same along the tracks of the round before; None in the first.
+    wavelength_m
+        Of the band's middle.
+    """
 
     problem: Problem
     candidates: Candidates
     initial: State
+    before: State | None
     wavelength_m: float
 
     @classmethod
@@ -254,37 +321,92 @@ class TrackSearch:
         knots_s = _knots(records, errors)
         prior = Prior({node: NodePrior.of(one, knots_s, candidates.axes) for node, one in sorted(errors.items())})
         pairs = [Blocks.of(record, knots_s) for record in records]
-        echoes = [blocks.echoes(candidates.patches) for blocks in pairs]
-        problem = Problem(pairs, echoes, knots_s, prior, Gauge.none(prior.size))
-        values = [sum(one.values for one in of_pairs) for of_pairs in zip(*echoes, strict=True)]
-        problem = problem.of(range(count_in_memory(values)))
-        initial = problem.state(np.zeros(prior.size))
-        if len(problem.patches) >= LEAST_PATCHES:
-            problem = replace(problem, gauge=find_gauge(pairs, initial.cached, prior, knots_s, candidates.axes))
         wavelength_m = SPEED_OF_LIGHT_M_S / records[0].profiles.centre_frequency_hz
-        return cls(problem, candidates, initial, wavelength_m)
+        return cls._over(Problem(pairs, [], knots_s, prior, Gauge.none(prior.size)), candidates, None, wavelength_m)
+
+    @classmethod
+    def _over(
+        cls, problem: Problem, candidates: Candidates, unknowns: Floats | None, wavelength_m: float
+    ) -> "TrackSearch":
+        """Return the search over some patches; `unknowns` of the round before."""
+        pairs, prior = problem.pairs, problem.prior
+        echoes = [blocks.echoes(candidates.patches) for blocks in pairs]
+        values = [sum(one.values for one in of_pairs) for of_pairs in zip(*echoes, strict=True)]
+        problem = replace(problem, echoes=echoes).of(range(count_in_memory(values)))
+        initial = problem.state(np.zeros(prior.size))
+        before = None if unknowns is None else problem.state(unknowns)
+        if problem.patches:
+            gauge = find_gauge(pairs, (before or initial).cached, prior, problem.knots_s, candidates.axes)
+            problem = replace(problem, gauge=gauge)
+        return cls(problem, candidates, initial, before, wavelength_m)
+
+    def again(
+        self, state: State, grid: SceneGrid, terrain: Terrain, errors: Mapping[str, TrackErrors]
+    ) -> "TrackSearch | None":
+        """Return the search over the places that are bright in the image of refined tracks; None where none is."""
+        correction = self.problem.correction(state.unknowns)
+        refined = [replace(blocks.record, profiles=blocks.record.moved(correction)) for blocks in self.problem.pairs]
+        candidates = Candidates.of(refined, grid, terrain, errors, looks=REFINED_LOOKS)
+        if not candidates.patches or self._known(candidates):
+            return None
+        return self._over(self.problem, candidates, state.unknowns, self.wavelength_m)
+
+    def rounds(self, grid: SceneGrid, terrain: Terrain, errors: Mapping[str, TrackErrors]) -> Round:
+        """Return the last round that was worth it."""
+        best = self.solve()
+        while best.number < MOST_ROUNDS:
+            search = best.search.again(best.state, grid, terrain, errors)
+            if search is None:
+                break
+            found = replace(search.solve(), number=best.number + 1)
+            if found.further_db < -LEAST_FURTHER_DB:
+                break
+            best = found
+            if found.further_db < LEAST_FURTHER_DB:
+                break
+        return best
+
+    def _known(self, candidates: Candidates) -> bool:
+        """Return whether some bright places are those of this round: each in a patch of its own."""
+        patches = self.problem.patches
+        if len(patches) != len(candidates.patches):
+            return False
+        apart_m = np.linalg.norm(
+            np.array([one.place_m for one in candidates.patches])[:, None] - np.array([one.place_m for one in patches]),
+            axis=2,
+        )
+        half_m = [float(np.linalg.norm(one.pixels_m - one.place_m, axis=1).max()) / 2 for one in patches]
+        nearest = apart_m.argmin(axis=1)
+        return len({*nearest.tolist()}) == len(patches) and bool(
+            (apart_m.min(axis=1) < np.array(half_m)[nearest]).all()
+        )
 
     @property
     def axes(self) -> Floats:
         """(3, 3) float64, rows are east, north, up."""
         return self.candidates.axes
 
-    def solve(self) -> tuple[State, Evidence]:
+    def solve(self) -> Round:
         """Return the tracks fitted to all patches, and the evidence of patches that were not fitted."""
         problem, initial = self.problem, self.initial
         held_out_db = np.full((len(problem.pairs), len(problem.patches)), np.nan)
+        further_db = np.full_like(held_out_db, np.nan)
         everything, fold = np.ones(len(problem.patches), bool), np.arange(len(problem.patches)) % FOLDS
         few = len(problem.patches) < _FEW
-        states = [] if not few else [self._fitted(everything)]
-        for number in range(FOLDS if few else 1):
-            fitted = fold != (number + 2) % FOLDS
-            states.append(self._fitted(fitted))
-            held_out_db[:, ~fitted] = gains_db(initial.statistics, states[-1].statistics)[:, ~fitted]
-        lowest = self._lowest(states, everything)
-        state = problem.sharper(lowest, everything)
+        lowest = self.before if len(problem.patches) > 1 else self._fitted(everything)
+        for number in range(min(FOLDS, len(problem.patches)) if len(problem.patches) > 1 else 0):
+            fitted = fold != (number + 2) % min(FOLDS, len(problem.patches))
+            state = self._fitted(fitted)
+            held_out_db[:, ~fitted] = gains_db(initial.statistics, state.statistics)[:, ~fitted]
+            if self.before is not None:
+                further_db[:, ~fitted] = gains_db(self.before.statistics, state.statistics)[:, ~fitted]
+            lowest = self._lowest([state] if lowest is None else [lowest, state], everything)
+            if not few and mean_gain(held_out_db[:, np.isfinite(held_out_db[0])]).certain:
+                break
+        assert lowest is not None  # one place is fitted, of more some are
+        state = problem.sharper(lowest, everything, stages=_STAGES - 1 if few else 1)
+        state = self._unslipped(state, everything)
         apart_sigma = self._apart_sigma(state)
-        if apart_sigma > MOST_APART_SIGMA:
-            state, apart_sigma = lowest, self._apart_sigma(lowest)
         known = 2 * sum(min(one.ratio, MOST_RATIO) for statistics in state.statistics for one in statistics)
         evidence = Evidence(
             fitted_db=gains_db(initial.statistics, state.statistics),
@@ -293,9 +415,11 @@ class TrackSearch:
             before=range_shifts(problem, initial, self.axes),
             after=range_shifts(problem, state, self.axes),
             wavelength_m=self.wavelength_m,
+            steady=unsteady(initial, state),
             apart_sigma=apart_sigma,
         )
-        return state, evidence
+        measured = np.isfinite(further_db)
+        return Round(self, state, evidence, float(further_db[measured].mean()) if measured.any() else 0.0)
 
     def fix_gauge(
         self, state: State, points: Sequence[ReferencePoint], *, apart_sigma: float
@@ -321,11 +445,28 @@ class TrackSearch:
         best = self._lowest([problem.sharper(start, used) for start in starts], used)
         return problem.sharper(best, used, stages=_STAGES - 1)
 
+    def _unslipped(self, state: State, used: Bools) -> State:
+        """Return the tracks, searched again from where delays put them while parts of them are a wavelength off."""
+        problem = self.problem
+        for _ in range(_SLIPS):
+            before = range_shifts(problem, state, self.axes)
+            wrong = int(before.slipped(self.wavelength_m).sum())
+            if not wrong:
+                break
+            finer = range_shifts(problem, state, self.axes, parts=2 * PARTS)
+            other = problem.sharper(unslipped_start(problem, state, finer.by_point_m), used, stages=_STAGES - 1)
+            after = range_shifts(problem, other, self.axes)
+            if int(after.slipped(self.wavelength_m).sum()) >= wrong:
+                break
+            state = other
+        return state
+
     def _lowest(self, states: Sequence[State], used: Bools) -> State:
         """Return the state of lowest objective: sharp patches, at one place in all pairs."""
         problem = self.problem
         values = [
-            problem.value(state, used, self.initial.statistics) + pair_disagreement(problem, state.tracks, self.axes)[0]
+            problem.value(state, used, (self.before or self.initial).statistics)
+            + pair_disagreement(problem, state.tracks, self.axes)[0]
             for state in states
         ]
         return states[int(np.argmin(values))]
@@ -348,6 +489,16 @@ def _knots(records: Sequence[PairRecord], errors: Mapping[str, TrackErrors]) -> 
     last = max(float(one.time_s[-1]) for one in records)
     pulse_s = max(float(np.median(np.diff(one.time_s))) for one in records)
     correlation_s = min(one.correlation_s for one in errors.values())
-    step_s = max(min(correlation_s / _KNOTS_PER_CORRELATION_TIME, (last - first) / _LEAST_KNOTS), pulse_s)
+    wavenumber = 2 * np.pi * max(one.profiles.centre_frequency_hz for one in records) / SPEED_OF_LIGHT_M_S
+    turned = 2 * wavenumber * max(max(one.std_m) for one in errors.values())
+    # White noise averaged over τ bends between knots Δ apart by σ²Δ/3τ.
+    lasts = float(
+        np.clip(
+            3 * _BETWEEN_KNOTS_RAD2 / max(turned**2, 1e-12),
+            1 / _MOST_KNOTS_PER_CORRELATION_TIME,
+            1 / _KNOTS_PER_CORRELATION_TIME,
+        )
+    )
+    step_s = max(min(correlation_s * lasts, (last - first) / _LEAST_KNOTS), pulse_s)
     count = max(2, int(np.ceil((last - first) / step_s)))
     return first + (np.arange(count) + 0.5) * (last - first) / count

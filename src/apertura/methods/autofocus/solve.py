@@ -366,3 +366,58 @@ class _PhaseFit:
                     by_block[patch.blocks] = patch.wavenumber * (one.weight * left)[:, None] * slope
                     gradient[node] += blocks.average.T @ by_block
         return total, gradient
+
+
+# ---- Start of the search beyond a slip: delays of the points in parts of the aperture -------------------------------
+
+_DELAY_STD_M = 0.03
+"""Metres of total path, of a point's delay in a part of the aperture: against the prior of the tracks."""
+
+
+def unslipped_start(problem: Problem, state: State, further_m: Floats) -> State:
+    """Return the tracks that bring points to one range in all parts of the aperture, least squares with the prior.
+
+    Parameters
+    ----------
+    problem, state
+        As solved.
+    further_m
+        (pair, patch, part) float64, metres of total path by which a part shows a point farther; NaN where it does not.
+
+    Notes
+    -----
+    Source: docs/theory/autofocus.md, eq. 16: delays have no cycles. What they leave is less than half a wavelength.
+    """
+    fit = _DelayFit(problem.pairs, state.cached, state.tracks, further_m)
+    return problem.state(minimise(fit, problem.prior, problem.gauge, state.unknowns, iterations=40))
+
+
+@dataclass(frozen=True, eq=False)
+class _DelayFit:
+    """Half the squared delays, in standard deviations, that tracks leave between parts, over pairs and patches."""
+
+    pairs: Sequence[Blocks]
+    cached: Sequence[Sequence[Contribution]]
+    reference: Tracks
+    further_m: Floats
+
+    def __call__(self, tracks: Tracks) -> tuple[float, dict[str, Floats]]:
+        total, gradient = 0.0, {node: np.zeros_like(track) for node, track in tracks.items()}
+        for blocks, patches, by_patch in zip(self.pairs, self.cached, self.further_m, strict=True):
+            moved = blocks.moves({node: tracks[node] - self.reference[node] for node in blocks.record.nodes})
+            for patch, further_m in zip(patches, by_patch, strict=True):
+                measured = np.isfinite(further_m)
+                if measured.sum() < 2:
+                    continue
+                path = phases(patch, moved) / patch.wavenumber
+                ends = np.linspace(0, len(path), len(further_m) + 1).astype(np.int64)
+                size = np.diff(ends)
+                part = np.repeat(np.arange(len(size)), size)
+                left = np.where(measured, np.add.reduceat(path, ends[:-1]) / size - np.nan_to_num(further_m), 0.0)
+                left = np.where(measured, left - left.sum() / measured.sum(), 0.0) / _DELAY_STD_M
+                total += 0.5 * float(left @ left)
+                for node, slope in patch.slopes.items():
+                    by_block = np.zeros_like(moved[node])
+                    by_block[patch.blocks] = (left / size / _DELAY_STD_M)[part][:, None] * slope
+                    gradient[node] += blocks.average.T @ by_block
+        return total, gradient

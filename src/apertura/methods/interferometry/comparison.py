@@ -11,6 +11,7 @@ from apertura.common.contracts import Window
 from apertura.common.flags import Flags
 from apertura.methods.interferometry.coherence import chance, map_coherence, unbiased
 from apertura.methods.interferometry.heights import (
+    MARGIN,
     KnownHeight,
     Level,
     PlacedHeights,
@@ -113,11 +114,14 @@ def interferogram_flags(measured: InterferogramCounts) -> Flags:
         )
     if ambiguous:
         flags["height_ambiguous"] = "; ".join(ambiguous)
-    if one.residues > MOST_RESIDUES * one.loops or one.folded > MOST_FOLDED * one.told:
-        folded = f"; {one.folded} places are shown by several pixels and left out" if one.folded else ""
+    inconsistent = []
+    if one.residues > MOST_RESIDUES * one.loops:
+        inconsistent.append(f"around {one.residues} of {one.loops} loops of four pixels the phase does not come back")
+    if one.folded > MOST_FOLDED * one.told:
+        inconsistent.append(f"{one.folded} places are shown by several pixels and left out")
+    if inconsistent:
         flags["unwrapping_inconsistent"] = (
-            f"around {one.residues} of {one.loops} loops of four pixels the phase does not come back to itself, "
-            f"heights may err by multiples of {one.ambiguity_m:.3g} m{folded}"
+            f"{'; '.join(inconsistent)}: heights may err by multiples of {one.ambiguity_m:.3g} m"
         )
     if one.told and not one.points:
         flags["height_relative"] = (
@@ -226,14 +230,22 @@ def form_interferogram(
     centre = float(np.angle(np.exp(1j * phase[valid].astype(np.float64)).sum())) if valid.any() else 0.0
     centred = np.where(valid, np.angle(np.exp(1j * (phase - centre))), np.nan).astype(np.float32)
     unwrapped = unwrap(centred, magnitude, looks=looks)
+    own = np.minimum(looks, 2 * energy)
     known = [
-        replace(one, measured_rad=float(phase[one.row, one.column]) - centre)
+        replace(
+            one,
+            measured_rad=float(phase[one.row, one.column]) - centre,
+            # what decorrelates a window about a point is spread over all its looks, of which the point takes one; the
+            # window does not cut the response in its middle
+            std_rad=float(phase_std(unbiased(magnitude[one.row, one.column], looks), looks)) / MARGIN,
+        )
         for one in ground.known
         if common[one.row, one.column]
     ]
     reference = level(unwrapped, known)
     alone = remove_level(unwrapped, reference) if reference else np.full(common.shape, np.nan, np.float32)
-    at_place = _placed(ground, alone, magnitude, np.minimum(looks, 2 * energy), looks)
+    scatter = phase_std(unbiased(magnitude, looks), own).astype(np.float64)
+    at_place = _placed(ground, alone, np.hypot(scatter, reference.std_rad or 0.0 if reference else 0.0))
     panels = {
         "phase": np.where(common, phase, np.nan).astype(np.float32),
         "coherence": np.where(common, magnitude, np.nan).astype(np.float32),
@@ -246,16 +258,14 @@ def form_interferogram(
     return Interferogram(panels, looks, _unwrapping(counted, unwrapped, alone, reference, at_place), reference)
 
 
-def _placed(
-    ground: AssumedGround, alone: NDArray[np.float32], magnitude: NDArray[np.float32], own: Floats, looks: float
-) -> PlacedHeights:
-    """Return heights at their own places from the phase due to height."""
+def _placed(ground: AssumedGround, alone: NDArray[np.float32], phase_std_rad: Floats) -> PlacedHeights:
+    """Return heights at their own places from the phase due to height and its deviation."""
     rise = ground.sensed.height(alone.astype(np.float64))
     std = np.full(rise.shape, np.nan)
     there = np.isfinite(rise)
     if there.any():
         steep = np.abs(ground.sensed.slope + 2 * ground.sensed.bend * rise)[there]
-        std[there] = phase_std(unbiased(magnitude[there], looks), own[there]) / steep
+        std[there] = phase_std_rad[there] / steep
     return place_heights(ground.height_m, rise, std, ground.shift_px)
 
 

@@ -132,6 +132,8 @@ class KnownHeight:
         The phase due to its height there.
     measured_rad
         The phase that is measured there, within a turn; NaN where none is.
+    std_rad
+        Its standard deviation.
     """
 
     name: str
@@ -139,6 +141,7 @@ class KnownHeight:
     column: int
     phase_rad: float
     measured_rad: float = float("nan")
+    std_rad: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -155,12 +158,15 @@ class Level:
         The points of known height that give it; none: the median of the phase does.
     spread_rad
         Largest distance of such a point from the constant; None of fewer than two.
+    std_rad
+        Standard deviation of the constant: one error that all heights share; None without points, where it is unknown.
     """
 
     phase_rad: float
     part: int
     points: tuple[str, ...] = ()
     spread_rad: float | None = None
+    std_rad: float | None = None
 
 
 def level(phase: Unwrapped, known: Sequence[KnownHeight]) -> Level | None:
@@ -193,7 +199,19 @@ def level(phase: Unwrapped, known: Sequence[KnownHeight]) -> Level | None:
     constants = {one.name: value - one.phase_rad for one, value, of in measured if of == part}
     constant = float(np.median(list(constants.values())))
     spread = max(abs(value - constant) for value in constants.values()) if len(constants) > 1 else None
-    return Level(round(constant, 6), part, tuple(constants), spread)
+    std = _level_std(list(constants.values()), [one.std_rad for one, _, of in measured if of == part])
+    return Level(round(constant, 6), part, tuple(constants), spread, round(std, 6))
+
+
+def _level_std(constants: Sequence[float], stds: Sequence[float]) -> float:
+    """Return the standard deviation of the median of some constants: by their own deviations, or by their scatter.
+
+    Source: docs/theory/interferometry.md, eq. 15a.
+    """
+    count = len(constants)
+    by_points = float(np.sqrt(np.square(stds).sum())) / count
+    by_scatter = float(np.std(constants, ddof=1)) / np.sqrt(count) if count > 1 else 0.0
+    return float(max(by_points, by_scatter) * (np.sqrt(np.pi / 2) if count > 2 else 1.0))
 
 
 def _unwrapped(one: KnownHeight, phase: Unwrapped, valid: NDArray[np.int64]) -> tuple[float, int]:
@@ -291,7 +309,7 @@ class PlacedHeights:
     height
         (y, x) float64, metres, of the ground at the middle of each pixel; NaN where no pixel shows it, or several do.
     std
-        (y, x) float64, metres, by the phase's scatter alone.
+        (y, x) float64, metres, by the phase's scatter and by that of the level.
     folded
         Places that more than one pixel shows by these heights: layover, or errors of unwrapping by whole turns.
     """

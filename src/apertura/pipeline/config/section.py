@@ -15,7 +15,10 @@ from apertura.common.errors import CampaignError, quoted
 # ---- Base of every section; names that become names of folders ------------------------------------------------------
 
 RESERVED_NAMES = frozenset(
-    {"fused", "layers", "stac", "map", "mosaic", "interferometry", "study", "logs", "benchmarks", "tiles", "workflow"}
+    {
+        *("fused", "layers", "stac", "map", "mosaic", "interferometry", "study", "logs", "benchmarks", "tiles"),
+        *("tracks", "workflow"),
+    }
 )
 """Names of the results folder that no flight or node may take."""
 

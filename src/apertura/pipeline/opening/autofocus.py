@@ -8,6 +8,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from apertura.common.arrays import Times
 from apertura.core.focus.inputs import Profiles
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.phase_centres import TrackCorrection
@@ -111,7 +112,7 @@ def _stated(known: NodePositions) -> tuple[float, float, float]:
 
 # ---- Refined tracks, from which images take their phase centres -----------------------------------------------------
 
-_QUOTED = ("gain_fitted_db", "gain_held_out_db", "held_out_better")
+_QUOTED = ("gain_fitted_db", "gain_held_out_db", "gain_std_db")
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,8 +180,35 @@ class RefinedTrack:
         """Return a node with its log corrected."""
         if self.correction is None:
             return logged
-        moved_m = self.correction.at(logged.name, _seconds(logged.track.time.values - self.began))
+        moved_m = self.moved_m(logged.name, logged.track.time.values)
         return replace(logged, track=logged.track.assign(position=logged.track.position + moved_m))
+
+    def moved_m(self, node: str, at: Times) -> NDArray[np.float64]:
+        """Return what is added to the logged points of a node at some times, (time, 3) float64 metres in the frame.
+
+        Before the first pulse and after the last it stays what it was there.
+        """
+        if self.correction is None:
+            return np.zeros((len(at), 3))
+        return self.correction.at(node, _seconds(at - self.began))
+
+    def left_m(self, node: str, at: Times) -> NDArray[np.float64]:
+        """Return the standard deviation of what the refinement leaves of a node's error, along the axes of the frame.
+
+        Returns
+        -------
+        ndarray
+            (time, 3) float64, metres; NaN where the images say nothing of the node: before the first pulse, after the
+            last, and everywhere if no track was moved.
+        """
+        left_m, nodes = np.full((len(at), 3), np.nan), self.stage.attrs["nodes"]
+        if self.correction is None or self.correction.further_m or node not in nodes:
+            return left_m
+        knots_s, at_s = self.correction.time_s, _seconds(at - self.began)
+        inside = (at_s >= knots_s[0]) & (at_s <= knots_s[-1])
+        std_m = self.stage["std"].values[nodes.index(node)]
+        left_m[inside] = np.stack([np.interp(at_s[inside], knots_s, axis) for axis in std_m.T], axis=-1)
+        return left_m
 
     def _moved(self, correction: TrackCorrection, logged: OpenPair) -> tuple[Aperture, NDArray[np.float64]]:
         """Return the phase centres of a pair, and by how much paths of its echoes are longer than with the logs."""

@@ -31,6 +31,10 @@ _TIME_SYSTEMS = {
     19.0: ": TAI taken for GPST?",
 }
 _RANGES_M = (0.05, 0.1, 0.15, 0.3, 0.5, 1.0, 2.0, 4.0)
+CHANCES = 48
+"""Wrong tracks drawn at random; a third each is offset, inclined and bent."""
+
+_CHANCE_M, _CHANCE_PERIODS = (0.03, 2.0), (0.25, 1.5)  # sizes, as those of hypotheses; over the aperture
 _AXES = ("forward", "right", "down")
 _POINTS = ("radar_tx", "radar_rx", "sidelink")
 
@@ -121,6 +125,41 @@ def hypotheses_of(nodes: Mapping[str, Acquisition], found: Sequence[PairGeometry
         what = f"the ground lies {height_m:+.1f} m from where the config has it: another datum?"
         yield Hypothesis(what, "height", tuple(one.history for one in found), height_m)
     yield from _longer_paths(nodes, found)
+
+
+def hypotheses_by_chance(
+    nodes: Mapping[str, Acquisition], found: Sequence[PairGeometry], generator: np.random.Generator
+) -> Iterator[Hypothesis]:
+    """Yield smooth wrong tracks of one or two unknowns that are drawn: what explains no better than they do is chance.
+
+    Parameters
+    ----------
+    nodes, found
+        As `hypotheses_of`.
+    generator
+        Draws node, direction, size, and whether the track is offset, inclined or bent.
+
+    Notes
+    -----
+    Source: docs/theory/focus.md, "Hypotheses".
+    """
+    for number in range(CHANCES):
+        size_m = float(np.exp(generator.uniform(*np.log(_CHANCE_M))))
+        direction = generator.standard_normal(3)
+        error_m = size_m * direction / np.linalg.norm(direction)
+        name = list(nodes)[generator.integers(len(nodes))]
+        periods, phase = generator.uniform(*_CHANCE_PERIODS), generator.uniform(0, 2 * np.pi)
+        histories = []
+        for one in found:
+            along = np.linspace(0, 1, len(one.time))
+            shape = (np.ones_like(along), 2 * along - 1, np.sin(2 * np.pi * periods * along + phase))[number % 3]
+            sent, received = (float(node == name) * shape[:, None] * error_m for node in one.pair.split("-"))
+            aperture = one.history.aperture
+            moved = replace(one.history, aperture=Aperture(aperture.tx_m + sent, aperture.rx_m + received))
+            apart = aperture.tx_m - aperture.rx_m
+            longer_m = np.linalg.norm(apart + sent - received, axis=1) - np.linalg.norm(apart, axis=1)
+            histories.append(_delayed(moved, longer_m) if one.sidelink_m.any() else moved)
+        yield Hypothesis(f"the log of {name} errs by {size_m:.2f} m", "chance", tuple(histories))
 
 
 def _shifted_logs(nodes: Mapping[str, Acquisition], found: Sequence[PairGeometry]) -> Iterator[Hypothesis]:
@@ -225,3 +264,78 @@ def _delayed(history: PhaseHistory, path_m: Any) -> PhaseHistory:
 
 def _span(seconds: float) -> np.timedelta64:
     return np.timedelta64(round(seconds * 1e9), "ns")
+
+
+# ---- Which hypothesis explains what was lost -------------------------------------------------------------------------
+
+LEAST_GAIN_DB = 1.0
+"""Least gain of the measure at which a hypothesis is named."""
+
+LEAST_SHARE = 0.7
+"""Of the dB lost that a hypothesis must bring back to be named: most of it."""
+
+LEAST_AGAINST_NEXT = 2.0
+"""Its gain over that of the best other cause, and of the best wrong track drawn at random, dB over dB."""
+
+CLEAR_DB = 10.0
+"""dB by which a gain exceeds another beyond doubt, however large both are."""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A hypothesis that was tried.
+
+    Attributes
+    ----------
+    gain_db
+        Of the joint peak power at the bright place.
+    hypothesis
+        What was tried.
+    offset
+        It changes the path of each pair by a constant alone, beside moving the point.
+    """
+
+    gain_db: float
+    hypothesis: Hypothesis
+    offset: bool
+
+    @property
+    def cause(self) -> str:
+        """Kinds that are one cause: a path longer by samples of the prefix or by an offset is the same."""
+        return "range" if self.hypothesis.kind == "prefix" else self.hypothesis.kind
+
+
+def explanation(trials: Sequence[Trial], drawn: Sequence[Trial], lost_db: float) -> list[dict[str, Any]]:
+    """Return the report of the trial that alone explains most of what was lost, or that an offset does; else nothing.
+
+    Parameters
+    ----------
+    trials, drawn
+        Of hypotheses, and of wrong tracks drawn at random.
+    lost_db
+        What there is to gain.
+
+    Notes
+    -----
+    Source: docs/theory/focus.md, "Hypotheses".
+
+    Examples
+    --------
+    >>> late, arm = (Hypothesis(kind, kind, ()) for kind in ("time", "lever arm"))
+    >>> [one["kind"] for one in explanation([Trial(6.0, late, False), Trial(2.0, arm, True)], [], 7.0)]
+    ['time']
+    >>> explanation([Trial(6.0, late, False), Trial(4.0, arm, True)], [], 7.0)
+    []
+    """
+    best = max(trials, key=lambda one: one.gain_db, default=None)
+    if best is None or best.gain_db < max(LEAST_GAIN_DB, LEAST_SHARE * lost_db):
+        return []
+    others = [*(one for one in trials if one.cause != best.cause), *drawn]
+    rivals = [one for one in others if one.gain_db > max(best.gain_db / LEAST_AGAINST_NEXT, best.gain_db - CLEAR_DB)]
+    if any(not (one.offset and best.offset) for one in rivals):
+        return []
+    what = best.hypothesis.what
+    if rivals:  # a constant of each pair does it, whatever made it: a path, an arm, a log, a phase
+        what = f"pairs are off by a constant: of a path, an arm, a phase, a log's place or time, such as: {what}"
+    report = {"what": what, "kind": "offset" if rivals else best.hypothesis.kind}
+    return [report | {"gain_db": round(best.gain_db, 2), "lost_db": round(max(lost_db, best.gain_db), 2)}]

@@ -1,18 +1,22 @@
 """Finished images of a campaign opened again: a layer at few places, and how two of them agree."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.common.contracts import Window
 from apertura.common.errors import CampaignError
 from apertura.common.provenance import sha256_file
-from apertura.core.quality.agreement import Agreement, agreement
-from apertura.core.quality.bright_points import BrightPoint, has_point
+from apertura.core.imaging.focus_check import SPECKLE
+from apertura.core.imaging.view import carrier_at
+from apertura.core.quality.agreement import Agreement, agreement, agreement_of_ground
+from apertura.core.quality.bright_points import BrightPoint, bright_points, has_point, near
 from apertura.core.quality.measures import BlockRaster
+from apertura.core.quality.point_targets import BandLimitedPatch
 from apertura.core.scene.grid import SceneGrid
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.store import read_manifest
@@ -72,65 +76,143 @@ def averaged(raster: Any, dots: int) -> NDArray[np.float32]:
     return values
 
 
-# ---- Agreement of two images by their bright points -----------------------------------------------------------------
+# ---- What two images share ------------------------------------------------------------------------------------------
 
 
-def agreement_of(first: "xr.Dataset", second: "xr.Dataset", grid: SceneGrid) -> Agreement | None:
-    """Return how a second stage `image` lies against a first; None where they share no bright point.
+@dataclass(frozen=True, eq=False)
+class ComparedImage:
+    """An image as it is compared with others of its scene.
+
+    Attributes
+    ----------
+    raster
+        (y, x) complex64.
+    points
+        Its isolated bright points whose main lobe lies in the image. Each stands above what lies around it there,
+        whether or not it dominates its range cell in every pulse, as evidence of focus has to.
+    cell_m, spectrum
+        Finest resolution cell, and (2, 2) covariance of a point's spatial spectrum, cycles² per m².
+    focus
+        Its section of image.json.
+    carriers, grid
+        Of points over the image, as `apertura.core.imaging.view.carriers_of`; and where its pixels lie.
+    """
+
+    raster: BlockRaster
+    points: Sequence[BrightPoint]
+    cell_m: float
+    spectrum: NDArray[np.float64]
+    focus: Mapping[str, Any]
+    carriers: NDArray[np.float64]
+    grid: SceneGrid
+
+    @classmethod
+    def of(cls, image: "xr.Dataset", grid: SceneGrid, windows: Iterable[Window]) -> "ComparedImage":
+        """Return a stage `image` with its bright points, from windows that cover it once."""
+        quality = image.attrs["quality"]
+        return cls.found(image.image, quality["focus"], np.array(quality["view"]["carriers_cycles_m"]), grid, windows)
+
+    @classmethod
+    def found(
+        cls,
+        raster: BlockRaster,
+        focus: Mapping[str, Any],
+        carriers: NDArray[np.float64],
+        grid: SceneGrid,
+        windows: Iterable[Window],
+    ) -> "ComparedImage":
+        """Return an image with its bright points."""
+        spectrum = np.array(focus["spectrum_cycles2_m2"])
+        points = bright_places(raster, grid, windows, spectrum, cell_m=focus["cell_m"])
+        image = cls(raster, points, focus["cell_m"], spectrum, focus, carriers, grid)
+        placed = [replace(point, carrier=image.carrier(point.row, point.column)) for point in points]
+        return replace(image, points=placed)
+
+    def carrier(self, row: float, column: float) -> tuple[float, float]:
+        """Return the carrier of a point there, cycles per pixel down and right."""
+        east, north = carrier_at(self.carriers, self.grid.shape, row, column)
+        return -north * self.grid.spacing_m, east * self.grid.spacing_m
+
+    def shows(self, point: BrightPoint) -> bool:
+        """Return whether one of its bright points lies within a resolution cell of another image's."""
+        reach_px = self.cell_m / self.grid.spacing_m
+        return any(np.hypot(point.row - one.row, point.column - one.column) <= reach_px for one in self.points)
+
+    def at(self, row: float, column: float) -> complex:
+        """Return the image at a fractional pixel, interpolated about the carrier of a point there."""
+        patch = BandLimitedPatch(self.raster, round(row), round(column), self.carrier(row, column))
+        return complex(patch.at(row, column))
+
+
+def bright_places(
+    raster: BlockRaster,
+    grid: SceneGrid,
+    windows: Iterable[Window],
+    spectrum: NDArray[np.float64],
+    *,
+    cell_m: float,
+    isolated: bool = True,
+) -> list[BrightPoint]:
+    """Return the bright points of an image whose main lobe lies in it.
+
+    Parameters
+    ----------
+    raster
+        (y, x) complex64.
+    grid, windows
+        Of it, and windows that cover it once.
+    spectrum
+        (2, 2) float64, covariance of a point's spatial spectrum east and north, cycles² per m².
+    cell_m
+        Finest resolution cell.
+    isolated
+        Those alone that stand far enough above their surroundings not to be speckle.
+    """
+    cell_px = cell_m / grid.spacing_m
+    found = bright_points(raster, windows, cell_px=max(8, round(cell_px)), shown=near(spectrum, grid.spacing_m, cell_m))
+    return [
+        point
+        for point in found
+        if (point.background <= SPECKLE or not isolated)
+        and all(
+            cell_px <= at <= size - 1 - cell_px for at, size in zip((point.row, point.column), grid.shape, strict=True)
+        )
+    ]
+
+
+def agreement_of(
+    first: ComparedImage, second: ComparedImage, grid: SceneGrid, windows: Sequence[Window]
+) -> Agreement | None:
+    """Return how a second image lies against a first: by bright points, else by ground; None where nothing tells.
 
     None as well where pixels are wider than a resolution cell: they do not resolve the place of a point.
     """
     if not comparable(first, second, grid):
         return None
-    return agreement_by_focus((first.image, second.image), (_focus(first), _focus(second)), grid)
+    images = first.raster, second.raster
+    where: dict[str, Any] = {
+        "spacing_m": grid.spacing_m,
+        "cell_m": max(first.cell_m, second.cell_m),
+        "spectrum": (first.spectrum + second.spectrum) / 2,
+    }
+    alone = all(len(one.points) == one.focus["maxima"] == 1 for one in (first, second))
+    by_points = agreement(images, (first.points, second.points), alone=alone, **where)
+    return by_points or agreement_of_ground(images, windows, **where)
 
 
-def agreement_by_focus(
-    images: tuple[BlockRaster, BlockRaster], focus: tuple[Mapping[str, Any], Mapping[str, Any]], grid: SceneGrid
-) -> Agreement | None:
-    """Return the agreement of two images on a grid, by `apertura.core.imaging.focus_check.focus_report` of each."""
-    return agreement(
-        images,
-        (_points(focus[0], grid), _points(focus[1], grid)),
-        spacing_m=grid.spacing_m,
-        cell_m=max(one["cell_m"] for one in focus),
-        alone=all(one["maxima"] == 1 for one in focus),
-        spectrum=np.mean([one["spectrum_cycles2_m2"] for one in focus], axis=0),
-    )
-
-
-def comparable(first: "xr.Dataset", second: "xr.Dataset", grid: SceneGrid) -> bool:
+def comparable(first: ComparedImage, second: ComparedImage, grid: SceneGrid) -> bool:
     """Return whether the pixels of two images are fine enough to compare the places of points."""
-    return bool(grid.spacing_m <= min(_focus(image)["cell_m"] for image in (first, second)))
+    return grid.spacing_m <= min(first.cell_m, second.cell_m)
 
 
-def shows_points_of(first: "xr.Dataset", second: "xr.Dataset", grid: SceneGrid) -> bool:
+def shows_points_of(first: ComparedImage, second: ComparedImage, grid: SceneGrid) -> bool:
     """Return whether a second image has a bright pixel where a first has one of its bright points."""
-    reach = max(1, round(_focus(first)["cell_m"] / grid.spacing_m))
-    points = _points(_focus(first), grid)
-    return any(has_point(second.image, round(point.row), round(point.column), reach=reach) for point in points)
+    reach = max(1, round(first.cell_m / grid.spacing_m))
+    return any(has_point(second.raster, round(one.row), round(one.column), reach=reach) for one in first.points)
 
 
-def _focus(image: "xr.Dataset") -> dict[str, Any]:
-    focus: dict[str, Any] = image.attrs["quality"]["focus"]
-    return focus
-
-
-def agreement_report(found: Agreement | None) -> dict[str, float] | None:
+def agreement_report(found: Agreement | None) -> dict[str, float | str] | None:
     """Return an agreement as JSON values."""
-    return None if found is None else {name: float(f"{value:.4g}") for name, value in asdict(found).items()}
-
-
-def _points(focus: Mapping[str, Any], grid: SceneGrid) -> list[BrightPoint]:
-    points = focus["points"]
-    rows, columns = grid.pixel_of([point["x_m"] for point in points], [point["y_m"] for point in points])
-    return [
-        BrightPoint(
-            float(row),
-            float(column),
-            point["amplitude"],
-            point["background"],
-            carrier=(-point["carrier_cycles_m"][1] * grid.spacing_m, point["carrier_cycles_m"][0] * grid.spacing_m),
-        )
-        for row, column, point in zip(rows, columns, points, strict=True)
-    ]
+    if found is None:
+        return None
+    return {name: value if isinstance(value, str) else float(f"{value:.4g}") for name, value in asdict(found).items()}

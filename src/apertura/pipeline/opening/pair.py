@@ -393,6 +393,7 @@ def _positions(stated: Mapping[str, Any]) -> NodePositions:
         float(stated.get("correlation_s", 1.0)),
         str(stated.get("stated_by", "nobody")),
         float(stated.get("drift_m", 0.0)),
+        stated.get("receiver"),
     )
 
 

@@ -18,7 +18,7 @@ from apertura.core.imaging.job import decide_integration, imaging_job
 from apertura.core.planning.decisions import decide_accuracy
 from apertura.core.planning.plan import Decision, Plan, memory_limit
 from apertura.core.planning.planner import make_plan
-from apertura.core.quality.budget import BudgetLine, expected, noise_loss, offset_line, position_lines
+from apertura.core.quality.budget import BudgetLine, noise_loss, offset_line, position_lines, summed
 from apertura.core.quality.path_errors import Effect, PointPaths
 from apertura.core.scene.clearance import check_antennas
 from apertura.core.scene.terrain import GroundModels
@@ -83,7 +83,8 @@ def budget_of(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> list[Budg
 
 def positions_loss_db(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> float:
     """Return what errors of position that somebody stated are expected to cost an image of a pair, dB, 0 or less."""
-    return expected(_positions(campaign, pair, paths_to_middle(pair, scene))).loss_db
+    lines = _positions(campaign, pair, paths_to_middle(pair, scene))
+    return summed(line.effect for line in lines if line.stated is not None).loss_db
 
 
 def paths_to_middle(pair: OpenPair, scene: OpenScene) -> PointPaths:

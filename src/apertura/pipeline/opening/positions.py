@@ -11,6 +11,7 @@ from apertura.common.arrays import Times
 from apertura.common.errors import CampaignError
 from apertura.common.flags import Flags
 from apertura.core.geometry.track_checks import CheckedTrack
+from apertura.formats.tracks.track import FIXES
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import SEGMENTS, Node
 from apertura.pipeline.opening.node_log import NodeLog
@@ -130,15 +131,28 @@ def position_error(track: xr.Dataset, settings: Node, at: Times) -> dict[str, An
     dict
         std_m: [north, east, up], metres, the median over the pulses of what the log states, else the config's, else
         None; stated_by: log, config or nobody; correlation_s: how long an error lasts, seconds; drift_m: of
-        a slow error.
+        a slow error; receiver: the kind of solution that most of these epochs have, a key of `RECEIVER_STD_M`.
     """
+    epochs = np.searchsorted(track.time.values, at).clip(0, track.sizes["epoch"] - 1)
+    receiver = {"receiver": _kind_of_solution(track.fix.values[epochs]) if "fix" in track else "unknown"}
     if "position_std" in track:
-        epochs = np.searchsorted(track.time.values, at).clip(0, track.sizes["epoch"] - 1)
         stated = track.position_std.values[epochs]
         stated = stated[(stated > 0).all(axis=1)]
         if len(stated):
-            return stated_error(settings) | {"std_m": np.median(stated, axis=0).tolist(), "stated_by": "log"}
-    return stated_error(settings)
+            return stated_error(settings) | receiver | {"std_m": np.median(stated, axis=0).tolist(), "stated_by": "log"}
+    return stated_error(settings) | receiver
+
+
+def _kind_of_solution(fix: NDArray[np.int8]) -> str:
+    """Return the commonest kind of solution among RTKLIB's numbers.
+
+    Examples
+    --------
+    >>> _kind_of_solution(np.array([1, 1, 5], np.int8)), _kind_of_solution(np.array([0], np.int8))
+    ('fix', 'unknown')
+    """
+    number = int(np.bincount(np.maximum(fix, 0)).argmax()) if len(fix) else 0
+    return next((name for name, own in FIXES.items() if own == number), "unknown")
 
 
 def stated_error(settings: Node) -> dict[str, Any]:

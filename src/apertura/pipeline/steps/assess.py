@@ -3,19 +3,22 @@
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from itertools import chain, product
+from itertools import chain, combinations, permutations
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 
+from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
 from apertura.common.flags import Flags
 from apertura.common.provenance import chained_sha256
-from apertura.core.combination import choose_fusion
+from apertura.core.combination import CoherentSum, agreement_between, choose_fusion
+from apertura.core.echo.compression import centre_frequency
 from apertura.core.focus.inputs import PhaseHistory
-from apertura.core.imaging.focus_check import joint_peak_power
+from apertura.core.imaging.focus_check import joint_peak_power, strongest_echo
 from apertura.core.quality.agreement import Agreement
 from apertura.core.scene.grid import SceneGrid
 from apertura.pipeline.campaign import Campaign
@@ -26,13 +29,22 @@ from apertura.pipeline.opening.autofocus import open_refined
 from apertura.pipeline.opening.diagnosis import (
     Hypothesis,
     PairGeometry,
+    Trial,
     evidence_of,
+    explanation,
+    hypotheses_by_chance,
     hypotheses_of,
     moved_evidence,
     some_pulses,
 )
 from apertura.pipeline.opening.echo import pair_echo
-from apertura.pipeline.opening.images import agreement_of, agreement_report, comparable, shows_points_of
+from apertura.pipeline.opening.images import (
+    ComparedImage,
+    agreement_of,
+    agreement_report,
+    comparable,
+    shows_points_of,
+)
 from apertura.pipeline.opening.scene import OpenScene, open_scene, settled_scene
 from apertura.pipeline.opening.transmitted import Transmitted, transmitted
 from apertura.pipeline.steps.calibration import calibrated
@@ -40,18 +52,22 @@ from apertura.pipeline.store import open_stage, save_document
 
 # ---- Hypotheses that would sharpen a bad image, tried on a bright place ---------------------------------------------
 
-LEAST_GAIN_DB = 1.0
-"""Least gain of the measure at which a hypothesis is reported; below 2 dB weak evidence (docs/theory/focus.md)."""
+_ALIKE_RAD = 0.5
+"""RMS phase over the aperture, beside a constant and a shift of the point, below which paths differ by an offset."""
 
 _SIDE_PX = 128
 _PIXELS_PER_CELL = 2.5
-_MOST_NAMED = 3
 
 
 def hypotheses(
-    campaign: Campaign, flight: str, *, brightest: tuple[float, float], cell_m: float
+    campaign: Campaign,
+    flight: str,
+    *,
+    brightest: tuple[float, float],
+    cell_m: float,
+    focused: Collection[str] = (),
 ) -> list[dict[str, Any]]:
-    """Return the hypotheses that would make the images of a flight sharper and agree, the best first.
+    """Return the hypothesis that explains most of what the images of a flight lost, alone; none where several could.
 
     Parameters
     ----------
@@ -61,14 +77,20 @@ def hypotheses(
         Easting and northing of a bright place in the scene's CRS, metres.
     cell_m
         Resolution cell.
+    focused
+        Pairs whose own image is sharp: they have lost nothing but their agreement.
 
     Returns
     -------
     list
-        what, kind, and gain_db: gain of the peak power at the bright place.
+        what, kind, gain_db and lost_db: gain of the peak power at the bright place, and what there is to gain.
+
+    Notes
+    -----
+    Source: docs/theory/focus.md, "Hypotheses".
     """
     waveform = campaign.settings.waveform
-    if not isinstance(waveform, SampledWaveform):
+    if not isinstance(waveform, SampledWaveform):  # positions travel with a phase history: there are no logs to doubt
         return []
     sent = transmitted(campaign, waveform)
     logged = {node: open_acquisition(campaign, flight, node, sent) for node in campaign.flight(flight).nodes}
@@ -81,19 +103,73 @@ def hypotheses(
     if track.correction is not None:
         found = moved_evidence(nodes, found)
     scene = open_scene(campaign)
-    now = joint_peak_power([one.history for one in found], _around(scene, brightest, cell_m), scene.level.height_m)
-    named: list[tuple[float, Hypothesis]] = []
-    for hypothesis in chain(hypotheses_of(nodes, found), _other_echoes(campaign, flight, nodes, found, sent=sent)):
-        grid = _around(scene, _moved(scene.grid, brightest, found, hypothesis.histories), cell_m)
+    here, height_m = _around(scene, brightest, cell_m), scene.level.height_m
+    now = joint_peak_power([one.history for one in found], here, height_m)
+    lost_db = _db(_possible(found, here, height_m, focused) / now)
+
+    def tried(hypothesis: Hypothesis) -> Trial | None:
+        place = _moved(scene.grid, brightest, found, hypothesis.histories)
         try:
-            then = joint_peak_power(hypothesis.histories, grid, scene.level.height_m + hypothesis.height_m)
+            then = joint_peak_power(hypothesis.histories, _around(scene, place, cell_m), height_m + hypothesis.height_m)
         except ValueError:  # the places are too far apart for one pulse: rejected
-            continue
-        gain_db = 10 * float(np.log10(max(then, 1e-12) / now))
-        if gain_db > LEAST_GAIN_DB:
-            named.append((gain_db, hypothesis))
-    named.sort(key=lambda one: -one[0])
-    return [{"what": one.what, "kind": one.kind, "gain_db": round(gain_db, 2)} for gain_db, one in named[:_MOST_NAMED]]
+            return None
+        return Trial(_db(then / now), hypothesis, offset=_is_offset(scene, (brightest, place), found, hypothesis))
+
+    possible = chain(hypotheses_of(nodes, found), _other_echoes(campaign, flight, nodes, found, sent=sent))
+    trials = [one for one in map(tried, possible) if one is not None]
+    by_chance = hypotheses_by_chance(nodes, found, np.random.default_rng(0))
+    drawn = [one for one in map(tried, by_chance) if one is not None]
+    return explanation(trials, drawn, lost_db)
+
+
+def _db(ratio: float) -> float:
+    return 10 * float(np.log10(max(ratio, 1e-12)))
+
+
+def _possible(found: Sequence[PairGeometry], grid: SceneGrid, height_m: float, focused: Collection[str]) -> float:
+    """Return the joint peak power if every pair were sharp at one place and in phase.
+
+    A pair that is sharp by itself has its own peak, another one the strongest echo in its pulses.
+    """
+    amplitudes = np.array(
+        [
+            np.sqrt(joint_peak_power([one.history], grid, height_m))
+            if one.pair in focused
+            else strongest_echo(one.history, grid, height_m)
+            for one in found
+        ]
+    )
+    return float((amplitudes**2).mean() + amplitudes.mean() ** 2) / 2
+
+
+def _is_offset(
+    scene: OpenScene,
+    places: tuple[tuple[float, float], tuple[float, float]],
+    found: Sequence[PairGeometry],
+    hypothesis: Hypothesis,
+) -> bool:
+    """Return whether a hypothesis changes paths by a constant for each pair, beside moving the bright place.
+
+    Source: docs/theory/focus.md, eq. 2.
+    """
+    here_m, there_m = (_ground(scene, place) for place in places)
+    there_m = there_m + hypothesis.height_m * np.cross(*scene.axes[:2])
+    for one, changed in zip(found, hypothesis.histories, strict=True):
+        before, after = one.history, changed
+        if len(before) != len(after):
+            return False
+        longer_m = (after.aperture.path(there_m[None]) - before.aperture.path(here_m[None]))[:, 0]
+        longer_m -= SPEED_OF_LIGHT_M_S * (after.reference_delay_s - before.reference_delay_s)
+        moves = np.column_stack([np.ones(len(longer_m)), before.aperture.path_gradient(here_m) @ scene.axes[:2].T])
+        rest_m = longer_m - moves @ np.linalg.lstsq(moves, longer_m, rcond=None)[0]
+        if 2 * np.pi * centre_frequency(before.frequency_hz) / SPEED_OF_LIGHT_M_S * float(rest_m.std()) > _ALIKE_RAD:
+            return False
+    return True
+
+
+def _ground(scene: OpenScene, place: tuple[float, float]) -> NDArray[np.float64]:
+    row, column = scene.grid.pixel_of([place[0]], [place[1]])
+    return np.asarray(scene.level.positions_at(scene.grid, row, column)[0])
 
 
 def _evidence(nodes: Mapping[str, Acquisition], pair: str, echo: xr.Dataset, window: str) -> PairGeometry:
@@ -138,8 +214,10 @@ def _other_echoes(
 
 
 def hypothesis_line(named: Sequence[dict[str, Any]]) -> str:
-    """Return the best hypothesis, to append to a flag; empty without one."""
-    return f"; focus improves {named[0]['gain_db']:.1f} dB if {named[0]['what']}" if named else ""
+    """Return the hypothesis named, to append to a flag, or that there is none."""
+    if not named:
+        return "; no single cause explains it"
+    return f"; {named[0]['gain_db']:.1f} of {named[0]['lost_db']:.1f} dB come back if {named[0]['what']}"
 
 
 def _around(scene: OpenScene, place: tuple[float, float], cell_m: float) -> SceneGrid:
@@ -168,6 +246,8 @@ _PHASE = "pairs_out_of_phase"
 _LOOKS_WRONG = frozenset({"defocused", "echo_elsewhere", "pairs_apart", _PHASE, "pair_unconfirmed"})
 """Flags that a wrong geometry raises; hypotheses are tried where one is raised."""
 
+_TIED = "as many pairs say the opposite, and their images do not show which is wrong"
+
 _VISIBLE_SNR_DB = 20.0
 """A bright point this far above the noise should show in every image of the scene."""
 
@@ -178,36 +258,34 @@ def assess(campaign: Campaign, flight: str) -> Path:
     pairs, grid = campaign.flight(flight).pairs, settled_scene(campaign).grid
     images = {pair: open_stage(campaign.stage("image", flight, pair), "image") for pair in pairs}
     quality = {pair: image.attrs["quality"] for pair, image in images.items()}
-    reference = min(pairs, key=lambda pair: (*_rank(quality[pair]["focus"]), pairs.index(pair)))
-    found = {pair: agreement_of(images[reference], images[pair], grid) for pair in pairs if pair != reference}
-    refined = open_refined(campaign, flight).correction is not None
-    unconfirmed = {
-        pair
-        for pair, one in found.items()
-        if one is None
-        and _visible(quality[reference]["focus"])
-        and comparable(images[reference], images[pair], grid)
-        and (
-            quality[pair]["focus"]["verdict"] == "defocused"
-            or not shows_points_of(images[reference], images[pair], grid)
-        )
+    windows = list(grid.tiles(campaign.settings.processing.tile_px))
+    shown = {pair: ComparedImage.of(image, grid, windows) for pair, image in images.items()}
+    between = {(one, two): agreement_of(shown[one], shown[two], grid, windows) for one, two in combinations(pairs, 2)}
+    hidden = {
+        (one, two)
+        for one, two in permutations(pairs, 2)
+        if between.get((one, two), between.get((two, one))) is None and _hides(shown[one], shown[two], grid)
     }
-    fusion = choose_fusion(
-        reference,
-        found,
-        unfit=_unfit(found, unconfirmed, reference),
-        align=refined or campaign.settings.processing.fusion.align_phase,
-    )
+    rank = {pair: _rank(one["focus"]) for pair, one in quality.items()}
+    refined = open_refined(campaign, flight).correction is not None
+    as_formed = choose_fusion(rank, between, hidden=hidden, align=False)
     # A path that is constant for a pair is invisible to the refinement of tracks: its phase is removed here.
-    flags = _flags(found, reference, unconfirmed, taken_off={_PHASE} if refined else set())
+    align = refined or campaign.settings.processing.fusion.align_phase
+    fusion = choose_fusion(rank, between, hidden=hidden, align=True) if align else as_formed
+    flags = _flags(pairs, as_formed, hidden, taken_off={_PHASE} if refined else set())
     for pair, name, line in _wrong_codes(quality):
         flags[pair][name] = line
+    reference = fusion.reference
     named = _hypotheses(campaign, flight, images, flags, reference)
+    against = {pair: agreement_between(between, reference, pair) for pair in pairs if pair != reference}
     report = {
         "flight": flight,
         "reference": reference,
         "hypotheses": named,
-        "pairs": {pair: {"agreement": agreement_report(found.get(pair)), "flags": flags[pair]} for pair in pairs},
+        "pairs": {pair: {"agreement": agreement_report(against.get(pair)), "flags": flags[pair]} for pair in pairs},
+        "between": [
+            {"first": one, "second": two, **(agreement_report(found) or {})} for (one, two), found in between.items()
+        ],
         "fusion": fusion.report,
         "code_sha256": chained_sha256(
             lineage.result.code_sha256, [image.attrs["code_sha256"] for image in images.values()]
@@ -218,30 +296,37 @@ def assess(campaign: Campaign, flight: str) -> Path:
     return path
 
 
+def _hides(first: ComparedImage, second: ComparedImage, grid: SceneGrid) -> bool:
+    """Return whether a second image lacks the bright points of a first that stand far enough above its noise."""
+    return (
+        any(point["snr_db"] > _VISIBLE_SNR_DB for point in first.focus["points"])
+        and comparable(first, second, grid)
+        and (second.focus["verdict"] == "defocused" or not shows_points_of(first, second, grid))
+    )
+
+
 def _flags(
-    found: Mapping[str, Agreement | None], reference: str, unconfirmed: Collection[str], *, taken_off: Collection[str]
+    pairs: Sequence[str], chosen: CoherentSum, hidden: Collection[tuple[str, str]], *, taken_off: Collection[str]
 ) -> dict[str, Flags]:
-    """Return pair → flags of disagreement; both of two carry it, since their images do not show which is wrong.
+    """Return pair → flags of disagreement.
 
-    Flags in `taken_off`, as the phase of refined tracks, are corrected before pairs are added and not raised.
+    Where most pairs agree, the others carry them; where as many say the opposite, as of two pairs that differ, their
+    images do not show which is wrong, and both sides do. Flags in `taken_off`, as the phase of refined tracks, are
+    corrected before pairs are added and not raised.
     """
-    flags = {pair: Flags() for pair in (reference, *found)}
-    for pair, one in found.items():
-        raised = _disagreement(one, (reference, pair), certain=pair in unconfirmed)
-        for side, (name, line) in product((pair, reference), raised.items()):
-            if name not in taken_off:
-                flags[side] = Flags.merged(flags[side], {name: line})
+    flags = {pair: Flags() for pair in pairs}
+    for pair in pairs:
+        blind = [one for one in chosen.agreeing if (one, pair) in hidden]
+        raised = _disagreement(chosen, pair, blind)
+        if not raised:
+            continue
+        # Two pairs of which one shows nothing of the other: the other may as well show what is not there.
+        tied = {one for tie in chosen.ties for one in tie if pair in tie} or (len(chosen.agreeing) == 1 and blind)
+        opposite = f"; {_TIED}" if tied else ""
+        for side in (pair, *(chosen.agreeing if tied else ())):
+            lines = {name: line + opposite for name, line in raised.items() if name not in taken_off}
+            flags[side] = Flags.merged(flags[side], lines)
     return flags
-
-
-def _unfit(found: Mapping[str, Agreement | None], unconfirmed: Collection[str], reference: str) -> dict[str, str]:
-    """Return pair → reason, for pairs whose points lie elsewhere than the reference's: their phases mean nothing."""
-    apart = {
-        pair: f"its bright points lie {100 * one.shift_m:.1f} cm from those of {reference}"
-        for pair, one in found.items()
-        if one is not None and one.shifted
-    }
-    return apart | dict.fromkeys(unconfirmed, f"shows none of the bright points of {reference}")
 
 
 def _hypotheses(
@@ -253,11 +338,16 @@ def _hypotheses(
 ) -> list[dict[str, Any]]:
     """Try hypotheses where flags indicate a wrong geometry; append the best to these flags."""
     suspicious = {pair: _LOOKS_WRONG & {*images[pair].attrs["flags"], *raised} for pair, raised in flags.items()}
-    if not any(suspicious.values()):
+    if not any(suspicious.values()) or not isinstance(campaign.settings.waveform, SampledWaveform):
         return []
     quality = images[reference].attrs["quality"]
     brightest = quality["brightest"]["x_m"], quality["brightest"]["y_m"]
-    named = hypotheses(campaign, flight, brightest=brightest, cell_m=quality["focus"]["cell_m"])
+    sharp = {
+        pair
+        for pair, image in images.items()
+        if image.attrs["quality"]["focus"]["verdict"] == "focused" and "pair_unconfirmed" not in flags[pair]
+    }
+    named = hypotheses(campaign, flight, brightest=brightest, cell_m=quality["focus"]["cell_m"], focused=sharp)
     for pair, names in suspicious.items():
         for name in names:
             line = flags[pair].get(name) or images[pair].attrs["flags"][name]
@@ -270,29 +360,32 @@ def _rank(focus: Mapping[str, Any]) -> tuple[int, float]:
     return ["focused", "defocused", "cannot tell"].index(focus["verdict"]), -focus.get("loss_db", 0.0)
 
 
-def _visible(focus: Mapping[str, Any]) -> bool:
-    return any(point["snr_db"] > _VISIBLE_SNR_DB for point in focus["points"])
-
-
-def _disagreement(one: Agreement | None, pairs: tuple[str, str], *, certain: bool) -> dict[str, str]:
-    """Return flags of the reference and another pair; their images alone do not show which of them is wrong."""
-    reference, pair = pairs
+def _disagreement(chosen: CoherentSum, pair: str, blind: Sequence[str]) -> dict[str, str]:
+    """Return the flags of a pair that is not of the set that agrees; `blind`: members none of whose points it shows."""
+    agreeing, one = " and ".join(chosen.agreeing), chosen.apart.get(pair)
     if one is None:
-        line = f"{pair} shows none of the bright points of {reference}: its echo is too weak, or one of them is wrong"
-        return {"pair_unconfirmed": line} if certain else {}
-    raised = {}
+        line = f"{pair} shows none of the bright points of {' and '.join(blind)}: its echo is too weak, or it is wrong"
+        return {"pair_unconfirmed": line} if blind else {}
+    where = f"{one.points} {one.by}"
     if one.shifted:
-        raised["pairs_apart"] = (
-            f"{one.points} bright points of {pair} lie {100 * one.shift_m:.1f} ± {100 * one.shift_std_m:.1f} cm from "
-            f"where {reference} has them, {100 * one.shift_east_m:+.1f} cm east and {100 * one.shift_north_m:+.1f} cm "
-            "north: positions, lever arms, path offsets or heights of one are wrong"
+        return {
+            "pairs_apart": (
+                f"{where} of {pair} lie {100 * one.shift_m:.1f} ± {100 * one.shift_std_m:.1f} cm from where {agreeing} "
+                f"{'has' if len(chosen.agreeing) == 1 else 'have'} them, {100 * one.shift_east_m:+.1f} cm east and "
+                f"{100 * one.shift_north_m:+.1f} cm north: positions, lever arms, path offsets or heights are wrong"
+            ),
+            **({_PHASE: _phase_line(one, where, pair, chosen.reference)} if one.out_of_phase else {}),
+        }
+    return {_PHASE: _phase_line(one, where, pair, chosen.reference)}
+
+
+def _phase_line(one: Agreement, where: str, pair: str, reference: str) -> str:
+    found = f"{pair} is {one.phase_rad:+.2f} ± {one.phase_std_rad:.2f} rad from {reference} at {where}"
+    if one.incoherent:
+        return (
+            f"{found}, coherence {one.coherence:.2f}: no common phase; positions of one are wrong from point to point"
         )
-    if one.out_of_phase:
-        raised[_PHASE] = (
-            f"{pair} is {one.phase_rad:+.2f} ± {one.phase_std_rad:.2f} rad from {reference} at {one.points} bright "
-            "points: path offsets or positions of one are wrong by a fraction of the wavelength"
-        )
-    return raised
+    return f"{found}: path offsets or positions are wrong by a fraction of the wavelength"
 
 
 def _wrong_codes(quality: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, str, str]]:

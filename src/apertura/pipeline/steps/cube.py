@@ -18,7 +18,7 @@ from apertura.core.scene.grid import SceneGrid
 from apertura.methods.interferometry.coherence import chance, coherence, common_band, window_px
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.lineage import result_of
-from apertura.pipeline.opening.images import agreement_of, agreement_report
+from apertura.pipeline.opening.images import ComparedImage, agreement_of, agreement_report
 from apertura.pipeline.opening.results import assessment_of
 from apertura.pipeline.opening.scene import settled_scene
 from apertura.pipeline.steps.stamping import stamped
@@ -229,7 +229,7 @@ def cube(campaign: Campaign) -> Path:
     grid, side = settled_scene(campaign).grid, campaign.settings.processing.tile_px
     folder, windows = campaign.stage("cube"), list(grid.tiles(side))
     with undamaged(folder, expected="images as this version forms them", remedy="Run the workflow again."):
-        described = _empty(images, assessed, grid)
+        described = _empty(images, assessed, grid, windows)
     with writing(folder) as wip:
         empty = stamped(
             described,
@@ -324,17 +324,20 @@ def _compare(images: Images, references: Mapping[str, str], arrays: _CubeArrays,
                 arrays.plane(f"{kind}_{name}", *one)[()] = value
 
 
-def _between_flights(references: Mapping[str, xr.Dataset], grid: SceneGrid) -> dict[str, Any]:
+def _between_flights(
+    references: Mapping[str, xr.Dataset], grid: SceneGrid, windows: Sequence[Window]
+) -> dict[str, Any]:
     """Return the shift of each flight's reference image against the first flight's, and its flags."""
-    (first, image), *others = references.items()
+    first, *others = references
+    shown = {name: ComparedImage.of(image, grid, windows) for name, image in references.items()} if others else {}
     between: dict[str, Any] = {}
     flags: dict[str, Flags] = {}
-    for name, other in others:
-        found = agreement_of(image, other, grid)
+    for name in others:
+        found = agreement_of(shown[first], shown[name], grid, windows)
         between[name] = agreement_report(found)
         if found is not None and found.shifted:
             line = (
-                f"{found.points} bright points of flight {name} lie {100 * found.shift_m:.1f} ± "
+                f"{found.points} {found.by} of flight {name} lie {100 * found.shift_m:.1f} ± "
                 f"{100 * found.shift_std_m:.1f} cm from where flight {first} has them, {100 * found.shift_east_m:+.1f} "
                 f"cm east and {100 * found.shift_north_m:+.1f} cm north: a base station, datum or time system differs"
             )
@@ -342,7 +345,9 @@ def _between_flights(references: Mapping[str, xr.Dataset], grid: SceneGrid) -> d
     return {"agreement": {"reference": first, "flights": between}, "flags": flags}
 
 
-def _empty(images: Images, assessed: Mapping[str, Mapping[str, Any]], grid: SceneGrid) -> xr.Dataset:
+def _empty(
+    images: Images, assessed: Mapping[str, Mapping[str, Any]], grid: SceneGrid, windows: Sequence[Window]
+) -> xr.Dataset:
     """Return the cube without the values of its rasters and of measures on them."""
     pairs = sorted({pair for _, pair in images})
     named = labels(images, assessed, pairs)
@@ -357,5 +362,5 @@ def _empty(images: Images, assessed: Mapping[str, Mapping[str, Any]], grid: Scen
         pairs=pairs,
         fusion={flight: one["fusion"] for flight, one in assessed.items()},
         coherence_window=window_of(images, grid.spacing_m),
-        **_between_flights(references, grid),
+        **_between_flights(references, grid, windows),
     )

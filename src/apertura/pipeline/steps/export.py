@@ -1,6 +1,6 @@
 """Rules `export` and `export_fused`: rasters, pictures and report of one image, or of the sums of a flight's images."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,16 +10,20 @@ import xarray as xr
 from rasterio import Affine
 
 from apertura.common.atomic import write_json
+from apertura.common.contracts import Window
 from apertura.common.flags import Flags
 from apertura.common.provenance import Provenance, canonical_json, chained_sha256
+from apertura.core.combination import InPhase, in_phase
+from apertura.core.quality.focus import DEFOCUSED_DB
 from apertura.core.quality.measures import Amplitude, BlockRaster, image_statistics
-from apertura.core.quality.point_targets import find_peak
+from apertura.core.quality.point_targets import CUT_REACH_M, cuts_report, find_peak
 from apertura.core.scene.grid import SceneGrid
 from apertura.formats.export import write_exports
 from apertura.formats.export.radiometry import ECHO, Radiometry, of_sums
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.digests import Lineage
 from apertura.pipeline.lineage import result_of
+from apertura.pipeline.opening.images import ComparedImage, bright_places
 from apertura.pipeline.opening.results import assessment_of
 from apertura.pipeline.opening.scene import settled_scene
 from apertura.pipeline.steps.stamping import tags_of
@@ -65,11 +69,15 @@ def export_fused(campaign: Campaign, flight: str) -> list[Path]:
     pairs, assessed = campaign.flight(flight).pairs, assessment_of(campaign, flight)
     images = {pair: open_stage(campaign.stage("image", flight, pair), "image") for pair in pairs}
     folder, grid = campaign.result(flight, "fused"), settled_scene(campaign).grid
+    windows = list(grid.tiles(campaign.settings.processing.tile_px))
+    measured, isolated = _in_phase(images, assessed, sums["noncoherent"], grid, windows)
+    at_points = measured if isolated else None
     report = {
         **_worst(images, assessed["fusion"]),
-        **_measures(grid, campaign.settings.processing.tile_px, sums, _divided(images, assessed["fusion"])),
+        "focus": _focus(images, at_points, [*assessed["fusion"]["phases_rad"]]),
+        **_measures(grid, windows, sums, images, assessed),
         "fusion": assessed["fusion"],
-        "coherence": _coherence(assessed),
+        "coherence": _coherence(measured, assessed) | {"isolated": isolated},
         "agreement": cube.attrs["agreement"]["flights"].get(flight),
         "flags": Flags.merged(
             _flags(
@@ -77,8 +85,9 @@ def export_fused(campaign: Campaign, flight: str) -> list[Path]:
                     pair: Flags.merged(image.attrs["flags"], assessed["pairs"][pair]["flags"])
                     for pair, image in images.items()
                 },
-                assessed["fusion"]["left_out"],
+                assessed["fusion"],
             ),
+            _incoherent(at_points),
             cube.attrs["flags"].get(flight, {}),
         ),
     }
@@ -135,42 +144,134 @@ def _divided(images: Mapping[str, xr.Dataset], fusion: Mapping[str, Any]) -> dic
 
 
 def _measures(
-    grid: SceneGrid, tile_px: int, sums: Mapping[str, BlockRaster], radiometry: Mapping[str, Radiometry]
+    grid: SceneGrid,
+    windows: Sequence[Window],
+    sums: Mapping[str, BlockRaster],
+    images: Mapping[str, xr.Dataset],
+    assessed: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """Return the image statistics of the sums."""
-    windows = list(grid.tiles(tile_px))
+    """Return the image statistics of the sums, cuts through the brightest target, and what is gained over one pair."""
     statistics = {source: image_statistics(layer, windows) for source, layer in sums.items()}
-    top = statistics["coherent"]
+    radiometry, top = _divided(images, assessed["fusion"]), statistics["coherent"]
     peak = find_peak(sums["coherent"], top.row, top.column)
     x, y = map(float, grid.map_at(peak.row, peak.column))
     peaks = {source: one.peak for source, one in statistics.items()} | {"coherent": float(abs(peak.value))}
     levels = {
         source: radiometry[source].measured(peaks[source], one.noise_floor_db) for source, one in statistics.items()
     }
+    along = images[assessed["reference"]].attrs["quality"]["brightest"]["cross_range_direction"]
+    floors = {pair: images[pair].attrs["quality"]["noise_floor_db"] for pair in assessed["fusion"]["phases_rad"]}
+    best = min(floors, key=lambda pair: floors[pair])
     return {
         "radiometry": {source: one.report for source, one in {**radiometry, **levels}.items()},
         "entropy": {source: round(one.entropy, 6) for source, one in statistics.items()},
         "noise_floor_db": top.noise_floor_db,
-        "brightest": {"x_m": round(x, 4), "y_m": round(y, 4), "amplitude": float(abs(peak.value))},
+        "gain": {
+            "best_pair": best,
+            "over_best_pair_db": round(floors[best] - top.noise_floor_db, 2),
+            "allowed_db": round(10 * float(np.log10(len(floors))), 2),
+        },
+        "brightest": {
+            "x_m": round(x, 4),
+            "y_m": round(y, 4),
+            "amplitude": float(abs(peak.value)),
+            "cross_range_direction": along,
+            **cuts_report(
+                sums["coherent"],
+                peak,
+                cross_range=(along[0], along[1]),
+                spacing_m=grid.spacing_m,
+                reach_m=CUT_REACH_M,
+            ),
+        },
     }
 
 
-def _coherence(assessed: Mapping[str, Any]) -> dict[str, float | int | None]:
-    """Return |Σ z|²/P² of the P pairs added with their phases, z a pair's mean phasor against the reference.
+def _in_phase(
+    images: Mapping[str, xr.Dataset],
+    assessed: Mapping[str, Any],
+    places: BlockRaster,
+    grid: SceneGrid,
+    windows: Sequence[Window],
+) -> tuple[InPhase | None, bool]:
+    """Return how far the images added are in phase at bright places of the sum without phase; None of a single image.
 
-    None where no pair's phase was measured.
+    And whether these are isolated points that all of them show. Without any, the brightest places are taken: of many
+    scatterers in a cell each image has its own sum, and the phases need not agree.
     """
-    added, agreed = assessed["fusion"]["phases_rad"], assessed["pairs"]
-    reports = {pair: agreed[pair]["agreement"] for pair in added if agreed[pair]["agreement"]}
-    chance = {"chance": round(1 / (len(reports) + 1), 4), "pairs": len(reports) + 1 if reports else 0}
-    if not reports:
-        return {"mean": None, **chance}
-    phasors = [one["coherence"] * np.exp(1j * (one["phase_rad"] - added[pair])) for pair, one in reports.items()]
-    return {"mean": round(float(abs(1 + sum(phasors)) ** 2) / (len(reports) + 1) ** 2, 4), **chance}
+    added = assessed["fusion"]["phases_rad"]
+    shown = {pair: ComparedImage.of(images[pair], grid, windows) for pair in added}
+    cell_m = max(image.cell_m for image in shown.values())
+    spectrum = np.mean([image.spectrum for image in shown.values()], axis=0)
+    points = [
+        point
+        for point in bright_places(places, grid, windows, spectrum, cell_m=cell_m)
+        if all(image.shows(point) for image in shown.values())
+    ]
+    isolated = bool(points)
+    points = points or bright_places(places, grid, windows, spectrum, cell_m=cell_m, isolated=False)
+    divisors = {
+        pair: images[pair].attrs["quality"]["brightest"]["amplitude"] * np.exp(1j * turn)
+        for pair, turn in added.items()
+    }
+    amplitudes = [[shown[pair].at(one.row, one.column) / by for pair, by in divisors.items()] for one in points]
+    if len(added) == 1 or not points:
+        return None, isolated
+    return in_phase(np.array(amplitudes), np.array([one.background for one in points])), isolated
 
 
-def _flags(of_pairs: Mapping[str, Mapping[str, str]], left_out: Mapping[str, str]) -> Flags:
-    """Return the flags of all pairs, each line with its pairs unless all carry it, and the pairs that are left out."""
+def _focus(images: Mapping[str, xr.Dataset], measured: InPhase | None, added: Sequence[str]) -> dict[str, Any]:
+    """Return the verdict of the coherent sum: what its images lost, and what it lost by their phases."""
+    of_pairs = {pair: images[pair].attrs["quality"]["focus"] for pair in added}
+    if len(added) == 1:
+        one = of_pairs[added[0]]
+        return {name: one[name] for name in ("verdict", "loss_db", "std_db") if name in one} | {
+            "why": f"{added[0]} alone: {one['why']}"
+        }
+    told = [one for one in of_pairs.values() if "loss_db" in one]
+    if measured is None or not told:
+        missing = "no isolated bright point is common to the pairs added" if measured is None else "no pair was judged"
+        return {"verdict": "cannot tell", "why": missing}
+    # Images are added at equal peaks; in focus each peak would be higher by what it lost.
+    of_images = -20 * float(np.log10(np.mean([10 ** (-one["loss_db"] / 20) for one in told])))
+    loss_db = of_images + measured.loss_db
+    std_db = float(np.hypot(np.mean([one["std_db"] for one in told]), measured.loss_std_db))
+    bad = loss_db < DEFOCUSED_DB - 2 * std_db
+    return {
+        "verdict": "defocused" if bad else "focused",
+        "loss_db": round(loss_db, 3),
+        "std_db": round(std_db, 3),
+        "why": (
+            f"{measured.places} bright points of the sum lost {abs(loss_db):.2f} ± {std_db:.2f} dB of their peak, "
+            f"{abs(measured.loss_db):.2f} dB of it because the pairs differ in phase"
+        ),
+    }
+
+
+def _coherence(measured: InPhase | None, assessed: Mapping[str, Any]) -> dict[str, float | int | None]:
+    pairs = len(assessed["fusion"]["phases_rad"])
+    return {
+        "mean": None if measured is None else round(measured.coherence, 4),
+        "std": None if measured is None else round(measured.std, 4),
+        "chance": round(1 / pairs, 4),
+        "pairs": pairs,
+        "points": 0 if measured is None else measured.places,
+    }
+
+
+def _incoherent(measured: InPhase | None) -> dict[str, str]:
+    """Return the flag of a sum whose images are not in phase where it shows bright points."""
+    if measured is None or measured.loss_db >= DEFOCUSED_DB - 2 * measured.loss_std_db:
+        return {}
+    line = (
+        f"at {measured.places} bright points the pairs keep {measured.coherence:.2f} ± {measured.std:.2f} of their "
+        f"power in phase, {measured.chance:.2f} by chance: the peaks of the sum lost {abs(measured.loss_db):.1f} dB"
+    )
+    return {"sum_incoherent": line}
+
+
+def _flags(of_pairs: Mapping[str, Mapping[str, str]], fusion: Mapping[str, Any]) -> Flags:
+    """Return the flags of all pairs, each line with its pairs unless all carry it, and those of the choice of pairs."""
     raised: dict[str, dict[str, list[str]]] = {}
     for pair, flags in of_pairs.items():
         for flag, line in flags.items():
@@ -181,20 +282,27 @@ def _flags(of_pairs: Mapping[str, Mapping[str, str]], left_out: Mapping[str, str
         )
         for flag, lines in raised.items()
     }
-    alone = "; ".join(f"{pair} is not in the coherent sum: {why}" for pair, why in left_out.items())
-    return Flags.merged(flags, {"pair_left_out": alone} if alone else {})
+    alone = "; ".join(f"{pair} is not in the coherent sum: {why}" for pair, why in fusion["left_out"].items())
+    if ties := " or ".join(" and ".join(tie) for tie in fusion["ties"]):
+        alone += f"; a tie: {ties} would make as large a sum, and the better focused one was taken"
+    chosen = {"pair_left_out": alone} if alone else {}
+    if unmeasured := fusion["unmeasured"]:
+        known, unknown = len(fusion["phases_rad"]) - len(unmeasured), len(unmeasured)
+        lost = [-20 * np.log10(abs(known + turn * unknown) / (known + unknown) + 1e-3) for turn in (1j, -1)]
+        chosen["phase_unmeasured"] = (
+            "; ".join(f"{pair} is added with phase 0: {why}" for pair, why in unmeasured.items())
+            + f"; wrong by a quarter of a turn the peak would be {lost[0]:.0f} dB lower, by half a turn "
+            + (f"{lost[1]:.0f} dB" if known != unknown else "gone, and each target shown twice beside its place")
+        )
+    return Flags.merged(flags, chosen)
 
 
 def _worst(images: Mapping[str, xr.Dataset], fusion: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the worst errors and models of the images, as those of their sum."""
+    """Return the worst errors and models of the images, as those of their sum, and the budget of each."""
     qualities = [image.attrs["quality"] for image in images.values()]
     worst = max(qualities, key=lambda quality: quality["numerical_error_db"])
     left_out = "".join(f"; without {pair}: {why}" for pair, why in fusion["left_out"].items())
-    added = {pair: images[pair].attrs["quality"] for pair in fusion["phases_rad"]}
-    verdicts = {quality["focus"]["verdict"]: pair for pair, quality in added.items()}
-    verdict = next(one for one in ("defocused", "cannot tell", "focused") if one in verdicts)
     return {
-        "focus": {"verdict": verdict, "why": f"the worst of the pairs added coherently, {verdicts[verdict]}"},
         "budgets": {pair: image.attrs["quality"]["budget"] for pair, image in images.items()},
         "models": {
             "fusion": f"mean of the peak-normalised images, with and without phase{left_out}",
@@ -204,7 +312,6 @@ def _worst(images: Mapping[str, xr.Dataset], fusion: Mapping[str, Any]) -> dict[
         "numerical_error_confidence": round(1 - sum(1 - one["numerical_error_confidence"] for one in qualities), 4),
         "numerical_error_estimate_db": worst["numerical_error_estimate_db"],
         "instruction_set": ", ".join(sorted({quality["instruction_set"] for quality in qualities})),
-        "peak_error_db": max(quality["peak_error_db"] for quality in qualities),
         "redone": [one for quality in qualities for one in quality["redone"]],
     }
 
@@ -215,7 +322,6 @@ def _quality_tags(report: Mapping[str, Any]) -> dict[str, str]:
         "APERTURA_INSTRUCTION_SET": report["instruction_set"],
         "APERTURA_ERROR_DB": f"{report['numerical_error_db']:.2f}",
         "APERTURA_ERROR_CONFIDENCE": f"{report['numerical_error_confidence']:.2f}",
-        "APERTURA_PEAK_ERROR_DB": f"{report['peak_error_db']:.2f}",
         "APERTURA_FLAGS": canonical_json(report["flags"]),
         "APERTURA_MODELS": canonical_json(report["models"]),
         **{f"APERTURA_{name.upper()}": canonical_json(value) for name, value in reports.items()},

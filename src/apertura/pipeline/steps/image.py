@@ -71,10 +71,10 @@ def image(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Pa
         lines = [*budget, arithmetic_line(quality["numerical_error_db"])]
         focus = focus_report(work.formation, target)
         quality |= {"focus": focus, "budget": [line.report for line in lines]}
-        expected_db = expected(lines).loss_db
-        focus["expected_db"] = round(expected_db, 3)
+        spoilt = expected(lines)
+        focus |= {"expected_db": round(spoilt.loss_db, 3), "expected_std_db": round(spoilt.loss_std_db, 3)}
         of_stages = echo.attrs["flags"], work.track.stage.attrs["flags"]
-        quality["flags"] = Flags.merged(*of_stages, plan.flags, quality["flags"], focus_flags(focus, expected_db))
+        quality["flags"] = Flags.merged(*of_stages, plan.flags, quality["flags"], focus_flags(focus, spoilt))
         finish(wip, folder, lineage=lineage, quality=quality, flags=quality["flags"])
     return folder
 

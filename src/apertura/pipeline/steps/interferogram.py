@@ -102,7 +102,8 @@ def _level_line(level: Level) -> str:
     if not level.points:
         return "heights count from the terrain: the median phase is taken for none"
     spread = "" if level.spread_rad is None else f", which agree to {level.spread_rad:.2f} rad"
-    return f"heights count from {' and '.join(level.points)}{spread}"
+    known = "" if level.std_rad is None else f", known to {level.std_rad:.2f} rad"
+    return f"heights count from {' and '.join(level.points)}{spread}{known}"
 
 
 def _tags(report: dict[str, Any]) -> dict[str, str]:

@@ -18,7 +18,7 @@ from apertura.core.imaging.range_profiles import profiles_of
 from apertura.core.planning.plan import Decision
 from apertura.methods.autofocus.inputs import PairRecord, ReferencePoint, Refinement, TrackErrors
 from apertura.methods.autofocus.patches import Candidates
-from apertura.methods.autofocus.path_offsets import refine_one_phase
+from apertura.methods.autofocus.path_offsets import FOLDS, refine_one_phase
 from apertura.methods.autofocus.refine import refine as refine_tracks
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.lineage import result_of
@@ -113,11 +113,11 @@ def refine(campaign: Campaign, flight: str) -> Path:
 
 
 def _searched(given: RefinementInputs, scene: OpenScene, method: str) -> Refinement:
-    """Return the refinement of tracks, or of one phase per pulse."""
+    """Return the refinement of tracks, or of one phase per pulse where there are places enough to validate it."""
     records, errors = given.records, given.errors
-    if method == "tracks":
+    found = None if method == "tracks" else Candidates.of(records, scene.grid, scene.terrain, errors)
+    if found is None or len(found.patches) < FOLDS:
         return refine_tracks(records, scene.grid, scene.terrain, errors, reference_points=given.points)
-    found = Candidates.of(records, scene.grid, scene.terrain, errors)
     return refine_one_phase(records, found, errors, method=method)
 
 

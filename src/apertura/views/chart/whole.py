@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 
 from apertura.common.errors import CampaignError
 from apertura.common.tables import write_table
-from apertura.core.quality.budget import is_stated
+from apertura.core.quality.budget import is_counted
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import Flight, SampledWaveform
 from apertura.pipeline.lineage import result_of, with_inputs
@@ -49,7 +49,7 @@ class Whole:
     load
         Mean load of the machine, processes that want to run.
     expected_loss_db
-        By the lines of the budget that somebody stated, arithmetic included, 0 or less.
+        By the lines of the budget that are expected, arithmetic included, 0 or less.
     measured_loss_db, measured_std_db
         At bright points; NaN where none is bright enough.
     numerical_error_db
@@ -252,8 +252,8 @@ def _whole(name: str, runs: list[_Run]) -> Whole:
 
 
 def _expected_db(report: Mapping[str, Any]) -> float:
-    """Return the loss of all causes that somebody stated, unrounded."""
-    return float(sum(line["loss_db"] for line in report["budget"] if is_stated(line)))
+    """Return the loss of all causes that are expected, unrounded."""
+    return float(sum(line["loss_db"] for line in report["budget"] if is_counted(line)))
 
 
 def _title(campaign: Campaign, rows: list[Whole], repeats: int) -> str:

@@ -8,3 +8,6 @@ PAGE = "report.html"
 
 PANELS = "panels.png"
 """Images of a flight and their sums side by side."""
+
+SUM_CUTS = "cuts.png"
+"""Cuts through the brightest target of the coherent sum, beside the panels."""

@@ -11,7 +11,10 @@ from matplotlib.gridspec import GridSpec
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from numpy.typing import NDArray
 
-from apertura.core.quality.budget import is_stated
+from apertura.core.quality.budget import is_counted
+from apertura.core.quality.measures import BlockRaster
+from apertura.core.quality.point_targets import CUT_REACH_M, cut_through, find_peak, line_through
+from apertura.core.scene.grid import SceneGrid
 from apertura.views.report.sheet import BLUE, GREEN, GREY, ORANGE, RED, column_of, sheet, thinned
 
 _COLOURS = (ORANGE, BLUE, GREEN)
@@ -143,6 +146,18 @@ class DrawnCut:
         return np.asarray(10 * np.log10(np.maximum(self.power / self.power[self.power.size // 2], 1e-12)))
 
 
+def drawn_cuts(raster: BlockRaster, brightest: Mapping[str, Any], grid: SceneGrid) -> list[DrawnCut]:
+    """Return the cuts through the brightest target of a pair or a sum, `brightest` of its image.json."""
+    east, north = brightest["cross_range_direction"]
+    row, column = grid.pixel_of(brightest["x_m"], brightest["y_m"])
+    peak, cuts = find_peak(raster, round(float(row)), round(float(column))), []
+    for name, direction in (("cross-range", (east, north)), ("ground range", (north, -east))):
+        line: dict[str, Any] = {"direction": direction, "spacing_m": grid.spacing_m, "reach_m": CUT_REACH_M}
+        cut = cut_through(raster, peak, **line)
+        cuts.append(DrawnCut(name, *line_through(raster, peak, **line), cut.width_m, cut.pslr_db, cut.islr_db))
+    return cuts
+
+
 def draw_cuts(path: Path, cuts: Sequence[DrawnCut], *, title: str, tags: Mapping[str, str]) -> None:
     """Draw cuts side by side on one scale of dB, as a PNG.
 
@@ -255,7 +270,7 @@ def _draw_causes(axes: Axes, lines: Sequence[Mapping[str, Any]], measure: str) -
     sizes = [abs(line[measure]) if line[measure] is not None else 0.0 for line in lines]
     highest = max([10 * least, *sizes])
     for stated, style in _STYLES.items():
-        some = [place for place, line in enumerate(lines) if is_stated(line) == stated and sizes[place] > least]
+        some = [place for place, line in enumerate(lines) if is_counted(line) == stated and sizes[place] > least]
         axes.barh(some, [sizes[place] for place in some], height=0.62, **style)
     for place, (size, line) in enumerate(zip(sizes, lines, strict=True)):
         if size <= least:
@@ -272,7 +287,7 @@ def _draw_causes(axes: Axes, lines: Sequence[Mapping[str, Any]], measure: str) -
 def _draw_measured(axes: Axes, measured: Measured) -> None:
     if measured.expected_db is not None:
         expected = max(abs(measured.expected_db), _LEAST["loss_db"])
-        axes.axvline(expected, color=BLUE, linestyle=":", label="expected, all stated")
+        axes.axvline(expected, color=BLUE, linestyle=":", label="expected")
     if measured.loss_db is not None:
         loss = max(abs(measured.loss_db), _LEAST["loss_db"])
         axes.axvline(loss, color=RED, linewidth=1.4, label="measured at bright points")

@@ -16,9 +16,7 @@ from apertura.common.progress import progress
 from apertura.common.provenance import Provenance
 from apertura.core.focus.contributions import block_contributions
 from apertura.core.geometry.geodesy import map_from_frame
-from apertura.core.imaging.certify import CUT_REACH_M
 from apertura.core.imaging.range_profiles import aperture_of, profiles_of
-from apertura.core.quality.point_targets import cut_through, find_peak, line_through
 from apertura.formats.export.coverage import footprint
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import SampledWaveform
@@ -44,6 +42,7 @@ from apertura.views.report.image_drawings import (
     draw_budget,
     draw_cuts,
     draw_phase,
+    drawn_cuts,
     sidelink_error_rad,
 )
 from apertura.views.report.sheet import thinned
@@ -198,15 +197,7 @@ class Shown:
 
     def cuts(self) -> list[DrawnCut]:
         """Return the cuts whose widths image.json states."""
-        east, north = self.image.attrs["quality"]["brightest"]["cross_range_direction"]
-        image, spacing_m = self.image.image, self.scene.grid.spacing_m
-        peak = find_peak(image, *(round(at) for at in self._target))
-        cuts = []
-        for name, direction in (("cross-range", (east, north)), ("ground range", (north, -east))):
-            line: dict[str, Any] = {"direction": direction, "spacing_m": spacing_m, "reach_m": CUT_REACH_M}
-            cut = cut_through(image, peak, **line)
-            cuts.append(DrawnCut(name, *line_through(image, peak, **line), cut.width_m, cut.pslr_db, cut.islr_db))
-        return cuts
+        return drawn_cuts(self.image.image, self.image.attrs["quality"]["brightest"], self.scene.grid)
 
     def waterfall(self) -> Waterfall:
         """Return the mean power of the range profiles, read some at a time."""

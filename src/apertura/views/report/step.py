@@ -31,7 +31,8 @@ from apertura.views.image_report import (
     shared_rows,
     verdict_row,
 )
-from apertura.views.report import PAGE, PANELS, PICTURES
+from apertura.views.report import PAGE, PANELS, PICTURES, SUM_CUTS
+from apertura.views.report.image_drawings import draw_cuts, drawn_cuts
 from apertura.views.report.page import Block, Heading, Paragraph, Picture, Table, rst_table, rst_text
 from apertura.views.report.page import page as page_of
 from apertura.views.report.panels import draw_panels
@@ -44,14 +45,16 @@ _MOST_PANELS = 2  # pairs beside their sums
 
 
 def page(campaign: Campaign, flight: str) -> list[Path]:
-    """Write results/<flight>/report.html and the panels of its images; return their paths."""
+    """Write results/<flight>/report.html, the panels of its images and the cuts of their sum; return their paths."""
     lineage = result_of(campaign, "page", flight).begin(campaign.root)
     reports = read_reports(campaign, flight)
-    panels, text = campaign.result(flight, FUSED, PANELS), campaign.result(flight, PAGE)
+    panels, cuts = (campaign.result(flight, FUSED, name) for name in (PANELS, SUM_CUTS))
+    text = campaign.result(flight, PAGE)
     _write_panels(panels, campaign, flight, reports[FUSED], lineage)
+    _write_cuts(cuts, campaign, flight, reports[FUSED], lineage)
     title = f"{campaign.settings.campaign}, flight {flight}"
     write_text(text, page_of(title, [Heading(1, title), *_blocks(campaign, flight, reports)]))
-    written = [text, panels]
+    written = [text, panels, cuts]
     record_files(campaign.root / lineage.result.manifest, written, lineage)
     return written
 
@@ -67,6 +70,7 @@ def _blocks(campaign: Campaign, flight: str, reports: Mapping[str, Mapping[str, 
         campaign.result(flight, FUSED, PANELS).read_bytes(),
         _caption("panels"),
     )
+    yield Picture(campaign.result(flight, FUSED, SUM_CUTS).read_bytes(), _caption("sum_cuts"))
     for pair in campaign.flight(flight).pairs:
         yield from _pair_blocks(campaign, flight, pair, reports[pair])
     raised = flag_rows(reports)
@@ -115,6 +119,14 @@ def _write_panels(path: Path, campaign: Campaign, flight: str, fused: Mapping[st
     draw_panels(
         path, powers, size_m=(east - west, north - south), target_m=brightest, title=f"flight {flight}", tags=tags
     )
+
+
+def _write_cuts(path: Path, campaign: Campaign, flight: str, fused: Mapping[str, Any], lineage: Lineage) -> None:
+    cube = open_stage(campaign.stage("cube"), "cube")
+    coherent = cube.coherent[cube.attrs["flights"].index(flight)]
+    tags = tags_of(Provenance.of(lineage.modules, [cube]), lineage)
+    title = f"flight {flight}, coherent sum of {' + '.join(fused['fusion']['phases_rad'])}"
+    draw_cuts(path, drawn_cuts(coherent, fused["brightest"], settled_scene(campaign).grid), title=title, tags=tags)
 
 
 def asked_rows(campaign: Campaign) -> list[tuple[str, str]]:
