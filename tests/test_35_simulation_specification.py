@@ -39,7 +39,15 @@ def test_a_preset_keeps_its_echoes_inside_the_prefix_and_its_targets_on_the_grid
             assert arrival.max() < waveform.cyclic_prefix_s
             assert arrival.min() > -(waveform.symbol_s - 1 / waveform.subcarrier_spacing_hz)
     xmin, ymin, xmax, ymax = specification.scene.bounds(specification.origin)
-    widths = {"demo": 12.0, "swarm": 12.0, "paper": 24.0, "continuous": 40.0, "paper-uav": 8.0, "flight": 409.6}
+    widths = {
+        "demo": 12.0,
+        "swarm": 12.0,
+        "paper": 24.0,
+        "continuous": 40.0,
+        "paper-uav": 8.0,
+        "flight": 409.6,
+        "first-flight": 12.0,
+    }
     width = widths.get(name, 6.0)
     assert (xmax - xmin, ymax - ymin) == pytest.approx((width, width))
     targets = tuple(target for target in specification.targets if not isinstance(target, Clutter))

@@ -21,7 +21,7 @@ from apertura.core.geometry.aperture import Aperture, Weigh
 from apertura.core.imaging.formation import PULSES_READ, Formation
 from apertura.core.imaging.range_profiles import GUARD_SAMPLES, OVERSAMPLING, RangeWindow, range_compress
 from apertura.core.imaging.view import ground_axes
-from apertura.core.quality.bright_points import BrightPoint, PointResponse, bright_points
+from apertura.core.quality.bright_points import SPECKLE, BrightPoint, PointResponse, bright_points
 from apertura.core.quality.focus import Focus, PointFocus, SubApertures, compare_parts, judge, judge_parts, point_focus
 from apertura.core.quality.measures import coherence_factor
 from apertura.core.quality.path_errors import Effect
@@ -298,9 +298,6 @@ def _echo_power(history: PhaseHistory) -> float:
 
 
 # ---- Focus report of an image
-
-SPECKLE = 0.06
-"""Power around a bright point relative to its own, above which it may be speckle: the brightest of 10⁶ has 0.07."""
 
 _SQUARE_CELLS, _LEAST_PX = 2.0, 4  # side of the squares of which the brightest maximum is looked at
 _PATCHES = 4  # imaged by subapertures: the brightest places

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from apertura.common.contracts import Window
 from apertura.core.quality.bright_points import BrightPoint, common_shift
-from apertura.core.quality.measures import BlockRaster
+from apertura.core.quality.measures import BlockRaster, weighted_median
 from apertura.core.quality.point_targets import PATCH_PX, BandLimitedPatch
 
 REACH_M = 4.0
@@ -219,7 +219,7 @@ def _weighted_place(
     The variances told, of each point in units, are a lower bound: points that scatter more say so themselves. Points
     that lie far from the median are other points that happen to be near.
     """
-    middle = np.array([_weighted_median(along, 1 / variance) for along in shifts.T])
+    middle = np.array([weighted_median(along, 1 / variance) for along in shifts.T])
     off = np.abs((shifts - middle) @ unit) / np.sqrt(variance)[:, None]
     excess = _excess(off, variance)
     weight = np.where((off < _FAR * excess).all(axis=1), 1 / variance, 0.0)
@@ -232,18 +232,12 @@ def _excess(off: NDArray[np.float64], variance: NDArray[np.float64]) -> float:
     By the weighted median: a weak point that is a sidelobe in one image does not make the bright ones uncertain.
     """
     weights = np.repeat(1 / variance, off.shape[1])
-    return max(1.0, 1.4826 * _weighted_median(off.ravel(), weights)) if len(off) > 1 else 1.0
+    return max(1.0, 1.4826 * weighted_median(off.ravel(), weights)) if len(off) > 1 else 1.0
 
 
 def _carrier(point: BrightPoint) -> tuple[float, float]:
     """Return the carrier of a point, cycles per pixel east and north; zero if it is not told."""
     return (0.0, 0.0) if point.carrier is None else (point.carrier[1], -point.carrier[0])
-
-
-def _weighted_median(values: NDArray[np.float64], weights: NDArray[np.float64]) -> float:
-    order = np.argsort(values)
-    share = np.cumsum(weights[order]) - weights[order] / 2
-    return float(np.interp(weights.sum() / 2, share, values[order]))
 
 
 def _between(images: tuple[BlockRaster, BlockRaster], first: BrightPoint, second: BrightPoint) -> list[complex]:

@@ -11,6 +11,9 @@ from apertura.core.geometry.aperture import Aperture, Weigh
 from apertura.core.quality.measures import BlockRaster
 from apertura.core.quality.point_targets import PATCH_PX, find_peak
 
+SPECKLE = 0.06
+"""Power around a bright point relative to its own, above which it may be speckle: the brightest of 10⁶ has 0.07."""
+
 # ---- What of one point an image shows at another place
 
 SMEARED_CELLS = 6.0

@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from apertura.core.quality.measures import coherence_factor
+from apertura.core.quality.measures import coherence_factor, weighted_median
 
 # ---- Subapertures: noise, drift and entropy
 
@@ -270,8 +270,8 @@ def judge(points: Sequence[tuple[float, PointFocus | None]]) -> Focus:
     losses = np.array([focus.loss_db for _, focus in measured])
     stds = np.array([_std_db(focus) for _, focus in measured])
     weights = np.array([amplitude for amplitude, _ in measured])
-    loss = _weighted_median(losses, weights)
-    spread = 1.4826 * _weighted_median(np.abs(losses - loss), weights)
+    loss = weighted_median(losses, weights)
+    spread = 1.4826 * weighted_median(np.abs(losses - loss), weights)
     std = float(np.hypot(spread, np.median(stds)) / np.sqrt(len(measured)))
     bad = loss < DEFOCUSED_DB - 2 * std
     line = f"{len(measured)} bright points lost {abs(loss):.2f} ± {std:.2f} dB of their peak to phase errors"
@@ -310,9 +310,3 @@ def judge_parts(parts: SubApertures, *, cell_m: float) -> Focus:
 def _std_db(focus: PointFocus) -> float:
     """Return the standard deviation of the loss of one point by noise and neighbours, dB."""
     return 10 / float(np.log(10)) * focus.interference * float(np.sqrt(2 / LEAST_BLOCKS)) + 0.02
-
-
-def _weighted_median(values: NDArray[np.float64], weights: NDArray[np.float64]) -> float:
-    order = np.argsort(values)
-    share = np.cumsum(weights[order]) - weights[order] / 2
-    return float(np.interp(weights.sum() / 2, share, values[order]))

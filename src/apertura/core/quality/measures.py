@@ -177,6 +177,19 @@ def content_loss_db(terms: NDArray[np.complex128]) -> float:
     return float(10 * np.log10(incoherent / coherent)) if coherent > 0 and incoherent > 0 else 0.0
 
 
+def weighted_median(values: NDArray[np.float64], weights: NDArray[np.float64]) -> float:
+    """Return the value with half of the weight on either side, interpolated.
+
+    Examples
+    --------
+    >>> weighted_median(np.array([1.0, 9.0, 2.0]), np.array([1.0, 1.0, 1.0]))
+    2.0
+    """
+    order = np.argsort(values)
+    share = np.cumsum(weights[order]) - weights[order] / 2
+    return float(np.interp(weights.sum() / 2, share, values[order]))
+
+
 # ---- Sums of images as amplitudes
 
 

@@ -23,6 +23,9 @@ from apertura.methods.autofocus.solve import Problem, State
 MOST_RATIO = 1e3
 """Peak to surroundings, power: above, a point's neighbours and not its noise bound the accuracy of its phase."""
 
+FOLDS = 4
+"""Of cross-validation: a quarter of the patches is left out of a fit, and decides on what was fitted to the others."""
+
 
 @dataclass(frozen=True, eq=False)
 class Remaining:

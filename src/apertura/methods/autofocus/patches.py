@@ -271,11 +271,9 @@ def looks_of(records: Sequence[PairRecord], errors: Mapping[str, TrackErrors]) -
     """
     spans_s, shortest_s, longest_s = [], [], []
     for one in records:
-        wavenumber = 2 * np.pi * one.profiles.centre_frequency_hz / SPEED_OF_LIGHT_M_S
-        of_nodes = [errors[node] for node in one.nodes]
-        turned = 2 * wavenumber * max(max(error.std_m) for error in of_nodes)
-        longest_s.append(min(error.correlation_s for error in of_nodes))
-        shortest_s.append(longest_s[-1] * min(1.0, _BLURRED_RAD2 / (2 * turned**2)))
+        lasts_s, turned = one.turned(errors)
+        longest_s.append(lasts_s)
+        shortest_s.append(lasts_s * min(1.0, _BLURRED_RAD2 / (2 * turned**2)))
         spans_s.append(float(one.time_s[-1] - one.time_s[0]))
     most, least = (int(np.clip(max(spans_s) / max(min(one), 1e-9), 1, MOST_LOOKS)) for one in (shortest_s, longest_s))
     steps = max(1, int(np.ceil(np.log2(most / least)))) if most > least else 0

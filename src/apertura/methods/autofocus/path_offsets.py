@@ -12,14 +12,11 @@ from apertura.core.focus.contributions import block_contributions
 from apertura.core.geometry.phase_centres import TrackCorrection
 from apertura.core.quality.budget import NodePositions, position_lines
 from apertura.core.quality.path_errors import Effect, PointPaths
-from apertura.methods.autofocus.evidence import MOST_RATIO, gains_db, mean_gain
+from apertura.methods.autofocus.evidence import FOLDS, MOST_RATIO, gains_db, mean_gain
 from apertura.methods.autofocus.inputs import PairRecord, Refinement, TrackErrors
 from apertura.methods.autofocus.objective import PatchImage
 from apertura.methods.autofocus.one_phase import METHODS, Patches
 from apertura.methods.autofocus.patches import Candidates, Patch, bandwidth_hz, count_in_memory
-
-FOLDS = 4
-"""Of cross-validation: each part of the patches is left out of one fit. Tracks are refined where there are fewer."""
 
 _APART_CELLS = 2.0  # of range, c/B of total path: patches nearer than that share noise
 _BLOCKS_PER_CORRELATION_TIME = 10  # at least
@@ -120,9 +117,7 @@ class _Pair:
     def of(cls, record: PairRecord, patches: Sequence[Patch], errors: Mapping[str, TrackErrors]) -> "_Pair":
         profiles = record.profiles
         wavenumber = 2 * np.pi * profiles.centre_frequency_hz / SPEED_OF_LIGHT_M_S
-        of_nodes = [errors[node] for node in record.nodes]
-        correlation_s = min(error.correlation_s for error in of_nodes)
-        turned = 2 * wavenumber * max(max(error.std_m) for error in of_nodes)
+        correlation_s, turned = record.turned(errors)
         lasts = min(1 / _BLOCKS_PER_CORRELATION_TIME, _BETWEEN_BLOCKS_RAD2 / max(2 * turned**2, 1e-12))
         edges = _edges(record.time_s, correlation_s * lasts)
         middle = (edges[:-1] + edges[1:] - 1) // 2

@@ -11,6 +11,7 @@ from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import Terrain
 from apertura.methods.autofocus.evidence import (
+    FOLDS,
     MOST_RATIO,
     PARTS,
     Evidence,
@@ -201,9 +202,6 @@ def _apart(residuals: Floats) -> float:
 
 # ---- Refinement of a flight's tracks --------------------------------------------------------------------------------
 
-
-FOLDS = 4
-"""Of cross-validation: a quarter of the patches is left out of the fit and decides on acceptance."""
 
 _KNOTS_PER_CORRELATION_TIME = 10  # of corrections, by the shortest correlation time of an error
 _LEAST_KNOTS = 64  # of a flight
@@ -488,9 +486,8 @@ def _knots(records: Sequence[PairRecord], errors: Mapping[str, TrackErrors]) -> 
     first = min(float(one.time_s[0]) for one in records)
     last = max(float(one.time_s[-1]) for one in records)
     pulse_s = max(float(np.median(np.diff(one.time_s))) for one in records)
-    correlation_s = min(one.correlation_s for one in errors.values())
-    wavenumber = 2 * np.pi * max(one.profiles.centre_frequency_hz for one in records) / SPEED_OF_LIGHT_M_S
-    turned = 2 * wavenumber * max(max(one.std_m) for one in errors.values())
+    of_pairs = [one.turned(errors) for one in records]
+    correlation_s, turned = min(lasts for lasts, _ in of_pairs), max(turned for _, turned in of_pairs)
     # White noise averaged over τ bends between knots Δ apart by σ²Δ/3τ.
     lasts = float(
         np.clip(

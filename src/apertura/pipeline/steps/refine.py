@@ -16,9 +16,10 @@ from apertura.core.geometry.geodesy import frame_from_map
 from apertura.core.geometry.phase_centres import TrackCorrection
 from apertura.core.imaging.range_profiles import profiles_of
 from apertura.core.planning.plan import Decision
+from apertura.methods.autofocus.evidence import FOLDS
 from apertura.methods.autofocus.inputs import PairRecord, ReferencePoint, Refinement, TrackErrors
 from apertura.methods.autofocus.patches import Candidates
-from apertura.methods.autofocus.path_offsets import FOLDS, refine_one_phase
+from apertura.methods.autofocus.path_offsets import refine_one_phase
 from apertura.methods.autofocus.refine import refine as refine_tracks
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.lineage import result_of
