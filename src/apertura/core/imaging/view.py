@@ -67,37 +67,6 @@ def view_report(formation: Formation, began: np.datetime64, time_s: NDArray[np.f
     }
 
 
-def carrier_at(carriers: NDArray[np.float64], shape: tuple[int, int], row: float, column: float) -> tuple[float, float]:
-    """Return the spatial frequency that a point's band lies about, east and north, cycles per metre.
-
-    Parameters
-    ----------
-    carriers
-        (3, 3, 2) float64, `carriers_cycles_m` of a view: rows, columns, east and north.
-    shape
-        Rows and columns of the image.
-    row, column
-        Fractional pixel.
-
-    Notes
-    -----
-    By the parabolas through the nine places. The direction to an antenna turns by a small share of the angle under
-    which the scene is seen from it, so its third order is what is left out.
-
-    Examples
-    --------
-    >>> bent = np.array([[[c * c, r] for c in (-1, 0, 1)] for r in (-1, 0, 1)], float)
-    >>> carrier_at(bent, (101, 101), 75, 75)
-    (0.25, 0.5)
-    """
-    weights = []
-    for at, size in zip((row, column), shape, strict=True):
-        along = 2 * at / max(size - 1, 1) - 1
-        weights.append(np.array([along * (along - 1) / 2, 1 - along**2, along * (along + 1) / 2]))
-    east, north = np.einsum("r,c,rcx->x", *weights, np.asarray(carriers, np.float64))
-    return float(east), float(north)
-
-
 def carriers_of(formation: Formation) -> NDArray[np.float64]:
     """Return the carriers of points at corners, edges and middle of the scene, (3, 3, 2) as `carrier_at` takes them.
 

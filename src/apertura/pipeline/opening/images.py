@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 from apertura.common.contracts import Window
 from apertura.common.errors import CampaignError
 from apertura.common.provenance import sha256_file
-from apertura.core.imaging.view import carrier_at
 from apertura.core.quality.agreement import Agreement, agreement, agreement_of_ground
 from apertura.core.quality.bright_points import SPECKLE, BrightPoint, bright_points, has_point, near
 from apertura.core.quality.measures import BlockRaster
-from apertura.core.quality.point_targets import BandLimitedPatch
+from apertura.core.quality.point_targets import BandLimitedPatch, carrier_at
 from apertura.core.scene.grid import SceneGrid
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.store import read_manifest
