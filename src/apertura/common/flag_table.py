@@ -241,6 +241,12 @@ _OF_IMAGES = {
         "how far places would have to stand out, and what speckle shows",
         "no bright place to refine tracks by; images are formed from the logs",
         "reflectors in the scene; processing.autofocus off", "methods/autofocus/patches.py"),
+    "cause_found": Flag(
+        "what is wrong, by how much, and dB that it explains",
+        "one wrong constant of the config explains what points lost better than errors of the logs do: images are "
+        "formed with it corrected",
+        "the constant named: lever_arms_m or attitude, config/clocks.tsv, scene.height_m",
+        "methods/autofocus/causes.py"),
     "prior_inconsistent": Flag(
         "how large the motions are against the errors stated",
         "motions that the images settle are much larger or smaller than the errors that logs or config state",

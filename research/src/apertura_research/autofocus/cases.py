@@ -15,6 +15,7 @@ from apertura.core.geometry.phase_centres import TrackCorrection
 from apertura.core.imaging.range_profiles import range_compress
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import FlatGround
+from apertura.methods.autofocus.causes import Cause, late_logs, other_arm, other_height
 from apertura.methods.autofocus.inputs import PairRecord, TrackErrors
 from apertura.simulation.echoes import transfer
 from apertura.simulation.scene import Scatterers
@@ -367,6 +368,85 @@ def case(
         tuple(record(pair, flight, truth, probes, None, noises[pair]) for pair in PAIRS[pairs]),
         flight.reach_m,
     )
+
+
+# ---- Flights with one wrong constant of the config ------------------------------------------------------------------
+
+_SWAY = {"yaw": ((8.0, 3.1), (4.0, 1.3)), "roll": ((5.0, 2.3),)}
+"""Degrees and seconds of the sway of a body about its course, as wind makes it."""
+
+_WIDEST = {"time": 0.2, "lever arm": 0.3, "height": 0.5}
+"""Of what is drawn: seconds, metres in each axis, metres."""
+
+
+def body_axes(flight: LoggedFlight, node: str, generator: np.random.Generator) -> Floats:
+    """Return forward, right, down of a body that follows its course and sways, (pulse, 3, 3): columns, in the frame."""
+    east, north, _ = np.gradient(flight.logged_m[node], flight.time_s, axis=0).T
+    angle = {
+        name: sum(
+            np.radians(size) * np.sin(2 * np.pi * flight.time_s / period_s + generator.uniform(0, 2 * np.pi))
+            for size, period_s in waves
+        )
+        for name, waves in _SWAY.items()
+    }
+    course = np.arctan2(north, east) + angle["yaw"]
+    level, flat = np.zeros_like(course), np.array([0.0, 0.0, 1.0])
+    forward = np.stack([np.cos(course), np.sin(course), level], -1)
+    starboard = np.stack([np.sin(course), -np.cos(course), level], -1)
+    right = np.cos(angle["roll"])[:, None] * starboard - np.sin(angle["roll"])[:, None] * flat
+    return np.stack([forward, right, np.cross(forward, right)], -1)
+
+
+def wrong_case(
+    kind: str, scene: str, geometry: str, sigma_m: float, seed: int, *, snr_db: float = 10.0
+) -> tuple[AutofocusCase, tuple[Cause, ...], tuple[str, Floats]]:
+    """Return a case of both pairs with one wrong constant beside the logs' errors, what may be wrong, and what is.
+
+    Parameters
+    ----------
+    kind
+        time, lever arm, height, or nothing.
+    scene, geometry, sigma_m, seed, snr_db
+        As of `case`.
+
+    Returns
+    -------
+    tuple
+        The case; all causes that a campaign with such logs has; node, or 'all', and the values.
+    """
+    one, flight, generator = case(scene, geometry, "joint", sigma_m, snr_db, seed), FLIGHTS[geometry](), _drawn(seed)
+    axes = {node: body_axes(flight, node, generator) for node in NODES}
+    flown = {node: (flight.time_s, flight.logged_m[node]) for node in NODES}
+    causes = [
+        *(late_logs([node], flown) for node in NODES),
+        *(other_arm(node, flight.time_s, axes[node]) for node in NODES),
+        other_height(NODES, flight.time_s, np.array([0.0, 0.0, 1.0])),
+        late_logs(NODES, flown),
+    ]
+    possible = [cause for cause in causes if cause.kind == kind]
+    node, values = "", np.zeros(0)
+    moved = {node: np.array(moved_m) for node, moved_m in one.truth.moved_m.items()}
+    if possible:
+        wrong = possible[generator.integers(min(len(NODES), len(possible)))]
+        values = generator.uniform(0.2, 1.0, len(wrong.std)) * generator.choice([-1, 1], len(wrong.std)) * _WIDEST[kind]
+        for name, by_unit in wrong.moved_m.items():
+            moved[name] += np.tensordot(values, by_unit, axes=1)
+        node = next(iter(wrong.moved_m)) if len(wrong.moved_m) == 1 else "all"
+    truth = TrackCorrection(flight.time_s, moved)
+    _, of_scene, of_noise, of_probes = np.random.default_rng(seed).spawn(4)
+    scatterers, probes = SCENES[scene](of_scene), _probes(of_probes)
+    noises = dict(zip(PAIRS["joint"], of_noise.spawn(2), strict=True))
+    made = replace(
+        one,
+        truth=truth,
+        records=tuple(record(pair, flight, truth, scatterers, snr_db, noises[pair]) for pair in PAIRS["joint"]),
+        probes=tuple(record(pair, flight, truth, probes, None, noises[pair]) for pair in PAIRS["joint"]),
+    )
+    return made, tuple(causes), (node, values)
+
+
+def _drawn(seed: int) -> np.random.Generator:
+    return np.random.default_rng([seed, 1])
 
 
 def _probes(generator: np.random.Generator) -> TargetScene:

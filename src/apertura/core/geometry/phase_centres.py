@@ -51,6 +51,11 @@ class TrackCorrection:
             return np.zeros((len(time_s), 3))
         return np.stack([np.interp(time_s, self.time_s, axis) for axis in moved.T], axis=-1)
 
+    def with_further(self, later: "TrackCorrection") -> "TrackCorrection":
+        """Return this and a correction, at the same knots, of tracks that it corrected."""
+        moved_m = {node: self.moved_m.get(node, 0.0) + moved for node, moved in later.moved_m.items()}
+        return TrackCorrection(self.time_s, {**self.moved_m, **moved_m}, {**self.further_m, **later.further_m})
+
     def aperture(self, logged: Aperture, pair: str, time_s: NDArray[np.float64]) -> Aperture:
         """Return the phase centres of a pair, transmitter-receiver, as corrected at the times of its pulses."""
         tx, rx = pair.split("-")

@@ -115,6 +115,7 @@ _REACH_CELLS, _STEPS = 3.0, 37  # of the line in range on which a point is searc
 _SLIP_SIGMA = 4.0  # standard deviations from which a shift in range is a slip
 _NEARER, _NEARER_OF_FEW = 0.6, 0.75
 """Wavelengths: from here a shift is nearer to a whole turn than to none; noise is allowed for, more of few points."""
+_NOTHING = 1e-9  # contrast over contrast, of a patch out of what the pulses hold
 _SCATTERING_POINTS, _POINT_STD_CELLS = 3, 0.055
 """Points from which their scatter says how well a shift is known; and that of one of fewer, in cells c/B of path: a
 point some 20 dB out of the noise of a part."""
@@ -335,8 +336,11 @@ def gains_db(before: Sequence[Sequence[PatchImage]], after: Sequence[Sequence[Pa
     >>> gains_db([[PatchImage(1.0, 0.1, 9.0)]], [[PatchImage(1.0, 0.2, 9.0)]]).round(2)
     array([[3.01]])
     """
-    ratio = [[b.contrast / a.contrast for a, b in zip(*both, strict=True)] for both in zip(before, after, strict=True)]
-    return np.asarray(10 * np.log10(np.array(ratio)), np.float64)
+    ratio = [
+        [b.contrast / max(a.contrast, 1e-150) for a, b in zip(*both, strict=True)]
+        for both in zip(before, after, strict=True)
+    ]
+    return np.asarray(10 * np.log10(np.maximum(np.array(ratio), _NOTHING)), np.float64)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,7 +1,7 @@
 """Inputs and outcome of a refinement of tracks: data of each pair, prior of track errors, corrections."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any
 
@@ -59,6 +59,14 @@ class PairRecord:
         """Return the profiles over corrected tracks (docs/theory/autofocus.md, eq. 3)."""
         aperture = correction.aperture(self.profiles.aperture, self.pair, self.time_s)
         return self.profiles.moved(aperture, correction.longer_m(self.pair, self.time_s, self.sidelink_m))
+
+    def corrected(self, correction: TrackCorrection) -> "PairRecord":
+        """Return the record as if its logs had been corrected."""
+        tx, rx = self.nodes
+        between_m = self.sidelink_m
+        if between_m is not None:
+            between_m = between_m + correction.at(tx, self.time_s) - correction.at(rx, self.time_s)
+        return replace(self, profiles=self.moved(correction), sidelink_m=between_m)
 
 
 @dataclass(frozen=True)

@@ -257,7 +257,7 @@ class PatchImage:
     def of(cls, image: NDArray[np.complex64], brightest: float = 0.0) -> "PatchImage":
         """Return those of an image (pixel,); `brightest` is the power of the brightest pixel of all patches."""
         power = np.abs(image).astype(np.float64) ** 2
-        energy = max(float(power.sum()), 1e-300)
+        energy = max(float(power.sum()), 1e-150)  # its square is more than nothing, also where pulses hold nothing
         about = max(float(np.median(power)) / np.log(2), _SIDELOBES * brightest, 1e-300)
         return cls(energy, float((power**2).sum()) / energy**2, float(power.max()) / about)
 

@@ -10,6 +10,7 @@ from apertura.common.arrays import Bools, Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import Terrain
+from apertura.methods.autofocus.causes import LEAST_EVIDENCE, Cause, Explained, explained, more_of
 from apertura.methods.autofocus.evidence import (
     FOLDS,
     MOST_RATIO,
@@ -229,6 +230,7 @@ def refine(
     errors: Mapping[str, TrackErrors],
     *,
     reference_points: Sequence[ReferencePoint] = (),
+    causes: Sequence[Cause] = (),
 ) -> Refinement:
     """Return the corrections of a flight's tracks that make its images sharpest, and whether they are accepted.
 
@@ -242,25 +244,102 @@ def refine(
         Node → error statistics of its log.
     reference_points
         Points of known place, which fix the image's position.
+    causes
+        Constants of the config that may be wrong, tried where errors of the logs alone do not explain the images.
 
     Notes
     -----
     Source: docs/theory/autofocus.md. A rejected refinement keeps its corrections; images are formed without them.
     """
+    plain = _Model.of(records, grid, terrain, errors)
+    found = plain.refinement(errors, reference_points)
+    cause = _cause(records, grid, terrain, errors, causes)
+    if cause is None:
+        return found
+    other = _Model.of([one.corrected(cause.correction) for one in records], grid, terrain, errors)
+    rest = other.refinement(errors, reference_points)
+    evidence = other.evidence_against(plain, cause)
+    return found if evidence < LEAST_EVIDENCE else cause.with_rest(rest, evidence)
+
+
+@dataclass(frozen=True, eq=False)
+class _Model:
+    """Errors of the logs as the only ones, or beside a cause: the search, and where it ended."""
+
+    begun: "TrackSearch"
+    best: "Round | None"
+    by_speckle: Refinement | None
+
+    @classmethod
+    def of(
+        cls, records: Sequence[PairRecord], grid: SceneGrid, terrain: Terrain, errors: Mapping[str, TrackErrors]
+    ) -> "_Model":
+        begun = TrackSearch.begin(records, grid, terrain, errors)
+        best = begun.rounds(grid, terrain, errors) if begun.problem.patches else None
+        ask = best is None or not (best.evidence.accepted or len(best.search.problem.patches) >= _FEW)
+        return cls(begun, best, begun.by_speckle(grid, terrain, errors) if ask else None)
+
+    def refinement(self, errors: Mapping[str, TrackErrors], points: Sequence[ReferencePoint]) -> Refinement:
+        """Return what becomes of the tracks."""
+        if self.by_speckle is not None and self.by_speckle.accepted:
+            return self.by_speckle
+        if self.best is None:
+            return self.begun.candidates.rejected(errors, self.by_speckle)
+        search, state, evidence = self.best.search, self.best.state, self.best.evidence
+        left = remaining(search.problem, state)
+        unknowns, ties = search.fix_gauge(state, points, apart_sigma=evidence.apart_sigma)
+        found = {"patches": len(search.problem.patches), "rounds": self.best.number}
+        report = {**evidence.report, **left.report, **ties, **found}
+        correction = search.problem.correction(unknowns)
+        return Refinement(correction, left.std_m, evidence.accepted, evidence.why, report, evidence.flags)
+
+    def evidence_against(self, plain: "_Model", cause: Explained) -> float:
+        """Return by how much the objective of the logs' errors alone lies above that of these beside a cause.
+
+        Notes
+        -----
+        Source: docs/theory/autofocus.md, eq. 16b: over the places that either model sees; what is sharp along the logs
+        must not be given up for others.
+        """
+        if self.best is None or plain.best is None:
+            return -np.inf
+        moved = cause.correction.moved_m
+        rest, alone = self.best.state.tracks, plain.best.state.tracks
+        both = {node: moved[node] + track for node, track in rest.items()}
+        less = {node: track - moved[node] for node, track in alone.items()}
+        still = {node: np.zeros_like(track) for node, track in alone.items()}
+        if plain.begun.blur(both) > plain.begun.blur(still):
+            return -np.inf
+        searches = ((plain.best.search, alone, both), (self.best.search, less, rest))
+        sharper = sum(search.blur(one) - search.blur(other) for search, one, other in searches)
+        unknowns = plain.best.state.unknowns, self.best.state.unknowns
+        energy = 0.5 * (float(unknowns[0] @ unknowns[0]) - float(unknowns[1] @ unknowns[1]))
+        return sharper + energy - cause.energy
+
+
+def _cause(
+    records: Sequence[PairRecord],
+    grid: SceneGrid,
+    terrain: Terrain,
+    errors: Mapping[str, TrackErrors],
+    causes: Sequence[Cause],
+) -> Explained | None:
+    """Return the cause that explains most of what a flight lost, its size found in rounds as places come out."""
+    if not causes:
+        return None
     begun = TrackSearch.begin(records, grid, terrain, errors)
-    best = begun.rounds(grid, terrain, errors) if begun.problem.patches else None
-    if best is None or not (best.evidence.accepted or len(best.search.problem.patches) >= _FEW):
-        by_speckle = begun.by_speckle(grid, terrain, errors)
-        if by_speckle is not None and by_speckle.accepted:
-            return by_speckle
-        if best is None:
-            return begun.candidates.rejected(errors, by_speckle)
-    search, state, evidence = best.search, best.state, best.evidence
-    left = remaining(search.problem, state)
-    unknowns, ties = search.fix_gauge(state, reference_points, apart_sigma=evidence.apart_sigma)
-    report = {**evidence.report, **left.report, **ties, "patches": len(search.problem.patches), "rounds": best.number}
-    correction = search.problem.correction(unknowns)
-    return Refinement(correction, left.std_m, evidence.accepted, evidence.why, report, evidence.flags)
+    if not begun.problem.patches:
+        return None
+    found = explained(begun.problem, causes, begun.axes, np.random.default_rng(0))
+    for _ in range(MOST_ROUNDS - 1 if found is not None else 0):
+        assert found is not None
+        moved = [one.corrected(found.correction) for one in records]
+        again = TrackSearch.begin(moved, grid, terrain, errors)
+        further = more_of(again.problem, found, again.axes) if again.problem.patches else found
+        if further.gain_db - found.gain_db < LEAST_FURTHER_DB:
+            break
+        found = further
+    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -343,7 +422,7 @@ class TrackSearch:
     ) -> "TrackSearch | None":
         """Return the search over the places that are bright in the image of refined tracks; None where none is."""
         correction = self.problem.correction(state.unknowns)
-        refined = [replace(blocks.record, profiles=blocks.record.moved(correction)) for blocks in self.problem.pairs]
+        refined = [blocks.record.corrected(correction) for blocks in self.problem.pairs]
         candidates = Candidates.of(refined, grid, terrain, errors, looks=REFINED_LOOKS)
         if not candidates.patches or self._known(candidates):
             return None
@@ -468,6 +547,12 @@ class TrackSearch:
             for state in states
         ]
         return states[int(np.argmin(values))]
+
+    def blur(self, tracks: Tracks) -> float:
+        """Return the objective of some tracks without their prior, as seen at the places of this search."""
+        state = replace(self.problem.at(tracks), unknowns=np.zeros(0))
+        value = self.problem.value(state, np.ones(len(self.problem.patches), bool), self.initial.statistics)
+        return value + pair_disagreement(self.problem, tracks, self.axes)[0]
 
     def by_speckle(self, grid: SceneGrid, terrain: Terrain, errors: Mapping[str, TrackErrors]) -> Refinement | None:
         """Return the refinement by speckle; None of one pair alone."""

@@ -89,6 +89,14 @@ class NodeLog:
             *self._sound, at=at, lever_arm_m=getattr(self.settings.lever_arms_m, name), **self._from_log
         )
 
+    @property
+    def has_attitude(self) -> bool:
+        """Whether body axes are known: from the log at all its sound epochs, or from the course."""
+        _, _, logged = self._sound
+        return self.settings.attitude == "course" or (
+            self.settings.attitude == "log" and bool(np.isfinite(logged).all())
+        )
+
     def body_axes(self, at: Times) -> NDArray[np.float64]:
         """Return forward, right, down of the body in the log's frame at given times, (time, axis, body) float64."""
         return attitude_axes(*self._sound, at=at, **self._from_log)

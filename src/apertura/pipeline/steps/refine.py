@@ -1,6 +1,6 @@
 """Rule `refine`: errors of a flight's tracks as its images show them, all pairs together, or why they are left."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -9,6 +9,8 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from apertura.common.arrays import Floats
+from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.flags import Flags
 from apertura.common.provenance import merged
 from apertura.core.focus.inputs import Profiles
@@ -16,6 +18,7 @@ from apertura.core.geometry.geodesy import frame_from_map
 from apertura.core.geometry.phase_centres import TrackCorrection
 from apertura.core.imaging.range_profiles import profiles_of
 from apertura.core.planning.plan import Decision
+from apertura.methods.autofocus.causes import Cause, late_logs, other_arm, other_height
 from apertura.methods.autofocus.evidence import FOLDS
 from apertura.methods.autofocus.inputs import PairRecord, ReferencePoint, Refinement, TrackErrors
 from apertura.methods.autofocus.patches import Candidates
@@ -24,6 +27,7 @@ from apertura.methods.autofocus.refine import refine as refine_tracks
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.lineage import result_of
 from apertura.pipeline.opening.autofocus import autofocus_of, clock_s, errors_of
+from apertura.pipeline.opening.node_log import raw_log
 from apertura.pipeline.opening.pair import OpenPair, open_pair, pattern_digests
 from apertura.pipeline.opening.plan import weighing
 from apertura.pipeline.opening.scene import OpenScene, open_scene
@@ -47,12 +51,15 @@ class RefinementInputs:
         Points of the scene whose places are known.
     began
         Zero of the clock, UTC.
+    causes
+        Constants of the config that may be wrong.
     """
 
     records: tuple[PairRecord, ...]
     errors: Mapping[str, TrackErrors]
     points: tuple[ReferencePoint, ...]
     began: np.datetime64
+    causes: tuple[Cause, ...] = ()
 
 
 def refinement_inputs(campaign: Campaign, pairs: Mapping[OpenPair, Profiles], scene: OpenScene) -> RefinementInputs:
@@ -72,7 +79,31 @@ def refinement_inputs(campaign: Campaign, pairs: Mapping[OpenPair, Profiles], sc
         PairRecord(pair.name, profiles, clock_s(pair, began), pair.sidelink_m, weighing(campaign, pair, scene))
         for pair, profiles in pairs.items()
     ]
-    return RefinementInputs(tuple(records), errors_of(list(pairs)), reference_points(campaign), began)
+    flight, height = next(iter(pairs)).flight, scene.axes[2]
+    causes = tuple(_causes(campaign, flight, records, began, height))
+    return RefinementInputs(tuple(records), errors_of(list(pairs)), reference_points(campaign), began, causes)
+
+
+def _causes(
+    campaign: Campaign, flight: str, records: Sequence[PairRecord], began: np.datetime64, up: Floats
+) -> Iterator[Cause]:
+    """Yield what may be wrong: height of the ground; times of logs; lever arms of nodes whose attitude is known."""
+    flown = {
+        node: (one.time_s, leg)
+        for one in records
+        for node, leg in zip(one.nodes, one.profiles.aperture.legs, strict=True)
+    }
+    yield other_height(list(flown), records[0].time_s, up)
+    logged = [node for node in flown if campaign.logged(flight, node)]
+    for node in logged:
+        yield late_logs([node], flown)
+        time_s, _ = flown[node]
+        wave_m = SPEED_OF_LIGHT_M_S / records[0].profiles.centre_frequency_hz
+        log = raw_log(campaign, flight, node, wave_m)
+        if log.has_attitude:
+            yield other_arm(node, time_s, log.body_axes(began + (1e9 * time_s).astype("timedelta64[ns]")))
+    if len(logged) > 1:
+        yield late_logs(logged, flown)
 
 
 def reference_points(campaign: Campaign) -> tuple[ReferencePoint, ...]:
@@ -118,7 +149,8 @@ def _searched(given: RefinementInputs, scene: OpenScene, method: str) -> Refinem
     records, errors = given.records, given.errors
     found = None if method == "tracks" else Candidates.of(records, scene.grid, scene.terrain, errors)
     if found is None or len(found.patches) < FOLDS:
-        return refine_tracks(records, scene.grid, scene.terrain, errors, reference_points=given.points)
+        points, causes = given.points, given.causes
+        return refine_tracks(records, scene.grid, scene.terrain, errors, reference_points=points, causes=causes)
     return refine_one_phase(records, found, errors, method=method)
 
 
