@@ -62,6 +62,7 @@ def _write_config(root: Path, campaign: DrawnCampaign) -> None:
             "spacing_m": scene.spacing_m,
             "height_m": specification.origin.height_m if scene.height_m is None else scene.height_m,
             "height_datum": "ellipsoid",
+            **_stated_air(specification),
         },
     }
     write_config(
@@ -72,6 +73,14 @@ def _write_config(root: Path, campaign: DrawnCampaign) -> None:
     _write_segments(root, specification)
     name, sent = campaign.waveform.sent
     np.save(root / "raw" / name, sent)
+
+
+def _stated_air(specification: CampaignSpecification) -> dict[str, Any]:
+    """Return what the config says of the air: nothing of the standard atmosphere, which nobody had to measure."""
+    if specification.atmosphere == "standard":
+        return {}
+    vacuum = specification.atmosphere == "vacuum"
+    return {"atmosphere": "vacuum" if vacuum else {"refractivity_n": specification.atmosphere}}
 
 
 def _write_segments(root: Path, specification: CampaignSpecification) -> None:

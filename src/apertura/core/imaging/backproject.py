@@ -192,7 +192,9 @@ def _error(formation: Formation, pixels: NDArray[np.int64], exact: NDArray[np.co
 def _compressed(inputs: PhaseHistory | Profiles, grid: SceneGrid, ground: Terrain, beams: Beams | None) -> Profiles:
     if isinstance(inputs, Profiles):
         return inputs
-    window = RangeWindow.of(inputs.aperture, grid, ground, inputs.frequency_hz, beams=beams)
+    window = RangeWindow.of(
+        inputs.aperture, grid, ground, inputs.frequency_hz, beams=beams, wave_speed_m_s=inputs.wave_speed_m_s
+    )
     return range_compress(inputs, grid, ground, window=window)
 
 
@@ -204,6 +206,6 @@ def _job(
         job = profiles_job(inputs, grid, ground, **weighed)
     else:
         known = (inputs.aperture, inputs.frequency_hz, inputs.weight)
-        job = imaging_job(*known, grid, ground, history=inputs, **weighed)
+        job = imaging_job(*known, grid, ground, history=inputs, wave_speed_m_s=inputs.wave_speed_m_s, **weighed)
     illumination = None if job.beams is None else illuminate(job.beams, job.aperture, job.points_m)
     return replace(job, illumination=illumination, memory_bytes=memory_limit())

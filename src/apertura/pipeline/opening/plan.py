@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from rich.filesize import decimal
 
-from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
 from apertura.common.flags import Flags
 from apertura.core.antenna.beam import Beams
@@ -94,7 +93,7 @@ def paths_to_middle(pair: OpenPair, scene: OpenScene) -> PointPaths:
         pair.time_s,
         point_m=scene.middle_m,
         axes=scene.axes,
-        wavelength_m=SPEED_OF_LIGHT_M_S / centre_frequency(pair.frequency_hz),
+        wavelength_m=pair.wave_speed_m_s / centre_frequency(pair.frequency_hz),
     )
 
 
@@ -221,6 +220,7 @@ def job_of(campaign: Campaign, pair: OpenPair, scene: OpenScene, *, threads: int
         history=pair.history,
         beams=pair.beams,
         integration=campaign.settings.processing.integrated,
+        wave_speed_m_s=pair.wave_speed_m_s,
     )
     return replace(
         job,
