@@ -14,8 +14,9 @@ from pydantic.dataclasses import dataclass
 from pydantic.fields import FieldInfo
 
 from apertura.common.arrays import Floats
+from apertura.common.constants import LARGEST_REFRACTIVITY
 from apertura.common.documents import read_yaml, validated
-from apertura.core.geometry.atmosphere import LARGEST_REFRACTIVITY, Atmosphere
+from apertura.core.geometry.atmosphere import Atmosphere
 from apertura.core.geometry.geodesy import geodetic_from_ecef, projected_from_ecef
 from apertura.simulation.continuous import Framing
 from apertura.simulation.echoes import TrueAir

@@ -14,9 +14,6 @@ SCALE_HEIGHT_M = 7350.0
 STANDARD_HUMIDITY_PERCENT = 50.0
 """Relative humidity taken where nobody states it; the standard atmosphere has none."""
 
-LARGEST_REFRACTIVITY = 500.0
-"""Of air anywhere on Earth, hot, wet and low: ITU-R P.453, Fig. 1 has 400 as its largest mean at sea level."""
-
 _STANDARD_K, _STANDARD_HPA, _LAPSE_K_M, _BAROMETRIC = 288.15, 1013.25, 6.5e-3, 5.2559  # ISO 2533, below 11 km
 _HIGHEST_M = 11_000.0  # where its lapse ends
 _UNKNOWN = 10.0, 20.0, 100 / np.sqrt(12)  # K, hPa, % (any humidity alike): weather against the standard atmosphere

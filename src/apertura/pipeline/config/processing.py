@@ -7,9 +7,8 @@ from typing import Any, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
-from apertura.common.constants import VERTICAL_DATUMS
+from apertura.common.constants import LARGEST_REFRACTIVITY, VERTICAL_DATUMS
 from apertura.common.errors import CampaignError, quoted
-from apertura.core.geometry.atmosphere import LARGEST_REFRACTIVITY
 from apertura.core.imaging.choices import ImagingChoices
 from apertura.pipeline.config.section import CrsName, Metres3, Name, Section, Title, plain_crs
 

@@ -66,6 +66,7 @@ def budget_of(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> list[Budg
             _scaled(pair.report, "calibration", "std_m", _CM),
             unit="cm of path",
         ),
+        _air(campaign, pair, paths),
         _sampling(pair.report.get("pulses", {})),
         _antenna(pair),
     ]
@@ -121,6 +122,38 @@ def arithmetic_line(error_db: float) -> BudgetLine:
     return BudgetLine(
         "arithmetic", f"{error_db:.1f} dB measured", Effect(10 * np.log10(1 - 10 ** (error_db / 10)), 0, 0)
     )
+
+
+def _air(campaign: Campaign, pair: OpenPair, paths: PointPaths) -> BudgetLine:
+    """Return what the uncertainty of the air's refractivity does: all pairs lie wrong alike, less what paths differ by.
+
+    Against the transmitter's own image a pair's phase is off by what its path differs, the sidelink's length included
+    (docs/theory/atmosphere.md, eq. 6).
+    """
+    per_n, said = 1e-6 * float(pair.air["std_n"]), f"{pair.air['source']}: N = {pair.air['refractivity_n']:.1f}"
+    tx_m, rx_m = (np.linalg.norm(leg - paths.point_m, axis=1) for leg in paths.aperture.legs)
+    known_m, further_m = np.zeros(len(tx_m)), rx_m - tx_m
+    if not pair.monostatic and isinstance(campaign.settings.waveform, SampledWaveform):
+        known_m = np.linalg.norm(paths.aperture.tx_m - paths.aperture.rx_m, axis=1)
+    effect = paths.of_offset(per_n * (tx_m + rx_m - known_m), common=True)
+    phase_rad = 2 * np.pi / paths.wavelength_m * per_n * float(np.abs(further_m - known_m).mean())
+    effect = replace(effect, phase_rad=0.0 if pair.monostatic else phase_rad)
+    said = f"{said} ± {pair.air['std_n']:.1f}"
+    assumed = campaign.settings.scene.atmosphere == "auto"
+    return BudgetLine("atmosphere", None if assumed else said, effect, assumed=said if assumed else None)
+
+
+def air_decision(pair: OpenPair) -> Decision:
+    """Return which air the paths of a pair are of, and what vacuum would have done: one constant for all of them."""
+    air = pair.air
+    cell_m = pair.wave_speed_m_s / float(np.ptp(pair.frequency_hz)) / 2
+    moved_m, left_m = float(air["vacuum_would_move_m"]), float(air["one_constant_leaves_m"])
+    why = (
+        f"{air['source']}; mean along the paths from {air['antennas_m']:.0f} m; vacuum would move the image by "
+        f"{100 * moved_m:.2g} cm, {moved_m / cell_m:.2g} of a range cell; one value for all pulses leaves "
+        f"{100 * left_m:.1g} cm of path"
+    )
+    return Decision("atmosphere", f"N = {air['refractivity_n']:.1f}", why)
 
 
 def _scaled(report: Mapping[str, Any], section: str, name: str, unit: float) -> float | None:
@@ -187,7 +220,9 @@ def plan_pair(campaign: Campaign, pair: OpenPair, scene: OpenScene, *, threads: 
     flags = check_antennas(scene.grid, scene.terrain, pair.aperture, where=where)
     accuracy = accuracy_of(campaign, pair, scene)
     plan = plan_job(campaign, job_of(campaign, pair, scene, threads=threads), accuracy_db=float(accuracy.value))
-    plan = replace(plan, decisions=(*plan.decisions, accuracy), flags=Flags.merged(flags, plan.flags))
+    plan = replace(
+        plan, decisions=(*plan.decisions, accuracy, air_decision(pair)), flags=Flags.merged(flags, plan.flags)
+    )
     written = manifest_of(campaign.stage("image", pair.flight, pair.name)).is_file()
     free_disk = None if written else shutil.disk_usage(campaign.root).free
     check_fits(plan, free_disk=free_disk, where=f"{pair.flight}/{pair.name}")
