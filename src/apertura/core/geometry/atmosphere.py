@@ -65,7 +65,20 @@ def standard_weather(height_m: float) -> tuple[float, float, float]:
 
 
 def wave_speed(refractivity_n: float) -> float:
-    """Return the speed of a wave, m/s, in a medium of N units; of 0 exactly that in vacuum."""
+    """Return the speed of a wave in a medium of N units, m/s; of 0 exactly that in vacuum.
+
+    Parameters
+    ----------
+    refractivity_n
+        (n - 1)·10⁶: of `Atmosphere.mean_n` along a path.
+
+    Examples
+    --------
+    >>> import apertura as ap
+    >>> air = ap.Atmosphere.standard(620.0)  # at the ground; an antenna flies 300 m above it
+    >>> round(ap.wave_speed(float(air.mean_n(920.0, 620.0))), -3)
+    299708000.0
+    """
     return SPEED_OF_LIGHT_M_S / (1 + 1e-6 * refractivity_n)
 
 
