@@ -123,7 +123,10 @@ def test_a_target_seen_through_air_lies_where_it_stands_by_the_speed_in_air_and_
 
 @pytest.mark.parametrize("engine", [name for name in ENGINES if name not in {"cuda"}])
 def test_an_image_in_air_is_that_of_a_larger_world_in_vacuum(engine):
-    """docs/theory/atmosphere.md, eq. 4, pixel by pixel; every engine against itself, and against the double sum."""
+    """docs/theory/atmosphere.md, eq. 4, pixel by pixel; every engine against itself, and against the double sum.
+
+    Without a certificate, which would replace an engine that errs.
+    """
     if not load_engine(engine).available():
         pytest.skip("cannot run here")
     aperture = flight()
@@ -132,7 +135,7 @@ def test_an_image_in_air_is_that_of_a_larger_world_in_vacuum(engine):
     in_air = history(aperture, AIR, wave_speed_m_s=SPEED_OF_LIGHT_M_S / AIR)
     vacuum = replace(in_air, aperture=larger, wave_speed_m_s=SPEED_OF_LIGHT_M_S)
     images = [
-        np.asarray(ap.backproject(given, on, terrain=0.0, engine=engine, integration="all", certified_pixels=16))
+        np.asarray(ap.backproject(given, on, terrain=0.0, engine=engine, integration="all", certified_pixels=0))
         for given, on in ((in_air, GRID), (vacuum, grid))
     ]
     exact = np.asarray(ap.backproject(in_air, GRID, terrain=0.0, engine="reference", integration="all"))

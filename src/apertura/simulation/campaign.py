@@ -113,7 +113,10 @@ def _write_flights(root: Path, campaign: DrawnCampaign, generator: Generator) ->
     origin, targets = specification.origin, specification.targets
     ground, *streams = independent_streams(generator, 1 + 2 * len(specification.flights))
     standing = scatterers(origin, targets, ground)
-    truth: dict[str, Any] = targets_truth(origin, targets, specification.scene.crs) | {"flights": {}}
+    air = specification.air
+    known = {"refractivity_n": air.atmosphere.refractivity_n if air else 0.0, "at_m": origin.height_m}
+    truth: dict[str, Any] = targets_truth(origin, targets, specification.scene.crs)
+    truth |= {"atmosphere": known, "flights": {}}
     for flight, drawing, noise in zip(specification.flights, streams[::2], streams[1::2], strict=True):
         (root / "raw" / flight.name).mkdir()
         if flight.framing:

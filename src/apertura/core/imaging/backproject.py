@@ -89,8 +89,8 @@ def backproject(  # noqa: PLR0913 - each choice is a keyword, so that an editor 
     -------
     xarray.DataArray
         (y, x) complex64, carrier kept, 1 is the amplitude of an echo in every pulse; a dask array on whatever
-        scheduler the caller has. Attributes: units; `wave_speed_m_s`; the plan: `setting`, `predicted_error_db`, and as JSON `models`
-        (choice → value and reason) and `flags` (limit crossed → what was measured); the certificate:
+        scheduler the caller has. Attributes: units; `wave_speed_m_s`; the plan: `setting`, `predicted_error_db`, and
+        as JSON `models` (choice → value and reason) and `flags` (limit crossed → what was measured); the certificate:
         `numerical_error_db`, an upper bound at `numerical_error_confidence` for the whole image, and
         `numerical_error_estimate_db`, against the double sum over pulses and subcarriers, or from profiles alone
         against their band-limited interpolation in float64.
