@@ -30,6 +30,7 @@ from apertura.pipeline.store import manifest_of
 # ---- Error budget of a pair, from config, logs and echo -------------------------------------------------------------
 
 _MS, _CM, _PPM = 1e-3, 1e-2, 1e-6
+_USUAL_N = 300.0  # of air at the ground: what vacuum is told by
 _SHOWN_CELLS = 0.01  # of a range cell: a shift below it is lost in any peak of 20 dB (docs/theory/focus.md, eq. 6)
 
 
@@ -148,10 +149,12 @@ def air_decision(pair: OpenPair) -> Decision:
     """Return which air the paths of a pair are of, and what vacuum would have done: one constant for all of them."""
     air = pair.air
     cell_m = pair.wave_speed_m_s / float(np.ptp(pair.frequency_hz)) / 2
-    moved_m, left_m = float(air["vacuum_would_move_m"]), float(air["one_constant_leaves_m"])
+    moved_m, left_m, other = float(air["vacuum_would_move_m"]), float(air["one_constant_leaves_m"]), "vacuum"
+    if not air["refractivity_n"]:
+        moved_m, other = 1e-6 * _USUAL_N * float(air["range_m"]), f"air of N = {_USUAL_N:.0f}"
     shows = "" if moved_m > _SHOWN_CELLS * cell_m else ", which does not show"
     why = (
-        f"{air['source']}; mean along the paths from {air['antennas_m']:.0f} m; vacuum would move the image by "
+        f"{air['source']}; mean along the paths from {air['antennas_m']:.0f} m; {other} would move the image by "
         f"{100 * moved_m:.2g} cm of slant range, {moved_m / cell_m:.2g} of a cell{shows}; one value for all pulses "
         f"leaves {100 * left_m:.1g} cm of path"
     )
