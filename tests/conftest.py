@@ -104,9 +104,13 @@ def finished_tiny(_tiny, all_steps):
 
 
 @pytest.fixture(scope="session")
-def finished_sample(shared, all_steps):
+def finished_sample(shared, all_steps, tmp_path_factory):
     """The independently made campaign-sample with all its results; read only."""
-    return all_steps("sample", shared / "campaign-sample")
+    from folders import copy_writable, state
+
+    campaign = copy_writable(shared / "campaign-sample", tmp_path_factory.mktemp("sample") / "campaign")
+    state(campaign, "scene", atmosphere="vacuum")  # which the model that made it flies in
+    return all_steps("sample", campaign)
 
 
 def pytest_generate_tests(metafunc):

@@ -9,6 +9,7 @@ import pytest
 import zarr
 from folders import complaint, require_files
 
+from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.contracts import check
 from apertura.common.errors import CampaignError
 from apertura.formats.reading import read_phase_history
@@ -66,7 +67,8 @@ def read(kind, *paths):
 def test_what_was_written_comes_back(tmp_path, kind):
     fields = arrays()
     echo = check(read(kind, write(tmp_path / f"b{SUFFIX[kind]}", fields)), "echo")
-    assert echo.attrs == {"frame": "ecef", "pair": "a-b", "flags": {}}
+    of_vacuum = {"reference": "delay", "wave_speed_m_s": SPEED_OF_LIGHT_M_S}  # until a campaign states its air
+    assert echo.attrs == {"frame": "ecef", "pair": "a-b", "flags": {}, **of_vacuum}
     np.testing.assert_array_equal(echo.time.values, fields.pop("time").astype("datetime64[ns]"))
     np.testing.assert_allclose(echo.frequency.values, fields.pop("frequency"), rtol=1e-15)
     for name, values in fields.items():

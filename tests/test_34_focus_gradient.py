@@ -188,7 +188,10 @@ def test_a_stage_of_profiles_does_as_well_as_arrays_and_other_stages_are_refused
             "tx_position": (("pulse", "axis"), profiles.aperture.tx_m),
             "rx_position": (("pulse", "axis"), profiles.aperture.rx_m),
         },
-        attrs={name: getattr(profiles, name) for name in ("step_m", "centre_frequency_hz", "oversampling")},
+        attrs={
+            name: getattr(profiles, name)
+            for name in ("step_m", "centre_frequency_hz", "oversampling", "wave_speed_m_s")
+        },
     )
     one, other = (ap.gradient(given, patch, slope) for given in (profiles, stage))
     assert np.array_equal(one.rx_m, other.rx_m)

@@ -136,7 +136,7 @@ def collection(pulses=6, **changes):
     frequency = 1.2e9 + 1e5 * np.arange(64)
     parts = {"time": time, "tx_m": track, "rx_m": track, "frequency_hz": frequency, "path_limit_m": limit_m}
     ground = {"point_m": place, "origin_m": place, "axes": np.stack([east, north, -down])}
-    rest = {"area_m": (-5.0, -5.0, 5.0, 5.0), "spacing_m": 0.5, "parameters": {}}
+    rest = {"area_m": (-5.0, -5.0, 5.0, 5.0), "spacing_m": 0.5, "parameters": {}, "wave_speed_m_s": SPEED_OF_LIGHT_M_S}
     return CphdCollection("c f01 a-a", "a-a", **(parts | ground | rest | changes))
 
 

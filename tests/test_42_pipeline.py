@@ -151,9 +151,8 @@ def test_what_the_product_says_of_its_error_is_true(finished_tiny):
     dataset = open_stage(finished_tiny.stage("echo", *pair), "echo")
     formed = open_stage(finished_tiny.stage("image", *pair), "image").image.values
     frequency, places = dataset.frequency.values, (dataset.tx_position.values, dataset.rx_position.values)
-    spectra = PhaseHistory(
-        dataset.transfer.values, frequency, window_weights("hann", 1024), np.zeros(len(places[0])), Aperture(*places)
-    )
+    sampled = dataset.transfer.values, frequency, window_weights("hann", 1024), np.zeros(len(places[0]))
+    spectra = PhaseHistory(*sampled, Aperture(*places), dataset.attrs["wave_speed_m_s"])
     rows, columns = random_pixels(formed.shape, 200, seed=99)
     scene = open_scene(finished_tiny)
     exact = reference.form(spectra, scene.terrain.positions_at(scene.grid, rows, columns))

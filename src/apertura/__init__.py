@@ -19,6 +19,7 @@ __version__ = "0.1.0"
 
 _PUBLIC = {
     "Aperture": "apertura.core.geometry.aperture",
+    "Atmosphere": "apertura.core.geometry.atmosphere",
     "Dem": "apertura.core.scene.dem",
     "FlatGround": "apertura.core.scene.terrain",
     "PhaseHistory": "apertura.core.focus.inputs",
@@ -33,6 +34,7 @@ _PUBLIC = {
     "open_dem": "apertura.core.scene.dem",
     "range_compress": "apertura.core.imaging.range_profiles",
     "simulate": "apertura.simulation",
+    "wave_speed": "apertura.core.geometry.atmosphere",
     "write_campaign": "apertura.pipeline.opening.writing",
 }
 """Public name → module that defines it."""

@@ -3,5 +3,8 @@
 SPEED_OF_LIGHT_M_S = 299_792_458.0
 """Speed of light in vacuum, m/s (exact by definition of the metre)."""
 
+LARGEST_REFRACTIVITY = 500.0
+"""N units, (n - 1)·10⁶, of air anywhere on Earth, hot, wet and low: the largest mean of ITU-R P.453's maps is 400."""
+
 VERTICAL_DATUMS = {"EPSG:5773": "egm96", "EPSG:3855": "egm2008"}
 """Vertical CRS → the datum that its heights count from, as the config calls it."""

@@ -118,6 +118,7 @@ _FRAME = {
     "pair": "transmitter-receiver",
     "flags": "edges crossed so far: flag name → what was measured, in one line",
 }
+_WAVE = {"wave_speed_m_s": "speed of the wave along the paths, m/s: path = wave_speed_m_s · delay"}
 
 STAGES: Mapping[str, Stage] = {
     "raw": Stage(
@@ -169,7 +170,7 @@ STAGES: Mapping[str, Stage] = {
             "reference_delay": Variable(("pulse",), "float64", "s", "τ_ref, already removed from `transfer`"),
             "path_limit": Variable(("pulse",), "float64", "m", "total path beyond which an echo leaves the prefix"),
         },
-        _FRAME,
+        _FRAME | _WAVE,
         {
             "sidelink_delay": Variable(
                 ("pulse",), "float64", "m", "measured delay of the sidelink times c, any constant in it; NaN: no lock"
@@ -197,6 +198,7 @@ STAGES: Mapping[str, Stage] = {
         },
         {
             **_FRAME,
+            **_WAVE,
             "step_m": "total path between range samples, m",
             "centre_frequency_hz": "f_mid, to which the profile is referenced, Hz",
             "oversampling": "samples per resolution cell c/B of total path",

@@ -134,6 +134,23 @@ def heights(place: JobPlace) -> Iterable[str]:
     return map(place.campaign.relative, place.campaign.height_files().values())
 
 
+def ground_under_air(place: JobPlace) -> Iterable[str]:
+    """Return the files that the height of the ground comes from, where it decides the air."""
+    return [] if place.campaign.settings.scene.atmosphere == "vacuum" else heights(place)
+
+
+def air(place: JobPlace) -> Mapping[str, Any]:
+    """Return what decides the air that waves fly through: of the ground's height no more than counts."""
+    stated = place.campaign.values["scene"]
+    if stated["atmosphere"] == "vacuum":
+        return {"scene": {"atmosphere": "vacuum"}}
+    ground = ("dem_datum", "bounds_m", "crs") if stated["dem"] else ("height_datum",)
+    of_ground = {key: stated[key] for key in ground}
+    if not stated["dem"]:
+        of_ground["height_m"] = round(stated["height_m"], -1)
+    return {"scene": {"atmosphere": stated["atmosphere"], **of_ground}}
+
+
 def patterns(place: JobPlace) -> Iterable[str]:
     """Return the files of the sampled patterns of the pairs' antennas."""
     files = (path for _, pair in place.pairs for path in place.campaign.pattern_files(pair).values())

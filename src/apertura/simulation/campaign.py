@@ -62,6 +62,7 @@ def _write_config(root: Path, campaign: DrawnCampaign) -> None:
             "spacing_m": scene.spacing_m,
             "height_m": specification.origin.height_m if scene.height_m is None else scene.height_m,
             "height_datum": "ellipsoid",
+            **_stated_air(specification),
         },
     }
     write_config(
@@ -72,6 +73,14 @@ def _write_config(root: Path, campaign: DrawnCampaign) -> None:
     _write_segments(root, specification)
     name, sent = campaign.waveform.sent
     np.save(root / "raw" / name, sent)
+
+
+def _stated_air(specification: CampaignSpecification) -> dict[str, Any]:
+    """Return what the config says of the air: nothing of the standard atmosphere, which nobody had to measure."""
+    if specification.atmosphere == "standard":
+        return {}
+    vacuum = specification.atmosphere == "vacuum"
+    return {"atmosphere": "vacuum" if vacuum else {"refractivity_n": specification.atmosphere}}
 
 
 def _write_segments(root: Path, specification: CampaignSpecification) -> None:
@@ -104,7 +113,10 @@ def _write_flights(root: Path, campaign: DrawnCampaign, generator: Generator) ->
     origin, targets = specification.origin, specification.targets
     ground, *streams = independent_streams(generator, 1 + 2 * len(specification.flights))
     standing = scatterers(origin, targets, ground)
-    truth: dict[str, Any] = targets_truth(origin, targets, specification.scene.crs) | {"flights": {}}
+    air = specification.air
+    known = {"refractivity_n": air.atmosphere.refractivity_n if air else 0.0, "at_m": origin.height_m}
+    truth: dict[str, Any] = targets_truth(origin, targets, specification.scene.crs)
+    truth |= {"atmosphere": known, "flights": {}}
     for flight, drawing, noise in zip(specification.flights, streams[::2], streams[1::2], strict=True):
         (root / "raw" / flight.name).mkdir()
         if flight.framing:

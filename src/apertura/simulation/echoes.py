@@ -3,6 +3,7 @@
 The exact sum costs one matrix product per pulse; for thousands of scatterers there is a gridded one.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from apertura.common.arrays import Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.geometry.aperture import Aperture
+from apertura.core.geometry.atmosphere import Atmosphere
 from apertura.simulation.scene import Scatterers
 
 _BLOCK = 64  # subcarriers that share one exponential
@@ -151,16 +153,43 @@ class Paths:
         return Paths(self.delay_s[pulses], self.amplitude[pulses], self.delay_rate[pulses])
 
 
+@dataclass(frozen=True)
+class TrueAir:
+    """Air that every leg of every path flies through, by the heights of its own ends.
+
+    Attributes
+    ----------
+    atmosphere
+        Refractivity by height.
+    height
+        Positions (..., 3), metres → heights (...), metres.
+    """
+
+    atmosphere: Atmosphere
+    height: Callable[[Floats], Floats]
+
+    def index(self, antenna_m: Floats, points_m: Floats) -> Floats:
+        """Return the mean refractive index (pulse, point) from antennas (pulse, 3) to points (point, 3)."""
+        ends = self.height(antenna_m)[:, None], self.height(points_m)[None]
+        return np.asarray(1 + 1e-6 * self.atmosphere.mean_n(*ends))
+
+    def index_between(self, one_m: Floats, other_m: Floats) -> Floats:
+        """Return the mean refractive index (pulse, 1) between antennas (pulse, 3) each."""
+        mean_n = self.atmosphere.mean_n(self.height(one_m), self.height(other_m))
+        return np.asarray(1 + 1e-6 * mean_n)[:, None]
+
+
 def echo_paths(
     tx_position_m: Floats,
     rx_position_m: Floats,
     scatterers: Scatterers,
     *,
     path_offset_m: float = 0.0,
+    air: TrueAir | None = None,
     tx_velocity_m_s: Floats | float = 0.0,
     rx_velocity_m_s: Floats | float = 0.0,
 ) -> Paths:
-    """Return the echoes of scatterers: delay (R_tx + R_rx + offset)/c, amplitude a/(R_tx·R_rx).
+    """Return the echoes of scatterers: delay (n_tx·R_tx + n_rx·R_rx + offset)/c, amplitude a/(R_tx·R_rx).
 
     Parameters
     ----------
@@ -168,6 +197,8 @@ def echo_paths(
         (pulse, 3) float64, phase centres in the Cartesian frame of the scatterers, metres.
     path_offset_m
         Electrical path of the receiving channel beyond geometry, metres.
+    air
+        What the legs fly through; None: vacuum.
     tx_velocity_m_s, rx_velocity_m_s
         (pulse, 3) float64, for Doppler within the pulse; zero without.
 
@@ -184,9 +215,13 @@ def echo_paths(
     """
     tx_range, tx_rate = _range_and_rate(tx_position_m, tx_velocity_m_s, scatterers.position_m)
     rx_range, rx_rate = _range_and_rate(rx_position_m, rx_velocity_m_s, scatterers.position_m)
+    amplitude = scatterers.amplitude / (tx_range * rx_range)
+    if air is not None:
+        tx_n, rx_n = (air.index(leg, scatterers.position_m) for leg in (tx_position_m, rx_position_m))
+        tx_range, rx_range, tx_rate, rx_rate = tx_range * tx_n, rx_range * rx_n, tx_rate * tx_n, rx_rate * rx_n
     return Paths(
         (tx_range + rx_range + path_offset_m) / SPEED_OF_LIGHT_M_S,
-        scatterers.amplitude / (tx_range * rx_range),
+        amplitude,
         (tx_rate + rx_rate) / SPEED_OF_LIGHT_M_S,
     )
 
@@ -196,13 +231,14 @@ def direct_path(
     rx_position_m: Floats,
     *,
     path_offset_m: float = 0.0,
+    air: TrueAir | None = None,
     relative_velocity_m_s: Floats | float = 0.0,
 ) -> Paths:
-    """Return the one path from antenna to antenna: delay (R + offset)/c, amplitude 1/R, level inside 1 m.
+    """Return the one path from antenna to antenna: delay (n·R + offset)/c, amplitude 1/R, level inside 1 m.
 
     Parameters
     ----------
-    tx_position_m, rx_position_m, path_offset_m
+    tx_position_m, rx_position_m, path_offset_m, air
         As for `echo_paths`.
     relative_velocity_m_s
         (pulse, 3) float64, transmitter's less receiver's velocity.
@@ -213,8 +249,9 @@ def direct_path(
     array([[0.25+0.j]])
     """
     distance, rate = _range_and_rate(tx_position_m - rx_position_m, relative_velocity_m_s, np.zeros((1, 3)))
-    delay = (distance + path_offset_m) / SPEED_OF_LIGHT_M_S
-    return Paths(delay, 1 / np.maximum(distance, 1.0).astype(np.complex128), rate / SPEED_OF_LIGHT_M_S)
+    index = 1.0 if air is None else air.index_between(tx_position_m, rx_position_m)
+    delay, rate = (distance * index + path_offset_m) / SPEED_OF_LIGHT_M_S, rate * index / SPEED_OF_LIGHT_M_S
+    return Paths(delay, 1 / np.maximum(distance, 1.0).astype(np.complex128), rate)
 
 
 def _range_and_rate(antenna_m: Floats, velocity_m_s: Floats | float, points_m: Floats) -> tuple[Floats, Floats]:

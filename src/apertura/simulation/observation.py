@@ -94,6 +94,7 @@ def _logged(campaign: DrawnCampaign, flight: SimulatedFlight, receiver: str) -> 
         sidelink_rx=place(receiver, "sidelink"),
         tx_velocity=velocity(sender),
         rx_velocity=velocity(receiver),
+        air=campaign.specification.air,
     )
 
 

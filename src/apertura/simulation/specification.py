@@ -14,9 +14,12 @@ from pydantic.dataclasses import dataclass
 from pydantic.fields import FieldInfo
 
 from apertura.common.arrays import Floats
+from apertura.common.constants import LARGEST_REFRACTIVITY
 from apertura.common.documents import read_yaml, validated
-from apertura.core.geometry.geodesy import projected_from_ecef
+from apertura.core.geometry.atmosphere import Atmosphere
+from apertura.core.geometry.geodesy import geodetic_from_ecef, projected_from_ecef
 from apertura.simulation.continuous import Framing
+from apertura.simulation.echoes import TrueAir
 from apertura.simulation.impairments import (
     STRICT_KEYS,
     AntennaPoint,
@@ -140,10 +143,27 @@ class CampaignSpecification:
     nodes: Mapping[Name, SimulatedNode] = Field(min_length=1, description="one section per UAV")
     flights: tuple[SimulatedFlight, ...] = Field(description="who flies what, one after the other")
     scene: ImageGrid = Field(description="the grid on which the campaign is imaged")
+    atmosphere: Literal["standard", "vacuum"] | Annotated[float, Field(ge=0, le=LARGEST_REFRACTIVITY)] = Field(
+        default="standard",
+        description="air that all paths fly through: standard, at the origin's height, 50 % humidity; vacuum; or the "
+        "refractivity at the origin, (n - 1)·10⁶, which the config then states; it thins with height",
+    )
     synthesis: Literal["exact", "periodic"] = Field(
         default="exact",
         description="true edges of every echo, or fast, for long flights: as if echoes did not begin or end",
     )
+
+    @property
+    def air(self) -> TrueAir | None:
+        """What paths between positions in ECEF fly through; None: vacuum."""
+        if self.atmosphere == "vacuum":
+            return None
+        ground_m = self.origin.height_m
+        if self.atmosphere == "standard":
+            atmosphere = Atmosphere.standard(ground_m)
+        else:
+            atmosphere = Atmosphere.stated(float(self.atmosphere), ground_m=ground_m)
+        return TrueAir(atmosphere, lambda position: np.asarray(geodetic_from_ecef(position)[..., 2]))
 
     @model_validator(mode="after")
     def _nodes_fly(self) -> Self:

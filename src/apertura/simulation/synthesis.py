@@ -20,7 +20,7 @@ from scipy import fft
 from apertura.common.arrays import Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.echo.compression import rotated
-from apertura.simulation.echoes import Paths, direct_path, echo_paths, spectrum
+from apertura.simulation.echoes import Paths, TrueAir, direct_path, echo_paths, spectrum
 from apertura.simulation.impairments import Adc, ChannelName, ImpairmentDraw, Impairments, Ripple
 from apertura.simulation.scene import Scatterers
 from apertura.simulation.waveform import TransmitWaveform
@@ -275,6 +275,8 @@ class Geometry:
         (pulse, 3) float64, m/s, of transmitter and receiver, for Doppler within the pulse.
     gain
         (pulse, point) float64, field of both radar antennas towards each scatterer, relative to their boresights.
+    air
+        What all paths fly through; None: vacuum.
     """
 
     radar_tx: Floats
@@ -284,6 +286,7 @@ class Geometry:
     tx_velocity: Floats | float = 0.0
     rx_velocity: Floats | float = 0.0
     gain: Floats | float = 1.0
+    air: TrueAir | None = None
 
 
 def straight_pair(along_m: Floats, height_m: float, *, rx_ahead_m: float = 0.0) -> Geometry:
@@ -323,6 +326,7 @@ def receive(
         geometry.radar_rx,
         scatterers,
         path_offset_m=path_offset_m.get("radar", 0.0),
+        air=geometry.air,
         tx_velocity_m_s=velocity[0],
         rx_velocity_m_s=velocity[1],
     )
@@ -331,6 +335,7 @@ def receive(
         geometry.sidelink_tx,
         geometry.sidelink_rx,
         path_offset_m=path_offset_m.get("sidelink", 0.0),
+        air=geometry.air,
         relative_velocity_m_s=np.subtract(*velocity),
     )
     power = spectral_power(waveform, echoes)
@@ -399,7 +404,9 @@ def _with_leakage(echoes: Paths, geometry: Geometry, impairments: Impairments, o
     leakage = impairments.leakage
     if leakage is None:
         return echoes
-    direct = direct_path(geometry.radar_tx, geometry.radar_rx, path_offset_m=offset_m + leakage.path_m)
+    direct = direct_path(
+        geometry.radar_tx, geometry.radar_rx, path_offset_m=offset_m + leakage.path_m, air=geometry.air
+    )
     level = np.full(direct.amplitude.shape, np.sqrt(power) * 10 ** (leakage.level_db / 20), np.complex128)
     return echoes.and_also(Paths(direct.delay_s, level, direct.delay_rate))
 

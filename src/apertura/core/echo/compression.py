@@ -74,10 +74,13 @@ def centre_frequency(frequency_hz: NDArray[np.float64]) -> float:
     return float(frequency_hz[len(frequency_hz) // 2])
 
 
-def range_step(frequency_hz: NDArray[np.float64], *, oversampling: float) -> tuple[float, int]:
+def range_step(
+    frequency_hz: NDArray[np.float64], *, oversampling: float, wave_speed_m_s: float = SPEED_OF_LIGHT_M_S
+) -> tuple[float, int]:
     """Return the total path between range samples (m) and the length of the inverse DFT that gives it.
 
-    Of (subcarrier,) equally spaced frequencies, at least `oversampling` samples per resolution cell c/B.
+    Of (subcarrier,) equally spaced frequencies, at least `oversampling` samples per resolution cell v/B of a wave of
+    speed v, `wave_speed_m_s`.
 
     Raises
     ------
@@ -94,7 +97,7 @@ def range_step(frequency_hz: NDArray[np.float64], *, oversampling: float) -> tup
     if not (spacing > 0 and (np.abs(steps - spacing) <= 0.01 * spacing).all()):
         raise ValueError(f"{len(frequency_hz)} frequencies: must be two or more that ascend in equal steps")
     length = fft.next_fast_len(int(np.ceil(oversampling * len(frequency_hz))))
-    return SPEED_OF_LIGHT_M_S / (spacing * length), length
+    return wave_speed_m_s / (spacing * length), length
 
 
 def compress(
@@ -106,8 +109,9 @@ def compress(
     start_m: NDArray[np.float64],
     count: int,
     oversampling: float = 2.0,
+    wave_speed_m_s: float = SPEED_OF_LIGHT_M_S,
 ) -> NDArray[np.complex64]:
-    """Return range profiles p(ρ) = Σ w_n H_n exp(+j2π(f_n-f_mid)ρ/c), sampled from `start_m` on.
+    """Return range profiles p(ρ) = Σ w_n H_n exp(+j2π(f_n-f_mid)ρ/v), sampled from `start_m` on.
 
     Parameters
     ----------
@@ -125,6 +129,8 @@ def compress(
         Samples kept per pulse.
     oversampling
         Of `range_step`, whose step this profile has.
+    wave_speed_m_s
+        v, speed of the wave along the paths.
 
     Returns
     -------
@@ -139,7 +145,7 @@ def compress(
     Notes
     -----
     Source: docs/theory.md, eq. 4. Referring the profile to band centre halves the bandwidth of an
-    interpolator; exp(+j2πf_mid·ρ/c) remains for backprojection. Where the swath is a part of the unambiguous range, the
+    interpolator; exp(+j2πf_mid·ρ/v) remains for backprojection. Where the swath is a part of the unambiguous range, the
     subcarriers are decimated to it first (docs/theory.md, eq. 4a), at the accuracy of complex64.
 
     Examples
@@ -156,7 +162,7 @@ def compress(
         raise ValueError(f"{count=}: the unambiguous range holds {length} samples")
     middle, after = len(frequency_hz) // 2, np.arange(count) - count // 2
     spacing_hz = float(frequency_hz[-1] - frequency_hz[0]) / (len(frequency_hz) - 1)
-    turns = (start_m / SPEED_OF_LIGHT_M_S - reference_delay_s) * spacing_hz + (count // 2) / length
+    turns = (start_m / wave_speed_m_s - reference_delay_s) * spacing_hz + (count // 2) / length
     carrier = np.exp(-2j * np.pi * (frequency_hz[middle] * reference_delay_s % 1.0))
     filters, response = _decimation(len(frequency_hz), length, count)
     factor, blocks = len(filters), -(-len(frequency_hz) // len(filters))

@@ -8,7 +8,6 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.antenna.beam import Beams
 from apertura.core.focus.engines.native_binding import KERNEL, EchoJob, available, call
 from apertura.core.focus.inputs import Profiles
@@ -44,7 +43,7 @@ def band_limited_image(
     -----
     Source: docs/theory.md, eq. 6.
     """
-    k = 2 * np.pi * profiles.centre_frequency_hz / SPEED_OF_LIGHT_M_S
+    k = profiles.wavenumber_rad_m
     taps = np.arange(1 - _HALF_TAPS, _HALF_TAPS + 1)
     padded = np.pad(profiles.samples.astype(np.complex128), [(0, 0), (_HALF_TAPS, _HALF_TAPS)])
     image = np.zeros(len(pixels), np.complex128)
@@ -139,7 +138,7 @@ class Echoes:
     step_m
         Total path between samples.
     turns_per_m
-        f_mid/c.
+        f_mid/v.
     """
 
     samples: NDArray[np.float32]
@@ -162,7 +161,7 @@ class Echoes:
             np.ascontiguousarray(rx, np.float64),
             np.concatenate([profiles.start_m[part] for part in parts]) - TAPS * profiles.step_m,
             profiles.step_m,
-            profiles.centre_frequency_hz / SPEED_OF_LIGHT_M_S,
+            profiles.centre_frequency_hz / profiles.wave_speed_m_s,
         )
 
     def __len__(self) -> int:

@@ -53,11 +53,13 @@ class PhaseHistory:
         (pulse,) float64, delay already removed from `transfer`.
     aperture
         Phase centres in the frame of the pixels.
+    wave_speed_m_s
+        Speed of the wave along the paths, m/s: delay times it is path (docs/theory/atmosphere.md, eq. 4).
 
     Raises
     ------
     ValueError
-        If the shapes do not belong together.
+        If the shapes do not belong together, or the wave is faster than light.
     """
 
     transfer: NDArray[np.complex64]
@@ -65,6 +67,7 @@ class PhaseHistory:
     weight: NDArray[np.float64]
     reference_delay_s: NDArray[np.float64]
     aperture: Aperture
+    wave_speed_m_s: float = SPEED_OF_LIGHT_M_S
 
     def __post_init__(self) -> None:
         pulses, subcarriers = self.transfer.shape if self.transfer.ndim == 2 else (-1, -1)
@@ -78,6 +81,7 @@ class PhaseHistory:
                 f"{self.transfer.shape=}, {self.frequency_hz.shape=}, {self.weight.shape=}: must be "
                 "(pulse, subcarrier) and (subcarrier,) twice"
             )
+        _check_wave_speed(self.wave_speed_m_s)
 
     def __len__(self) -> int:
         """Return the number of pulses."""
@@ -97,8 +101,13 @@ class PhaseHistory:
 
         As `Profiles.moved`.
         """
-        delay_s = self.reference_delay_s + further_m / SPEED_OF_LIGHT_M_S
+        delay_s = self.reference_delay_s + further_m / self.wave_speed_m_s
         return replace(self, reference_delay_s=delay_s, aperture=aperture)
+
+
+def _check_wave_speed(wave_speed_m_s: float) -> None:
+    if not SPEED_OF_LIGHT_M_S / 1.1 < wave_speed_m_s <= SPEED_OF_LIGHT_M_S:
+        raise ValueError(f"{wave_speed_m_s=}: must be that of light in air, or in vacuum {SPEED_OF_LIGHT_M_S}")
 
 
 @dataclass(frozen=True)
@@ -106,13 +115,13 @@ class Profiles:
     """Range profiles of a band-limited signal, cropped to the scene.
 
     Sample i of pulse p lies at total path ``start_m[p] + i·step_m`` and holds
-    Σ_n w_n H_n exp(+j2π(f_n - f_mid)·path/c) (with H_n for absolute delay), so that
-    profile·exp(+j2π f_mid·path/c) is in phase at a target.
+    Σ_n w_n H_n exp(+j2π(f_n - f_mid)·path/v) (with H_n for absolute delay), v the speed of the wave, so that
+    profile·exp(+j2π f_mid·path/v) is in phase at a target.
 
     Attributes
     ----------
     samples
-        (pulse, range) complex64, oversampled by `oversampling` ≥ 2 against c/B of total path.
+        (pulse, range) complex64, oversampled by `oversampling` ≥ 2 against v/B of total path.
     start_m
         (pulse,) float64, total path tx → pixel → rx of sample 0, metres.
     step_m
@@ -120,14 +129,16 @@ class Profiles:
     centre_frequency_hz
         f_mid.
     oversampling
-        Nyquist cells per sample inverted: (c/B)/step_m.
+        Nyquist cells per sample inverted: (v/B)/step_m.
     aperture
         Phase centres in the frame of the pixels.
+    wave_speed_m_s
+        v, as of `PhaseHistory`.
 
     Raises
     ------
     ValueError
-        If the shapes do not belong together, or the step is not positive.
+        If the shapes do not belong together, the step is not positive, or the wave is faster than light.
     """
 
     samples: NDArray[np.complex64]
@@ -136,6 +147,7 @@ class Profiles:
     centre_frequency_hz: float
     oversampling: float
     aperture: Aperture
+    wave_speed_m_s: float = SPEED_OF_LIGHT_M_S
 
     def __post_init__(self) -> None:
         pulses = len(self.samples) if self.samples.ndim == 2 else -1
@@ -146,6 +158,22 @@ class Profiles:
             )
         if not 0 < self.step_m < np.inf:
             raise ValueError(f"{self.step_m=}: must be positive")
+        _check_wave_speed(self.wave_speed_m_s)
+
+    @property
+    def wavenumber_rad_m(self) -> float:
+        """2πf_mid/v."""
+        return 2 * np.pi * self.centre_frequency_hz / self.wave_speed_m_s
+
+    @property
+    def wavelength_m(self) -> float:
+        """v/f_mid."""
+        return self.wave_speed_m_s / self.centre_frequency_hz
+
+    @property
+    def bandwidth_hz(self) -> float:
+        """B, which one resolution cell v/B is of."""
+        return self.wave_speed_m_s / (self.step_m * self.oversampling)
 
     def __len__(self) -> int:
         """Return the number of pulses."""
@@ -192,9 +220,10 @@ class Profiles:
         -----
         Source: docs/theory/autofocus.md, eq. 3: an echo at path R lies at R + ∆ and has the phase of R + ∆.
         """
-        wavenumber = 2 * np.pi * self.centre_frequency_hz / SPEED_OF_LIGHT_M_S
         rotated = (
-            PhaseRotated(self.samples, np.exp(-1j * wavenumber * further_m)) if np.any(further_m) else self.samples
+            PhaseRotated(self.samples, np.exp(-1j * self.wavenumber_rad_m * further_m))
+            if np.any(further_m)
+            else self.samples
         )
         samples = cast("NDArray[np.complex64]", rotated)
         return replace(self, samples=samples, start_m=self.start_m + further_m, aperture=aperture)

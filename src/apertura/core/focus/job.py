@@ -31,6 +31,8 @@ class Signal:
         Per pulse.
     window
         (subcarrier,) float64, weights over the band, of any scale; flat by default.
+    wave_speed_m_s
+        As of `Profiles`.
     """
 
     centre_hz: float
@@ -38,11 +40,12 @@ class Signal:
     step_m: float
     samples: int
     window: NDArray[np.float64] = field(default_factory=lambda: np.ones(1), repr=False)
+    wave_speed_m_s: float = SPEED_OF_LIGHT_M_S
 
     @property
     def wavenumber_rad_m(self) -> float:
-        """2πf_mid/c."""
-        return 2 * np.pi * self.centre_hz / SPEED_OF_LIGHT_M_S
+        """2πf_mid/v."""
+        return 2 * np.pi * self.centre_hz / self.wave_speed_m_s
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,7 +185,7 @@ class Job:
     @property
     def wavelength_m(self) -> float:
         """Of the band centre."""
-        return SPEED_OF_LIGHT_M_S / self.centre_hz
+        return self.signal.wave_speed_m_s / self.centre_hz
 
     @property
     def points_m(self) -> NDArray[np.float64]:

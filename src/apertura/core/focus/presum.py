@@ -153,7 +153,7 @@ def presummed(profiles: Profiles, presum: Presum, middle_m: NDArray[np.float64])
     -----
     Source: docs/theory/planner.md, "Pulses".
     """
-    k = 2 * np.pi * profiles.centre_frequency_hz / SPEED_OF_LIGHT_M_S
+    k = profiles.wavenumber_rad_m
     aperture = _virtual(profiles.aperture, presum)
     real, virtual = profiles.aperture.path(middle_m), aperture.path(middle_m)
     begin = profiles.start_m - real
@@ -170,6 +170,7 @@ def presummed(profiles: Profiles, presum: Presum, middle_m: NDArray[np.float64])
         profiles.centre_frequency_hz,
         profiles.oversampling,
         aperture,
+        profiles.wave_speed_m_s,
     )
 
 

@@ -53,7 +53,8 @@ def backproject(  # noqa: PLR0913 - each choice is a keyword, so that an editor 
     ----------
     profiles
         Range profiles; or calibrated transfer functions, which are compressed in range first; or a stage `profile` or
-        `echo` of a campaign.
+        `echo` of a campaign. They carry the speed of the wave: that in vacuum unless stated, ``ap.wave_speed(285)`` in
+        air of so many N units, that of its config's air in a stage.
     grid
         Pixels; their frame is that of the phase centres: ECEF, or the local frame of a grid with ``crs="local"``.
     accuracy_db
@@ -88,8 +89,8 @@ def backproject(  # noqa: PLR0913 - each choice is a keyword, so that an editor 
     -------
     xarray.DataArray
         (y, x) complex64, carrier kept, 1 is the amplitude of an echo in every pulse; a dask array on whatever
-        scheduler the caller has. Attributes: units; the plan: `setting`, `predicted_error_db`, and as JSON `models`
-        (choice → value and reason) and `flags` (limit crossed → what was measured); the certificate:
+        scheduler the caller has. Attributes: units; `wave_speed_m_s`; the plan: `setting`, `predicted_error_db`, and
+        as JSON `models` (choice → value and reason) and `flags` (limit crossed → what was measured); the certificate:
         `numerical_error_db`, an upper bound at `numerical_error_confidence` for the whole image, and
         `numerical_error_estimate_db`, against the double sum over pulses and subcarriers, or from profiles alone
         against their band-limited interpolation in float64.
@@ -161,6 +162,7 @@ def backproject(  # noqa: PLR0913 - each choice is a keyword, so that an editor 
             flags["accuracy_missed"] = f"{sure}, {accuracy_db:g} dB asked"
     attributes |= {
         "units": "1",
+        "wave_speed_m_s": inputs.wave_speed_m_s,
         "long_name": "focused scene, carrier kept",
         "grid_mapping": "spatial_ref",
         "setting": formation.plan.setting.line,
@@ -192,7 +194,9 @@ def _error(formation: Formation, pixels: NDArray[np.int64], exact: NDArray[np.co
 def _compressed(inputs: PhaseHistory | Profiles, grid: SceneGrid, ground: Terrain, beams: Beams | None) -> Profiles:
     if isinstance(inputs, Profiles):
         return inputs
-    window = RangeWindow.of(inputs.aperture, grid, ground, inputs.frequency_hz, beams=beams)
+    window = RangeWindow.of(
+        inputs.aperture, grid, ground, inputs.frequency_hz, beams=beams, wave_speed_m_s=inputs.wave_speed_m_s
+    )
     return range_compress(inputs, grid, ground, window=window)
 
 
@@ -204,6 +208,6 @@ def _job(
         job = profiles_job(inputs, grid, ground, **weighed)
     else:
         known = (inputs.aperture, inputs.frequency_hz, inputs.weight)
-        job = imaging_job(*known, grid, ground, history=inputs, **weighed)
+        job = imaging_job(*known, grid, ground, history=inputs, wave_speed_m_s=inputs.wave_speed_m_s, **weighed)
     illumination = None if job.beams is None else illuminate(job.beams, job.aperture, job.points_m)
     return replace(job, illumination=illumination, memory_bytes=memory_limit())

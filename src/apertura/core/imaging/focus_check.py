@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.flags import Flags
 from apertura.core.antenna.beam import Beams
 from apertura.core.antenna.illumination import illumination_mask
@@ -152,7 +151,7 @@ def echo_elsewhere(
     Source: docs/theory/focus.md, "Echo elsewhere". The direct path between the antennas does not count.
     """
     some = history[history.aperture.sample(_MOST_PULSES)]
-    step_m, length = range_step(some.frequency_hz, oversampling=1.0)
+    step_m, length = range_step(some.frequency_hz, oversampling=1.0, wave_speed_m_s=some.wave_speed_m_s)
     path_m, power = _profiles(some, step_m, length)
     nearest, farthest = swath(grid, terrain, some.aperture)
     span_m = step_m * length
@@ -210,6 +209,7 @@ def _profiles(history: PhaseHistory, step_m: float, length: int) -> tuple[NDArra
         start_m=np.zeros(len(history)),
         count=length,
         oversampling=1.0,
+        wave_speed_m_s=history.wave_speed_m_s,
     )
     path_m = np.broadcast_to(step_m * np.arange(length), samples.shape)
     return path_m, np.abs(samples).astype(np.float64) ** 2
@@ -285,10 +285,11 @@ def _window(history: PhaseHistory, places: NDArray[np.float64]) -> RangeWindow:
     some = places[::every, ::every]
     paths = history.aperture.path(some).reshape(len(history), -1)
     between = 2 * float(np.linalg.norm(some[1, 1] - some[0, 0]))  # a path grows by two metres per metre at most
-    step, length = range_step(history.frequency_hz, oversampling=OVERSAMPLING)
+    speed = history.wave_speed_m_s
+    step, length = range_step(history.frequency_hz, oversampling=OVERSAMPLING, wave_speed_m_s=speed)
     first = paths.min(axis=1) - between - GUARD_SAMPLES * step
     samples = int(np.ceil((np.ptp(paths, axis=1).max() + 2 * between) / step)) + 2 * GUARD_SAMPLES + 1
-    return RangeWindow(first, samples, step, length, paths.max(axis=1))
+    return RangeWindow(first, samples, step, length, paths.max(axis=1), speed)
 
 
 def _echo_power(history: PhaseHistory) -> float:
@@ -313,7 +314,7 @@ _WINDOWED = 0.62  # a Hann window leaves a band as wide, in standard deviation, 
 def resolution_cell_m(formation: Formation) -> float:
     """Return the finest resolution cell of the image's scene, metres."""
     profiles, grid = formation.profiles, formation.grid
-    half = _half_band_hz(profiles)
+    half = profiles.bandwidth_hz / 2
     pixels = grid.sample_pixels(_CELL_POINTS)
     band = profiles.centre_frequency_hz - half, profiles.centre_frequency_hz + half
     return profiles.aperture.resolution_cell_m(
@@ -326,16 +327,13 @@ def _sector_of(formation: Formation) -> Weigh | None:
     return None if sector is None else sector.over(formation.profiles.aperture)
 
 
-def _half_band_hz(profiles: Profiles) -> float:
-    return SPEED_OF_LIGHT_M_S / (profiles.step_m * profiles.oversampling) / 2
-
-
 def _response(formation: Formation) -> PointResponse:
     """Return what of one point the image shows at other places."""
     history, profiles = formation.history, formation.profiles
     if history is None:
         raise ValueError("the response of a point needs a phase history, there are only profiles")
-    step_m, length = range_step(history.frequency_hz, oversampling=_RESPONSE_OVERSAMPLING)
+    how = {"oversampling": _RESPONSE_OVERSAMPLING, "wave_speed_m_s": history.wave_speed_m_s}
+    step_m, length = range_step(history.frequency_hz, **how)
     envelope = compress(
         np.ones((1, len(history.frequency_hz)), np.complex64),
         history.frequency_hz,
@@ -343,13 +341,9 @@ def _response(formation: Formation) -> PointResponse:
         reference_delay_s=np.zeros(1),
         start_m=np.array([-step_m * (length // 2)]),
         count=length,
-        oversampling=_RESPONSE_OVERSAMPLING,
+        **how,
     )[0]
-    wavelength_m, aperture, beams = (
-        SPEED_OF_LIGHT_M_S / profiles.centre_frequency_hz,
-        profiles.aperture,
-        formation.beams,
-    )
+    wavelength_m, aperture, beams = profiles.wavelength_m, profiles.aperture, formation.beams
     weigh = None if beams is None else lambda some, points_m: beams[some].weight(aperture[some], points_m)
     return PointResponse(aperture, envelope, step_m, wavelength_m, weigh)
 
@@ -366,7 +360,7 @@ def _spectrum(formation: Formation) -> NDArray[np.float64]:
     profiles, grid = formation.profiles, formation.grid
     row, column = ((size - 1) / 2 for size in grid.shape)
     here, axes = ground_axes(formation, row, column)
-    half = _half_band_hz(profiles)
+    half = profiles.bandwidth_hz / 2
     band = profiles.centre_frequency_hz + half * np.linspace(-1, 1, _BAND_SAMPLES) * _WINDOWED
     return profiles.aperture.spectrum(here, axes, frequency_hz=band, weigh=_sector_of(formation))
 

@@ -94,8 +94,8 @@ def _outside(inputs: PhaseHistory | Profiles, points: np.ndarray) -> float:
     some = inputs[inputs.aperture.sample(_PULSES)]
     path = some.aperture.path(points)
     if isinstance(some, PhaseHistory):
-        unambiguous_m = SPEED_OF_LIGHT_M_S / float(np.abs(np.diff(some.frequency_hz)).mean())
-        return float((np.abs(path - SPEED_OF_LIGHT_M_S * some.reference_delay_s[:, None]) > unambiguous_m).mean())
+        unambiguous_m = some.wave_speed_m_s / float(np.abs(np.diff(some.frequency_hz)).mean())
+        return float((np.abs(path - some.wave_speed_m_s * some.reference_delay_s[:, None]) > unambiguous_m).mean())
     place = (path - some.start_m[:, None]) / some.step_m
     return float(((place < 0) | (place > some.samples.shape[1] - 1)).mean())
 
@@ -142,6 +142,7 @@ def imaging_job(
     history: PhaseHistory | None = None,
     beams: Beams | None = None,
     integration: Any = "auto",
+    wave_speed_m_s: float = SPEED_OF_LIGHT_M_S,
 ) -> Job:
     """Return the planner's job.
 
@@ -159,6 +160,8 @@ def imaging_job(
         Of the antennas, where they have any.
     integration
         As `requested` of `apertura.core.planning.decisions.integrate`.
+    wave_speed_m_s
+        Speed of the wave along the paths.
 
     Returns
     -------
@@ -169,7 +172,7 @@ def imaging_job(
     ground_m = grid.sample_points(_POINTS, ground.level.height_m)
     decided = decide_integration(aperture, centre, grid, ground.level, antennas=beams, requested=integration)
     beams = Beams.within(decided.sector, beams)
-    window = RangeWindow.of(aperture, grid, ground.full, frequency_hz, beams=beams)
+    window = RangeWindow.of(aperture, grid, ground.full, frequency_hz, beams=beams, wave_speed_m_s=wave_speed_m_s)
     return Job(
         aperture=aperture,
         ground_m=ground_m,
@@ -178,7 +181,7 @@ def imaging_job(
         centre_hz=centre,
         bandwidth_hz=float(frequency_hz[-1] - frequency_hz[0]) * count / (count - 1),
         subcarriers=count,
-        signal=Signal(centre, window.unambiguous / count, window.step_m, window.samples, weight),
+        signal=Signal(centre, window.unambiguous / count, window.step_m, window.samples, weight, wave_speed_m_s),
         frame=grid.frame,
         terrain=ground,
         patches_on=partial(_patches, grid),
@@ -200,7 +203,6 @@ def profiles_job(
     grid, ground, beams, integration
         As `imaging_job`.
     """
-    bandwidth_hz = SPEED_OF_LIGHT_M_S / (profiles.step_m * profiles.oversampling)
     centre, samples = profiles.centre_frequency_hz, profiles.samples.shape[1]
     ground_m = grid.sample_points(_POINTS, ground.level.height_m)
     decided = decide_integration(profiles.aperture, centre, grid, ground.level, antennas=beams, requested=integration)
@@ -210,9 +212,9 @@ def profiles_job(
         shape=grid.shape,
         spacing_m=grid.spacing_m,
         centre_hz=centre,
-        bandwidth_hz=bandwidth_hz,
+        bandwidth_hz=profiles.bandwidth_hz,
         subcarriers=samples,
-        signal=Signal(centre, profiles.oversampling, profiles.step_m, samples),
+        signal=Signal(centre, profiles.oversampling, profiles.step_m, samples, wave_speed_m_s=profiles.wave_speed_m_s),
         frame=grid.frame,
         terrain=ground,
         patches_on=partial(_patches, grid),

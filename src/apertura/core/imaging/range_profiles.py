@@ -7,6 +7,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.antenna.beam import Beams
 from apertura.core.echo.compression import centre_frequency, compress, range_step, window_weights
 from apertura.core.focus.inputs import PhaseHistory, Profiles
@@ -40,6 +41,8 @@ class RangeWindow:
         Samples after which the profile repeats itself.
     farthest_m
         (pulse,) float64, longest total path to a pixel that the pulse contributes to, metres; -inf without any.
+    wave_speed_m_s
+        Speed of the wave that `step_m` is of.
     """
 
     start_m: NDArray[np.float64]
@@ -47,6 +50,7 @@ class RangeWindow:
     step_m: float
     unambiguous: int
     farthest_m: NDArray[np.float64]
+    wave_speed_m_s: float = SPEED_OF_LIGHT_M_S
 
     @property
     def contributing(self) -> NDArray[np.bool_]:
@@ -62,6 +66,7 @@ class RangeWindow:
         frequency_hz: NDArray[np.float64],
         *,
         beams: Beams | None = None,
+        wave_speed_m_s: float = SPEED_OF_LIGHT_M_S,
     ) -> "RangeWindow":
         """Return the window that a scene needs.
 
@@ -76,17 +81,19 @@ class RangeWindow:
         beams
             Weights of pulses: each pulse's window covers the pixels that it may contribute to. By default all of the
             scene.
+        wave_speed_m_s
+            Speed of the wave along the paths.
 
         Notes
         -----
         Source: docs/theory.md, eq. 4.
         """
         nearest, farthest = swath(grid, terrain, aperture, beams=beams)
-        step, length = range_step(frequency_hz, oversampling=OVERSAMPLING)
+        step, length = range_step(frequency_hz, oversampling=OVERSAMPLING, wave_speed_m_s=wave_speed_m_s)
         spans = farthest - nearest
         samples = int(np.ceil(spans.max(initial=0.0, where=np.isfinite(spans)) / step)) + 2 * GUARD_SAMPLES + 1
         nearest = np.where(np.isfinite(nearest), nearest, 0.0)
-        return cls(nearest - GUARD_SAMPLES * step, samples, step, length, farthest)
+        return cls(nearest - GUARD_SAMPLES * step, samples, step, length, farthest, wave_speed_m_s)
 
 
 def range_compress(
@@ -111,7 +118,7 @@ def range_compress(
     Raises
     ------
     ValueError
-        If the scene is deeper than the unambiguous range.
+        If the scene is deeper than the unambiguous range, or the window is of another wave's speed.
 
     Notes
     -----
@@ -129,8 +136,10 @@ def range_compress(
     >>> len(profiles), round(float(np.abs(profiles.samples).max()), 1)
     (8, 1.0)
     """
-    frequency = history.frequency_hz
-    window = window or RangeWindow.of(history.aperture, grid, terrain, frequency)
+    frequency, speed = history.frequency_hz, history.wave_speed_m_s
+    window = window or RangeWindow.of(history.aperture, grid, terrain, frequency, wave_speed_m_s=speed)
+    if window.wave_speed_m_s != speed:
+        raise ValueError(f"{window.wave_speed_m_s=}: must be {speed}, that of the history")
     if window.samples > window.unambiguous:
         raise ValueError(
             f"the scene spans {window.samples} samples of range: must be at most the {window.unambiguous} unambiguous"
@@ -143,6 +152,7 @@ def range_compress(
         start_m=window.start_m,
         count=window.samples,
         oversampling=OVERSAMPLING,
+        wave_speed_m_s=speed,
     )
     return Profiles(
         samples,
@@ -151,6 +161,7 @@ def range_compress(
         centre_frequency(frequency),
         window.unambiguous / len(frequency),
         history.aperture,
+        speed,
     )
 
 
@@ -202,6 +213,7 @@ def phase_history_of(echo: xr.Dataset, window: str, *, lazy: bool = False) -> Ph
         window_weights(window, len(echo.subcarrier)),
         echo.reference_delay.values,
         aperture_of(echo),
+        wave_speed_of(echo),
     )
 
 
@@ -214,7 +226,13 @@ def profiles_of(profile: xr.Dataset, *, lazy: bool = False) -> Profiles:
         profile.attrs["centre_frequency_hz"],
         profile.attrs["oversampling"],
         aperture_of(profile),
+        wave_speed_of(profile),
     )
+
+
+def wave_speed_of(stage: xr.Dataset) -> float:
+    """Return the speed of the wave (m/s) that an echo or profile stage states."""
+    return float(stage.attrs["wave_speed_m_s"])
 
 
 def aperture_of(stage: xr.Dataset) -> Aperture:

@@ -5,7 +5,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.imaging.formation import Formation
 from apertura.core.scene.visibility import bistatic_angle_deg, incidence_deg
 
@@ -57,10 +56,8 @@ def view_report(formation: Formation, began: np.datetime64, time_s: NDArray[np.f
         "range_m": round(float(path[closest]) / 2, 4),
         "height_m": round(float(-looked @ up), 4),
         "centre_hz": float(profiles.centre_frequency_hz),
-        "band_hz": float(f"{SPEED_OF_LIGHT_M_S / (profiles.step_m * profiles.oversampling):.8g}"),
-        "carrier_cycles_m": [
-            float(f"{part:.8g}") for part in slope * profiles.centre_frequency_hz / SPEED_OF_LIGHT_M_S
-        ],
+        "band_hz": float(f"{profiles.bandwidth_hz:.8g}"),
+        "carrier_cycles_m": [float(f"{part:.8g}") for part in slope / profiles.wavelength_m],
         "carriers_cycles_m": [
             [[float(f"{x:.8g}") for x in place] for place in line] for line in carriers_of(formation)
         ],
@@ -80,7 +77,7 @@ def carriers_of(formation: Formation) -> NDArray[np.float64]:
         here, axes = ground_axes(formation, max(1.0, at[0]), min(at[1], shape[1] - 2.0))  # axes point up and right
         weight = np.ones(len(aperture)) if beams is None else beams[some].weight(aperture, here[None])[:, 0]
         slope = np.average(aperture.path_gradient(here), axis=0, weights=weight if weight.any() else None)
-        found[row, column] = axes @ slope * profiles.centre_frequency_hz / SPEED_OF_LIGHT_M_S
+        found[row, column] = axes @ slope / profiles.wavelength_m
     return found
 
 

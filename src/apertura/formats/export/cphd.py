@@ -58,6 +58,8 @@ class CphdCollection:
         West, south, east and north edge of the scene from the origin, metres along the axes.
     spacing_m
         Of the scene's pixels.
+    wave_speed_m_s
+        Speed of the wave along the paths.
     parameters
         Name → text that goes with the collection: where it comes from.
     """
@@ -74,6 +76,7 @@ class CphdCollection:
     axes: Floats
     area_m: tuple[float, float, float, float]
     spacing_m: float
+    wave_speed_m_s: float
     parameters: Mapping[str, str]
 
     @property
@@ -85,8 +88,17 @@ class CphdCollection:
     @property
     def reference_delay_s(self) -> Floats:
         """Delay of the reference point, to which samples must be referred: (pulse,) float64, seconds."""
+        return self._point_path_m / self.wave_speed_m_s
+
+    @property
+    def troposphere_s(self) -> Floats:
+        """What of it is air: (pulse,) float64, seconds beyond the same path in vacuum."""
+        return self.reference_delay_s - self._point_path_m / SPEED_OF_LIGHT_M_S
+
+    @property
+    def _point_path_m(self) -> Floats:
         legs = [np.linalg.norm(leg - self.point_m, axis=1) for leg in (self.tx_m, self.rx_m)]
-        return np.asarray(sum(legs) / SPEED_OF_LIGHT_M_S, np.float64)
+        return np.asarray(sum(legs), np.float64)
 
     @property
     def swath_s(self) -> tuple[float, float]:
@@ -95,7 +107,7 @@ class CphdCollection:
         As much as their frequencies resolve, and no later than what stays inside the prefix.
         """
         half = 0.5 / (_OVERSAMPLED * self._step_hz)
-        latest = float((self.path_limit_m / SPEED_OF_LIGHT_M_S - self.reference_delay_s).min())
+        latest = float((self.path_limit_m / self.wave_speed_m_s - self.reference_delay_s).min())
         return -half, min(half, latest)
 
     @property
@@ -111,7 +123,7 @@ class CphdCollection:
     @property
     def exposed_s(self) -> Floats:
         """When each pulse is at the reference point: (pulse,) float64, seconds from `start`."""
-        return np.asarray(self.sent_s + np.linalg.norm(self.tx_m - self.point_m, axis=1) / SPEED_OF_LIGHT_M_S)
+        return np.asarray(self.sent_s + np.linalg.norm(self.tx_m - self.point_m, axis=1) / self.wave_speed_m_s)
 
     @property
     def _step_hz(self) -> float:
@@ -123,6 +135,7 @@ class CphdCollection:
         kind = [(name, "f8", (3,)) if count == 3 else (name, "f8") for name, count in _RECORD]
         table = np.zeros(len(self.time), [*kind, ("SIGNAL", "i8"), *([(PATH_LIMIT, "f8")] if limited else [])])
         sent, delay = self.sent_s, self.reference_delay_s
+        table["TDTropoSRP"] = self.troposphere_s
         table["TxTime"], table["RcvTime"] = sent, sent + delay
         towards = 0.0
         for leg, position in (("Tx", self.tx_m), ("Rcv", self.rx_m)):
@@ -130,7 +143,7 @@ class CphdCollection:
             table[f"{leg}Pos"], table[f"{leg}Vel"] = position, velocity
             line = position - self.point_m
             towards = towards + (velocity * line).sum(axis=1) / np.linalg.norm(line, axis=1)
-        table["aFDOP"] = -towards / SPEED_OF_LIGHT_M_S
+        table["aFDOP"] = -towards / self.wave_speed_m_s
         table["SRPPos"], table["SIGNAL"] = self.point_m, 1
         table["FX1"], table["FX2"] = self.frequency_hz[0], self.frequency_hz[-1]
         table["TOA1"], table["TOA2"] = self.swath_s

@@ -85,6 +85,7 @@ def joined(paths: Sequence[Path], passes: Sequence[dict[str, NDArray[Any]]], *, 
                 path_limit=np.full(len(antenna), np.inf),
                 used=np.ones(len(antenna), bool),
                 frame="local",
+                reference="point",
             )
         )
     return phase_history.joined(histories, pair=pair, expected=_EXPECTED)

@@ -137,6 +137,7 @@ def history(path: Path, fields: dict[str, NDArray[Any]], *, pair: str) -> Histor
         flags=_flags(fields, path_m / SPEED_OF_LIGHT_M_S, normal),
         frame=str(fields["frame"]),
         dropped={why: count for why, count in dropped.items() if count},
+        reference="point",
     )
 
 

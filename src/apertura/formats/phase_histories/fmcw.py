@@ -10,6 +10,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from apertura.common.arrays import Times
+from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
 from apertura.core.echo.dechirp import FrequencySweep, transfer_of
 from apertura.formats.isolated import UnreadableError, read_isolated
@@ -172,6 +173,7 @@ def joined_sweeps(read: Sequence[Sweeps], *, pair: str, described: Mapping[str, 
         attrs={
             "pair": pair,
             "flags": {},
+            "wave_speed_m_s": SPEED_OF_LIGHT_M_S,
             "dropped": {why: count for why, count in dropped.items() if count},
             "sweep_used_s": sweep.samples / sweep.sample_rate_hz,
         },

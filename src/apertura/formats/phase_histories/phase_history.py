@@ -4,12 +4,13 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apertura.common.arrays import Floats
+from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
 from apertura.common.flags import Flags
 
@@ -66,6 +67,9 @@ class History:
         Reason → how many pulses `used` leaves out.
     flags
         Edge crossed → what was measured, in one line.
+    reference
+        What samples are referred to: a delay as it was, or a point, so that τ_ref is its distance over the speed of
+        light in vacuum, and no delay of its own.
     """
 
     path: Path
@@ -80,6 +84,7 @@ class History:
     frame: str
     dropped: Mapping[str, int] = field(default_factory=dict)
     flags: Mapping[str, str] = field(default_factory=dict)
+    reference: Literal["delay", "point"] = "delay"
 
 
 def largest_by_row(
@@ -123,7 +128,7 @@ def largest_by_row(
 
 
 def joined(histories: Sequence[History], *, pair: str, expected: str) -> "xr.Dataset":
-    """Return the `echo` stage of files that follow each other; samples are read lazily.
+    """Return the `echo` stage of files that follow each other, of waves in vacuum; samples are read lazily.
 
     Parameters
     ----------
@@ -163,7 +168,7 @@ def joined(histories: Sequence[History], *, pair: str, expected: str) -> "xr.Dat
     attrs: dict[str, Any] = {"frame": first.frame} if first.frame else {}
     missing = missing_flags(pulsed["time"][1].astype("datetime64[ns]").astype(np.int64))
     flags = Flags.merged(missing, *(one.flags for one in histories))
-    attrs |= {"pair": pair, "flags": flags}
+    attrs |= {"pair": pair, "flags": flags, "reference": first.reference, "wave_speed_m_s": SPEED_OF_LIGHT_M_S}
     reasons = Counter[str]()
     for one in histories:
         reasons.update(one.dropped)

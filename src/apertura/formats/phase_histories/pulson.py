@@ -82,7 +82,7 @@ def read_pulson(paths: Sequence[Path], *, pair: str) -> xr.Dataset:
             "reference_delay": ("pulse", np.full(len(samples), start_ps * 1e-12)),
             "path_limit": ("pulse", np.full(len(samples), (start_ps * 1e-12 + lasts_s) * SPEED_OF_LIGHT_M_S)),
         },
-        attrs={"pair": pair, "flags": flags},
+        attrs={"pair": pair, "flags": flags, "wave_speed_m_s": SPEED_OF_LIGHT_M_S},
     )
 
 

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.common.arrays import Floats
-from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.antenna.beam import Beams
 from apertura.core.focus.inputs import Profiles
 from apertura.core.geometry.phase_centres import TrackCorrection
@@ -51,9 +50,8 @@ class PairRecord:
     def turned(self, errors: Mapping[str, "TrackErrors"]) -> tuple[float, float]:
         """Return how long the shortest error of its nodes lasts, seconds, and the phase of the largest, radians rms."""
         of_nodes = [errors[node] for node in self.nodes]
-        wavenumber = 2 * np.pi * self.profiles.centre_frequency_hz / SPEED_OF_LIGHT_M_S
         largest_m = max(max(error.std_m) for error in of_nodes)
-        return min(error.correlation_s for error in of_nodes), 2 * wavenumber * largest_m
+        return min(error.correlation_s for error in of_nodes), 2 * self.profiles.wavenumber_rad_m * largest_m
 
     def moved(self, correction: TrackCorrection) -> Profiles:
         """Return the profiles over corrected tracks (docs/theory/autofocus.md, eq. 3)."""

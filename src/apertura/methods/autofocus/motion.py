@@ -35,12 +35,15 @@ class Recorded:
         (pulse,) float64.
     time_s
         (pulse,) float64, seconds by the recorder, ascending.
+    wave_speed_m_s
+        Speed of the wave along the paths.
     """
 
     transfer: Complexes
     frequency_hz: Floats
     reference_delay_s: Floats
     time_s: Floats
+    wave_speed_m_s: float = SPEED_OF_LIGHT_M_S
 
     def __len__(self) -> int:
         return len(self.time_s)
@@ -52,7 +55,7 @@ class Recorded:
     @property
     def shortest_wave_m(self) -> float:
         """Wavelength of the highest frequency, metres."""
-        return SPEED_OF_LIGHT_M_S / float(self.frequency_hz[-1])
+        return self.wave_speed_m_s / float(self.frequency_hz[-1])
 
     def moving(self) -> "Recorded":
         """Return the echoes less what all pulses have in common: coupling, and echoes of a node at rest."""

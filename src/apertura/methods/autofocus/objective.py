@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.common.arrays import Floats
-from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.focus.contributions import block_contributions
 from apertura.core.focus.inputs import Profiles
 from apertura.core.geometry.aperture import Aperture
@@ -153,8 +152,7 @@ class Blocks:
         blocks = slice(int(statistics[0]), int(statistics[-1]) + 1) if statistics.size else slice(0, 1)
         whole, aperture = self.record.profiles, self.aperture[blocks]
         middle = aperture.path(patch.place_m)
-        wavenumber = 2 * np.pi * whole.centre_frequency_hz / SPEED_OF_LIGHT_M_S
-        turned = sums[:, blocks].T * np.exp(-1j * wavenumber * (middle[:, None] + offsets))
+        turned = sums[:, blocks].T * np.exp(-1j * whole.wavenumber_rad_m * (middle[:, None] + offsets))
         return PatchEcho(
             patch,
             blocks,
@@ -181,7 +179,7 @@ class Blocks:
         profiles = replace(profiles, samples=np.asarray(profiles.samples))
         values = block_contributions(profiles, echo.patch.pixels_m, edges=np.arange(len(profiles) + 1))
         wavenumber, band = (
-            2 * np.pi * frequency / SPEED_OF_LIGHT_M_S
+            2 * np.pi * frequency / profiles.wave_speed_m_s
             for frequency in (profiles.centre_frequency_hz, bandwidth_hz(profiles) / np.sqrt(12))
         )
         return Contribution(values, echo.blocks, slopes, wavenumber, band)

@@ -138,7 +138,7 @@ def count_in_memory(values: Sequence[int]) -> int:
 
 def bandwidth_hz(profiles: Profiles) -> float:
     """Return the bandwidth of some profiles."""
-    return SPEED_OF_LIGHT_M_S / (profiles.step_m * profiles.oversampling)
+    return profiles.bandwidth_hz
 
 
 def _spans(place_m: Floats, record: PairRecord, axes: Floats, correlation_s: float) -> tuple[Floats, Floats, Floats]:

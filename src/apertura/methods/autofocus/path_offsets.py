@@ -116,7 +116,6 @@ class _Pair:
     @classmethod
     def of(cls, record: PairRecord, patches: Sequence[Patch], errors: Mapping[str, TrackErrors]) -> "_Pair":
         profiles = record.profiles
-        wavenumber = 2 * np.pi * profiles.centre_frequency_hz / SPEED_OF_LIGHT_M_S
         correlation_s, turned = record.turned(errors)
         lasts = min(1 / _BLOCKS_PER_CORRELATION_TIME, _BETWEEN_BLOCKS_RAD2 / max(2 * turned**2, 1e-12))
         edges = _edges(record.time_s, correlation_s * lasts)
@@ -128,7 +127,7 @@ class _Pair:
         path_m = profiles.aperture[middle].path(places).mean(axis=0)
         slope = profiles.aperture[middle].path_gradient(places.mean(axis=0))
         cell_m = SPEED_OF_LIGHT_M_S / bandwidth_hz(profiles)
-        return cls(record.pair, time_s, 2 * turned**2 * lasts, cached, path_m, cell_m, slope, wavenumber)
+        return cls(record.pair, time_s, 2 * turned**2 * lasts, cached, path_m, cell_m, slope, profiles.wavenumber_rad_m)
 
     def fitted(self, method: str) -> _Fit:
         """Return the offsets, and what each patch gains by offsets that were not fitted to it.
@@ -201,7 +200,7 @@ def _of_logs(record: PairRecord, found: Candidates, errors: Mapping[str, TrackEr
         record.time_s,
         point_m=np.mean([patch.place_m for patch in found.patches], axis=0),
         axes=found.axes,
-        wavelength_m=SPEED_OF_LIGHT_M_S / profiles.centre_frequency_hz,
+        wavelength_m=profiles.wavelength_m,
     )
     nodes = [NodePositions(errors[node].std_m, errors[node].correlation_s) for node in dict.fromkeys(record.nodes)]
     (line,) = position_lines(paths, nodes, sidelink=record.sidelink_m is not None)

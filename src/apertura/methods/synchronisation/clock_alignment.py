@@ -79,7 +79,8 @@ class PointResponse:
         at_s = self.echo.time_s + offset_s
         kept = self.log.inside(at_s)
         some, speed = self.echo[kept], self.log.speeds_m_s(at_s)[kept]
-        paths_s = self.log.phase_centres(at_s[kept]).path(self.point_m) / SPEED_OF_LIGHT_M_S - some.reference_delay_s
+        paths_m = self.log.phase_centres(at_s[kept]).path(self.point_m)
+        paths_s = paths_m / self.echo.wave_speed_m_s - some.reference_delay_s
         frequency = self.echo.frequency_hz
         spacing_hz = float(frequency[-1] - frequency[0]) / (frequency.size - 1)
         weight = speed / max(float(speed.sum()), 1e-30)

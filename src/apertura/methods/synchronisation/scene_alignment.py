@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.common.arrays import Floats
-from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.echo.compression import centre_frequency, compress, range_step
 from apertura.core.focus.engines import load_engine
 from apertura.core.focus.inputs import Profiles
@@ -56,9 +55,10 @@ class SceneSharpness:
     def of(cls, echo: Recorded, log: Logged, places_m: Floats) -> "SceneSharpness":
         """Return the sharpness of echoes; pulses are compressed once."""
         frequency = echo.frequency_hz
-        step_m, length = range_step(frequency, oversampling=_OVERSAMPLING)
+        speed = echo.wave_speed_m_s
+        step_m, length = range_step(frequency, oversampling=_OVERSAMPLING, wave_speed_m_s=speed)
         taper = np.hanning(frequency.size + 2)[1:-1]
-        start_m = echo.reference_delay_s * SPEED_OF_LIGHT_M_S
+        start_m = echo.reference_delay_s * speed
         samples = compress(
             echo.transfer,
             frequency,
@@ -67,9 +67,10 @@ class SceneSharpness:
             start_m=start_m,
             count=length,
             oversampling=_OVERSAMPLING,
+            wave_speed_m_s=speed,
         )
         placeholder = log.phase_centres(np.full(len(echo), log.first_s))
-        profiles = Profiles(samples, start_m, step_m, centre_frequency(frequency), _OVERSAMPLING, placeholder)
+        profiles = Profiles(samples, start_m, step_m, centre_frequency(frequency), _OVERSAMPLING, placeholder, speed)
         return cls(profiles, echo.time_s, log, places_m)
 
     def image(self, offset_s: float, path_m: float) -> NDArray[np.complex64]:
@@ -130,7 +131,7 @@ def align_on_scene(
     some = echo.moving()[:: -(-len(echo) // MOST_PULSES)]
     low, high = plausible_offsets(echo, log, within_s)
     bandwidth_hz = float(echo.frequency_hz[-1] - echo.frequency_hz[0])
-    cell_m = SPEED_OF_LIGHT_M_S / (2 * bandwidth_hz)
+    cell_m = echo.wave_speed_m_s / (2 * bandwidth_hz)
     coarse = SceneSharpness.of(some, log, _coarse(grid, terrain, cell_m))
     offsets_s = offset_steps(some, log, low, high)[::2]
     paths_m = np.arange(-search_m, search_m + cell_m, 2 * cell_m) if search_m > 0 else np.zeros(1)

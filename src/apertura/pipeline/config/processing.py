@@ -7,7 +7,7 @@ from typing import Any, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
-from apertura.common.constants import VERTICAL_DATUMS
+from apertura.common.constants import LARGEST_REFRACTIVITY, VERTICAL_DATUMS
 from apertura.common.errors import CampaignError, quoted
 from apertura.core.imaging.choices import ImagingChoices
 from apertura.pipeline.config.section import CrsName, Metres3, Name, Section, Title, plain_crs
@@ -154,6 +154,36 @@ class KnownPoint(Section):
     std_m: float = Field(gt=0, description="standard deviation of each coordinate, m")
 
 
+class Air(Section):
+    """Air at the ground of the scene, in place of the standard atmosphere: as measured, or its refractivity."""
+
+    temperature_c: float | None = Field(None, ge=-60, le=60, description="at the ground, °C")
+    pressure_hpa: float | None = Field(None, ge=300, le=1100, description="at the ground, not reduced to the sea, hPa")
+    relative_humidity: float | None = Field(None, ge=0, le=100, description="at the ground, %")
+    refractivity_n: float | None = Field(
+        None, ge=0, le=LARGEST_REFRACTIVITY, description="(n - 1)·10⁶ at the ground, instead of the other three"
+    )
+
+    @model_validator(mode="after")
+    def _one_way(self) -> Self:
+        weather = self.temperature_c, self.pressure_hpa, self.relative_humidity
+        given = sum(value is not None for value in weather)
+        if given != (3 if self.refractivity_n is None else 0):
+            raise ValueError(
+                f"{given} of temperature_c, pressure_hpa, relative_humidity"
+                f"{' beside refractivity_n' if self.refractivity_n is not None else ''}: give all three, or "
+                "refractivity_n alone"
+            )
+        return self
+
+    @property
+    def weather(self) -> tuple[float, float, float]:
+        """Temperature, °C, pressure, hPa, and humidity, %; ValueError where refractivity is stated instead."""
+        if self.temperature_c is None or self.pressure_hpa is None or self.relative_humidity is None:
+            raise ValueError("the refractivity is stated, and no weather")
+        return self.temperature_c, self.pressure_hpa, self.relative_humidity
+
+
 class Scene(Section):
     """The campaign's output grid."""
 
@@ -177,6 +207,12 @@ class Scene(Section):
     )
     geoid: str | None = Field(
         None, description="grid file of the geoid heights count from (.gtx, .tif); null: looked for where PROJ looks"
+    )
+    atmosphere: Literal["auto", "vacuum"] | Air = Field(
+        "auto",
+        description="air that the waves fly through: auto, standard atmosphere at the ground's height with 50 % "
+        "humidity; {temperature_c: x, pressure_hpa: y, relative_humidity: z} measured at the ground; "
+        "{refractivity_n: 290} there; vacuum; it thins with height",
     )
     reference_points: tuple[KnownPoint, ...] = Field(
         (),

@@ -230,6 +230,12 @@ class PhaseHistoryWaveform(Section):
         json_schema_extra={"enum": [*_formats("phase_history")]},
     )
 
+    air: Literal["auto", "measured", "point", "corrected"] = Field(
+        "auto",
+        description="air in the delays of the files: measured, delays as they were; point, samples are referred to a "
+        "point whose distance the file states, so that only what lies beyond it is delayed by air; corrected, whoever "
+        "made them took it out; auto: point for afrl_mat and cphd, else measured",
+    )
     channel: str | None = Field(None, description="of a CPHD file with several channels the one to image")
 
     @field_validator("format")

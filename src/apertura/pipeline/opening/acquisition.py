@@ -15,12 +15,14 @@ from apertura.core.echo.association import Association, associate
 from apertura.core.echo.captures import Read, Samples
 from apertura.core.echo.demodulate import Numerology
 from apertura.core.geometry.aperture import Aperture
+from apertura.core.imaging.range_profiles import wave_speed_of
 from apertura.formats.recordings.sample_file import SampleFile, SampleLayout
 from apertura.formats.times import FIRST
 from apertura.methods.autofocus.motion import Logged, Recorded
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import SampledWaveform
 from apertura.pipeline.digests import digest_of
+from apertura.pipeline.opening.air import scene_air
 from apertura.pipeline.opening.node_log import NodeLog, raw_log, shortest_wave
 from apertura.pipeline.opening.reading import read_history
 from apertura.pipeline.opening.transmitted import Transmitted, check_mixing
@@ -227,7 +229,8 @@ def unaligned(campaign: Campaign, flight: str, node: str) -> Unaligned:
     """
     clock = campaign.clock(flight, node)
     applied_ns, applied_ppm = 0, 0.0
-    if isinstance(campaign.settings.waveform, SampledWaveform):
+    sampled = isinstance(campaign.settings.waveform, SampledWaveform)
+    if sampled:
         path = campaign.stage("echo", flight, f"{node}-{node}")
         if not manifest_of(path).is_file():
             raise CampaignError(
@@ -244,11 +247,13 @@ def unaligned(campaign: Campaign, flight: str, node: str) -> Unaligned:
         off_m = 0.0
     times = history.time.values
     log = raw_log(campaign, flight, node, shortest_wave(history.frequency.values))
+    speed = wave_speed_of(history) if sampled else _wave_speed(campaign, log)
     echo = Recorded(
         np.asarray(history.transfer.values),
         history.frequency.values,
         history.reference_delay.values,
         _seconds(times, times[0]),
+        speed,
     )
     apart_ns = int((log.track.time.values[0] - times[0]).astype("timedelta64[ns]").astype(np.int64))
     own_clock = bool(times[0] < FIRST)
@@ -258,6 +263,14 @@ def unaligned(campaign: Campaign, flight: str, node: str) -> Unaligned:
 def _some(history: xr.Dataset) -> xr.Dataset:
     """Return at most `MOST_PULSES` pulses, evenly spread."""
     return history.isel(pulse=slice(None, None, -(-history.sizes["pulse"] // MOST_PULSES)))
+
+
+def _wave_speed(campaign: Campaign, log: NodeLog) -> float:
+    """Return the speed of the wave over a whole log: which part of it was recorded is not known before alignment."""
+    times = log.track.time.values[log.checked.kept]
+    times = times[:: -(-len(times) // MOST_PULSES)][1:-1]
+    aperture = Aperture(log.antenna("radar_tx", times), log.antenna("radar_rx", times))
+    return scene_air(campaign, aperture.tx_m).over(aperture).wave_speed_m_s
 
 
 def _logged(log: NodeLog) -> Logged:

@@ -259,7 +259,7 @@ def _sidelink_m(tx: Acquisition, rx: Acquisition, tx_at: Times, rx_at: Times | N
 
 def _delayed(history: PhaseHistory, path_m: Any) -> PhaseHistory:
     """Return an echo over paths that are longer by `path_m`."""
-    return replace(history, reference_delay_s=history.reference_delay_s + path_m / SPEED_OF_LIGHT_M_S)
+    return replace(history, reference_delay_s=history.reference_delay_s + path_m / history.wave_speed_m_s)
 
 
 def _span(seconds: float) -> np.timedelta64:

@@ -17,10 +17,12 @@ from apertura.core.echo.demodulate import remove_path
 from apertura.core.echo.pulse_filter import truncation_flags
 from apertura.core.echo.sidelink import DIVIDING
 from apertura.core.echo.transfer import Transfer, transfer_by_code, transfer_by_sidelink
+from apertura.core.geometry.aperture import Aperture
 from apertura.core.quality.budget import strictest_accuracy_db
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import Processing, PulseWaveform
 from apertura.pipeline.opening.acquisition import Acquisition, common_pulses
+from apertura.pipeline.opening.air import SceneAir, stated_air
 from apertura.pipeline.opening.positions import PulsePositions, keep_segments, place
 from apertura.pipeline.opening.transmitted import Transmitted
 
@@ -84,6 +86,7 @@ def pair_echo(
     sent: Transmitted,
     processing: Processing,
     calibration: dict[str, Any] | None,
+    air: SceneAir,
 ) -> PairEcho:
     """Return the echo of a pair from its nodes' recordings; path offsets are the calibration's, or the config's."""
     pulses = common_pulses(tx, rx, prf_hz=sent.waveform.prf_hz)
@@ -91,10 +94,12 @@ def pair_echo(
     positions = place(tx, rx, tx.raw.time.values[pulses.tx_index[paired]])
     paired = paired[positions.good]
     at = tx.raw.time.values[pulses.tx_index[paired]]
-    measured, sidelink_m = _transfer((tx, rx), pulses.rx_index[paired], at, sent, processing)
+    measured, sidelink_m = _transfer((tx, rx), pulses.rx_index[paired], at, sent, processing, air)
     at = at[measured.kept]
     offset_m = calibration["offset_m"] if calibration else _stated_offset_m(rx, monostatic=tx.name == rx.name)
-    beyond_m = offset_m - sidelink_m  # path of an echo beyond tx → scene → rx
+    beyond_m = offset_m - sidelink_m  # electrical path of an echo beyond tx → scene → rx
+    aperture = Aperture(tx.antenna("radar_tx", at), rx.antenna("radar_rx", at))
+    flown = air.over(aperture)
     frequency, delay_s = rx.numerology.frequency_hz, beyond_m / SPEED_OF_LIGHT_M_S
     captures = np.flatnonzero(measured.kept)
 
@@ -105,17 +110,17 @@ def pair_echo(
         {
             "time": ("pulse", at),
             "row": _rows(len(at)),
-            "tx_position": (("pulse", "axis"), tx.antenna("radar_tx", at)),
-            "rx_position": (("pulse", "axis"), rx.antenna("radar_rx", at)),
+            "tx_position": (("pulse", "axis"), aperture.tx_m),
+            "rx_position": (("pulse", "axis"), aperture.rx_m),
             "frequency": ("subcarrier", frequency),
             "reference_delay": ("pulse", np.zeros(len(beyond_m))),
-            "path_limit": ("pulse", SPEED_OF_LIGHT_M_S * sent.waveform.longest_delay_s - beyond_m),
+            "path_limit": ("pulse", flown.wave_speed_m_s * (sent.waveform.longest_delay_s - delay_s)),
             **_sidelink(measured),
             **_axes((tx, rx), at),
             **_sidelink_vector((tx, rx), at),
         },
         attrs=_attributes((tx, rx), pulses, positions, measured, at=at, calibration=calibration)
-        | {"stated_offset_m": offset_m},
+        | {"stated_offset_m": offset_m, **stated_air(flown)},
     )
     return PairEcho(dataset, form, measured.saturation)
 
@@ -153,17 +158,18 @@ def _transfer(
     at: Times,
     sent: Transmitted,
     processing: Processing,
+    air: SceneAir,
 ) -> tuple[Transfer, NDArray[np.float64]]:
-    """Return the transfer functions of captures, sent `at` the transmitter's tags, and sidelink lengths (m); 0 without.
+    """Return the transfer functions of captures, sent `at` the transmitter's tags, and electrical lengths of sidelinks.
 
-    Both of its ends are taken from the logs at the transmitter's tag (docs/theory.md, "Geometry").
+    In metres; 0 without. Both ends are taken from the logs at the transmitter's tag (docs/theory.md, "Geometry").
     """
     tx, rx = nodes
     if tx.name == rx.name:
         read, sent_ns = rx.reader(["radar"], captures), at.astype("datetime64[ns]").astype(np.int64)
         measured = transfer_by_code(read, sent.inverse, rx.numerology, time_s=(sent_ns - sent_ns[0]) * 1e-9)
         return _of_what_was_sent(measured, sent), np.zeros(len(at))
-    length_m = np.linalg.norm(tx.antenna("sidelink", at) - rx.antenna("sidelink", at), axis=1)
+    length_m = air.electrical_m(tx.antenna("sidelink", at), rx.antenna("sidelink", at))
     measured = transfer_by_sidelink(
         rx.reader(["radar", "sidelink"], captures),
         sent.inverse,

@@ -28,6 +28,7 @@ from apertura.formats.beam_pattern import read_beam_pattern
 from apertura.formats.reading import open_recording
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import CONFIG, Antenna, SampledWaveform
+from apertura.pipeline.opening.air import in_air, scene_air
 from apertura.pipeline.opening.node_log import raw_log, shortest_wave
 from apertura.pipeline.opening.positions import inside_segments, keep_segments, place, position_error, stated_error
 from apertura.pipeline.opening.reading import read_history
@@ -184,8 +185,9 @@ def recorded_echo(campaign: Campaign, flight: str, pair: str) -> xr.Dataset:
         )
         raise CampaignError(found, where, expected, remedy)
     if logged:
-        return _placed_by_logs(campaign, flight, (tx, rx), history)
+        return in_air(campaign, _placed_by_logs(campaign, flight, (tx, rx), history))
     _check_frame(campaign.settings.scene.crs, history.attrs["frame"])
+    history = in_air(campaign, history)
     nodes = campaign.settings.nodes
     known = {leg: stated_error(nodes[node]) | {"node": node} for leg, node in (("tx", tx), ("rx", rx))}
     return history.assign_attrs(positions=known)
@@ -275,6 +277,10 @@ class OpenPair:
         What is left of errors of position after the tracks were refined; None where they are those of the logs.
     report
         Attributes of stage echo; empty before it is formed.
+    wave_speed_m_s
+        Speed of the wave along the paths.
+    air
+        What is known of it, as stage echo states it.
     """
 
     flight: str
@@ -291,6 +297,8 @@ class OpenPair:
     sidelink_m: NDArray[np.float64] | None = None
     left: Effect | None = None
     report: Mapping[str, Any] = field(default_factory=dict)
+    wave_speed_m_s: float = field(kw_only=True)
+    air: Mapping[str, Any] = field(kw_only=True)
 
     @property
     def monostatic(self) -> bool:
@@ -331,6 +339,8 @@ def open_pair(campaign: Campaign, flight: str, pair: str, *, echo: xr.Dataset | 
         beams=beams,
         sidelink_m=echo.sidelink_vector.values if "sidelink_vector" in echo else None,
         report=echo.attrs,
+        wave_speed_m_s=history.wave_speed_m_s,
+        air=echo.attrs["atmosphere"],
     )
 
 
@@ -352,12 +362,14 @@ def _expected(campaign: Campaign, flight: str, pair: str, waveform: SampledWavef
         length_m = np.linalg.norm(tx.antenna("sidelink", times) - rx.antenna("sidelink", times), axis=1)
         beyond_m -= offset.sidelink + float(length_m.min())
     weight = window_weights(campaign.settings.processing.window, len(frequency))
-    limit_m = SPEED_OF_LIGHT_M_S * waveform.longest_delay_s - beyond_m
+    aperture = Aperture(tx.antenna("radar_tx", times), rx.antenna("radar_rx", times))
+    flown = scene_air(campaign, aperture.tx_m).over(aperture)
+    limit_m = flown.wave_speed_m_s * waveform.longest_delay_s - beyond_m
     known = {log.name: _positions(position_error(log.track, log.settings, times)) for log in (tx, rx)}
     return OpenPair(
         flight,
         pair,
-        Aperture(tx.antenna("radar_tx", times), rx.antenna("radar_rx", times)),
+        aperture,
         frequency,
         weight,
         limit_m,
@@ -365,6 +377,8 @@ def _expected(campaign: Campaign, flight: str, pair: str, waveform: SampledWavef
         began=times[0],
         positions=tuple(known.values()),
         beams=beams_of(campaign, pair, axes),
+        wave_speed_m_s=flown.wave_speed_m_s,
+        air=flown.report,
     )
 
 

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from rich.filesize import decimal
 
-from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
 from apertura.common.flags import Flags
 from apertura.core.antenna.beam import Beams
@@ -31,6 +30,8 @@ from apertura.pipeline.store import manifest_of
 # ---- Error budget of a pair, from config, logs and echo -------------------------------------------------------------
 
 _MS, _CM, _PPM = 1e-3, 1e-2, 1e-6
+_USUAL_N = 300.0  # of air at the ground: what vacuum is told by
+_SHOWN_CELLS = 0.01  # of a range cell: a shift below it is lost in any peak of 20 dB (docs/theory/focus.md, eq. 6)
 
 
 def budget_of(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> list[BudgetLine]:
@@ -67,6 +68,7 @@ def budget_of(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> list[Budg
             _scaled(pair.report, "calibration", "std_m", _CM),
             unit="cm of path",
         ),
+        _air(campaign, pair, paths),
         _sampling(pair.report.get("pulses", {})),
         _antenna(pair),
     ]
@@ -94,7 +96,7 @@ def paths_to_middle(pair: OpenPair, scene: OpenScene) -> PointPaths:
         pair.time_s,
         point_m=scene.middle_m,
         axes=scene.axes,
-        wavelength_m=SPEED_OF_LIGHT_M_S / centre_frequency(pair.frequency_hz),
+        wavelength_m=pair.wave_speed_m_s / centre_frequency(pair.frequency_hz),
     )
 
 
@@ -122,6 +124,41 @@ def arithmetic_line(error_db: float) -> BudgetLine:
     return BudgetLine(
         "arithmetic", f"{error_db:.1f} dB measured", Effect(10 * np.log10(1 - 10 ** (error_db / 10)), 0, 0)
     )
+
+
+def _air(campaign: Campaign, pair: OpenPair, paths: PointPaths) -> BudgetLine:
+    """Return what the uncertainty of the air's refractivity does: all pairs lie wrong alike, less what paths differ by.
+
+    Against the transmitter's own image a pair's phase is off by what its path differs, the sidelink's length included
+    (docs/theory/atmosphere.md, eq. 6).
+    """
+    per_n, said = 1e-6 * float(pair.air["std_n"]), f"{pair.air['source']}: N = {pair.air['refractivity_n']:.1f}"
+    tx_m, rx_m = (np.linalg.norm(leg - paths.point_m, axis=1) for leg in paths.aperture.legs)
+    known_m, further_m = np.zeros(len(tx_m)), rx_m - tx_m
+    if not pair.monostatic and isinstance(campaign.settings.waveform, SampledWaveform):
+        known_m = np.linalg.norm(paths.aperture.tx_m - paths.aperture.rx_m, axis=1)
+    effect = paths.of_offset(per_n * (tx_m + rx_m - known_m), common=True)
+    phase_rad = 2 * np.pi / paths.wavelength_m * per_n * float(np.abs(further_m - known_m).mean())
+    effect = replace(effect, phase_rad=0.0 if pair.monostatic else phase_rad)
+    said = f"{said} ± {pair.air['std_n']:.1f}"
+    assumed = campaign.settings.scene.atmosphere == "auto"
+    return BudgetLine("atmosphere", None if assumed else said, effect, assumed=said if assumed else None)
+
+
+def air_decision(pair: OpenPair) -> Decision:
+    """Return which air the paths of a pair are of, and what vacuum would have done: one constant for all of them."""
+    air = pair.air
+    cell_m = pair.wave_speed_m_s / float(np.ptp(pair.frequency_hz)) / 2
+    moved_m, left_m, other = float(air["vacuum_would_move_m"]), float(air["one_constant_leaves_m"]), "vacuum"
+    if not air["refractivity_n"]:
+        moved_m, other = 1e-6 * _USUAL_N * float(air["range_m"]), f"air of N = {_USUAL_N:.0f}"
+    shows = "" if moved_m > _SHOWN_CELLS * cell_m else ", which does not show"
+    why = (
+        f"{air['source']}; mean along the paths from {air['antennas_m']:.0f} m; {other} would move the image by "
+        f"{100 * moved_m:.2g} cm of slant range, {moved_m / cell_m:.2g} of a cell{shows}; one value for all pulses "
+        f"leaves {100 * left_m:.1g} cm of path"
+    )
+    return Decision("atmosphere", f"N = {air['refractivity_n']:.1f}", why)
 
 
 def _scaled(report: Mapping[str, Any], section: str, name: str, unit: float) -> float | None:
@@ -188,7 +225,9 @@ def plan_pair(campaign: Campaign, pair: OpenPair, scene: OpenScene, *, threads: 
     flags = check_antennas(scene.grid, scene.terrain, pair.aperture, where=where)
     accuracy = accuracy_of(campaign, pair, scene)
     plan = plan_job(campaign, job_of(campaign, pair, scene, threads=threads), accuracy_db=float(accuracy.value))
-    plan = replace(plan, decisions=(*plan.decisions, accuracy), flags=Flags.merged(flags, plan.flags))
+    plan = replace(
+        plan, decisions=(*plan.decisions, accuracy, air_decision(pair)), flags=Flags.merged(flags, plan.flags)
+    )
     written = manifest_of(campaign.stage("image", pair.flight, pair.name)).is_file()
     free_disk = None if written else shutil.disk_usage(campaign.root).free
     check_fits(plan, free_disk=free_disk, where=f"{pair.flight}/{pair.name}")
@@ -221,6 +260,7 @@ def job_of(campaign: Campaign, pair: OpenPair, scene: OpenScene, *, threads: int
         history=pair.history,
         beams=pair.beams,
         integration=campaign.settings.processing.integrated,
+        wave_speed_m_s=pair.wave_speed_m_s,
     )
     return replace(
         job,

@@ -11,7 +11,6 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
 from apertura.common.flags import Flags
 from apertura.common.provenance import chained_sha256
@@ -25,6 +24,7 @@ from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import OfdmWaveform, SampledWaveform
 from apertura.pipeline.lineage import result_of
 from apertura.pipeline.opening.acquisition import Acquisition, open_acquisition
+from apertura.pipeline.opening.air import scene_air
 from apertura.pipeline.opening.autofocus import open_refined
 from apertura.pipeline.opening.diagnosis import (
     Hypothesis,
@@ -159,10 +159,10 @@ def _is_offset(
         if len(before) != len(after):
             return False
         longer_m = (after.aperture.path(there_m[None]) - before.aperture.path(here_m[None]))[:, 0]
-        longer_m -= SPEED_OF_LIGHT_M_S * (after.reference_delay_s - before.reference_delay_s)
+        longer_m -= before.wave_speed_m_s * (after.reference_delay_s - before.reference_delay_s)
         moves = np.column_stack([np.ones(len(longer_m)), before.aperture.path_gradient(here_m) @ scene.axes[:2].T])
         rest_m = longer_m - moves @ np.linalg.lstsq(moves, longer_m, rcond=None)[0]
-        if 2 * np.pi * centre_frequency(before.frequency_hz) / SPEED_OF_LIGHT_M_S * float(rest_m.std()) > _ALIKE_RAD:
+        if 2 * np.pi * centre_frequency(before.frequency_hz) / before.wave_speed_m_s * float(rest_m.std()) > _ALIKE_RAD:
             return False
     return True
 
@@ -189,7 +189,8 @@ def _other_echoes(
 
     def formed(one: PairGeometry, nodes: Mapping[str, Acquisition], sent: Transmitted) -> PhaseHistory:
         tx, rx = (nodes[name] for name in one.pair.split("-"))
-        echo = pair_echo(tx, rx, sent, campaign.settings.processing, calibration[one.pair])
+        air = scene_air(campaign, tx.track.position.values)
+        echo = pair_echo(tx, rx, sent, campaign.settings.processing, calibration[one.pair], air)
         some = echo.at(some_pulses(echo.dataset))
         return evidence_of(nodes, one.pair, some, campaign.settings.processing.window).history
 

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.documents import undamaged
 from apertura.common.errors import CampaignError
 from apertura.common.flags import Flags
@@ -13,7 +14,7 @@ from apertura.common.provenance import canonical_json, chained_sha256
 from apertura.core.echo.calibration import estimate_path_offset, reflector_history
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.geodesy import frame_from_map
-from apertura.core.imaging.range_profiles import Rows
+from apertura.core.imaging.range_profiles import Rows, wave_speed_of
 from apertura.core.quality.measures import coherence_factor
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import Calibration
@@ -88,6 +89,7 @@ def _settings(campaign: Campaign) -> Calibration:
 def _pair(campaign: Campaign, echo: xr.Dataset, requested: Calibration, *, where: str) -> dict[str, Any]:
     reflector = frame_from_map(campaign.settings.scene.crs, *requested.reflector_m)
     path_m = Aperture(echo.tx_position.values, echo.rx_position.values).path(reflector)
+    path_m = path_m * (SPEED_OF_LIGHT_M_S / wave_speed_of(echo))  # electrical, as path offsets are
     transfer, frequency = Rows(echo.transfer), echo.frequency.values
     offset = estimate_path_offset(transfer, frequency, path_m=path_m, search_m=requested.search_m, where=where)
     history = reflector_history(transfer, frequency, path_m=path_m + offset.offset_m)

@@ -13,6 +13,7 @@ from apertura.common.progress import progress
 from apertura.common.provenance import Provenance, canonical_json
 from apertura.core.echo.demodulate import remove_path
 from apertura.core.geometry.geodesy import LOCAL, ecef_from_geodetic, ned_axes
+from apertura.core.imaging.range_profiles import wave_speed_of
 from apertura.formats.export import PHASE_HISTORY
 from apertura.formats.export.cphd import CphdCollection, write_cphd
 from apertura.pipeline.campaign import Campaign
@@ -77,6 +78,7 @@ def _collection(
         axes,
         (float(west), float(south), float(east), float(north)),
         scene.grid.spacing_m,
+        wave_speed_of(echo),
         {**tags, "APERTURA_FLAGS": canonical_json(echo.attrs["flags"]), "APERTURA_FRAME": echo.attrs["frame"]},
     )
 

@@ -11,6 +11,7 @@ from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import SampledWaveform
 from apertura.pipeline.lineage import result_of
 from apertura.pipeline.opening.acquisition import open_acquisition
+from apertura.pipeline.opening.air import scene_air
 from apertura.pipeline.opening.echo import PairEcho, pair_echo
 from apertura.pipeline.opening.pair import recorded_echo
 from apertura.pipeline.opening.transmitted import transmitted
@@ -34,7 +35,8 @@ def echo(campaign: Campaign, flight: str, pair: str) -> Path:
         tx, rx = pair.split("-")
         nodes = {node: open_acquisition(campaign, flight, node, sent) for node in dict.fromkeys((tx, rx))}
         parents = [stage for node in nodes.values() for stage in (node.raw, node.track)]
-        formed = pair_echo(nodes[tx], nodes[rx], sent, campaign.settings.processing, calibration)
+        air = scene_air(campaign, nodes[tx].track.position.values)
+        formed = pair_echo(nodes[tx], nodes[rx], sent, campaign.settings.processing, calibration, air)
     formed = formed.within(campaign, flight, pair)
     inputs = {name: lineage.sources.digests[name] for name in map(campaign.relative, files)}
     if calibration:

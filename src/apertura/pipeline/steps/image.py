@@ -31,7 +31,7 @@ from apertura.pipeline.store import finish, mark_rewritten, open_array, open_sta
 _MISSING = np.complex64(complex(np.nan, np.nan))
 """Value of a tile that no pulse illuminates; it is not stored."""
 
-_QUOTED = ("pulses", "positions", "time_tags", "sidelink", "clock", "code", "calibration")
+_QUOTED = ("pulses", "positions", "time_tags", "sidelink", "clock", "code", "calibration", "atmosphere")
 
 
 def image(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Path:

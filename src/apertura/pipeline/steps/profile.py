@@ -18,6 +18,7 @@ from apertura.core.imaging.range_profiles import (
     aperture_of,
     phase_history_of,
     range_compress,
+    wave_speed_of,
 )
 from apertura.core.scene.clearance import check_antennas
 from apertura.pipeline.campaign import Campaign
@@ -37,7 +38,8 @@ def profile(campaign: Campaign, flight: str, pair: str) -> Path:
     aperture, frequency, where = aperture_of(source), source.frequency.values, f"flight {flight}, pair {pair}"
     check_antennas(scene.grid, scene.terrain, aperture, where=where)
     beams = weighing(campaign, open_pair(campaign, flight, pair, echo=source), scene)
-    window = RangeWindow.of(aperture, scene.grid, scene.terrain, frequency, beams=beams)
+    speed = wave_speed_of(source)
+    window = RangeWindow.of(aperture, scene.grid, scene.terrain, frequency, beams=beams, wave_speed_m_s=speed)
     _check_held(window.farthest_m, source.path_limit.values, campaign, where=where)
     _check_unambiguous(window)
     requested = campaign.settings.processing.window
@@ -50,6 +52,7 @@ def profile(campaign: Campaign, flight: str, pair: str) -> Path:
         "centre_frequency_hz": centre_frequency(frequency),
         "oversampling": window.unambiguous / len(frequency),
         "window": requested,
+        "wave_speed_m_s": speed,
     }
     settings, parents = {**lineage.result.settings, **scene.spec}, [source, *scene.parents]
     inputs = merged(scene.inputs, pattern_digests(campaign, pair))

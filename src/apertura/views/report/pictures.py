@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from rasterio import Affine
 
 from apertura.common.arrays import Floats
-from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.progress import progress
 from apertura.common.provenance import Provenance
 from apertura.core.focus.contributions import block_contributions
@@ -182,7 +181,7 @@ class Shown:
         phasors = block_contributions(logged, self._target_m, edges=every)[0].astype(np.complex128)
         stages = {}
         if "sidelink_phase" in echo and "sidelink_vector" in echo:
-            wavenumber_rad_m = 2 * np.pi * float(echo.frequency.values.mean()) / SPEED_OF_LIGHT_M_S
+            wavenumber_rad_m = 2 * np.pi * float(echo.frequency.values.mean()) / logged.wave_speed_m_s
             length_m = np.linalg.norm(echo.sidelink_vector.values, axis=1)
             error = sidelink_error_rad(echo.sidelink_phase.values, length_m, wavenumber_rad_m=wavenumber_rad_m)
             stages["before: without the sidelink"] = np.nan_to_num(phasors * np.exp(1j * error))

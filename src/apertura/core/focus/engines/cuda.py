@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
 from apertura.core.antenna.beam import Beams
 from apertura.core.focus.engines.cuda_prediction import DEGREE, SIDE, candidates, simulated
@@ -236,7 +235,7 @@ def prepare(profiles: Profiles, *, oversampling: int = 6) -> ResidentTables:
     Source: docs/theory/engine.md, "Cells" and "A GPU".
     """
     samples, start_m, places = profiles.for_tables()
-    wavenumber = 2 * np.pi * profiles.centre_frequency_hz / SPEED_OF_LIGHT_M_S
+    wavenumber = profiles.wavenumber_rad_m
     design = design_table(profiles.oversampling, wavenumber * profiles.step_m, oversampling=oversampling, degree=DEGREE)
     return ResidentTables(
         samples=samples,

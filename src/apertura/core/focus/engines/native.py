@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.antenna.beam import Beams
 from apertura.core.focus.engines.engine import EngineOptions, checked_pixels
 from apertura.core.focus.engines.native_binding import (
@@ -78,7 +77,7 @@ def prepare(profiles: Profiles, *, oversampling: int = 6, degree: int = 2) -> Ta
     if degree not in (1, 2):
         raise ValueError(f"{degree=}: must be 1 or 2")
     samples, start_m, places = profiles.for_tables()
-    wavenumber = 2 * np.pi * profiles.centre_frequency_hz / SPEED_OF_LIGHT_M_S
+    wavenumber = profiles.wavenumber_rad_m
     design = design_table(profiles.oversampling, wavenumber * profiles.step_m, oversampling=oversampling, degree=degree)
     cell_m = profiles.step_m * design.down / design.up
     padding = [(0, -len(samples) % KERNEL.batch)]

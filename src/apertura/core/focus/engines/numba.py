@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.antenna.beam import Beams
 from apertura.core.focus.engines.engine import (
     BEAM_S,
@@ -143,7 +142,7 @@ def prepare(profiles: Profiles, *, oversampling: int = 8) -> OversampledTables:
         np.ascontiguousarray(fine, np.complex64),
         profiles.start_m,
         profiles.step_m / factor,
-        2 * np.pi * profiles.centre_frequency_hz / SPEED_OF_LIGHT_M_S,
+        profiles.wavenumber_rad_m,
         profiles.aperture,
     )
 

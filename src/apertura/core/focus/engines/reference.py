@@ -7,7 +7,6 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.antenna.beam import Beams
 from apertura.core.focus.engines.engine import BEAM_S, EngineOptions, Setting, compiled_for
 from apertura.core.focus.inputs import PhaseHistory
@@ -67,7 +66,7 @@ def form(history: PhaseHistory, pixels: NDArray[np.float64], *, beams: Beams | N
     >>> from apertura.core.geometry.aperture import Aperture
     >>> f = 1e9 + 1e6 * np.arange(8)
     >>> tx = np.array([[0.0, 0.0, 10.0]])
-    >>> echo = np.exp(-2j * np.pi * f * 20 / SPEED_OF_LIGHT_M_S).astype(np.complex64)[None]
+    >>> echo = np.exp(-2j * np.pi * f * 20 / 299792458.0).astype(np.complex64)[None]
     >>> history = PhaseHistory(echo, f, np.full(8, 1 / 8), np.zeros(1), Aperture(tx, tx))
     >>> form(history, np.zeros((1, 1, 3))).round(6) + 0.0
     array([[1.+0.j]])
@@ -103,7 +102,7 @@ def terms(history: PhaseHistory, pixels: NDArray[np.float64], beams: Beams | Non
     frequency = history.frequency_hz
     step = float(frequency[-1] - frequency[0]) / (len(frequency) - 1)
     weighted = history.transfer * history.weight
-    delay = history.aperture.path(pixels) / SPEED_OF_LIGHT_M_S - history.reference_delay_s[:, None]
+    delay = history.aperture.path(pixels) / history.wave_speed_m_s - history.reference_delay_s[:, None]
     total = _polynomial(weighted.astype(np.complex128, copy=False), np.exp(2j * np.pi * (step * delay % 1.0)))
     total *= np.exp(2j * np.pi * (frequency[0] * delay % 1.0))
     if beams is not None:

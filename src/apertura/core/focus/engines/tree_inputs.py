@@ -11,7 +11,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.contracts import Window
 from apertura.core.antenna.beam import Beams
 from apertura.core.focus.engines import native
@@ -186,8 +185,8 @@ class Trees:
 
     @property
     def wavenumber_rad_m(self) -> float:
-        """2πf_mid/c."""
-        return 2 * np.pi * self.profiles.centre_frequency_hz / SPEED_OF_LIGHT_M_S
+        """2πf_mid/v."""
+        return self.profiles.wavenumber_rad_m
 
     @property
     def band_rad_m(self) -> float:
@@ -293,7 +292,7 @@ def prepare(profiles: Profiles, *, oversampling: int = 24, taps: int = 8) -> Tre
     contiguous = replace(profiles, samples=samples, start_m=start_m)
     legs = [leaves_of(leg) for leg in places]
     deviation, rough = parabola_deviation(legs[0]) + parabola_deviation(legs[1]), leaf_roughness(*legs)
-    turn = 2 * np.pi * profiles.centre_frequency_hz / SPEED_OF_LIGHT_M_S * profiles.step_m
+    turn = profiles.wavenumber_rad_m * profiles.step_m
     design = cells(profiles.oversampling, turn, float(oversampling), taps)
     polynomials = np.stack([tracks(leg) for leg in legs], axis=1)
     return Trees(

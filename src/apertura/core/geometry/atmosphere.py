@@ -1,0 +1,248 @@
+"""The speed of a wave in air: refractivity at the ground, its profile with height, its mean along a straight path."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from apertura.common.arrays import Floats
+from apertura.common.constants import SPEED_OF_LIGHT_M_S
+
+SCALE_HEIGHT_M = 7350.0
+"""Height over which the refractivity of air falls to 1/e: ITU-R P.453, the world's mean profile."""
+
+STANDARD_HUMIDITY_PERCENT = 50.0
+"""Relative humidity taken where nobody states it; the standard atmosphere has none."""
+
+_STANDARD_K, _STANDARD_HPA, _LAPSE_K_M, _BAROMETRIC = 288.15, 1013.25, 6.5e-3, 5.2559  # ISO 2533, below 11 km
+_HIGHEST_M = 11_000.0  # where its lapse ends
+_UNKNOWN = 10.0, 20.0, 100 / np.sqrt(12)  # K, hPa, % (any humidity alike): weather against the standard atmosphere
+_MEASURED = 1.0, 1.0, 5.0  # K, hPa, %: a thermometer, a barometer and a hygrometer in the field
+_STATED_N = 1.0  # N units: to which a refractivity is given
+_PROFILE = 0.1  # of what refractivity falls by from the ground to the path's mean: scale heights of 6.5 to 8.2 km
+
+
+def refractivity(temperature_c: float, pressure_hpa: float, relative_humidity: float) -> float:
+    """Return N = (n - 1)·10⁶ of air at radio frequencies.
+
+    Parameters
+    ----------
+    temperature_c
+        Degrees Celsius, -50 to 60.
+    pressure_hpa
+        Total pressure at the place (not reduced to sea level), hPa.
+    relative_humidity
+        Percent, over water.
+
+    Notes
+    -----
+    Source: ITU-R P.453, N = 77.6/T·(P + 4810·e/T), within 0.1 % up to 100 GHz, free of dispersion; its formula of the
+    saturation vapour pressure over water; docs/theory/atmosphere.md, eq. 1.
+
+    Examples
+    --------
+    >>> round(refractivity(15.0, 1013.25, 0.0), 1), round(refractivity(15.0, 1013.25, 50.0), 1)
+    (272.9, 311.4)
+    """
+    kelvin, t = temperature_c + 273.15, temperature_c
+    enhanced = 1 + 1e-4 * (7.2 + pressure_hpa * (0.0320 + 5.9e-6 * t**2))
+    saturated_hpa = enhanced * 6.1121 * np.exp((18.678 - t / 234.5) * t / (t + 257.14))
+    vapour_hpa = relative_humidity / 100 * saturated_hpa
+    return float(77.6 / kelvin * (pressure_hpa + 4810 * vapour_hpa / kelvin))
+
+
+def standard_weather(height_m: float) -> tuple[float, float, float]:
+    """Return temperature (°C), pressure (hPa) and humidity (%) of the standard atmosphere at a height above the sea.
+
+    Examples
+    --------
+    >>> [round(value, 2) for value in standard_weather(1000.0)]
+    [8.5, 898.75, 50.0]
+    """
+    kelvin = _STANDARD_K - _LAPSE_K_M * float(np.clip(height_m, -1000.0, _HIGHEST_M))
+    pressure_hpa = _STANDARD_HPA * (kelvin / _STANDARD_K) ** _BAROMETRIC
+    return kelvin - 273.15, float(pressure_hpa), STANDARD_HUMIDITY_PERCENT
+
+
+def wave_speed(refractivity_n: float) -> float:
+    """Return the speed of a wave in a medium of N units, m/s; of 0 exactly that in vacuum.
+
+    Parameters
+    ----------
+    refractivity_n
+        (n - 1)·10⁶: of `Atmosphere.mean_n` along a path.
+
+    Examples
+    --------
+    >>> import apertura as ap
+    >>> air = ap.Atmosphere.standard(620.0)  # at the ground; an antenna flies 300 m above it
+    >>> round(ap.wave_speed(float(air.mean_n(920.0, 620.0))), -3)
+    299708000.0
+    """
+    return SPEED_OF_LIGHT_M_S / (1 + 1e-6 * refractivity_n)
+
+
+@dataclass(frozen=True)
+class Atmosphere:
+    """Air over a scene: refractivity at its ground, falling exponentially with height.
+
+    Attributes
+    ----------
+    refractivity_n
+        N units at `ground_m`; 0: vacuum.
+    ground_m
+        Height that it holds at, metres; of the same datum as all heights here, taken as above the sea.
+    source
+        Where it comes from, in a few words.
+    std_n
+        Standard deviation at the ground, N units.
+
+    Examples
+    --------
+    >>> air = Atmosphere.standard(0.0)
+    >>> round(air.refractivity_n, 1), round(float(air.mean_n(3000.0, 0.0)), 1)
+    (311.4, 255.6)
+    """
+
+    refractivity_n: float
+    ground_m: float
+    source: str
+    std_n: float = 0.0
+
+    @classmethod
+    def vacuum(cls) -> "Atmosphere":
+        """Return no air: waves fly at the speed of light in vacuum."""
+        return cls(0.0, 0.0, "vacuum, as asked for")
+
+    @classmethod
+    def standard(cls, ground_m: float) -> "Atmosphere":
+        """Return the standard atmosphere over ground at a height above the sea (m), with 50 % of humidity."""
+        weather = standard_weather(ground_m)
+        source = f"standard atmosphere at the ground's {ground_m:.0f} m, humidity {STANDARD_HUMIDITY_PERCENT:.0f} %"
+        return cls(refractivity(*weather), ground_m, source, _spread(weather, _UNKNOWN))
+
+    @classmethod
+    def of_weather(
+        cls, temperature_c: float, pressure_hpa: float, relative_humidity: float, *, ground_m: float
+    ) -> "Atmosphere":
+        """Return air as measured at the ground; parameters as `refractivity`."""
+        weather = temperature_c, pressure_hpa, relative_humidity
+        source = f"{temperature_c:g} °C, {pressure_hpa:g} hPa, {relative_humidity:g} % at the ground, as stated"
+        return cls(refractivity(*weather), ground_m, source, _spread(weather, _MEASURED))
+
+    @classmethod
+    def stated(cls, refractivity_n: float, *, ground_m: float) -> "Atmosphere":
+        """Return air of a refractivity that is given for the ground, N units."""
+        return cls(refractivity_n, ground_m, f"N = {refractivity_n:g} at the ground, as stated", _STATED_N)
+
+    def at_n(self, height_m: Any) -> Floats:
+        """Return N at heights (m), of their shape."""
+        return np.asarray(self.refractivity_n * np.exp((self.ground_m - np.asarray(height_m)) / SCALE_HEIGHT_M))
+
+    def mean_n(self, one_m: Any, other_m: Any) -> Floats:
+        """Return the mean of N along straight paths between heights.
+
+        Parameters
+        ----------
+        one_m, other_m
+            Heights of both ends, metres, of shapes that broadcast.
+
+        Notes
+        -----
+        Source: docs/theory/atmosphere.md, eq. 3: height is linear along a path, so that its length does not matter.
+
+        Examples
+        --------
+        >>> air = Atmosphere(300.0, 0.0, "an example")
+        >>> air.mean_n(0.0, 0.0), air.mean_n(np.array([735.0]), 0.0).round(2)
+        (array(300.), array([285.49]))
+        """
+        low, high = np.minimum(one_m, other_m), np.maximum(one_m, other_m)
+        scale = (high - low) / SCALE_HEIGHT_M
+        falls = np.where(scale > 1e-9, -np.expm1(-scale) / np.maximum(scale, 1e-9), 1.0)
+        return np.asarray(self.at_n(low) * falls)
+
+    def over(self, tx_m: Floats, rx_m: Floats, range_m: tuple[Floats, Floats]) -> "FlightAir":
+        """Return the one refractivity of a pair's flight.
+
+        Parameters
+        ----------
+        tx_m, rx_m
+            (pulse,) float64, heights of the antennas, metres.
+        range_m
+            (pulse,) float64 each: distances of both antennas from the scene, metres, which the legs are weighed by.
+        """
+        legs = np.stack([self.mean_n(tx_m, self.ground_m), self.mean_n(rx_m, self.ground_m)])
+        length_m = np.stack(range_m)
+        of_pulses = (legs * length_m).sum(axis=0) / np.maximum(length_m.sum(axis=0), 1e-9)
+        mean = float(of_pulses.mean())
+        falls = abs(self.refractivity_n - mean)
+        scaled = self.std_n * mean / self.refractivity_n if self.refractivity_n else 0.0
+        left_m = length_m.sum(axis=0) * 1e-6 * (of_pulses - mean)
+        return FlightAir(
+            mean,
+            float(np.hypot(scaled, _PROFILE * falls)),
+            self,
+            float(np.mean([tx_m.mean(), rx_m.mean()])),
+            float(length_m.sum(axis=0).mean()),
+            float(np.abs(left_m).max()),
+        )
+
+
+@dataclass(frozen=True)
+class FlightAir:
+    """Air of a pair's flight: one refractivity for all its paths.
+
+    Attributes
+    ----------
+    refractivity_n
+        Mean of N over pulses and along both legs.
+    std_n
+        Its standard deviation, N units.
+    atmosphere
+        What it is the mean of.
+    antennas_m
+        Mean height of the antennas, metres.
+    path_m
+        Mean total path to the scene, metres.
+    left_m
+        Largest error of a total path by one refractivity for all pulses, metres.
+    """
+
+    refractivity_n: float
+    std_n: float
+    atmosphere: Atmosphere
+    antennas_m: float
+    path_m: float
+    left_m: float
+
+    @property
+    def wave_speed_m_s(self) -> float:
+        """Speed of the wave along the paths, m/s."""
+        return wave_speed(self.refractivity_n)
+
+    @property
+    def report(self) -> dict[str, Any]:
+        """As JSON values, for stages and image.json."""
+        air = self.atmosphere
+        return {
+            "refractivity_n": round(self.refractivity_n, 3),
+            "std_n": round(self.std_n, 2),
+            "source": air.source,
+            "ground_n": round(air.refractivity_n, 3),
+            "ground_m": round(air.ground_m, 1),
+            "antennas_m": round(self.antennas_m, 1),
+            "range_m": round(self.path_m / 2, 2),
+            "vacuum_would_move_m": round(1e-6 * self.refractivity_n * self.path_m / 2, 4),
+            "one_constant_leaves_m": float(f"{self.left_m:.2g}"),
+        }
+
+
+def _spread(weather: tuple[float, float, float], off: tuple[float, float, float]) -> float:
+    """Return the standard deviation of N by independent errors of temperature, pressure and humidity."""
+    middle, changes = refractivity(*weather), []
+    for number, error in enumerate(off):
+        wrong = list(weather)
+        wrong[number] += error
+        changes.append(refractivity(*wrong) - middle)
+    return float(np.hypot.reduce(changes))

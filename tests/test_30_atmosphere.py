@@ -1,0 +1,243 @@
+"""The speed of light in air: refractivity, its mean along paths, and images of waves that are slower than in vacuum."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import apertura as ap
+from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.core.focus.engines import ENGINES, load_engine
+from apertura.core.geometry.atmosphere import (
+    SCALE_HEIGHT_M,
+    Atmosphere,
+    refractivity,
+    standard_weather,
+    wave_speed,
+)
+from apertura.core.imaging.range_profiles import RangeWindow, range_compress
+from apertura.core.scene.terrain import FlatGround
+from apertura.formats.phase_histories.phase_history import History, joined
+
+ROOT = Path(__file__).parent.parent
+AIR = 1.000282
+
+
+def test_refractivity_is_that_of_the_recommendation():
+    """Dry air and vapour by hand: 77.6·1013.25/288.15; e_s = 17.04 hPa at 15 °C in tables, 3.73e5·e/T² of vapour."""
+    assert refractivity(15.0, 1013.25, 0.0) == pytest.approx(77.6 * 1013.25 / 288.15, rel=1e-12)
+    wet = refractivity(15.0, 1013.25, 100.0) - refractivity(15.0, 1013.25, 0.0)
+    assert wet == pytest.approx(3.73e5 * 17.04 / 288.15**2, rel=0.006)  # 0.4 % is the enhancement of moist air
+    assert refractivity(30.0, 1000.0, 100.0) == pytest.approx(430, abs=3)  # the tropics
+    assert standard_weather(5000.0)[:2] == pytest.approx((-17.5, 540.2), abs=0.1)  # ISO 2533
+
+
+@pytest.mark.parametrize("heights", [(600.0, 610.0), (3000.0, 0.0), (-50.0, 9000.0), (500.0, 500.0)])
+def test_the_mean_along_a_path_is_that_of_its_integral(heights):
+    air = Atmosphere(300.0, 100.0, "a test")
+    along = np.linspace(0, 1, 20001)
+    profile = 300.0 * np.exp(-(heights[0] + along * (heights[1] - heights[0]) - 100.0) / SCALE_HEIGHT_M)
+    exact = ((profile[1:] + profile[:-1]) / 2).mean()
+    assert air.mean_n(*heights) == pytest.approx(exact, rel=1e-7)
+    assert air.mean_n(*heights[::-1]) == air.mean_n(*heights)
+
+
+def test_bending_is_less_than_a_tenth_of_a_millimetre_below_ten_kilometres():
+    """The quickest path between two points of a layered air against the straight one, by a sine-shaped detour."""
+    air, length = Atmosphere(320.0, 0.0, "a test"), 10_000.0
+    x = np.linspace(0, length, 4001)
+
+    def path_m(sag_m):
+        height = 100.0 + sag_m * np.sin(np.pi * x / length)
+        steps = np.hypot(np.diff(x), np.diff(height))
+        return float((steps * (1 + 1e-6 * (air.at_n(height[1:]) + air.at_n(height[:-1])) / 2)).sum())
+
+    times = [path_m(sag) for sag in np.linspace(0, 2, 81)]
+    bend = 320e-6 / SCALE_HEIGHT_M
+    assert times[0] - min(times) == pytest.approx(bend**2 * length**3 / 24, rel=0.05)
+    assert times[0] - min(times) < 1e-4
+
+
+def test_a_flight_has_one_refractivity_weighed_by_its_legs():
+    air = Atmosphere.stated(300.0, ground_m=0.0)
+    high, low, far, near = (np.full(5, value) for value in (3000.0, 10.0, 5000.0, 100.0))
+    flown = air.over(high, low, (far, near))
+    exact = (5000 * air.mean_n(3000.0, 0.0) + 100 * air.mean_n(10.0, 0.0)) / 5100
+    assert flown.refractivity_n == pytest.approx(float(exact), rel=1e-12)
+    assert flown.left_m == pytest.approx(0, abs=1e-12)
+    climbing = air.over(np.linspace(900, 1200, 5), np.linspace(900, 1200, 5), (np.full(5, 1500.0),) * 2)
+    assert 3e-3 < climbing.left_m < 1.5e-2  # of a path of 3 km
+    assert flown.report["vacuum_would_move_m"] == pytest.approx(flown.refractivity_n * 1e-6 * 5100 / 2, rel=1e-3)
+
+
+def test_what_the_weather_may_be_covers_ten_kelvin_twenty_hectopascals_and_any_humidity():
+    air = Atmosphere.standard(300.0)
+    celsius, hpa, humidity = standard_weather(300.0)
+    for wrong in ((10, 0, 0), (-10, 0, 0), (0, 20, 0), (0, -20, 0)):
+        off = refractivity(celsius + wrong[0], hpa + wrong[1], humidity) - air.refractivity_n
+        assert abs(off) < air.std_n
+    for extreme in (0.0, 100.0):
+        assert abs(refractivity(celsius, hpa, extreme) - air.refractivity_n) < 2 * air.std_n
+    measured = Atmosphere.of_weather(celsius, hpa, humidity, ground_m=300.0)
+    assert measured.refractivity_n == air.refractivity_n
+    assert 1 < measured.std_n < air.std_n / 3
+    assert Atmosphere.vacuum().std_n == 0
+    assert wave_speed(0.0) == SPEED_OF_LIGHT_M_S  # to the bit
+
+
+# ---- Images of waves in air -----------------------------------------------------------------------------------------
+
+FREQUENCY = 1.2e9 + 2e6 * np.arange(128)
+GRID = ap.SceneGrid("local", -6.0, 6.0, 0.25, (48, 48))
+TARGET = np.array([[1.25, -0.75, 0.0]])  # a corner of pixels; pixel middles lie half a spacing beside
+
+
+def flight(range_m=600.0, pulses=96):
+    along = np.linspace(-range_m / 12, range_m / 12, pulses)
+    track = np.stack([along, np.full(pulses, -0.8 * range_m), np.full(pulses, 0.6 * range_m)], -1)
+    return ap.Aperture(track, track + [20.0, 3.0, 1.0])
+
+
+def history(aperture, index, **changes):
+    """Return the echo of TARGET through air, by the delays of both legs, less the delay of the origin."""
+    origin_s, target_s = (index * aperture.path(place) / SPEED_OF_LIGHT_M_S for place in (0 * TARGET, TARGET))
+    delay_s = target_s - origin_s
+    echo = np.exp(-2j * np.pi * FREQUENCY * delay_s).astype(np.complex64)
+    weight = np.hanning(130)[1:-1] / np.hanning(130).sum()
+    return ap.PhaseHistory(echo, FREQUENCY, weight, origin_s[:, 0], aperture, **changes)
+
+
+def peak_m(image):
+    row, column = np.unravel_index(int(np.abs(np.asarray(image)).argmax()), image.shape)
+    return float(image.x[column]), float(image.y[row])
+
+
+def test_a_target_seen_through_air_lies_where_it_stands_by_the_speed_in_air_and_beyond_it_in_vacuum():
+    aperture, fine = flight(), ap.SceneGrid("local", 0.25, 0.25, 0.02, (100, 100))
+    for speed, off_m in ((SPEED_OF_LIGHT_M_S / AIR, 0.0), (SPEED_OF_LIGHT_M_S, 282e-6 * 600 / 0.8)):
+        given = history(aperture, AIR, wave_speed_m_s=speed)
+        x, y = peak_m(ap.backproject(given, fine, terrain=0.0, certified_pixels=8).compute())
+        assert (x, y) == pytest.approx((1.25, -0.75 + off_m), abs=0.05 * off_m + 0.021)
+
+
+@pytest.mark.parametrize("engine", [name for name in ENGINES if name not in {"cuda"}])
+def test_an_image_in_air_is_that_of_a_larger_world_in_vacuum(engine):
+    """docs/theory/atmosphere.md, eq. 4, pixel by pixel; every engine against itself, and against the double sum.
+
+    Without a certificate, which would replace an engine that errs.
+    """
+    if not load_engine(engine).available():
+        pytest.skip("cannot run here")
+    aperture = flight()
+    larger = ap.Aperture(*(AIR * leg for leg in aperture.legs))
+    grid = replace(GRID, west_m=AIR * GRID.west_m, north_m=AIR * GRID.north_m, spacing_m=AIR * GRID.spacing_m)
+    in_air = history(aperture, AIR, wave_speed_m_s=SPEED_OF_LIGHT_M_S / AIR)
+    vacuum = replace(in_air, aperture=larger, wave_speed_m_s=SPEED_OF_LIGHT_M_S)
+    images = [
+        np.asarray(ap.backproject(given, on, terrain=0.0, engine=engine, integration="all", certified_pixels=0))
+        for given, on in ((in_air, GRID), (vacuum, grid))
+    ]
+    exact = np.asarray(ap.backproject(in_air, GRID, terrain=0.0, engine="reference", integration="all"))
+    assert np.abs(images[0] - images[1]).max() < 1e-3 * np.abs(exact).max()
+    assert np.abs(images[0] - exact).max() < 2e-3 * np.abs(exact).max()
+
+
+def test_profiles_are_of_one_speed_and_no_wave_is_faster_than_light():
+    aperture = flight()
+    given = history(aperture, AIR, wave_speed_m_s=SPEED_OF_LIGHT_M_S / AIR)
+    profiles = range_compress(given, GRID, FlatGround(0.0))
+    assert profiles.wave_speed_m_s == given.wave_speed_m_s
+    assert profiles.bandwidth_hz == pytest.approx(256e6)
+    assert profiles.wavelength_m * profiles.wavenumber_rad_m == pytest.approx(2 * np.pi)
+    window = RangeWindow.of(aperture, GRID, FlatGround(0.0), FREQUENCY)
+    with pytest.raises(ValueError, match="that of the history"):
+        range_compress(given, GRID, FlatGround(0.0), window=window)
+    for speed in (SPEED_OF_LIGHT_M_S * 1.0001, 1.0):
+        with pytest.raises(ValueError, match="wave_speed_m_s"):
+            replace(given, wave_speed_m_s=speed)
+
+
+def test_echoes_over_longer_paths_are_longer_by_that_in_air():
+    aperture, further_m = flight(), np.full(96, 1.7)
+    given = history(aperture, AIR, wave_speed_m_s=SPEED_OF_LIGHT_M_S / AIR)
+    longer_s = given.moved(aperture, further_m).reference_delay_s - given.reference_delay_s
+    np.testing.assert_allclose(longer_s, 1.7 * AIR / SPEED_OF_LIGHT_M_S, rtol=1e-12)
+
+
+def test_histories_that_a_reader_joins_are_of_vacuum_until_a_campaign_says_otherwise(tmp_path):
+    place = np.ones((3, 3))
+    one = History(
+        tmp_path / "a", np.arange(3).astype("datetime64[ns]"), place, place, np.ones((3, 4), np.complex64),
+        1e9 + 1e6 * np.arange(4), np.zeros(3), np.full(3, np.inf), np.ones(3, bool), "local", reference="point",
+    )  # fmt: skip
+    echo = joined([one], pair="a-a", expected="a test")
+    assert (echo.attrs["wave_speed_m_s"], echo.attrs["reference"]) == (SPEED_OF_LIGHT_M_S, "point")
+
+
+# ---- Who takes vacuum -----------------------------------------------------------------------------------------------
+
+_SIZE = "sizes of cells, searches, windows or grids, and limits of checks: 0.03 % of them is nothing"
+_DRAWN = "what is drawn or listed"
+_ELECTRICAL = "electrical paths: cables, delays given as c times seconds"
+_DEFAULT = "where arrays state no speed of their own"
+_FORMAT = "delays of a point that a file states as a distance, or delays as they were, for in_air to convert"
+
+VACUUM = {
+    "common/constants.py": "the constant",
+    "core/geometry/atmosphere.py": "v = c/n",
+    "core/geometry/aperture.py": _SIZE,
+    "core/scene/auto_grid.py": _SIZE,
+    "core/planning/plan.py": _SIZE,
+    "core/planning/planner.py": _SIZE,
+    "core/focus/presum.py": _SIZE,
+    "core/focus/inputs.py": _DEFAULT,
+    "core/focus/job.py": _DEFAULT,
+    "core/imaging/range_profiles.py": _DEFAULT,
+    "core/imaging/job.py": f"{_DEFAULT}; {_SIZE}",
+    "core/echo/compression.py": _DEFAULT,
+    "core/echo/calibration.py": _ELECTRICAL,
+    "core/echo/dechirp.py": _ELECTRICAL,
+    "core/echo/transfer.py": _ELECTRICAL,
+    "methods/autofocus/evidence.py": _SIZE,
+    "methods/autofocus/patches.py": _SIZE,
+    "methods/autofocus/path_offsets.py": _SIZE,
+    "methods/autofocus/refine.py": _SIZE,
+    "methods/autofocus/speckle.py": _SIZE,
+    "methods/autofocus/motion.py": _DEFAULT,
+    "methods/synchronisation/clock_alignment.py": _ELECTRICAL,
+    "methods/interferometry/sensitivity.py": "radians per metre of height, to 0.03 %",
+    "formats/phase_histories/afrl.py": _FORMAT,
+    "formats/phase_histories/cphd.py": _FORMAT,
+    "formats/phase_histories/phase_history.py": _FORMAT,
+    "formats/phase_histories/fmcw.py": _FORMAT,
+    "formats/phase_histories/pulson.py": _FORMAT,
+    "formats/export/cphd.py": "what TDTropoSRP counts from",
+    "simulation/echoes.py": "delay of an optical path",
+    "simulation/fmcw.py": "flies in vacuum, and its config says so",
+    "simulation/gridding.py": "as simulation/echoes.py's plain sum, of arrays in vacuum",
+    "simulation/synthesis.py": "excess of reflections beside the sidelink",
+    "pipeline/check/reach.py": _SIZE,
+    "pipeline/resources.py": _SIZE,
+    "pipeline/examination/facts.py": _DRAWN,
+    "pipeline/opening/acquisition.py": _ELECTRICAL,
+    "pipeline/opening/diagnosis.py": _SIZE,
+    "pipeline/opening/echo.py": _ELECTRICAL,
+    "pipeline/opening/node_log.py": _SIZE,
+    "pipeline/opening/pair.py": _ELECTRICAL,
+    "pipeline/steps/calibration.py": _ELECTRICAL,
+    "views/inspect/pictures.py": _DRAWN,
+}
+"""Modules that take the speed of light in vacuum, and why: what turns delay into path takes that of its arrays."""
+
+
+def test_who_takes_the_speed_of_light_in_vacuum_is_listed_with_the_reason():
+    source = ROOT / "src/apertura"
+    users = {
+        path.relative_to(source).as_posix()
+        for path in source.rglob("*.py")
+        if "SPEED_OF_LIGHT_M_S" in path.read_text(encoding="utf-8")
+    }
+    assert users == set(VACUUM), "read docs/theory/atmosphere.md, One place"
+    for path in (source / "core/focus/engines").rglob("*.py"):
+        assert "SPEED_OF_LIGHT_M_S" not in path.read_text(encoding="utf-8"), path
