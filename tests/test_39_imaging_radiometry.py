@@ -115,5 +115,5 @@ def test_the_link_is_the_radar_equation():
     link = Link(30.0, 10.0, 10.0, 20.0, 30.0, 1000.0)
     received_w = 100 * 0.25**2 / (4 * np.pi) ** 3
     assert link.constant(wavelength_m=0.25, sent_power=64.0) == pytest.approx(received_w * 100 * 1000**2 / 64)
-    noise = link.pulse_noise(3.0, spacing_hz=1e5, code_power=1.0, squares=1 / 64)
+    noise = link.pulse_noise(3.0, spacing_hz=1e5, squares=1 / 64)
     assert noise == pytest.approx(1.380649e-23 * 290 * 10**0.3 * 1e5 * 1e8 / 64)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.common.arrays import Floats
-from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.common.constants import BOLTZMANN_J_K, REFERENCE_K, SPEED_OF_LIGHT_M_S
 from apertura.common.contracts import Window
 from apertura.core.antenna.beam import Beams
 from apertura.core.antenna.illumination import illumination_mask
@@ -17,9 +17,6 @@ from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.looks import BLOCK_PX, Lattice
 from apertura.core.scene.swath import balls
 from apertura.core.scene.terrain import FlatGround, Terrain
-
-BOLTZMANN_J_K, REFERENCE_K = 1.380649e-23, 290.0
-"""k, exact in SI; T₀ that noise figures are defined at (IEEE Std 686)."""
 
 Quantity = Literal["sigma0", "beta0", "gamma0"]
 
@@ -42,8 +39,6 @@ class Link:
         Power at the converter of a complex sine whose |I + jQ| is `full_scale_counts`.
     full_scale_counts
         In the numbers recorded.
-    std_db
-        Standard deviation of all of these together.
 
     Examples
     --------
@@ -58,7 +53,6 @@ class Link:
     receiver_gain_db: float
     full_scale_dbm: float
     full_scale_counts: float
-    std_db: float = 0.0
 
     @property
     def counts_w(self) -> float:
@@ -78,7 +72,7 @@ class Link:
         sent_dbw = self.transmit_power_dbm - 30 + self.transmit_gain_dbi + self.receive_gain_dbi
         return 10 ** (sent_dbw / 10) * wavelength_m**2 / (4 * np.pi) ** 3 * self.counts_w / sent_power
 
-    def pulse_noise(self, noise_figure_db: float, *, spacing_hz: float, code_power: float, squares: float) -> float:
+    def pulse_noise(self, noise_figure_db: float, *, spacing_hz: float, squares: float) -> float:
         """Return the power of thermal noise in a range profile, kT₀F over the DFT's bins: eq. 8.
 
         Parameters
@@ -87,13 +81,11 @@ class Link:
             Of the receiver, at the antenna's port.
         spacing_hz
             Δf, bandwidth of a bin.
-        code_power
-            Mean |c_n|², by which echoes are divided.
         squares
-            Σw_n² of the window over the subcarriers.
+            Σw_n²/|c_n|²: window over the subcarriers, and codes by which echoes are divided.
         """
         noise_w = BOLTZMANN_J_K * REFERENCE_K * 10 ** (noise_figure_db / 10) * spacing_hz
-        return noise_w * self.counts_w / code_power * squares
+        return noise_w * self.counts_w * squares
 
 
 def cell_constant(frequency_hz: Floats, weight: Floats) -> float:
@@ -140,8 +132,8 @@ class Calibration:
         Every pulse, and its weights as they formed the image: antennas and sector.
     count
         M, by which the image's sum was divided.
-    constant, std_db
-        K of eq. 2, stated or measured, and its standard deviation.
+    constant
+        K of eq. 2, stated or measured.
     cell_m2
         Of `cell_constant`.
     lattice
@@ -164,7 +156,6 @@ class Calibration:
     beams: Beams | None
     count: int
     constant: float
-    std_db: float
     cell_m2: float
     lattice: Lattice
     gain: Floats
@@ -183,14 +174,13 @@ class Calibration:
         constant: float,
         cell_m2: float,
         count: int | None = None,
-        std_db: float = 0.0,
         threads: int = 1,
     ) -> "Calibration":
         """Return the calibration of an image.
 
         Parameters
         ----------
-        grid, terrain, aperture, beams, constant, cell_m2, count, std_db
+        grid, terrain, aperture, beams, constant, cell_m2, count
             As of `Calibration`; positions in the grid's processing frame; `count` is every pulse by default.
         threads
             Blocks of the lattice in work at once.
@@ -214,7 +204,6 @@ class Calibration:
             beams,
             count or len(aperture),
             constant,
-            std_db,
             cell_m2,
             lattice,
             gain,

@@ -27,6 +27,9 @@ SOURCES: Mapping[str, str] = {
     "mask": "layers",
     "looks": "layers",
     "nesz": "layers",
+    "sigma0": "radiometry",
+    "gamma0": "radiometry",
+    "beta0": "radiometry",
     "phase": "interferogram",
     "coherence": "interferogram",
     "unwrapped": "interferogram",
@@ -36,6 +39,7 @@ SOURCES: Mapping[str, str] = {
 }
 """Raster that a file may be written from → kind of folder the file lies in.
 
+Those of radiometry lie beside layers where a pair is calibrated: complex, of the power that they are named after.
 ``image`` is a pair's, complex; ``coherent`` the complex and ``noncoherent`` the power sum of a flight's pairs, as a
 complex amplitude without phase, ``magnitude`` the sum of their magnitudes; layers explain a pair's image, real, and
 lie beside it; those of an interferogram are of two images, ``panels`` all of them by name.
@@ -127,6 +131,12 @@ EXPORTS: tuple[Export, ...] = (
     Export("looks.qml", "looks", "apertura.formats.export.style:write_layer_style"),
     Export("nesz.tif", "nesz", "apertura.formats.export.layers:write_nesz"),
     Export("nesz.qml", "nesz", "apertura.formats.export.style:write_layer_style"),
+    Export("sigma0_db.tif", "sigma0", "apertura.formats.export.db:write_db"),
+    Export("sigma0_db.qml", "sigma0", "apertura.formats.export.style:write_backscatter_style"),
+    Export("gamma0_db.tif", "gamma0", "apertura.formats.export.db:write_db"),
+    Export("gamma0_db.qml", "gamma0", "apertura.formats.export.style:write_backscatter_style"),
+    Export("beta0_db.tif", "beta0", "apertura.formats.export.db:write_db"),
+    Export("beta0_db.qml", "beta0", "apertura.formats.export.style:write_backscatter_style"),
     Export("phase.tif", "phase", "apertura.formats.export.interferogram:write_phase"),
     Export("phase.qml", "phase", "apertura.formats.export.style:write_layer_style"),
     Export("coherence.tif", "coherence", "apertura.formats.export.interferogram:write_coherence"),
@@ -269,11 +279,11 @@ def write_exports(
     Parameters
     ----------
     kind
-        ``pair``, ``fused``, ``layers`` or ``interferogram``.
+        ``pair``, ``fused``, ``layers``, ``radiometry`` or ``interferogram``.
     folder
         Where they go.
     rasters, titles
-        Source → (y, x) raster on the campaign's grid, and its title.
+        Source → (y, x) raster on the campaign's grid, and its title; of ``radiometry`` those that are asked for.
     tags
         Of every file, name → text.
     radiometry
@@ -284,6 +294,8 @@ def write_exports(
     written = []
     for export in exports_in(kind):
         path, source = folder / export.file, export.source
+        if kind == "radiometry" and source not in rasters:
+            continue
         means = {TAG: canonical_json(radiometry[source])} if source in radiometry else {}
         export.write(path, rasters[source], title=titles[source], tags={**tags, **means}, **shared)
         written.append(path)
