@@ -24,6 +24,7 @@ from apertura.core.imaging.range_profiles import range_compress
 from apertura.core.quality.bright_points import bright_point
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import FlatGround
+from apertura.pipeline.opening.radiometry import LEAST_CONTRAST
 from apertura.simulation.echoes import transfer
 from apertura.simulation.impairments import Impairments, Radio, draw_impairments
 from apertura.simulation.observation import physical
@@ -36,6 +37,8 @@ COUNTS, WIDTH_DEG, STATED_STD_DB = 8192.0, (60.0, 60.0), 0.5
 RADIO = Radio(-10.0, 8.0, 9.0, full_scale_dbm=4.0, gain_db=40.0, noise_figure_db=6.0)
 LINK = Link(-10.0, 8.0, 9.0, 40.0, 4.0, COUNTS)
 HEIGHT_M = 8.0
+UNTOLD_DB = 10 / np.log(10) * np.sqrt(2 / LEAST_CONTRAST + 1 / LEAST_CONTRAST**2)
+"""Scatter of a peak that is hardly above its surroundings."""
 WAVE = TransmitWaveform(
     qpsk_codes(256, np.random.default_rng(0)), 1.2e9, "band_centre", 1.6e6, 0.625e-6, 1.25e-6, 512e6, 100.0
 )
@@ -130,17 +133,21 @@ def points(draws: int) -> None:
         errors = [abs(cross_section(*case, apart=apart, seed=None)[0]) for case in cases]
         kind = "bistatic" if apart else "monostatic"
         print(f"{kind}: {len(cases)} points without noise: off by {max(errors):.3f} dB at most", flush=True)
-        inside, worst, scatter = 0, 0.0, []
-        for draw in range(draws):
+        inside, lost, scatter, draw = 0, 0, list[float](), 0
+        while len(scatter) < draws:
+            draw += 1
             case = cases[int(generator.integers(len(cases)))]
             wrong_db = STATED_STD_DB * generator.standard_normal()  # of the radio, as stated
             error_db, scatter_db = cross_section(*case, apart=apart, seed=draw)
+            if scatter_db > UNTOLD_DB:
+                lost += 1
+                continue
             std_db = float(np.hypot(scatter_db, STATED_STD_DB))
             inside += abs(error_db + wrong_db) < 1.96 * std_db
-            worst, scatter = max(worst, abs(error_db) / max(scatter_db, 1e-9)), [*scatter, scatter_db]
+            scatter.append(scatter_db)
         print(
             f"{kind}: {inside} of {draws} noisy draws within 1.96 of their standard deviation "
-            f"(scatter {min(scatter):.2f} to {max(scatter):.2f} dB)",
+            f"(scatter {min(scatter):.2f} to {max(scatter):.2f} dB; {lost} more below 10 dB above noise)",
             flush=True,
         )
 
@@ -188,7 +195,8 @@ def noise(draws: int = 8) -> None:
         measured = noise_power(profiles, grid.positions_at(rows, columns, 0.0), beams=weighing)
         thermal = LINK.pulse_noise(0.0, spacing_hz=WAVE.subcarrier_spacing_hz, squares=float((weights() ** 2).sum()))
         told.append(10 * float(np.log10(measured / thermal)))
-    print(f"noise figure 6 dB, measured below echoes: {min(told):.2f} to {max(told):.2f} dB in {draws} draws")
+    spread = f"{min(told):.2f} to {max(told):.2f} dB, mean {np.mean(told):.2f} dB"
+    print(f"noise figure 6 dB, measured below echoes: {spread} in {draws} draws")
 
 
 PARTS = {"points": points, "clutter": lambda _: clutter(), "noise": lambda _: noise()}

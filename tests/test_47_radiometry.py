@@ -8,8 +8,12 @@ import pytest
 import rasterio
 from folders import complaint, edit_config, export_flight, run_steps
 
+from apertura.core.quality.bright_points import BrightPoint
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.lineage import result_of
+from apertura.pipeline.opening.pair import open_pair
+from apertura.pipeline.opening.radiometry import calibrated_pair
+from apertura.pipeline.opening.scene import open_scene
 from apertura.simulation import GaussianBeam, ImageGrid, PointTarget, Radio, preset, simulate
 from apertura.views.score import score
 
@@ -128,3 +132,13 @@ def test_a_radio_forms_no_image_again(tiny):
     changed = {name for name in made if before[name].settings != after[name].settings}
     assert changed == {"layers"}
     assert "results/f01/uav1-uav2/image.manifest.json" in after["layers"].sources
+
+
+@pytest.mark.slow
+def test_a_peak_of_noise_has_no_cross_section(flown):
+    scene = open_scene(flown)
+    calibrated = calibrated_pair(flown, open_pair(flown, "f01", "uav1-uav1"), scene)
+    points = [BrightPoint(60.0, 60.0, amplitude=1.0, background=share) for share in (0.05, 0.2)]
+    told, untold = calibrated.points(points, scene, 1e-9)
+    assert told["std_db"] > 1
+    assert untold["rcs_m2"] is None

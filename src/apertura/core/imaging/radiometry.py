@@ -112,7 +112,7 @@ def cell_constant(frequency_hz: Floats, weight: Floats) -> float:
 
 _PITCHES_PX = (128, 64, 32, 16)  # of the lattice, the widest that is no wider than
 _RANGE_SHARE = 24  # ranges to the scene: logarithms of gain and area between nodes then err by 0.1 dB in a beam of 20°
-_PULSES = 512  # summed for a block of the lattice, or up to twice as many
+_PULSES = 128  # summed for a block of the lattice, or up to twice as many
 _POINT_PULSES = 8192  # summed for a point, or up to twice as many
 _BINS = 32  # of the density of pulses over spatial frequency, whose square is integrated
 _AT_ONCE = 64  # pulses whose illumination is decided together

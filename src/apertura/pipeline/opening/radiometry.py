@@ -21,6 +21,9 @@ from apertura.pipeline.opening.plan import integration_of
 from apertura.pipeline.opening.scene import OpenScene
 from apertura.pipeline.opening.transmitted import transmitted
 
+LEAST_CONTRAST = 10.0
+"""Power of a peak against noise and clutter around it, below which it is as likely one of theirs: no cross-section."""
+
 _MOST_POINTS = 50  # whose cross-section is stated, the brightest
 
 
@@ -97,6 +100,11 @@ class CalibratedPair:
         pulse_noise
             Noise of a pulse, measured.
 
+        Returns
+        -------
+        list of dict
+            rcs_m2, rcs_dbsm, std_db and scatter_db of each; None where a peak is no point of its own.
+
         Notes
         -----
         Source: docs/theory/radiometry.md, eq. 4.
@@ -116,9 +124,9 @@ class CalibratedPair:
                 "std_db": round(float(std), 2),
                 "scatter_db": round(float(scatter), 2),
             }
-            if np.isfinite(one_db)
+            if np.isfinite(one_db) and LEAST_CONTRAST * doubt <= 1
             else {"rcs_m2": None, "rcs_dbsm": None, "std_db": None, "scatter_db": None}
-            for one, one_db, std, scatter in zip(sigma, sigma_db, std_db, scatter_db, strict=True)
+            for one, one_db, std, scatter, doubt in zip(sigma, sigma_db, std_db, scatter_db, inverse, strict=True)
         ]
 
     def noise_report(self, pulse_noise: float) -> dict[str, Any]:
