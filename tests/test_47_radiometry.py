@@ -9,6 +9,7 @@ import rasterio
 from folders import complaint, edit_config, export_flight, run_steps
 
 from apertura.core.quality.bright_points import BrightPoint
+from apertura.formats.export import product_files
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.lineage import result_of
 from apertura.pipeline.opening.pair import open_pair
@@ -110,6 +111,12 @@ def with_radio(root, *, left_out=()):
 
     edit_config(root, change)
     return Campaign
+
+
+def test_coefficients_are_products_where_they_are_written():
+    files = set(product_files({"f01": ["a-b"]}, ["gamma0"]))
+    assert {"f01/a-b/gamma0_db.tif", "f01/a-b/gamma0_db.qml", "mosaic/a-b/gamma0_db.vrt"} <= files
+    assert not any("sigma0" in name for name in files)
 
 
 def test_a_radio_stated_in_parts_is_one_message(tiny):

@@ -72,6 +72,11 @@ class Campaign(RawFolder):
         stated = (radio_of(self.settings.nodes, pair) for pair in self._pairs)
         return any(value is not None for one in stated for value in one.values())
 
+    @property
+    def coefficients(self) -> tuple[str, ...]:
+        """Backscattering coefficients that are written of its images; none where they are relative."""
+        return self.settings.processing.radiometry if self.calibrated else ()
+
     def check_radio(self) -> None:
         """Raise CampaignError where the radio of its pairs is stated in parts."""
         sampled = isinstance(self.settings.waveform, SampledWaveform)

@@ -222,6 +222,12 @@ def radio(place: JobPlace) -> Mapping[str, Any]:
     return {"radio": stated, "radiometry": list(campaign.settings.processing.radiometry)}
 
 
+def coefficients(place: JobPlace) -> Mapping[str, Any]:
+    """Return which backscattering coefficients are written; nothing where images are relative."""
+    written = place.campaign.coefficients
+    return {"radiometry": list(written)} if written else {}
+
+
 def calibrated(place: JobPlace) -> Iterable[str]:
     """Return the image that is calibrated with what was sent; nothing where images are relative."""
     campaign = place.campaign

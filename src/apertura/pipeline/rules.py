@@ -467,7 +467,7 @@ _ROWS = (
         "Write a mosaic of each product of all flights, mosaic/<pair>/<product>.vrt.",
         f"{_STEPS}.mosaic:mosaic",
         sources=("layers", "export", "fused"),
-        settings=("campaign",),
+        settings=("campaign", inputs.coefficients),
         styles=True,
         manifest="mosaic/mosaic",
         demand=Demand(500),

@@ -161,5 +161,7 @@ def print_findings(campaign: Campaign, *, paths: bool) -> None:
     console.print(table)
     print_summary(campaign)
     if paths:
-        for file in product_files({flight.name: flight.pairs for flight in campaign.image_flights}):
+        for file in product_files(
+            {flight.name: flight.pairs for flight in campaign.image_flights}, campaign.coefficients
+        ):
             print(campaign.results / file)

@@ -7,7 +7,7 @@ as entry point of group ``apertura.exports``. Importing this module imports no f
 """
 
 import pkgutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -203,7 +203,7 @@ def export_modules(folder: str) -> list[str]:
     return sorted({export.module for export in exports_in(folder)})
 
 
-def mosaics(pairs: Mapping[str, Sequence[str]]) -> dict[str, list[str]]:
+def mosaics(pairs: Mapping[str, Sequence[str]], coefficients: Sequence[str] = ()) -> dict[str, list[str]]:
     """Return the rasters of all flights, relative to `MOSAICS` → what they are made of, relative to the results.
 
     Images of one pair, or the sums of a flight: others are taken from other places, or mean something else.
@@ -212,6 +212,8 @@ def mosaics(pairs: Mapping[str, Sequence[str]]) -> dict[str, list[str]]:
     ----------
     pairs
         Flight → its pairs, the lowest first.
+    coefficients
+        Sources of kind ``radiometry`` that are written, where images are calibrated.
 
     Examples
     --------
@@ -221,34 +223,42 @@ def mosaics(pairs: Mapping[str, Sequence[str]]) -> dict[str, list[str]]:
     found: dict[str, list[str]] = {}
     for flight, names in pairs.items():
         for folder, kinds in _folders(names):
-            for row in (row for kind in kinds for row in exports_in(kind)):
+            for row in _written(kinds, coefficients):
                 if row.mosaicked and row.file.endswith(".tif"):
                     name = f"{folder}/{row.file.removesuffix('.tif')}.vrt"
                     found.setdefault(name, []).append(f"{flight}/{folder}/{row.file}")
     return found
 
 
-def mosaic_files(pairs: Mapping[str, Sequence[str]]) -> Iterator[str]:
+def mosaic_files(pairs: Mapping[str, Sequence[str]], coefficients: Sequence[str] = ()) -> Iterator[str]:
     """Yield the rasters of all flights and their styles, relative to the results; as `mosaics`."""
     styles = {row.file for row in EXPORTS if row.style}
-    for name in mosaics(pairs):
+    for name in mosaics(pairs, coefficients):
         style = f"{name.removesuffix('.vrt')}.qml"
         yield from (f"{MOSAICS}/{file}" for file in (name, style) if file == name or Path(file).name in styles)
 
 
 def _folders(pairs: Sequence[str]) -> Iterator[tuple[str, tuple[str, ...]]]:
     """Yield the folders of a flight, and the kinds of rows that lie in each."""
-    yield from ((pair, ("pair", "layers")) for pair in pairs)
+    yield from ((pair, ("pair", "layers", "radiometry")) for pair in pairs)
     yield "fused", ("fused",)
 
 
-def product_files(pairs: Mapping[str, Sequence[str]]) -> Iterator[str]:
+def _written(kinds: Iterable[str], coefficients: Sequence[str]) -> Iterator[Export]:
+    """Yield the rows of some kinds, of radiometry those of the coefficients written."""
+    rows = (row for kind in kinds for row in exports_in(kind))
+    return (row for row in rows if SOURCES[row.source] != "radiometry" or row.source in coefficients)
+
+
+def product_files(pairs: Mapping[str, Sequence[str]], coefficients: Sequence[str] = ()) -> Iterator[str]:
     """Yield every file that a finished campaign offers its user, relative to the results.
 
     Parameters
     ----------
     pairs
         Flight → its pairs.
+    coefficients
+        As of `mosaics`.
 
     Examples
     --------
@@ -258,9 +268,9 @@ def product_files(pairs: Mapping[str, Sequence[str]]) -> Iterator[str]:
     yield from COVERAGE
     for flight, names in pairs.items():
         for folder, kinds in _folders(names):
-            files = [row.file for kind in kinds for row in exports_in(kind)]
+            files = [row.file for row in _written(kinds, coefficients)]
             yield from (f"{flight}/{folder}/{file}" for file in (*files, "image.json"))
-    yield from mosaic_files(pairs)
+    yield from mosaic_files(pairs, coefficients)
     yield MAP
 
 
