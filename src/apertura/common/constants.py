@@ -8,3 +8,6 @@ LARGEST_REFRACTIVITY = 500.0
 
 VERTICAL_DATUMS = {"EPSG:5773": "egm96", "EPSG:3855": "egm2008"}
 """Vertical CRS → the datum that its heights count from, as the config calls it."""
+BOLTZMANN_J_K = 1.380649e-23
+REFERENCE_K = 290.0
+"""Boltzmann's constant, exact in SI; temperature that noise figures refer to (IEEE Std 686)."""

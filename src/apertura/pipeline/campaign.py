@@ -16,8 +16,11 @@ from apertura.pipeline.config import (
     ClockRow,
     Flight,
     Node,
+    SampledWaveform,
     Segment,
     check_interferometry,
+    check_radio,
+    radio_of,
     read_clocks,
     read_flights,
     read_segments,
@@ -54,12 +57,34 @@ class Campaign(RawFolder):
         images = [f"{one.name}/{pair}" for one in flights if one.kind == "image" for pair in one.pairs]
         check_interferometry(settings.interferometry, images, where=CONFIG)
         imaging = tuple(read_segments(segments, flights=flights))
-        return cls(root, settings, flights, imaging, tuple(read_clocks(clocks, flights=flights)))
+        campaign = cls(root, settings, flights, imaging, tuple(read_clocks(clocks, flights=flights)))
+        campaign.check_radio()
+        return campaign
 
     @property
     def image_flights(self) -> tuple[Flight, ...]:
         """Flights that become images."""
         return tuple(flight for flight in self.flights if flight.kind == "image")
+
+    @cached_property
+    def calibrated(self) -> bool:
+        """Whether the radio of its pairs is stated, so that images are calibrated."""
+        stated = (radio_of(self.settings.nodes, pair) for pair in self._pairs)
+        return any(value is not None for one in stated for value in one.values())
+
+    @property
+    def coefficients(self) -> tuple[str, ...]:
+        """Backscattering coefficients that are written of its images; none where they are relative."""
+        return self.settings.processing.radiometry if self.calibrated else ()
+
+    def check_radio(self) -> None:
+        """Raise CampaignError where the radio of its pairs is stated in parts."""
+        sampled = isinstance(self.settings.waveform, SampledWaveform)
+        check_radio(self.settings.nodes, self._pairs, sampled=sampled, where=CONFIG)
+
+    @property
+    def _pairs(self) -> list[str]:
+        return sorted({pair for flight in self.image_flights for pair in flight.pairs})
 
     @cached_property
     def values(self) -> dict[str, Any]:

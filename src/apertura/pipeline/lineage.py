@@ -152,16 +152,19 @@ def modules_of(campaign: Campaign, result: str, *where: str) -> tuple[str, ...]:
         As `result_of`.
     """
     rule = RESULTS[result]
-    step = (rule.module, *_written(rule))
+    step = (rule.module, *_written(rule, calibrated=campaign.calibrated))
     runs = _closure(step)
     engines = tuple(ENGINES.values()) if _FOCUSES & runs else ()
     readers = sorted(set(_readers(campaign, rule, where))) if _READS in runs else ()
     return (*step, *engines, *readers)
 
 
-def _written(rule: Rule) -> tuple[str, ...]:
+def _written(rule: Rule, *, calibrated: bool) -> tuple[str, ...]:
     styles = {row.module for row in EXPORTS if row.style} if rule.styles else set()
-    return (*sorted(styles), *(export_modules(rule.exports) if rule.exports else ()))
+    exports = [*export_modules(rule.exports)] if rule.exports else []
+    if rule.exports == "layers" and calibrated:
+        exports += [module for module in export_modules("radiometry") if module not in exports]
+    return (*sorted(styles), *exports)
 
 
 @cache

@@ -218,11 +218,53 @@ def _beams(place: JobPlace) -> Mapping[str, tuple[str, Any]]:
     return {point: beam for _, pair in place.pairs for point, beam in place.campaign.antennas(pair).items()}
 
 
+_RADIO = frozenset({"antennas", "transmit_power_dbm", "receiver", "amplitude_std_db"})
+"""What a node states that its echoes do not depend on."""
+
+
+def radio(place: JobPlace) -> Mapping[str, Any]:
+    """Return the radios of the pairs and what is made of them; nothing where images are relative."""
+    from apertura.pipeline.config import Receiver, radio_of
+
+    campaign = place.campaign
+    if not campaign.calibrated:
+        return {}
+    nodes = campaign.settings.nodes
+    stated: dict[str, Any] = {
+        key: value.model_dump(mode="json") if isinstance(value, Receiver) else value
+        for _, pair in place.pairs
+        for key, value in radio_of(nodes, pair).items()
+    }
+    stated |= {f"nodes.{node}.amplitude_std_db": nodes[node].amplitude_std_db for (_, node) in place.below(Scope.NODE)}
+    return {"radio": stated, "radiometry": list(campaign.settings.processing.radiometry)}
+
+
+def coefficients(place: JobPlace) -> Mapping[str, Any]:
+    """Return which backscattering coefficients are written; nothing where images are relative."""
+    written = place.campaign.coefficients
+    return {"radiometry": list(written)} if written else {}
+
+
+def calibrated(place: JobPlace) -> Iterable[str]:
+    """Return the image that is calibrated with what was sent; nothing where images are relative."""
+    campaign = place.campaign
+    if not campaign.calibrated:
+        return []
+    sent = campaign.relative(campaign.sent_file)
+    return [sent, *(campaign.manifest("image", *pair) for pair in place.pairs)]
+
+
+def calibration_of_images(place: JobPlace) -> Iterable[str]:
+    """Return the manifests of what states the radiometry of images; nothing where they are relative."""
+    campaign = place.campaign
+    return [campaign.manifest("layers", *pair) for pair in place.pairs] if campaign.calibrated else []
+
+
 def pair_settings(place: JobPlace) -> Mapping[str, Any]:
     """Return what matters for a pair's echo: its nodes, whether there are beams, not what they are."""
     campaign, (flight, pair) = place.campaign, place.where
     nodes = {
-        node: {key: value for key, value in campaign.values["nodes"][node].items() if key != "antennas"}
+        node: {key: value for key, value in campaign.values["nodes"][node].items() if key not in _RADIO}
         for node in pair.split("-")
     }
     stated = {
@@ -240,7 +282,7 @@ def grid(place: JobPlace) -> Mapping[str, Any]:
 
 
 _BEFORE_THE_IMAGE = frozenset({"window", "sidelink", "false_alarms_per_s", "autofocus", "autofocus_method"})
-_AFTER_THE_IMAGE = frozenset({"fusion"})
+_AFTER_THE_IMAGE = frozenset({"fusion", "radiometry"})
 
 
 def imaging(place: JobPlace) -> Mapping[str, Any]:

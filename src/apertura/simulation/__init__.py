@@ -10,7 +10,7 @@ from apertura.common.documents import validated
 from apertura.common.errors import CampaignError
 from apertura.simulation.campaign import write_campaign
 from apertura.simulation.continuous import Framing
-from apertura.simulation.impairments import Impairments
+from apertura.simulation.impairments import Impairments, Radio
 from apertura.simulation.presets import PRESETS
 from apertura.simulation.scene import (
     Clutter,
@@ -47,6 +47,7 @@ __all__ = [
     "Plate",
     "PointTarget",
     "PulseSpecification",
+    "Radio",
     "SimulatedFlight",
     "SimulatedNode",
     "Straight",

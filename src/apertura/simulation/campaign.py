@@ -99,11 +99,27 @@ def _node_section(node: SimulatedNode) -> dict[str, Any]:
     stated = node.path_offset_m if node.stated_path_offset_m is None else node.stated_path_offset_m
     beams = {point: {key: list(pair) for key, pair in asdict(beam).items()} for point, beam in node.antennas.items()}
     return {
-        **({"antennas": beams} if beams else {}),
+        **_radio_section(node, beams),
         "lever_arms_m": {name: list(arm) for name, arm in node.lever_arms_m.items()},
         "path_offset_m": dict(stated),
         "attitude": node.attitude,
         **({} if node.position_std_m is None else {"position_std_m": node.position_std_m}),
+    }
+
+
+def _radio_section(node: SimulatedNode, beams: Mapping[Any, Any]) -> dict[str, Any]:
+    """Return the beams of a node and, where it states its radio, that as the config has it."""
+    radio = node.radio
+    if radio is None:
+        return {"antennas": dict(beams)} if beams else {}
+    gains = {"radar_tx_gain_dbi": radio.transmit_gain_dbi, "radar_rx_gain_dbi": radio.receive_gain_dbi}
+    receiver = {"full_scale_dbm": radio.full_scale_dbm, "gain_db": radio.gain_db}
+    receiver |= {} if radio.noise_figure_db is None else {"noise_figure_db": radio.noise_figure_db}
+    return {
+        "antennas": {**beams, **gains},
+        "transmit_power_dbm": radio.transmit_power_dbm,
+        "receiver": {"full_scale_counts": 2.0 ** (node.impairments.adc.bits - 1), **receiver},
+        **({} if radio.amplitude_std_db is None else {"amplitude_std_db": radio.amplitude_std_db}),
     }
 
 
@@ -117,6 +133,9 @@ def _write_flights(root: Path, campaign: DrawnCampaign, generator: Generator) ->
     known = {"refractivity_n": air.atmosphere.refractivity_n if air else 0.0, "at_m": origin.height_m}
     truth: dict[str, Any] = targets_truth(origin, targets, specification.scene.crs)
     truth |= {"atmosphere": known, "flights": {}}
+    if any(node.radio is not None for node in specification.nodes.values()):
+        for target in truth["targets"]:
+            target["rcs_m2"] = target["amplitude"] ** 2
     for flight, drawing, noise in zip(specification.flights, streams[::2], streams[1::2], strict=True):
         (root / "raw" / flight.name).mkdir()
         if flight.framing:

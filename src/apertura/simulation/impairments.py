@@ -143,6 +143,21 @@ class Adc:
 
 
 @dataclass(frozen=True, config=STRICT_KEYS)
+class Radio:
+    """Power, gains and receiver of a node in physical units; docs/theory/simulate.md, "Radio"."""
+
+    transmit_power_dbm: float = Field(description="mean power while it sends, at the antenna's port, dBm")
+    transmit_gain_dbi: float = Field(description="of its transmitting radar antenna on boresight, dBi")
+    receive_gain_dbi: float = Field(description="of its receiving radar antenna on boresight, dBi")
+    full_scale_dbm: float = Field(description="power at the converter of a complex sine at full scale, dBm")
+    gain_db: float = Field(description="from the receiving antenna's port to the converter, dB")
+    noise_figure_db: float | None = Field(default=None, ge=0, description="of the receiver, dB; null: no noise")
+    amplitude_std_db: float | None = Field(
+        default=None, ge=0, description="what the config says of the error of all of these, dB; null: nothing"
+    )
+
+
+@dataclass(frozen=True, config=STRICT_KEYS)
 class Localization:
     """Logged position less true position: white noise after a moving average."""
 

@@ -7,11 +7,14 @@ import numpy as np
 from numpy.random import Generator
 
 from apertura.common.arrays import Floats
+from apertura.common.constants import BOLTZMANN_J_K, REFERENCE_K, SPEED_OF_LIGHT_M_S
+from apertura.core.echo.compression import centre_frequency
 from apertura.simulation.impairments import (
     AntennaPoint,
     ImpairmentDraw,
     Impairments,
     RadarPoint,
+    Radio,
     draw_impairments,
     independent_streams,
 )
@@ -65,8 +68,39 @@ def fly(
             path_offset_m=nodes[name].path_offset_m,
             sidelink=name != sender,
         )
+        radios = nodes[sender].radio, nodes[name].radio
+        if radios[0] is not None and radios[1] is not None:
+            channels["radar"] = physical(channels["radar"], transmitter=radios[0], receiver=radios[1])
         observations[name] = Observation(channels, draws[name], geometry)
     return observations
+
+
+def physical(channel: Channel, *, transmitter: Radio, receiver: Radio) -> Channel:
+    """Return a radar channel in root watts at the converter, with the receiver's thermal noise and full scale.
+
+    Parameters
+    ----------
+    channel
+        Whose amplitudes are roots of cross-sections in m² over R_tx·R_rx.
+    transmitter, receiver
+        Radios of both nodes.
+
+    Notes
+    -----
+    Source: docs/theory/simulate.md, "Radio".
+    """
+    waveform = channel.waveform
+    wavelength_m = SPEED_OF_LIGHT_M_S / centre_frequency(waveform.frequency_hz)
+    gains_db = transmitter.transmit_power_dbm - 30 + transmitter.transmit_gain_dbi + receiver.receive_gain_dbi
+    received = 10 ** ((gains_db + receiver.gain_db) / 10) * wavelength_m**2 / (4 * np.pi) ** 3
+    level = np.sqrt(received / waveform.mean_power)
+    noise = 0.0
+    if receiver.noise_figure_db is not None:
+        amplified = 10 ** ((receiver.noise_figure_db + receiver.gain_db) / 10)
+        noise = BOLTZMANN_J_K * REFERENCE_K * amplified * waveform.sample_rate_hz
+    paths = replace(channel.paths, amplitude=channel.paths.amplitude * level)
+    full_scale = float(10 ** ((receiver.full_scale_dbm - 30) / 20))
+    return replace(channel, paths=paths, noise_variance=noise, full_scale=full_scale)
 
 
 def _possible(impairments: Impairments, flight: SimulatedFlight) -> Impairments:

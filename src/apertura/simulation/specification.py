@@ -26,6 +26,7 @@ from apertura.simulation.impairments import (
     ChannelName,
     Impairments,
     RadarPoint,
+    Radio,
     independent_streams,
 )
 from apertura.simulation.scene import GaussianBeam, Origin, Target, Track, Trajectory, Vector
@@ -56,6 +57,10 @@ class SimulatedNode:
         default=None, gt=0, description="what the config says of the log's errors, per axis, m; null: nothing"
     )
     impairments: Impairments = Field(default=Impairments(), description="what is wrong with it")
+    radio: Radio | None = Field(
+        default=None,
+        description="power, gains and receiver: amplitudes of targets are then roots of their cross-sections in m²",
+    )
     antennas: Mapping[RadarPoint, GaussianBeam] = Field(
         default_factory=dict, description="beams of the radar antennas; missing: the same in all directions"
     )
@@ -164,6 +169,16 @@ class CampaignSpecification:
         else:
             atmosphere = Atmosphere.stated(float(self.atmosphere), ground_m=ground_m)
         return TrueAir(atmosphere, lambda position: np.asarray(geodetic_from_ecef(position)[..., 2]))
+
+    @model_validator(mode="after")
+    def _radios_are_of_all(self) -> Self:
+        stated = [name for name, node in self.nodes.items() if node.radio is not None]
+        if stated and len(stated) < len(self.nodes):
+            raise ValueError(f"radio is stated of {', '.join(stated)} alone: state it of every node, or of none")
+        noisy = [name for name in stated if self.nodes[name].impairments.radar_snr_db is not None]
+        if noisy:
+            raise ValueError(f"{noisy[0]} has a radio, with noise by noise_figure_db, and radar_snr_db as well")
+        return self
 
     @model_validator(mode="after")
     def _nodes_fly(self) -> Self:

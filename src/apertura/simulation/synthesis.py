@@ -47,6 +47,8 @@ class Channel:
         The receiver's local oscillator and sampling rate less their nominal frequencies, Hz.
     noise_variance
         E|n|² of a complex sample.
+    full_scale
+        Amplitude of I + jQ that the converter takes as full scale, where a radio is stated; None: by its backoff.
     """
 
     waveform: TransmitWaveform
@@ -57,6 +59,7 @@ class Channel:
     cfo_hz: float = 0.0
     sfo_hz: float = 0.0
     noise_variance: float = 0.0
+    full_scale: float | None = None
 
 
 def transfer_functions(channel: Channel, generator: Generator | None) -> Complex:
@@ -378,8 +381,11 @@ def spectral_power(waveform: TransmitWaveform, paths: Paths, response: Complex |
 def full_scale(channel: Channel, adc: Adc) -> float:
     """Return the amplitude of I or Q that the converter takes as full scale, set once per flight.
 
-    The RMS of I and of Q over all pulses, with noise and all that leaks in, lies `adc.backoff_db` under it.
+    The RMS of I and of Q over all pulses, with noise and all that leaks in, lies `adc.backoff_db` under it, unless
+    the channel has a full scale of its own.
     """
+    if channel.full_scale is not None:
+        return channel.full_scale
     power = spectral_power(channel.waveform, channel.paths, channel.response) * channel.waveform.mean_power
     rms = np.sqrt((power + channel.noise_variance) / 2)
     return float(rms * 10 ** (adc.backoff_db / 20))

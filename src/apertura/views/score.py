@@ -1,7 +1,8 @@
 """Found against put: every point target of truth.json, in the GeoTIFFs a user would open."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,13 +13,17 @@ from apertura.common.documents import read_json, undamaged
 from apertura.common.errors import CampaignError
 from apertura.common.paths import inside
 from apertura.common.raster import opened_raster
+from apertura.core.quality.bright_points import BrightPoint, bright_point
 from apertura.core.quality.point_targets import cut_through, find_peak
 from apertura.core.scene.grid import SceneGrid
 from apertura.formats.export import product, product_files
+from apertura.formats.export.radiometry import CROSS_SECTIONS
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import Flight
-from apertura.pipeline.opening.scene import settled_scene
-from apertura.pipeline.store import open_stage
+from apertura.pipeline.opening.pair import open_pair
+from apertura.pipeline.opening.radiometry import calibrated_pair
+from apertura.pipeline.opening.scene import open_scene, settled_scene
+from apertura.pipeline.store import open_listed, open_stage
 from apertura.views.image_report import FUSED
 from apertura.views.summary import print_summary
 
@@ -28,7 +33,7 @@ REACH_M = 1.0
 
 @dataclass(frozen=True)
 class Finding:
-    """One target in one image; lengths in metres."""
+    """One target in one image; lengths in metres; its cross-section as found and put, where images are calibrated."""
 
     flight: str
     image: str
@@ -37,6 +42,9 @@ class Finding:
     error_north_m: float
     cross_range_m: float
     ground_range_m: float
+    rcs_dbsm: float | None = None
+    rcs_std_db: float | None = None
+    rcs_put_dbsm: float | None = None
 
     @property
     def error_m(self) -> float:
@@ -56,7 +64,8 @@ def score(campaign: Campaign) -> list[Finding]:
     expected, remedy = "true target places", "Only simulated campaigns have them."
     document = read_json(path, expected=expected, remedy=remedy)
     with undamaged(path, expected=expected, remedy=remedy):
-        targets = [{name: float(target[name]) for name in ("x", "y")} for target in document["targets"]]
+        known = ("x", "y", "rcs_m2")
+        targets = [{name: float(target[name]) for name in known if name in target} for target in document["targets"]]
     return [finding for flight in campaign.image_flights for finding in _flight(campaign, flight, targets)]
 
 
@@ -72,11 +81,13 @@ def _flight(campaign: Campaign, flight: Flight, targets: list[dict[str, float]])
             )
         with opened_raster(file, expected="a finished campaign", remedy="Run the workflow again.") as raster:
             image, spacing = raster.read(1), grid.spacing_m
+        sections = _cross_sections(campaign, flight.name, name)
         for number, target in enumerate(targets):
             row, column = map(float, grid.pixel_of(target["x"], target["y"]))
             if not (0 <= row < image.shape[0] - 1 and 0 <= column < image.shape[1] - 1):
                 continue
-            peak = find_peak(image, *_brightest_near(image, row, column, REACH_M / 4 / spacing))
+            nearest = _brightest_near(image, row, column, REACH_M / 4 / spacing)
+            peak = find_peak(image, *nearest)
             across = (along[1], -along[0])
             cuts = [
                 cut_through(image, peak, direction=direction, spacing_m=spacing, reach_m=REACH_M)
@@ -90,7 +101,28 @@ def _flight(campaign: Campaign, flight: Flight, targets: list[dict[str, float]])
                 error_north_m=(row - peak.row) * spacing,
                 cross_range_m=cuts[0].width_m,
                 ground_range_m=cuts[1].width_m,
+                **({} if sections is None else sections(bright_point(image, *nearest), target.get("rcs_m2"))),
             )
+
+
+def _cross_sections(
+    campaign: Campaign, flight: str, pair: str
+) -> Callable[[BrightPoint, float | None], dict[str, Any]] | None:
+    """Return what gives a point's cross-section in a pair's image, and that put there; None where none is known."""
+    if not campaign.calibrated or pair == FUSED:
+        return None
+    scene, path = open_scene(campaign), campaign.result(flight, pair, CROSS_SECTIONS)
+    calibrated = calibrated_pair(campaign, open_pair(campaign, flight, pair), scene)
+    noise = open_listed(path, campaign.root / campaign.manifest("layers", flight, pair))["noise"]["pulse"]
+
+    def found(point: BrightPoint, put_m2: float | None) -> dict[str, Any]:
+        if calibrated is None:
+            return {}
+        (one,) = calibrated.points([point], scene, np.nan if noise is None else float(noise))
+        put = None if not put_m2 else 10 * float(np.log10(put_m2))
+        return {"rcs_dbsm": one["rcs_dbsm"], "rcs_std_db": one["std_db"], "rcs_put_dbsm": put}
+
+    return found
 
 
 def _brightest_near(image: NDArray[np.complex64], row: float, column: float, reach: float) -> tuple[int, int]:
@@ -112,17 +144,24 @@ def print_findings(campaign: Campaign, *, paths: bool) -> None:
     """Print a short table of what `score` finds, and where the products lie."""
     console = Console(width=120)
     table = Table(title=f"{campaign.settings.campaign}: found against put", title_justify="left")
-    for heading in ("flight", "image", "target", "east", "north", "off by", "cross-range", "ground range"):
+    calibrated = ("RCS, dBsm", "put") if campaign.calibrated else ()
+    headings = ("flight", "image", "target", "east", "north", "off by", "cross-range", "ground range", *calibrated)
+    for heading in headings:
         table.add_column(heading, justify="right" if heading not in {"flight", "image"} else "left")
     for finding in score(campaign):
         numbers = (finding.error_east_m, finding.error_north_m, finding.error_m)
         widths = (finding.cross_range_m, finding.ground_range_m)
         row = [f"{100 * value:+.1f} cm" for value in numbers[:2]] + [f"{100 * numbers[2]:.1f} cm"]
-        table.add_row(
-            finding.flight, finding.image, str(finding.target), *row, *(f"{100 * width:.1f} cm" for width in widths)
-        )
+        row += [f"{100 * width:.1f} cm" for width in widths]
+        if finding.rcs_put_dbsm is not None or finding.rcs_dbsm is not None:
+            known = finding.rcs_dbsm is not None
+            row.append(f"{finding.rcs_dbsm:.2f} ± {finding.rcs_std_db:.2f}" if known else "in noise or clutter")
+            row.append("" if finding.rcs_put_dbsm is None else f"{finding.rcs_put_dbsm:.2f}")
+        table.add_row(finding.flight, finding.image, str(finding.target), *row)
     console.print(table)
     print_summary(campaign)
     if paths:
-        for file in product_files({flight.name: flight.pairs for flight in campaign.image_flights}):
+        for file in product_files(
+            {flight.name: flight.pairs for flight in campaign.image_flights}, campaign.coefficients
+        ):
             print(campaign.results / file)

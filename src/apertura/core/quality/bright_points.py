@@ -261,7 +261,7 @@ def bright_points(
     kept = separated(
         np.array([one[0] for one in found]), lambda one, others: shown(pixels[one], pixels[others]), most=MOST_POINTS
     )
-    return [_bright_point(image, int(row), int(column)) for row, column in pixels[kept]]
+    return [bright_point(image, int(row), int(column)) for row, column in pixels[kept]]
 
 
 def has_point(image: BlockRaster, row: int, column: int, *, reach: int) -> bool:
@@ -283,7 +283,8 @@ def has_point(image: BlockRaster, row: int, column: int, *, reach: int) -> bool:
     return bool(here.size and here.max() ** 2 > _POINT_CONTRAST * np.median(about.astype(np.float64) ** 2) / np.log(2))
 
 
-def _bright_point(image: BlockRaster, row: int, column: int) -> BrightPoint:
+def bright_point(image: BlockRaster, row: int, column: int) -> BrightPoint:
+    """Return the maximum of an image near a pixel, with the power around it."""
     peak = find_peak(image, row, column)
     about = tuple(slice(max(0, at - PATCH_PX // 2), at + PATCH_PX // 2) for at in (row, column))
     power = np.abs(np.nan_to_num(np.asarray(image[about[0], about[1]]))).astype(np.float64) ** 2

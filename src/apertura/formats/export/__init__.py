@@ -7,7 +7,7 @@ as entry point of group ``apertura.exports``. Importing this module imports no f
 """
 
 import pkgutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -27,6 +27,9 @@ SOURCES: Mapping[str, str] = {
     "mask": "layers",
     "looks": "layers",
     "nesz": "layers",
+    "sigma0": "radiometry",
+    "gamma0": "radiometry",
+    "beta0": "radiometry",
     "phase": "interferogram",
     "coherence": "interferogram",
     "unwrapped": "interferogram",
@@ -36,6 +39,7 @@ SOURCES: Mapping[str, str] = {
 }
 """Raster that a file may be written from → kind of folder the file lies in.
 
+Those of radiometry lie beside layers where a pair is calibrated: complex, of the power that they are named after.
 ``image`` is a pair's, complex; ``coherent`` the complex and ``noncoherent`` the power sum of a flight's pairs, as a
 complex amplitude without phase, ``magnitude`` the sum of their magnitudes; layers explain a pair's image, real, and
 lie beside it; those of an interferogram are of two images, ``panels`` all of them by name.
@@ -127,6 +131,12 @@ EXPORTS: tuple[Export, ...] = (
     Export("looks.qml", "looks", "apertura.formats.export.style:write_layer_style"),
     Export("nesz.tif", "nesz", "apertura.formats.export.layers:write_nesz"),
     Export("nesz.qml", "nesz", "apertura.formats.export.style:write_layer_style"),
+    Export("sigma0_db.tif", "sigma0", "apertura.formats.export.db:write_db"),
+    Export("sigma0_db.qml", "sigma0", "apertura.formats.export.style:write_backscatter_style"),
+    Export("gamma0_db.tif", "gamma0", "apertura.formats.export.db:write_db"),
+    Export("gamma0_db.qml", "gamma0", "apertura.formats.export.style:write_backscatter_style"),
+    Export("beta0_db.tif", "beta0", "apertura.formats.export.db:write_db"),
+    Export("beta0_db.qml", "beta0", "apertura.formats.export.style:write_backscatter_style"),
     Export("phase.tif", "phase", "apertura.formats.export.interferogram:write_phase"),
     Export("phase.qml", "phase", "apertura.formats.export.style:write_layer_style"),
     Export("coherence.tif", "coherence", "apertura.formats.export.interferogram:write_coherence"),
@@ -193,7 +203,7 @@ def export_modules(folder: str) -> list[str]:
     return sorted({export.module for export in exports_in(folder)})
 
 
-def mosaics(pairs: Mapping[str, Sequence[str]]) -> dict[str, list[str]]:
+def mosaics(pairs: Mapping[str, Sequence[str]], coefficients: Sequence[str] = ()) -> dict[str, list[str]]:
     """Return the rasters of all flights, relative to `MOSAICS` → what they are made of, relative to the results.
 
     Images of one pair, or the sums of a flight: others are taken from other places, or mean something else.
@@ -202,6 +212,8 @@ def mosaics(pairs: Mapping[str, Sequence[str]]) -> dict[str, list[str]]:
     ----------
     pairs
         Flight → its pairs, the lowest first.
+    coefficients
+        Sources of kind ``radiometry`` that are written, where images are calibrated.
 
     Examples
     --------
@@ -211,34 +223,42 @@ def mosaics(pairs: Mapping[str, Sequence[str]]) -> dict[str, list[str]]:
     found: dict[str, list[str]] = {}
     for flight, names in pairs.items():
         for folder, kinds in _folders(names):
-            for row in (row for kind in kinds for row in exports_in(kind)):
+            for row in _written(kinds, coefficients):
                 if row.mosaicked and row.file.endswith(".tif"):
                     name = f"{folder}/{row.file.removesuffix('.tif')}.vrt"
                     found.setdefault(name, []).append(f"{flight}/{folder}/{row.file}")
     return found
 
 
-def mosaic_files(pairs: Mapping[str, Sequence[str]]) -> Iterator[str]:
+def mosaic_files(pairs: Mapping[str, Sequence[str]], coefficients: Sequence[str] = ()) -> Iterator[str]:
     """Yield the rasters of all flights and their styles, relative to the results; as `mosaics`."""
     styles = {row.file for row in EXPORTS if row.style}
-    for name in mosaics(pairs):
+    for name in mosaics(pairs, coefficients):
         style = f"{name.removesuffix('.vrt')}.qml"
         yield from (f"{MOSAICS}/{file}" for file in (name, style) if file == name or Path(file).name in styles)
 
 
 def _folders(pairs: Sequence[str]) -> Iterator[tuple[str, tuple[str, ...]]]:
     """Yield the folders of a flight, and the kinds of rows that lie in each."""
-    yield from ((pair, ("pair", "layers")) for pair in pairs)
+    yield from ((pair, ("pair", "layers", "radiometry")) for pair in pairs)
     yield "fused", ("fused",)
 
 
-def product_files(pairs: Mapping[str, Sequence[str]]) -> Iterator[str]:
+def _written(kinds: Iterable[str], coefficients: Sequence[str]) -> Iterator[Export]:
+    """Yield the rows of some kinds, of radiometry those of the coefficients written."""
+    rows = (row for kind in kinds for row in exports_in(kind))
+    return (row for row in rows if SOURCES[row.source] != "radiometry" or row.source in coefficients)
+
+
+def product_files(pairs: Mapping[str, Sequence[str]], coefficients: Sequence[str] = ()) -> Iterator[str]:
     """Yield every file that a finished campaign offers its user, relative to the results.
 
     Parameters
     ----------
     pairs
         Flight → its pairs.
+    coefficients
+        As of `mosaics`.
 
     Examples
     --------
@@ -248,9 +268,9 @@ def product_files(pairs: Mapping[str, Sequence[str]]) -> Iterator[str]:
     yield from COVERAGE
     for flight, names in pairs.items():
         for folder, kinds in _folders(names):
-            files = [row.file for kind in kinds for row in exports_in(kind)]
+            files = [row.file for row in _written(kinds, coefficients)]
             yield from (f"{flight}/{folder}/{file}" for file in (*files, "image.json"))
-    yield from mosaic_files(pairs)
+    yield from mosaic_files(pairs, coefficients)
     yield MAP
 
 
@@ -269,11 +289,11 @@ def write_exports(
     Parameters
     ----------
     kind
-        ``pair``, ``fused``, ``layers`` or ``interferogram``.
+        ``pair``, ``fused``, ``layers``, ``radiometry`` or ``interferogram``.
     folder
         Where they go.
     rasters, titles
-        Source → (y, x) raster on the campaign's grid, and its title.
+        Source → (y, x) raster on the campaign's grid, and its title; of ``radiometry`` those that are asked for.
     tags
         Of every file, name → text.
     radiometry
@@ -284,6 +304,8 @@ def write_exports(
     written = []
     for export in exports_in(kind):
         path, source = folder / export.file, export.source
+        if kind == "radiometry" and source not in rasters:
+            continue
         means = {TAG: canonical_json(radiometry[source])} if source in radiometry else {}
         export.write(path, rasters[source], title=titles[source], tags={**tags, **means}, **shared)
         written.append(path)

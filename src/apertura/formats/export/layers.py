@@ -1,6 +1,7 @@
 """Layers of an image: angles of view, mask of shadow and layover, and number of pulses."""
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ from rasterio import Affine
 
 from apertura.common.errors import ContractError
 from apertura.formats.export.cog import Band, NorthUpRaster, Pixels, write_cog
+from apertura.formats.export.radiometry import TAG
 
 SHADOW, LAYOVER, OUTSIDE = 1, 2, 255
 """Bits of the mask, and its value where no pulse makes the pixel; 0 is visible once."""
@@ -33,6 +35,9 @@ MASK = Band(
 )
 LOOKS = Band("float32", 0, "pulses", "effective number of pulses that make the pixel", "AVERAGE")
 NESZ = Band("float32", np.nan, "dB", "echo per pulse as strong as the noise: relative, no sigma0", "AVERAGE")
+
+NESZ_ABSOLUTE = "noise-equivalent sigma0"
+"""Meaning of `NESZ` of a calibrated pair."""
 
 
 def write_incidence(
@@ -83,8 +88,12 @@ def write_looks(
 def write_nesz(
     path: Path, noise_db: NorthUpRaster, /, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
 ) -> None:
-    """Write the echo that equals the noise, (y, x) float32 dB of its power, NaN outside. Else as `write_looks`."""
-    write_cog(path, noise_db, NESZ, transform=transform, crs=crs, tags=tags, title=title, value=_only("float32"))
+    """Write the echo that equals the noise, (y, x) float32 dB of its power, NaN outside. Else as `write_looks`.
+
+    With the tag `apertura.formats.export.radiometry.TAG` it is the σ⁰ that equals the noise.
+    """
+    band = replace(NESZ, meaning=NESZ_ABSOLUTE) if TAG in tags else NESZ
+    write_cog(path, noise_db, band, transform=transform, crs=crs, tags=tags, title=title, value=_only("float32"))
 
 
 def _only(dtype: str) -> Callable[[Pixels], Pixels]:

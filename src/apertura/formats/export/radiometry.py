@@ -12,6 +12,8 @@ if TYPE_CHECKING:
     from apertura.formats.export.cog import Band
 
 TAG = "APERTURA_RADIOMETRY"
+CROSS_SECTIONS = "radiometry.json"
+"""What the radio of a calibrated pair says of its image, beside the layers."""
 
 
 @dataclass(frozen=True)
@@ -60,6 +62,39 @@ class Radiometry:
 
 ECHO = Radiometry("echo amplitude", "echo power", "the echo of a target that every pulse counted sees")
 """Of the image of a pair (docs/theory.md, eq. 6)."""
+
+
+_COEFFICIENTS = {
+    "sigma0": ("sigma0, radar cross-section per area of ground", "1 m2 per m2 of ground"),
+    "beta0": ("beta0, radar cross-section per area of the slant plane", "1 m2 per m2 of the slant plane"),
+    "gamma0": ("gamma0, radar cross-section per area across the line of sight", "1 m2 per m2 across the bisector"),
+}
+
+CF_SIGMA0 = "surface_backwards_scattering_coefficient_of_radar_wave"
+"""Standard name of σ⁰ in CF (Standard Name Table); γ⁰ and β⁰ have none."""
+
+
+def of_coefficient(name: str, *, std_db: float | None, noise: str = "in it") -> dict[str, Any]:
+    """Return the radiometry of a calibrated raster, for `TAG`.
+
+    Parameters
+    ----------
+    name
+        sigma0, beta0 or gamma0.
+    std_db
+        Standard deviation of the calibration; None: not stated.
+    noise
+        What became of noise.
+
+    Examples
+    --------
+    >>> of_coefficient("sigma0", std_db=0.5)["standard_name"]
+    'surface_backwards_scattering_coefficient_of_radar_wave'
+    """
+    power, one_is = _COEFFICIENTS[name]
+    standard = {"standard_name": CF_SIGMA0} if name == "sigma0" else {}
+    stated = {"calibration_std_db": std_db} if std_db is not None else {"calibration_std": "not stated"}
+    return {"amplitude": f"root of {power}", "power": power, "one_is": one_is, "noise": noise, **standard, **stated}
 
 
 def of_sums(peaks: Mapping[str, float], phases_rad: Mapping[str, float]) -> dict[str, Radiometry]:

@@ -5,7 +5,7 @@ a scene that is mostly noise, and whiten the noise.
 """
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from math import ceil, floor, log10
 from pathlib import Path
 from xml.etree import ElementTree as ET  # only written, never parsed
@@ -24,6 +24,8 @@ from apertura.formats.export.radiometry import TAG
 _DOCTYPE = "<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>\n"
 _VERSION = "3.22"
 _RAMP = ("#440154", "#3b528b", "#21918c", "#5ec962", "#fde725")  # viridis
+_GREYS = ("#000000", "#404040", "#808080", "#c0c0c0", "#ffffff")
+_STEP_DB = 5.0  # that the ends of the colours of a coefficient are whole multiples of
 _DOTS = 1024  # of the longer side of a layer, among which the ends of its colours are looked for
 _LEAST_DB = 1.0  # between black and white, of an image that is all one power
 
@@ -98,13 +100,30 @@ def write_layer_style(path: Path, *_: object, **__: object) -> None:
     """
     with rasterio.Env(**ISOLATED), rasterio.open(_beside(path)) as raster:
         values, unit = _few(raster), raster.units[0]
-    low, high = _round_ends(values[np.isfinite(values)])
+    _write_ramp(path, *_round_ends(values[np.isfinite(values)]), unit)
+
+
+def write_backscatter_style(path: Path, *_: object, **__: object) -> None:
+    """Write the style of a backscattering coefficient: grey over whole 5 dB that hold 2 to 99.5 % of the pixels.
+
+    Parameters as `write_db_style`. Speckle reaches down to nothing and reflectors far up: neither sets the colours.
+    """
+    with rasterio.Env(**ISOLATED), rasterio.open(_beside(path)) as raster:
+        values, unit = _few(raster), raster.units[0]
+    known = values[np.isfinite(values)]
+    low, high = np.percentile(known, (2.0, 99.5)) if known.size else (-30.0, 0.0)
+    low, high = _STEP_DB * floor(low / _STEP_DB), _STEP_DB * ceil(high / _STEP_DB)
+    _write_ramp(path, low, max(high, low + _STEP_DB), unit, ramp=_GREYS)
+
+
+def _write_ramp(path: Path, low: float, high: float, unit: str, *, ramp: Sequence[str] = _RAMP) -> None:
+    """Write colours between two values, and a legend with their unit."""
     options = {"classificationMin": f"{low:g}", "classificationMax": f"{high:g}"}
     renderer = _renderer("singlebandpseudocolor", band="1", **options)
     ends = {"minimumValue": f"{low:g}", "maximumValue": f"{high:g}"}
     shader = ET.SubElement(ET.SubElement(renderer, "rastershader"), "colorrampshader", ends)
     shader.attrib |= {"colorRampType": "INTERPOLATED", "classificationMode": "1", "clip": "0"}
-    for share, colour in zip(np.linspace(0, 1, len(_RAMP)), _RAMP, strict=True):
+    for share, colour in zip(np.linspace(0, 1, len(ramp)), ramp, strict=True):
         value = f"{low + share * (high - low):g}"
         ET.SubElement(shader, "item", value=value, color=colour, alpha="255", label=f"{value} {unit}")
     _write(path, renderer)

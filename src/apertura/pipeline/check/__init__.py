@@ -177,7 +177,9 @@ def load(root: Path) -> tuple[Campaign | None, list[CampaignError]]:
     clocks = _tried(lambda: tuple(read_clocks(_inside(root, CLOCKS), flights=listed)), wrong) if listed else ()
     if settings is None or flights is None or segments is None or clocks is None:
         return None, wrong
-    return Campaign(root, settings, flights, segments, clocks), wrong
+    campaign = Campaign(root, settings, flights, segments, clocks)
+    _tried(campaign.check_radio, wrong)
+    return campaign, wrong
 
 
 def _inside(root: Path, path: Path) -> Path:

@@ -16,7 +16,16 @@ from apertura.pipeline.config.flights import (
     read_flights,
     read_segments,
 )
-from apertura.pipeline.config.nodes import Antenna, Antennas, LeverArms, Node, PathOffsets
+from apertura.pipeline.config.nodes import (
+    Antenna,
+    Antennas,
+    LeverArms,
+    Node,
+    PathOffsets,
+    Receiver,
+    check_radio,
+    radio_of,
+)
 from apertura.pipeline.config.processing import Calibration, Interferometry, Processing, Scene, check_interferometry
 from apertura.pipeline.config.section import Name, Section
 from apertura.pipeline.config.waveform import (
@@ -49,6 +58,7 @@ __all__ = [
     "PhaseHistoryWaveform",
     "Processing",
     "PulseWaveform",
+    "Receiver",
     "SampledWaveform",
     "Scene",
     "Section",
@@ -56,7 +66,9 @@ __all__ = [
     "Settings",
     "Waveform",
     "check_interferometry",
+    "check_radio",
     "located",
+    "radio_of",
     "read_clocks",
     "read_flights",
     "read_segments",

@@ -1,9 +1,13 @@
 """Section `nodes`: equipment of each UAV, lever arms, antennas, and values that its log lacks."""
 
+import math
+from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
+from apertura.common.errors import CampaignError
 from apertura.formats.names import TRACKS
 from apertura.formats.tracks.log_options import LogOptions
 from apertura.pipeline.config.section import Metres3, Section
@@ -60,6 +64,7 @@ class Log(Section):
 
 # ---- Section `nodes`: equipment, lever arms, antennas ---------------------------------------------------------------
 
+_OHMS = 50.0  # that voltages are stated in
 StandardDeviation = Annotated[float, Field(gt=0)]
 Beamwidth = Annotated[float, Field(gt=0, le=180)]
 
@@ -88,6 +93,9 @@ class Antenna(Section):
         return self
 
 
+Decibels = Annotated[float, Field(ge=-300, le=300)]
+Gain = Annotated[float, Field(ge=-60, le=80)]
+
 _BEAM = "null (isotropic), or boresight_deg with beamwidth_deg or pattern, and cutoff_db"
 
 
@@ -96,9 +104,15 @@ class Antennas(Section):
 
     radar_tx: Antenna | None = Field(None, description=f"transmitting radar antenna: {_BEAM}")
     radar_rx: Antenna | None = Field(None, description=f"receiving radar antenna: {_BEAM}")
+    radar_tx_gain_dbi: Gain | None = Field(
+        None, description="peak gain of the transmitting radar antenna, to which its beam is relative, dBi"
+    )
+    radar_rx_gain_dbi: Gain | None = Field(
+        None, description="peak gain of the receiving radar antenna, to which its beam is relative, dBi"
+    )
 
     def any(self) -> bool:
-        """Return whether one of them is stated."""
+        """Return whether one of them has a beam."""
         return self.radar_tx is not None or self.radar_rx is not None
 
 
@@ -121,6 +135,41 @@ class PathOffsets(Section):
     sidelink: float = Field(0.0, description="sidelink channel, m")
 
 
+class Receiver(Section):
+    """From the port of the receiving radar antenna to the numbers recorded."""
+
+    full_scale_counts: float = Field(
+        gt=0, le=2**32, description="|I + jQ| of a complex sine at full scale, in the numbers recorded: 8192 of 14 bits"
+    )
+    full_scale_dbm: Decibels | None = Field(None, description="power of that sine at the converter's input, dBm")
+    full_scale_v: Annotated[float, Field(gt=0, le=1e6)] | None = Field(
+        None, description="instead of full_scale_dbm, its amplitude (half of peak to peak) in 50 ohms, V"
+    )
+    gain_db: Decibels = Field(description="from the antenna's port to the converter's input, cables included, dB")
+    noise_figure_db: Annotated[float, Field(ge=0, le=100)] | None = Field(
+        None, description="noise figure at the antenna's port, dB: what measured noise is compared with; null: unknown"
+    )
+
+    @model_validator(mode="after")
+    def _one_full_scale(self) -> Self:
+        if (self.full_scale_dbm is None) == (self.full_scale_v is None):
+            raise ValueError("give either full_scale_dbm or full_scale_v, what the converter takes as full scale")
+        return self
+
+    @property
+    def at_full_scale_dbm(self) -> float:
+        """Power of a sine at full scale, dBm.
+
+        Examples
+        --------
+        >>> round(Receiver(full_scale_counts=8192, full_scale_v=0.5, gain_db=30).at_full_scale_dbm, 2)
+        3.98
+        """
+        if self.full_scale_v is None:
+            return float(self.full_scale_dbm or 0.0)
+        return 10 * math.log10(self.full_scale_v**2 / (2 * _OHMS) * 1e3)
+
+
 class Node(Section):
     """One UAV."""
 
@@ -128,6 +177,19 @@ class Node(Section):
     antennas: Antennas = Field(default_factory=Antennas, description="beams: where the antennas look, in body axes")
     path_offset_m: PathOffsets = Field(
         default_factory=PathOffsets, description="electrical path beyond geometry, as receiver"
+    )
+    transmit_power_dbm: Decibels | None = Field(
+        None, description="mean power at the transmitting antenna's port while the signal is sent, dBm; null: unknown"
+    )
+    receiver: Receiver | None = Field(
+        None,
+        description="its radar receiver: full_scale_counts, full_scale_dbm or full_scale_v, gain_db, noise_figure_db; "
+        "with transmit_power_dbm and both gains of antennas images are calibrated to sigma0; null: they are relative",
+    )
+    amplitude_std_db: Annotated[float, Field(ge=0, le=100)] | None = Field(
+        None,
+        description="error of what is stated of power, antenna gains and receiver together, standard deviation, dB; "
+        "null: nobody knows",
     )
     attitude: Literal["log", "course", "none"] = Field(
         "none", description="where attitude comes from: the log, the course over ground, or none"
@@ -177,3 +239,54 @@ class Node(Section):
                 "set attitude to log or course, or the beam to null"
             )
         return self
+
+
+# ---- The radio of a pair, where images are calibrated --------------------------------------------------------------
+
+
+def radio_of(nodes: Mapping[str, Node], pair: str) -> dict[str, object]:
+    """Return key of the config → what it states of a pair's radio; None where it states nothing.
+
+    Examples
+    --------
+    >>> list(radio_of({"a": Node(transmit_power_dbm=10.0), "b": Node()}, "a-b"))[:2]
+    ['nodes.a.transmit_power_dbm', 'nodes.a.antennas.radar_tx_gain_dbi']
+    """
+    tx, rx = pair.split("-")
+    return {
+        f"nodes.{tx}.transmit_power_dbm": nodes[tx].transmit_power_dbm,
+        f"nodes.{tx}.antennas.radar_tx_gain_dbi": nodes[tx].antennas.radar_tx_gain_dbi,
+        f"nodes.{rx}.antennas.radar_rx_gain_dbi": nodes[rx].antennas.radar_rx_gain_dbi,
+        f"nodes.{rx}.receiver": nodes[rx].receiver,
+    }
+
+
+def check_radio(nodes: Mapping[str, Node], pairs: Iterable[str], *, sampled: bool, where: Path) -> None:
+    """Raise CampaignError unless the radio of all pairs is stated, or of none.
+
+    Parameters
+    ----------
+    nodes, pairs
+        Of the campaign.
+    sampled
+        Whether samples were recorded: the scale of recorded phase histories is not known.
+    where
+        The config.
+
+    Raises
+    ------
+    CampaignError
+        If the radio of some pair is stated in parts.
+    """
+    stated = {key: value for pair in pairs for key, value in radio_of(nodes, pair).items()}
+    missing = [key for key, value in stated.items() if value is None]
+    if len(missing) < len(stated) and (missing or not sampled):
+        raise CampaignError(
+            f"{', '.join(missing)} {'is' if len(missing) == 1 else 'are'} not stated, "
+            f"{next(key for key, value in stated.items() if value is not None)} is"
+            if missing
+            else "a radio is stated, but numbers of a recorded phase history have no stated scale",
+            where=where,
+            expected="power, both antenna gains and receiver of every pair, or of none of them",
+            remedy="State what is missing, or set the rest to null: images are then relative.",
+        )

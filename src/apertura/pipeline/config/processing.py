@@ -40,6 +40,10 @@ class Processing(ImagingChoices):
         description="what is refined: tracks, or one phase per pulse and pair by either method; auto: one phase, by "
         "minimum_entropy, where all of the scene sees errors of position alike, else tracks",
     )
+    radiometry: tuple[Literal["sigma0", "gamma0", "beta0"], ...] = Field(
+        ("sigma0",),
+        description="which backscattering coefficients are written of calibrated images, sigma0_db.tif and so on",
+    )
     scheduler: str = Field(
         "threads",
         description="who forms the tiles: threads of the step, or the dask scheduler at tcp://host:port, if whoever "

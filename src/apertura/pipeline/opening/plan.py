@@ -12,7 +12,7 @@ from apertura.common.errors import CampaignError
 from apertura.common.flags import Flags
 from apertura.core.antenna.beam import Beams
 from apertura.core.echo.compression import centre_frequency
-from apertura.core.focus.job import Job
+from apertura.core.focus.job import Integration, Job
 from apertura.core.imaging.job import decide_integration, imaging_job
 from apertura.core.planning.decisions import decide_accuracy
 from apertura.core.planning.plan import Decision, Plan, memory_limit
@@ -277,11 +277,15 @@ def weighing(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> Beams | No
 
     As in `job_of`, but without the echo: the ranges that profiles must cover follow from it.
     """
+    return Beams.within(integration_of(campaign, pair, scene).sector, pair.beams)
+
+
+def integration_of(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> Integration:
+    """Return over how much of a flight the pixels of a pair are integrated."""
     centre_hz, requested = centre_frequency(pair.frequency_hz), campaign.settings.processing.integrated
-    settled = decide_integration(
+    return decide_integration(
         pair.aperture, centre_hz, scene.grid, scene.level, antennas=pair.beams, requested=requested
     )
-    return Beams.within(settled.sector, pair.beams)
 
 
 def check_fits(plan: Plan, *, free_disk: int | None, where: str, memory: int | None = None) -> None:

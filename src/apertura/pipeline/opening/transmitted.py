@@ -76,6 +76,8 @@ class Transmitted:
         Grid of the frequencies that echoes are measured at.
     inverse
         (subcarrier,) complex64, inverse filter of the transmitted signal.
+    mean_power
+        E|s|² while it is sent, in the units that echoes are divided by: of a symbol, of a pulse whose peak is 1.
     report, flags
         Decisions on it, and flags.
     """
@@ -83,6 +85,7 @@ class Transmitted:
     waveform: SampledWaveform
     numerology: Numerology
     inverse: NDArray[np.complex64]
+    mean_power: float
     report: dict[str, Any] = field(default_factory=dict)
     flags: dict[str, str] = field(default_factory=dict)
 
@@ -96,8 +99,8 @@ def transmitted(campaign: Campaign, waveform: SampledWaveform) -> Transmitted:
         If the file is missing or contradicts the waveform.
     """
     if isinstance(waveform, OfdmWaveform):
-        inverse = 1 / read_codes(campaign.sent_file, waveform.subcarriers)
-        return Transmitted(waveform, symbol_numerology(waveform), inverse)
+        codes = read_codes(campaign.sent_file, waveform.subcarriers)
+        return Transmitted(waveform, symbol_numerology(waveform), 1 / codes, float((np.abs(codes) ** 2).sum()))
     if isinstance(waveform, PulseWaveform):
         return _pulse_sent(campaign.sent_file, waveform)
     raise TypeError(f"no way to take out what a {type(waveform).__name__} sends")
@@ -118,7 +121,8 @@ def _pulse_sent(path: Path, waveform: PulseWaveform) -> Transmitted:
     """Return a pulse that is sent once: a DFT of the whole capture, and its filter (docs/theory/waveforms.md)."""
     length = waveform.capture_samples
     lead = waveform.lead_s * waveform.sample_rate_hz
-    spectrum = pulse_spectrum(read_pulse(path, waveform), lead=lead, length=length)
+    pulse = read_pulse(path, waveform)
+    spectrum = pulse_spectrum(pulse, lead=lead, length=length)
     power = np.abs(spectrum) ** 2
     if waveform.band_hz is None:
         first, last = occupied_band(power)
@@ -140,7 +144,8 @@ def _pulse_sent(path: Path, waveform: PulseWaveform) -> Transmitted:
     numerology = Numerology(waveform.carrier_hz, waveform.sample_rate_hz, numbers, 0, length, longest)
     band_hz = [float(number * numerology.spacing_hz) for number in (first, last)]
     report = {**chosen.report, "band_hz": band_hz, "energy_inside": round(inside, 4)}
-    return Transmitted(waveform, numerology, chosen.inverse, report, chosen.flags)
+    mean_power = float((np.abs(pulse) ** 2).mean())
+    return Transmitted(waveform, numerology, chosen.inverse, mean_power, report, chosen.flags)
 
 
 def read_pulse(path: Path, waveform: PulseWaveform) -> NDArray[np.complex128]:

@@ -14,12 +14,13 @@ from apertura.common.contracts import Window
 from apertura.common.flags import Flags
 from apertura.common.provenance import Provenance, canonical_json, chained_sha256
 from apertura.core.combination import InPhase, in_phase
+from apertura.core.quality.budget import NO_EFFECT, BudgetLine
 from apertura.core.quality.focus import DEFOCUSED_DB
 from apertura.core.quality.measures import Amplitude, BlockRaster, image_statistics
 from apertura.core.quality.point_targets import CUT_REACH_M, cuts_report, find_peak
 from apertura.core.scene.grid import SceneGrid
 from apertura.formats.export import write_exports
-from apertura.formats.export.radiometry import ECHO, Radiometry, of_sums
+from apertura.formats.export.radiometry import CROSS_SECTIONS, ECHO, Radiometry, of_sums
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.digests import Lineage
 from apertura.pipeline.lineage import result_of
@@ -27,7 +28,7 @@ from apertura.pipeline.opening.images import ComparedImage, bright_places
 from apertura.pipeline.opening.results import assessment_of
 from apertura.pipeline.opening.scene import settled_scene
 from apertura.pipeline.steps.stamping import tags_of
-from apertura.pipeline.store import open_stage, record_files
+from apertura.pipeline.store import open_listed, open_stage, record_files
 
 
 def export(campaign: Campaign, flight: str, pair: str) -> list[Path]:
@@ -46,6 +47,8 @@ def export(campaign: Campaign, flight: str, pair: str) -> list[Path]:
         "flags": Flags.merged(image.attrs["flags"], agreed["flags"]),
         "radiometry": {"image": ECHO.measured(peak, quality["noise_floor_db"]).report},
     }
+    if campaign.calibrated:
+        report |= _calibrated(campaign, flight, pair, report["budget"])
     origin = _with_code(Provenance.of(lineage.modules, [image]), assessed)
     folder = campaign.result(flight, pair)
     written = write_exports(
@@ -58,6 +61,18 @@ def export(campaign: Campaign, flight: str, pair: str) -> list[Path]:
         **_georeference(settled_scene(campaign).grid),
     )
     return _finish(folder, written, {"flight": flight, "pair": pair, **report}, lineage)
+
+
+def _calibrated(
+    campaign: Campaign, flight: str, pair: str, budget: Sequence[Mapping[str, Any]]
+) -> dict[str, list[Mapping[str, Any]] | Mapping[str, Any]]:
+    """Return what the pair's radio says of its image: cross-sections of bright points, and the line of the budget."""
+    manifest = campaign.root / campaign.manifest("layers", flight, pair)
+    said = open_listed(campaign.result(flight, pair, CROSS_SECTIONS), manifest)
+    std_db = said["std_db"]
+    stated = None if std_db is None else f"{std_db:.2g} dB"
+    line = BudgetLine("amplitude", stated, NO_EFFECT, "an error of power or gain")
+    return {"cross_sections": said, "budget": [*budget, line.report]}
 
 
 def export_fused(campaign: Campaign, flight: str) -> list[Path]:

@@ -1,20 +1,23 @@
-"""Rule `layers`: angles, mask, looks and noise of a pair, as GeoTIFFs on the campaign's grid."""
+"""Rule `layers`: angles, mask, looks, noise and σ⁰ of a pair, as GeoTIFFs on the campaign's grid."""
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import xarray as xr
 from numpy.typing import NDArray
 from rasterio import Affine
 
+from apertura.common.atomic import write_json
 from apertura.common.contracts import Window
 from apertura.common.provenance import Provenance
 from apertura.core.antenna.beam import Beams
 from apertura.core.focus.inputs import Profiles
 from apertura.core.imaging.noise import PLACES, noise_power
+from apertura.core.imaging.radiometry import Quantity
 from apertura.core.imaging.range_profiles import profiles_of
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.looks import BLOCK_PX, Looks
@@ -22,21 +25,27 @@ from apertura.core.scene.terrain import FlatGround, Terrain
 from apertura.core.scene.visibility import Relief, bistatic_angle_deg, incidence_deg, surface_normals, visibility
 from apertura.formats.export import write_exports
 from apertura.formats.export.layers import OUTSIDE
+from apertura.formats.export.radiometry import CROSS_SECTIONS, of_coefficient
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.lineage import result_of
 from apertura.pipeline.opening.pair import open_pair, pattern_digests
 from apertura.pipeline.opening.plan import weighing
+from apertura.pipeline.opening.radiometry import CalibratedPair, calibrated_pair, points_of
 from apertura.pipeline.opening.scene import OpenScene, open_scene
 from apertura.pipeline.steps.stamping import tags_of
 from apertura.pipeline.store import open_stage, record_files
 
 
 def layers(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> list[Path]:
-    """Write incidence, bistatic angle, mask, looks and noise of one pair; return their paths."""
+    """Write incidence, bistatic angle, mask, looks and noise of one pair, and σ⁰ where its radio is stated.
+
+    Returns their paths. What the radio makes of bright points and of noise is in radiometry.json.
+    """
     lineage = result_of(campaign, "layers", flight, pair).begin(campaign.root)
     echo, profile = (open_stage(campaign.stage(stage, flight, pair), stage) for stage in ("echo", "profile"))
     scene, profiles = open_scene(campaign), profiles_of(profile, lazy=True)
-    beams = weighing(campaign, open_pair(campaign, flight, pair, echo=echo), scene)
+    opened = open_pair(campaign, flight, pair, echo=echo)
+    beams, calibrated = weighing(campaign, opened, scene), calibrated_pair(campaign, opened, scene, threads=threads)
     looks = Looks.of(scene.grid, scene.terrain, profiles.aperture, beams, threads=threads)
     noise = _noise(profiles, scene, beams)
     origin = Provenance.of(
@@ -45,16 +54,35 @@ def layers(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> l
         settings={**lineage.result.settings, **scene.spec},
         inputs=pattern_digests(campaign, pair) | scene.inputs,
     )
-    rasters = _rasters(scene, looks, noise, threads=threads)
-    written = write_exports(
-        "layers",
-        campaign.result(flight, pair),
-        rasters,
-        titles={name: f"{campaign.settings.campaign} · flight {flight} · {pair} · {name}" for name in rasters},
-        tags=tags_of(origin, lineage) | {"APERTURA_PULSE_NOISE": f"{noise:.4g}"},
-        transform=Affine(*scene.grid.transform),
-        crs=scene.grid.crs_wkt,
-    )
+    rasters = {"layers": _rasters(scene, looks, noise, calibrated, threads=threads)}
+    image = None if calibrated is None else open_stage(campaign.stage("image", flight, pair), "image")
+    means: dict[str, dict[str, Any]] = {}
+    if calibrated is not None and image is not None:
+        asked, std_db = campaign.settings.processing.radiometry, calibrated.stated_std_db
+        rasters["radiometry"] = {name: _coefficient(scene, image, calibrated, name, threads=threads) for name in asked}
+        means = {name: of_coefficient(name, std_db=std_db) for name in asked}
+        means |= {"nesz": of_coefficient("sigma0", std_db=std_db, noise="alone")}
+        origin = Provenance.of(
+            lineage.modules,
+            [echo, profile, image, *scene.parents],
+            settings={**lineage.result.settings, **scene.spec},
+            inputs=pattern_digests(campaign, pair) | scene.inputs,
+        )
+    folder, written = campaign.result(flight, pair), []
+    for kind, some in rasters.items():
+        written += write_exports(
+            kind,
+            folder,
+            some,
+            titles={name: f"{campaign.settings.campaign} · flight {flight} · {pair} · {name}" for name in some},
+            tags=tags_of(origin, lineage) | {"APERTURA_PULSE_NOISE": f"{noise:.4g}"},
+            radiometry=means,
+            transform=Affine(*scene.grid.transform),
+            crs=scene.grid.crs_wkt,
+        )
+    if calibrated is not None and image is not None:
+        written.append(folder / CROSS_SECTIONS)
+        write_json(written[-1], _report(scene, image, calibrated, noise))
     record_files(campaign.root / lineage.result.manifest, written, lineage)
     return written
 
@@ -105,7 +133,38 @@ class LazyLayer:
         return values
 
 
-def _rasters(scene: OpenScene, looks: Looks, noise: float, *, threads: int) -> dict[str, LazyLayer]:
+def _coefficient(
+    scene: OpenScene, image: xr.Dataset, calibrated: CalibratedPair, name: Quantity, *, threads: int
+) -> LazyLayer:
+    """Return the image whose power is σ⁰, β⁰ or γ⁰, complex64."""
+    level = isinstance(scene.terrain, FlatGround) and name == "sigma0"
+
+    def scaled(window: Window) -> NDArray[np.complex64]:
+        normal = None if level else _surface(scene.grid, scene.terrain, window)[1]
+        per_one = calibrated.calibration.power(window, name, normal)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return np.asarray(image.image[window].values / np.sqrt(per_one), np.complex64)
+
+    return LazyLayer(scene.grid, np.complex64, scaled, threads)
+
+
+def _report(scene: OpenScene, image: xr.Dataset, calibrated: CalibratedPair, noise: float) -> dict[str, Any]:
+    """Return what the radio says of an image, for radiometry.json."""
+    found = points_of(image.image, image.attrs["quality"], scene, list(scene.grid.tiles(BLOCK_PX)))
+    constant = calibrated.calibration.constant
+    return {
+        "calibrated_by": "the radio that the config states",
+        "constant_db": round(10 * float(np.log10(constant)), 3),
+        "std_db": calibrated.stated_std_db,
+        "link": asdict(calibrated.link),
+        "noise": {"pulse": noise if np.isfinite(noise) else None, **calibrated.noise_report(noise)},
+        "points": calibrated.points(found, scene, noise),
+    }
+
+
+def _rasters(
+    scene: OpenScene, looks: Looks, noise: float, calibrated: CalibratedPair | None, *, threads: int
+) -> dict[str, LazyLayer]:
     """Return the layers; `noise` is that of one pulse."""
     grid, terrain = scene.grid, scene.terrain
 
@@ -117,6 +176,10 @@ def _rasters(scene: OpenScene, looks: Looks, noise: float, *, threads: int) -> d
         return _inside(looks, window, angle_deg)
 
     def nesz(window: Window) -> NDArray[np.float64]:
+        if calibrated is not None:
+            calibration = calibrated.calibration
+            power = (noise or np.nan) * calibration.pixel_noise(window) / calibration.power(window, "sigma0", None)
+            return _inside(looks, window, 10 * np.log10(power))
         effective = looks.effective(window).astype(np.float64)
         return 10 * np.log10((noise or np.nan) / np.where(effective > 0, effective, np.nan))
 

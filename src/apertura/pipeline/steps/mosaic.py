@@ -19,9 +19,12 @@ def mosaic(campaign: Campaign) -> list[Path]:
     """
     lineage = result_of(campaign, "mosaic").begin(campaign.root)
     made = _made(campaign.root, lineage.result.sources)
-    styles = {row.file: row for kind in ("pair", "fused", "layers") for row in exports_in(kind) if row.style}
+    styles = {
+        row.file: row for kind in ("pair", "fused", "layers", "radiometry") for row in exports_in(kind) if row.style
+    }
     written = []
-    for name, files in mosaics({flight.name: flight.pairs for flight in campaign.image_flights}).items():
+    pairs = {flight.name: flight.pairs for flight in campaign.image_flights}
+    for name, files in mosaics(pairs, campaign.coefficients).items():
         path, sources = campaign.result(MOSAICS, name), [campaign.result(file) for file in files]
         for source in sources:
             _check(source, made)

@@ -60,12 +60,14 @@ def _images(campaign: Campaign) -> Iterator[tuple[str, str]]:
 
 def _layers(campaign: Campaign, flight: str, image: str, report: Mapping[str, Any]) -> list[Layer]:
     """Return what a page can show of an image: real rasters, the linear ones only where no dB show the same."""
-    kinds = {"export": "fused"} if image == FUSED else {"export": "pair", "layers": "layers"}
+    kinds = [("export", "fused")] if image == FUSED else [("export", "pair"), ("layers", "layers")]
+    kinds += [("layers", "radiometry")] if image != FUSED else []
     return [
         layer
-        for result, kind in kinds.items()
+        for result, kind in kinds
         for row in exports_in(kind)
         if row.file.endswith(".tif")
+        and (kind != "radiometry" or row.source in campaign.coefficients)
         and (layer := _layer(campaign.root / campaign.manifest(result, flight, image), row, report)) is not None
     ]
 

@@ -1,0 +1,216 @@
+"""Cross-sections, σ⁰ and NESZ of calibrated images against what was put: `python benchmarks/radiometry.py`.
+
+`points`: 0.1, 1 and 10 m² at five ranges and three squints, mono- and bistatic, through beams, without noise and in
+100 noisy draws each; `clutter`: ground of one σ⁰ over incidences of 30° to 70°; `noise`: the noise figure that the
+noise of simulated recordings has. Echoes are those of `apertura.simulation` with a `Radio`.
+"""
+
+import argparse
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
+from apertura.core.antenna.beam import Beam, Beams, antenna_axes, gaussian_cut
+from apertura.core.echo.compression import centre_frequency, window_weights
+from apertura.core.focus.engines import reference
+from apertura.core.focus.inputs import PhaseHistory
+from apertura.core.geometry.aperture import Aperture
+from apertura.core.imaging.backproject import backproject
+from apertura.core.imaging.noise import noise_power
+from apertura.core.imaging.radiometry import Calibration, Link, cell_constant
+from apertura.core.imaging.range_profiles import range_compress
+from apertura.core.quality.bright_points import bright_point
+from apertura.core.scene.grid import SceneGrid
+from apertura.core.scene.terrain import FlatGround
+from apertura.pipeline.opening.radiometry import LEAST_CONTRAST
+from apertura.simulation.echoes import transfer
+from apertura.simulation.impairments import Impairments, Radio, draw_impairments
+from apertura.simulation.observation import physical
+from apertura.simulation.scene import Scatterers
+from apertura.simulation.synthesis import Geometry, receive, transfer_functions
+from apertura.simulation.waveform import TransmitWaveform, qpsk_codes
+
+RCS_M2, RANGES_M, SQUINTS_DEG = (0.1, 1.0, 10.0), (14.0, 25.0, 40.0, 70.0, 110.0), (-25.0, 0.0, 25.0)
+COUNTS, WIDTH_DEG, STATED_STD_DB = 8192.0, (60.0, 60.0), 0.5
+RADIO = Radio(-10.0, 8.0, 9.0, full_scale_dbm=4.0, gain_db=40.0, noise_figure_db=6.0)
+LINK = Link(-10.0, 8.0, 9.0, 40.0, 4.0, COUNTS)
+HEIGHT_M = 8.0
+UNTOLD_DB = 10 / np.log(10) * np.sqrt(2 / LEAST_CONTRAST + 1 / LEAST_CONTRAST**2)
+"""Scatter of a peak that is hardly above its surroundings."""
+WAVE = TransmitWaveform(
+    qpsk_codes(256, np.random.default_rng(0)), 1.2e9, "band_centre", 1.6e6, 0.625e-6, 1.25e-6, 512e6, 100.0
+)
+
+
+def weights(window: str = "hann") -> NDArray[np.float64]:
+    """Return the window over the subcarriers."""
+    return window_weights(window, len(WAVE.codes))
+
+
+def flown(*, apart: bool, length_m: float = 8.0, pulses: int = 160, height_m: float = HEIGHT_M) -> Aperture:
+    """Return a straight pass eastward at north 0; the receiver ahead, aside and above."""
+    along = np.linspace(-length_m / 2, length_m / 2, pulses)
+    track = np.stack([along, 0 * along, np.full(pulses, height_m)], -1)
+    return Aperture(track, track + ([5.0, -1.5, 1.0] if apart else 0.0))
+
+
+def beams(aperture: Aperture) -> Beams:
+    """Return beams of both antennas to the north, a little down."""
+    body = np.broadcast_to(np.diag([1.0, -1.0, -1.0]), (len(aperture), 3, 3))
+    limits = np.pi, np.pi / 2
+    cuts = (gaussian_cut(width, cutoff_db=-40.0, limit_rad=most) for width, most in zip(WIDTH_DEG, limits, strict=True))
+    one = Beam(antenna_axes(body, (-90.0, -15.0)), *(part for cut in cuts for part in cut))
+    return Beams(one, one)
+
+
+def counts(
+    points: Scatterers, aperture: Aperture, gain: NDArray[np.float64], generator: np.random.Generator | None
+) -> NDArray[np.complex64]:
+    """Return transfer functions in the numbers that a receiver with `RADIO` records."""
+    geometry = Geometry(aperture.tx_m, aperture.rx_m, aperture.tx_m, aperture.rx_m, gain=gain)
+    clean = Impairments()
+    times = np.arange(len(aperture)) / WAVE.prf_hz
+    draw = draw_impairments(clean, times, WAVE.sample_rate_hz, np.random.default_rng(0))
+    channel = receive(WAVE, points, geometry, impairments=clean, draw=draw, transmitter=clean, sidelink=False)["radar"]
+    channel = physical(channel, transmitter=RADIO, receiver=RADIO)
+    scale = COUNTS / float(channel.full_scale or 1.0)
+    return np.asarray(transfer_functions(channel, generator) * scale, np.complex64)
+
+
+def constant() -> float:
+    """Return K of the link."""
+    wavelength_m = C / centre_frequency(WAVE.frequency_hz)
+    return LINK.constant(wavelength_m=wavelength_m, sent_power=float((np.abs(WAVE.codes) ** 2).sum()))
+
+
+def calibration(grid: SceneGrid, aperture: Aperture, weighing: Beams | None, window: str = "hann") -> Calibration:
+    """Return the calibration of an image."""
+    cell_m2 = cell_constant(WAVE.frequency_hz, weights(window))
+    return Calibration.of(grid, FlatGround(0.0), aperture, weighing, constant=constant(), cell_m2=cell_m2)
+
+
+def history(echo: NDArray[np.complex64], aperture: Aperture, window: str = "hann") -> PhaseHistory:
+    """Return transfer functions as an engine takes them."""
+    return PhaseHistory(echo, WAVE.frequency_hz, weights(window), np.zeros(len(aperture)), aperture)
+
+
+def cross_section(
+    rcs_m2: float, range_m: float, squint_deg: float, *, apart: bool, seed: int | None
+) -> tuple[float, float]:
+    """Return the error of a point's cross-section in its image and what it scatters by as told, dB."""
+    aperture = flown(apart=apart)
+    level_m, turn = np.sqrt(range_m**2 - HEIGHT_M**2), np.radians(squint_deg)
+    place = np.array([[level_m * np.sin(turn), level_m * np.cos(turn), 0.0]])
+    weighing = beams(aperture)
+    generator = None if seed is None else np.random.default_rng(seed)
+    echo = counts(
+        Scatterers(place, np.array([rcs_m2**0.5 + 0j])), aperture, weighing.weight(aperture, place), generator
+    )
+    spacing_m = 0.12 if range_m < 60 else 0.2
+    grid = SceneGrid("local", place[0, 0] - 32 * spacing_m, place[0, 1] + 32 * spacing_m, spacing_m, (64, 64))
+    given = history(echo, aperture)
+    image = reference.form(given, grid.positions(0.0), beams=weighing) / len(aperture)
+    point = bright_point(image.astype(np.complex64), 32, 32)
+    per_m2, share = calibration(grid, aperture, weighing).at(grid.positions_at([point.row], [point.column], 0.0))
+    pulse = 0.0
+    if generator is not None:
+        pulse = LINK.pulse_noise(6.0, spacing_hz=WAVE.subcarrier_spacing_hz, squares=float((weights() ** 2).sum()))
+    noise = float(share[0]) * pulse
+    found = max(point.amplitude**2 - noise, 1e-30) / per_m2[0]
+    # the ring around a point without noise holds its own sidelobes: they are no error of it
+    inverse = 0.0 if generator is None else max(noise / point.amplitude**2, point.background)
+    scatter_db = 10 / np.log(10) * np.sqrt(2 * inverse + inverse**2)
+    return 10 * float(np.log10(found / rcs_m2)), float(scatter_db)
+
+
+def points(draws: int) -> None:
+    """Print errors of cross-sections without noise, and how often noisy ones lie within two standard deviations."""
+    generator = np.random.default_rng(5)
+    for apart in (False, True):
+        cases = list(product(RCS_M2, RANGES_M, SQUINTS_DEG))
+        errors = [abs(cross_section(*case, apart=apart, seed=None)[0]) for case in cases]
+        kind = "bistatic" if apart else "monostatic"
+        print(f"{kind}: {len(cases)} points without noise: off by {max(errors):.3f} dB at most", flush=True)
+        inside, lost, scatter, draw = 0, 0, list[float](), 0
+        while len(scatter) < draws:
+            draw += 1
+            case = cases[int(generator.integers(len(cases)))]
+            wrong_db = STATED_STD_DB * generator.standard_normal()  # of the radio, as stated
+            error_db, scatter_db = cross_section(*case, apart=apart, seed=draw)
+            if scatter_db > UNTOLD_DB:
+                lost += 1
+                continue
+            std_db = float(np.hypot(scatter_db, STATED_STD_DB))
+            inside += abs(error_db + wrong_db) < 1.96 * std_db
+            scatter.append(scatter_db)
+        print(
+            f"{kind}: {inside} of {draws} noisy draws within 1.96 of their standard deviation "
+            f"(scatter {min(scatter):.2f} to {max(scatter):.2f} dB; {lost} more below 10 dB above noise)",
+            flush=True,
+        )
+
+
+def clutter(sigma0: float = 0.02) -> None:
+    """Print the mean σ⁰ of ground over incidence, against what was put."""
+    for apart, window in product((False, True), ("hann", "none")):
+        height_m = 25.0
+        aperture = flown(apart=apart, length_m=10.0, pulses=220, height_m=height_m)
+        generator = np.random.default_rng(8)
+        east, north = (-45.0, 45.0), (6.0, 85.0)
+        area, density = (east[1] - east[0]) * (north[1] - north[0]), 12.0
+        count = round(area * density)
+        place = np.column_stack([generator.uniform(*east, count), generator.uniform(*north, count), np.zeros(count)])
+        amplitude = generator.standard_normal((count, 2)) @ [1, 1j] * np.sqrt(sigma0 / density / 2)
+        echo = transfer(Scatterers(place, amplitude), aperture, WAVE.frequency_hz, gridded=True)
+        echo = np.asarray(echo * np.sqrt(constant()), np.complex64)
+        grid = SceneGrid("local", -22.0, 70.0, 0.1, (580, 440))
+        profiles = range_compress(history(echo, aperture, window), grid, FlatGround(0.0))
+        image = np.asarray(backproject(profiles, grid, terrain=FlatGround(0.0), integration="all"))
+        whole = (slice(0, 580), slice(0, 440))
+        found = np.abs(image) ** 2 / calibration(grid, aperture, None, window).power(whole, "sigma0")
+        incidence = np.degrees(np.arctan2(grid.y_m, height_m))
+        rows = []
+        for low in range(30, 70, 10):
+            band = found[(incidence >= low) & (incidence < low + 10)]
+            if band.size:
+                rows.append(f"{low}-{low + 10}°: {10 * np.log10(band.mean() / sigma0):+.2f}")
+        kind = "bistatic" if apart else "monostatic"
+        print(f"{kind}, {window}: σ⁰ off by (dB) {', '.join(rows)}; whole {10 * np.log10(found.mean() / sigma0):+.2f}")
+
+
+def noise(draws: int = 8) -> None:
+    """Print the noise figure that profiles of echoes and thermal noise have, against that put."""
+    aperture = flown(apart=False, length_m=20.0, pulses=2048, height_m=10.0)
+    grid = SceneGrid("local", -8.0, 36.0, 0.1, (160, 160))
+    weighing = beams(aperture)
+    places = np.array([[2.0, 25.0, 0.0], [-5.0, 30.0, 0.0]])
+    told = []
+    for draw in range(draws):
+        gain = weighing.weight(aperture, places)
+        echo = counts(Scatterers(places, np.array([1.0, 3.0 + 0j])), aperture, gain, np.random.default_rng(draw))
+        profiles = range_compress(history(echo, aperture), grid, FlatGround(0.0))
+        rows, columns = np.random.default_rng(draw).integers(0, grid.shape, (64, 2)).T
+        measured = noise_power(profiles, grid.positions_at(rows, columns, 0.0), beams=weighing)
+        thermal = LINK.pulse_noise(0.0, spacing_hz=WAVE.subcarrier_spacing_hz, squares=float((weights() ** 2).sum()))
+        told.append(10 * float(np.log10(measured / thermal)))
+    spread = f"{min(told):.2f} to {max(told):.2f} dB, mean {np.mean(told):.2f} dB"
+    print(f"noise figure 6 dB, measured below echoes: {spread} in {draws} draws")
+
+
+PARTS = {"points": points, "clutter": lambda _: clutter(), "noise": lambda _: noise()}
+
+
+def main() -> None:
+    """Print what was measured."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("parts", nargs="*", choices=[*PARTS, []], help="all by default")
+    parser.add_argument("--draws", type=int, default=100)
+    given = parser.parse_args()
+    for name in given.parts or PARTS:
+        PARTS[name](given.draws)
+
+
+if __name__ == "__main__":
+    main()

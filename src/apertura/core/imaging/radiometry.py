@@ -1,0 +1,375 @@
+"""Radiometry of an image: from the power of a pixel to the radar cross-section of a point, and to σ⁰ of ground."""
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apertura.common.arrays import Floats
+from apertura.common.constants import BOLTZMANN_J_K, REFERENCE_K, SPEED_OF_LIGHT_M_S
+from apertura.common.contracts import Window
+from apertura.core.antenna.beam import Beams
+from apertura.core.antenna.illumination import illumination_mask
+from apertura.core.geometry.aperture import Aperture
+from apertura.core.scene.grid import SceneGrid
+from apertura.core.scene.looks import BLOCK_PX, Lattice
+from apertura.core.scene.swath import balls
+from apertura.core.scene.terrain import FlatGround, Terrain
+
+Quantity = Literal["sigma0", "beta0", "gamma0"]
+
+# ---- The radio link of a pair: radar cross-section to numbers recorded
+
+
+@dataclass(frozen=True)
+class Link:
+    """What lies between the radar cross-section of a target and the numbers that a receiver records of it.
+
+    Attributes
+    ----------
+    transmit_power_dbm
+        Mean power of the signal while it is sent, at the port of the transmitting antenna.
+    transmit_gain_dbi, receive_gain_dbi
+        Peak gains of the antennas; patterns are relative to them.
+    receiver_gain_db
+        From the port of the receiving antenna to the converter.
+    full_scale_dbm
+        Power at the converter of a complex sine whose |I + jQ| is `full_scale_counts`.
+    full_scale_counts
+        In the numbers recorded.
+
+    Examples
+    --------
+    >>> link = Link(30.0, 10.0, 10.0, 40.0, 0.0, 8192.0)
+    >>> round(link.constant(wavelength_m=0.25, sent_power=1.0) / link.counts_w * (4 * np.pi) ** 3 / 0.25**2, 6)
+    100.0
+    """
+
+    transmit_power_dbm: float
+    transmit_gain_dbi: float
+    receive_gain_dbi: float
+    receiver_gain_db: float
+    full_scale_dbm: float
+    full_scale_counts: float
+
+    @property
+    def counts_w(self) -> float:
+        """|y|² of the numbers recorded per watt at the receiving antenna's port."""
+        return self.full_scale_counts**2 * 10 ** ((self.receiver_gain_db - self.full_scale_dbm + 30) / 10)
+
+    def constant(self, *, wavelength_m: float, sent_power: float) -> float:
+        """Return K of docs/theory/radiometry.md, eq. 2: |H|² of 1 m² at R_tx·R_rx = 1 m², on both boresights.
+
+        Parameters
+        ----------
+        wavelength_m
+            At the middle of the band.
+        sent_power
+            Mean |s|² of the transmitted signal in the units that echoes are divided by: Σ|c_n|² of an OFDM symbol.
+        """
+        sent_dbw = self.transmit_power_dbm - 30 + self.transmit_gain_dbi + self.receive_gain_dbi
+        return 10 ** (sent_dbw / 10) * wavelength_m**2 / (4 * np.pi) ** 3 * self.counts_w / sent_power
+
+    def pulse_noise(self, noise_figure_db: float, *, spacing_hz: float, squares: float) -> float:
+        """Return the power of thermal noise in a range profile, kT₀F over the DFT's bins: eq. 8.
+
+        Parameters
+        ----------
+        noise_figure_db
+            Of the receiver, at the antenna's port.
+        spacing_hz
+            Δf, bandwidth of a bin.
+        squares
+            Σw_n²/|c_n|²: window over the subcarriers, and codes by which echoes are divided.
+        """
+        noise_w = BOLTZMANN_J_K * REFERENCE_K * 10 ** (noise_figure_db / 10) * spacing_hz
+        return noise_w * self.counts_w * squares
+
+
+def cell_constant(frequency_hz: Floats, weight: Floats) -> float:
+    """Return c²/Δf · Σ w_n²/f_n, m²: what the band contributes to the area of a resolution cell (eq. 5).
+
+    λ·c/B of a flat band without window.
+
+    Parameters
+    ----------
+    frequency_hz, weight
+        (subcarrier,) float64, in equal steps; weights that sum to 1.
+
+    Examples
+    --------
+    >>> frequency = 1.2e9 + 1e5 * (np.arange(1000) - 500)
+    >>> round(cell_constant(frequency, np.full(1000, 1e-3)) / (0.25 * 3.0), 2)
+    1.0
+    """
+    spacing_hz = (frequency_hz[-1] - frequency_hz[0]) / (len(frequency_hz) - 1)
+    return float(SPEED_OF_LIGHT_M_S**2 / spacing_hz * (weight**2 / frequency_hz).sum())
+
+
+# ---- Calibration of an image, on a lattice
+
+_PITCHES_PX = (128, 64, 32, 16)  # of the lattice, the widest that is no wider than
+_RANGE_SHARE = 24  # ranges to the scene: logarithms of gain and area between nodes then err by 0.1 dB in a beam of 20°
+_PULSES = 128  # summed for a block of the lattice, or up to twice as many
+_POINT_PULSES = 8192  # summed for a point, or up to twice as many
+_BINS = 32  # of the density of pulses over spatial frequency, whose square is integrated
+_AT_ONCE = 64  # pulses whose illumination is decided together
+_LEAST = 1e-3  # of the strongest pulse: weaker ones do not decide how wide the aperture is
+_STEEPEST = 1e-2  # cosine between surface and slant plane below which a cell has no area of its own: layover
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """What turns the power of an image's pixels into radar cross-section and backscattering coefficients.
+
+    Attributes
+    ----------
+    grid, terrain
+        The scene.
+    aperture, beams
+        Every pulse, and its weights as they formed the image: antennas and sector.
+    count
+        M, by which the image's sum was divided.
+    constant
+        K of eq. 2, stated or measured.
+    cell_m2
+        Of `cell_constant`.
+    lattice
+        Nodes at which the following are computed.
+    gain, area_m2, noise
+        (node row, node column) float64: ln A² (eq. 3), ln of the cell's area on level ground (eq. 5), and ln Σw²/M² of
+        the pixel's noise; -inf where no pulse sees the node.
+    directions
+        (node row, node column, 3, 3) float64, unit vectors: up, normal of the slant plane, towards the bisector of
+        both antennas.
+
+    Notes
+    -----
+    Source: docs/theory/radiometry.md.
+    """
+
+    grid: SceneGrid
+    terrain: Terrain
+    aperture: Aperture
+    beams: Beams | None
+    count: int
+    constant: float
+    cell_m2: float
+    lattice: Lattice
+    gain: Floats
+    area_m2: Floats
+    noise: Floats
+    directions: Floats
+
+    @classmethod
+    def of(
+        cls,
+        grid: SceneGrid,
+        terrain: Terrain,
+        aperture: Aperture,
+        beams: Beams | None,
+        *,
+        constant: float,
+        cell_m2: float,
+        count: int | None = None,
+        threads: int = 1,
+    ) -> "Calibration":
+        """Return the calibration of an image.
+
+        Parameters
+        ----------
+        grid, terrain, aperture, beams, constant, cell_m2, count
+            As of `Calibration`; positions in the grid's processing frame; `count` is every pulse by default.
+        threads
+            Blocks of the lattice in work at once.
+
+        Examples
+        --------
+        >>> grid = SceneGrid("local", -4.0, 24.0, 0.5, (8, 16))
+        >>> track = np.stack([np.linspace(-9, 9, 37), np.zeros(37), np.full(37, 10.0)], -1)
+        >>> one = Calibration.of(grid, FlatGround(0.0), Aperture(track, track), None, constant=2.0, cell_m2=0.25 * 3.0)
+        >>> window = (slice(4, 5), slice(8, 9))
+        >>> per_m2, level = one.rcs_power(window)[0, 0], one.cell(window)[0, 0]
+        >>> bool(abs(per_m2 / (2 / 580**2) - 1) < 0.2), level.round(2)  # about 2/R⁴
+        (True, np.float64(0.28))
+        """
+        lattice = Lattice.of(grid.shape, _pitch_px(grid, terrain, aperture))
+        gain, area, noise = (np.full(lattice.shape, -np.inf) for _ in range(3))
+        found = cls(
+            grid,
+            terrain,
+            aperture,
+            beams,
+            count or len(aperture),
+            constant,
+            cell_m2,
+            lattice,
+            gain,
+            area,
+            noise,
+            np.zeros((*lattice.shape, 3, 3)),
+        )
+        tiles = list(grid.tiles(BLOCK_PX))
+        blocks = illumination_mask(beams, aperture, *balls(grid, terrain, tiles), pulses=_AT_ONCE)
+        with ThreadPoolExecutor(threads) as pool:
+            list(pool.map(found._fill, lattice.blocks, blocks.T))
+        return found
+
+    def _fill(self, block: Window, reaching: NDArray[np.bool_]) -> None:
+        """Compute the nodes of a block of the lattice from the pulses that may illuminate it."""
+        rows, columns = (at[part] for at, part in zip(self.lattice.nodes, block, strict=True))
+        row, column = (one.ravel() for one in np.meshgrid(rows, columns, indexing="ij"))
+        height_m = np.asarray(self.terrain.heights_at(self.grid, row, column), np.float64)
+        points, above = (self.grid.positions_at(row, column, height_m + more) for more in (0.0, 1.0))
+        up = (above - points) / np.linalg.norm(above - points, axis=-1, keepdims=True)
+        reached = np.flatnonzero(reaching)
+        first, last = (0, len(self.aperture))
+        if reached.size:
+            first, last = int(reached[0]) * _AT_ONCE, min(int(reached[-1] + 1) * _AT_ONCE, last)
+        every = max(1, (last - first) // _PULSES)
+        some, share = slice(first, last, every), every / self.count
+        gradient = self.aperture[some].path_gradient(points)
+        share_of, weight = self._parts(some, points)
+        amplitude = share_of.sum(axis=0) * share
+        slant, towards = _directions(gradient, share_of, up)
+        level = np.array([_spread(*one) for one in zip(gradient.swapaxes(0, 1), share_of.T, up, strict=True)])
+        shape = (len(rows), len(columns))
+        with np.errstate(divide="ignore"):
+            self.gain[block] = 2 * np.log(amplitude).reshape(shape)
+            self.area_m2[block] = np.log(self.cell_m2 * level).reshape(shape)
+            self.noise[block] = np.log((weight**2).sum(axis=0) * share / self.count).reshape(shape)
+        self.directions[block] = np.stack([up, slant, towards], axis=1).reshape(*shape, 3, 3)
+
+    def _parts(self, pulses: slice, points: Floats) -> tuple[Floats, Floats]:
+        """Return what each pulse adds to a point target, w·f/(R_tx·R_rx), and w, (pulse, point) each."""
+        aperture, beams = self.aperture[pulses], self.beams and self.beams[pulses]
+        there, back = (np.linalg.norm(points - leg[:, None], axis=-1) for leg in aperture.legs)
+        weight = np.ones(there.shape) if beams is None else beams.weight(aperture, points)
+        antennas = beams and beams.antennas
+        field = 1.0 if antennas is None else antennas.weight(aperture, points)
+        return weight * field / (there * back), weight
+
+    def at(self, points: Floats) -> tuple[Floats, Floats]:
+        """Return the power of 1 m² in the image, K·A², and of the noise in units of a pulse's, at points.
+
+        Parameters
+        ----------
+        points
+            (point, 3) float64, metres, in the frame of the aperture.
+
+        Returns
+        -------
+        tuple of ndarray
+            (point,) float64 each; zero where no pulse sees the point.
+        """
+        some = self.aperture.sample(_POINT_PULSES)
+        share = some.step / self.count
+        parts, weight = self._parts(some, points)
+        return self.constant * (parts.sum(axis=0) * share) ** 2, (weight**2).sum(axis=0) * share / self.count
+
+    def _between(self, logarithms: Floats, window: Window) -> Floats:
+        """Return values at the pixels of a window, between those nodes that have any; NaN where none has."""
+        known = np.isfinite(logarithms)
+        share = self.lattice.between(known.astype(np.float64), window)
+        mean = self.lattice.between(np.where(known, logarithms, 0.0), window)
+        return np.where(share > 0, np.exp(mean / np.where(share > 0, share, 1.0)), np.nan)
+
+    def rcs_power(self, window: Window) -> Floats:
+        """Return the power |I|² of a point of 1 m² at each pixel of a window, K·A²; NaN where nothing sees it."""
+        return self.constant * self._between(self.gain, window)
+
+    def cell(self, window: Window) -> Floats:
+        """Return the area of a resolution cell on level ground, m², at each pixel of a window."""
+        return self._between(self.area_m2, window)
+
+    def pixel_noise(self, window: Window) -> Floats:
+        """Return the noise of each pixel of a window in units of a pulse's, Σw²/M²."""
+        return self._between(self.noise, window)
+
+    def power(self, window: Window, quantity: Quantity, normal: Floats | None = None) -> Floats:
+        """Return the mean power |I|² of ground whose σ⁰, β⁰ or γ⁰ is 1, at each pixel of a window.
+
+        Parameters
+        ----------
+        window
+            Of the grid.
+        quantity
+            sigma0, per area of ground; beta0, per area of the slant plane; gamma0, per area across the bisector.
+        normal
+            (row, column, 3) float64, unit normals of the ground, upward; level ground by default.
+
+        Returns
+        -------
+        ndarray
+            (row, column) float64, NaN where no pulse sees the pixel, or the ground faces away (gamma0).
+        """
+        level = self.rcs_power(window) * self.cell(window)
+        if quantity == "sigma0" and (normal is None or isinstance(self.terrain, FlatGround)):
+            return level
+        up, slant, towards = np.moveaxis(self.lattice.between(self.directions, window), -2, 0)
+        slant, towards = _unit(slant), _unit(towards)
+        normal = up if normal is None else normal
+        in_plane = level * np.abs((up * slant).sum(-1))
+        if quantity == "beta0":
+            return np.asarray(in_plane)
+        sigma0 = in_plane / np.maximum(np.abs((normal * slant).sum(-1)), _STEEPEST)
+        if quantity == "sigma0":
+            return np.asarray(sigma0)
+        cosine = (normal * towards).sum(-1)
+        return np.asarray(sigma0 * np.where(cosine > 0, cosine, np.nan))
+
+
+def _pitch_px(grid: SceneGrid, terrain: Terrain, aperture: Aperture) -> int:
+    middle = terrain.positions_at(grid, *(np.array([size // 2]) for size in grid.shape))
+    few = aperture[aperture.sample(_PULSES)]
+    nearest_m = min(float(np.linalg.norm(leg - middle, axis=-1).min()) for leg in few.legs)
+    most = nearest_m / _RANGE_SHARE / grid.spacing_m
+    return next((pitch for pitch in _PITCHES_PX if pitch <= most), _PITCHES_PX[-1])
+
+
+def _directions(gradient: Floats, parts: Floats, up: Floats) -> tuple[Floats, Floats]:
+    """Return the normals of the slant planes, on the side of up, and directions towards the bisectors, (point, 3)."""
+    size = np.abs(parts)
+    weight = size / np.maximum(size.sum(axis=0), 1e-300)
+    mean = np.einsum("pk,pkc->kc", weight, gradient)
+    apart = gradient - mean
+    spread = np.einsum("pk,pkc,pkd->kcd", weight, apart, apart)
+    slant = np.cross(mean, np.linalg.eigh(spread)[1][..., -1])
+    slant *= np.where((slant * up).sum(-1, keepdims=True) < 0, -1.0, 1.0)
+    return _unit(slant), _unit(-mean)
+
+
+def _unit(vectors: Floats) -> Floats:
+    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-300))
+
+
+def _spread(gradient: Floats, parts: Floats, up: Floats) -> float:
+    """Return ∫(dU/ds)² ds / U² of a place, per unit of spatial frequency on level ground: eq. 5.
+
+    Pulses are sorted by azimuth, so that a track which wobbles or passes twice is counted as it adds up, and their
+    density is taken over parts of the aperture, since what is finer scatters far beyond the cell.
+    """
+    size = np.abs(parts)
+    counts = size > _LEAST * size.max(initial=0.0)
+    if counts.sum() < 2:
+        return float("nan")
+    gradient, parts = gradient[counts], parts[counts]
+    level = gradient - (gradient @ up)[:, None] * up
+    mean = parts @ level
+    ahead = mean / max(float(np.linalg.norm(mean)), 1e-300)
+    across = np.cross(up, ahead)
+    azimuth = np.arctan2(level @ across, level @ ahead)
+    order = np.argsort(azimuth, kind="stable")
+    parts, squared = parts[order], (level[order] ** 2).sum(axis=-1)
+    steps = np.diff(azimuth[order]) * (squared[1:] + squared[:-1]) / 2
+    place = np.concatenate([[0.0], np.cumsum(steps)])
+    if not place[-1] > 0:
+        return float("nan")
+    edge = place[-1] / (2 * (len(place) - 1))  # a pulse stands for half a step on both sides
+    place = np.concatenate([[-edge], place, [place[-1] + edge]])
+    summed = np.concatenate([[0.0], np.cumsum(parts) - parts / 2, [parts.sum()]])
+    bins = np.linspace(place[0], place[-1], min(_BINS, len(parts)) + 1)
+    density = np.diff(np.interp(bins, place, summed))
+    return float((density**2).sum() / ((bins[1] - bins[0]) * summed[-1] ** 2))
