@@ -7,7 +7,7 @@ from typing import Any
 from apertura.common.documents import undamaged
 from apertura.common.errors import shown
 from apertura.common.flag_table import FLAGS
-from apertura.core.quality.budget import is_counted, is_stated
+from apertura.core.quality.budget import is_counted
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.store import open_listed
 
@@ -74,7 +74,7 @@ class ImageValues:
             focus.get("loss_db"),
             focus.get("expected_db"),
             worst["cause"] if worst else "",
-            tuple(line["cause"] for line in budget if not is_stated(line)),
+            tuple(line["cause"] for line in budget if not is_counted(line)),
             float(report["numerical_error_db"]),
             used,
             (used or 0) + (pulses.get("dropped") or 0),
