@@ -37,7 +37,7 @@ class ImageValues:
     worst_cause
         Of the causes stated, the one that the budget expects to cost most.
     not_stated
-        Causes of the budget whose size nobody has stated.
+        Causes of the budget whose size nobody has stated and nothing is assumed for.
     error_db
         Bound of the numerical error, dB.
     used, recorded
