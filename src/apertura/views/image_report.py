@@ -7,7 +7,7 @@ from typing import Any
 from apertura.common.documents import undamaged
 from apertura.common.errors import shown
 from apertura.common.flag_table import FLAGS
-from apertura.core.quality.budget import is_counted, is_stated
+from apertura.core.quality.budget import is_counted
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.store import open_listed
 
@@ -37,7 +37,7 @@ class ImageValues:
     worst_cause
         Of the causes stated, the one that the budget expects to cost most.
     not_stated
-        Causes of the budget whose size nobody has stated.
+        Causes of the budget whose size nobody has stated and nothing is assumed for.
     error_db
         Bound of the numerical error, dB.
     used, recorded
@@ -74,7 +74,7 @@ class ImageValues:
             focus.get("loss_db"),
             focus.get("expected_db"),
             worst["cause"] if worst else "",
-            tuple(line["cause"] for line in budget if not is_stated(line)),
+            tuple(line["cause"] for line in budget if not is_counted(line)),
             float(report["numerical_error_db"]),
             used,
             (used or 0) + (pulses.get("dropped") or 0),
