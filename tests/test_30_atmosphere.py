@@ -178,6 +178,7 @@ def test_histories_that_a_reader_joins_are_of_vacuum_until_a_campaign_says_other
 # ---- Who takes vacuum -----------------------------------------------------------------------------------------------
 
 _SIZE = "sizes of cells, searches, windows or grids, and limits of checks: 0.03 % of them is nothing"
+_POWER = "wavelength of the radar equation: 0.003 dB"
 _DRAWN = "what is drawn or listed"
 _ELECTRICAL = "electrical paths: cables, delays given as c times seconds"
 _DEFAULT = "where arrays state no speed of their own"
@@ -194,6 +195,7 @@ VACUUM = {
     "core/focus/inputs.py": _DEFAULT,
     "core/focus/job.py": _DEFAULT,
     "core/imaging/range_profiles.py": _DEFAULT,
+    "core/imaging/radiometry.py": _POWER,
     "core/imaging/job.py": f"{_DEFAULT}; {_SIZE}",
     "core/echo/compression.py": _DEFAULT,
     "core/echo/calibration.py": _ELECTRICAL,
@@ -216,6 +218,7 @@ VACUUM = {
     "simulation/echoes.py": "delay of an optical path",
     "simulation/fmcw.py": "flies in vacuum, and its config says so",
     "simulation/gridding.py": "as simulation/echoes.py's plain sum, of arrays in vacuum",
+    "simulation/observation.py": _POWER,
     "simulation/synthesis.py": "excess of reflections beside the sidelink",
     "pipeline/check/reach.py": _SIZE,
     "pipeline/resources.py": _SIZE,
@@ -224,6 +227,7 @@ VACUUM = {
     "pipeline/opening/diagnosis.py": _SIZE,
     "pipeline/opening/echo.py": _ELECTRICAL,
     "pipeline/opening/node_log.py": _SIZE,
+    "pipeline/opening/radiometry.py": _POWER,
     "pipeline/opening/pair.py": _ELECTRICAL,
     "pipeline/steps/calibration.py": _ELECTRICAL,
     "views/inspect/pictures.py": _DRAWN,

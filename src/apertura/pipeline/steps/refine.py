@@ -10,7 +10,6 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from apertura.common.arrays import Floats
-from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.flags import Flags
 from apertura.common.provenance import merged
 from apertura.core.focus.inputs import Profiles
@@ -98,7 +97,7 @@ def _causes(
     for node in logged:
         yield late_logs([node], flown)
         time_s, _ = flown[node]
-        wave_m = SPEED_OF_LIGHT_M_S / records[0].profiles.centre_frequency_hz
+        wave_m = 2 * np.pi / records[0].profiles.wavenumber_rad_m
         log = raw_log(campaign, flight, node, wave_m)
         if log.has_attitude:
             yield other_arm(node, time_s, log.body_axes(began + (1e9 * time_s).astype("timedelta64[ns]")))
