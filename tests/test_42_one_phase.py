@@ -10,7 +10,6 @@ from spoiling.logs import read_log, write_log
 from spoiling.of_logs import noisy
 from track_noise import saying
 
-from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.imaging.range_profiles import profiles_of
 from apertura.methods.autofocus.one_phase import METHODS, MOST_LOSS_DB, SpaceVariance
 from apertura.methods.autofocus.patches import Candidates
@@ -110,7 +109,7 @@ def test_what_was_found_is_what_images_use(campaigns):
         assert np.std(further_m) > 0.01
         np.testing.assert_allclose(moved.start_m - profiles.start_m, further_m, atol=1e-8)
         delayed_s = imaged.history.reference_delay_s - pair.history.reference_delay_s
-        np.testing.assert_allclose(SPEED_OF_LIGHT_M_S * delayed_s, further_m, atol=1e-8)
+        np.testing.assert_allclose(pair.history.wave_speed_m_s * delayed_s, further_m, atol=1e-8)
         np.testing.assert_array_equal(imaged.aperture.tx_m, pair.aperture.tx_m)
 
 

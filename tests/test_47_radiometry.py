@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import rasterio
-from folders import complaint, edit_config, export_flight, run_steps
+from folders import complaint, copy_writable, edit_config, export_flight, run_steps
 
 from apertura.core.quality.bright_points import BrightPoint
 from apertura.formats.export import product_files
@@ -15,6 +15,7 @@ from apertura.pipeline.lineage import result_of
 from apertura.pipeline.opening.pair import open_pair
 from apertura.pipeline.opening.radiometry import calibrated_pair
 from apertura.pipeline.opening.scene import open_scene
+from apertura.pipeline.steps.layers import layers
 from apertura.simulation import GaussianBeam, ImageGrid, PointTarget, Radio, preset, simulate
 from apertura.views.score import score
 
@@ -149,3 +150,14 @@ def test_a_peak_of_noise_has_no_cross_section(flown):
     told, untold = calibrated.points(points, scene, 1e-9)
     assert told["std_db"] > 1
     assert untold["rcs_m2"] is None
+
+
+@pytest.mark.slow
+def test_a_coefficient_that_is_no_longer_asked_for_goes(flown, tmp_path):
+    """Of an old radio it would lie beside an image of the new one."""
+    root = copy_writable(flown.root, tmp_path / "campaign")
+    edit_config(root, lambda document: document.setdefault("processing", {}).update(radiometry=["gamma0"]))
+    campaign = Campaign.load(root)
+    layers(campaign, "f01", "uav1-uav1")
+    folder = campaign.result("f01", "uav1-uav1")
+    assert [path.name for path in sorted(folder.glob("*0_db.*"))] == ["gamma0_db.qml", "gamma0_db.tif"]

@@ -311,6 +311,7 @@ def cphd() -> list[bytes]:
             np.eye(3),
             (-5.0, -5.0, 5.0, 5.0),
             0.5,
+            299_700_000.0,
             {"APERTURA_FRAME": "ecef"},
         )
         with TemporaryDirectory() as folder:

@@ -1,9 +1,10 @@
 """Radiometry of a raster: meaning of its values, in words for the band and as JSON for the tag."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from math import log10
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from apertura.common.provenance import canonical_json
@@ -72,6 +73,16 @@ _COEFFICIENTS = {
 
 CF_SIGMA0 = "surface_backwards_scattering_coefficient_of_radar_wave"
 """Standard name of σ⁰ in CF (Standard Name Table); γ⁰ and β⁰ have none."""
+
+
+def remove_outdated(folder: Path, written: Collection[Path]) -> None:
+    """Remove coefficients and cross-sections that an earlier run wrote into a folder and this one did not."""
+    for name in (
+        *(f"{one}_db{suffix}" for one in _COEFFICIENTS for suffix in (".tif", ".qml", ".vrt")),
+        CROSS_SECTIONS,
+    ):
+        if folder / name not in written:
+            (folder / name).unlink(missing_ok=True)
 
 
 def of_coefficient(name: str, *, std_db: float | None, noise: str = "in it") -> dict[str, Any]:

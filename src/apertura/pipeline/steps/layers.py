@@ -25,7 +25,7 @@ from apertura.core.scene.terrain import FlatGround, Terrain
 from apertura.core.scene.visibility import Relief, bistatic_angle_deg, incidence_deg, surface_normals, visibility
 from apertura.formats.export import write_exports
 from apertura.formats.export.layers import OUTSIDE
-from apertura.formats.export.radiometry import CROSS_SECTIONS, of_coefficient
+from apertura.formats.export.radiometry import CROSS_SECTIONS, of_coefficient, remove_outdated
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.lineage import result_of
 from apertura.pipeline.opening.pair import open_pair, pattern_digests
@@ -83,6 +83,7 @@ def layers(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> l
     if calibrated is not None and image is not None:
         written.append(folder / CROSS_SECTIONS)
         write_json(written[-1], _report(scene, image, calibrated, noise))
+    remove_outdated(folder, written)
     record_files(campaign.root / lineage.result.manifest, written, lineage)
     return written
 

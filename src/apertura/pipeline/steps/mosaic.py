@@ -7,6 +7,7 @@ from apertura.common.errors import CampaignError
 from apertura.common.provenance import sha256_file
 from apertura.formats.export import MOSAICS, exports_in, mosaics
 from apertura.formats.export.mosaic import write_mosaic
+from apertura.formats.export.radiometry import remove_outdated
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.lineage import result_of
 from apertura.pipeline.store import read_manifest, record_files
@@ -35,6 +36,8 @@ def mosaic(campaign: Campaign) -> list[Path]:
         if style := styles.get(path.with_suffix(".qml").name):
             written.append(path.with_suffix(".qml"))
             style.write(written[-1])
+    for folder in {path.parent for path in written}:
+        remove_outdated(folder, written)
     record_files(campaign.root / lineage.result.manifest, written, lineage)
     return written
 
