@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.common.arrays import Complexes, Floats
-from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.echo.transfer import transfer_by_code
 from apertura.core.focus.engines import reference
 from apertura.core.focus.inputs import PhaseHistory
@@ -81,7 +80,7 @@ def profiles_at(history: PhaseHistory, slant_m: Floats) -> Complexes:
 
     Σ_n w_n G_n exp(j2πf_nτ), the inner sum of eq. 6 of docs/theory.md, as one matrix product.
     """
-    turns = np.outer(history.frequency_hz, 2 * slant_m / SPEED_OF_LIGHT_M_S)
+    turns = np.outer(history.frequency_hz, 2 * slant_m / history.wave_speed_m_s)
     waves = np.exp(2j * np.pi * (turns % 1.0)).astype(np.complex64)
     return np.asarray((history.transfer * history.weight).astype(np.complex64) @ waves, np.complex64)
 
