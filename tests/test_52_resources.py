@@ -110,5 +110,7 @@ def job_of(path):
     if where == "fused":
         return "export_fused", SimpleNamespace(flight=folder[0])
     rule, _, share = rule.partition(".")
+    if where == rule:  # a flight's own folder
+        return rule, SimpleNamespace(flight=folder[0])
     key = "pair" if "-" in where else "node"
     return rule, SimpleNamespace(flight=folder[0], **{key: where}, **({"scatteritem": share} if share else {}))
