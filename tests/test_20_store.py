@@ -128,6 +128,14 @@ def test_a_folder_without_a_manifest_is_not_finished(tmp_path):
         open_stage(tmp_path / "track.zarr", "track")
 
 
+def test_a_stage_of_another_version_is_one_message(tmp_path):
+    save_stage(track().drop_vars("attitude"), tmp_path / "track.zarr")
+    with pytest.raises(
+        CampaignError, match=r"written by another version of apertura: .*attitude.*Run the workflow again"
+    ):
+        open_stage(tmp_path / "track.zarr", "track")
+
+
 def test_the_same_stage_gives_the_same_manifest(tmp_path):
     for name in ("a", "b"):
         save_stage(track(), tmp_path / name / "track.zarr")

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from apertura.common.atomic import naming, remove
 from apertura.common.contracts import check
+from apertura.common.errors import CampaignError, ContractError
 from apertura.common.progress import progress
 from apertura.pipeline.store.manifest import ResultOrigin, check_stage
 from apertura.pipeline.store.progress import create, finish, open_array, writing
@@ -54,16 +55,23 @@ def open_stage(folder: Path, stage: str) -> "xr.Dataset":
     Raises
     ------
     CampaignError
-        If the folder is missing or contradicts its manifest; on reading, if a chunk is damaged.
-    ContractError
-        If its arrays break the contract.
+        If the folder is missing, contradicts its manifest, or is whole and no such stage: another version's; on
+        reading, if a chunk is damaged.
     """
     import xarray as xr
 
     from apertura.pipeline.store.chunks import StageStore
 
     store = StageStore(folder, read_only=True, sha256=check_stage(folder))
-    return check(xr.open_zarr(store, consolidated=False, chunks=None), stage)
+    try:
+        return check(xr.open_zarr(store, consolidated=False, chunks=None), stage)
+    except ContractError as error:
+        raise CampaignError(
+            f"written by another version of apertura: {error}",
+            where=folder,
+            expected=f"stage {stage} as this version writes it",
+            remedy="Run the workflow again: it makes what another version made anew.",
+        ) from error
 
 
 # ---- Arrays written block by block along their first dimension ------------------------------------------------------
