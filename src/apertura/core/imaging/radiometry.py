@@ -14,7 +14,7 @@ from apertura.core.antenna.beam import Beams
 from apertura.core.antenna.illumination import illumination_mask
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.scene.grid import SceneGrid
-from apertura.core.scene.looks import BLOCK_PX, Lattice
+from apertura.core.scene.looks import AT_ONCE, BLOCK_PX, Lattice, pulses_of
 from apertura.core.scene.swath import balls
 from apertura.core.scene.terrain import FlatGround, Terrain
 
@@ -115,7 +115,6 @@ _RANGE_SHARE = 24  # ranges to the scene: logarithms of gain and area between no
 _PULSES = 128  # summed for a block of the lattice, or up to twice as many
 _POINT_PULSES = 8192  # summed for a point, or up to twice as many
 _BINS = 32  # of the density of pulses over spatial frequency, whose square is integrated
-_AT_ONCE = 64  # pulses whose illumination is decided together
 _LEAST = 1e-3  # of the strongest pulse: weaker ones do not decide how wide the aperture is
 _STEEPEST = 1e-2  # cosine between surface and slant plane below which a cell has no area of its own: layover
 
@@ -212,7 +211,7 @@ class Calibration:
             np.zeros((*lattice.shape, 3, 3)),
         )
         tiles = list(grid.tiles(BLOCK_PX))
-        blocks = illumination_mask(beams, aperture, *balls(grid, terrain, tiles), pulses=_AT_ONCE)
+        blocks = illumination_mask(beams, aperture, *balls(grid, terrain, tiles), pulses=AT_ONCE)
         with ThreadPoolExecutor(threads) as pool:
             list(pool.map(found._fill, lattice.blocks, blocks.T))
         return found
@@ -224,12 +223,9 @@ class Calibration:
         height_m = np.asarray(self.terrain.heights_at(self.grid, row, column), np.float64)
         points, above = (self.grid.positions_at(row, column, height_m + more) for more in (0.0, 1.0))
         up = (above - points) / np.linalg.norm(above - points, axis=-1, keepdims=True)
-        reached = np.flatnonzero(reaching)
-        first, last = (0, len(self.aperture))
-        if reached.size:
-            first, last = int(reached[0]) * _AT_ONCE, min(int(reached[-1] + 1) * _AT_ONCE, last)
-        every = max(1, (last - first) // _PULSES)
-        some, share = slice(first, last, every), every / self.count
+        reached = pulses_of(reaching, len(self.aperture))
+        every = max(1, (reached.stop - reached.start) // _PULSES)
+        some, share = slice(reached.start, reached.stop, every), every / self.count
         gradient = self.aperture[some].path_gradient(points)
         share_of, weight = self._parts(some, points)
         amplitude = share_of.sum(axis=0) * share

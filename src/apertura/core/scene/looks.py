@@ -132,7 +132,7 @@ SPREAD = 17
 """Pulses, evenly spread over those that illuminate a pixel, from which shadow is decided."""
 
 _PULSES = 1024  # summed for a block of the lattice, or up to twice as many
-_AT_ONCE = 64  # pulses of a block whose illumination is decided together
+AT_ONCE = 64  # pulses of a block whose illumination is decided together
 _EXACT = (64, 8, 1)  # steps between the pulses tried, coarse first, until one illuminates the pixel
 _DARK_PULSES = 64  # evaluated for the centres of a block that no pulse reaches: its neighbours interpolate with them
 _NO_WEIGHT_PENALTY = 1e6  # added to the distance of a pulse without weight: it is a centre only where none has weight
@@ -210,7 +210,7 @@ class Looks:
             np.zeros((*lattice.shape, SPREAD), np.int32),
         )
         tiles = list(grid.tiles(BLOCK_PX))
-        blocks = illumination_mask(beams, aperture, *balls(grid, terrain, tiles), pulses=_AT_ONCE)
+        blocks = illumination_mask(beams, aperture, *balls(grid, terrain, tiles), pulses=AT_ONCE)
         with ThreadPoolExecutor(threads) as pool:
             list(pool.map(looks._fill, lattice.blocks, blocks.T))
         return looks
@@ -219,7 +219,7 @@ class Looks:
         """Compute the nodes of a block of the lattice from the pulses that may illuminate it."""
         rows, columns = (at[part] for at, part in zip(self.lattice.nodes, block, strict=True))
         points = self.terrain.positions_at(self.grid, *np.meshgrid(rows, columns, indexing="ij")).reshape(-1, 3)
-        some = _pulses_of(reaching, len(self.aperture))
+        some = pulses_of(reaching, len(self.aperture))
         every = max(1, (some.stop - some.start) // (_PULSES if reaching.any() else _DARK_PULSES))
         few = slice(some.start, some.stop, every)
         aperture, beams = self.aperture[few], self.beams and self.beams[few]
@@ -257,11 +257,11 @@ class Looks:
         cells = [cell for cell in part.tiles(pitch) if not mask[cell].all()]
         if not cells or self.beams is None:
             return
-        reaching = illumination_mask(self.beams, self.aperture, *balls(part, self.terrain, cells), pulses=_AT_ONCE)
+        reaching = illumination_mask(self.beams, self.aperture, *balls(part, self.terrain, cells), pulses=AT_ONCE)
         positions = self.terrain.positions(part)
         for cell, blocks in zip(cells, reaching.T, strict=True):
             undecided = ~mask[cell]
-            mine = np.flatnonzero(np.repeat(blocks, _AT_ONCE)[: len(self.aperture)])
+            mine = np.flatnonzero(np.repeat(blocks, AT_ONCE)[: len(self.aperture)])
             mask[cell][undecided] = _any(self.beams, self.aperture, positions[cell][undecided], mine)
 
     @cached_property
@@ -287,20 +287,20 @@ class Looks:
         return centre[..., 0, :], centre[..., 1, :]
 
 
-def _pulses_of(reaching: NDArray[np.bool_], pulses: int) -> slice:
+def pulses_of(reaching: NDArray[np.bool_], pulses: int) -> slice:
     """Return the first to the last pulse of the blocks marked; all pulses where none is."""
     blocks = np.flatnonzero(reaching)
     if not blocks.size:
         return slice(0, pulses)
-    return slice(int(blocks[0]) * _AT_ONCE, min(int(blocks[-1] + 1) * _AT_ONCE, pulses))
+    return slice(int(blocks[0]) * AT_ONCE, min(int(blocks[-1] + 1) * AT_ONCE, pulses))
 
 
 def _any(beams: Beams, aperture: Aperture, points: Floats, pulses: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Return at which points (point, 3) any of some pulses has a weight."""
     illuminated = np.zeros(len(points), bool)
     for every in _EXACT:
-        for first in range(0, len(pulses), _AT_ONCE * every):
-            some, left = pulses[first : first + _AT_ONCE * every : every], np.flatnonzero(~illuminated)
+        for first in range(0, len(pulses), AT_ONCE * every):
+            some, left = pulses[first : first + AT_ONCE * every : every], np.flatnonzero(~illuminated)
             if not left.size:
                 return illuminated
             illuminated[left] = (beams[some].weight(aperture[some], points[left]) != 0).any(axis=0)

@@ -16,6 +16,7 @@ from apertura.methods.autofocus.evidence import (
     MOST_RATIO,
     PARTS,
     Evidence,
+    RangeShifts,
     gains_db,
     mean_gain,
     range_shifts,
@@ -253,7 +254,7 @@ def refine(
     """
     plain = _Model.of(records, grid, terrain, errors)
     found = plain.refinement(errors, reference_points)
-    cause = _cause(records, grid, terrain, errors, causes)
+    cause = plain.begun.cause(grid, terrain, errors, causes)
     if cause is None:
         return found
     other = _Model.of([one.corrected(cause.correction) for one in records], grid, terrain, errors)
@@ -315,31 +316,6 @@ class _Model:
         unknowns = plain.best.state.unknowns, self.best.state.unknowns
         energy = 0.5 * (float(unknowns[0] @ unknowns[0]) - float(unknowns[1] @ unknowns[1]))
         return sharper + energy - cause.energy
-
-
-def _cause(
-    records: Sequence[PairRecord],
-    grid: SceneGrid,
-    terrain: Terrain,
-    errors: Mapping[str, TrackErrors],
-    causes: Sequence[Cause],
-) -> Explained | None:
-    """Return the cause that explains most of what a flight lost, its size found in rounds as places come out."""
-    if not causes:
-        return None
-    begun = TrackSearch.begin(records, grid, terrain, errors)
-    if not begun.problem.patches:
-        return None
-    found = explained(begun.problem, causes, begun.axes, np.random.default_rng(0))
-    for _ in range(MOST_ROUNDS - 1 if found is not None else 0):
-        assert found is not None
-        moved = [one.corrected(found.correction) for one in records]
-        again = TrackSearch.begin(moved, grid, terrain, errors)
-        further = more_of(again.problem, found, again.axes) if again.problem.patches else found
-        if further.gain_db - found.gain_db < LEAST_FURTHER_DB:
-            break
-        found = further
-    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -482,7 +458,7 @@ class TrackSearch:
                 break
         assert lowest is not None  # one place is fitted, of more some are
         state = problem.sharper(lowest, everything, stages=_STAGES - 1 if few else 1)
-        state = self._unslipped(state, everything)
+        state, shifts = self._unslipped(state, everything)
         apart_sigma = self._apart_sigma(state)
         known = 2 * sum(min(one.ratio, MOST_RATIO) for statistics in state.statistics for one in statistics)
         evidence = Evidence(
@@ -490,7 +466,7 @@ class TrackSearch:
             held_out_db=held_out_db[:, np.isfinite(held_out_db[0])],
             settled=problem.gauge.settled(state.unknowns, known=known),
             before=range_shifts(problem, initial, self.axes),
-            after=range_shifts(problem, state, self.axes),
+            after=shifts,
             wavelength_m=self.wavelength_m,
             steady=unsteady(initial, state),
             apart_sigma=apart_sigma,
@@ -522,12 +498,12 @@ class TrackSearch:
         best = self._lowest([problem.sharper(start, used) for start in starts], used)
         return problem.sharper(best, used, stages=_STAGES - 1)
 
-    def _unslipped(self, state: State, used: Bools) -> State:
-        """Return the tracks, searched again from where delays put them while parts of them are a wavelength off."""
+    def _unslipped(self, state: State, used: Bools) -> tuple[State, RangeShifts]:
+        """Return the tracks, searched again from where delays put them while parts are a wavelength off, and shifts."""
         problem = self.problem
+        shifts = range_shifts(problem, state, self.axes)
         for _ in range(_SLIPS):
-            before = range_shifts(problem, state, self.axes)
-            wrong = int(before.slipped(self.wavelength_m).sum())
+            wrong = int(shifts.slipped(self.wavelength_m).sum())
             if not wrong:
                 break
             finer = range_shifts(problem, state, self.axes, parts=2 * PARTS)
@@ -535,8 +511,8 @@ class TrackSearch:
             after = range_shifts(problem, other, self.axes)
             if int(after.slipped(self.wavelength_m).sum()) >= wrong:
                 break
-            state = other
-        return state
+            state, shifts = other, after
+        return state, shifts
 
     def _lowest(self, states: Sequence[State], used: Bools) -> State:
         """Return the state of lowest objective: sharp patches, at one place in all pairs."""
@@ -548,10 +524,29 @@ class TrackSearch:
         ]
         return states[int(np.argmin(values))]
 
+    def cause(
+        self, grid: SceneGrid, terrain: Terrain, errors: Mapping[str, TrackErrors], causes: Sequence[Cause]
+    ) -> Explained | None:
+        """Return the cause that explains most of what a flight lost, its size found in rounds as places come out."""
+        if not causes or not self.problem.patches:
+            return None
+        found = explained(self.problem, causes, self.axes, np.random.default_rng(0))
+        if found is None:
+            return None
+        for _ in range(MOST_ROUNDS - 1):
+            moved = [blocks.record.corrected(found.correction) for blocks in self.problem.pairs]
+            again = TrackSearch.begin(moved, grid, terrain, errors)
+            further = more_of(again.problem, found, again.axes) if again.problem.patches else found
+            if further.gain_db - found.gain_db < LEAST_FURTHER_DB:
+                break
+            found = further
+        return found
+
     def blur(self, tracks: Tracks) -> float:
         """Return the objective of some tracks without their prior, as seen at the places of this search."""
-        state = replace(self.problem.at(tracks), unknowns=np.zeros(0))
-        value = self.problem.value(state, np.ones(len(self.problem.patches), bool), self.initial.statistics)
+        value = self.problem.value(
+            self.problem.at(tracks), np.ones(len(self.problem.patches), bool), self.initial.statistics
+        )
         return value + pair_disagreement(self.problem, tracks, self.axes)[0]
 
     def by_speckle(self, grid: SceneGrid, terrain: Terrain, errors: Mapping[str, TrackErrors]) -> Refinement | None:
