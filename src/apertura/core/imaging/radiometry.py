@@ -230,7 +230,7 @@ class Calibration:
         share_of, weight = self._parts(some, points)
         amplitude = share_of.sum(axis=0) * share
         slant, towards = _directions(gradient, share_of, up)
-        level = np.array([_spread(*one) for one in zip(gradient.swapaxes(0, 1), share_of.T, up, strict=True)])
+        level = _spread(gradient.swapaxes(0, 1), share_of.T, up)
         shape = (len(rows), len(columns))
         with np.errstate(divide="ignore"):
             self.gain[block] = 2 * np.log(amplitude).reshape(shape)
@@ -242,9 +242,9 @@ class Calibration:
         """Return what each pulse adds to a point target, w·f/(R_tx·R_rx), and w, (pulse, point) each."""
         aperture, beams = self.aperture[pulses], self.beams and self.beams[pulses]
         there, back = (np.linalg.norm(points - leg[:, None], axis=-1) for leg in aperture.legs)
-        weight = np.ones(there.shape) if beams is None else beams.weight(aperture, points)
-        antennas = beams and beams.antennas
-        field = 1.0 if antennas is None else antennas.weight(aperture, points)
+        antennas, sector = beams and beams.antennas, beams and beams.sector
+        field = np.ones(there.shape) if antennas is None else antennas.weight(aperture, points)
+        weight = field if sector is None else field * sector.weight(aperture, points)
         return weight * field / (there * back), weight
 
     def at(self, points: Floats) -> tuple[Floats, Floats]:
@@ -341,31 +341,57 @@ def _unit(vectors: Floats) -> Floats:
     return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-300))
 
 
-def _spread(gradient: Floats, parts: Floats, up: Floats) -> float:
-    """Return ∫(dU/ds)² ds / U² of a place, per unit of spatial frequency on level ground: eq. 5.
+def _spread(gradient: Floats, parts: Floats, up: Floats) -> Floats:
+    """Return ∫(dU/ds)² ds / U² of each place, per unit of spatial frequency on level ground: eq. 5.
 
     Pulses are sorted by azimuth, so that a track which wobbles or passes twice is counted as it adds up, and their
     density is taken over parts of the aperture, since what is finer scatters far beyond the cell.
+
+    Parameters
+    ----------
+    gradient
+        (place, pulse, 3) float64, of the total path.
+    parts
+        (place, pulse) float64, what each pulse adds to a point target.
+    up
+        (place, 3) float64, unit vectors.
+
+    Returns
+    -------
+    ndarray
+        (place,) float64; NaN where fewer than two pulses count, or none moves the spatial frequency.
     """
+    places, pulses = parts.shape
     size = np.abs(parts)
-    counts = size > _LEAST * size.max(initial=0.0)
-    if counts.sum() < 2:
-        return float("nan")
-    gradient, parts = gradient[counts], parts[counts]
-    level = gradient - (gradient @ up)[:, None] * up
-    mean = parts @ level
-    ahead = mean / max(float(np.linalg.norm(mean)), 1e-300)
+    counts = size > _LEAST * size.max(axis=1, initial=0.0, keepdims=True)
+    many = counts.sum(axis=1)
+    parts = np.where(counts, parts, 0.0)
+    level = gradient - (gradient @ up[:, :, None]) * up[:, None]
+    mean = (parts[:, None] @ level)[:, 0]
+    ahead = _unit(mean)
     across = np.cross(up, ahead)
-    azimuth = np.arctan2(level @ across, level @ ahead)
-    order = np.argsort(azimuth, kind="stable")
-    parts, squared = parts[order], (level[order] ** 2).sum(axis=-1)
-    steps = np.diff(azimuth[order]) * (squared[1:] + squared[:-1]) / 2
-    place = np.concatenate([[0.0], np.cumsum(steps)])
-    if not place[-1] > 0:
-        return float("nan")
-    edge = place[-1] / (2 * (len(place) - 1))  # a pulse stands for half a step on both sides
-    place = np.concatenate([[-edge], place, [place[-1] + edge]])
-    summed = np.concatenate([[0.0], np.cumsum(parts) - parts / 2, [parts.sum()]])
-    bins = np.linspace(place[0], place[-1], min(_BINS, len(parts)) + 1)
-    density = np.diff(np.interp(bins, place, summed))
-    return float((density**2).sum() / ((bins[1] - bins[0]) * summed[-1] ** 2))
+    azimuth = np.arctan2((level @ across[:, :, None])[..., 0], (level @ ahead[:, :, None])[..., 0])
+    # Pulses that do not count are sorted behind the others, where steps between them are nothing.
+    order = np.argsort(np.where(counts, azimuth, np.inf), axis=1, kind="stable")
+    parts, azimuth = (np.take_along_axis(one, order, axis=1) for one in (parts, azimuth))
+    squared = np.take_along_axis((level**2).sum(axis=-1), order, axis=1)
+    counted = np.arange(pulses) < many[:, None]
+    steps = np.diff(azimuth, axis=1) * (squared[:, 1:] + squared[:, :-1]) / 2 * counted[:, 1:]
+    place = np.concatenate([np.zeros((places, 1)), np.cumsum(steps, axis=1)], axis=1)
+    known = (many > 1) & (place[:, -1] > 0)
+    place, parts, many = place[known], parts[known], many[known, None]
+    length, edge = place[:, -1:], 1 / (2 * (many - 1))  # a pulse stands for half a step on both sides
+    place = np.concatenate([-edge, place / length, 1 + edge], axis=1)
+    summed = np.cumsum(parts, axis=1)
+    total = summed[:, -1:]
+    summed = np.concatenate([np.zeros_like(total), summed - parts / 2, total], axis=1)
+    # All places end to end on one axis, so far apart that none reaches the next: one interpolation for all of them.
+    bins = np.minimum(_BINS, many)
+    at = np.minimum(np.arange(_BINS + 1) / bins, 1.0) * (1 + 2 * edge) - edge
+    apart = 4.0 * np.arange(len(place))[:, None]
+    density = np.diff(
+        np.interp((at + apart).ravel(), (place + apart).ravel(), summed.ravel()).reshape(at.shape), axis=1
+    )
+    spread = np.full(places, np.nan)
+    spread[known] = (density**2).sum(axis=1) / ((1 + 2 * edge) * length / bins * total**2)[:, 0]
+    return spread

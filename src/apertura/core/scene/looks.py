@@ -84,14 +84,20 @@ class Lattice:
         (low, high, up), (left, right, across) = (_cells(at, part) for at, part in zip(self.nodes, window, strict=True))
         extra = (1,) * (values.ndim - 2)
         up, across = up.reshape(-1, 1, *extra), across.reshape(1, -1, *extra)
-        corners = [values[np.ix_(row, column)] for row in (low, high) for column in (left, right)]
-        top, bottom = (one + across * (other - one) for one, other in (corners[:2], corners[2:]))
-        smooth = np.asarray(top + up * (bottom - top), np.float64)
+        values, left, right = values[:, left[0] : right[-1] + 1], left - left[0], right - left[0]
+        # First between rows of nodes, of few columns, so that one pass over all pixels is left.
+        rows = values[low] + up * (values[high] - values[low])
+        smooth = np.asarray(rows[:, left] + across * (rows[:, right] - rows[:, left]), np.float64)
         if farthest is None:
             return smooth
+        # Corners are compared once a cell.
+        (lows, row), (lefts, column) = (np.unique(one, return_inverse=True) for one in (low, left))
+        highs, rights = (np.minimum(at + 1, size - 1) for at, size in zip((lows, lefts), values.shape, strict=False))
+        corners = [values[np.ix_(*at)] for at in ((lows, lefts), (lows, rights), (highs, lefts), (highs, rights))]
         distance = np.max([np.linalg.norm(corner - corners[0], axis=-1) for corner in corners[1:]], axis=0)
         jumps = (distance > farthest).any(axis=tuple(range(2, distance.ndim)))
         if jumps.any():
+            jumps = jumps[np.ix_(row, column)]
             near = values[np.ix_(np.where(up.ravel() < 0.5, low, high), np.where(across.ravel() < 0.5, left, right))]
             smooth[jumps] = near[jumps]
         return smooth
