@@ -42,7 +42,7 @@ struct Batch {
   alignas(64) float xh[kBatch][kBlocks], yh[kBatch][kBlocks], hh[kBatch][kBlocks];
   alignas(64) float weight[kBatch][kBlocks], weight_x[kBatch][kBlocks], weight_y[kBatch][kBlocks];  // (7)
   float weight_h[kBatch];
-  // Depth inside the sector, in widths of its edge: integration.md, (4).
+  // Depth inside the sector, in widths of its edge: integration.md, (5).
   alignas(64) float depth[kBatch][kBlocks], depth_x[kBatch][kBlocks], depth_y[kBatch][kBlocks];
   float depth_h[kBatch], depth_xx[kBatch], depth_xy[kBatch], depth_yy[kBatch];  // second order at the origin
 };

@@ -206,10 +206,11 @@ inline void weigh_patch(const ApertureJob& job, const Patch& patch, int64_t puls
 }
 
 // (6) of one pulse at each pixel of a patch, and the sector's weight.
-inline void weigh_pixels(const ApertureJob& job, const Positions& at, int64_t pulse, float* weight) {
+inline void weigh_pixels(const ApertureJob& job, const Patch& patch, const Positions& at, int64_t pulse,
+                         float* weight) {
   const int64_t n = job.padded;
   for (int64_t slot = 0; slot < kPixels; slot++) weight[slot] = 1;
-  if (job.sector) weigh_by_sector(job, at, pulse, weight);
+  if (job.sector) weigh_by_sector(job, patch, at, pulse, weight);
   for (int64_t leg = 0; leg < 2; leg++) {
     const BeamJob* beam = job.beam[leg];
     if (!beam) continue;

@@ -25,6 +25,7 @@ constexpr Field kFields[] = {
     APERTURA_FIELD(SectorJob, centre),
     APERTURA_FIELD(SectorJob, inner),
     APERTURA_FIELD(SectorJob, outer),
+    APERTURA_FIELD(SectorJob, moved),
     {"SectorJob", 0, sizeof(SectorJob)},
     APERTURA_FIELD(ApertureJob, cells),
     APERTURA_FIELD(ApertureJob, transmitter),

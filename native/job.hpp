@@ -14,10 +14,11 @@ struct BeamJob {
   double peak;  // largest |gain| of the product
 };
 
-// The sector that pixels are integrated over, docs/theory/integration.md (1) and (3).
+// The sector that pixels are integrated over, docs/theory/integration.md (1), (3) and (4).
 struct SectorJob {
   const double* axis[2];        // of transmitter and receiver, (3, padded)
   double centre, inner, outer;  // of s; from `inner` to `outer` off the centre the weight falls from 1 to 0
+  const float* moved;           // (rows, columns): centre of each pixel's sector less `centre`; null: none is moved
 };
 
 // A tile of pixels to be formed from tables. Lengths in metres unless they say "cells".

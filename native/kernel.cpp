@@ -53,7 +53,7 @@ void add_patch(const ApertureJob& job, const Patch& patch, int64_t begin, int64_
     if (batch.count[kExactPath] && !gathered) gather(job, patch, at), gathered = true;
     for (int64_t n = 0; n < batch.count[kExactPath]; n++) {
       const int64_t one = pulse + batch.order[kExactPath][n];
-      if (each) weigh_pixels(job, at, one, weight);
+      if (each) weigh_pixels(job, patch, at, one, weight);
       add_exact<Phase, kDegree>(job, patch, at, one, each ? weight : nullptr, sum);
     }
     job.counts[0] += batch.count[kSharedCurvature] + batch.count[kLinearHeights] + batch.count[kWideWindow];

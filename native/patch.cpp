@@ -105,6 +105,40 @@ void describe_block(Patch& patch, int64_t block, const double height[kPixels]) {
   }
 }
 
+// How the centres of a sector lie over a patch: integration.md, (4). A block that is not whole is taken as level.
+void describe_centres(const SectorJob& sector, int64_t stride, Patch& patch) {
+  int64_t count = 0;
+  double sum = 0;
+  for (int64_t slot = 0; slot < kPixels; slot++) {
+    if (!holds(patch, slot)) continue;
+    patch.moved[slot] = sector.moved[(patch.row + pixel_row(slot)) * stride + patch.column + pixel_column(slot)];
+    sum += patch.moved[slot], count++;
+  }
+  patch.moved_mean = float(sum / count);
+  for (int64_t block = 0; block < kBlocks; block++) {
+    int64_t here = 0;
+    double level = 0, along_x = 0, along_y = 0;
+    for (int64_t slot = 16 * block; slot < 16 * block + 16; slot++) {
+      if (!holds(patch, slot)) continue;
+      level += patch.moved[slot], here++;
+      along_x += (pixel_column(slot) - block_column(block) - 1.5) * patch.moved[slot];
+      along_y += (pixel_row(slot) - block_row(block) - 1.5) * patch.moved[slot];
+    }
+    if (here) patch.moved_b[block] = float(level / here);
+    // Squares of -1.5, -0.5, 0.5 and 1.5, four times each, add up to 20.
+    if (here == 16) patch.moved_x[block] = float(along_x / 20), patch.moved_y[block] = float(along_y / 20);
+    for (int64_t slot = 16 * block; slot < 16 * block + 16; slot++) {
+      if (!holds(patch, slot)) continue;
+      const double x = double(pixel_column(slot) - block_column(block)) - 1.5;
+      const double y = double(pixel_row(slot) - block_row(block)) - 1.5;
+      const double rest =
+          patch.moved[slot] - patch.moved_b[block] - x * patch.moved_x[block] - y * patch.moved_y[block];
+      patch.moved_bend = std::fmax(patch.moved_bend, float(std::fabs(rest)));
+      patch.moved_reach = std::fmax(patch.moved_reach, std::fabs(patch.moved[slot] - patch.moved_mean));
+    }
+  }
+}
+
 }  // namespace
 
 void fit(const ApertureJob& job, int64_t row, int64_t column, double deviation_cells, Patch& patch) {
@@ -136,6 +170,7 @@ void fit(const ApertureJob& job, int64_t row, int64_t column, double deviation_c
   patch.third = kThirdOrder * inner * inner * inner;
   patch.shared = kSharedCurvatureError * reach * inner * inner;
   patch.own = kOwnCurvatureError * reach * reach * inner * inner;
+  if (job.sector && job.sector->moved) describe_centres(*job.sector, job.columns, patch);
   // A block without pixels stands where one with pixels is, so that it never decides about its group.
   for (int64_t block = 0; block < kBlocks; block++)
     if (!patch.present[block]) {

@@ -27,6 +27,9 @@ struct alignas(64) Patch {
   float square[kBlocks];                                      // |d|^2: squared distance of that centre from the origin
   float dot_x[kBlocks], dot_y[kBlocks], dot_h[kBlocks];       // d . step_x, d . step_y and d . up
   float rise[kPixels];                                        // h': height of each pixel above its block's
+  float moved[kPixels];                                       // of a sector: centre of each pixel less that of the job
+  float moved_b[kBlocks], moved_x[kBlocks], moved_y[kBlocks];  // the same at each block's centre, and its slopes
+  float moved_mean, moved_reach, moved_bend;  // over the patch; largest deviation from it, and from a block's slopes
   double origin[3], step_x[3], step_y[3], up[3];
   float xx, xy, yy, xh, yh;         // products of step_x, step_y and up
   float block_reach, pixel_reach;   // D and delta: largest |d|, largest distance of a pixel from its block's centre

@@ -24,7 +24,10 @@ inline void place_in_sector(const ApertureJob& job, const Patch& patch, int64_t 
   const float inner = float(sector.inner), outer = float(sector.outer);
   const float reach = patch.block_reach + patch.pixel_reach, inside_block = patch.pixel_reach * patch.pixel_reach;
   alignas(64) float slack[kBatch], bend[kBatch];
-  for (int64_t q = 0; q < kBatch; q++) out.place[q] = float(-sector.centre), slack[q] = bend[q] = 0;
+  for (int64_t q = 0; q < kBatch; q++) {
+    out.place[q] = float(-sector.centre) - patch.moved_mean;
+    slack[q] = patch.moved_reach, bend[q] = patch.moved_bend;
+  }
   for (int64_t leg = 0; leg < 2; leg++) {
     const double *antenna = (leg ? job.receiver : job.transmitter) + pulse, *axis = sector.axis[leg] + pulse;
     for (int64_t q = 0; q < kBatch; q++) {
@@ -50,14 +53,17 @@ inline void place_in_sector(const ApertureJob& job, const Patch& patch, int64_t 
   }
 }
 
-// Depth inside the sector, in widths of its edge, at the centre of each block and its slopes: (4).
+// Depth inside the sector, in widths of its edge, at the centre of each block and its slopes: (5).
 inline void fit_depth(const ApertureJob& job, const Patch& patch, const OriginPaths& origin, const SectorPlaces& places,
                       int64_t pulse, int64_t q, Batch& batch) {
   const SectorJob& sector = *job.sector;
   const int64_t n = job.padded;
   const float side = places.place[q] < 0 ? 1 : -1, per_width = float(1 / (sector.outer - sector.inner));
   alignas(64) float s[kBlocks], s_x[kBlocks], s_y[kBlocks];
-  for (int64_t b = 0; b < kBlocks; b++) s[b] = float(-sector.centre), s_x[b] = s_y[b] = 0;
+  for (int64_t b = 0; b < kBlocks; b++) {
+    s[b] = float(-sector.centre) - patch.moved_b[b];
+    s_x[b] = -patch.moved_x[b], s_y[b] = -patch.moved_y[b];
+  }
   float s_h = 0, s_xx = 0, s_xy = 0, s_yy = 0;
   for (int64_t leg = 0; leg < 2; leg++) {
     const double* axis = sector.axis[leg] + pulse + q;
@@ -95,12 +101,13 @@ inline void fit_depth(const ApertureJob& job, const Patch& patch, const OriginPa
 }
 
 // (3): the weight of one pulse at each pixel of a patch, times what `weight` holds.
-inline void weigh_by_sector(const ApertureJob& job, const Positions& at, int64_t pulse, float* weight) {
+inline void weigh_by_sector(const ApertureJob& job, const Patch& patch, const Positions& at, int64_t pulse,
+                            float* weight) {
   const SectorJob& sector = *job.sector;
   const int64_t n = job.padded;
   const double per_width = 1 / (sector.outer - sector.inner);
   for (int64_t slot = 0; slot < kPixels; slot++) {
-    double place = -sector.centre;
+    double place = -sector.centre - patch.moved[slot];
     for (int64_t leg = 0; leg < 2; leg++) {
       const double *antenna = (leg ? job.receiver : job.transmitter) + pulse, *axis = sector.axis[leg] + pulse;
       const double wx = at.x[slot] - antenna[0], wy = at.y[slot] - antenna[n], wz = at.z[slot] - antenna[2 * n];

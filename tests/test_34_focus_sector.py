@@ -88,6 +88,29 @@ def test_engines_agree_on_both_sides_of_the_edge(isa, flown, half, antenna):
     assert counts[3] > 0 or half == 0.25
 
 
+@pytest.mark.quick("*-False-0.04", "*-True-0.1")
+@compiled
+@pytest.mark.parametrize("half", [0.04, 0.1, 0.25])
+@pytest.mark.parametrize("rough", [False, True])
+def test_engines_agree_where_the_centre_follows_what_was_flown(isa, flown, half, rough):
+    """A sector far ahead of the flight: the centre of each pixel is its own, and changes within patches and blocks."""
+    pixels = flown.pixels.copy()
+    if rough:
+        pixels[..., 2] = 0.05 * np.sin(2 * pixels[..., 0])
+    places = ecef(pixels)
+    ahead = sector_of(flown.aperture, half, centre=0.6).following(flown.aperture, places[::8, ::8].reshape(-1, 3))
+    centres, beams = ahead.centre_at(places), Beams(sector=ahead)
+    assert np.ptp(centres) > 0.05
+    assert centres.max() < 0.6
+    truth, counts = reference.form(flown.scene.history(), places, beams=beams), np.zeros(4, np.int64)
+    tables = native.prepare(flown.scene.profiles(places))
+    image = native.form(tables, places, beams=beams, counts=counts)
+    assert decibels(image - truth, truth) <= -70
+    assert counts[1] > 0 or rough  # weighed block by block, not only pixel by pixel
+    part = native.form(tables, places[16:, 32:], beams=beams)
+    np.testing.assert_array_equal(part.view(np.uint32), image[16:, 32:].view(np.uint32))
+
+
 @compiled
 def test_a_rough_surface_is_weighed_at_its_height_at_the_edge(isa, flown):
     rough = flown.pixels.copy()
@@ -138,17 +161,19 @@ def test_the_edge_is_level_at_both_ends():
     assert np.abs(np.diff(slope)).max() < 0.01
 
 
-@pytest.mark.quick("False")
+@pytest.mark.quick("False-0.05")
+@pytest.mark.parametrize("centre", [0.05, 0.9])
 @pytest.mark.parametrize("antenna", [False, True])
-def test_pulses_that_are_left_out_add_nothing_at_all(antenna):
+def test_pulses_that_are_left_out_add_nothing_at_all(antenna, centre):
     """Whatever piece of the scene: each pulse with a weight anywhere in it is in a block that reaches it."""
     generator = np.random.default_rng(3)
     along = np.linspace(-60, 60, 1000)
     sway = np.stack([along, 2 * np.sin(along / 9), 20 + np.cos(along / 5)], -1)
     aperture = Aperture(sway, sway + [3.0, 0.5, 1.0])
     beam = swaying_beam(sway, (20, 0, 0), 30) if antenna else None
-    beams = Beams(beam, None, Sector.of(aperture, chord_m=3.0, centre=0.05, half=0.12))
     middle = generator.uniform([-70, 10, -2], [70, 60, 4], (40, 3))
+    sector = Sector.of(aperture, chord_m=3.0, centre=centre, half=0.12)
+    beams = Beams(beam, None, sector if centre < 0.5 else sector.following(aperture, middle))
     radius = generator.uniform(0.1, 9.0, 40)
     lit = illumination_mask(beams, aperture, middle, radius, pulses=PULSES)
     inside = middle + generator.uniform(-1, 1, (60, 40, 3)) * radius[:, None] / np.sqrt(3)

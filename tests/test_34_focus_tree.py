@@ -203,8 +203,13 @@ def test_smooth_weights_are_applied_at_the_leaves(isa, plain, sway_deg):
     assert decibels(image - formed(plain)[0], image) > -30  # the weight matters
 
 
-def test_the_edges_of_a_sector_go_directly(plain):
-    beams = Beams(None, None, Sector.of(plain.aperture, chord_m=1.2, centre=0.02, half=0.25))
+@pytest.mark.parametrize(("centre", "half"), [(0.02, 0.25), (0.7, 0.2)])
+def test_the_edges_of_a_sector_go_directly(plain, centre, half):
+    """Also where the centre of each place is where the flight came nearest to it."""
+    sector = Sector.of(plain.aperture, chord_m=1.2, centre=centre, half=half)
+    if centre > 0.5:
+        sector = sector.following(plain.aperture, ecef(plain.pixels)[::10, ::10].reshape(-1, 3))
+    beams = Beams(None, None, sector)
     image, share = formed(plain, beams=beams)
     assert (share[:2] > 0.2).all()  # inside, at the edge
     assert weighed_error_db(plain, image, beams) <= -62

@@ -1,6 +1,7 @@
 """How much of a flight is integrated: what is asked, what pixels carry, what was flown."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -98,14 +99,36 @@ def test_a_target_inside_the_swath_has_the_amplitude_of_its_echo():
     assert not np.allclose(np.abs(image.values), np.abs(whole.values), atol=0.01)
 
 
-def test_a_scene_that_is_not_passed_is_integrated_where_it_was_nearest():
-    """The flight ends 30 m before the scene: the sector lies at the flight's end, as wide as asked."""
-    ahead = straight(60.0, 800, east_m=-70.0)
+def test_a_place_that_is_not_passed_is_integrated_where_it_was_nearest():
+    """The flight ends 30 m before the scene: the sector of each place lies at the flight's end, as wide as asked."""
+    ahead, places = straight(60.0, 800, east_m=-70.0), points().reshape(-1, 3)
     chosen = settled(ahead, requested={"degrees": 6.0})
-    assert chosen.sector.centre > 0.4
-    weight = chosen.sector.weight(ahead, points().reshape(-1, 3))
-    assert np.median((weight > 0.99).any(axis=0)) == 1  # at zero Doppler none of the scene would be seen
-    assert settled(straight(), requested={"degrees": 6.0}).sector.centre == 0.0
+    sector = chosen.sector
+    last = replace(sector, ends=None)[-1:].place(ahead[-1:], places)[0]
+    np.testing.assert_allclose(sector.centre_at(places), last + sector.outer, atol=0.02 * sector.half)
+    assert (sector.weight(ahead, places) > 0.99).any(axis=0).all()
+    least, most = (chosen.report["squint_deg"][part] for part in ("least", "most"))
+    assert 0 < least < most
+    assert settled(straight(), requested={"degrees": 6.0}).sector.ends is None
+
+
+@pytest.mark.parametrize("east_m", [-60.0, -20.0, 0.0, 35.0])
+@pytest.mark.parametrize("spacing_m", [0.1, 0.4, 1.5])
+def test_a_place_whose_own_span_its_pixels_carry_takes_all_pulses(east_m, spacing_m):
+    """Short passes, squinted and not: who spans more than fits takes what fits, nobody less."""
+    short, places = straight(12.0, 200, east_m=east_m), points(30.0).reshape(-1, 3)
+    chosen = integrate(short, points(30.0), spacing_m=spacing_m, wavelength_m=WAVELENGTH)
+    if chosen.sector is None:
+        assert spacing_m < 1
+        return
+    sector = chosen.sector
+    place, summed = sector.place(short, places), sector.weight(short, places).sum(axis=0)
+    span = np.ptp(place, axis=0)
+    fits, wider = span <= 2 * sector.inner, span > 2.1 * sector.outer
+    assert (summed[fits] > 0.999 * len(short)).all()
+    assert (place[:, wider].min(axis=0) <= -0.97 * sector.outer).all()
+    assert (place[:, wider].max(axis=0) >= 0.97 * sector.outer).all()
+    assert "outside_swath" not in chosen.flags
 
 
 def test_antennas_that_look_ahead_are_integrated_where_they_look():
@@ -116,7 +139,7 @@ def test_antennas_that_look_ahead_are_integrated_where_they_look():
     beam = Beam(np.broadcast_to(axes, (len(flown), 3, 3)), angle, np.ones(3), angle, np.ones(3))
     chosen = settled(flown, requested={"degrees": 10.0}, antennas=Beams(beam, beam))
     assert chosen.sector.centre == pytest.approx(np.sin(squint))
-    assert chosen.report["squint_deg"] == pytest.approx(25.0)
+    assert chosen.report["squint_deg"]["median"] == pytest.approx(25.0)
 
 
 def test_a_circle_about_the_scene_counts_as_a_whole_and_says_so():
@@ -132,9 +155,10 @@ def test_a_circle_about_the_scene_counts_as_a_whole_and_says_so():
     assert "integration_turns" not in settled(straight(), requested={"degrees": 10.0}).flags
 
 
-def test_a_scene_that_reaches_beyond_the_swath_is_flagged_with_its_share():
-    beside = points(120.0)
-    chosen = integrate(straight(40.0), beside, spacing_m=0.5, wavelength_m=WAVELENGTH, requested={"degrees": 8.0})
+def test_a_scene_beside_a_gap_of_the_flight_is_flagged_with_its_share():
+    whole = straight(120.0).tx_m
+    flown = monostatic(whole[np.abs(whole[:, 0]) > 25])
+    chosen = integrate(flown, points(60.0), spacing_m=0.5, wavelength_m=WAVELENGTH, requested={"degrees": 8.0})
     assert 20 < float(chosen.flags["outside_swath"].split()[0]) < 80
     assert chosen.report["pulses_per_pixel"]["least"] == 0
 

@@ -11,6 +11,9 @@ TAPER = 0.1
 """Of the half width: the weight falls from 1 to 0 between 1 - TAPER and 1 + TAPER (docs/theory/integration.md)."""
 
 _SAMPLES = 4096  # of the window, and 64 times as many of its response
+_TRIED = 256  # pulses among which those are looked for that end what was flown
+_END = 0.01  # of the half width: how well these know it
+_CORNERS = 64  # points of a tile whose mean is its middle
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,7 +22,8 @@ class Sector:
 
     With u_t, u_r the unit vectors from the antennas to the pixel, s = a_t·u_t + a_r·u_r is the decrease of the total
     path per metre that both antennas fly together: 0 at the closest approach, 1 straight ahead. A pulse counts
-    for a pixel where s is within `half` of `centre`, with a smooth edge.
+    for a pixel where s is within `half` of the centre, with a smooth edge. The centre of a pixel is `centre`, or, where
+    too little of its sector was flown, the nearest one of which all was (`following`).
 
     Attributes
     ----------
@@ -27,7 +31,10 @@ class Sector:
         (pulse, 3) float64: displacement of each antenna over that of both together; their lengths sum to 1, or are 0
         where no antenna moves and every pixel is at its closest approach.
     centre, half
-        Of s; at `centre` ± `half` the weight is one half.
+        Of s; at the centre ± `half` the weight is one half.
+    ends
+        Pulses at which s of some pixel is least or largest, and the sector of these pulses; None: `centre` is that of
+        every pixel.
 
     Raises
     ------
@@ -36,7 +43,7 @@ class Sector:
 
     Notes
     -----
-    Source: docs/theory/integration.md, eq. 1 and 3.
+    Source: docs/theory/integration.md, eq. 1, 3 and 4.
 
     Examples
     --------
@@ -51,6 +58,7 @@ class Sector:
     rx_axis: NDArray[np.float64]
     centre: float
     half: float
+    ends: "tuple[Aperture, Sector] | None" = None
 
     def __post_init__(self) -> None:
         if self.tx_axis.shape != self.rx_axis.shape or self.tx_axis.ndim != 2 or self.tx_axis.shape[1] != 3:
@@ -77,6 +85,67 @@ class Sector:
         """Return the sector of some pulses."""
         return replace(self, tx_axis=self.tx_axis[pulses], rx_axis=self.rx_axis[pulses])
 
+    def following(self, aperture: Aperture, points_m: NDArray[np.float64]) -> "Sector":
+        """Return the sector whose centres follow what was flown past each pixel.
+
+        Parameters
+        ----------
+        aperture
+            Of the same pulses.
+        points_m
+            (point, 3) float64, metres, spread over the scene.
+
+        Notes
+        -----
+        Source: docs/theory/integration.md, eq. 4.
+
+        Examples
+        --------
+        >>> track = np.stack([np.linspace(-5, 5, 101), np.zeros(101), np.full(101, 10.0)], -1)
+        >>> flown, points = Aperture(track, track), np.array([[0.0, 30.0, 0.0], [20.0, 30.0, 0.0]])
+        >>> sector = Sector.of(flown, chord_m=2.0, centre=0.0, half=0.1)
+        >>> sector.weight(flown, points).sum(axis=0).round(), sector.following(flown, points).centre_at(points).round(2)
+        (array([64.,  0.]), array([0.  , 0.52]))
+        """
+        some = np.unique(np.append(np.arange(len(aperture))[aperture.sample(_TRIED)], len(aperture) - 1))
+        few, there = aperture[some], replace(self[some], ends=None)
+        place = there.place(few, points_m)
+        if (place.min(axis=0) <= -self.outer).all() and (place.max(axis=0) >= self.outer).all():
+            return self  # every place was passed by more than its sector
+        # The fewest pulses by which the ends of what was flown are known to a small part of the sector.
+        within = np.concatenate([place, -place], axis=1)
+        within = within <= within.min(axis=0) + _END * self.half
+        ends: list[int] = []
+        while within.any():
+            ends.append(int(within.sum(axis=1).argmax()))
+            within &= ~within[ends[-1]]
+        return replace(self, ends=(few[np.array(ends)], there[np.array(ends)]))
+
+    def centre_at(self, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the centre of s of each point (..., 3), in metres: (...) float64."""
+        if self.ends is None:
+            return np.full(points_m.shape[:-1], self.centre)
+        aperture, there = self.ends
+        place = there.place(aperture, points_m) + self.centre
+        first, last = place.min(axis=0), place.max(axis=0)
+        middle = (first + last) / 2
+        lowest, highest = np.minimum(first + self.outer, middle), np.maximum(last - self.outer, middle)
+        return np.asarray(np.clip(self.centre, lowest, highest))
+
+    def moved(self, points_m: NDArray[np.float64]) -> NDArray[np.float32] | None:
+        """Return the centre of s of each point less `centre`, (...) float32; None where none is moved."""
+        if self.ends is None:
+            return None
+        aperture, there = self.ends
+        corners = points_m.reshape(-1, 3)
+        middle = np.nanmean(corners[:: max(1, len(corners) // _CORNERS)], axis=0)
+        radius = np.nanmax(np.linalg.norm(corners - middle, axis=-1), initial=0.0)
+        place, slack = there.place(aperture, middle[None]), there.slack(aperture, middle[None], radius)
+        if np.isfinite(radius) and (place + slack).min() <= -self.outer and (place - slack).max() >= self.outer:
+            return None
+        moved = (self.centre_at(points_m) - self.centre).astype(np.float32)
+        return moved if np.nan_to_num(moved).any() else None
+
     def axis_change(self, other: "Sector") -> NDArray[np.float64]:
         """Return the largest change of s by other axes, of a sector of as many pulses, (pulse,)."""
         axes = ((self.tx_axis, other.tx_axis), (self.rx_axis, other.rx_axis))
@@ -93,7 +162,7 @@ class Sector:
         return (1 + TAPER) * self.half
 
     def place(self, aperture: Aperture, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return s less the centre, (pulse, ...) float64, of points (..., 3) in metres.
+        """Return s less the centre of the point, (pulse, ...) float64, of points (..., 3) in metres.
 
         Raises
         ------
@@ -105,7 +174,7 @@ class Sector:
         # Matrix products about a nearby origin, where squares of distances keep their precision.
         flat, middle = points_m.reshape(-1, 3), aperture.legs[0][:1].sum(axis=0)
         offset_m = flat - middle
-        place = np.full((len(aperture), len(flat)), -self.centre)
+        place = np.tile(-self.centre_at(flat), (len(aperture), 1))
         for axis, leg in zip((self.tx_axis, self.rx_axis), aperture.legs, strict=True):
             antenna = leg - middle
             square = antenna @ (-2 * offset_m.T)
@@ -128,7 +197,7 @@ class Sector:
     def slack(
         self, aperture: Aperture, points_m: NDArray[np.float64], radius_m: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return the largest change of s within some radius of a point: as `place`.
+        """Return the largest change of `place` within some radius of a point.
 
         Parameters
         ----------
@@ -138,6 +207,12 @@ class Sector:
             Of balls about the points, metres, in a shape that goes with (pulse, ...).
         """
         slack = np.zeros((len(aperture), *points_m.shape[:-1]))
+        if self.ends is not None:  # a centre moves no farther than the ends of what was flown
+            slack += (
+                self.ends[1]
+                .slack(self.ends[0], points_m, np.broadcast_to(radius_m, slack.shape).max(axis=0))
+                .max(axis=0)
+            )
         for axis, leg in zip((self.tx_axis, self.rx_axis), aperture.legs, strict=True):
             leg_m = points_m - leg.reshape(-1, *(1,) * (points_m.ndim - 1), 3)
             length = np.linalg.norm(axis, axis=1).reshape(-1, *(1,) * (points_m.ndim - 1))

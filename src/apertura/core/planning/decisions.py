@@ -219,18 +219,8 @@ def integrate(
     else:
         why, half = "asked for", float(np.sin(np.radians(requested.get("degrees", 0)) / 2) * np.sqrt(1 - squint**2))
         half = wavelength_m / (2 * per_path * requested["resolution_m"]) if "resolution_m" in requested else half
-    centre = _nearest_flown(squint, half * (1 + TAPER), place)
-    sector = Sector(flight.tx_axis, flight.rx_axis, centre, half)
+    sector = Sector(flight.tx_axis, flight.rx_axis, squint, half).following(aperture, points)
     return _integration_of(sector, aperture, points_m, wavelength_m / (2 * per_path * half), why, where)
-
-
-def _nearest_flown(squint: float, outer: float, place: NDArray[np.float64]) -> float:
-    """Return the centre nearest to `squint` about which most of the scene (pulse, place) was flown past."""
-    first, last = place.min(axis=0), place.max(axis=0)
-    middle = (first + last) / 2
-    reach = np.maximum(last - middle - outer, 0)
-    centre = float(np.median(np.clip(squint, middle - reach, middle + reach)))
-    return centre if abs(centre - squint) > 1e-3 * outer else squint
 
 
 def _squint(flight: Sector, antennas: Beams | None) -> float:
@@ -268,13 +258,14 @@ def _integration_of(
     least, median, most = (round(float(np.quantile(pulses, part))) for part in (0, 0.5, 1))
     counted = f"of {len(aperture)} pulses a place takes {least} to {most} (median {median})"
     width, sidelobe_db = response()
+    squint_deg = np.degrees(np.arcsin(np.quantile(sector.centre_at(points).clip(-1, 1), (0, 0.5, 1)))).round(3)
     report = {
         "degrees": round(degrees, 3),
         "resolution_m": float(f"{resolution_m:.4g}"),
         "width_m": float(f"{width * resolution_m:.4g}"),
         "sidelobe_db": round(sidelobe_db, 2),
         "taper": TAPER,
-        "squint_deg": round(float(np.degrees(np.arcsin(np.clip(sector.centre, -1, 1)))), 3),
+        "squint_deg": dict(zip(("least", "median", "most"), squint_deg.tolist(), strict=True)),
         "pulses_per_pixel": {"least": least, "median": median, "most": most, "of": len(aperture)},
     }
     flags = {}

@@ -114,7 +114,11 @@ class BeamJob(ctypes.Structure):
 class SectorJob(ctypes.Structure):
     """native/job.hpp, SectorJob."""
 
-    _fields_ = [("axis", _pointer * 2), *((name, _double) for name in ("centre", "inner", "outer"))]
+    _fields_ = [
+        ("axis", _pointer * 2),
+        *((name, _double) for name in ("centre", "inner", "outer")),
+        ("moved", _pointer),
+    ]
 
 
 class ApertureJob(ctypes.Structure):
@@ -381,7 +385,9 @@ KeptArrays = list[NDArray[np.generic]]
 """Arrays that a struct points into, kept alive as long as the struct is used."""
 
 
-def weights_of(beams: Beams | None, pulses: int, padded: int) -> tuple[Any, Any, KeptArrays]:
+def weights_of(
+    beams: Beams | None, pulses: int, padded: int, pixels: NDArray[np.float64]
+) -> tuple[Any, Any, KeptArrays]:
     """Return the pointers `beam` and `sector` of an `ApertureJob`, and the arrays that they point into.
 
     Parameters
@@ -390,6 +396,8 @@ def weights_of(beams: Beams | None, pulses: int, padded: int) -> tuple[Any, Any,
         Over as many pulses.
     pulses, padded
         Of the tables, without and with those that fill a batch.
+    pixels
+        (row, column, 3) float64, metres: of the tile.
 
     Raises
     ------
@@ -405,7 +413,7 @@ def weights_of(beams: Beams | None, pulses: int, padded: int) -> tuple[Any, Any,
             kept += arrays
     if beams.sector is None:
         return pointers, None, kept
-    sector, arrays = _sector(beams.sector, pulses, padded)
+    sector, arrays = _sector(beams.sector, pulses, padded, pixels)
     return pointers, ctypes.pointer(sector), kept + arrays
 
 
@@ -427,7 +435,7 @@ def _beam(beam: Beam, pulses: int, padded: int) -> tuple[BeamJob, KeptArrays]:
     return job, [axes, *gains]
 
 
-def _sector(sector: Sector, pulses: int, padded: int) -> tuple[SectorJob, KeptArrays]:
+def _sector(sector: Sector, pulses: int, padded: int, pixels: NDArray[np.float64]) -> tuple[SectorJob, KeptArrays]:
     if len(sector.tx_axis) != pulses:
         raise ValueError(f"{len(sector.tx_axis)=}: must be one for each of {pulses} pulses")
     filling = [(0, padded - pulses), (0, 0)]
@@ -436,4 +444,8 @@ def _sector(sector: Sector, pulses: int, padded: int) -> tuple[SectorJob, KeptAr
         for axis in (sector.tx_axis, sector.rx_axis)
     ]
     pointers = (ctypes.c_void_p * 2)(*(axis.ctypes.data for axis in axes))
-    return SectorJob(pointers, sector.centre, sector.inner, sector.outer), [*axes]
+    moved = sector.moved(pixels)
+    if moved is None:
+        return SectorJob(pointers, sector.centre, sector.inner, sector.outer, None), [*axes]
+    moved = np.ascontiguousarray(np.nan_to_num(moved))
+    return SectorJob(pointers, sector.centre, sector.inner, sector.outer, moved.ctypes.data), [*axes, moved]
