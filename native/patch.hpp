@@ -23,11 +23,11 @@ static constexpr float half_span(int64_t count) { return count > 1 ? 0.5f * floa
 // Lengths in cells but for `origin`. Pixel (i, j) lies at origin + j step_x + i step_y + height up, i and j counted
 // from the patch's middle; pixels are stored block by block, and row by row in a block.
 struct alignas(64) Patch {
-  float along_x[kBlocks], along_y[kBlocks], height[kBlocks];  // centre of each block: pixels, pixels, cells
-  float square[kBlocks];                                      // |d|^2: squared distance of that centre from the origin
-  float dot_x[kBlocks], dot_y[kBlocks], dot_h[kBlocks];       // d . step_x, d . step_y and d . up
-  float rise[kPixels];                                        // h': height of each pixel above its block's
-  float moved[kPixels];                                       // of a sector: centre of each pixel less that of the job
+  float along_x[kBlocks], along_y[kBlocks], height[kBlocks];   // centre of each block: pixels, pixels, cells
+  float square[kBlocks];                                       // |d|^2: squared distance of that centre from the origin
+  float dot_x[kBlocks], dot_y[kBlocks], dot_h[kBlocks];        // d . step_x, d . step_y and d . up
+  float rise[kPixels];                                         // h': height of each pixel above its block's
+  float moved[kPixels];                                        // of a sector: centre of each pixel less that of the job
   float moved_b[kBlocks], moved_x[kBlocks], moved_y[kBlocks];  // the same at each block's centre, and its slopes
   float moved_mean, moved_reach, moved_bend;  // over the patch; largest deviation from it, and from a block's slopes
   double origin[3], step_x[3], step_y[3], up[3];
