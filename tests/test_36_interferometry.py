@@ -9,6 +9,7 @@ import pytest
 
 import apertura as ap
 from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
+from apertura.core.quality.path_errors import autocorrelation
 from apertura.core.scene.looks import Looks
 from apertura.core.scene.terrain import FlatGround
 from apertura.methods.interferometry.comparison import AssumedGround, form_interferogram, interferogram_flags
@@ -22,7 +23,7 @@ from apertura.methods.interferometry.heights import (
     remove_level,
     unwrap,
 )
-from apertura.methods.interferometry.sensitivity import Sensitivity, sensitivity
+from apertura.methods.interferometry.sensitivity import FlownAntenna, Sensitivity, TrackPhase, sensitivity
 
 FREQUENCY = 1.0e9 + np.arange(128) * 400e6 / 128
 WAVELENGTH = C / FREQUENCY.mean()
@@ -223,6 +224,33 @@ def test_what_has_changed_between_the_flights_lowers_coherence_and_widens_the_de
     wrong -= np.nanmedian(wrong)  # no point of known height
     assert np.sqrt(np.nanmean((wrong / changed.panels["height_std"][INSIDE]) ** 2)) < 1.2
     assert list(interferogram_flags(changed.measured)) == ["height_relative"]
+
+
+@pytest.mark.parametrize("same", [False, True])
+@pytest.mark.parametrize("correlation_s", [0.5, 4.0, 1e4])
+def test_errors_of_the_tracks_turn_the_phase_as_much_as_told(same, correlation_s):
+    """Eq. 8a against drawn errors: of two flights, and of one whose receivers share a transmitter."""
+    generator, time_s, std_m = np.random.default_rng(5), np.linspace(0, 30, 301), np.array([0.01, 0.02, 0.015])
+    places = np.array([[x, y, 0.0] for x in (-20.0, 0.0, 25.0) for y in (20.0, 60.0)])
+    along = np.stack([np.linspace(-15, 15, 301), np.zeros(301), np.full(301, 20.0)], -1)
+    flown = [("a", 1, along), ("a" if same else "b", -1, along + [0, 0, 1.0]), ("c", -1, along + [3.0, 0, 0])]
+    some, k = slice(3, None, 18), 2 * np.pi / WAVELENGTH
+    times = np.tile(time_s[some], (6, 1))
+    antennas = [
+        FlownAntenna(name, sign, np.broadcast_to(leg[some], (6, 17, 3)), times, std_m, correlation_s)
+        for name, sign, leg in flown
+    ]
+    reference = [0, 5]
+    told = TrackPhase(places, np.eye(3), antennas, k).std(reference)
+    lag = np.abs(np.subtract.outer(time_s, time_s))
+    root = np.linalg.cholesky(autocorrelation(lag, correlation_s) + 1e-9 * np.eye(301))
+    error = {name: np.einsum("tu,dux->dtx", root, generator.standard_normal((300, 301, 3)) * std_m) for name in "abc"}
+    phase = np.zeros((300, 6))
+    for name, sign, leg in flown:
+        away = leg[:, None] - places
+        toward = away / np.linalg.norm(away, axis=-1, keepdims=True)
+        phase += sign * k * np.tensordot(error[name], toward / 301, axes=([1, 2], [0, 2]))
+    np.testing.assert_allclose((phase - phase[:, reference].mean(axis=1, keepdims=True)).std(axis=0), told, rtol=0.15)
 
 
 def test_another_scene_is_decorrelated_and_tells_no_height():

@@ -1,6 +1,6 @@
 """Interferogram of two images of one scene: coherence, phase, heights, and the limits that it exceeds."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -153,6 +153,9 @@ class AssumedGround:
         (y, x, 2) float64, rows and columns from a pixel to the ground it shows, per metre of height.
     known
         Points of known height.
+    track_std
+        From the points that heights count from to the deviation of the phase by errors of the tracks, (y, x) float64
+        rad; None where nobody knows these.
     """
 
     height_m: Floats
@@ -160,6 +163,7 @@ class AssumedGround:
     sensed: Sensitivity
     shift_px: Floats
     known: Sequence[KnownHeight] = ()
+    track_std: Callable[[Sequence[KnownHeight]], Floats] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -245,7 +249,11 @@ def form_interferogram(
     reference = level(unwrapped, known)
     alone = remove_level(unwrapped, reference) if reference else np.full(common.shape, np.nan, np.float32)
     scatter = phase_std(unbiased(magnitude, looks), own).astype(np.float64)
-    at_place = _placed(ground, alone, np.hypot(scatter, reference.std_rad or 0.0 if reference else 0.0))
+    if reference:
+        scatter = np.hypot(scatter, reference.std_rad or 0.0)
+    if reference and ground.track_std:
+        scatter = np.hypot(scatter, ground.track_std([one for one in known if one.name in reference.points]))
+    at_place = _placed(ground, alone, scatter)
     panels = {
         "phase": np.where(common, phase, np.nan).astype(np.float32),
         "coherence": np.where(common, magnitude, np.nan).astype(np.float32),

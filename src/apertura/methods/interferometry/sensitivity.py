@@ -1,11 +1,13 @@
-"""Sensitivity of the phase between two images to height: radians per metre, shift of the ground, common spectrum."""
+"""Sensitivity of the phase between two images to height and to errors of the tracks."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from apertura.common.arrays import Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.core.quality.path_errors import autocorrelation
 
 Legs = tuple[Floats, Floats]
 """Phase centres of transmitter and receiver of the pulses that make each place, (place, pulse, 3) metres each."""
@@ -169,3 +171,132 @@ def _shared(one: Floats, other: Floats) -> Floats:
     both = np.minimum(one[:, 1], other[:, 1]) - np.maximum(one[:, 0], other[:, 0])
     mean = np.sqrt((one[:, 1] - one[:, 0]) * (other[:, 1] - other[:, 0]))
     return np.asarray(np.clip(both / np.maximum(mean, 1e-12), 0, 1))
+
+
+# ---- Errors of the tracks -------------------------------------------------------------------------------------------
+
+_BINS = 128  # of time, over which the errors of a track are taken as one
+_FINER = 8  # points of the aperture for each pulse given
+_WITHIN = 33  # lags at which the correlation of two bins is averaged, odd
+_NODES = 1024  # places in work at once
+_REFERENCES = 256  # places whose mean phase stands for that of all
+
+
+@dataclass(frozen=True, eq=False)
+class FlownAntenna:
+    """One antenna of one of two images, and what is known of its positions.
+
+    Attributes
+    ----------
+    platform
+        Antennas of one platform in one flight have one error.
+    sign
+        1 for the first image, -1 for the second.
+    position_m
+        (place, pulse, 3) float64, metres: at pulses spread over the aperture of each place.
+    time_s
+        (place, pulse) float64, seconds of a clock that all antennas share.
+    std_m
+        (3,) float64, standard deviation of its positions east, north and up, metres.
+    correlation_s
+        As `apertura.core.quality.path_errors.autocorrelation`.
+    """
+
+    platform: str
+    sign: int
+    position_m: Floats
+    time_s: Floats
+    std_m: Floats
+    correlation_s: float
+
+
+@dataclass(frozen=True, eq=False)
+class TrackPhase:
+    """Errors of the phase between two images that come from the tracks.
+
+    Attributes
+    ----------
+    places_m
+        (place, 3) float64, metres, on the ground.
+    axes
+        (3, 3) float64, unit vectors east, north and up.
+    antennas
+        Of both images; those whose errors nobody knows are left out.
+    wavenumber_rad_m
+        Of the band's middle.
+
+    Notes
+    -----
+    Source: docs/theory/interferometry.md, eq. 8a.
+    """
+
+    places_m: Floats
+    axes: Floats
+    antennas: Sequence[FlownAntenna]
+    wavenumber_rad_m: float
+
+    def std(self, reference: Sequence[int]) -> Floats:
+        """Return the deviation of the phase of each place less the mean phase of some, (place,) float64 rad.
+
+        Parameters
+        ----------
+        reference
+            Places that the phase counts from; empty: all.
+
+        Examples
+        --------
+        Two flights past a scene 30 m away; the second errs by 1 cm along its line of sight to the first place, for
+        longer than it flies: nothing there, k (1 cm) sin 45° for a place seen from 45° aside.
+
+        >>> places = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 30.0]])
+        >>> antenna = np.broadcast_to([0.0, -30.0, 0.0], (2, 5, 3))
+        >>> time = np.broadcast_to(np.arange(5.0), (2, 5))
+        >>> flown = FlownAntenna("f02/uav1", -1, antenna, time, np.array([0.0, 0.0, 0.01]), 1e6)
+        >>> TrackPhase(places, np.eye(3), [flown], 25.0).std([0]).round(3)
+        array([0.   , 0.177])
+        """
+        count = len(self.places_m)
+        chosen = np.array(reference or np.arange(count)[:: max(1, count // _REFERENCES)])
+        variance = np.zeros(count)
+        for platform in dict.fromkeys(one.platform for one in self.antennas):
+            some = [one for one in self.antennas if one.platform == platform]
+            first = min(float(one.time_s.min()) for one in some)
+            width_s = max(max(float(one.time_s.max()) for one in some) - first, 1e-9) / _BINS
+            between = _between_bins(width_s, some[0].correlation_s)
+            mean = self._per_error(some, chosen, first, width_s).mean(axis=0)
+            for start in range(0, count, _NODES):
+                part = np.arange(start, min(start + _NODES, count))
+                apart = self._per_error(some, part, first, width_s) - mean
+                variance[part] += np.einsum("pab,pab->p", apart @ between, apart)
+        return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
+
+    def _per_error(
+        self, antennas: Sequence[FlownAntenna], places: np.ndarray, first_s: float, width_s: float
+    ) -> Floats:
+        """Return the phase of some places per deviation of a platform's error along each axis in each bin of time."""
+        total = np.zeros(len(places) * 3 * _BINS)
+        rows = np.arange(len(places))[:, None, None]
+        for one in antennas:
+            away = one.position_m[places] - self.places_m[places][:, None]
+            along = away / np.linalg.norm(away, axis=-1, keepdims=True) @ self.axes.T * one.std_m
+            pulses = along.shape[1]
+            at = np.linspace(0, pulses - 1, _FINER * pulses)
+            low = np.minimum(at.astype(np.int64), max(0, pulses - 2))
+            high, share = np.minimum(low + 1, pulses - 1), at - low
+            along = along[:, low] + (along[:, high] - along[:, low]) * share[:, None]
+            time_s = one.time_s[places]
+            time_s = time_s[:, low] + (time_s[:, high] - time_s[:, low]) * share
+            bins = np.clip(((time_s - first_s) / width_s).astype(np.int64), 0, _BINS - 1)[:, :, None]
+            index = (rows * 3 + np.arange(3)) * _BINS + bins
+            phase = one.sign * self.wavenumber_rad_m / len(at) * along
+            total += np.bincount(index.ravel(), phase.ravel(), minlength=total.size)
+        return total.reshape(len(places), 3, _BINS)
+
+
+def _between_bins(width_s: float, correlation_s: float) -> Floats:
+    """Return the correlation of the mean errors of two bins of time, (bin, bin)."""
+    within = np.linspace(-1, 1, _WITHIN)
+    weight = 1 - np.abs(within)
+    lag = np.abs(np.arange(_BINS)[:, None] + within) * width_s
+    row = (autocorrelation(lag, correlation_s) * weight).sum(axis=1) / weight.sum()
+    return np.asarray(row[np.abs(np.subtract.outer(np.arange(_BINS), np.arange(_BINS)))])

@@ -1,7 +1,8 @@
 """Two images of a campaign, opened for an interferogram: sensitivity of each pixel's phase to height."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,14 +12,15 @@ from numpy.typing import NDArray
 from apertura.common.contracts import Window
 from apertura.common.errors import CampaignError
 from apertura.core.imaging.range_profiles import aperture_of
-from apertura.core.scene.looks import Looks
+from apertura.core.scene.looks import Lattice, Looks
 from apertura.methods.interferometry.comparison import AssumedGround
 from apertura.methods.interferometry.heights import KnownHeight
-from apertura.methods.interferometry.sensitivity import Legs, Sensitivity, sensitivity
+from apertura.methods.interferometry.sensitivity import FlownAntenna, Legs, Sensitivity, TrackPhase, sensitivity
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import CONFIG
+from apertura.pipeline.opening.autofocus import clock_s, open_refined
 from apertura.pipeline.opening.images import opened_layer
-from apertura.pipeline.opening.pair import open_pair
+from apertura.pipeline.opening.pair import OpenPair, open_pair
 from apertura.pipeline.opening.plan import weighing
 from apertura.pipeline.opening.scene import OpenScene
 from apertura.pipeline.store import open_stage
@@ -65,13 +67,16 @@ def open_two(campaign: Campaign, name: str, scene: OpenScene) -> TwoImages:
         expected = f"one of {', '.join(requested.pairs) or 'none: no two images are named'}"
         raise CampaignError(f"no interferogram {name!r}", f"{CONFIG}: interferometry.pairs", expected, "Name it there.")
     images = requested.images(name)
-    bands, legs, looks = [], [], []
-    for flight, pair in images:
+    bands, legs, looks, antennas = [], [], [], list[FlownAntenna]()
+    began: np.datetime64 | None = None
+    for sign, (flight, pair) in zip((1, -1), images, strict=True):
         echo, profile = (open_stage(campaign.stage(stage, flight, pair), stage) for stage in ("echo", "profile"))
         opened = open_pair(campaign, flight, pair, echo=echo)
         bands.append((float(opened.frequency_hz.min()), float(opened.frequency_hz.max())))
         looks.append(Looks.of(scene.grid, scene.terrain, aperture_of(profile), weighing(campaign, opened, scene)))
         legs.append(_legs(looks[-1]))
+        began = began or opened.began
+        antennas += _antennas(campaign, opened, looks[-1], sign=sign, began=began)
     if not np.allclose(bands[0], bands[1], rtol=_SAME, atol=0):
         found = " and ".join(f"{low / 1e6:.6g} to {high / 1e6:.6g} MHz" for low, high in bands)
         where = f"{CONFIG}: interferometry.pairs.{name}"
@@ -80,7 +85,54 @@ def open_two(campaign: Campaign, name: str, scene: OpenScene) -> TwoImages:
     stages = [open_stage(campaign.stage("image", *image), "image") for image in images]
     sensed = _sensed(scene, looks[0], legs, bands[0])
     visible = np.logical_and(*(_plain(campaign, *image) for image in images))
-    return TwoImages((first, second), (stages[0], stages[1]), _ground(campaign, scene, sensed, visible))
+    ground = _ground(campaign, scene, sensed, visible)
+    if antennas:
+        wavenumber = np.pi * sum(bands[0]) / opened.wave_speed_m_s
+        phase = TrackPhase(_nodes(scene, looks[0]), scene.axes, antennas, wavenumber)
+        ground = replace(ground, track_std=partial(_track_std, phase, looks[0].lattice))
+    return TwoImages((first, second), (stages[0], stages[1]), ground)
+
+
+def _antennas(
+    campaign: Campaign, opened: OpenPair, looks: Looks, *, sign: int, began: np.datetime64
+) -> list[FlownAntenna]:
+    """Return the antennas of an image whose position errors are known: stated, or left by the refinement."""
+    pulses = looks.pulses.reshape(-1, looks.pulses.shape[-1])
+    at_s, refined = clock_s(opened, began), open_refined(campaign, opened.flight)
+    time = opened.began + (opened.time_s * 1e9).astype("timedelta64[ns]")
+    names = dict.fromkeys(opened.name.split("-"))
+    known = dict(zip(names, opened.positions, strict=True))
+    antennas = []
+    for node, leg in zip(opened.name.split("-"), looks.aperture.legs, strict=True):
+        positions = known[node].assumed
+        left_m = refined.left_m(node, time)
+        if np.isfinite(left_m).any():
+            std_m = np.full(3, np.sqrt(np.nanmean(left_m**2)))
+        elif positions.std_m is not None:
+            std_m = np.array(positions.std_m)
+        else:
+            continue
+        antennas.append(
+            FlownAntenna(f"{opened.flight}/{node}", sign, leg[pulses], at_s[pulses], std_m, positions.correlation_s)
+        )
+    return antennas
+
+
+def _nodes(scene: OpenScene, looks: Looks) -> NDArray[np.float64]:
+    """Return the places of the nodes of a lattice, (node, 3)."""
+    rows, columns = np.meshgrid(*looks.lattice.nodes, indexing="ij")
+    return scene.terrain.positions_at(scene.grid, rows, columns).reshape(-1, 3)
+
+
+def _track_std(phase: TrackPhase, lattice: Lattice, known: Sequence[KnownHeight]) -> NDArray[np.float64]:
+    """Return the deviation of the phase of every pixel by errors of the tracks, of heights that count from points."""
+    columns = lattice.shape[1]
+    nearest = [
+        int(np.abs(lattice.nodes[0] - one.row).argmin()) * columns + int(np.abs(lattice.nodes[1] - one.column).argmin())
+        for one in known
+    ]
+    whole: Window = (slice(0, int(lattice.nodes[0][-1]) + 1), slice(0, int(lattice.nodes[1][-1]) + 1))
+    return lattice.between(phase.std(nearest).reshape(lattice.shape), whole)
 
 
 def _legs(looks: Looks) -> Legs:
@@ -92,9 +144,7 @@ def _legs(looks: Looks) -> Legs:
 
 def _sensed(scene: OpenScene, looks: Looks, legs: Sequence[Legs], band_hz: tuple[float, float]) -> Sensitivity:
     """Return the sensitivity to height at every pixel: computed at nodes of the lattice, bilinear between them."""
-    lattice, grid = looks.lattice, scene.grid
-    rows, columns = np.meshgrid(*lattice.nodes, indexing="ij")
-    places = scene.terrain.positions_at(grid, rows, columns).reshape(-1, 3)
+    lattice, grid, places = looks.lattice, scene.grid, _nodes(scene, looks)
     at_nodes = sensitivity(places, scene.axes, legs[0], legs[1], band_hz=band_hz)
     whole: Window = (slice(0, grid.shape[0]), slice(0, grid.shape[1]))
 
