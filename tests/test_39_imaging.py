@@ -160,12 +160,60 @@ def test_what_cannot_be_imaged_is_refused_with_one_message(given, grid, options,
 
 
 @pytest.mark.parametrize(
-    "fields",
-    [{"weight": np.ones(3)}, {"reference_delay_s": np.zeros(3)}, {"transfer": np.zeros((95, 200), np.complex64)}],
+    ("fields", "complaint"),
+    [
+        ({"weight": np.ones(3)}, r"PhaseHistory: .*weight \(3,\).*expected transfer \(pulse, subcarrier\)"),
+        ({"reference_delay_s": np.zeros(3)}, r"reference_delay_s \(3,\)"),
+        ({"reference_delay_s": 0.0}, r"reference_delay_s \(\)"),
+        ({"transfer": np.zeros((95, 200), np.complex64)}, r"transfer \(95, 200\).*aperture of 96 pulses"),
+        ({"transfer": np.zeros((200, 96), np.complex64)}, r"transfer \(200, 96\).*Transpose"),
+        ({"transfer": "echo"}, "PhaseHistory: transfer: 'echo'; expected an array of numbers"),
+        ({"frequency_hz": None}, r"frequency_hz"),
+        ({"aperture": np.zeros((96, 3))}, "PhaseHistory: aperture: an object of type ndarray.*Make one by Aperture"),
+    ],
 )
-def test_a_history_of_shapes_that_do_not_belong_together_is_refused(fields):
-    with pytest.raises(ValueError, match="must be"):
+def test_a_history_of_what_does_not_belong_together_is_refused(fields, complaint):
+    with pytest.raises(CampaignError, match=complaint):
         spoiled(**fields)
+
+
+def test_lists_are_taken_as_arrays():
+    history = point_history()
+    given = replace(history, weight=list(history.weight), reference_delay_s=[0.0] * len(history))
+    np.testing.assert_array_equal(given.weight, history.weight)
+    assert len(ap.Aperture([[0.0, 0, 9], [1, 0, 9]], [[0.0, 0, 9], [1, 0, 9]])) == 2
+    with pytest.raises(CampaignError, match=r"tx_m \(3,\).*x, y and z of each pulse"):
+        ap.Aperture([0.0, 0, 9], [0.0, 0, 9])
+
+
+def scaled(factor):
+    return spoiled(frequency_hz=point_history().frequency_hz * factor)
+
+
+def range_compressed():
+    return ap.range_compress(point_history(), TARGET_GRID, ap.FlatGround(0.0))
+
+
+@pytest.mark.parametrize(
+    ("given", "complaint"),
+    [
+        (lambda: scaled(1e-9), "frequency_hz.*radio frequencies in Hz.*Is that in GHz"),
+        (lambda: scaled(1e-6), "frequency_hz.*Is that in MHz"),
+        (lambda: scaled(-1), "frequency_hz.*Give them in Hz"),
+        (lambda: scaled(np.nan), "frequency_hz"),
+        (lambda: spoiled(weight=np.zeros(200)), "weight: 0 to 0"),
+        (lambda: spoiled(weight=np.linspace(-1, 1, 200)), "weight: -1 to 1.*no weight below 0"),
+        (lambda: spoiled(weight=np.append(np.ones(199), np.nan)), "weight: 1 of 200 not finite, first at 199"),
+        (lambda: spoiled(reference_delay_s=np.append(np.inf, np.zeros(95))), "1 of 96 not finite, first at 0"),
+        (lambda: replace(range_compressed(), centre_frequency_hz=1.2), "centre_frequency_hz.*Is that in GHz"),
+        (lambda: np.ones((96, 200)), "an object of type ndarray.*expected a PhaseHistory"),
+        (lambda: "results/f01", "an object of type str"),
+        (lambda: xr.Dataset({"image": ("x", [1.0])}), "a dataset of image"),
+    ],
+)
+def test_numbers_that_are_none_of_a_radar_are_refused_before_an_image(given, complaint):
+    with pytest.raises(CampaignError, match=complaint):
+        ap.backproject(given(), TARGET_GRID)
 
 
 def test_frequencies_that_do_not_ascend_in_equal_steps_are_refused():
@@ -177,7 +225,7 @@ def test_profiles_that_end_within_the_scene_are_flagged():
     profiles = ap.range_compress(point_history(), TARGET_GRID, ap.FlatGround(0.0))
     short = replace(profiles, samples=profiles.samples[:, :60])
     assert "beyond the samples" in json.loads(ap.backproject(short, TARGET_GRID).attrs["flags"])["scene_beyond_samples"]
-    with pytest.raises(ValueError, match="as many pulses"):
+    with pytest.raises(CampaignError, match=r"samples \(50, .*as many pulses"):
         replace(profiles, samples=profiles.samples[:50])
 
 

@@ -7,7 +7,49 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.common.errors import CampaignError, quoted
 from apertura.core.geometry.aperture import Aperture
+
+
+def _as_arrays(one: Any, kinds: dict[str, type]) -> None:
+    """Make arrays of lists and numbers that an input was given; what has a shape, such as lazy samples, stays.
+
+    Raises
+    ------
+    CampaignError
+        If something is no array of numbers, or `aperture` no `Aperture`.
+    """
+    where = type(one).__name__
+    for name, kind in kinds.items():
+        value = getattr(one, name)
+        if not hasattr(value, "ndim"):
+            try:
+                object.__setattr__(one, name, np.asarray(value, kind))
+            except (TypeError, ValueError):
+                raise CampaignError(
+                    quoted(value), f"{where}: {name}", "an array of numbers", "Give it as a numpy array."
+                ) from None
+    if not isinstance(one.aperture, Aperture):
+        raise CampaignError(
+            f"an object of type {type(one.aperture).__name__}",
+            where=f"{where}: aperture",
+            expected="an Aperture: phase centres of transmitter and receiver, (pulse, 3) each",
+            remedy="Make one by Aperture(tx_m, rx_m).",
+        )
+
+
+def _check_shapes(one: Any, expected: dict[str, tuple[int, ...]], said: str) -> None:
+    """Raise CampaignError unless arrays have the shapes that go together."""
+    found = {name: tuple(getattr(one, name).shape) for name in expected}
+    pulses = {"aperture": len(one.aperture)} | {name: shape[0] if shape else 0 for name, shape in found.items()}
+    if found != expected or pulses["aperture"] != next(iter(expected.values()))[0]:
+        shapes = ", ".join(f"{name} {shape}" for name, shape in found.items())
+        raise CampaignError(
+            f"{shapes}, aperture of {pulses['aperture']} pulses",
+            where=f"{type(one).__name__}",
+            expected=said,
+            remedy="Transpose what lies the other way round; give one row for each pulse.",
+        )
 
 
 class PhaseRotated:
@@ -58,8 +100,10 @@ class PhaseHistory:
 
     Raises
     ------
+    CampaignError
+        If something is no array, or the shapes do not belong together.
     ValueError
-        If the shapes do not belong together, or the wave is faster than light.
+        If the wave is faster than light.
     """
 
     transfer: NDArray[np.complex64]
@@ -70,17 +114,12 @@ class PhaseHistory:
     wave_speed_m_s: float = SPEED_OF_LIGHT_M_S
 
     def __post_init__(self) -> None:
+        real = dict.fromkeys(("frequency_hz", "weight", "reference_delay_s"), np.float64)
+        _as_arrays(self, {"transfer": np.complex64, **real})
         pulses, subcarriers = self.transfer.shape if self.transfer.ndim == 2 else (-1, -1)
-        if (len(self.aperture), self.reference_delay_s.shape) != (pulses, (pulses,)):
-            raise ValueError(
-                f"{self.transfer.shape=}, {self.reference_delay_s.shape=}, {len(self.aperture)=}: must be "
-                "(pulse, subcarrier), (pulse,) and as many pulses"
-            )
-        if not self.frequency_hz.shape == self.weight.shape == (subcarriers,):
-            raise ValueError(
-                f"{self.transfer.shape=}, {self.frequency_hz.shape=}, {self.weight.shape=}: must be "
-                "(pulse, subcarrier) and (subcarrier,) twice"
-            )
+        vectors = {"reference_delay_s": (pulses,), "frequency_hz": (subcarriers,), "weight": (subcarriers,)}
+        said = "transfer (pulse, subcarrier), reference_delay_s (pulse,), frequency_hz and weight (subcarrier,)"
+        _check_shapes(self, {"transfer": (pulses, subcarriers), **vectors}, f"{said}, as many pulses of the aperture")
         _check_wave_speed(self.wave_speed_m_s)
 
     def __len__(self) -> int:
@@ -137,8 +176,10 @@ class Profiles:
 
     Raises
     ------
+    CampaignError
+        If something is no array, or the shapes do not belong together.
     ValueError
-        If the shapes do not belong together, the step is not positive, or the wave is faster than light.
+        If the step is not positive, or the wave is faster than light.
     """
 
     samples: NDArray[np.complex64]
@@ -150,12 +191,10 @@ class Profiles:
     wave_speed_m_s: float = SPEED_OF_LIGHT_M_S
 
     def __post_init__(self) -> None:
-        pulses = len(self.samples) if self.samples.ndim == 2 else -1
-        if (len(self.aperture), self.start_m.shape) != (pulses, (pulses,)):
-            raise ValueError(
-                f"{self.samples.shape=}, {self.start_m.shape=}, {len(self.aperture)=}: must be (pulse, range), "
-                "(pulse,) and as many pulses"
-            )
+        _as_arrays(self, {"samples": np.complex64, "start_m": np.float64})
+        pulses, length = self.samples.shape if self.samples.ndim == 2 else (-1, -1)
+        said = "samples (pulse, range), start_m (pulse,), as many pulses of the aperture"
+        _check_shapes(self, {"samples": (pulses, length), "start_m": (pulses,)}, said)
         if not 0 < self.step_m < np.inf:
             raise ValueError(f"{self.step_m=}: must be positive")
         _check_wave_speed(self.wave_speed_m_s)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.common.errors import CampaignError
 
 Weigh = Callable[[slice, NDArray[np.float64]], NDArray[np.float64]]
 """Pulses and points (point, 3) → (pulse, point) float64."""
@@ -28,7 +29,7 @@ class Aperture:
 
     Raises
     ------
-    ValueError
+    CampaignError
         If shapes differ or are not (pulse, 3).
 
     Examples
@@ -43,8 +44,16 @@ class Aperture:
     rx_m: NDArray[np.float64]
 
     def __post_init__(self) -> None:
+        for name in ("tx_m", "rx_m"):
+            if not hasattr(getattr(self, name), "ndim"):  # a list, say
+                object.__setattr__(self, name, np.asarray(getattr(self, name), np.float64))
         if self.tx_m.shape != self.rx_m.shape or self.tx_m.ndim != 2 or self.tx_m.shape[1] != 3:
-            raise ValueError(f"{self.tx_m.shape=}, {self.rx_m.shape=}: both must be (pulse, 3)")
+            raise CampaignError(
+                f"tx_m {self.tx_m.shape}, rx_m {self.rx_m.shape}",
+                where="Aperture",
+                expected="phase centres of as many pulses, (pulse, 3) each, metres",
+                remedy="Give x, y and z of each pulse in a row; one antenna that does both is given twice.",
+            )
 
     def __len__(self) -> int:
         """Return the number of pulses."""

@@ -28,6 +28,8 @@ from apertura.core.scene.terrain import FlatGround, GroundModels, Terrain
 
 _POINTS = 9  # along a side of the scene, sampled
 _PULSES = 256  # sampled for total paths
+_RADIO_HZ = (1e5, 1e12)  # what radars use, and far beyond it
+_USUAL_HZ = (1e7, 1e12)  # of which a number without its unit is taken to be one
 
 
 def check_inputs(inputs: PhaseHistory | Profiles, grid: SceneGrid, terrain: Terrain) -> dict[str, str]:
@@ -43,12 +45,14 @@ def check_inputs(inputs: PhaseHistory | Profiles, grid: SceneGrid, terrain: Terr
     Raises
     ------
     CampaignError
-        If the grid's CRS is not one for a scene, a position, sample or height is not finite, an antenna is in the
-        ground, all samples are zero, or the scene lies beyond the samples of all pulses.
+        If the grid's CRS is not one for a scene, frequencies are none of a radar, a weight is negative, a position,
+        delay, weight, sample or height is not finite, an antenna is in the ground, all weights or samples are zero, or
+        the scene lies beyond the samples of all pulses.
     """
     if grid.crs != LOCAL:
         check_crs(grid.crs, grid.bounds_m)
     check_positions(inputs.aperture)
+    _check_band(inputs)
     _check_samples(inputs)
     points = terrain.positions_at(grid, *grid.sample_pixels(_POINTS)).reshape(-1, 3)
     if not np.isfinite(points).all():
@@ -70,6 +74,42 @@ def check_inputs(inputs: PhaseHistory | Profiles, grid: SceneGrid, terrain: Terr
     if outside:
         flags["scene_beyond_samples"] = f"{100 * outside:.1f} % of the scene's total paths lie beyond the samples"
     return flags
+
+
+def _check_band(inputs: PhaseHistory | Profiles) -> None:
+    """Raise CampaignError unless frequencies are those of a radar, and weights and delays can be summed with."""
+    if isinstance(inputs, Profiles):
+        frequency, name = np.array([inputs.centre_frequency_hz]), "centre_frequency_hz"
+        finite = {"start_m": inputs.start_m}
+    else:
+        frequency, name = inputs.frequency_hz, "frequency_hz"
+        finite = {"weight": inputs.weight, "reference_delay_s": inputs.reference_delay_s}
+    low, high = (float(edge(frequency)) for edge in (np.min, np.max))
+    if not (_RADIO_HZ[0] <= low and high <= _RADIO_HZ[1]):  # NaN is neither
+        units = {"GHz": 1e9, "MHz": 1e6, "kHz": 1e3}
+        meant = [one for one, hz in units.items() if _USUAL_HZ[0] <= low * hz and high * hz <= _USUAL_HZ[1]]
+        raise CampaignError(
+            f"{low:.6g} to {high:.6g}" if low != high else f"{low:.6g}",
+            where=f"backproject: {name}",
+            expected=f"radio frequencies in Hz, {_RADIO_HZ[0]:g} to {_RADIO_HZ[1]:g}",
+            remedy=f"Is that in {meant[0]}? Multiply by {units[meant[0]]:g}." if meant else "Give them in Hz.",
+        )
+    for name, values in finite.items():
+        lost = np.flatnonzero(~np.isfinite(values))
+        if lost.size:
+            raise CampaignError(
+                f"{lost.size} of {values.size} not finite, first at {int(lost[0])}",
+                where=f"backproject: {name}",
+                expected="finite numbers",
+                remedy="Leave such pulses or subcarriers out.",
+            )
+    if isinstance(inputs, PhaseHistory) and not (inputs.weight.min() >= 0 < inputs.weight.max()):
+        raise CampaignError(
+            f"{inputs.weight.min():.6g} to {inputs.weight.max():.6g}",
+            where="backproject: weight",
+            expected="a window over the subcarriers: no weight below 0, some above",
+            remedy="Take window='hann', or weights of your own.",
+        )
 
 
 def _check_samples(inputs: PhaseHistory | Profiles) -> None:

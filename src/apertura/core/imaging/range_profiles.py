@@ -8,6 +8,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.common.errors import CampaignError
 from apertura.core.antenna.beam import Beams
 from apertura.core.echo.compression import centre_frequency, compress, range_step, window_weights
 from apertura.core.focus.inputs import PhaseHistory, Profiles
@@ -245,13 +246,25 @@ def inputs_of(given: PhaseHistory | Profiles | xr.Dataset, window: str = "hann")
 
     Raises
     ------
-    TypeError
-        If a dataset is another stage.
+    CampaignError
+        If it is something else.
     """
     if isinstance(given, PhaseHistory | Profiles):
         return given
+    if not hasattr(given, "data_vars"):
+        raise CampaignError(
+            f"an object of type {type(given).__name__}",
+            where="profiles",
+            expected="a PhaseHistory, Profiles, or a stage echo or profile as an xarray.Dataset",
+            remedy="Make one of its arrays.",
+        )
     if "transfer" in given:
         return phase_history_of(given, window)
     if "profile" in given:
         return profiles_of(given)
-    raise TypeError(f"a dataset with {sorted(map(str, given.variables))}: must be a stage echo or profile")
+    raise CampaignError(
+        f"a dataset of {', '.join(sorted(map(str, given.variables)))}",
+        where="profiles",
+        expected="a stage echo, which holds transfer, or profile, which holds profile",
+        remedy="Open one of these.",
+    )
