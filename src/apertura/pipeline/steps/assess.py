@@ -274,7 +274,7 @@ def assess(campaign: Campaign, flight: str) -> Path:
     align = refined or campaign.settings.processing.fusion.align_phase
     fusion = choose_fusion(rank, between, hidden=hidden, align=True) if align else as_formed
     flags = _flags(pairs, as_formed, hidden, taken_off={_PHASE} if refined else set())
-    for pair, name, line in _wrong_codes(quality):
+    for pair, name, line in wrong_codes({pair: one.get("code", {}) for pair, one in quality.items()}):
         flags[pair][name] = line
     reference = fusion.reference
     named = _hypotheses(campaign, flight, images, flags, reference)
@@ -389,15 +389,33 @@ def _phase_line(one: Agreement, where: str, pair: str, reference: str) -> str:
     return f"{found}: path offsets or positions are wrong by a fraction of the wavelength"
 
 
-def _wrong_codes(quality: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, str, str]]:
-    """Return pair, flag and line for each pair of a transmitter whose sidelink carries another code."""
-    evidence = {
-        pair.split("-")[0]: (pair, one["code"]["evidence"])
-        for pair, one in quality.items()
-        if one.get("code", {}).get("carried") is False
-    }
-    return [
-        (pair, "wrong_code", f"{evidence[tx][1]} (seen by {evidence[tx][0]})")
-        for pair, tx in ((pair, pair.split("-")[0]) for pair in quality)
-        if tx in evidence
-    ]
+def wrong_codes(codes: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, str, str]]:
+    """Return pair, flag and line for each pair whose transmitter sent, or whose receiver recorded, another code.
+
+    Where some receivers find the code and others find another, the transmitter sent it, and these recorded another
+    transmitter; where none finds it, all pairs of the transmitter are wrong.
+
+    Parameters
+    ----------
+    codes
+        Pair → `CodeEvidence` as it stands in image.json.
+
+    Examples
+    --------
+    >>> found, other = {"carried": True, "evidence": "locked"}, {"carried": False, "evidence": "another code"}
+    >>> wrong_codes({"a-a": {}, "a-b": other})
+    [('a-a', 'wrong_code', 'another code (seen by a-b)'), ('a-b', 'wrong_code', 'another code (seen by a-b)')]
+    >>> wrong_codes({"a-a": {}, "a-b": other, "a-c": found})
+    [('a-b', 'wrong_code', 'another code; a-c found the code that was stated')]
+    """
+    carried = {pair: one.get("carried") for pair, one in codes.items()}
+    flags = []
+    for pair in codes:
+        of_one = [other for other in codes if other.split("-")[0] == pair.split("-")[0]]
+        seen_by = next((other for other in of_one if carried[other] is False), None)
+        if seen_by and not any(carried[other] for other in of_one):
+            flags.append((pair, "wrong_code", f"{codes[seen_by]['evidence']} (seen by {seen_by})"))
+        elif carried[pair] is False:
+            found = ", ".join(other for other in of_one if carried[other])
+            flags.append((pair, "wrong_code", f"{codes[pair]['evidence']}; {found} found the code that was stated"))
+    return flags
