@@ -1,5 +1,6 @@
 """Constants measured at reflectors in one campaign, taken up by another of the same radar whose radio nobody states."""
 
+import hashlib
 import json
 import shutil
 from dataclasses import replace
@@ -23,6 +24,7 @@ from apertura.pipeline.steps import export, layers
 from apertura.simulation import GaussianBeam, ImageGrid, PointTarget, Radio, preset, simulate
 from apertura.views.reflectors import write_constants
 from apertura.views.score import score
+from apertura.views.verify.chain import verify
 
 RADIO = Radio(10.0, 8.0, 9.0, full_scale_dbm=4.0, gain_db=37.3, noise_figure_db=6.0, amplitude_std_db=0.5)
 PAIRS = ("uav1-uav1", "uav1-uav2")
@@ -193,6 +195,13 @@ def test_the_budget_has_the_deviation_of_the_file(later):
 
 
 @pytest.mark.slow
+def test_a_calibrated_product_is_followed_to_the_file_and_to_the_raw_samples(later):
+    chain = verify(later.result("f01", "uav1-uav1", "sigma0_db.tif"))
+    assert {link.state for link in chain.links} == {"same"}
+    assert {"calibration.json", "raw/f01/uav1.sigmf-data"} <= {link.name for link in chain.links}
+
+
+@pytest.mark.slow
 def test_the_file_is_a_source_of_the_layers_and_another_makes_them_again(later, tmp_path):
     root = copy_writable(later.root, tmp_path / "campaign")
     campaign = Campaign.load(root)
@@ -220,6 +229,28 @@ def test_a_radio_that_is_stated_wrong_is_flagged_and_not_used(later, tmp_path):
     export.export(campaign, "f01", "uav1-uav1")
     image = json.loads(campaign.result("f01", "uav1-uav1", "image.json").read_text())
     assert "constant_disagrees" in image["flags"]
+
+
+@pytest.mark.slow
+def test_a_receiver_that_loses_gain_between_flights_is_flagged_in_its_own_pair(measured, tmp_path):
+    """Samples of uav1 are a fifth lower in f02, 1.94 dB; uav2 divides by its sidelink, and records as before."""
+    root = copy_writable(measured.root, tmp_path / "campaign")
+    shutil.rmtree(root / "results")
+    path = root / "raw/f02/uav1.sigmf-data"
+    (np.fromfile(path, "<i2") * 0.8).round().astype("<i2").tofile(path)
+    meta = json.loads(path.with_suffix(".sigmf-meta").read_text())
+    meta["global"]["core:sha512"] = hashlib.sha512(path.read_bytes()).hexdigest()
+    path.with_suffix(".sigmf-meta").write_text(json.dumps(meta))
+    campaign = run_steps(root, exports=False)
+    for flight in campaign.image_flights:
+        for pair in flight.pairs:
+            layers.layers(campaign, flight.name, pair)
+    flags = {pair: one.flags for pair, one in measured_constants(campaign)[0].pairs.items()}
+    assert list(flags["uav1-uav1"]) == ["constant_drifts"]
+    line = flags["uav1-uav1"]["constant_drifts"]
+    assert float(line.split()[0]) == pytest.approx(20 * np.log10(0.8), abs=0.1)
+    assert line.endswith("dB from f01 to f02")
+    assert flags["uav1-uav2"] == {}
 
 
 @pytest.mark.slow
