@@ -90,8 +90,20 @@ def test_a_dihedral_is_narrow_along_its_seam_and_wide_across():
     size_m = (0.5, 1.0)
     best, null_deg = rcs("dihedral", size_m)[0], np.degrees(np.arcsin(WAVELENGTH_M / 2))
     assert rcs("dihedral", size_m, towards(null_deg))[0] < 1e-6 * best
+    half_deg = np.degrees(np.arcsin(WAVELENGTH_M / 4))
+    assert rcs("dihedral", size_m, towards(half_deg))[0] / best == pytest.approx((2 / np.pi) ** 2, rel=0.01)
     assert rcs("dihedral", size_m, towards(0, 15))[0] / best == pytest.approx(2 * np.sin(np.radians(30)) ** 2)
     assert rcs("dihedral", size_m, towards(0, 46))[0] == 0
+
+
+def test_antennas_apart_lose_across_a_dihedral_and_along_its_seam_are_what_its_length_makes_of_them():
+    """Across: the second order of the sinc of its width; along: specular, so nothing where both lie alike aside."""
+    size_m, best = (0.3, 1.0), rcs("dihedral", (0.3, 1.0))[0]
+    shift = np.pi / WAVELENGTH_M * 2 * np.sin(np.radians(3)) * 2 * 0.3 * np.sin(np.pi / 4)
+    across, _ = rcs("dihedral", size_m, towards(0, -3), towards(0, 3))
+    assert np.sqrt(across / best) == pytest.approx(np.sin(shift) / shift, rel=5e-3)
+    assert np.sqrt(across / best) < 0.95
+    assert rcs("dihedral", size_m, towards(-4), towards(4))[0] == pytest.approx(best)
 
 
 def test_spheres_are_those_of_rayleigh_of_resonance_and_of_optics():

@@ -20,7 +20,7 @@ from apertura.pipeline.opening.radiometry import calibrated_pair
 from apertura.pipeline.opening.reflectors import measured_constants
 from apertura.pipeline.opening.scene import open_scene
 from apertura.pipeline.stale import stale_results
-from apertura.pipeline.steps import export, layers
+from apertura.pipeline.steps import cphd, export, layers
 from apertura.simulation import GaussianBeam, ImageGrid, PointTarget, Radio, preset, simulate
 from apertura.views.reflectors import write_constants
 from apertura.views.score import score
@@ -264,6 +264,29 @@ def test_a_constant_that_is_not_the_earlier_one_has_drifted(measured, tmp_path):
     assert "since reflectors of campaign over_reflectors" in flags["uav1-uav2"]["constant_drifts"]
     message = complaint(lambda: write_constants(campaign, root / "earlier.json"))
     assert "what processing.radiometric_calibration takes up" in message
+
+
+@pytest.mark.slow
+def test_a_phase_history_is_calibrated_by_its_own_images(measured, tmp_path):
+    """As CPHD, without a scale and without beams: the constant is that towards the reflectors."""
+    (tmp_path / "config").mkdir()
+    scene = measured.values["scene"]
+    waveform = {"kind": "phase_history", "format": "cphd"}
+    config = {"campaign": "histories", "waveform": waveform, "nodes": {"uav1": {}}, "scene": scene}
+    (tmp_path / "config/config.yaml").write_text(json.dumps(config))
+    (tmp_path / "config/flights.tsv").write_text("flight\tkind\ttransmitter\tnodes\nf01\timage\tuav1\tuav1\n")
+    written = cphd.cphd(measured, "f01", "uav1-uav1")
+    (tmp_path / "raw/f01").mkdir(parents=True)
+    shutil.copy(written, tmp_path / "raw/f01/uav1.cphd")
+    campaign = run_steps(tmp_path, exports=False)
+    layers.layers(campaign, "f01", "uav1-uav1")
+    found = read_constants(write_constants(campaign)).pairs["uav1-uav1"]
+    assert found.radar.sent_power is None
+    assert -3 < found.constant_db - true_constant_db(measured, "uav1-uav1") < 0  # what the beams lack there
+    campaign = state(tmp_path, "processing", radiometric_calibration="calibration.json")
+    layers.layers(campaign, "f01", "uav1-uav1")
+    points = json.loads(campaign.result("f01", "uav1-uav1", "radiometry.json").read_text())["points"]
+    assert points[0]["rcs_dbsm"] == pytest.approx(10 * np.log10(corner_m2()), abs=0.4)
 
 
 @pytest.mark.slow
