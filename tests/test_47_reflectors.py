@@ -267,6 +267,14 @@ def test_a_constant_that_is_not_the_earlier_one_has_drifted(measured, tmp_path):
 
 
 @pytest.mark.slow
+def test_nothing_is_measured_in_images_of_other_settings(measured, tmp_path):
+    root = copy_writable(measured.root, tmp_path / "campaign")
+    campaign = state(root, "processing", window="none")
+    assert "4 of 4 images are overtaken" in complaint(lambda: write_constants(campaign, root / "new.json"))
+    assert not (root / "new.json").exists()
+
+
+@pytest.mark.slow
 def test_a_phase_history_is_calibrated_by_its_own_images(measured, tmp_path):
     """As CPHD, without a scale and without beams: the constant is that towards the reflectors."""
     (tmp_path / "config").mkdir()
@@ -356,6 +364,16 @@ def test_a_measured_constant_needs_no_radio_and_forms_no_image_again(tiny):
     assert campaign.calibrated
     assert {name for name in made if before[name].settings != after[name].settings} == {"layers"}
     assert "calibration.json" in after["layers"].sources
+
+
+def test_a_reflector_makes_nothing_again(tiny):
+    made = ("scene", "echo", "profile", "refined_track", "image", "layers", "export", "map")
+    places = {"scene": (), "map": (), "refined_track": ("f01",)}
+    before = {name: result_of(Campaign.load(tiny), name, *places.get(name, ("f01", "uav1-uav2"))) for name in made}
+    ball = {"name": "ball", "position_m": [0.0, 0.0, 0.0], "std_m": 0.01, "kind": "sphere", "size_m": [0.2]}
+    campaign = state(tiny, "scene", reflectors=[ball])
+    for name in made:
+        assert result_of(campaign, name, *places.get(name, ("f01", "uav1-uav2"))) == before[name]
 
 
 def test_a_file_of_constants_is_checked_before_anything_runs(tiny):

@@ -10,6 +10,7 @@ from apertura.common.errors import CampaignError
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.opening.constants import FILE
 from apertura.pipeline.opening.reflectors import measured_constants
+from apertura.pipeline.stale import stale_results
 
 
 def write_constants(campaign: Campaign, to: Path | None = None) -> Path:
@@ -18,7 +19,7 @@ def write_constants(campaign: Campaign, to: Path | None = None) -> Path:
     Raises
     ------
     CampaignError
-        If nothing can be measured, or the file is the one that the campaign itself takes up.
+        If nothing can be measured, images are overtaken, or the file is the one that the campaign itself takes up.
     """
     path = campaign.root / FILE if to is None else to
     used = campaign.calibration_file
@@ -28,6 +29,15 @@ def write_constants(campaign: Campaign, to: Path | None = None) -> Path:
             where=path,
             expected="another file: what is measured is compared with it",
             remedy="Name one with --to.",
+        )
+    images = {campaign.manifest("image", one.name, pair) for one in campaign.image_flights for pair in one.pairs}
+    overtaken = [manifest for manifest in stale_results(campaign) if manifest in images]
+    if overtaken:
+        raise CampaignError(
+            f"{len(overtaken)} of {len(images)} images are overtaken, {overtaken[0]} among them",
+            where=campaign.root,
+            expected="images made from the files and settings of now",
+            remedy="Run the workflow first.",
         )
     constants, left_out = measured_constants(campaign)
     write_json(path, constants.model_dump(mode="json"))
