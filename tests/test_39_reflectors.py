@@ -136,6 +136,14 @@ def test_what_pulses_see_is_the_mean_of_amplitudes():
     assert seen == pytest.approx(((3 * roots[0] + roots[1]) / 4) ** 2, rel=1e-6)
 
 
+def test_pulses_that_do_not_count_do_not_forbid_a_reflector():
+    """Out of the beam the antennas may be as far apart as they like."""
+    tx, rx = np.concatenate([AHEAD, towards(-9)]), np.concatenate([AHEAD, towards(9)])
+    corner, frequency = Reflector("trihedral", (1.0,), AXES), np.array([1.49896229e9] * 2)
+    assert corner.seen(tx, rx, np.array([1.0, 0.0]), frequency)[0] == pytest.approx(rcs("trihedral", (1.0,))[0])
+    assert np.isnan(corner.seen(tx, rx, np.array([1.0, 0.1]), frequency)[0])
+
+
 def test_flights_over_one_reflector_do_not_lessen_its_own_error():
     mean = together(np.full(8, 60.0), np.full(8, 0.2), np.full(8, 0.5), ["r"] * 8, [f"f{n}" for n in range(8)])
     assert mean.std == pytest.approx(np.hypot(0.5, 0.2 / 8**0.5))
