@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import rasterio
 from folders import complaint, copy_writable, edit_config, export_flight, run_steps, state
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
@@ -272,6 +273,42 @@ def test_nothing_is_measured_in_images_of_other_settings(measured, tmp_path):
     campaign = state(root, "processing", window="none")
     assert "4 of 4 images are overtaken" in complaint(lambda: write_constants(campaign, root / "new.json"))
     assert not (root / "new.json").exists()
+
+
+@pytest.mark.slow
+def test_reflectors_stand_on_a_dem_or_are_left_out_beside_it(measured, tmp_path):
+    """The ground 0.5 m below both: they are looked for where they are imaged, and lose to focus what that costs."""
+    root = copy_writable(measured.root, tmp_path / "campaign")
+    shutil.rmtree(root / "results")
+    scene = measured.settings.scene
+    west, south, east, north = scene.bounds_m
+    ground = np.full((20, 20), measured.settings.scene.reflectors[0].position_m[2] - 0.5, np.float32)
+    placed = rasterio.transform.from_bounds(west - 7, south - 7, east + 7, north + 7, 20, 20)
+    with rasterio.open(
+        root / "dem.tif",
+        "w",
+        driver="GTiff",
+        width=20,
+        height=20,
+        count=1,
+        dtype="float32",
+        crs=scene.crs,
+        transform=placed,
+    ) as raster:
+        raster.write(ground, 1)
+    far = measured.values["scene"]["reflectors"][1] | {"name": "far", "position_m": [east + 5, north + 5, 620.0]}
+    stated = {"dem": "dem.tif", "dem_datum": "ellipsoid", "reflectors": [*measured.values["scene"]["reflectors"], far]}
+    table = root / "config/flights.tsv"
+    table.write_text("".join(table.read_text().splitlines(keepends=True)[:2]))
+    state(root, "scene", **stated)
+    campaign = run_steps(root, exports=False)
+    layers.layers(campaign, "f01", "uav1-uav1")
+    layers.layers(campaign, "f01", "uav1-uav2")
+    constants, left_out = measured_constants(campaign)
+    for one in constants.measurements:
+        assert one["constant_db"] == pytest.approx(true_constant_db(measured, one["pair"]), abs=0.3), one
+        assert one["off_m"] < 0.03
+    assert "f01 uav1-uav1 far: outside the image" in left_out
 
 
 @pytest.mark.slow

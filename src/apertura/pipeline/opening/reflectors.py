@@ -237,16 +237,23 @@ class _View:
         return place, np.array([*turned, ahead])
 
     def _ground(self, row: float, column: float) -> NDArray[np.float64]:
-        return np.asarray(self.scene.terrain.positions_at(self.scene.grid, np.array([row]), np.array([column]))[0])
+        """Return the place of a pixel, (3,) float64; NaN off a DEM."""
+        height_m = float(self.scene.terrain.heights_at(self.scene.grid, row, column))
+        return self.scene.grid.positions_at(row, column, height_m) if np.isfinite(height_m) else np.full(3, np.nan)
 
     def _focused(
         self, pulses: Aperture, path_m: NDArray[np.float64], part: NDArray[np.float64], start: tuple[Any, Any]
     ) -> tuple[float, float]:
-        """Return the pixel on the ground whose path is closest to a target's over the pulses, by Gauss and Newton."""
+        """Return the pixel on the ground whose path is closest to a target's over the pulses, by Gauss and Newton.
+
+        NaN where that leads off a DEM.
+        """
         at, root = np.array([float(one) for one in start]), np.sqrt(part / part.sum())
         for _ in range(_ROUNDS):
             here, down, right = (pulses.path(self._ground(*(at + step))) for step in ((0, 0), (1, 0), (0, 1)))
             slope = np.stack([down - here, right - here], axis=-1)
+            if not np.isfinite(slope).all():
+                return np.nan, np.nan
             step = np.linalg.lstsq(root[:, None] * slope, root * (path_m - here), rcond=None)[0]
             at = at + step
             if np.abs(step).max() < _FOLLOWED_M:
