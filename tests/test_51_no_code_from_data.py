@@ -44,6 +44,7 @@ TYPED = {
     "list": "list",
     "map": "map .",
     "plan": "plan .",
+    "reflectors": "reflectors .",
     "report": "report .",
     "reproduce": "reproduce results/f01/uav1-uav1/db.tif",
     "run": "run . --cores 2",
@@ -78,7 +79,7 @@ TYPED = {
 }
 """Command → what is typed in the campaign folder, where that is more than the command."""
 
-MAY_REFUSE = {"align", "step calibrate", "step interferogram", "step page"}
+MAY_REFUSE = {"align", "reflectors", "step calibrate", "step interferogram", "step page"}
 """Commands that ask for what such a campaign does not have."""
 
 QUICK = ("check", "init", "plan", "step scene")

@@ -29,6 +29,7 @@ from apertura.formats.tracks import ardupilot, dataflash_fields, px4_ulog, ulog_
 from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import Flight, PulseWaveform, read_clocks, read_flights, read_segments, read_settings
+from apertura.pipeline.opening.constants import read_constants
 from apertura.pipeline.opening.results import OpenCampaign, assessment_of
 from apertura.pipeline.opening.scene import settled_scene
 from apertura.pipeline.opening.transmitted import read_codes, read_framing, read_pulse
@@ -347,6 +348,13 @@ PARSERS: dict[str, Parser] = {
         "results/c01/calibration.json",
         lambda: seeds.documents({"pairs": {"uav1-uav1": seeds.OFFSET, "uav1-uav2": seeds.OFFSET}}),
         _calibration,
+        _JSON_TREE,
+        _JSON,
+    ),
+    "constants.json": Parser(
+        "calibration.json",
+        lambda: seeds.documents(seeds.CONSTANTS),
+        read_constants,
         _JSON_TREE,
         _JSON,
     ),

@@ -422,6 +422,30 @@ ASSESSED = {
     "fusion": {"phases_rad": {"uav1-uav1": 0.0}, "left_out": {"uav1-uav2": "why"}, "unmeasured": {}, "why": {}},
     "pairs": {"uav1-uav1": AGREED, "uav1-uav2": AGREED},
 }
+RADAR = {"centre_hz": 1.4e9, "bandwidth_hz": 4e8, "subcarriers": 1024, "sent_power": 1024.0}
+SHAPED = {"radar_tx": {"beamwidth_deg": [70.0, 50.0], "pattern_sha256": None}}
+CONSTANTS = {
+    "schema_version": 1,
+    "software": "0.1.0",
+    "campaign": "past",
+    "flights": {"f01": "2025-05-14T09:30:00Z"},
+    "reference": "uav1-uav1",
+    "pairs": {
+        "uav1-uav1": {
+            "radar": {**RADAR, "antennas": SHAPED},
+            "constant_db": 62.1,
+            "std_db": 0.3,
+            "chance": 0.8,
+            "reflectors": 2,
+            "flights": 1,
+            "phase_rad": None,
+            "phase_std_rad": None,
+            "flags": {"constant_drifts": "one line"},
+        }
+    },
+    "measurements": [{"flight": "f01", "constant_db": 62.0}],
+    "images": {"results/f01/uav1-uav1/image.manifest.json": "2d" * 32},
+}
 REPORTED = {
     "flight": "f01",
     "engine": "native",

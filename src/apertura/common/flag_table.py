@@ -297,6 +297,19 @@ _OF_IMAGES = {
     "pair_unconfirmed": Flag(
         "bright points in common", "a pair shows none of the bright points of another",
         "SNR of its echo; names of its channels", "pipeline/steps/assess.py"),
+    "constant_drifts": Flag(
+        "dB or rad from one flight to another, or since an earlier calibration, and its standard deviation",
+        "the constant or the phase of a pair is not what it was, by more than three standard deviations",
+        "cables, gains, temperature; what the antennas point at", "pipeline/opening/reflectors.py"),
+    "reflectors_disagree": Flag(
+        "reflectors, the sum of squares that they differ by, and how often chance does as much",
+        "reflectors of one calibration say different things: the standard deviation of the constant was widened",
+        "places, sizes and orientation of the reflectors; what else lies in their cells; patterns of the antennas",
+        "pipeline/opening/reflectors.py"),
+    "constant_disagrees": Flag(
+        "dB between the radio as stated and the constant measured, in standard deviations of both",
+        "what the config states of power, gains and receiver is not what reflectors said; theirs was used",
+        "transmit_power_dbm, gains of antennas, receiver of the nodes", "pipeline/opening/radiometry.py"),
     "accuracy_missed": Flag(
         "bound of the error, and the accuracy asked, dB",
         "the error is not known to be below the accuracy asked, 95 % sure",

@@ -68,7 +68,9 @@ class Campaign(RawFolder):
 
     @cached_property
     def calibrated(self) -> bool:
-        """Whether the radio of its pairs is stated, so that images are calibrated."""
+        """Whether the radio of its pairs is stated, or their constants were measured, so that images are calibrated."""
+        if self.settings.processing.radiometric_calibration:
+            return True
         stated = (radio_of(self.settings.nodes, pair) for pair in self._pairs)
         return any(value is not None for one in stated for value in one.values())
 
@@ -78,7 +80,9 @@ class Campaign(RawFolder):
         return self.settings.processing.radiometry if self.calibrated else ()
 
     def check_radio(self) -> None:
-        """Raise CampaignError where the radio of its pairs is stated in parts."""
+        """Raise CampaignError where the radio of its pairs is stated in parts, unless their constants were measured."""
+        if self.settings.processing.radiometric_calibration:
+            return
         sampled = isinstance(self.settings.waveform, SampledWaveform)
         check_radio(self.settings.nodes, self._pairs, sampled=sampled, where=CONFIG)
 
@@ -123,6 +127,12 @@ class Campaign(RawFolder):
         """The file of the transmitted signal: code symbols, or the samples of a pulse."""
         key = getattr(self.settings.waveform, "file_key", "")
         return self.file(getattr(self.settings.waveform, key, ""), f"waveform.{key}")
+
+    @property
+    def calibration_file(self) -> Path | None:
+        """The file of the constants that were measured at reflectors, where the config names one."""
+        named = self.settings.processing.radiometric_calibration
+        return self.file(named, "processing.radiometric_calibration") if named else None
 
     def relative(self, path: Path) -> str:
         """Return a path inside the campaign folder as the workflow names it."""

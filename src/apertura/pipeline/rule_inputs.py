@@ -236,7 +236,9 @@ def radio(place: JobPlace) -> Mapping[str, Any]:
         for key, value in radio_of(nodes, pair).items()
     }
     stated |= {f"nodes.{node}.amplitude_std_db": nodes[node].amplitude_std_db for (_, node) in place.below(Scope.NODE)}
-    return {"radio": stated, "radiometry": list(campaign.settings.processing.radiometry)}
+    processing = campaign.settings.processing
+    measured = {"radiometric_calibration": named} if (named := processing.radiometric_calibration) else {}
+    return {"radio": stated, "radiometry": list(processing.radiometry), **measured}
 
 
 def coefficients(place: JobPlace) -> Mapping[str, Any]:
@@ -246,12 +248,13 @@ def coefficients(place: JobPlace) -> Mapping[str, Any]:
 
 
 def calibrated(place: JobPlace) -> Iterable[str]:
-    """Return the image that is calibrated with what was sent; nothing where images are relative."""
+    """Return the image that is calibrated, what was sent, and the file of constants; nothing where it is relative."""
     campaign = place.campaign
     if not campaign.calibrated:
         return []
-    sent = campaign.relative(campaign.sent_file)
-    return [sent, *(campaign.manifest("image", *pair) for pair in place.pairs)]
+    files = [campaign.sent_file] if is_sampled(campaign) else []
+    files += [path for path in [campaign.calibration_file] if path is not None]
+    return [*map(campaign.relative, files), *(campaign.manifest("image", *pair) for pair in place.pairs)]
 
 
 def calibration_of_images(place: JobPlace) -> Iterable[str]:
@@ -275,14 +278,18 @@ def pair_settings(place: JobPlace) -> Mapping[str, Any]:
     return {"nodes": nodes, **{name: value for name, value in stated.items() if value}}
 
 
+_POINTS = frozenset({"reference_points", "reflectors"})
+"""Of the scene, what its grid does not depend on."""
+
+
 def grid(place: JobPlace) -> Mapping[str, Any]:
     """Return what decides the grid."""
     stated = place.campaign.values["scene"]
-    return {"scene": {key: value for key, value in stated.items() if key != "reference_points"}}
+    return {"scene": {key: value for key, value in stated.items() if key not in _POINTS}}
 
 
 _BEFORE_THE_IMAGE = frozenset({"window", "sidelink", "false_alarms_per_s", "autofocus", "autofocus_method"})
-_AFTER_THE_IMAGE = frozenset({"fusion", "radiometry"})
+_AFTER_THE_IMAGE = frozenset({"fusion", "radiometry", "radiometric_calibration"})
 
 
 def imaging(place: JobPlace) -> Mapping[str, Any]:

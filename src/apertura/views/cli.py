@@ -292,6 +292,18 @@ def score(
 
 
 @app.command()
+def reflectors(
+    campaign: CampaignFolder,
+    to: Annotated[Path | None, typer.Option(metavar="FILE", help="by default calibration.json in that folder")] = None,
+) -> None:
+    """Measure the constant of each pair at reflectors of known cross-section, and write it for later campaigns."""
+    opened, path = _opened(campaign), None if to is None else given(to)
+    from apertura.views.reflectors import write_constants
+
+    print(as_typed(write_constants(opened, path)))
+
+
+@app.command()
 def verify(
     product: Annotated[Path, typer.Argument(help="a file, a stage or a manifest of a campaign, or a campaign folder")],
     *,

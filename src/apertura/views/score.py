@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
@@ -13,7 +12,7 @@ from apertura.common.documents import read_json, undamaged
 from apertura.common.errors import CampaignError
 from apertura.common.paths import inside
 from apertura.common.raster import opened_raster
-from apertura.core.quality.bright_points import BrightPoint, bright_point
+from apertura.core.quality.bright_points import BrightPoint, bright_point, brightest_near
 from apertura.core.quality.point_targets import cut_through, find_peak
 from apertura.core.scene.grid import SceneGrid
 from apertura.formats.export import product, product_files
@@ -86,7 +85,7 @@ def _flight(campaign: Campaign, flight: Flight, targets: list[dict[str, float]])
             row, column = map(float, grid.pixel_of(target["x"], target["y"]))
             if not (0 <= row < image.shape[0] - 1 and 0 <= column < image.shape[1] - 1):
                 continue
-            nearest = _brightest_near(image, row, column, REACH_M / 4 / spacing)
+            nearest = brightest_near(image, row, column, REACH_M / 4 / spacing)
             peak = find_peak(image, *nearest)
             across = (along[1], -along[0])
             cuts = [
@@ -123,13 +122,6 @@ def _cross_sections(
         return {"rcs_dbsm": one["rcs_dbsm"], "rcs_std_db": one["std_db"], "rcs_put_dbsm": put}
 
     return found
-
-
-def _brightest_near(image: NDArray[np.complex64], row: float, column: float, reach: float) -> tuple[int, int]:
-    first = [max(0, int(np.floor(at - reach))) for at in (row, column)]
-    window = np.abs(image[first[0] : int(row + reach) + 2, first[1] : int(column + reach) + 2])
-    down, right = np.unravel_index(int(np.nanargmax(window)), window.shape)
-    return first[0] + int(down), first[1] + int(right)
 
 
 def _along_track(campaign: Campaign, flight: Flight, grid: SceneGrid) -> tuple[float, float]:

@@ -239,13 +239,7 @@ class Calibration:
         self.directions[block] = np.stack([up, slant, towards], axis=1).reshape(*shape, 3, 3)
 
     def _parts(self, pulses: slice, points: Floats) -> tuple[Floats, Floats]:
-        """Return what each pulse adds to a point target, w·f/(R_tx·R_rx), and w, (pulse, point) each."""
-        aperture, beams = self.aperture[pulses], self.beams and self.beams[pulses]
-        there, back = (np.linalg.norm(points - leg[:, None], axis=-1) for leg in aperture.legs)
-        antennas, sector = beams and beams.antennas, beams and beams.sector
-        field = np.ones(there.shape) if antennas is None else antennas.weight(aperture, points)
-        weight = field if sector is None else field * sector.weight(aperture, points)
-        return weight * field / (there * back), weight
+        return _parts(self.aperture[pulses], self.beams and self.beams[pulses], points)
 
     def at(self, points: Floats) -> tuple[Floats, Floats]:
         """Return the power of 1 m² in the image, K·A², and of the noise in units of a pulse's, at points.
@@ -260,10 +254,8 @@ class Calibration:
         tuple of ndarray
             (point,) float64 each; zero where no pulse sees the point.
         """
-        some = self.aperture.sample(_POINT_PULSES)
-        share = some.step / self.count
-        parts, weight = self._parts(some, points)
-        return self.constant * (parts.sum(axis=0) * share) ** 2, (weight**2).sum(axis=0) * share / self.count
+        _, parts, noise = point_parts(self.aperture, self.beams, points, count=self.count)
+        return self.constant * parts.sum(axis=0) ** 2, noise
 
     def _between(self, logarithms: Floats, window: Window) -> Floats:
         """Return values at the pixels of a window, between those nodes that have any; NaN where none has."""
@@ -315,6 +307,46 @@ class Calibration:
             return np.asarray(sigma0)
         cosine = (normal * towards).sum(-1)
         return np.asarray(sigma0 * np.where(cosine > 0, cosine, np.nan))
+
+
+def _parts(aperture: Aperture, beams: Beams | None, points: Floats) -> tuple[Floats, Floats]:
+    """Return what each pulse adds to a point target, w·f/(R_tx·R_rx), and w, (pulse, point) each."""
+    there, back = (np.linalg.norm(points - leg[:, None], axis=-1) for leg in aperture.legs)
+    antennas, sector = beams and beams.antennas, beams and beams.sector
+    field = np.ones(there.shape) if antennas is None else antennas.weight(aperture, points)
+    weight = field if sector is None else field * sector.weight(aperture, points)
+    return weight * field / (there * back), weight
+
+
+def point_parts(
+    aperture: Aperture, beams: Beams | None, points: Floats, *, count: int
+) -> tuple[Aperture, Floats, Floats]:
+    """Return what pulses add to the image of points of 1 m² where K is 1, the parts of A of eq. 3.
+
+    Parameters
+    ----------
+    aperture, beams, count
+        As of `Calibration`.
+    points
+        (point, 3) float64, metres, in the frame of the aperture.
+
+    Returns
+    -------
+    tuple
+        The pulses taken, every so many; (pulse, point) float64, their parts, which add up to A; (point,) float64,
+        the noise in units of a pulse's.
+
+    Examples
+    --------
+    >>> track = np.array([[0.0, 0.0, 10.0]] * 4)
+    >>> _, parts, noise = point_parts(Aperture(track, track), None, np.zeros((1, 3)), count=4)
+    >>> round(float(parts.sum()), 6), float(noise[0])
+    (0.01, 0.25)
+    """
+    some = aperture.sample(_POINT_PULSES)
+    taken, share = aperture[some], some.step / count
+    parts, weight = _parts(taken, beams and beams[some], points)
+    return taken, parts * share, (weight**2).sum(axis=0) * share / count
 
 
 def _pitch_px(grid: SceneGrid, terrain: Terrain, aperture: Aperture) -> int:

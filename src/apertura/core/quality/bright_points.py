@@ -292,6 +292,22 @@ def bright_point(image: BlockRaster, row: int, column: int) -> BrightPoint:
     return BrightPoint(peak.row, peak.column, float(abs(peak.value)), float(background))
 
 
+def brightest_near(image: BlockRaster, row: float, column: float, reach: float) -> tuple[int, int]:
+    """Return the brightest pixel of an image within `reach` pixels of a place, by row and by column.
+
+    Examples
+    --------
+    >>> brightest_near(np.eye(9)[::-1] * np.arange(9), 4.5, 4.5, 1.0)
+    (3, 5)
+    """
+    first = [max(0, int(np.floor(at - reach))) for at in (row, column)]
+    window = np.abs(
+        np.nan_to_num(np.asarray(image[first[0] : int(row + reach) + 2, first[1] : int(column + reach) + 2]))
+    )
+    down, right = np.unravel_index(int(window.argmax()), window.shape)
+    return first[0] + int(down), first[1] + int(right)
+
+
 def _cell_maxima(magnitude: NDArray[np.float32], window: Window, cell_px: int) -> list[tuple[float, int, int]]:
     """Return (magnitude, row, column) of the largest local maximum in each square cell of a block, where there is one.
 

@@ -50,6 +50,7 @@ CHECKS: Mapping[str, str] = {
     "attitude": "apertura.pipeline.check.tracks:check_attitude",
     "coverage": "apertura.pipeline.check.tracks:check_coverage",
     "patterns": "apertura.pipeline.check.reach:check_patterns",
+    "constants": "apertura.pipeline.check.reach:check_constants",
     "crs": "apertura.pipeline.check.scene:check_scene_crs",
     "reference_points": "apertura.pipeline.check.scene:check_reference_points",
     "dem": "apertura.pipeline.check.scene:check_dem",

@@ -45,6 +45,8 @@ def check_files(examined: "Examination") -> Iterator[CampaignError]:
         lambda: {f"scene.{role}": path for role, path in campaign.height_files().items()}
     ]
     lookups += [partial(campaign.pattern_files, pair) for flight in campaign.image_flights for pair in flight.pairs]
+    if campaign.settings.processing.radiometric_calibration:
+        lookups.append(lambda: {"processing.radiometric_calibration": campaign.calibration_file or campaign.root})
     waveform = campaign.settings.waveform
     if isinstance(waveform, SampledWaveform):
         lookups.append(lambda: {f"waveform.{waveform.file_key}": campaign.sent_file})

@@ -266,3 +266,16 @@ def check_patterns(examined: Examination) -> Iterator[CampaignError]:
             read_beam_pattern(path)
         except CampaignError as problem:
             yield problem
+
+
+def check_constants(examined: Examination) -> Iterator[CampaignError]:
+    """Yield a file of measured constants that is none, or lacks a pair."""
+    campaign = examined.campaign
+    path = campaign.calibration_file
+    if path is None or not path.is_file() or path.stat().st_size == 0:
+        return
+    from apertura.pipeline.opening.constants import lacking, read_constants
+
+    known = read_constants(path).pairs
+    pairs = dict.fromkeys(pair for flight in campaign.image_flights for pair in flight.pairs)
+    yield from (lacking(pair, known, path) for pair in pairs if pair not in known)

@@ -43,14 +43,16 @@ def check_scene_crs(examined: Examination) -> Iterator[CampaignError]:
 
 
 def check_reference_points(examined: Examination) -> Iterator[CampaignError]:
-    """Yield each point of known place that lies outside the scene, or so high that it is no height of the ground."""
+    """Yield each known point, or reflector, outside the scene, or so high that it is no height of the ground."""
     grid = examined.grid
     if grid is None:
         return
-    for number, point in enumerate(examined.campaign.settings.scene.reference_points):
+    scene = examined.campaign.settings.scene
+    known = {"reference_points": scene.reference_points, "reflectors": scene.reflectors}
+    for key, number, point in ((key, *one) for key, points in known.items() for one in enumerate(points)):
         west, south, east, north = grid.bounds_m
         x, y, height_m = point.position_m
-        where, remedy = f"{CONFIG}: scene.reference_points[{number}]", "Correct position_m, or take the point out."
+        where, remedy = f"{CONFIG}: scene.{key}[{number}]", "Correct position_m, or take the point out."
         if not (west <= x <= east and south <= y <= north):
             swapped = west <= y <= east and south <= x <= north
             yield CampaignError(

@@ -26,7 +26,14 @@ from apertura.pipeline.config.nodes import (
     check_radio,
     radio_of,
 )
-from apertura.pipeline.config.processing import Calibration, Interferometry, Processing, Scene, check_interferometry
+from apertura.pipeline.config.processing import (
+    Calibration,
+    Interferometry,
+    KnownReflector,
+    Processing,
+    Scene,
+    check_interferometry,
+)
 from apertura.pipeline.config.section import Name, Section
 from apertura.pipeline.config.waveform import (
     FmcwWaveform,
@@ -50,6 +57,7 @@ __all__ = [
     "Flight",
     "FmcwWaveform",
     "Interferometry",
+    "KnownReflector",
     "LeverArms",
     "Name",
     "Node",

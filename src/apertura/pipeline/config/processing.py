@@ -3,7 +3,7 @@
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
@@ -43,6 +43,11 @@ class Processing(ImagingChoices):
     radiometry: tuple[Literal["sigma0", "gamma0", "beta0"], ...] = Field(
         ("sigma0",),
         description="which backscattering coefficients are written of calibrated images, sigma0_db.tif and so on",
+    )
+    radiometric_calibration: str | None = Field(
+        None,
+        description="file that `apertura reflectors` wrote of flights of this radar: its constants calibrate images in "
+        "place of the radio that nodes state; null: that radio",
     )
     scheduler: str = Field(
         "threads",
@@ -158,6 +163,46 @@ class KnownPoint(Section):
     std_m: float = Field(gt=0, description="standard deviation of each coordinate, m")
 
 
+_CORNERS = ("trihedral", "dihedral")  # that look somewhere
+_SIZES = {"trihedral": "[leg]", "dihedral": "[across the seam, along it]", "sphere": "[radius]"}
+
+
+class KnownReflector(KnownPoint):
+    """A reflector whose radar cross-section follows from its shape."""
+
+    kind: Literal["trihedral", "dihedral", "sphere"] = Field(description="of three triangles, two rectangles, a sphere")
+    size_m: tuple[Annotated[float, Field(gt=0, le=100)], ...] = Field(
+        description="trihedral: [leg of its triangles]; dihedral: [across the seam, along it]; sphere: [radius], m"
+    )
+    azimuth_deg: float | None = Field(
+        None, ge=-360, le=360, description="where its boresight points, clockwise from the north of scene.crs, deg"
+    )
+    elevation_deg: float | None = Field(None, ge=-90, le=90, description="and above the horizontal, deg")
+    roll_deg: float = Field(
+        0.0,
+        ge=-360,
+        le=360,
+        description="clockwise about the boresight, seen along it from behind; 0: seam of a dihedral level, one seam "
+        "of a trihedral upward in the vertical plane of the boresight, deg",
+    )
+    rcs_std_db: float = Field(
+        0.0, ge=0, le=100, description="error of its cross-section as built and set up, standard deviation, dB"
+    )
+
+    @model_validator(mode="after")
+    def _is_complete(self) -> Self:
+        if len(self.size_m) != (2 if self.kind == "dihedral" else 1):
+            raise ValueError(f"size_m={list(self.size_m)}: a {self.kind} has {_SIZES[self.kind]}")
+        aimed = [value for value in (self.azimuth_deg, self.elevation_deg) if value is not None]
+        if len(aimed) != (2 if self.kind in _CORNERS else 0):
+            raise ValueError(
+                f"a {self.kind} looks somewhere: state both azimuth_deg and elevation_deg"
+                if self.kind in _CORNERS
+                else "a sphere looks nowhere: azimuth_deg and elevation_deg are of corners"
+            )
+        return self
+
+
 class Air(Section):
     """Air at the ground of the scene, in place of the standard atmosphere: as measured, or its refractivity."""
 
@@ -224,14 +269,22 @@ class Scene(Section):
         "position_m [easting, northing, ellipsoidal height] and std_m",
     )
 
+    reflectors: tuple[KnownReflector, ...] = Field(
+        (),
+        description="reflectors of known cross-section, which `apertura reflectors` measures constants at: a list of "
+        "name, position_m and std_m as of reference_points, kind (trihedral, dihedral, sphere), size_m, and of corners "
+        "azimuth_deg and elevation_deg",
+    )
+
     @model_validator(mode="after")
     def _points_are_somewhere(self) -> Self:
-        if self.reference_points and self.crs == "auto":
-            raise ValueError("reference_points are in crs, which is auto: give the CRS")
-        names = [point.name for point in self.reference_points]
-        twice = sorted({name for name in names if names.count(name) > 1})
-        if twice:
-            raise ValueError(f"reference_points: two are called {twice[0]!r}")
+        for key in ("reference_points", "reflectors"):
+            names = [point.name for point in getattr(self, key)]
+            if names and self.crs == "auto":
+                raise ValueError(f"{key} are in crs, which is auto: give the CRS")
+            twice = sorted({name for name in names if names.count(name) > 1})
+            if twice:
+                raise ValueError(f"{key}: two are called {twice[0]!r}")
         return self
 
     @model_validator(mode="after")

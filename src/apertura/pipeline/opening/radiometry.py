@@ -1,4 +1,4 @@
-"""Radiometry of a pair as the config states it: from power, gains and receiver to the calibration of its image."""
+"""Radiometry of a pair: from its radio as stated, or its constant as measured, to the calibration of its image."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -8,13 +8,16 @@ from numpy.typing import NDArray
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.contracts import Window
+from apertura.common.flags import Flags
 from apertura.core.antenna.beam import Beams
 from apertura.core.echo.compression import centre_frequency
 from apertura.core.imaging.radiometry import Calibration, Link, cell_constant
+from apertura.core.imaging.reflectors import DRIFT_SIGMAS
 from apertura.core.quality.bright_points import BrightPoint
 from apertura.core.quality.measures import BlockRaster
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import Node, Receiver, SampledWaveform, radio_of
+from apertura.pipeline.opening.constants import PairConstant, constant_of
 from apertura.pipeline.opening.images import bright_places
 from apertura.pipeline.opening.pair import OpenPair
 from apertura.pipeline.opening.plan import integration_of
@@ -29,14 +32,18 @@ _MOST_POINTS = 50  # whose cross-section is stated, the brightest
 
 @dataclass(frozen=True, eq=False)
 class CalibratedPair:
-    """A pair whose radio is stated.
+    """A pair whose radio is stated, or whose constant was measured.
 
     Attributes
     ----------
+    calibrated_by
+        Where its constant comes from, in words.
     link
-        Its radio.
-    stated_std_db
-        Error of what is stated of it; None where nobody knows.
+        Its radio; None where it is not stated.
+    std_db
+        Standard deviation of its constant; None where nobody knows.
+    flags
+        Of its constant.
     calibration
         Of its image.
     beams
@@ -47,8 +54,10 @@ class CalibratedPair:
         Stated; None: unknown.
     """
 
-    link: Link
-    stated_std_db: float | None
+    calibrated_by: str
+    link: Link | None
+    std_db: float | None
+    flags: Flags
     calibration: Calibration
     beams: Beams | None
     thermal_noise: float | None
@@ -114,7 +123,7 @@ class CalibratedPair:
         sigma = np.maximum(power - noise, 0.0) / np.where(per_m2 > 0, per_m2, np.nan)
         inverse = np.maximum(noise / power, background)
         scatter_db = 10 / np.log(10) * np.sqrt(2 * inverse + inverse**2)
-        std_db = np.hypot(scatter_db, self.stated_std_db or 0.0)
+        std_db = np.hypot(scatter_db, self.std_db or 0.0)
         with np.errstate(divide="ignore"):
             sigma_db = 10 * np.log10(sigma)
         return [
@@ -137,11 +146,14 @@ class CalibratedPair:
         return {"noise_figure_db": self.noise_figure_db, "noise_figure_measured_db": measured}
 
 
-def stated_link(campaign: Campaign, pair: str) -> tuple[Link, float | None, float | None]:
-    """Return the radio of a calibrated pair, the error of what is stated, None unknown, and the noise figure, dB."""
+def stated_link(campaign: Campaign, pair: str) -> tuple[Link, float | None, float | None] | None:
+    """Return the radio of a pair, the error of what is stated, None unknown, and the noise figure, dB; None: no radio.
+
+    Where constants were measured a radio may be stated in parts, which is none.
+    """
     power, transmit, receive, receiver = radio_of(campaign.settings.nodes, pair).values()
-    if not isinstance(receiver, Receiver):
-        raise TypeError("a calibrated campaign states the receivers of its pairs")
+    if not isinstance(receiver, Receiver) or None in (power, transmit, receive):
+        return None
     nodes: list[Node] = [campaign.settings.nodes[name] for name in dict.fromkeys(pair.split("-"))]
     known = [node.amplitude_std_db for node in nodes]
     std_db = None if None in known else float(np.sqrt(sum((one or 0.0) ** 2 for one in known)))
@@ -153,7 +165,7 @@ def stated_link(campaign: Campaign, pair: str) -> tuple[Link, float | None, floa
 def calibrated_pair(
     campaign: Campaign, opened: OpenPair, scene: OpenScene, *, threads: int = 1
 ) -> CalibratedPair | None:
-    """Return the calibration of an open pair's image; None where its radio is not stated.
+    """Return the calibration of an open pair's image; None where neither radio nor constant is known.
 
     Parameters
     ----------
@@ -162,14 +174,21 @@ def calibrated_pair(
     threads
         Blocks of the lattice in work at once.
     """
-    waveform = campaign.settings.waveform
-    if not campaign.calibrated or not isinstance(waveform, SampledWaveform):
+    waveform, frequency = campaign.settings.waveform, opened.frequency_hz
+    measured, stated = constant_of(campaign, opened), stated_link(campaign, opened.name)
+    sent = transmitted(campaign, waveform) if stated and isinstance(waveform, SampledWaveform) else None
+    link, std_db, figure_db = stated if stated and sent else (None, None, None)
+    constant, by, flags = 0.0, "the radio that the config states", Flags()
+    if link and sent:
+        wavelength_m = SPEED_OF_LIGHT_M_S / centre_frequency(frequency)
+        constant = link.constant(wavelength_m=wavelength_m, sent_power=sent.mean_power)
+    if measured:
+        found, by = measured
+        flags = Flags.merged(found.flags, _disagreement(found, constant, std_db) if link else {})
+        constant, std_db = found.constant, found.std_db
+    elif not link:
         return None
-    link, std_db, figure_db = stated_link(campaign, opened.name)
-    sent, frequency = transmitted(campaign, waveform), opened.frequency_hz
-    integration = integration_of(campaign, opened, scene)
-    beams = Beams.within(integration.sector, opened.beams)
-    constant = link.constant(wavelength_m=SPEED_OF_LIGHT_M_S / centre_frequency(frequency), sent_power=sent.mean_power)
+    beams, count = image_weights(campaign, opened, scene)
     calibration = Calibration.of(
         scene.grid,
         scene.terrain,
@@ -177,14 +196,33 @@ def calibrated_pair(
         beams,
         constant=constant,
         cell_m2=cell_constant(frequency, opened.weight),
-        count=integration.count if integration.sector else None,
+        count=count,
         threads=threads,
     )
     thermal = None
-    if figure_db is not None:
+    if figure_db is not None and link and sent:
         filtered = (opened.weight * np.abs(sent.inverse)) ** 2
         thermal = link.pulse_noise(figure_db, spacing_hz=sent.numerology.spacing_hz, squares=float(filtered.sum()))
-    return CalibratedPair(link, std_db, calibration, beams, thermal, figure_db)
+    return CalibratedPair(by, link, std_db, flags, calibration, beams, thermal, figure_db)
+
+
+def image_weights(campaign: Campaign, opened: OpenPair, scene: OpenScene) -> tuple[Beams | None, int]:
+    """Return the weights of a pair's pulses in its image, and the number that the image was divided by."""
+    integration = integration_of(campaign, opened, scene)
+    count = integration.count if integration.sector else None
+    return Beams.within(integration.sector, opened.beams), count or len(opened.aperture)
+
+
+def _disagreement(found: PairConstant, stated: float, std_db: float | None) -> dict[str, str]:
+    """Return the flag of a constant that was measured and is not what the config's radio says."""
+    apart_db = 10 * float(np.log10(stated)) - found.constant_db
+    both_db = float(np.hypot(found.std_db, std_db or 0.0))
+    if std_db is None or abs(apart_db) <= DRIFT_SIGMAS * both_db:
+        return {}
+    return {
+        "constant_disagrees": f"the radio that the config states makes it {apart_db:+.2f} dB of what reflectors said, "
+        f"{abs(apart_db) / both_db:.1f} standard deviations of both"
+    }
 
 
 def points_of(

@@ -48,7 +48,7 @@ def export(campaign: Campaign, flight: str, pair: str) -> list[Path]:
         "radiometry": {"image": ECHO.measured(peak, quality["noise_floor_db"]).report},
     }
     if campaign.calibrated:
-        report |= _calibrated(campaign, flight, pair, report["budget"])
+        report |= _calibrated(campaign, flight, pair, report)
     origin = _with_code(Provenance.of(lineage.modules, [image]), assessed)
     folder = campaign.result(flight, pair)
     written = write_exports(
@@ -63,16 +63,15 @@ def export(campaign: Campaign, flight: str, pair: str) -> list[Path]:
     return _finish(folder, written, {"flight": flight, "pair": pair, **report}, lineage)
 
 
-def _calibrated(
-    campaign: Campaign, flight: str, pair: str, budget: Sequence[Mapping[str, Any]]
-) -> dict[str, list[Mapping[str, Any]] | Mapping[str, Any]]:
-    """Return what the pair's radio says of its image: cross-sections of bright points, and the line of the budget."""
+def _calibrated(campaign: Campaign, flight: str, pair: str, report: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what the pair's constant says of its image: cross-sections of points, line of the budget, flags."""
     manifest = campaign.root / campaign.manifest("layers", flight, pair)
     said = open_listed(campaign.result(flight, pair, CROSS_SECTIONS), manifest)
     std_db = said["std_db"]
     stated = None if std_db is None else f"{std_db:.2g} dB"
     line = BudgetLine("amplitude", stated, NO_EFFECT, "an error of power or gain")
-    return {"cross_sections": said, "budget": [*budget, line.report]}
+    flags = Flags.merged(report["flags"], said["flags"])
+    return {"cross_sections": said, "budget": [*report["budget"], line.report], "flags": flags}
 
 
 def export_fused(campaign: Campaign, flight: str) -> list[Path]:

@@ -58,7 +58,7 @@ def layers(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> l
     image = None if calibrated is None else open_stage(campaign.stage("image", flight, pair), "image")
     means: dict[str, dict[str, Any]] = {}
     if calibrated is not None and image is not None:
-        asked, std_db = campaign.settings.processing.radiometry, calibrated.stated_std_db
+        asked, std_db = campaign.settings.processing.radiometry, calibrated.std_db
         rasters["radiometry"] = {name: _coefficient(scene, image, calibrated, name, threads=threads) for name in asked}
         means = {name: of_coefficient(name, std_db=std_db) for name in asked}
         means |= {"nesz": of_coefficient("sigma0", std_db=std_db, noise="alone")}
@@ -154,10 +154,11 @@ def _report(scene: OpenScene, image: xr.Dataset, calibrated: CalibratedPair, noi
     found = points_of(image.image, image.attrs["quality"], scene, list(scene.grid.tiles(BLOCK_PX)))
     constant = calibrated.calibration.constant
     return {
-        "calibrated_by": "the radio that the config states",
+        "calibrated_by": calibrated.calibrated_by,
         "constant_db": round(10 * float(np.log10(constant)), 3),
-        "std_db": calibrated.stated_std_db,
-        "link": asdict(calibrated.link),
+        "std_db": calibrated.std_db,
+        "flags": calibrated.flags,
+        "link": calibrated.link and asdict(calibrated.link),
         "noise": {"pulse": noise if np.isfinite(noise) else None, **calibrated.noise_report(noise)},
         "points": calibrated.points(found, scene, noise),
     }
