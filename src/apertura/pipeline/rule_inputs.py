@@ -240,18 +240,23 @@ def radio(place: JobPlace) -> Mapping[str, Any]:
 
 
 def coefficients(place: JobPlace) -> Mapping[str, Any]:
-    """Return which backscattering coefficients are written; nothing where images are relative."""
+    """Return which backscattering coefficients and mean powers are written; nothing where none is."""
     written = place.campaign.coefficients
     return {"radiometry": list(written)} if written else {}
 
 
-def calibrated(place: JobPlace) -> Iterable[str]:
-    """Return the image that is calibrated with what was sent; nothing where images are relative."""
+def multilook(place: JobPlace) -> Mapping[str, Any]:
+    """Return how power is averaged; nothing where it is not."""
+    stated = place.campaign.values["processing"]["multilook"]
+    return {"multilook": stated} if stated else {}
+
+
+def measured_image(place: JobPlace) -> Iterable[str]:
+    """Return the image that is calibrated, with what was sent, or averaged; nothing where neither is asked for."""
     campaign = place.campaign
-    if not campaign.calibrated:
-        return []
-    sent = campaign.relative(campaign.sent_file)
-    return [sent, *(campaign.manifest("image", *pair) for pair in place.pairs)]
+    sent = [campaign.relative(campaign.sent_file)] if campaign.calibrated else []
+    asked = campaign.calibrated or multilook(place)
+    return [*sent, *(campaign.manifest("image", *pair) for pair in place.pairs if asked)]
 
 
 def calibration_of_images(place: JobPlace) -> Iterable[str]:
@@ -282,7 +287,7 @@ def grid(place: JobPlace) -> Mapping[str, Any]:
 
 
 _BEFORE_THE_IMAGE = frozenset({"window", "sidelink", "false_alarms_per_s", "autofocus", "autofocus_method"})
-_AFTER_THE_IMAGE = frozenset({"fusion", "radiometry"})
+_AFTER_THE_IMAGE = frozenset({"fusion", "radiometry", "multilook"})
 
 
 def imaging(place: JobPlace) -> Mapping[str, Any]:
