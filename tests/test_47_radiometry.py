@@ -18,9 +18,13 @@ from apertura.pipeline.opening.pair import open_pair
 from apertura.pipeline.opening.radiometry import calibrated_pair
 from apertura.pipeline.opening.scene import open_scene
 from apertura.pipeline.steps.layers import layers
+from apertura.pipeline.steps.mosaic import mosaic
+from apertura.pipeline.steps.stac import stac
 from apertura.simulation import GaussianBeam, ImageGrid, PointTarget, Radio, preset, simulate
 from apertura.simulation.presets import DEMO_ORIGIN
 from apertura.views.score import score
+from apertura.views.verify.chain import verify
+from apertura.views.webmap.step import webmap
 
 RCS_M2 = (0.1, 1.0, 10.0)
 PLACES = ((-2.0, -1.5, 0.0), (0.0, 1.2, 0.0), (2.0, -0.5, 0.0))
@@ -203,20 +207,40 @@ def test_mean_power_lies_on_a_coarser_grid_and_says_what_it_is(flown, tmp_path):
 
 
 def test_mean_power_of_a_relative_image_is_that_of_its_echoes(finished_tiny, tmp_path):
-    """Of squares of pixels as they are in power.tif, those at the edge too; nothing else is made again."""
+    """Of squares of pixels as they are in power.tif, those at the edge too; no image is formed again."""
     root = copy_writable(finished_tiny.root, tmp_path / "campaign")
-    edit_config(root, lambda document: document.setdefault("processing", {}).update(multilook={"spacing_m": 0.4}))
-    campaign = Campaign.load(root)
-    assert campaign.coefficients == ("multilook",)
+    campaign = state(root, "processing", multilook={"spacing_m": 0.4})
     made = [result_of(one, "image", "f01", "uav1-uav1").settings for one in (finished_tiny, campaign)]
     assert made[0] == made[1]
-    layers(campaign, "f01", "uav1-uav1")
+    for pair in PAIRS:
+        layers(campaign, "f01", pair)
     folder = campaign.result("f01", "uav1-uav1")
     pixels, squares = (rasterio.open(folder / f"{name}.tif").read(1) for name in ("power", "multilook_power"))
     assert squares[1, 2] == pytest.approx(pixels[4:8, 8:12].mean(), rel=1e-5)
-    assert {f"f01/a-b/multilook_{name}" for name in ("power.tif", "power.qml", "db.tif", "db.qml")} <= set(
-        product_files({"f01": ["a-b"]}, campaign.coefficients)
-    )
+    assert squares.shape == tuple(-(-size // 4) for size in pixels.shape)
+    assert {link.state for link in verify(folder / "multilook_db.tif").links} == {"same"}
+
+
+@pytest.mark.slow
+def test_mean_power_is_mosaicked_and_in_the_catalog_at_its_own_place(finished_tiny, tmp_path):
+    """But on no map, whose layers lie on one grid."""
+    root = copy_writable(finished_tiny.root, tmp_path / "campaign")
+    campaign = state(root, "processing", multilook={"spacing_m": 0.4})
+    files = {f"uav1-uav1/multilook_{name}" for name in ("power.tif", "power.qml", "db.tif", "db.qml")}
+    named = set(product_files({"f01": PAIRS}, campaign.coefficients))
+    assert {f"f01/{name}" for name in files} | {"mosaic/uav1-uav1/multilook_db.vrt"} <= named
+    for pair in PAIRS:
+        layers(campaign, "f01", pair)
+    mosaic(campaign)
+    stac(campaign)
+    webmap(campaign)
+    folder, about = campaign.results, json.loads((campaign.results / "stac/images/f01/uav1-uav1.json").read_text())
+    with rasterio.open(folder / "f01/uav1-uav1/multilook_db.tif") as raster:
+        assert rasterio.open(folder / "mosaic/uav1-uav1/multilook_db.vrt").transform == raster.transform
+        asset = about["assets"]["multilook_db"]
+        assert (asset["proj:shape"], asset["proj:transform"]) == ([*raster.shape], [*raster.transform][:6])
+    assert "proj:shape" not in about["assets"]["db"]
+    assert "multilook" not in (folder / "map/map.json").read_text()
 
 
 @pytest.mark.slow

@@ -326,7 +326,10 @@ class Chain:
             if stage == "image.manifest.json":
                 spec = _spec(inside(self.root, f"{folder}/image.zarr/zarr.json", where=link.name))
                 image = folder.removeprefix("results/")  # of several, each has its own under its name
-                if spec is not None and spec not in (stated, stated.get(image), stated.get(image.rpartition("/")[2])):
+                apart = stated.get(image), stated.get(image.rpartition("/")[2])
+                if (
+                    spec is not None and spec not in apart and {**stated, **spec} != stated
+                ):  # layers state their own, too
                     link.add("changed", f"APERTURA_RUNSPEC: {folder}/image.zarr was made with other settings")
 
 
