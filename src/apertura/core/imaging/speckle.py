@@ -14,10 +14,8 @@ from apertura.core.scene.map_crs import BLOCK_PX
 LAGS_PX = 32
 """Lags of the correlation of speckle, either way: a cell is 2 to 4 pixels wide, its correlation gone by ten cells."""
 
-_MEASURED_PX = (
-    128  # side of the blocks that the correlation is measured in: four times the lags, that all have many pairs
-)
-_MEASURED_WINDOWS = 3  # of local looks along such a block, at least
+_MEASURED_PX = 128  # side of the blocks that the correlation is measured in: all lags then have many pairs
+_MEASURED_WINDOWS = 3  # of local looks along a block, at least
 _MEASURED_BLOCKS, _MOST_PX = 64, 1 << 24  # that looks are measured in, and pixels of all of them, about
 WINDOW = 7
 """Side of the window of the filter and of local looks, cells of the multilooked raster; Lee's own (1980)."""
@@ -309,7 +307,7 @@ class Multilook:
         blocks = [image((slice(row, row + rows), slice(column, column + columns))) for row, column in starts]
         looks = within = found = float("nan")
         try:
-            speckle = Speckle.of(blocks)
+            speckle = Speckle.of(one[:_MEASURED_PX, :_MEASURED_PX] for one in blocks)
         except ValueError:
             return cls(image, pixels, side, noise, False, looks, within, found)
         looks, within = speckle.looks(side), speckle.looks(WINDOW * side)

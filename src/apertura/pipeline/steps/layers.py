@@ -82,8 +82,7 @@ def layers(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> l
     absolute = {} if calibrated is None else {"nesz": of_coefficient("sigma0", std_db=std_db, noise="alone")}
     write("layers", _rasters(scene, looks, noise, calibrated, threads=threads), absolute)
     if image is not None:
-        powers = {"": GroundPower(scene, image, None, None)}
-        means = {"": ECHO.report}
+        powers, means = dict[str, GroundPower](), dict[str, Mapping[str, Any]]()
         if calibrated is not None:
             mask = folder / product("mask", "write_mask").file
             powers = {name: GroundPower(scene, image, calibrated, mask, name) for name in asked}
@@ -94,9 +93,11 @@ def layers(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> l
             write_json(written[-1], _report(scene, image, calibrated, noise))
         if multilook is not None:
             per_weight = noise / integration_of(campaign, opened, scene).count ** 2
-            for name, power in powers.items():
-                source = f"multilook_{name}" if name else "multilook"
-                raster, said = _multilooked(power, means[name], looks, per_weight, multilook, threads=threads)
+            averaged = {f"multilook_{name}": (power, means[name]) for name, power in powers.items()}
+            for source, (power, meaning) in (
+                averaged or {"multilook": (GroundPower(scene, image), ECHO.report)}
+            ).items():
+                raster, said = _multilooked(power, meaning, looks, per_weight, multilook, threads=threads)
                 write("multilook", {source: raster}, {source: said})
     remove_outdated(folder, written)
     record_files(campaign.root / lineage.result.manifest, written, lineage)
@@ -167,8 +168,8 @@ class GroundPower:
 
     scene: OpenScene
     image: xr.Dataset
-    calibrated: CalibratedPair | None
-    mask: Path | None
+    calibrated: CalibratedPair | None = None
+    mask: Path | None = None
     quantity: Quantity = "sigma0"
 
     def per_one(self, window: Window) -> NDArray[np.float64]:
@@ -235,6 +236,7 @@ def _rasters(
 ) -> dict[str, LazyLayer]:
     """Return the layers; `noise` is that of one pulse."""
     grid, terrain = scene.grid, scene.terrain
+    level = isinstance(terrain, FlatGround)
 
     def incidence(window: Window) -> NDArray[np.float64]:
         return _inside(looks, window, incidence_deg(*_surface(grid, terrain, window), looks.centre(window)[0]))
@@ -245,8 +247,8 @@ def _rasters(
 
     def nesz(window: Window) -> NDArray[np.float64]:
         if calibrated is not None:
-            calibration = calibrated.calibration
-            power = (noise or np.nan) * calibration.pixel_noise(window) / calibration.power(window, "sigma0", None)
+            calibration, normal = calibrated.calibration, None if level else _surface(grid, terrain, window)[1]
+            power = (noise or np.nan) * calibration.pixel_noise(window) / calibration.power(window, "sigma0", normal)
             return _inside(looks, window, 10 * np.log10(power))
         effective = looks.effective(window).astype(np.float64)
         return 10 * np.log10((noise or np.nan) / np.where(effective > 0, effective, np.nan))
