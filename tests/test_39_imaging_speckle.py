@@ -142,3 +142,22 @@ def test_what_is_hardly_seen_has_no_looks_and_no_filter():
     done = Multilook.of(image.__getitem__, image.shape, 2, filtered=True)
     assert (done.filtered, np.isnan(done.looks)) == (False, True)
     assert np.isnan(found_looks([], 10.0))
+
+
+def test_ground_without_any_power_stays_zero_and_counts_for_no_looks():
+    """As simulations without noise have it beside their targets."""
+    image = speckle(0.4) * (np.arange(SIZE) < SIZE // 2)
+    done = Multilook.of(image.__getitem__, image.shape, SIDE, filtered=True)
+    assert (whole(done)[:, -20:] == 0).all()
+    assert done.found == pytest.approx(Multilook.of(speckle(0.4).__getitem__, image.shape, SIDE).looks, rel=0.2)
+
+
+@pytest.mark.parametrize(("shape", "side"), [((1, 1), 1), ((3, 40), 2), ((40, 30), 100)])
+def test_an_image_smaller_than_a_window_has_its_mean(shape, side):
+    image = np.ones(shape, np.complex64)
+    done = Multilook.of(image.__getitem__, shape, side, filtered=True)
+    values = whole(done)
+    assert values.shape == tuple(-(-size // side) for size in shape)
+    assert np.isnan(done.found)
+    known = values[np.isfinite(values)]
+    assert known == pytest.approx(1)

@@ -16,12 +16,14 @@ LAGS_PX = 32
 
 _MEASURED_PX = 128  # side of the blocks that the correlation is measured in: all lags then have many pairs
 _MEASURED_WINDOWS = 3  # of local looks along a block, at least
+_LARGEST_PX = 4096  # along a block; of wider windows no looks are found
 _MEASURED_BLOCKS, _MOST_PX = 64, 1 << 24  # that looks are measured in, and pixels of all of them, about
 WINDOW = 7
 """Side of the window of the filter and of local looks, cells of the multilooked raster; Lee's own (1980)."""
 
 _PARTS = 4  # of a block, either way, that tell how the direction of view turns across it
-_FEWEST = 9  # lags: of fewer all are about zero
+_MOST_CHANCE = 0.5  # |ρ|² at far lags: of a block of two cells, or of an image that does not vary
+_FEWEST_PX = 10  # along a block: of less all lags are about zero
 _STEP, _SCATTER = 0.02, 0.2  # of ln(looks): of its histogram, and of what 49 cells tell, which smooths it
 
 
@@ -85,7 +87,7 @@ class Speckle:
         Raises
         ------
         ValueError
-            If no block is left, or they are too small.
+            If no block is left, they are too small, or the correlation has no end in them.
 
         Examples
         --------
@@ -94,13 +96,16 @@ class Speckle:
         >>> round(Speckle.of(white).looks(5), 1)
         25.0
         """
-        some = (one for one in blocks if 2 * np.isfinite(one).sum() >= one.size and np.nansum(np.abs(one)))
+        large = (one for one in blocks if min(one.shape) >= _FEWEST_PX)
+        some = (one for one in large if 2 * np.isfinite(one).sum() >= one.size and np.nansum(np.abs(one)))
         found = [_squared_correlation(one) for one in some]
-        if not found or len(found[0]) < _FEWEST:
+        if not found:
             raise ValueError("no block of the image holds enough pixels")
         middle = np.median(found, axis=0)
         corner = slice(0, len(middle) // 4)
         floor = np.median(middle[corner, corner])  # chance: of so few pixels no correlation is nothing
+        if floor > _MOST_CHANCE:
+            raise ValueError(f"pixels of the image are correlated by {floor:.2f} wherever they lie")
         return cls(np.maximum(middle - floor, 0.0) / (1 - floor))
 
     @property
@@ -168,7 +173,7 @@ def _local(power: Floats, within: float) -> tuple[Floats, Floats]:
     count, filled = summed(known.astype(np.float64)), np.where(known, power, 0.0)
     with np.errstate(invalid="ignore", divide="ignore"):
         mean = summed(filled) / count
-        ratio = np.maximum(summed(filled**2) / count / mean**2 - 1, 0.0)
+        ratio = np.where(mean > 0, np.maximum(summed(filled**2) / count / mean**2 - 1, 0.0), 0.0)
     return mean, (1 + 1 / within) * ratio + 1 / within
 
 
@@ -197,10 +202,11 @@ def found_looks(rasters: Iterable[Floats], within: float) -> float:
     >>> bool(abs(found_looks([power], 490.0) / 10 - 1) < 0.1)
     True
     """
-    half = WINDOW // 2
-    local = [1 / _local(one, within)[1][half:-half:2, half:-half:2] for one in rasters if min(one.shape) >= WINDOW]
-    values = np.log(np.concatenate([one.ravel() for one in local])) if local else np.array([])
-    values = values[np.isfinite(values)]
+    inner, values = slice(WINDOW // 2, -(WINDOW // 2), 2), np.array([])
+    for one in rasters:
+        if min(one.shape) >= WINDOW:
+            mean, spread = _local(one, within)
+            values = np.append(values, -np.log(spread[inner, inner][mean[inner, inner] > 0]))
     if not values.size:
         return float("nan")
     places = np.arange(values.min(), values.max() + _STEP, _STEP)
@@ -299,8 +305,8 @@ class Multilook:
         >>> some.shape, round(some.looks), some.mean((slice(0, 2), slice(5, 8))).shape
         ((128, 128), 16, (2, 3))
         """
-        wanted = max(_MEASURED_PX, _MEASURED_WINDOWS * WINDOW * side)
-        rows, columns = (min(wanted, size) // side * side or size for size in pixels)
+        wanted = min(max(_MEASURED_PX, _MEASURED_WINDOWS * WINDOW * side), _LARGEST_PX)
+        rows, columns = (min(wanted, size) // side * side or min(wanted, size) for size in pixels)
         count = max(1, min(_MEASURED_BLOCKS, min(_MOST_PX, 2 * pixels[0] * pixels[1]) // (rows * columns)))
         corners = np.random.default_rng(0).uniform(size=(count, 2)) * (pixels[0] - rows, pixels[1] - columns)
         starts = sorted({(int(row) // side * side, int(column) // side * side) for row, column in corners})

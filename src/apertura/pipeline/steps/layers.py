@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import rasterio
 import rasterio.windows
 import xarray as xr
 from numpy.typing import NDArray
@@ -16,6 +15,7 @@ from rasterio import Affine
 from apertura.common.atomic import write_json
 from apertura.common.contracts import Window
 from apertura.common.provenance import Provenance
+from apertura.common.raster import opened_raster
 from apertura.core.antenna.beam import Beams
 from apertura.core.focus.inputs import Profiles
 from apertura.core.imaging.noise import PLACES, noise_power
@@ -181,7 +181,7 @@ class GroundPower:
         power = self.calibrated.calibration.power(window, self.quantity, normal)
         if flat or self.mask is None:
             return power
-        with rasterio.open(self.mask) as raster:
+        with opened_raster(self.mask, expected="what this step has written", remedy="Run it again.") as raster:
             return np.where(raster.read(1, window=rasterio.windows.Window.from_slices(*window)) == 0, power, np.nan)
 
     def amplitude(self, window: Window) -> NDArray[np.complex64]:
