@@ -1,11 +1,13 @@
 """Cross-sections, σ⁰ and NESZ of calibrated images against what was put: `python benchmarks/radiometry.py`.
 
 `points`: 0.1, 1 and 10 m² at five ranges and three squints, mono- and bistatic, through beams, without noise and in
-100 noisy draws each; `clutter`: ground of one σ⁰ over incidences of 30° to 70°; `noise`: the noise figure that the
-noise of simulated recordings has. Echoes are those of `apertura.simulation` with a `Radio`.
+100 noisy draws each; `clutter`: ground of one σ⁰ over incidences of 30° to 70°, level, on slopes and across the edge of
+a beam; `looks`: of its mean power, and after the filter; `noise`: the noise figure that the noise of simulated
+recordings has. Echoes are those of `apertura.simulation` with a `Radio`.
 """
 
 import argparse
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -21,9 +23,10 @@ from apertura.core.imaging.backproject import backproject
 from apertura.core.imaging.noise import noise_power
 from apertura.core.imaging.radiometry import Calibration, Link, cell_constant
 from apertura.core.imaging.range_profiles import range_compress
+from apertura.core.imaging.speckle import Multilook, Speckle
 from apertura.core.quality.bright_points import bright_point
 from apertura.core.scene.grid import SceneGrid
-from apertura.core.scene.terrain import FlatGround
+from apertura.core.scene.terrain import FlatGround, Plane, Terrain
 from apertura.pipeline.opening.radiometry import LEAST_CONTRAST
 from apertura.simulation.echoes import transfer
 from apertura.simulation.impairments import Impairments, Radio, draw_impairments
@@ -37,6 +40,8 @@ COUNTS, WIDTH_DEG, STATED_STD_DB = 8192.0, (60.0, 60.0), 0.5
 RADIO = Radio(-10.0, 8.0, 9.0, full_scale_dbm=4.0, gain_db=40.0, noise_figure_db=6.0)
 LINK = Link(-10.0, 8.0, 9.0, 40.0, 4.0, COUNTS)
 HEIGHT_M = 8.0
+SLOPED_M = 35.0
+"""North of the track where ground on a slope is at height 0."""
 UNTOLD_DB = 10 / np.log(10) * np.sqrt(2 / LEAST_CONTRAST + 1 / LEAST_CONTRAST**2)
 """Scatter of a peak that is hardly above its surroundings."""
 WAVE = TransmitWaveform(
@@ -56,12 +61,12 @@ def flown(*, apart: bool, length_m: float = 8.0, pulses: int = 160, height_m: fl
     return Aperture(track, track + ([5.0, -1.5, 1.0] if apart else 0.0))
 
 
-def beams(aperture: Aperture) -> Beams:
+def beams(aperture: Aperture, width_deg: tuple[float, float] = WIDTH_DEG, down_deg: float = -15.0) -> Beams:
     """Return beams of both antennas to the north, a little down."""
     body = np.broadcast_to(np.diag([1.0, -1.0, -1.0]), (len(aperture), 3, 3))
     limits = np.pi, np.pi / 2
-    cuts = (gaussian_cut(width, cutoff_db=-40.0, limit_rad=most) for width, most in zip(WIDTH_DEG, limits, strict=True))
-    one = Beam(antenna_axes(body, (-90.0, -15.0)), *(part for cut in cuts for part in cut))
+    cuts = (gaussian_cut(width, cutoff_db=-40.0, limit_rad=most) for width, most in zip(width_deg, limits, strict=True))
+    one = Beam(antenna_axes(body, (-90.0, down_deg)), *(part for cut in cuts for part in cut))
     return Beams(one, one)
 
 
@@ -152,32 +157,120 @@ def points(draws: int) -> None:
         )
 
 
-def clutter(sigma0: float = 0.02) -> None:
-    """Print the mean σ⁰ of ground over incidence, against what was put."""
-    for apart, window in product((False, True), ("hann", "none")):
-        height_m = 25.0
-        aperture = flown(apart=apart, length_m=10.0, pulses=220, height_m=height_m)
-        generator = np.random.default_rng(8)
-        east, north = (-45.0, 45.0), (6.0, 85.0)
-        area, density = (east[1] - east[0]) * (north[1] - north[0]), 12.0
-        count = round(area * density)
-        place = np.column_stack([generator.uniform(*east, count), generator.uniform(*north, count), np.zeros(count)])
-        amplitude = generator.standard_normal((count, 2)) @ [1, 1j] * np.sqrt(sigma0 / density / 2)
+CLUTTER = SceneGrid("local", -22.0, 70.0, 0.1, (580, 440))
+CLUTTER_HEIGHT_M = 25.0
+EDGE_WIDTH_DEG, DRAWS = 20.0, 4
+SCATTERERS_M = 0.2
+"""Side of the square of ground that a scatterer stands for."""
+SLOPES = {"level": (0.0, 0.0), "20 % up": (0.0, 0.2), "20 % down": (0.0, -0.2), "20 % along": (0.2, 0.0)}
+"""Rise eastward, along the track, and northward, away from it."""
+
+
+def clutter_power(
+    terrain: Terrain,
+    slope: tuple[float, float],
+    *,
+    apart: bool,
+    window: str = "hann",
+    width_deg: float | None = None,
+    seed: int = 8,
+    sigma0: float = 0.02,
+) -> tuple[NDArray[np.complex64], NDArray[np.float64]]:
+    """Return the image of ground of one σ⁰ over `CLUTTER`, divided so that its mean power should be 1, and places.
+
+    Through beams of a width of `width_deg` in elevation, or none.
+    """
+    grid, level = CLUTTER, flown(apart=apart, length_m=10.0, pulses=220, height_m=CLUTTER_HEIGHT_M)
+    aperture, generator = level, np.random.default_rng(seed)
+    # one at random in each square: of places all at random the density would add to speckle
+    east, north = np.meshgrid(np.arange(-45.0, 45.0, SCATTERERS_M), np.arange(6.0, 85.0, SCATTERERS_M))
+    x, y = ((low + SCATTERERS_M * generator.uniform(size=low.shape)).ravel() for low in (east, north))
+    place = np.column_stack([x, y, slope[0] * x + slope[1] * (y - SLOPED_M)])
+    steep = np.sqrt(1 + slope[0] ** 2 + slope[1] ** 2)
+    amplitude = generator.standard_normal((x.size, 2)) @ [1, 1j] * np.sqrt(sigma0 * steep / 2) * SCATTERERS_M
+    weighing = None if width_deg is None else beams(aperture, (WIDTH_DEG[0], width_deg), -45.0)
+    if weighing is None:
         echo = transfer(Scatterers(place, amplitude), aperture, WAVE.frequency_hz, gridded=True)
-        echo = np.asarray(echo * np.sqrt(constant()), np.complex64)
-        grid = SceneGrid("local", -22.0, 70.0, 0.1, (580, 440))
-        profiles = range_compress(history(echo, aperture, window), grid, FlatGround(0.0))
-        image = np.asarray(backproject(profiles, grid, terrain=FlatGround(0.0), integration="all"))
-        whole = (slice(0, 580), slice(0, 440))
-        found = np.abs(image) ** 2 / calibration(grid, aperture, None, window).power(whole, "sigma0")
-        incidence = np.degrees(np.arctan2(grid.y_m, height_m))
-        rows = []
-        for low in range(30, 70, 10):
-            band = found[(incidence >= low) & (incidence < low + 10)]
-            if band.size:
-                rows.append(f"{low}-{low + 10}°: {10 * np.log10(band.mean() / sigma0):+.2f}")
+    else:
+        echo = np.concatenate(
+            [
+                transfer(
+                    Scatterers(place, amplitude * weighing[one].weight(aperture[one], place)[0]),
+                    aperture[one],
+                    WAVE.frequency_hz,
+                    gridded=True,
+                )
+                for one in (slice(pulse, pulse + 1) for pulse in range(len(aperture)))
+            ]
+        )
+    profiles = range_compress(history(np.asarray(echo, np.complex64), aperture, window), grid, terrain)
+    image = np.asarray(backproject(profiles, grid, terrain=terrain, beams=weighing, integration="all"))
+    normal = np.broadcast_to(np.array([-slope[0], -slope[1], 1.0]) / steep, (*grid.shape, 3))
+    whole, cell_m2 = (
+        (slice(0, grid.shape[0]), slice(0, grid.shape[1])),
+        cell_constant(WAVE.frequency_hz, weights(window)),
+    )
+    known = Calibration.of(grid, terrain, aperture, weighing, constant=1.0, cell_m2=cell_m2)
+    return np.asarray(image / np.sqrt(known.power(whole, "sigma0", normal) * sigma0), np.complex64), terrain.positions(
+        grid
+    )
+
+
+def clutter() -> None:
+    """Print the mean σ⁰ of ground over incidence, against what was put: level, on slopes, and across a beam's edge."""
+    for apart, (name, slope) in product((False, True), SLOPES.items()):
+        for window in ("hann", "none") if name == "level" else ("hann",):
+            terrain = FlatGround(0.0) if name == "level" else Plane(0.0, SLOPED_M, 0.0, *slope)
+            drawn = [clutter_power(terrain, slope, apart=apart, window=window, seed=seed) for seed in range(DRAWS)]
+            power = np.mean([np.abs(image) ** 2 for image, _ in drawn], axis=0)
+            image, places = drawn[0]
+            incidence = np.degrees(np.arctan2(places[..., 1], CLUTTER_HEIGHT_M - places[..., 2]))
+            starts = product(*(range(0, size - 127, 64) for size in image.shape))
+            cell_px = Speckle.of(image[row : row + 128, column : column + 128] for row, column in starts).area_px
+            rows = []
+            for low, high in (*((low, low + 10) for low in range(30, 70, 10)), (30, 70)):
+                inside = (incidence >= low) & (incidence < high)
+                scatter_db = 10 / np.log(10) * np.sqrt(cell_px / inside.sum() / DRAWS)
+                rows.append(f"{low}-{high}°: {10 * np.log10(power[inside].mean()):+.2f} ± {scatter_db:.2f}")
+            kind = "bistatic" if apart else "monostatic"
+            print(f"{kind}, {window}, {name}: σ⁰ off by (dB, speckle) {', '.join(rows)}", flush=True)
+    for apart in (False, True):
+        drawn = [
+            clutter_power(FlatGround(0.0), SLOPES["level"], apart=apart, width_deg=EDGE_WIDTH_DEG, seed=seed)
+            for seed in range(DRAWS)
+        ]
+        power, places = np.mean([np.abs(image) ** 2 for image, _ in drawn], axis=0), drawn[0][1]
+        aperture = flown(apart=apart, length_m=10.0, pulses=2, height_m=CLUTTER_HEIGHT_M)
+        middle = places[:, places.shape[1] // 2]
+        weighing = beams(aperture, (WIDTH_DEG[0], EDGE_WIDTH_DEG), -45.0)
+        below_db, rows = 20 * np.log10(weighing.weight(aperture, middle).mean(axis=0)), []
+        for low in range(-24, 0, 6):
+            inside = (below_db >= low) & (below_db < low + 6) & (middle[:, 1] > CLUTTER_HEIGHT_M)
+            if inside.any():
+                rows.append(f"{low} to {low + 6} dB: {10 * np.log10(np.nanmean(power[inside])):+.2f}")
         kind = "bistatic" if apart else "monostatic"
-        print(f"{kind}, {window}: σ⁰ off by (dB) {', '.join(rows)}; whole {10 * np.log10(found.mean() / sigma0):+.2f}")
+        print(f"{kind}, far side of a beam, both ways: σ⁰ off by (dB) {', '.join(rows)}", flush=True)
+
+
+def looks() -> None:
+    """Print the looks of mean power of ground of one σ⁰, stated and counted, and what the filter does to it."""
+    for apart, window in product((False, True), ("hann", "none")):
+        image, _ = clutter_power(FlatGround(0.0), SLOPES["level"], apart=apart, window=window)
+        for side in (2, 4, 8):
+            plain = Multilook.of(image.__getitem__, CLUTTER.shape, side)
+            means = [
+                one.mean((slice(0, one.shape[0]), slice(0, one.shape[1])))
+                for one in (plain, replace(plain, filtered=True))
+            ]
+            counted = [one.mean() ** 2 / one.var() for one in means]
+            moved_db = 10 * np.log10(means[1].mean() / means[0].mean())
+            kind = "bistatic" if apart else "monostatic"
+            print(
+                f"{kind}, {window}, {side} × {side} pixels: {plain.looks:.2f} looks by "
+                f"correlation, {plain.found:.2f} found, {counted[0]:.2f} counted; filtered {counted[1]:.0f}, mean "
+                f"{moved_db:+.3f} dB",
+                flush=True,
+            )
 
 
 def noise(draws: int = 8) -> None:
@@ -199,7 +292,7 @@ def noise(draws: int = 8) -> None:
     print(f"noise figure 6 dB, measured below echoes: {spread} in {draws} draws")
 
 
-PARTS = {"points": points, "clutter": lambda _: clutter(), "noise": lambda _: noise()}
+PARTS = {"points": points, "clutter": lambda _: clutter(), "looks": lambda _: looks(), "noise": lambda _: noise()}
 
 
 def main() -> None:

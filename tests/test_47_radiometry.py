@@ -6,8 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import rasterio
-from folders import complaint, copy_writable, edit_config, export_flight, run_steps
+import rasterio.transform
+from folders import complaint, copy_writable, edit_config, export_flight, run_steps, state
 
+from apertura.core.geometry.geodesy import projected_from_ecef
 from apertura.core.quality.bright_points import BrightPoint
 from apertura.formats.export import product_files
 from apertura.pipeline.campaign import Campaign
@@ -16,8 +18,13 @@ from apertura.pipeline.opening.pair import open_pair
 from apertura.pipeline.opening.radiometry import calibrated_pair
 from apertura.pipeline.opening.scene import open_scene
 from apertura.pipeline.steps.layers import layers
+from apertura.pipeline.steps.mosaic import mosaic
+from apertura.pipeline.steps.stac import stac
 from apertura.simulation import GaussianBeam, ImageGrid, PointTarget, Radio, preset, simulate
+from apertura.simulation.presets import DEMO_ORIGIN
 from apertura.views.score import score
+from apertura.views.verify.chain import verify
+from apertura.views.webmap.step import webmap
 
 RCS_M2 = (0.1, 1.0, 10.0)
 PLACES = ((-2.0, -1.5, 0.0), (0.0, 1.2, 0.0), (2.0, -0.5, 0.0))
@@ -153,6 +160,18 @@ def test_a_peak_of_noise_has_no_cross_section(flown):
 
 
 @pytest.mark.slow
+def test_mean_power_is_that_of_echoes_where_no_coefficient_is_asked_for(flown, tmp_path):
+    root = copy_writable(flown.root, tmp_path / "campaign")
+    campaign = state(root, "processing", radiometry=[], multilook={"spacing_m": 100.0})
+    assert campaign.coefficients == ("multilook",)
+    layers(campaign, "f01", "uav1-uav1")
+    folder = campaign.result("f01", "uav1-uav1")
+    assert not list(folder.glob("*sigma0*"))
+    with rasterio.open(folder / "multilook_power.tif") as raster:
+        assert (raster.shape, raster.descriptions[0][:15]) == ((1, 1), "mean echo power")
+
+
+@pytest.mark.slow
 def test_a_coefficient_that_is_no_longer_asked_for_goes(flown, tmp_path):
     """Of an old radio it would lie beside an image of the new one."""
     root = copy_writable(flown.root, tmp_path / "campaign")
@@ -161,3 +180,106 @@ def test_a_coefficient_that_is_no_longer_asked_for_goes(flown, tmp_path):
     layers(campaign, "f01", "uav1-uav1")
     folder = campaign.result("f01", "uav1-uav1")
     assert [path.name for path in sorted(folder.glob("*0_db.*"))] == ["gamma0_db.qml", "gamma0_db.tif"]
+
+
+@pytest.mark.slow
+def test_mean_power_lies_on_a_coarser_grid_and_says_what_it_is(flown, tmp_path):
+    """Linear and in dB, of the coefficients asked for; with its mean kept, noise subtracted, speckle filtered."""
+    root = copy_writable(flown.root, tmp_path / "campaign")
+    products = {f"multilook_sigma0{end}" for end in ("_power.tif", "_power.qml", "_db.tif", "_db.qml")}
+    means = {}
+    for subtract in (False, True):
+        asked = {"spacing_m": 0.31, "subtract_noise": subtract, "speckle_filter": "lee"}
+        edit_config(root, lambda document, asked=asked: document.setdefault("processing", {}).update(multilook=asked))
+        campaign = Campaign.load(root)
+        folder = campaign.result("f01", "uav1-uav1")
+        assert products <= {path.name for path in layers(campaign, "f01", "uav1-uav1")}
+        with rasterio.open(folder / "multilook_sigma0_power.tif") as raster:
+            assert (raster.res, raster.shape) == ((pytest.approx(0.3), pytest.approx(0.3)), (20, 20))
+            mean, said = raster.read(1), json.loads(raster.tags()["APERTURA_RADIOMETRY"])
+            assert raster.descriptions[0].startswith("mean sigma0, radar cross-section per area of ground of 6 x 6 pix")
+        with rasterio.open(folder / "multilook_sigma0_db.tif") as raster:
+            decibels = raster.read(1)
+            assert raster.units == ("dB",)
+        assert (said["speckle_filter"], said["noise"]) == ("Lee", "subtracted" if subtract else "in it")
+        assert 1 < said["equivalent_looks"] < 36
+        positive = mean > 0
+        np.testing.assert_allclose(decibels[positive], 10 * np.log10(mean[positive]), atol=1e-3)
+        assert np.isnan(decibels[~positive]).all()
+        means[subtract] = mean
+    with rasterio.open(folder / "sigma0_db.tif") as raster:
+        sigma0 = 10 ** (raster.read(1) / 10)
+    with rasterio.open(folder / "nesz.tif") as raster:
+        noise = (10 ** (raster.read(1).astype(np.float64) / 10)).reshape(20, 6, 20, 6).mean(axis=(1, 3))
+    dim = means[False] < np.median(means[False])  # of bright ones float32 does not tell it
+    np.testing.assert_allclose((means[False] - means[True])[dim], noise[dim], rtol=0.01)
+    assert means[False].mean() == pytest.approx(np.nanmean(sigma0), rel=0.05)
+    edit_config(root, lambda document: document["processing"].pop("multilook"))
+    layers(Campaign.load(root), "f01", "uav1-uav1")
+    assert not list(folder.glob("multilook*"))
+
+
+def test_mean_power_of_a_relative_image_is_that_of_its_echoes(finished_tiny, tmp_path):
+    """Of squares of pixels as they are in power.tif, those at the edge too; no image is formed again."""
+    root = copy_writable(finished_tiny.root, tmp_path / "campaign")
+    campaign = state(root, "processing", multilook={"spacing_m": 0.4})
+    made = [result_of(one, "image", "f01", "uav1-uav1").settings for one in (finished_tiny, campaign)]
+    assert made[0] == made[1]
+    for pair in PAIRS:
+        layers(campaign, "f01", pair)
+    folder = campaign.result("f01", "uav1-uav1")
+    pixels, squares = (rasterio.open(folder / f"{name}.tif").read(1) for name in ("power", "multilook_power"))
+    assert squares[1, 2] == pytest.approx(pixels[4:8, 8:12].mean(), rel=1e-5)
+    assert squares.shape == tuple(-(-size // 4) for size in pixels.shape)
+    assert {link.state for link in verify(folder / "multilook_db.tif").links} == {"same"}
+
+
+@pytest.mark.slow
+def test_mean_power_is_mosaicked_and_in_the_catalog_at_its_own_place(finished_tiny, tmp_path):
+    """But on no map, whose layers lie on one grid."""
+    root = copy_writable(finished_tiny.root, tmp_path / "campaign")
+    campaign = state(root, "processing", multilook={"spacing_m": 0.4})
+    files = {f"uav1-uav1/multilook_{name}" for name in ("power.tif", "power.qml", "db.tif", "db.qml")}
+    named = set(product_files({"f01": PAIRS}, campaign.coefficients))
+    assert {f"f01/{name}" for name in files} | {"mosaic/uav1-uav1/multilook_db.vrt"} <= named
+    for pair in PAIRS:
+        layers(campaign, "f01", pair)
+    mosaic(campaign)
+    stac(campaign)
+    webmap(campaign)
+    folder, about = campaign.results, json.loads((campaign.results / "stac/images/f01/uav1-uav1.json").read_text())
+    with rasterio.open(folder / "f01/uav1-uav1/multilook_db.tif") as raster:
+        assert rasterio.open(folder / "mosaic/uav1-uav1/multilook_db.vrt").transform == raster.transform
+        asset = about["assets"]["multilook_db"]
+        assert (asset["proj:shape"], asset["proj:transform"]) == ([*raster.shape], [*raster.transform][:6])
+    assert "proj:shape" not in about["assets"]["db"]
+    assert "multilook" not in (folder / "map/map.json").read_text()
+
+
+@pytest.mark.slow
+def test_no_sigma0_is_told_where_the_mask_says_why(flown, tmp_path):
+    """A ridge lays its front over the ground before it and shades what is behind: eq. 10."""
+    root = copy_writable(flown.root, tmp_path / "campaign")
+    east, north, _ = projected_from_ecef("EPSG:32632", DEMO_ORIGIN.ecef(np.zeros(3)))
+    west, top = np.floor(east) - 10, np.ceil(north) + 10
+    x, y = np.meshgrid(west + 0.1 * (0.5 + np.arange(200)), top - 0.1 * (0.5 + np.arange(200)))
+    away = (x - east) * np.cos(np.radians(40)) - (y - north) * np.sin(np.radians(40))  # from the track
+    ridge = 620.0 + np.maximum(0, 1.5 - 4 * np.abs(away))
+    place = {"crs": "EPSG:32632", "transform": rasterio.transform.from_origin(west, top, 0.1, 0.1)}
+    with rasterio.open(root / "dem.tif", "w", "GTiff", 200, 200, 1, dtype="float64", **place) as raster:
+        raster.write(ridge, 1)
+    state(root, "processing", radiometry=["sigma0", "beta0"], multilook={"spacing_m": 0.2})
+    state(root, "scene", dem="dem.tif", dem_datum="ellipsoid")
+    campaign = run_steps(root, exports=False)
+    layers(campaign, "f01", "uav1-uav1")
+    folder = campaign.result("f01", "uav1-uav1")
+    names = ("mask", "sigma0_db", "beta0_db", "multilook_sigma0_power")
+    mask, sigma0, beta0, squares = (rasterio.open(folder / f"{name}.tif").read(1) for name in names)
+    assert min((mask == 1).sum(), (mask == 2).sum(), (mask == 0).sum()) > 100
+    assert np.isnan(sigma0[mask != 0]).all()
+    assert np.isnan(beta0[mask != 0]).all()
+    assert np.isfinite(beta0[mask == 0]).all()
+    assert np.isfinite(sigma0[mask == 0]).mean() > 0.95  # but for slopes that are nearly laid over
+    nesz = rasterio.open(folder / "nesz.tif").read(1)  # of the facet, as σ⁰ is
+    assert np.array_equal(np.isfinite(nesz)[mask == 0], np.isfinite(sigma0)[mask == 0])
+    assert np.isnan(squares[(np.isnan(sigma0).reshape(30, 4, 30, 4).sum(axis=(1, 3)) > 8)]).all()

@@ -127,8 +127,8 @@ _OF_RECORDINGS = {
         "the node's oscillator; which node transmits", "core/echo/own_pulses.py"),
     "wrong_code": Flag(
         "SNR of the sidelink",
-        "the sidelink is there but carries another code: in all pairs of the transmitter, it sent another one; in some, "
-        "their receivers recorded another transmitter",
+        "the sidelink is there but carries another code: if in all pairs of the transmitter, it sent another one; if in "
+        "some, their receivers recorded another transmitter",
         "waveform.codes; the recording", "core/echo/sidelink_state.py"),
     "sidelink_lost": Flag(
         "pulses dropped, of all", "pulses without a sidelink were dropped", "blockage, antenna",

@@ -76,8 +76,12 @@ class Campaign(RawFolder):
 
     @property
     def coefficients(self) -> tuple[str, ...]:
-        """Backscattering coefficients that are written of its images; none where they are relative."""
-        return self.settings.processing.radiometry if self.calibrated else ()
+        """Backscattering coefficients that are written of its images, none where they are relative; and multilooked."""
+        processing = self.settings.processing
+        written = processing.radiometry if self.calibrated else ()
+        if processing.multilook is None:
+            return written
+        return (*written, *([f"multilook_{name}" for name in written] or ["multilook"]))
 
     def check_radio(self) -> None:
         """Raise CampaignError where the radio of its pairs is stated in parts, unless their constants were measured."""

@@ -152,18 +152,19 @@ def modules_of(campaign: Campaign, result: str, *where: str) -> tuple[str, ...]:
         As `result_of`.
     """
     rule = RESULTS[result]
-    step = (rule.module, *_written(rule, calibrated=campaign.calibrated))
+    step = (rule.module, *_written(rule, measured=bool(campaign.coefficients)))
     runs = _closure(step)
     engines = tuple(ENGINES.values()) if _FOCUSES & runs else ()
     readers = sorted(set(_readers(campaign, rule, where))) if _READS in runs else ()
     return (*step, *engines, *readers)
 
 
-def _written(rule: Rule, *, calibrated: bool) -> tuple[str, ...]:
+def _written(rule: Rule, *, measured: bool) -> tuple[str, ...]:
     styles = {row.module for row in EXPORTS if row.style} if rule.styles else set()
     exports = [*export_modules(rule.exports)] if rule.exports else []
-    if rule.exports == "layers" and calibrated:
-        exports += [module for module in export_modules("radiometry") if module not in exports]
+    if rule.exports == "layers" and measured:
+        more = (module for kind in ("radiometry", "multilook") for module in export_modules(kind))
+        exports += [module for module in dict.fromkeys(more) if module not in exports]
     return (*sorted(styles), *exports)
 
 

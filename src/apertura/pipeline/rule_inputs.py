@@ -6,6 +6,7 @@ Nothing is imported here but what a function needs when it is called: the comman
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass
 from enum import Enum
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -242,19 +243,25 @@ def radio(place: JobPlace) -> Mapping[str, Any]:
 
 
 def coefficients(place: JobPlace) -> Mapping[str, Any]:
-    """Return which backscattering coefficients are written; nothing where images are relative."""
+    """Return which backscattering coefficients and mean powers are written; nothing where none is."""
     written = place.campaign.coefficients
     return {"radiometry": list(written)} if written else {}
 
 
-def calibrated(place: JobPlace) -> Iterable[str]:
-    """Return the image that is calibrated, what was sent, and the file of constants; nothing where it is relative."""
-    campaign = place.campaign
-    if not campaign.calibrated:
-        return []
-    files = [campaign.sent_file] if is_sampled(campaign) else []
-    files += [path for path in [campaign.calibration_file] if path is not None]
-    return [*map(campaign.relative, files), *(campaign.manifest("image", *pair) for pair in place.pairs)]
+def multilook(place: JobPlace) -> Mapping[str, Any]:
+    """Return how power is averaged; nothing where it is not."""
+    stated = place.campaign.values["processing"]["multilook"]
+    return {"multilook": stated} if stated else {}
+
+
+def measured_image(place: JobPlace) -> Iterable[str]:
+    """Return the image that is calibrated, with what was sent and the file of constants, or averaged; else nothing."""
+    campaign, files = place.campaign, list[Path]()
+    if campaign.calibrated:
+        files += [campaign.sent_file] if is_sampled(campaign) else []
+        files += [path for path in [campaign.calibration_file] if path is not None]
+    asked = campaign.calibrated or multilook(place)
+    return [*map(campaign.relative, files), *(campaign.manifest("image", *pair) for pair in place.pairs if asked)]
 
 
 def calibration_of_images(place: JobPlace) -> Iterable[str]:
@@ -289,7 +296,7 @@ def grid(place: JobPlace) -> Mapping[str, Any]:
 
 
 _BEFORE_THE_IMAGE = frozenset({"window", "sidelink", "false_alarms_per_s", "autofocus", "autofocus_method"})
-_AFTER_THE_IMAGE = frozenset({"fusion", "radiometry", "radiometric_calibration"})
+_AFTER_THE_IMAGE = frozenset({"fusion", "radiometry", "radiometric_calibration", "multilook"})
 
 
 def imaging(place: JobPlace) -> Mapping[str, Any]:

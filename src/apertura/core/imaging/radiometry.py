@@ -116,7 +116,7 @@ _PULSES = 128  # summed for a block of the lattice, or up to twice as many
 _POINT_PULSES = 8192  # summed for a point, or up to twice as many
 _BINS = 32  # of the density of pulses over spatial frequency, whose square is integrated
 _LEAST = 1e-3  # of the strongest pulse: weaker ones do not decide how wide the aperture is
-_STEEPEST = 1e-2  # cosine between surface and slant plane below which a cell has no area of its own: layover
+_STEEPEST = 0.1  # n·n_s below which no σ⁰ is told: there 1° of error of the slope is 0.7 dB, and zero is layover
 
 
 @dataclass(frozen=True, eq=False)
@@ -291,7 +291,8 @@ class Calibration:
         Returns
         -------
         ndarray
-            (row, column) float64, NaN where no pulse sees the pixel, or the ground faces away (gamma0).
+            (row, column) float64, NaN where no pulse sees the pixel; with normals also where the ground is so near to
+            layover that its area is hardly known, beyond it, or faces away (gamma0).
         """
         level = self.rcs_power(window) * self.cell(window)
         if quantity == "sigma0" and (normal is None or isinstance(self.terrain, FlatGround)):
@@ -302,7 +303,8 @@ class Calibration:
         in_plane = level * np.abs((up * slant).sum(-1))
         if quantity == "beta0":
             return np.asarray(in_plane)
-        sigma0 = in_plane / np.maximum(np.abs((normal * slant).sum(-1)), _STEEPEST)
+        upright = (normal * slant).sum(-1)
+        sigma0 = in_plane / np.where(upright >= _STEEPEST, upright, np.nan)
         if quantity == "sigma0":
             return np.asarray(sigma0)
         cosine = (normal * towards).sum(-1)

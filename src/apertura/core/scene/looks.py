@@ -286,6 +286,10 @@ class Looks:
         looks = np.maximum(1.0, total**2 / np.where(squares > 0, squares, np.inf))
         return np.where(self.illuminated(tile), looks, 0).astype(np.float32)
 
+    def weight_squares(self, window: Window) -> Floats:
+        """Return Σw² at the pixels of a window, (row, column) float64; 0 where no node about them has pulses."""
+        return self._sums(window)[1]
+
     def centre(self, tile: Window) -> tuple[Floats, Floats]:
         """Return transmitter and receiver at each pixel's closest approach, (row, column, 3) float64 metres each."""
         limit_m = _JUMP_PITCHES * self.lattice.pitch_px * self.grid.spacing_m

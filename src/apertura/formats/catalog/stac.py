@@ -175,11 +175,14 @@ class FileFacts:
         Of a raster: fields of the raster extension, one mapping a band.
     inputs
         Source file of a raster → sha256.
+    place
+        Of a raster: shape and transform, fields of the projection extension.
     """
 
     title: str
     bands: list[dict[str, Any]] = field(default_factory=list)
     inputs: Mapping[str, str] = field(default_factory=dict)
+    place: Mapping[str, Any] = field(default_factory=dict)
 
 
 def multihash(sha256: str) -> str:
@@ -220,7 +223,8 @@ def read_facts(path: Path) -> FileFacts:
             bands = [_band(raster, number) for number in range(raster.count)]
             facts = json.loads(raster.tags().get("APERTURA_INPUTS", "{}"))
             inputs = {str(name): str(digest) for name, digest in facts.items()}
-            return FileFacts(raster.descriptions[0] or path.name, bands, inputs)
+            place = {"proj:shape": list(raster.shape), "proj:transform": list(raster.transform)[:6]}
+            return FileFacts(raster.descriptions[0] or path.name, bands, inputs, place)
     except (ValueError, AttributeError) as error:
         raise CampaignError("cannot be read as GeoTIFF", path, expected, remedy) from error
 

@@ -7,7 +7,7 @@ as entry point of group ``apertura.exports``. Importing this module imports no f
 """
 
 import pkgutil
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -15,7 +15,7 @@ from types import MappingProxyType
 from typing import Any
 
 from apertura.common.provenance import canonical_json
-from apertura.formats.export.radiometry import TAG
+from apertura.formats.export.radiometry import CROSS_SECTIONS, TAG
 
 SOURCES: Mapping[str, str] = {
     "image": "pair",
@@ -30,6 +30,10 @@ SOURCES: Mapping[str, str] = {
     "sigma0": "radiometry",
     "gamma0": "radiometry",
     "beta0": "radiometry",
+    "multilook": "multilook",
+    "multilook_sigma0": "multilook",
+    "multilook_gamma0": "multilook",
+    "multilook_beta0": "multilook",
     "phase": "interferogram",
     "coherence": "interferogram",
     "unwrapped": "interferogram",
@@ -39,7 +43,8 @@ SOURCES: Mapping[str, str] = {
 }
 """Raster that a file may be written from → kind of folder the file lies in.
 
-Those of radiometry lie beside layers where a pair is calibrated: complex, of the power that they are named after.
+Those of radiometry lie beside layers where a pair is calibrated: complex, of the power that they are named after; those
+of multilook, where they are asked for: mean power of squares of pixels, real, on a coarser grid.
 ``image`` is a pair's, complex; ``coherent`` the complex and ``noncoherent`` the power sum of a flight's pairs, as a
 complex amplitude without phase, ``magnitude`` the sum of their magnitudes; layers explain a pair's image, real, and
 lie beside it; those of an interferogram are of two images, ``panels`` all of them by name.
@@ -137,6 +142,16 @@ EXPORTS: tuple[Export, ...] = (
     Export("gamma0_db.qml", "gamma0", "apertura.formats.export.style:write_backscatter_style"),
     Export("beta0_db.tif", "beta0", "apertura.formats.export.db:write_db"),
     Export("beta0_db.qml", "beta0", "apertura.formats.export.style:write_backscatter_style"),
+    *(
+        Export(f"{source}{end}", source, f"apertura.formats.export.{function}")
+        for source in (source for source, kind in SOURCES.items() if kind == "multilook")
+        for end, function in (
+            ("_power.tif", "multilook:write_mean_power"),
+            ("_power.qml", "style:write_linear_style"),
+            ("_db.tif", "multilook:write_mean_db"),
+            ("_db.qml", "style:write_backscatter_style"),
+        )
+    ),
     Export("phase.tif", "phase", "apertura.formats.export.interferogram:write_phase"),
     Export("phase.qml", "phase", "apertura.formats.export.style:write_layer_style"),
     Export("coherence.tif", "coherence", "apertura.formats.export.interferogram:write_coherence"),
@@ -156,6 +171,8 @@ EXPORTS: tuple[Export, ...] = (
     *(point.load() for point in entry_points(group="apertura.exports")),
 )
 """Every product of a pair or of a flight's sums, in the order in which they are written."""
+
+_OPTIONAL = ("radiometry", "multilook")  # kinds of which those rows are written that are asked for
 
 PHASE_HISTORY = "phase_history.cphd"
 """Transfer functions of a pair; as large as its echo, and so written for those who ask for it."""
@@ -213,7 +230,7 @@ def mosaics(pairs: Mapping[str, Sequence[str]], coefficients: Sequence[str] = ()
     pairs
         Flight → its pairs, the lowest first.
     coefficients
-        Sources of kind ``radiometry`` that are written, where images are calibrated.
+        Sources of kinds ``radiometry`` and ``multilook`` that are written.
 
     Examples
     --------
@@ -240,14 +257,14 @@ def mosaic_files(pairs: Mapping[str, Sequence[str]], coefficients: Sequence[str]
 
 def _folders(pairs: Sequence[str]) -> Iterator[tuple[str, tuple[str, ...]]]:
     """Yield the folders of a flight, and the kinds of rows that lie in each."""
-    yield from ((pair, ("pair", "layers", "radiometry")) for pair in pairs)
+    yield from ((pair, ("pair", "layers", *_OPTIONAL)) for pair in pairs)
     yield "fused", ("fused",)
 
 
 def _written(kinds: Iterable[str], coefficients: Sequence[str]) -> Iterator[Export]:
-    """Yield the rows of some kinds, of radiometry those of the coefficients written."""
+    """Yield the rows of some kinds, of optional ones those of the coefficients written."""
     rows = (row for kind in kinds for row in exports_in(kind))
-    return (row for row in rows if SOURCES[row.source] != "radiometry" or row.source in coefficients)
+    return (row for row in rows if SOURCES[row.source] not in _OPTIONAL or row.source in coefficients)
 
 
 def product_files(pairs: Mapping[str, Sequence[str]], coefficients: Sequence[str] = ()) -> Iterator[str]:
@@ -289,11 +306,12 @@ def write_exports(
     Parameters
     ----------
     kind
-        ``pair``, ``fused``, ``layers``, ``radiometry`` or ``interferogram``.
+        ``pair``, ``fused``, ``layers``, ``radiometry``, ``multilook`` or ``interferogram``.
     folder
         Where they go.
     rasters, titles
-        Source → (y, x) raster on the campaign's grid, and its title; of ``radiometry`` those that are asked for.
+        Source → (y, x) raster on the campaign's grid, and its title; of ``radiometry`` and ``multilook`` those
+        that are asked for.
     tags
         Of every file, name → text.
     radiometry
@@ -304,9 +322,18 @@ def write_exports(
     written = []
     for export in exports_in(kind):
         path, source = folder / export.file, export.source
-        if kind == "radiometry" and source not in rasters:
+        if kind in _OPTIONAL and source not in rasters:
             continue
         means = {TAG: canonical_json(radiometry[source])} if source in radiometry else {}
         export.write(path, rasters[source], title=titles[source], tags={**tags, **means}, **shared)
         written.append(path)
     return written
+
+
+def remove_outdated(folder: Path, written: Collection[Path]) -> None:
+    """Remove optional rasters and cross-sections that an earlier run wrote into a folder and this one did not."""
+    rows = [row.file for kind in _OPTIONAL for row in exports_in(kind)]
+    mosaicked = [f"{name.removesuffix('.tif')}.vrt" for name in rows if name.endswith(".tif")]
+    for name in (*rows, *mosaicked, CROSS_SECTIONS):
+        if folder / name not in written:
+            (folder / name).unlink(missing_ok=True)

@@ -1,6 +1,6 @@
 """Images in decibels, which most users of a GIS open first."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 
@@ -30,12 +30,26 @@ DB = Band("float32", np.nan, "dB", "{power}, 10 log10", "AVERAGE")
 
 
 def write_db(
-    path: Path, image: NorthUpRaster, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
+    path: Path,
+    image: NorthUpRaster,
+    *,
+    transform: Affine,
+    crs: str,
+    tags: Mapping[str, str],
+    title: str = "",
+    value: Callable[[Pixels], Pixels] = power,
 ) -> None:
     """Write 20 log10 |image| as a float32 COG whose overviews are the dB of averaged power.
 
-    A pixel without power has no dB: it is nodata (NaN), never -inf, yet counts as zero in the
+    A pixel without power has no dB: it is nodata (NaN), never -inf, yet counts as what it is in the
     averaged power of the overviews. Parameters and errors as `write_slc`.
+
+    Parameters
+    ----------
+    path, image, transform, crs, tags, title
+        As `write_slc`.
+    value
+        Block of `image` → its power.
 
     Notes
     -----
@@ -56,7 +70,7 @@ def write_db(
     words, size = described(tags, title), size_of(image, POWER)
     with gdal_replacement(path, size=size) as temporary:
         linear = temporary.with_name("power.tif")
-        checksums = [fill(linear, lambda block: power(np.asarray(image[block])), POWER, place, {})]
+        checksums = [fill(linear, lambda block: value(np.asarray(image[block])), POWER, place, {})]
         if size > IN_MEMORY_BYTES:
             check_written(linear, checksums[0], {})
         levels = max(0, int(np.ceil(np.log2(max(image.shape) / BLOCK))))

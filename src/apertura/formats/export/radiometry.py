@@ -1,10 +1,9 @@
 """Radiometry of a raster: meaning of its values, in words for the band and as JSON for the tag."""
 
 import json
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
-from math import log10
-from pathlib import Path
+from math import isnan, log10
 from typing import TYPE_CHECKING, Any
 
 from apertura.common.provenance import canonical_json
@@ -75,16 +74,6 @@ CF_SIGMA0 = "surface_backwards_scattering_coefficient_of_radar_wave"
 """Standard name of σ⁰ in CF (Standard Name Table); γ⁰ and β⁰ have none."""
 
 
-def remove_outdated(folder: Path, written: Collection[Path]) -> None:
-    """Remove coefficients and cross-sections that an earlier run wrote into a folder and this one did not."""
-    for name in (
-        *(f"{one}_db{suffix}" for one in _COEFFICIENTS for suffix in (".tif", ".qml", ".vrt")),
-        CROSS_SECTIONS,
-    ):
-        if folder / name not in written:
-            (folder / name).unlink(missing_ok=True)
-
-
 def of_coefficient(name: str, *, std_db: float | None, noise: str = "in it") -> dict[str, Any]:
     """Return the radiometry of a calibrated raster, for `TAG`.
 
@@ -106,6 +95,42 @@ def of_coefficient(name: str, *, std_db: float | None, noise: str = "in it") -> 
     standard = {"standard_name": CF_SIGMA0} if name == "sigma0" else {}
     stated = {"calibration_std_db": std_db} if std_db is not None else {"calibration_std": "not stated"}
     return {"amplitude": f"root of {power}", "power": power, "one_is": one_is, "noise": noise, **standard, **stated}
+
+
+def of_multilooked(
+    radiometry: Mapping[str, Any], *, side_px: int, looks: float, found: float, noise: str, speckle: str
+) -> dict[str, Any]:
+    """Return the radiometry of the mean power of squares of pixels, for `TAG`.
+
+    Parameters
+    ----------
+    radiometry
+        Of the pixels.
+    side_px
+        Of a square.
+    looks, found
+        Equivalent number of looks of a square by the correlation of speckle, and that of homogeneous ground as found;
+        NaN where not measured.
+    noise
+        What became of noise.
+    speckle
+        The filter; none.
+
+    Examples
+    --------
+    >>> said = of_multilooked(ECHO.report, side_px=4, looks=3.3, found=3.1, noise="in it", speckle="none")
+    >>> said["power"], said["equivalent_looks"]
+    ('mean echo power of 4 x 4 pixels, 3.3 looks', 3.3)
+    """
+    measured = {
+        name: None if isnan(value) else round(value, 2)
+        for name, value in (("equivalent_looks", looks), ("equivalent_looks_found", found))
+    }
+    words = f"mean {radiometry['power']} of {side_px} x {side_px} pixels"
+    words += "" if isnan(looks) else f", {looks:.1f} looks"
+    words += "" if speckle == "none" else f", {speckle} filter"
+    stated = {"amplitude": f"root of {words}", "power": words, "noise": noise, "speckle_filter": speckle, **measured}
+    return {name: value for name, value in radiometry.items() if value is not None} | stated
 
 
 def of_sums(peaks: Mapping[str, float], phases_rad: Mapping[str, float]) -> dict[str, Radiometry]:

@@ -23,6 +23,16 @@ class Fusion(Section):
     )
 
 
+class Multilooking(Section):
+    """Mean power on a coarser grid."""
+
+    spacing_m: float = Field(gt=0, description="side of the squares that power is averaged over, to whole pixels, m")
+    subtract_noise: bool = Field(
+        False, description="take the noise measured off: what is left of places without echo scatters about zero"
+    )
+    speckle_filter: Literal["none", "lee"] = Field("none", description="what is done against the speckle that is left")
+
+
 class Processing(ImagingChoices):
     """How to compute; every key has a default."""
 
@@ -48,6 +58,11 @@ class Processing(ImagingChoices):
         None,
         description="file that `apertura reflectors` wrote of flights of this radar: its constants calibrate images in "
         "place of the radio that nodes state; null: that radio",
+    )
+    multilook: Multilooking | None = Field(
+        None,
+        description="mean power of squares of pixels, multilook_db.tif and so on, such as {spacing_m: 1.0, "
+        "subtract_noise: true, speckle_filter: lee}; null: none",
     )
     scheduler: str = Field(
         "threads",

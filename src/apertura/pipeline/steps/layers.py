@@ -1,12 +1,13 @@
-"""Rule `layers`: angles, mask, looks, noise and σ⁰ of a pair, as GeoTIFFs on the campaign's grid."""
+"""Rule `layers`: angles, mask, looks, noise, σ⁰ and mean power of a pair, as GeoTIFFs."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import rasterio.windows
 import xarray as xr
 from numpy.typing import NDArray
 from rasterio import Affine
@@ -14,22 +15,25 @@ from rasterio import Affine
 from apertura.common.atomic import write_json
 from apertura.common.contracts import Window
 from apertura.common.provenance import Provenance
+from apertura.common.raster import opened_raster
 from apertura.core.antenna.beam import Beams
 from apertura.core.focus.inputs import Profiles
 from apertura.core.imaging.noise import PLACES, noise_power
 from apertura.core.imaging.radiometry import Quantity
 from apertura.core.imaging.range_profiles import profiles_of
+from apertura.core.imaging.speckle import Multilook
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.looks import BLOCK_PX, Looks
 from apertura.core.scene.terrain import FlatGround, Terrain
 from apertura.core.scene.visibility import Relief, bistatic_angle_deg, incidence_deg, surface_normals, visibility
-from apertura.formats.export import write_exports
+from apertura.formats.export import product, remove_outdated, write_exports
 from apertura.formats.export.layers import OUTSIDE
-from apertura.formats.export.radiometry import CROSS_SECTIONS, of_coefficient, remove_outdated
+from apertura.formats.export.radiometry import CROSS_SECTIONS, ECHO, of_coefficient, of_multilooked
 from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.config.processing import Multilooking
 from apertura.pipeline.lineage import result_of
 from apertura.pipeline.opening.pair import open_pair, pattern_digests
-from apertura.pipeline.opening.plan import weighing
+from apertura.pipeline.opening.plan import integration_of, weighing
 from apertura.pipeline.opening.radiometry import CalibratedPair, calibrated_pair, points_of
 from apertura.pipeline.opening.scene import OpenScene, open_scene
 from apertura.pipeline.steps.stamping import tags_of
@@ -37,7 +41,7 @@ from apertura.pipeline.store import open_stage, record_files
 
 
 def layers(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> list[Path]:
-    """Write incidence, bistatic angle, mask, looks and noise of one pair, and σ⁰ where its radio is stated.
+    """Write incidence, bistatic angle, mask, looks and noise of one pair, σ⁰ where its radio is stated, and mean power.
 
     Returns their paths. What the radio makes of bright points and of noise is in radiometry.json.
     """
@@ -48,41 +52,53 @@ def layers(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> l
     beams, calibrated = weighing(campaign, opened, scene), calibrated_pair(campaign, opened, scene, threads=threads)
     looks = Looks.of(scene.grid, scene.terrain, profiles.aperture, beams, threads=threads)
     noise = _noise(profiles, scene, beams)
+    asked, multilook = campaign.settings.processing.radiometry, campaign.settings.processing.multilook
+    measured = calibrated is not None or multilook is not None
+    image = open_stage(campaign.stage("image", flight, pair), "image") if measured else None
     origin = Provenance.of(
         lineage.modules,
-        [echo, profile, *scene.parents],
+        [echo, profile, *([] if image is None else [image]), *scene.parents],
         settings={**lineage.result.settings, **scene.spec},
         inputs=pattern_digests(campaign, pair) | scene.inputs,
     )
-    rasters = {"layers": _rasters(scene, looks, noise, calibrated, threads=threads)}
-    image = None if calibrated is None else open_stage(campaign.stage("image", flight, pair), "image")
-    means: dict[str, dict[str, Any]] = {}
-    if calibrated is not None and image is not None:
-        asked, std_db = campaign.settings.processing.radiometry, calibrated.std_db
-        rasters["radiometry"] = {name: _coefficient(scene, image, calibrated, name, threads=threads) for name in asked}
-        means = {name: of_coefficient(name, std_db=std_db) for name in asked}
-        means |= {"nesz": of_coefficient("sigma0", std_db=std_db, noise="alone")}
-        origin = Provenance.of(
-            lineage.modules,
-            [echo, profile, image, *scene.parents],
-            settings={**lineage.result.settings, **scene.spec},
-            inputs=pattern_digests(campaign, pair) | scene.inputs,
+    folder, written = campaign.result(flight, pair), list[Path]()
+
+    def write(kind: str, rasters: Mapping[str, LazyLayer], means: Mapping[str, Mapping[str, Any]]) -> None:
+        (grid,) = {raster.grid for raster in rasters.values()} or {scene.grid}
+        written.extend(
+            write_exports(
+                kind,
+                folder,
+                rasters,
+                titles={name: f"{campaign.settings.campaign} · flight {flight} · {pair} · {name}" for name in rasters},
+                tags=tags_of(origin, lineage) | {"APERTURA_PULSE_NOISE": f"{noise:.4g}"},
+                radiometry=means,
+                transform=Affine(*grid.transform),
+                crs=grid.crs_wkt,
+            )
         )
-    folder, written = campaign.result(flight, pair), []
-    for kind, some in rasters.items():
-        written += write_exports(
-            kind,
-            folder,
-            some,
-            titles={name: f"{campaign.settings.campaign} · flight {flight} · {pair} · {name}" for name in some},
-            tags=tags_of(origin, lineage) | {"APERTURA_PULSE_NOISE": f"{noise:.4g}"},
-            radiometry=means,
-            transform=Affine(*scene.grid.transform),
-            crs=scene.grid.crs_wkt,
-        )
-    if calibrated is not None and image is not None:
-        written.append(folder / CROSS_SECTIONS)
-        write_json(written[-1], _report(scene, image, calibrated, noise))
+
+    std_db = None if calibrated is None else calibrated.std_db
+    absolute = {} if calibrated is None else {"nesz": of_coefficient("sigma0", std_db=std_db, noise="alone")}
+    write("layers", _rasters(scene, looks, noise, calibrated, threads=threads), absolute)
+    if image is not None:
+        powers, means = dict[str, GroundPower](), dict[str, Mapping[str, Any]]()
+        if calibrated is not None:
+            mask = folder / product("mask", "write_mask").file
+            powers = {name: GroundPower(scene, image, calibrated, mask, name) for name in asked}
+            means = {name: of_coefficient(name, std_db=std_db) for name in asked}
+            images = ((name, one.amplitude) for name, one in powers.items())
+            write("radiometry", {name: LazyLayer(scene.grid, np.complex64, of, threads) for name, of in images}, means)
+            written.append(folder / CROSS_SECTIONS)
+            write_json(written[-1], _report(scene, image, calibrated, noise))
+        if multilook is not None:
+            per_weight = noise / integration_of(campaign, opened, scene).count ** 2
+            averaged = {f"multilook_{name}": (power, means[name]) for name, power in powers.items()}
+            for source, (power, meaning) in (
+                averaged or {"multilook": (GroundPower(scene, image), ECHO.report)}
+            ).items():
+                raster, said = _multilooked(power, meaning, looks, per_weight, multilook, threads=threads)
+                write("multilook", {source: raster}, {source: said})
     remove_outdated(folder, written)
     record_files(campaign.root / lineage.result.manifest, written, lineage)
     return written
@@ -108,12 +124,15 @@ class LazyLayer:
         Window of the grid → values (row, column).
     threads
         Tiles computed at once.
+    tile_px
+        Side of a tile.
     """
 
     grid: SceneGrid
     dtype: type[np.generic]
     of: Callable[[Window], NDArray[Any]]
     threads: int
+    tile_px: int = BLOCK_PX
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -130,23 +149,72 @@ class LazyLayer:
             values[tile] = self.of((rows, columns))
 
         with ThreadPoolExecutor(self.threads) as pool:
-            list(pool.map(work, part.tiles(BLOCK_PX)))
+            list(pool.map(work, part.tiles(self.tile_px)))
         return values
 
 
-def _coefficient(
-    scene: OpenScene, image: xr.Dataset, calibrated: CalibratedPair, name: Quantity, *, threads: int
-) -> LazyLayer:
-    """Return the image whose power is σ⁰, β⁰ or γ⁰, complex64."""
-    level = isinstance(scene.terrain, FlatGround) and name == "sigma0"
+@dataclass(frozen=True, eq=False)
+class GroundPower:
+    """Power of an image, as its ground scatters it where the pair is calibrated.
 
-    def scaled(window: Window) -> NDArray[np.complex64]:
-        normal = None if level else _surface(scene.grid, scene.terrain, window)[1]
-        per_one = calibrated.calibration.power(window, name, normal)
+    Attributes
+    ----------
+    scene, image
+        Grid and ground, and the stage.
+    calibrated, mask, quantity
+        Of a calibrated pair: what its power is divided by, and the file in which other values than 0 are places whose
+        power is not that of their ground alone. None: power as it is.
+    """
+
+    scene: OpenScene
+    image: xr.Dataset
+    calibrated: CalibratedPair | None = None
+    mask: Path | None = None
+    quantity: Quantity = "sigma0"
+
+    def per_one(self, window: Window) -> NDArray[np.float64]:
+        """Return the mean power of a window, (row, column), of ground that is 1; NaN where it is not told."""
+        if self.calibrated is None:
+            return np.ones([part.stop - part.start for part in window])
+        scene, flat = self.scene, isinstance(self.scene.terrain, FlatGround)
+        normal = None if flat and self.quantity == "sigma0" else _surface(scene.grid, scene.terrain, window)[1]
+        power = self.calibrated.calibration.power(window, self.quantity, normal)
+        if flat or self.mask is None:
+            return power
+        with opened_raster(self.mask, expected="what this step has written", remedy="Run it again.") as raster:
+            return np.where(raster.read(1, window=rasterio.windows.Window.from_slices(*window)) == 0, power, np.nan)
+
+    def amplitude(self, window: Window) -> NDArray[np.complex64]:
+        """Return the complex pixels of a window whose power it is, (row, column)."""
         with np.errstate(invalid="ignore", divide="ignore"):
-            return np.asarray(image.image[window].values / np.sqrt(per_one), np.complex64)
+            return np.asarray(self.image.image[window].values / np.sqrt(self.per_one(window)), np.complex64)
 
-    return LazyLayer(scene.grid, np.complex64, scaled, threads)
+
+_FEWEST_CELLS = 64  # along a tile of mean power: those around it that the filter reads, too, are few
+
+
+def _multilooked(
+    power: GroundPower, means: Mapping[str, Any], looks: Looks, pulse_noise: float, asked: Multilooking, *, threads: int
+) -> tuple[LazyLayer, dict[str, Any]]:
+    """Return mean power on a coarser grid, float32, and what it means; `pulse_noise` is noise per Σw² of a pixel."""
+    grid = power.scene.grid
+    side = max(1, round(asked.spacing_m / grid.spacing_m))
+
+    def noise(window: Window) -> NDArray[np.float64]:
+        return pulse_noise * looks.weight_squares(window) / power.per_one(window)
+
+    subtracted = noise if asked.subtract_noise and np.isfinite(pulse_noise) else None
+    cells = Multilook.of(power.amplitude, grid.shape, side, noise=subtracted, filtered=asked.speckle_filter == "lee")
+    said = of_multilooked(
+        means,
+        side_px=side,
+        looks=cells.looks,
+        found=cells.found,
+        noise="in it" if subtracted is None else "subtracted",
+        speckle="Lee" if cells.filtered else "none",
+    )
+    coarse = replace(grid, spacing_m=side * grid.spacing_m, shape=cells.shape)
+    return LazyLayer(coarse, np.float32, cells.mean, threads, max(_FEWEST_CELLS, BLOCK_PX // side)), said
 
 
 def _report(scene: OpenScene, image: xr.Dataset, calibrated: CalibratedPair, noise: float) -> dict[str, Any]:
@@ -169,6 +237,7 @@ def _rasters(
 ) -> dict[str, LazyLayer]:
     """Return the layers; `noise` is that of one pulse."""
     grid, terrain = scene.grid, scene.terrain
+    level = isinstance(terrain, FlatGround)
 
     def incidence(window: Window) -> NDArray[np.float64]:
         return _inside(looks, window, incidence_deg(*_surface(grid, terrain, window), looks.centre(window)[0]))
@@ -179,8 +248,8 @@ def _rasters(
 
     def nesz(window: Window) -> NDArray[np.float64]:
         if calibrated is not None:
-            calibration = calibrated.calibration
-            power = (noise or np.nan) * calibration.pixel_noise(window) / calibration.power(window, "sigma0", None)
+            calibration, normal = calibrated.calibration, None if level else _surface(grid, terrain, window)[1]
+            power = (noise or np.nan) * calibration.pixel_noise(window) / calibration.power(window, "sigma0", normal)
             return _inside(looks, window, 10 * np.log10(power))
         effective = looks.effective(window).astype(np.float64)
         return 10 * np.log10((noise or np.nan) / np.where(effective > 0, effective, np.nan))

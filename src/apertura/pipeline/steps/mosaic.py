@@ -5,9 +5,8 @@ from pathlib import Path
 
 from apertura.common.errors import CampaignError
 from apertura.common.provenance import sha256_file
-from apertura.formats.export import MOSAICS, exports_in, mosaics
+from apertura.formats.export import EXPORTS, MOSAICS, mosaics, remove_outdated
 from apertura.formats.export.mosaic import write_mosaic
-from apertura.formats.export.radiometry import remove_outdated
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.lineage import result_of
 from apertura.pipeline.store import read_manifest, record_files
@@ -20,9 +19,7 @@ def mosaic(campaign: Campaign) -> list[Path]:
     """
     lineage = result_of(campaign, "mosaic").begin(campaign.root)
     made = _made(campaign.root, lineage.result.sources)
-    styles = {
-        row.file: row for kind in ("pair", "fused", "layers", "radiometry") for row in exports_in(kind) if row.style
-    }
+    styles = {row.file: row for row in EXPORTS if row.style}
     written = []
     pairs = {flight.name: flight.pairs for flight in campaign.image_flights}
     for name, files in mosaics(pairs, campaign.coefficients).items():

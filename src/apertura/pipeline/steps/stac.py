@@ -117,6 +117,8 @@ class _Described:
             facts, name = read_facts(path), quote(self.campaign.relative(path).removeprefix("results/"))
             key = path.stem if path.suffix == ".tif" else path.name
             assets[key] = asset_of(path, f"../../../{name}", sha256=digest, facts=facts)
+            if facts.place.get("proj:shape", list(self.scene.grid.shape)) != list(self.scene.grid.shape):
+                assets[key].extra_fields |= facts.place
             inputs = inputs or dict(facts.inputs)
         return assets, inputs
 

@@ -1,0 +1,163 @@
+"""Looks of mean power, by the correlation of speckle and as found, and a filter that keeps means, edges and points."""
+
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+import pytest
+
+from apertura.core.imaging.speckle import Multilook, Speckle, block_means, found_looks, lee
+
+SIZE, SIDE = 384, 4
+
+
+def speckle(band, seed=1, *, window="none", size=SIZE, sigma0=1.0):
+    """Developed speckle of a band, cycles per pixel, flat or under a Hann window, of ground of some σ⁰."""
+    generator = np.random.default_rng(seed)
+    frequency = np.abs(np.fft.fftfreq(size))
+    weight = np.where(frequency < band / 2, np.cos(np.pi * frequency / band) ** 2 if window == "hann" else 1.0, 0.0)
+    white = np.sqrt(sigma0) * (generator.standard_normal((size, size, 2)) @ [1, 1j])
+    field = np.fft.ifft2(np.fft.fft2(white) * np.outer(weight, weight))
+    return field / np.sqrt((weight**2).mean() ** 2 * 2)
+
+
+def blocks(image, side=128):
+    starts = product(range(0, SIZE, side), repeat=2)
+    return [image[row : row + side, column : column + side] for row, column in starts]
+
+
+def whole(multilook):
+    return multilook.mean((slice(0, multilook.shape[0]), slice(0, multilook.shape[1])))
+
+
+def counted(power):
+    return power.mean() ** 2 / power.var()
+
+
+@pytest.mark.parametrize(("window", "squares"), [("none", 1.0), ("hann", 35 / 128 / (3 / 8) ** 2)])
+def test_pixels_that_vary_as_one_are_those_of_the_band(window, squares):
+    """∫|ρ|² = ∫|U|⁴/(∫|U|²)²: 1/B of a flat band, 1.94/B under a Hann window, in either direction."""
+    measured = Speckle.of(blocks(speckle(0.4, window=window)))
+    assert measured.area_px == pytest.approx((squares / 0.4) ** 2, rel=0.08)
+
+
+@pytest.mark.parametrize("side", [2, 4, 8])
+def test_looks_by_correlation_are_those_that_mean_power_has(side):
+    """Eq. 3: neither the pixels of a square nor their number over the cell's area."""
+    image = speckle(0.4)
+    measured = Multilook.of(image.__getitem__, image.shape, side)
+    scatter = np.sqrt(2 / (SIZE / side) ** 2 * measured.looks + 4 / (SIZE / 2.5) ** 2)
+    assert measured.looks == pytest.approx(counted(whole(measured)), rel=max(0.05, 4 * scatter))
+    assert measured.found == pytest.approx(measured.looks, rel=0.15)
+
+
+def test_looks_are_found_where_squares_are_finer_than_cells():
+    """Eq. 4: a window of 49 squares has eleven looks, so its variance is a tenth less than that of squares."""
+    measured = Multilook.of((image := speckle(0.1)).__getitem__, image.shape, SIDE)
+    assert measured.within == pytest.approx(11.1, rel=0.1)
+    assert measured.found == pytest.approx(measured.looks, rel=0.15)
+
+
+def test_the_correlation_stands_where_the_carrier_bends():
+    """Direction of view turns across a block: by half the band here, which would halve the correlation."""
+    flat = speckle(0.3)
+    row, column = np.mgrid[:SIZE, :SIZE] / 128
+    bent = flat * np.exp(2j * np.pi * 128 * (0.1 * row**2 / 2 + 0.07 * row * column + 0.31 * column))
+    assert Speckle.of(blocks(bent)).area_px == pytest.approx(Speckle.of(blocks(flat)).area_px, rel=0.05)
+
+
+def test_looks_are_found_on_the_homogeneous_part_of_a_scene():
+    """Half is texture, with an edge and points besides, which would draw a mean or a median of local looks down."""
+    generator = np.random.default_rng(4)
+    sigma0 = np.where(np.arange(SIZE) < SIZE // 3, 8.0, 1.0) * np.ones((SIZE, 1))
+    sigma0[: SIZE // 2] *= generator.gamma(1.0, 1.0, (SIZE // 8, SIZE // 8)).repeat(8, 0).repeat(8, 1)[: SIZE // 2]
+    sigma0[tuple(generator.integers(0, SIZE, (2, 10)))] = 3e3
+    measured = Multilook.of((image := speckle(0.4, sigma0=sigma0)).__getitem__, image.shape, SIDE)
+    assert measured.found == pytest.approx(measured.looks, rel=0.15)
+    assert counted(whole(measured)) < measured.looks / 2
+
+
+def test_the_filter_keeps_the_mean_of_speckle_and_raises_its_looks():
+    plain = Multilook.of((image := speckle(0.4)).__getitem__, image.shape, SIDE)
+    before, after = whole(plain), whole(replace(plain, filtered=True))
+    assert 10 * np.log10(after.mean() / before.mean()) == pytest.approx(0, abs=0.05)
+    assert 10 * np.log10(np.median(after) / np.median(before)) > 0.2  # the mean is kept, the median is not
+    assert counted(after) > 8 * counted(before)
+
+
+def test_the_filter_keeps_an_edge_and_a_point():
+    """Beside a step of 10 dB a mean of the window would be 7 dB too high; and a peak stays."""
+    generator = np.random.default_rng(2)
+    ground = np.where(np.arange(200) < 100, 1.0, 10.0) * np.ones((200, 1))
+    power = ground * generator.gamma(10.0, 0.1, ground.shape)
+    power[50, 30] = 1000.0
+    smooth = lee(power, looks=10.0, within=490.0)
+    across_db = 10 * np.log10(np.delete(smooth, slice(40, 60), 0).mean(axis=0))
+    assert across_db[98:102] == pytest.approx([0, 0, 10, 10], abs=1.6)
+    assert smooth[50, 30] == pytest.approx(1000, rel=0.02)
+
+
+def test_the_noise_taken_off_leaves_the_ground_in_the_mean():
+    """Where it is as strong as the ground and where nothing is but noise: there half of the squares lie below zero."""
+    noise = 1.0
+    ground = np.where(np.arange(SIZE) < SIZE // 2, 1.0, 0.0) * np.ones((SIZE, 1))
+    image = speckle(0.4, sigma0=ground + noise)
+    for filtered in (False, True):
+        power = whole(
+            Multilook.of(
+                image.__getitem__,
+                image.shape,
+                SIDE,
+                noise=lambda window: np.full(image[window].shape, noise),
+                filtered=filtered,
+            )
+        )
+        inner = SIZE // SIDE // 2
+        assert power[:, 8 : inner - 8].mean() == pytest.approx(1, abs=0.08)
+        assert power[:, inner + 8 : -8].mean() == pytest.approx(0, abs=0.05)
+        assert (power[:, inner:] < 0).mean() > 0.4
+
+
+def test_windows_of_mean_power_have_no_seams():
+    image = speckle(0.4, size=150)[:, :130].astype(np.complex64)
+    image[20:40, 30:60] = np.nan
+    done = Multilook.of(image.__getitem__, image.shape, 4, noise=lambda at: np.ones(image[at].shape), filtered=True)
+    assert (done.filtered, done.shape) == (True, (38, 33))
+    part = (slice(7, 30), slice(11, 33))
+    np.testing.assert_array_equal(done.mean(part), whole(done)[part])
+    assert np.isnan(done.mean((slice(5, 10), slice(8, 15)))).all()
+
+
+def test_a_square_of_which_less_than_half_is_known_is_not_told():
+    values = np.arange(12.0).reshape(3, 4)
+    values[0, :2] = np.nan
+    np.testing.assert_array_equal(block_means(values, 2), [[4.5, 4.5], [8.5, 10.5]])
+    values[1, 1] = np.nan
+    assert np.isnan(block_means(values, 2)[0, 0])
+
+
+def test_what_is_hardly_seen_has_no_looks_and_no_filter():
+    image = np.full((64, 64), np.nan, np.complex64)
+    image[:8] = 1
+    done = Multilook.of(image.__getitem__, image.shape, 2, filtered=True)
+    assert (done.filtered, np.isnan(done.looks)) == (False, True)
+    assert np.isnan(found_looks([], 10.0))
+
+
+def test_ground_without_any_power_stays_zero_and_counts_for_no_looks():
+    """As simulations without noise have it beside their targets."""
+    image = speckle(0.4) * (np.arange(SIZE) < SIZE // 2)
+    done = Multilook.of(image.__getitem__, image.shape, SIDE, filtered=True)
+    assert (whole(done)[:, -20:] == 0).all()
+    assert done.found == pytest.approx(Multilook.of(speckle(0.4).__getitem__, image.shape, SIDE).looks, rel=0.2)
+
+
+@pytest.mark.parametrize(("shape", "side"), [((1, 1), 1), ((3, 40), 2), ((40, 30), 100)])
+def test_an_image_smaller_than_a_window_has_its_mean(shape, side):
+    image = np.ones(shape, np.complex64)
+    done = Multilook.of(image.__getitem__, shape, side, filtered=True)
+    values = whole(done)
+    assert values.shape == tuple(-(-size // side) for size in shape)
+    assert np.isnan(done.found)
+    known = values[np.isfinite(values)]
+    assert known == pytest.approx(1)
