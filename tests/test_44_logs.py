@@ -1,6 +1,7 @@
 """Logs and time tags in the echo of a campaign: what is left out is counted and said, what is right raises nothing."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,7 +10,11 @@ from folders import complaint, edit_config, edit_track, small_simulation
 from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.geodesy import ecef_from_geodetic
+from apertura.formats.tracks.track import make_track
 from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.config import Node
+from apertura.pipeline.opening.node_log import NodeLog
+from apertura.pipeline.opening.positions import place
 from apertura.pipeline.steps import echo, ingest
 from apertura.pipeline.store import open_stage
 from apertura.simulation import Impairments, PointTarget, Straight, simulate
@@ -219,3 +224,18 @@ def test_a_single_wrong_tag_is_left_out(tmp_path):
     attrs = echo_of(campaign).attrs
     assert attrs["pulses"] == {"used": 39, "dropped": 1, "reasons": {"time_tag_outlier": 1}}
     assert attrs["flags"]["time_tag_outlier"].startswith("1 of 40 pulses left out")
+
+
+@pytest.mark.parametrize(("arm_m", "flagged"), [(0.3, True), (0.0, False)])
+def test_an_attitude_that_looks_like_radians_is_a_flag_where_it_moves_an_antenna(arm_m, flagged):
+    """40 m flown east, yaw logged as π/2."""
+    time = np.datetime64("2026-05-14T09:30", "ns") + np.arange(80) * np.timedelta64(100, "ms")
+    place_m = np.column_stack([0.5 * np.arange(80), np.zeros(80), np.full(80, 20.0)])
+    angles = np.column_stack([0.02 * np.sin(np.arange(80)), np.full(80, -0.07), np.full(80, np.pi / 2)])
+    track = make_track(time, place_m, frame="local", attitude_deg=angles, node="a", where=Path("a.csv"))
+    arms = {"radar_tx": [arm_m, 0, 0]}
+    log = NodeLog("a", Node(attitude="log", lever_arms_m=arms), track, "a.csv", 0.2)
+    flags = place(log, log, time[5:-5]).flags
+    assert ("attitude_suspect" in flags) is flagged
+    if flagged:
+        assert "a: angles of attitude look in radians: yaw is 0° off the course so, 88°" in flags["attitude_suspect"]

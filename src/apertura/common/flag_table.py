@@ -99,6 +99,11 @@ _OF_RECORDINGS = {
         "m along the flight that positions err by",
         "times of the log are rounded so that positions err along the flight", "decimals of the log's times",
         "pipeline/opening/positions.py"),
+    "attitude_suspect": Flag(
+        "degrees that yaw is off the course over ground, as logged and by another convention",
+        "angles of the log's attitude look like radians, or are counted anticlockwise: lever arms and beams are turned "
+        "wrongly",
+        "the log's export; nodes.<n>.attitude course, or none", "pipeline/opening/positions.py"),
     "time_tag_jitter": Flag(
         "scatter of the tags in s rms, and the repetition interval",
         "tags scatter so much that single pulses may be paired with a neighbour", "frame counters",
