@@ -229,13 +229,10 @@ def _counted(sent: int, pulses: Association, positions: PulsePositions, measured
 
 
 def _axes(nodes: tuple[Acquisition, Acquisition], at: Times) -> dict[str, tuple[tuple[str, ...], NDArray[np.float64]]]:
-    """Return the body axes of the nodes whose antennas have a beam."""
-    beams = nodes[0].settings.antennas.radar_tx, nodes[1].settings.antennas.radar_rx
-    return {
-        name: (("pulse", "axis", "body"), node.body_axes(at))
-        for name, node, beam in zip(("tx_axes", "rx_axes"), nodes, beams, strict=True)
-        if beam is not None
-    }
+    """Return the body axes of the nodes whose attitude counts."""
+    tx, rx = nodes
+    turning = {"tx_axes": tx.turns("radar_tx") and tx, "rx_axes": rx.turns("radar_rx") and rx}
+    return {name: (("pulse", "axis", "body"), node.body_axes(at)) for name, node in turning.items() if node}
 
 
 def _sidelink_vector(nodes: tuple[Acquisition, Acquisition], at: Times) -> dict[str, tuple[tuple[str, ...], Any]]:
