@@ -18,11 +18,12 @@ from apertura.core.echo.pulse_filter import truncation_flags
 from apertura.core.echo.sidelink import DIVIDING
 from apertura.core.echo.transfer import Transfer, transfer_by_code, transfer_by_sidelink
 from apertura.core.geometry.aperture import Aperture
+from apertura.core.geometry.atmosphere import SceneAir
 from apertura.core.quality.budget import strictest_accuracy_db
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import Processing, PulseWaveform
 from apertura.pipeline.opening.acquisition import Acquisition, common_pulses
-from apertura.pipeline.opening.air import SceneAir, stated_air
+from apertura.pipeline.opening.air import stated_air
 from apertura.pipeline.opening.positions import PulsePositions, keep_segments, place
 from apertura.pipeline.opening.transmitted import Transmitted
 

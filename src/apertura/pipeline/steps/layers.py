@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +21,8 @@ from apertura.core.imaging.radiometry import Quantity
 from apertura.core.imaging.range_profiles import profiles_of
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.looks import BLOCK_PX, Looks
-from apertura.core.scene.terrain import FlatGround, Terrain
-from apertura.core.scene.visibility import Relief, bistatic_angle_deg, incidence_deg, surface_normals, visibility
+from apertura.core.scene.terrain import FlatGround
+from apertura.core.scene.visibility import Relief, bistatic_angle_deg, incidence_deg, surface, visibility
 from apertura.formats.export import write_exports
 from apertura.formats.export.layers import OUTSIDE
 from apertura.formats.export.radiometry import CROSS_SECTIONS, of_coefficient, remove_outdated
@@ -141,7 +141,7 @@ def _coefficient(
     level = isinstance(scene.terrain, FlatGround) and name == "sigma0"
 
     def scaled(window: Window) -> NDArray[np.complex64]:
-        normal = None if level else _surface(scene.grid, scene.terrain, window)[1]
+        normal = None if level else surface(scene.grid, scene.terrain, window)[1]
         per_one = calibrated.calibration.power(window, name, normal)
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.asarray(image.image[window].values / np.sqrt(per_one), np.complex64)
@@ -170,7 +170,7 @@ def _rasters(
     grid, terrain = scene.grid, scene.terrain
 
     def incidence(window: Window) -> NDArray[np.float64]:
-        return _inside(looks, window, incidence_deg(*_surface(grid, terrain, window), looks.centre(window)[0]))
+        return _inside(looks, window, incidence_deg(*surface(grid, terrain, window), looks.centre(window)[0]))
 
     def bistatic_angle(window: Window) -> NDArray[np.float64]:
         angle_deg = bistatic_angle_deg(terrain.positions(grid[window]), *looks.centre(window))
@@ -215,18 +215,3 @@ def _mask(scene: OpenScene, looks: Looks) -> Callable[[Window], NDArray[np.uint8
         return marked
 
     return mask
-
-
-def _surface(grid: SceneGrid, terrain: Terrain, window: Window) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return positions and normals of a window; its neighbours count, so that tiles leave no seams."""
-    around = [
-        np.arange(max(0, part.start - 1), max(2, min(size, part.stop + 1)))
-        for part, size in zip(window, grid.shape, strict=True)
-    ]
-    rows, columns = around
-    wider = replace(grid, first=(grid.first[0] + rows[0], grid.first[1] + columns[0]), shape=(rows.size, columns.size))
-    known = terrain.heights(grid[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1])
-    lacking = [(0, axis.size - size) for axis, size in zip(around, known.shape, strict=True)]
-    position = wider.positions(np.pad(known, lacking, mode="edge"))  # a grid of one row or column is continued level
-    inner = tuple(slice(part.start - axis[0], part.stop - axis[0]) for part, axis in zip(window, around, strict=True))
-    return position[inner], surface_normals(position)[inner]
