@@ -14,6 +14,8 @@ from apertura.core.quality.budget import (
     NodeAttitude,
     NodePositions,
     accuracy_for,
+    antenna_flags,
+    antenna_line,
     attitude_lines,
     expected,
     is_counted,
@@ -398,3 +400,34 @@ def test_an_attitude_that_moves_the_sidelink_s_antenna_turns_its_length():
     moved_m = 0.5 * np.radians(2.0)  # heading turns an arm to the right into the line of sight of both
     assert attitude.effect.phase_rad == pytest.approx(2 * np.pi / WAVELENGTH_M * moved_m, rel=1e-3)
     assert attitude_lines(paths, [node, None], sidelink=False)[0].effect.phase_rad == 0
+
+
+def cut_towards(paths):
+    """Azimuth of the point from each phase centre of a straight track, from an antenna that looks across it, rad."""
+    away = paths.point_m - paths.aperture.tx_m
+    return np.arctan2(away[:, 0], np.hypot(away[:, 1], away[:, 2]))
+
+
+def test_a_phase_that_is_linear_in_direction_is_a_phase_centre_beside_the_antenna():
+    """3 cm ahead along the track: the point lies 3 cm off, and is as sharp."""
+    paths = straight()
+    phase = 2 * 2 * np.pi / WAVELENGTH_M * 0.03 * np.sin(cut_towards(paths))  # both legs
+    line = antenna_line(paths, phase, np.ones(len(phase)))
+    assert line.effect.shift_m == pytest.approx(0.03, rel=1e-3)
+    assert line.effect.loss_db > -1e-6
+    assert antenna_flags([line]) == {}
+
+
+@pytest.mark.parametrize(("centre_m", "flagged"), [(0.004, False), (0.03, True)])
+def test_a_phase_centre_that_moves_with_the_angle_defocuses_as_its_phase_says(centre_m, flagged):
+    """Within a beam of ±30°, the centre that far out at the edges; the loss is that of the best peak of the sum."""
+    paths = straight()
+    angle = cut_towards(paths)
+    seen = np.abs(angle) < np.radians(30)
+    phase = 2 * 2 * np.pi / WAVELENGTH_M * centre_m * (np.degrees(angle) / 30) ** 2
+    line = antenna_line(paths, phase, np.where(seen, 1.0, 0.05))
+    count = int(seen.sum())
+    best = np.abs(np.fft.fft(np.exp(1j * phase[seen]), 8 * count)).max() / count
+    assert line.effect.loss_db == pytest.approx(20 * np.log10(best), abs=0.05)
+    assert ("antenna_phase" in antenna_flags([line])) is flagged
+    assert "1 rad" not in line.stated if flagged else f"{phase[seen].max():.2g} rad" in line.stated

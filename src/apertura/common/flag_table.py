@@ -234,6 +234,11 @@ _OF_IMAGES = {
     "beam_misses": Flag(
         "share of the scene", "part of the scene is seen by no antenna beam", "boresights; scene.bounds_m",
         "core/antenna/illumination.py"),
+    "antenna_phase": Flag(
+        "dB that a point in the middle of the scene loses by it, and cm that it is off",
+        "the phase of the antennas' patterns changes over the aperture, and is not taken out",
+        "lever_arms_m: to the phase centre, about which a pattern has least phase; phase_deg of the pattern",
+        "core/quality/budget.py"),
     "prediction_misses": Flag(
         "error predicted and accuracy asked, dB", "the plan is expected to miss the accuracy asked",
         "engine and options asked for", "core/planning/planner.py"),

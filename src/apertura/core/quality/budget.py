@@ -8,6 +8,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.common.flags import Flags
 from apertura.core.quality.path_errors import Effect, PointPaths
 
 ARITHMETIC_BELOW_DB = 10.0
@@ -33,6 +34,14 @@ of a level body that flies straight ahead, but multirotors lean by 5° to 15°, 
 LEVER_ARM_STD_M = 0.01
 """Metres in each axis that a lever arm errs by where nobody states it: measured with a ruler, to a phase centre that
 lies somewhere in its antenna."""
+
+LEAST_FIELD = 0.1
+"""Of the strongest pulse: weaker ones do not decide what the phase of a pattern does to a point."""
+
+UNTOLD_ANTENNA_DB = 0.2
+"""dB that the phase of antenna patterns may cost without a flag: what images tell of a loss."""
+
+_FEWEST_PULSES = 3  # that a shift over ground and a rest can be told apart from
 
 _FIXED = frozenset({"fix", "unknown"})
 _SLOW_S = 100.0
@@ -268,6 +277,41 @@ def _other_arms(_: PointPaths, node: NodeAttitude, growth: Growth) -> _Errors:
     std_m = LEVER_ARM_STD_M if node.arm_std_m is None else node.arm_std_m
     sizes = [std_m * np.einsum("pc,pcb->bp", grown, node.axes) for grown in growth if grown.any()]
     return f"{100 * std_m:.2g} cm in each axis", [(size, np.inf) for antenna in sizes for size in antenna]
+
+
+def antenna_line(paths: PointPaths, phase_rad: NDArray[np.float64], weight: NDArray[np.float64]) -> BudgetLine:
+    """Return the effect of the phase of antenna patterns, which no image is corrected for.
+
+    Parameters
+    ----------
+    paths
+        Of a point in the middle of the scene.
+    phase_rad, weight
+        (pulse,) float64: of both antennas towards the point, and their field; pulses that see it by less than
+        `LEAST_FIELD` of the strongest do not count.
+
+    Notes
+    -----
+    Source: docs/theory/focus.md, eq. 4c.
+    """
+    seen = weight >= LEAST_FIELD * weight.max()
+    if weight.max() <= 0 or seen.sum() < _FEWEST_PULSES:
+        return BudgetLine("antenna", None, NO_EFFECT, "a pattern that sees the middle of the scene")
+    part = replace(paths, aperture=paths.aperture[np.flatnonzero(seen)], time_s=paths.time_s[seen])
+    phase, mean = phase_rad[seen], float(phase_rad[seen].mean())  # a constant turns the point and moves it nowhere
+    effect = replace(part.of_offset(paths.wavelength_m / (2 * np.pi) * (mean - phase)), phase_rad=abs(mean))
+    turn = float(np.ptp(phase))
+    return BudgetLine("antenna", f"weighed by the beams stated, whose phase turns by {turn:.2g} rad over them", effect)
+
+
+def antenna_flags(lines: Iterable[BudgetLine]) -> Flags:
+    """Return the flag `antenna_phase` where the phase of the patterns costs more than `UNTOLD_ANTENNA_DB`."""
+    flags = Flags()
+    for line in lines:
+        if line.cause == "antenna" and line.effect.loss_db < -UNTOLD_ANTENNA_DB:
+            lost, off = f"{-line.effect.loss_db:.1f} dB", f"{100 * line.effect.shift_m:.2g} cm"
+            flags["antenna_phase"] = f"a point loses {lost} and lies {off} off: {line.stated}"
+    return flags
 
 
 def offset_line(

@@ -80,7 +80,8 @@ class Antenna(Section):
     )
     pattern: str | None = Field(
         None,
-        description="instead of beamwidth_deg a CSV of both cuts: columns cut (azimuth, elevation), angle_deg, gain_db",
+        description="instead of beamwidth_deg a CSV of both cuts: columns cut (azimuth, elevation), angle_deg, "
+        "gain_db, and phase_deg where it is known",
     )
     cutoff_db: float = Field(
         -20.0, ge=-80, le=-3, description="gain below which a cut ends: pulses beyond are left out, dB under its peak"

@@ -13,7 +13,7 @@ from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
 from apertura.common.flags import Flags
 from apertura.common.provenance import sha256_file
-from apertura.core.antenna.beam import LIMITS_RAD, Beam, Beams, antenna_axes, gaussian_cut, sampled_cut
+from apertura.core.antenna.beam import LIMITS_RAD, Beam, Beams, antenna_axes, gaussian_cut, sampled_cut, sampled_phase
 from apertura.core.antenna.illumination import Illumination, illuminate
 from apertura.core.echo.association import missing_flags
 from apertura.core.echo.compression import window_weights
@@ -76,14 +76,18 @@ def _beam(antenna: Antenna, pattern: Path | None, axes: NDArray[np.float64]) -> 
         if pattern is None:
             raise TypeError("an antenna has a beamwidth or a pattern")
         sampled = read_beam_pattern(pattern)
-        cuts = tuple(sampled_cut(*samples, cutoff_db=antenna.cutoff_db) for samples in sampled)
+        cuts = tuple(sampled_cut(angle, gain, cutoff_db=antenna.cutoff_db) for angle, gain, _ in sampled)
+        phases = [
+            None if phase is None else sampled_phase(angle, phase, cut[0])
+            for (angle, _, phase), cut in zip(sampled, cuts, strict=True)
+        ]
     else:
         widths = zip(antenna.beamwidth_deg, LIMITS_RAD.values(), strict=True)
         azimuth, elevation = (
             gaussian_cut(width, cutoff_db=antenna.cutoff_db, limit_rad=limit) for width, limit in widths
         )
-        cuts = azimuth, elevation
-    return Beam(antenna_axes(axes, antenna.boresight_deg), *cuts[0], *cuts[1])
+        cuts, phases = (azimuth, elevation), [None, None]
+    return Beam(antenna_axes(axes, antenna.boresight_deg), *cuts[0], *cuts[1], *phases)
 
 
 def antennas_report(campaign: Campaign, pair: str, illumination: Illumination | None) -> dict[str, Any]:

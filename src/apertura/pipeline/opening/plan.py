@@ -19,8 +19,10 @@ from apertura.core.planning.decisions import decide_accuracy
 from apertura.core.planning.plan import Decision, Plan, memory_limit
 from apertura.core.planning.planner import make_plan
 from apertura.core.quality.budget import (
+    NO_EFFECT,
     BudgetLine,
     NodeAttitude,
+    antenna_line,
     attitude_lines,
     noise_loss,
     offset_line,
@@ -80,7 +82,7 @@ def budget_of(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> list[Budg
         ),
         _air(campaign, pair, paths),
         _sampling(pair.report.get("pulses", {})),
-        _antenna(pair),
+        _antenna(pair, paths),
     ]
     if not monostatic:
         total = paths.aperture.path(paths.point_m)
@@ -221,10 +223,15 @@ def _sampling(pulses: Mapping[str, Any]) -> BudgetLine:
     return BudgetLine("missing pulses", stated, Effect(0.0, 0.0, 0.0), "nothing known")
 
 
-def _antenna(pair: OpenPair) -> BudgetLine:
-    """Return the line of the antennas: beams stated weigh the pulses; one that is not shades the aperture."""
-    stated = None if pair.beams is None else "weighed by the beams stated"
-    return BudgetLine("antenna", stated, Effect(0.0, 0.0, 0.0), "a beam without a phase of its own")
+def _antenna(pair: OpenPair, paths: PointPaths) -> BudgetLine:
+    """Return the line of the antennas: beams weigh the pulses; what phase their patterns have is not taken out."""
+    if pair.beams is None:
+        return BudgetLine("antenna", None, NO_EFFECT, "a beam without a phase of its own")
+    some, point = pair.beams[pair.aperture.sample(MOST_PULSES)], paths.point_m[None]
+    phase = some.phase(paths.aperture, point)
+    if phase is None:
+        return BudgetLine("antenna", "weighed by the beams stated", NO_EFFECT)
+    return antenna_line(paths, phase[:, 0], some.weight(paths.aperture, point)[:, 0])
 
 
 def _sidelink(report: Mapping[str, Any], *, subcarriers: int) -> list[BudgetLine]:
