@@ -450,8 +450,9 @@ def _interpolation_m(time_s: Floats, position_m: Floats) -> float | None:
 
 _COURSE_STEP_M = 2.0  # over ground, from which a course is taken: 1 cm of noise turns it by 0.4°
 _LEAST_STEPS = 10
-_FOLLOWS = 0.97  # mean of phasors of yaw less course: within 14° rms, wind and slips included
+_FOLLOWS = 0.85  # mean of phasors of yaw less course: within 33° rms, wind, slips and turns by hand included
 _LEAVES = 0.8  # the same where yaw does not follow it: 38° rms
+_CLOSER = 2.0  # times less must yaw scatter about the course by another convention than as logged
 _ROUND_DEG = (
     60.0  # no wider gap between courses: a heading that is held, or turned to the scene, does not do so by chance
 )
@@ -535,8 +536,9 @@ def check_yaw(position_m: Floats, attitude_rad: Floats, ned: Floats) -> YawFault
     others |= {"anticlockwise": -yaw} if certain else {}
     as_logged, *otherwise = (complex(np.exp(1j * (angle - course)).mean()) for angle in (yaw, *others.values()))
     for convention, mean in zip(others, otherwise, strict=True):
-        if abs(as_logged) < _LEAVES and abs(mean) > _FOLLOWS:
-            return YawFault(convention, certain, _scatter_deg(as_logged), _scatter_deg(mean))
+        logged_deg, other_deg = _scatter_deg(as_logged), _scatter_deg(mean)
+        if abs(as_logged) < _LEAVES and abs(mean) > _FOLLOWS and _CLOSER * other_deg < logged_deg:
+            return YawFault(convention, certain, logged_deg, other_deg)
     tilt = logged[:, :2]
     if small and abs(as_logged) > _FOLLOWS and np.abs(tilt).max() <= _LEVEL and np.ptp(tilt, axis=0).max() > _STILL:
         logged_deg, radians_deg = (abs(float(np.degrees(np.angle(mean)))) for mean in (as_logged, otherwise[0]))
