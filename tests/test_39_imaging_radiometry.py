@@ -12,7 +12,7 @@ from apertura.core.focus.engines import reference
 from apertura.core.focus.inputs import PhaseHistory
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.sector import Sector
-from apertura.core.imaging.radiometry import Calibration, Link, cell_constant
+from apertura.core.imaging.radiometry import Calibration, Link, cell_constant, pointing_std_db
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import FlatGround, Plane
 from apertura.core.scene.visibility import surface
@@ -144,9 +144,29 @@ def test_a_calibrated_image_from_python_has_sigma0_and_cross_section_of_every_pi
 
 def test_a_calibration_needs_a_constant_and_the_band():
     echo = history(flown(), (0.0, 20.0, 0.0), "hann")
-    with pytest.raises(
-        CampaignError, match=r"calibration: a constant of -1\.0; expected a positive number"
-    ):
+    with pytest.raises(CampaignError, match=r"calibration: a constant of -1\.0; expected a positive number"):
         ap.backproject(echo, GRID, calibration=-1.0)
     with pytest.raises(CampaignError, match="expected a PhaseHistory, or a stage echo"):
         ap.backproject(ap.range_compress(echo, GRID, LEVEL), GRID, calibration=1.0)
+
+
+def test_an_attitude_error_changes_the_power_of_a_point_by_the_slope_of_its_beam():
+    """Eq. 9: a point 15° below the axis of a Gaussian beam of 40° in elevation, 2° of roll: 24·θ·δθ/w² per antenna."""
+    aperture = Aperture(*2 * [np.tile([0.0, 0.0, 12.0], (8, 1))])
+    beam = side_beam((50.0, 40.0), pulses=8)
+    boresight = beam.axes[0, 0]
+    below = np.arctan2(-boresight[2], boresight[1]) + np.radians(15.0)
+    place = np.array([0.0, 12.0 / np.tan(below), 0.0])
+    roll = np.radians(2.0) * np.array([1.0, 0.0, 0.0])
+    slope_db = 24.08 * 15.0 * 2.0 / 40.0**2
+    both, one = ((True, True), (True, False))
+    for turned, expected in ((both, 2 * slope_db), (one, slope_db)):
+        assert pointing_std_db(Beams(beam, beam), aperture, place, [(roll, turned)]) == pytest.approx(
+            expected, rel=0.02
+        )
+    apart = pointing_std_db(Beams(beam, beam), aperture, place, [(roll, (True, False)), (roll, (False, True))])
+    assert apart == pytest.approx(np.sqrt(2) * slope_db, rel=0.02)
+    assert pointing_std_db(None, aperture, place, [(roll, both)]) == 0
+    level = np.array([0.0, 12.0 / np.tan(below - np.radians(15.0)), 0.0])
+    flat_db = pointing_std_db(Beams(beam, beam), aperture, level, [(roll, both)])
+    assert flat_db == pytest.approx(2 * 12.04 * (2.0 / 40.0) ** 2, rel=0.02)  # on the axis the square is left

@@ -191,6 +191,13 @@ class Beam:
         """Return the beam over some pulses."""
         return replace(self, axes=self.axes[pulses])
 
+    def turned(self, vector_rad: NDArray[np.float64]) -> "Beam":
+        """Return the beam turned by a rotation vector, (3,) rad, in the frame of the pixels."""
+        from scipy.spatial.transform import Rotation  # slow to import, and few steps need it
+
+        axes = Rotation.from_rotvec(vector_rad).apply(self.axes.reshape(-1, 3))
+        return replace(self, axes=axes.reshape(self.axes.shape))
+
     def gain(self, position_m: NDArray[np.float64], pixels: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the gain of each pulse towards each pixel.
 

@@ -10,8 +10,9 @@ from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.contracts import Window
 from apertura.core.antenna.beam import Beams
 from apertura.core.echo.compression import centre_frequency
-from apertura.core.imaging.radiometry import Calibration, Link, cell_constant
+from apertura.core.imaging.radiometry import Calibration, Link, Turn, cell_constant, pointing_std_db
 from apertura.core.quality.bright_points import BrightPoint
+from apertura.core.quality.budget import ATTITUDE_STD_DEG
 from apertura.core.quality.measures import BlockRaster
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import Node, Receiver, SampledWaveform, radio_of
@@ -45,6 +46,8 @@ class CalibratedPair:
         Power that thermal noise alone would have in a profile; None where no noise figure is stated.
     noise_figure_db
         Stated; None: unknown.
+    pointing_std_db
+        What errors of attitude do to a point in the middle of the scene, by the beams.
     """
 
     link: Link
@@ -53,6 +56,7 @@ class CalibratedPair:
     beams: Beams | None
     thermal_noise: float | None
     noise_figure_db: float | None
+    pointing_std_db: float
 
     def points(self, found: list[BrightPoint], scene: OpenScene, pulse_noise: float) -> list[dict[str, Any]]:
         """Return the radar cross-sections of bright points, for radiometry.json.
@@ -184,7 +188,22 @@ def calibrated_pair(
     if figure_db is not None:
         filtered = (opened.weight * np.abs(sent.inverse)) ** 2
         thermal = link.pulse_noise(figure_db, spacing_hz=sent.numerology.spacing_hz, squares=float(filtered.sum()))
-    return CalibratedPair(link, std_db, calibration, beams, thermal, figure_db)
+    pointing_db = pointing_std_db(beams, opened.aperture, scene.middle_m, _turns(campaign, opened, scene))
+    return CalibratedPair(link, std_db, calibration, beams, thermal, figure_db, pointing_db)
+
+
+def _turns(campaign: Campaign, opened: OpenPair, scene: OpenScene) -> list[Turn]:
+    """Return the errors of attitude of a pair's nodes about east, north and up, as stated or of their source."""
+    legs, turns = opened.name.split("-"), list[Turn]()
+    for name in dict.fromkeys(legs):
+        node = campaign.settings.nodes[name]
+        if node.attitude != "none":
+            tilt, heading = node.attitude_error_deg or ATTITUDE_STD_DEG[node.attitude]
+            of = legs[0] == name, legs[1] == name
+            turns += [
+                (np.radians(size) * axis, of) for size, axis in zip((tilt, tilt, heading), scene.axes, strict=True)
+            ]
+    return turns
 
 
 def points_of(

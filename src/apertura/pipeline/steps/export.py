@@ -71,8 +71,10 @@ def _calibrated(
     said = open_listed(campaign.result(flight, pair, CROSS_SECTIONS), manifest)
     std_db = said["std_db"]
     stated = None if std_db is None else f"{std_db:.2g} dB"
-    line = BudgetLine("amplitude", stated, NO_EFFECT, "an error of power or gain")
-    return {"cross_sections": said, "budget": [*budget, line.report]}
+    lines = [BudgetLine("amplitude", stated, NO_EFFECT, "an error of power or gain")]
+    if said["pointing_std_db"]:
+        lines.insert(0, BudgetLine("pointing", f"{said['pointing_std_db']:.2g} dB by attitude", NO_EFFECT))
+    return {"cross_sections": said, "budget": [*budget, *(line.report for line in lines)]}
 
 
 def export_fused(campaign: Campaign, flight: str) -> list[Path]:

@@ -157,6 +157,7 @@ def _report(scene: OpenScene, image: xr.Dataset, calibrated: CalibratedPair, noi
         "calibrated_by": "the radio that the config states",
         "constant_db": round(10 * float(np.log10(constant)), 3),
         "std_db": calibrated.stated_std_db,
+        "pointing_std_db": round(calibrated.pointing_std_db, 3),
         "link": asdict(calibrated.link),
         "noise": {"pulse": noise if np.isfinite(noise) else None, **calibrated.noise_report(noise)},
         "points": calibrated.points(found, scene, noise),
