@@ -13,8 +13,11 @@ from apertura.core.geometry.geodesy import ecef_from_geodetic
 from apertura.formats.tracks.track import make_track
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import Node
-from apertura.pipeline.opening.node_log import NodeLog
+from apertura.pipeline.opening.node_log import NodeLog, raw_log
+from apertura.pipeline.opening.pair import open_pair
+from apertura.pipeline.opening.plan import budget_of
 from apertura.pipeline.opening.positions import place
+from apertura.pipeline.opening.scene import expected_scene
 from apertura.pipeline.steps import echo, ingest
 from apertura.pipeline.store import open_stage
 from apertura.simulation import Impairments, PointTarget, Straight, simulate
@@ -28,6 +31,12 @@ def small_campaign(folder, *, pulses=40, prf_hz=20.0, **changes):
     nodes = {name: replace(node, log_format="pos_utc", lever_arms_m={}) for name, node in plan.nodes.items()}
     plan = replace(plan, nodes=nodes, waveform=replace(plan.waveform, prf_hz=prf_hz), **changes)
     return Campaign.load(simulate(folder / "campaign", plan, seed=3))
+
+
+def turned(row, degrees):
+    """Return an epoch of a CSV log with another yaw, its last column."""
+    *others, yaw = row.split(",")
+    return ",".join([*others, f"{float(yaw) + degrees:.4f}"])
 
 
 def echo_of(campaign, pair="a-b"):
@@ -239,3 +248,30 @@ def test_an_attitude_that_looks_like_radians_is_a_flag_where_it_moves_an_antenna
     assert ("attitude_suspect" in flags) is flagged
     if flagged:
         assert "a: angles of attitude look in radians: yaw is 0° off the course so, 88°" in flags["attitude_suspect"]
+
+
+@pytest.mark.parametrize("pair", ["uav1-uav1", "uav1-uav2"])
+def test_the_budget_of_a_campaign_expects_what_a_log_with_another_heading_does(tiny, pair):
+    """3° of yaw in the log of uav1 move its antennas on their arms, the sidelink's, too: paths change as stated."""
+
+    def nodes(document):
+        document["nodes"]["uav1"].update(attitude_std_deg=[1e-6, 3.0], attitude_correlation_s=1e9, lever_arm_std_m=1e-6)
+
+    def paths():
+        """Total paths to the middle of the scene, less the sidelink's length where one is divided by."""
+        opened = open_pair(Campaign.load(tiny), "f01", pair)
+        tx, rx = (raw_log(campaign, "f01", name, 0.2) for name in pair.split("-"))
+        at = opened.began + (1e9 * opened.time_s).round().astype("timedelta64[ns]")
+        between = np.linalg.norm(tx.antenna("sidelink", at) - rx.antenna("sidelink", at), axis=1)
+        return opened.aperture.path(scene.middle_m[None])[:, 0] - between * (not opened.monostatic)
+
+    edit_config(tiny, nodes)
+    campaign = Campaign.load(tiny)
+    scene = expected_scene(campaign, lambda: open_pair(campaign, "f01", pair).flown)
+    before, opened = paths(), open_pair(campaign, "f01", pair)
+    lines = {(line.cause, line.stated is None): line for line in budget_of(campaign, opened, scene)}
+    edit_track(tiny, "uav1", lambda rows: [rows[0], *(turned(row, 3.0) for row in rows[1:])])
+    wavenumber = 2 * np.pi * opened.frequency_hz.mean() / opened.wave_speed_m_s
+    moved_rad = wavenumber * abs((paths() - before).mean())
+    assert moved_rad > 0.02
+    assert lines["attitude", False].effect.phase_rad == pytest.approx(moved_rad, rel=0.1)
