@@ -1,5 +1,6 @@
 """Checks of a flight log's epochs: spikes, steps, frozen positions, rounded times and gaps."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -453,9 +454,7 @@ _LEAST_STEPS = 10
 _FOLLOWS = 0.85  # mean of phasors of yaw less course: within 33° rms, wind, slips and turns by hand included
 _LEAVES = 0.8  # the same where yaw does not follow it: 38° rms
 _CLOSER = 2.0  # times less must yaw scatter about the course by another convention than as logged
-_ROUND_DEG = (
-    60.0  # no wider gap between courses: a heading that is held, or turned to the scene, does not do so by chance
-)
+_ROUND_DEG = 60.0  # no wider gap between courses: no heading held, or turned to the scene, does the same by chance
 _WHOLE_TURN = 1.01 * 2 * np.pi  # that no angle in radians exceeds
 _UPSIDE = 1.01 * np.pi / 2  # nor roll and pitch of a node that is not upside down
 _LEVEL = 0.6  # roll and pitch in radians stay below in level flight; in degrees none that flies stays as level
@@ -549,9 +548,9 @@ def check_yaw(position_m: Floats, attitude_rad: Floats, ned: Floats) -> YawFault
 
 def _apart(places_m: Floats, least_m: float) -> NDArray[np.intp]:
     """Return indices of places, each at least so far from the one before."""
-    kept = [0]
-    for index, place in enumerate(places_m):
-        if np.hypot(*(place - places_m[kept[-1]])) >= least_m:
+    kept, places = [0], places_m.tolist()
+    for index, place in enumerate(places):
+        if math.dist(place, places[kept[-1]]) >= least_m:
             kept.append(index)
     return np.array(kept)
 
