@@ -8,6 +8,7 @@ import pytest
 
 import apertura as ap
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.common.errors import CampaignError
 from apertura.core.focus.engines import ENGINES, load_engine
 from apertura.core.geometry.atmosphere import (
     SCALE_HEIGHT_M,
@@ -119,6 +120,27 @@ def test_a_target_seen_through_air_lies_where_it_stands_by_the_speed_in_air_and_
         given = history(aperture, AIR, wave_speed_m_s=speed)
         x, y = peak_m(ap.backproject(given, fine, terrain=0.0, certified_pixels=8).compute())
         assert (x, y) == pytest.approx((1.25, -0.75 + off_m), abs=0.05 * off_m + 0.021)
+
+
+def test_the_air_of_a_scene_is_a_keyword_from_python_for_transfer_functions_and_profiles():
+    """N at the ground, an Atmosphere, the standard one, vacuum: the speed of waves between ground and antennas."""
+    aperture, given = flight(), history(flight(), AIR)
+    profiles = range_compress(given, GRID, FlatGround(0.0))
+    height_m = float(aperture.tx_m[:, 2].mean())
+    stated = Atmosphere.stated(300.0, ground_m=0.0)
+    expected = {wave_speed(float(stated.mean_n(height_m, 0.0))): (300.0, stated), SPEED_OF_LIGHT_M_S: ("vacuum",)}
+    expected[wave_speed(float(Atmosphere.standard(0.0).mean_n(height_m, 0.0)))] = ("auto",)
+    quick = {"terrain": 0.0, "certified_pixels": 0}
+    for speed, same in expected.items():
+        for air in same:
+            assert ap.backproject(given, GRID, atmosphere=air, **quick).wave_speed_m_s == pytest.approx(speed, abs=10)
+    by_speed = ap.backproject(given.at_speed(wave_speed(float(stated.mean_n(height_m, 0.0)))), GRID, **quick)
+    for recorded in (given, profiles):
+        image = ap.backproject(recorded, GRID, atmosphere=stated, **quick)
+        assert np.abs(image.values - by_speed.values).max() < 2e-3 * np.abs(by_speed.values).max()
+    assert np.abs(ap.backproject(given, GRID, **quick).values - by_speed.values).max() > 0.1
+    with pytest.raises(CampaignError, match="expected auto, vacuum, an Atmosphere, or N units"):
+        ap.backproject(given, GRID, atmosphere="dry")
 
 
 @pytest.mark.parametrize("engine", [name for name in ENGINES if name not in {"cuda"}])

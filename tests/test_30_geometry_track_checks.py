@@ -6,6 +6,7 @@ import pytest
 from apertura.core.geometry.phase_centres import position_spline
 from apertura.core.geometry.track_checks import (
     check_track,
+    check_yaw,
     find_frozen,
     find_spikes,
     find_steps,
@@ -187,3 +188,117 @@ def test_a_gap_longer_than_asked_is_a_hole_however_well_a_spline_bridges_it():
     for longest_s, holes in ((np.inf, 0), (0.5, 0), (0.3, 1)):
         checked = check_track(time_s, straight, poor_fix=sound, tolerated_m=0.01, longest_gap_s=longest_s)
         assert len(checked.holes) == holes
+
+
+WIND_M_S, AIR_M_S = np.array([2.0, -1.0]), 7.0
+
+
+def attitude(place_m, policy, generator):
+    """Roll, pitch and yaw (deg) of a multirotor that leans into its flight; positions are north, east, down."""
+    velocity = np.gradient(place_m[:, :2], 0.1, axis=0)
+    course = np.degrees(np.unwrap(np.arctan2(velocity[:, 1], velocity[:, 0])))
+    across = (velocity[:, 0] * WIND_M_S[1] - velocity[:, 1] * WIND_M_S[0]) / np.hypot(*velocity.T)
+    crab = -np.degrees(np.arcsin(across / AIR_M_S))
+    yaw = {
+        "ahead": course + crab,
+        "sideways": course + crab - 90,
+        "backwards": course + 180,
+        "held": np.full(len(course), generator.choice([0.5, 2.0, 90.0, 213.0])),
+        "at a target": np.degrees(np.arctan2(200 - place_m[:, 1], 150 - place_m[:, 0])),
+    }[policy]
+    wobble = 1.5 * np.cumsum(generator.standard_normal((len(course), 3)), axis=0) / np.sqrt(len(course))
+    return wobble + np.column_stack([2 * np.sin(course / 20), np.full(len(course), -4.0), (yaw + 180) % 360 - 180])
+
+
+def mapped(course_deg, seconds=10.0):
+    """Legs of 7 m/s at ten epochs a second, one for each course; north, east, down."""
+    course = np.radians(np.repeat(course_deg, round(10 * seconds)))
+    return np.cumsum(0.1 * AIR_M_S * np.column_stack([np.cos(course), np.sin(course), 0 * course]), axis=0)
+
+
+ROUND = mapped(np.arange(0, 361, 15), 2.0)
+FLOWN = {
+    "round": ROUND,
+    "lawnmower": mapped([90, 180, 270, 180] * 4),
+    "straight east": mapped([90]),
+    "straight north": mapped([0]),
+    "corner": mapped([0, 90]),
+    "hover": 0.03 * np.random.default_rng(3).standard_normal((600, 3)),
+}
+
+
+@pytest.mark.parametrize("flown", FLOWN)
+@pytest.mark.parametrize("policy", ["ahead", "sideways", "backwards", "held", "at a target"])
+def test_however_a_node_turns_its_right_attitude_is_not_accused(flown, policy):
+    for seed in range(5):
+        degrees = attitude(FLOWN[flown], policy, np.random.default_rng(seed))
+        assert check_yaw(FLOWN[flown], np.radians(degrees), np.eye(3)) is None
+
+
+@pytest.mark.parametrize(
+    ("flown", "policy", "certain"),
+    [
+        ("round", "ahead", True),
+        ("round", "sideways", True),
+        ("lawnmower", "ahead", False),
+        ("straight east", "ahead", False),
+        ("corner", "backwards", False),
+    ],
+)
+def test_radians_are_told_by_a_yaw_that_follows_the_course_as_radians_alone(flown, policy, certain):
+    degrees = attitude(FLOWN[flown], policy, np.random.default_rng(1))
+    fault = check_yaw(FLOWN[flown], np.radians(np.radians(degrees)), np.eye(3))
+    assert fault is not None
+    assert (fault.convention, fault.certain) == ("in radians", certain)
+    assert fault.otherwise_deg < 20
+    assert fault.as_logged_deg > 40
+
+
+def test_yaw_that_is_counted_anticlockwise_is_told_by_a_course_through_most_directions():
+    """From north or from east; a corner could also be flown by a node that turns towards the scene."""
+    degrees = attitude(ROUND, "ahead", np.random.default_rng(1))
+    for zero in (0.0, 90.0):
+        turned = np.radians(degrees * [1, 1, -1] + [0, 0, zero])
+        assert check_yaw(ROUND, turned, np.eye(3)).convention == "anticlockwise"
+    corner = FLOWN["corner"]
+    other = np.radians(attitude(corner, "ahead", np.random.default_rng(1)) * [1, 1, -1])
+    assert check_yaw(corner, other, np.eye(3)) is None
+
+
+def test_no_angle_beyond_a_whole_turn_is_in_radians():
+    """On both sides of the limit: of a lawnmower, one epoch of 2π and one of 6.5."""
+    radians = np.radians(attitude(FLOWN["lawnmower"], "ahead", np.random.default_rng(1)))
+    for largest, found in ((2 * np.pi, True), (6.5, False)):
+        radians[7, 2] = largest
+        assert (check_yaw(FLOWN["lawnmower"], np.radians(radians), np.eye(3)) is not None) is found
+
+
+def courses(kind, generator):
+    """Courses (deg) of four seconds each."""
+    first = generator.uniform(0, 360)
+    return {
+        "legs": generator.uniform(0, 360, generator.integers(2, 12)),
+        "circle": first + np.arange(0, 361, 15) * generator.choice([-1, 1]),
+        "lawnmower": first + np.array([0, 90, 180, 90] * 4),
+        "wandering": np.cumsum(generator.normal(0, 30, 30)),
+        "straight": np.array([first]),
+    }[kind]
+
+
+@pytest.mark.slow
+def test_of_drawn_flights_none_is_accused_and_radians_are_told():
+    """4000 flights; those that turn as they fly in 9 of 10 cases, straight ones ahead in 7."""
+    generator, told = np.random.default_rng(0), {}
+    for _ in range(4000):
+        kind = generator.choice(["legs", "circle", "lawnmower", "straight", "wandering"])
+        policy = generator.choice(["ahead", "sideways", "backwards", "held", "at a target"])
+        place_m = mapped(courses(kind, generator), 4.0)
+        degrees = attitude(place_m, policy, generator)
+        if policy == "held":
+            degrees[:, 2] += generator.uniform(-5, 5) - degrees[0, 2] * (generator.random() < 0.5)
+        assert check_yaw(place_m, np.radians(degrees), np.eye(3)) is None
+        found = check_yaw(place_m, np.radians(np.radians(degrees)), np.eye(3))
+        group = "turned" if kind != "straight" and policy in {"ahead", "sideways", "backwards"} else f"{kind} {policy}"
+        told.setdefault(group, []).append(found is not None and found.convention == "in radians")
+    assert np.mean(told["turned"]) > 0.9
+    assert np.mean(told["straight ahead"]) > 0.7

@@ -207,6 +207,8 @@ def test_gotcha_delays_are_referred_to_the_scene_centre(shared):
         ("cut,angle_deg,gain_db\nazimuth,-9,-9\nazimuth,0,nan\nazimuth,9,-9\n", "azimuth cut holds a cell that is no"),
         ("cut,angle_deg,gain_db\nazimuth,0,-9\nazimuth,0,0\nazimuth,9,-9\n", "angles of the azimuth cut do not grow"),
         ("cut,angle_deg,gain_db\nazimuth,0,-9\nazimuth,90,0\nazimuth,270,-9\n", "0° to 270°, beyond ±180°"),
+        ("cut,angle_deg,gain_db,phase_deg\nazimuth,-9,-9,0\nazimuth,0,0,\nazimuth,9,-9,0\n", "a cell that is no"),
+        ("cut,angle_deg,gain_db,phase_deg\nazimuth,-9,-9,0\nazimuth,0,0,2e5\nazimuth,9,-9,0\n", "a phase of 200000°"),
     ],
 )
 def test_a_pattern_that_cannot_be_read_is_named(tmp_path, rows, expected):

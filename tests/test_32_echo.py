@@ -232,3 +232,21 @@ def test_every_place_comes_back_from_ecef_to_a_micrometre(latitude, longitude, h
     np.testing.assert_allclose(ecef_from_projected("EPSG:32632", *projected), position, atol=1e-6)
     higher = ecef_from_geodetic(latitude, longitude, height_m + 1)
     np.testing.assert_allclose(ned_axes(position) @ [0, 0, -1], higher - position, atol=1e-6)
+
+
+@pytest.mark.parametrize("overrun", [0.02, 0.1, 0.3])
+def test_an_echo_beyond_the_prefix_loses_its_overrun_and_spreads_as_noise_over_the_period(overrun):
+    """docs/theory/focus.md, eq. 5a, of 512 subcarriers: 20 random codes, one echo of amplitude 1, no window."""
+    count, length, prefix = 512, 1024, 64
+    known = Numerology(1e9, 1024e6, np.arange(count), prefix_samples=prefix, dft_samples=length)
+    codes = np.exp(2j * np.pi * np.random.default_rng(1).random((20, count)))
+    period = np.fft.ifft(codes, length, norm="forward")
+    late = 2 * round(overrun * count)  # whole cells
+    captures = np.zeros((20, prefix + length), np.complex64)
+    captures[:, prefix + late :] = np.concatenate([period[:, -prefix:], period], axis=1)[:, : length - late]
+    transfer = demodulate(captures, known) / codes
+    power = np.abs(np.fft.ifft(transfer, axis=1)) ** 2
+    cell = round((prefix + late) * count / length)
+    assert 10 * np.log10(power[:, cell].mean()) == pytest.approx(20 * np.log10(1 - overrun), abs=0.3)
+    rest = np.delete(power, range(cell - 8, cell + 9), axis=1)
+    assert 10 * np.log10(rest.mean()) == pytest.approx(10 * np.log10(overrun * (1 - overrun) / count), abs=0.5)

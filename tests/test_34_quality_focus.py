@@ -1,5 +1,7 @@
 """An image knows whether it is focused: bright points, path errors, the error budget, pairs against each other."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,8 +11,12 @@ from apertura.core.quality.agreement import agreement
 from apertura.core.quality.bright_points import BrightPoint, PointResponse, bright_points, common_shift
 from apertura.core.quality.budget import (
     BudgetLine,
+    NodeAttitude,
     NodePositions,
     accuracy_for,
+    antenna_flags,
+    antenna_line,
+    attitude_lines,
     expected,
     is_counted,
     is_stated,
@@ -331,3 +337,97 @@ def test_the_phase_between_pixels_needs_the_carrier_that_the_pixels_fold(turns):
     folded = [[BrightPoint(row, column, 1.0)]] * 2
     if abs(turns) > 0.5:
         assert abs(agreement(tuple(images), tuple(folded), **where).phase_rad) > 0.3
+
+
+ARM_M = (0.3, 0.0, -0.1)  # forward and above the logged point
+
+
+def flying_east(**stated):
+    """A node whose body looks east: columns forward, right (south) and down, in east, north, up."""
+    axes = np.broadcast_to(np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]]).T, (200, 3, 3))
+    known = {"std_deg": (2.0, 2.0), "correlation_s": 1e9, "arm_std_m": 1e-9, **stated}
+    return NodeAttitude(axes, (ARM_M, ARM_M, (0.0, 0.0, 0.0)), "log", **known)
+
+
+def test_a_constant_error_of_attitude_displaces_by_what_the_end_of_the_lever_arm_does():
+    """2° of each angle on an arm: each moves the image as the track would be moved; nothing defocuses."""
+    paths = straight()
+    attitude, _ = attitude_lines(paths, [flying_east()], sidelink=False)
+    (slope,), squares = paths.by_node(same=True, sidelink=False), 0.0
+    for axis in np.eye(3):
+        moved = np.cross(np.radians(2.0) * axis, np.array([ARM_M[0], -ARM_M[1], -ARM_M[2]]))
+        squares += paths.of_offset(slope @ moved).shift_m ** 2
+    assert attitude.effect.shift_m == pytest.approx(np.sqrt(squares), rel=1e-6)
+    assert attitude.effect.shift_m == pytest.approx(0.3 * np.radians(2.0), rel=0.5)
+    assert attitude.effect.loss_db > -0.01
+
+
+def test_attitude_that_wanders_defocuses_as_drawn_angles_do():
+    """Mean over 100 draws of three angles, white noise over a second, on an arm of 0.4 m; in dB."""
+    paths, generator = straight(), np.random.default_rng(3)
+    node = replace(flying_east(std_deg=(2.0, 3.0), correlation_s=1.0), arms_m=((0.4, 0.0, 0.0),) * 2 + ((0.0,) * 3,))
+    attitude, _ = attitude_lines(paths, [node], sidelink=False)
+    (slope,), count, losses = paths.by_node(same=True, sidelink=False), len(paths.time_s), []
+    ground = paths.gradient[:, :2]
+    for _ in range(100):
+        angles = [moving_average_noise(generator, count, round(count / 30)) for _ in range(3)]
+        turned = np.stack(angles, -1) * np.radians([2.0, 2.0, 3.0])
+        error = (slope * np.cross(turned, [0.4, 0.0, 0.0])).sum(axis=1)
+        rest = error - ground @ np.linalg.pinv(ground) @ error
+        losses.append(20 * np.log10(abs(np.exp(2j * np.pi / WAVELENGTH_M * rest).mean())))
+    assert -6 < attitude.effect.loss_db < -2
+    assert attitude.effect.loss_db == pytest.approx(np.mean(losses), rel=0.15)
+
+
+def test_no_lever_arm_no_line_and_what_is_unstated_counts_by_the_source_of_attitude():
+    """A course knows less of the body than a log; a wrong arm of both legs moves the image about as much."""
+    paths, bare = straight(), replace(flying_east(), arms_m=((0.0, 0.0, 0.0),) * 3)
+    assert attitude_lines(paths, [bare], sidelink=False) == []
+    logged = replace(flying_east(), std_deg=None, arm_std_m=None)
+    attitude, arms = attitude_lines(paths, [logged], sidelink=False)
+    by_course, _ = attitude_lines(paths, [replace(logged, source="course")], sidelink=False)
+    assert [is_counted(line.report) and not is_stated(line.report) for line in (attitude, arms)] == [True, True]
+    assert by_course.effect.shift_m > 3 * attitude.effect.shift_m
+    assert arms.effect.shift_m == pytest.approx(0.01 * np.sqrt(2), rel=0.3)  # two antennas, half the path each
+    assert arms.effect.loss_db > -0.01
+
+
+def test_an_attitude_that_moves_the_sidelink_s_antenna_turns_its_length():
+    """An arm of the sidelink's antenna alone, across the line between the nodes: the path between them changes."""
+    paths = straight(apart_m=4.7)
+    node = replace(flying_east(), arms_m=((0.0,) * 3, (0.0,) * 3, (0.0, 0.5, 0.0)), std_deg=(1e-6, 2.0))
+    (attitude, _) = attitude_lines(paths, [node, None], sidelink=True)
+    moved_m = 0.5 * np.radians(2.0)  # heading turns an arm to the right into the line of sight of both
+    assert attitude.effect.phase_rad == pytest.approx(2 * np.pi / WAVELENGTH_M * moved_m, rel=1e-3)
+    assert attitude_lines(paths, [node, None], sidelink=False)[0].effect.phase_rad == 0
+
+
+def cut_towards(paths):
+    """Azimuth of the point from each phase centre of a straight track, from an antenna that looks across it, rad."""
+    away = paths.point_m - paths.aperture.tx_m
+    return np.arctan2(away[:, 0], np.hypot(away[:, 1], away[:, 2]))
+
+
+def test_a_phase_that_is_linear_in_direction_is_a_phase_centre_beside_the_antenna():
+    """3 cm ahead along the track: the point lies 3 cm off, and is as sharp."""
+    paths = straight()
+    phase = 2 * 2 * np.pi / WAVELENGTH_M * 0.03 * np.sin(cut_towards(paths))  # both legs
+    line = antenna_line(paths, phase, np.ones(len(phase)))
+    assert line.effect.shift_m == pytest.approx(0.03, rel=1e-3)
+    assert line.effect.loss_db > -1e-6
+    assert antenna_flags([line]) == {}
+
+
+@pytest.mark.parametrize(("centre_m", "flagged"), [(0.004, False), (0.03, True)])
+def test_a_phase_centre_that_moves_with_the_angle_defocuses_as_its_phase_says(centre_m, flagged):
+    """Within a beam of ±30°, the centre that far out at the edges; the loss is that of the best peak of the sum."""
+    paths = straight()
+    angle = cut_towards(paths)
+    seen = np.abs(angle) < np.radians(30)
+    phase = 2 * 2 * np.pi / WAVELENGTH_M * centre_m * (np.degrees(angle) / 30) ** 2
+    line = antenna_line(paths, phase, np.where(seen, 1.0, 0.05))
+    count = int(seen.sum())
+    best = np.abs(np.fft.fft(np.exp(1j * phase[seen]), 8 * count)).max() / count
+    assert line.effect.loss_db == pytest.approx(20 * np.log10(best), abs=0.05)
+    assert ("antenna_phase" in antenna_flags([line])) is flagged
+    assert "1 rad" not in line.stated if flagged else f"{phase[seen].max():.2g} rad" in line.stated

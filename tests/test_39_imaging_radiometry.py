@@ -4,15 +4,18 @@ import numpy as np
 import pytest
 from scenes import side_beam, straight_track
 
+import apertura as ap
+from apertura.common.errors import CampaignError
 from apertura.core.antenna.beam import Beams
 from apertura.core.echo.compression import window_weights
 from apertura.core.focus.engines import reference
 from apertura.core.focus.inputs import PhaseHistory
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.sector import Sector
-from apertura.core.imaging.radiometry import Calibration, Link, cell_constant
+from apertura.core.imaging.radiometry import Calibration, Link, cell_constant, pointing_std_db
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import FlatGround, Plane
+from apertura.core.scene.visibility import surface
 from apertura.simulation.echoes import transfer
 from apertura.simulation.scene import Scatterers
 
@@ -215,3 +218,53 @@ def test_the_link_is_the_radar_equation():
     assert link.constant(wavelength_m=0.25, sent_power=64.0) == pytest.approx(received_w * 100 * 1000**2 / 64)
     noise = link.pulse_noise(3.0, spacing_hz=1e5, squares=1 / 64)
     assert noise == pytest.approx(1.380649e-23 * 290 * 10**0.3 * 1e5 * 1e8 / 64)
+
+
+@pytest.mark.parametrize("terrain", [LEVEL, Plane(0.0, 20.0, 0.0, 0.0, -0.3)])
+def test_a_calibrated_image_from_python_has_sigma0_and_cross_section_of_every_pixel(terrain):
+    """A point of 0.1 m² at the corner of four pixels, K = 7; σ⁰ is the cross-section over the cell's area."""
+    aperture = flown()
+    height = float(terrain.heights_at(GRID, np.array([23.5]), np.array([23.5]))[0])
+    x, y = GRID.map_at(np.array([23]), np.array([23]))[0]
+    echo = history(aperture, (x, y, height), "hann", amplitude=np.sqrt(7.0 * 0.1))
+    image = ap.backproject(echo, GRID, terrain=terrain, calibration=7.0, integration="all", tile_px=16)
+    assert image.rcs.chunks == image.chunks
+    found = image.compute()
+    assert 10 * np.log10(float(found.rcs[23, 23]) / 0.1) == pytest.approx(0, abs=0.1)
+    own = calibrated(aperture, window="hann", terrain=terrain, constant=7.0)
+    whole = (slice(0, 48), slice(0, 48))
+    normal = None if terrain is LEVEL else surface(GRID, terrain, whole)[1]
+    np.testing.assert_allclose(found.sigma0, np.abs(found) ** 2 / own.power(whole, "sigma0", normal), rtol=1e-4)
+    assert found.sigma0.attrs["standard_name"] == "surface_backwards_scattering_coefficient_of_radar_wave"
+    assert (found.sigma0.attrs["units"], found.rcs.attrs["units"]) == ("1", "m2")
+    assert "sigma0" not in ap.backproject(echo, GRID, terrain=terrain, certified_pixels=0).coords
+
+
+def test_a_calibration_needs_a_constant_and_the_band():
+    echo = history(flown(), (0.0, 20.0, 0.0), "hann")
+    with pytest.raises(CampaignError, match=r"calibration: a constant of -1\.0; expected a positive number"):
+        ap.backproject(echo, GRID, calibration=-1.0)
+    with pytest.raises(CampaignError, match="expected a PhaseHistory, or a stage echo"):
+        ap.backproject(ap.range_compress(echo, GRID, LEVEL), GRID, calibration=1.0)
+
+
+def test_an_attitude_error_changes_the_power_of_a_point_by_the_slope_of_its_beam():
+    """Eq. 9: a point 15° below the axis of a Gaussian beam of 40° in elevation, 2° of roll: 24·θ·δθ/w² per antenna."""
+    aperture = Aperture(*2 * [np.tile([0.0, 0.0, 12.0], (8, 1))])
+    beam = side_beam((50.0, 40.0), pulses=8)
+    boresight = beam.axes[0, 0]
+    below = np.arctan2(-boresight[2], boresight[1]) + np.radians(15.0)
+    place = np.array([0.0, 12.0 / np.tan(below), 0.0])
+    roll = np.radians(2.0) * np.array([1.0, 0.0, 0.0])
+    slope_db = 24.08 * 15.0 * 2.0 / 40.0**2
+    both, one = ((True, True), (True, False))
+    for turned, expected in ((both, 2 * slope_db), (one, slope_db)):
+        assert pointing_std_db(Beams(beam, beam), aperture, place, [(roll, turned)]) == pytest.approx(
+            expected, rel=0.02
+        )
+    apart = pointing_std_db(Beams(beam, beam), aperture, place, [(roll, (True, False)), (roll, (False, True))])
+    assert apart == pytest.approx(np.sqrt(2) * slope_db, rel=0.02)
+    assert pointing_std_db(None, aperture, place, [(roll, both)]) == 0
+    level = np.array([0.0, 12.0 / np.tan(below - np.radians(15.0)), 0.0])
+    flat_db = pointing_std_db(Beams(beam, beam), aperture, level, [(roll, both)])
+    assert flat_db == pytest.approx(2 * 12.04 * (2.0 / 40.0) ** 2, rel=0.02)  # on the axis the square is left

@@ -448,3 +448,27 @@ def test_the_disk_must_hold_what_is_still_to_be_written(tiny, monkeypatch):
     line = only(tiny)
     assert re.search(r"results take at least \d+ MB more \(.*echo \d+ MB", line)
     assert "expected at most the 0 MB that are free" in line
+
+
+@pytest.mark.parametrize(("unit", "refused"), [("degrees", False), ("radians", True)])
+def test_an_attitude_in_radians_is_refused_where_the_course_proves_it_and_an_arm_needs_it(tiny, unit, refused):
+    """A circle of 10 m: every course is flown, and yaw follows it in radians alone."""
+
+    def circle(lines):
+        header, *rows = lines
+        turned = []
+        for number, row in enumerate(rows):
+            time, latitude, longitude, height, *_ = row.split(",")
+            angle = 360 * number / len(rows)
+            north, east = 10 * np.sin(np.radians(angle)), -10 * np.cos(np.radians(angle))
+            place = float(latitude) + north / 111_200, float(longitude) + east / 73_900
+            angles = np.array([1.0, -4.0, angle])
+            angles = np.radians(angles) if unit == "radians" else angles
+            turned.append(",".join([time, *(f"{one:.9f}" for one in place), height, *(f"{one:.4f}" for one in angles)]))
+        return [header, *turned]
+
+    edit_track(tiny, "uav1", circle)
+    lines = reported(tiny)
+    assert any(line.startswith(f"{TX}: angles of attitude look in radians: yaw is") for line in lines) is refused
+    edit_config(tiny, lambda document: document["nodes"]["uav1"].update(lever_arms_m={}))
+    assert not any("attitude" in line for line in reported(tiny))

@@ -1,6 +1,7 @@
 """Logs and time tags in the echo of a campaign: what is left out is counted and said, what is right raises nothing."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,7 +10,14 @@ from folders import complaint, edit_config, edit_track, small_simulation
 from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.geodesy import ecef_from_geodetic
+from apertura.formats.tracks.track import make_track
 from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.config import Node
+from apertura.pipeline.opening.node_log import NodeLog, raw_log
+from apertura.pipeline.opening.pair import open_pair
+from apertura.pipeline.opening.plan import budget_of
+from apertura.pipeline.opening.positions import place
+from apertura.pipeline.opening.scene import expected_scene
 from apertura.pipeline.steps import echo, ingest
 from apertura.pipeline.store import open_stage
 from apertura.simulation import Impairments, PointTarget, Straight, simulate
@@ -23,6 +31,12 @@ def small_campaign(folder, *, pulses=40, prf_hz=20.0, **changes):
     nodes = {name: replace(node, log_format="pos_utc", lever_arms_m={}) for name, node in plan.nodes.items()}
     plan = replace(plan, nodes=nodes, waveform=replace(plan.waveform, prf_hz=prf_hz), **changes)
     return Campaign.load(simulate(folder / "campaign", plan, seed=3))
+
+
+def turned(row, degrees):
+    """Return an epoch of a CSV log with another yaw, its last column."""
+    *others, yaw = row.split(",")
+    return ",".join([*others, f"{float(yaw) + degrees:.4f}"])
 
 
 def echo_of(campaign, pair="a-b"):
@@ -219,3 +233,45 @@ def test_a_single_wrong_tag_is_left_out(tmp_path):
     attrs = echo_of(campaign).attrs
     assert attrs["pulses"] == {"used": 39, "dropped": 1, "reasons": {"time_tag_outlier": 1}}
     assert attrs["flags"]["time_tag_outlier"].startswith("1 of 40 pulses left out")
+
+
+@pytest.mark.parametrize(("arm_m", "flagged"), [(0.3, True), (0.0, False)])
+def test_an_attitude_that_looks_like_radians_is_a_flag_where_it_moves_an_antenna(arm_m, flagged):
+    """40 m flown east, yaw logged as π/2."""
+    time = np.datetime64("2026-05-14T09:30", "ns") + np.arange(80) * np.timedelta64(100, "ms")
+    place_m = np.column_stack([0.5 * np.arange(80), np.zeros(80), np.full(80, 20.0)])
+    angles = np.column_stack([0.02 * np.sin(np.arange(80)), np.full(80, -0.07), np.full(80, np.pi / 2)])
+    track = make_track(time, place_m, frame="local", attitude_deg=angles, node="a", where=Path("a.csv"))
+    arms = {"radar_tx": [arm_m, 0, 0]}
+    log = NodeLog("a", Node(attitude="log", lever_arms_m=arms), track, "a.csv", 0.2)
+    flags = place(log, log, time[5:-5]).flags
+    assert ("attitude_suspect" in flags) is flagged
+    if flagged:
+        assert "a: angles of attitude look in radians: yaw is 0° off the course so, 88°" in flags["attitude_suspect"]
+
+
+@pytest.mark.parametrize("pair", ["uav1-uav1", "uav1-uav2"])
+def test_the_budget_of_a_campaign_expects_what_a_log_with_another_heading_does(tiny, pair):
+    """3° of yaw in the log of uav1 move its antennas on their arms, the sidelink's, too: paths change as stated."""
+
+    def nodes(document):
+        document["nodes"]["uav1"].update(attitude_std_deg=[1e-6, 3.0], attitude_correlation_s=1e9, lever_arm_std_m=1e-6)
+
+    def paths():
+        """Total paths to the middle of the scene, less the sidelink's length where one is divided by."""
+        opened = open_pair(Campaign.load(tiny), "f01", pair)
+        tx, rx = (raw_log(campaign, "f01", name, 0.2) for name in pair.split("-"))
+        at = opened.began + (1e9 * opened.time_s).round().astype("timedelta64[ns]")
+        between = np.linalg.norm(tx.antenna("sidelink", at) - rx.antenna("sidelink", at), axis=1)
+        return opened.aperture.path(scene.middle_m[None])[:, 0] - between * (not opened.monostatic)
+
+    edit_config(tiny, nodes)
+    campaign = Campaign.load(tiny)
+    scene = expected_scene(campaign, lambda: open_pair(campaign, "f01", pair).flown)
+    before, opened = paths(), open_pair(campaign, "f01", pair)
+    lines = {(line.cause, line.stated is None): line for line in budget_of(campaign, opened, scene)}
+    edit_track(tiny, "uav1", lambda rows: [rows[0], *(turned(row, 3.0) for row in rows[1:])])
+    wavenumber = 2 * np.pi * opened.frequency_hz.mean() / opened.wave_speed_m_s
+    moved_rad = wavenumber * abs((paths() - before).mean())
+    assert moved_rad > 0.02
+    assert lines["attitude", False].effect.phase_rad == pytest.approx(moved_rad, rel=0.1)

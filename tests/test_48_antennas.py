@@ -141,10 +141,13 @@ def test_an_image_is_the_mean_over_all_pulses_of_weight_times_echo(both):
     assert ratio == pytest.approx((w**2).sum() / w.sum(), rel=0.05)  # a·w is the echo: Σw·aw/M over Σaw/M
 
 
-def pattern(root, azimuth, elevation=((-80, 0), (0, 0), (80, 0))):
-    """Write a pattern and return the antenna that has it."""
+def pattern(root, azimuth, elevation=((-80, 0), (0, 0), (80, 0)), *, phase_deg=None):
+    """Write a pattern, with a phase by azimuth if given, and return the antenna that has it."""
     rows = [("azimuth", *sample) for sample in azimuth] + [("elevation", *sample) for sample in elevation]
     lines = ["cut,angle_deg,gain_db", *(f"{cut},{angle},{gain}" for cut, angle, gain in rows)]
+    if phase_deg is not None:
+        phases = ["phase_deg", *(phase_deg(angle) if cut == "azimuth" else 0 for cut, angle, _ in rows)]
+        lines = [f"{line},{phase}" for line, phase in zip(lines, phases, strict=True)]
     (root / "config" / "pattern.csv").write_text("\n".join(lines) + "\n")
     return {"boresight_deg": BEAM["boresight_deg"], "pattern": "config/pattern.csv"}
 
@@ -254,3 +257,16 @@ def test_what_beams_forbid_is_refused_when_asked_for_and_not_chosen_otherwise(be
     assert "weigh every pulse" in reasons["presum"]
     assert reasons["antenna"].startswith("transmit, receive: of 80 pulses")
     assert "antenna" not in expected_plan(stated(beamed, None), "f01", "uav1-uav1").reasons
+
+
+def test_the_phase_of_a_pattern_is_in_the_budget_and_flagged_where_it_costs_more_than_images_tell(beamed):
+    """A parabola of 120° at 10° off boresight in each antenna, and none."""
+    azimuth = [(angle, -12.04 * (angle / 15) ** 2) for angle in range(-20, 21, 2)]
+    for turn_deg, flagged in ((0.0, False), (120.0, True)):
+        antenna = pattern(beamed, azimuth, phase_deg=lambda angle, turn=turn_deg: turn * (angle / 10) ** 2)
+        campaign = stated(beamed, antenna)
+        _, report = imaged(campaign)
+        line = next(one for one in report["budget"] if one["cause"] == "antenna")
+        assert ("antenna_phase" in report["flags"]) is flagged
+        assert (line["loss_db"] < -0.2) is flagged
+        assert "whose phase turns by" in line["stated"]

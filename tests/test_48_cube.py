@@ -60,6 +60,28 @@ def test_images_are_selected_by_name(campaign, opened):
     assert opened.sel(flight="f01", pair="uav1-uav2").verdict.values.item() in {"focused", "cannot tell", "defocused"}
 
 
+def test_the_cube_says_what_it_is_as_cf_has_it(campaign, opened):
+    """What compliance-checker of IOOS asks of CF-1.11; decibels it does not know are a unit of CF all the same."""
+    assert opened.attrs["Conventions"] == "CF-1.11"
+    assert campaign.settings.campaign in opened.attrs["title"]
+    assert opened.attrs["history"]
+    named = {
+        name: array.attrs["standard_name"] for name, array in opened.variables.items() if "standard_name" in array.attrs
+    }
+    assert named == {
+        "incidence": "angle_of_incidence",
+        "centre_frequency": "sensor_band_central_radiation_frequency",
+        "time": "time",
+        "x": "projection_x_coordinate",
+        "y": "projection_y_coordinate",
+    }
+    for name, array in opened.variables.items():
+        assert array.attrs["long_name"]
+        texts = array.dtype.kind in "TOM" or name == "spatial_ref"
+        assert texts or array.attrs["units"] in {"1", "m", "Hz", "dB", "rad", "degree"}
+    assert not any("_FillValue" in array.attrs for array in opened.variables.values())
+
+
 def test_the_crs_is_one_line_away_and_every_raster_names_it(campaign, opened):
     assert opened.rio.crs.to_epsg() == 32632
     with warnings.catch_warnings():

@@ -58,6 +58,20 @@ def test_a_csv_log_is_reported_as_its_own_columns_say(shared):
         assert report.facts["bounds"][name] == pytest.approx([min(values), max(values)], abs=1e-6)
 
 
+def test_a_log_in_radians_lacks_degrees_before_any_campaign_is_made(tmp_path):
+    """40 m to the east with a yaw of π/2, and of 90."""
+    for yaw, lacking in ((1.5708, True), (90.0, False)):
+        time = np.datetime64("2026-05-14T09:30:00.0", "ms") + 100 * np.arange(80)
+        rows = [
+            f"{at}Z,{0.5 * number},0,20,{0.02 * (number % 3)},-0.07,{yaw}" for number, at in enumerate(time.astype(str))
+        ]
+        path = tmp_path / "uav1.track.csv"
+        path.write_text("\n".join(["time_utc,east_m,north_m,up_m,roll_deg,pitch_deg,yaw_deg", *rows, ""]))
+        said = [line for line in look(path).missing if line.startswith("an attitude in degrees")]
+        assert bool(said) is lacking
+        assert not lacking or "look in radians: yaw is 0° off the course so" in said[0]
+
+
 def test_lines_taken_out_of_a_log_are_a_gap_of_their_length_at_their_time(shared, tmp_path):
     lines = (F01 / "uav1.track.csv").read_text().splitlines(keepends=True)
     (tmp_path / "uav1.track.csv").write_text("".join(lines[:41] + lines[51:]))

@@ -22,6 +22,7 @@ _PUBLIC = {
     "Atmosphere": "apertura.core.geometry.atmosphere",
     "Dem": "apertura.core.scene.dem",
     "FlatGround": "apertura.core.scene.terrain",
+    "Link": "apertura.core.imaging.radiometry",
     "PhaseHistory": "apertura.core.focus.inputs",
     "Plane": "apertura.core.scene.terrain",
     "Profiles": "apertura.core.focus.inputs",

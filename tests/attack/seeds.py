@@ -229,9 +229,10 @@ def dataflash_texts() -> list[bytes]:
 
 
 def patterns() -> list[bytes]:
-    """Return a sampled beam."""
+    """Return a sampled beam, without and with phase."""
     rows = [f"{cut},{angle},{-(angle**2) / 100}" for cut in ("azimuth", "elevation") for angle in range(-60, 61, 20)]
-    return ["\n".join(["cut,angle_deg,gain_db", *rows, ""]).encode()]
+    with_phase = ["cut,angle_deg,gain_db,phase_deg", *(f"{row},-3.5" for row in rows), ""]
+    return ["\n".join(["cut,angle_deg,gain_db", *rows, ""]).encode(), "\n".join(with_phase).encode()]
 
 
 def _npy(array: np.ndarray) -> bytes:

@@ -16,6 +16,12 @@ if TYPE_CHECKING:
 
 _RASTERS, _SUMS, _IMAGES = ("flight", "pair", "y", "x"), ("flight", "y", "x"), ("flight", "pair")
 
+CF_SIGMA0 = "surface_backwards_scattering_coefficient_of_radar_wave"
+"""Standard name of σ⁰ in CF (Standard Name Table, https://cfconventions.org); γ⁰ and β⁰ have none."""
+
+STANDARD_NAMES = {"incidence": "angle_of_incidence", "centre_frequency": "sensor_band_central_radiation_frequency"}
+"""Variable of the cube → its standard name in CF; the others have none that means what they hold."""
+
 Row = tuple[tuple[str, ...], str, str, str]
 
 RASTERS: dict[str, Row] = {

@@ -99,6 +99,11 @@ _OF_RECORDINGS = {
         "m along the flight that positions err by",
         "times of the log are rounded so that positions err along the flight", "decimals of the log's times",
         "pipeline/opening/positions.py"),
+    "attitude_suspect": Flag(
+        "degrees that yaw is off the course over ground, as logged and by another convention",
+        "angles of the log's attitude look like radians, or are counted anticlockwise: lever arms and beams are turned "
+        "wrongly",
+        "the log's export; nodes.<n>.attitude course, or none", "pipeline/opening/positions.py"),
     "time_tag_jitter": Flag(
         "scatter of the tags in s rms, and the repetition interval",
         "tags scatter so much that single pulses may be paired with a neighbour", "frame counters",
@@ -127,8 +132,8 @@ _OF_RECORDINGS = {
         "the node's oscillator; which node transmits", "core/echo/own_pulses.py"),
     "wrong_code": Flag(
         "SNR of the sidelink",
-        "the sidelink is there but carries another code: if in all pairs of the transmitter, it sent another one; if in "
-        "some, their receivers recorded another transmitter",
+        "the sidelink is there but carries another code: in all pairs of a transmitter if it sent another one, in some "
+        "if their receivers recorded another transmitter",
         "waveform.codes; the recording", "core/echo/sidelink_state.py"),
     "sidelink_lost": Flag(
         "pulses dropped, of all", "pulses without a sidelink were dropped", "blockage, antenna",
@@ -229,6 +234,11 @@ _OF_IMAGES = {
     "beam_misses": Flag(
         "share of the scene", "part of the scene is seen by no antenna beam", "boresights; scene.bounds_m",
         "core/antenna/illumination.py"),
+    "antenna_phase": Flag(
+        "dB that a point in the middle of the scene loses by it, and cm that it is off",
+        "the phase of the antennas' patterns changes over the aperture, and is not taken out",
+        "lever_arms_m: to the phase centre, about which a pattern has least phase; phase_deg of the pattern",
+        "core/quality/budget.py"),
     "prediction_misses": Flag(
         "error predicted and accuracy asked, dB", "the plan is expected to miss the accuracy asked",
         "engine and options asked for", "core/planning/planner.py"),

@@ -1,4 +1,4 @@
-"""Antenna patterns as CSV: cut, angle_deg, gain_db."""
+"""Antenna patterns as CSV: cut, angle_deg, gain_db, and phase_deg where it was measured."""
 
 from pathlib import Path
 
@@ -10,17 +10,19 @@ from apertura.common.errors import CampaignError, quoted
 from apertura.core.antenna.beam import LIMITS_RAD
 from apertura.formats.tracks.csv_track import numbers, read_table
 
-Samples = tuple[NDArray[np.float64], NDArray[np.float64]]
-"""One sampled cut: angles from boresight (deg), growing, and gain (dB)."""
+Samples = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64] | None]
+"""One sampled cut: angles from boresight (deg), growing, gain (dB), and phase (deg); None: not measured."""
 
-_LARGEST_DB = 300.0
+_LARGEST_DB, _LARGEST_DEG = 300.0, 1e5
 _COLUMNS = ["cut", "angle_deg", "gain_db"]
+_PHASE = "phase_deg"
 
 
 def read_beam_pattern(path: Path) -> tuple[Samples, Samples]:
     """Return the azimuth and elevation cuts of a CSV file.
 
-    Its columns are cut (azimuth or elevation), angle_deg (growing within each cut, from boresight) and gain_db.
+    Its columns are cut (azimuth or elevation), angle_deg (growing within each cut, from boresight), gain_db and, where
+    it was measured, phase_deg: of the far field about the end of the lever arm, positive where the field leads.
 
     Raises
     ------
@@ -28,7 +30,7 @@ def read_beam_pattern(path: Path) -> tuple[Samples, Samples]:
         If a column or a cut is missing, a cell is not a number, or angles do not grow or reach too far.
     """
     try:
-        table = read_table(path, _COLUMNS)
+        table = read_table(path, _COLUMNS, optional=[_PHASE])
         unknown = sorted(set(table["cut"].fillna("").astype(str)) - LIMITS_RAD.keys())
         if unknown:
             raise ValueError(f"a cut called {quoted(unknown[0])}")
@@ -45,10 +47,11 @@ def read_beam_pattern(path: Path) -> tuple[Samples, Samples]:
 
 def _samples(cut: pd.DataFrame, name: str) -> Samples:
     angle, gain = numbers(cut[["angle_deg", "gain_db"]]).T
+    phase = numbers(cut[[_PHASE]])[:, 0] if _PHASE in cut else None
     limit = np.degrees(LIMITS_RAD[name])
     if len(angle) < 3:
         raise ValueError(f"{len(angle)} samples of the {name} cut, at least 3 are needed")
-    if not (np.isfinite(angle).all() and np.isfinite(gain).all()):
+    if not all(np.isfinite(values).all() for values in (angle, gain, phase) if values is not None):
         raise ValueError(f"the {name} cut holds a cell that is not a number")
     if np.abs(gain).max() > _LARGEST_DB:
         raise ValueError(f"a gain of {gain[np.abs(gain).argmax()]:g} dB in the {name} cut")
@@ -56,4 +59,6 @@ def _samples(cut: pd.DataFrame, name: str) -> Samples:
         raise ValueError(f"angles of the {name} cut do not grow")
     if angle[0] < -limit or angle[-1] > limit:
         raise ValueError(f"angles of the {name} cut go from {angle[0]:g}° to {angle[-1]:g}°, beyond ±{limit:g}°")
-    return angle, gain
+    if phase is not None and np.abs(phase).max() > _LARGEST_DEG:
+        raise ValueError(f"a phase of {phase[np.abs(phase).argmax()]:g}° in the {name} cut")
+    return angle, gain, phase

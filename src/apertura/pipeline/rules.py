@@ -421,7 +421,7 @@ _ROWS = (
         "Stack and add up every image, cube.zarr.",
         f"{_STEPS}.cube:cube",
         sources=("image", "assessment", "scene"),
-        settings=("processing.tile_px",),
+        settings=("campaign", "processing.tile_px"),
         demand=Demand(500, pixel_bytes=50, pixel_s=10),
         cost=Cost(2.5, mpx_s=1.0),
     ),

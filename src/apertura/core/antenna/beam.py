@@ -114,6 +114,19 @@ def sampled_cut(angle_deg: NDArray[np.float64], gain_db: NDArray[np.float64], *,
     return np.radians(fine[first:last]), 10 ** (level[first:last] / 20)
 
 
+def sampled_phase(
+    angle_deg: NDArray[np.float64], phase_deg: NDArray[np.float64], at_rad: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the phase of a sampled cut at some angles (rad), unwrapped and linear between samples.
+
+    Examples
+    --------
+    >>> sampled_phase(np.array([-30.0, 0, 30]), np.array([170.0, -170, -150]), np.radians([15.0])).round(4)
+    array([3.4907])
+    """
+    return np.asarray(np.interp(at_rad, np.radians(angle_deg), np.unwrap(np.radians(phase_deg))))
+
+
 # ---- Gain of each pulse at each pixel
 
 
@@ -133,6 +146,8 @@ class Beam:
         (n,) and (m,) float64, equally spaced and growing.
     azimuth_gain, elevation_gain
         (n,) and (m,) float64, field (not power) relative to boresight.
+    azimuth_phase_rad, elevation_phase_rad
+        (n,) and (m,) float64, phase of the field, which both add to; None: unknown. No engine takes it out.
 
     Raises
     ------
@@ -157,6 +172,8 @@ class Beam:
     azimuth_gain: NDArray[np.float64]
     elevation_rad: NDArray[np.float64]
     elevation_gain: NDArray[np.float64]
+    azimuth_phase_rad: NDArray[np.float64] | None = None
+    elevation_phase_rad: NDArray[np.float64] | None = None
 
     def __post_init__(self) -> None:
         if self.axes.ndim != 3 or self.axes.shape[1:] != (3, 3):
@@ -173,6 +190,13 @@ class Beam:
     def __getitem__(self, pulses: slice | NDArray[np.int64]) -> "Beam":
         """Return the beam over some pulses."""
         return replace(self, axes=self.axes[pulses])
+
+    def turned(self, vector_rad: NDArray[np.float64]) -> "Beam":
+        """Return the beam turned by a rotation vector, (3,) rad, in the frame of the pixels."""
+        from scipy.spatial.transform import Rotation  # slow to import, and few steps need it
+
+        axes = Rotation.from_rotvec(vector_rad).apply(self.axes.reshape(-1, 3))
+        return replace(self, axes=axes.reshape(self.axes.shape))
 
     def gain(self, position_m: NDArray[np.float64], pixels: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the gain of each pulse towards each pixel.
@@ -200,6 +224,18 @@ class Beam:
             for angle, (_, samples, values) in zip(angles, self._patterns(), strict=True)
         ]
         return np.asarray(gains[0] * gains[1])
+
+    def phase(self, position_m: NDArray[np.float64], pixels: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the phase of the field of each pulse towards each pixel, (pulse, pixel) rad; 0 where unknown."""
+        azimuth, elevation = self.angles(position_m, pixels)
+        total: NDArray[np.float64] = np.zeros_like(azimuth)
+        for angle, samples, values in (
+            (azimuth, self.azimuth_rad, self.azimuth_phase_rad),
+            (elevation, self.elevation_rad, self.elevation_phase_rad),
+        ):
+            if values is not None:
+                total += np.interp(angle, samples, values)
+        return total
 
     def angles(self, position_m: NDArray[np.float64], pixels: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return azimuth and elevation of each pixel from boresight, (2, pulse, pixel) rad; else as `gain`."""
@@ -258,6 +294,16 @@ class Beams:
         """Return the beams of antennas inside a sector; None where there is neither."""
         beams = antennas or cls()
         return cls(beams.transmit, beams.receive, sector) if antennas or sector else None
+
+    def phase(self, aperture: Aperture, pixels: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        """Return (pulse, pixel) rad, the phases of both antennas towards each pixel together; None: unknown."""
+        legs = zip((self.transmit, self.receive), aperture.legs, strict=True)
+        known = [
+            beam.phase(position_m, pixels)
+            for beam, position_m in legs
+            if beam and (beam.azimuth_phase_rad is not None or beam.elevation_phase_rad is not None)
+        ]
+        return np.asarray(np.sum(known, axis=0)) if known else None
 
     def weight(self, aperture: Aperture, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return (pulse, pixel) float64, the product of both gains and the sector's; else as `Beam.gain`."""

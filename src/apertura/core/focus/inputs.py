@@ -143,6 +143,10 @@ class PhaseHistory:
         delay_s = self.reference_delay_s + further_m / self.wave_speed_m_s
         return replace(self, reference_delay_s=delay_s, aperture=aperture)
 
+    def at_speed(self, wave_speed_m_s: float) -> "PhaseHistory":
+        """Return the same delays as those of a wave of another speed, m/s."""
+        return replace(self, wave_speed_m_s=wave_speed_m_s)
+
 
 def _check_wave_speed(wave_speed_m_s: float) -> None:
     if not SPEED_OF_LIGHT_M_S / 1.1 < wave_speed_m_s <= SPEED_OF_LIGHT_M_S:
@@ -266,3 +270,8 @@ class Profiles:
         )
         samples = cast("NDArray[np.complex64]", rotated)
         return replace(self, samples=samples, start_m=self.start_m + further_m, aperture=aperture)
+
+    def at_speed(self, wave_speed_m_s: float) -> "Profiles":
+        """Return the same delays as those of a wave of another speed, m/s."""
+        scale = wave_speed_m_s / self.wave_speed_m_s
+        return replace(self, start_m=scale * self.start_m, step_m=scale * self.step_m, wave_speed_m_s=wave_speed_m_s)

@@ -7,6 +7,8 @@ import numpy as np
 
 from apertura.common.arrays import Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.core.geometry.aperture import Aperture
+from apertura.core.geometry.geodesy import LOCAL, geodetic_from_ecef
 
 SCALE_HEIGHT_M = 7350.0
 """Height over which the refractivity of air falls to 1/e: ITU-R P.453, the world's mean profile."""
@@ -236,6 +238,43 @@ class FlightAir:
             "vacuum_would_move_m": round(1e-6 * self.refractivity_n * self.path_m / 2, 4),
             "one_constant_leaves_m": float(f"{self.left_m:.2g}"),
         }
+
+
+@dataclass(frozen=True, eq=False)
+class SceneAir:
+    """Air over a scene.
+
+    Attributes
+    ----------
+    atmosphere
+        Its refractivity by height.
+    middle_m
+        (3,) float64, metres, in the frame of the antennas: a place in the middle of the scene.
+    frame
+        'ecef', where heights are those above the ellipsoid, or 'local', where they are z.
+    """
+
+    atmosphere: Atmosphere
+    middle_m: Floats
+    frame: str
+
+    def over(self, aperture: Aperture) -> FlightAir:
+        """Return the one refractivity of a pair's paths to the scene."""
+        tx_m, rx_m = (self._heights(leg) for leg in aperture.legs)
+        ranges = tuple(np.linalg.norm(leg - self.middle_m, axis=1) for leg in aperture.legs)
+        return self.atmosphere.over(tx_m, rx_m, (ranges[0], ranges[1]))
+
+    def electrical_m(self, one_m: Floats, other_m: Floats) -> Floats:
+        """Return the electrical length (pulse,) of straight paths between antennas (pulse, 3), metres: c times delay.
+
+        By the air at their own height: that between antennas that fly is thinner than that down to the scene.
+        """
+        length_m = np.linalg.norm(one_m - other_m, axis=1)
+        mean_n = self.atmosphere.mean_n(self._heights(one_m), self._heights(other_m))
+        return np.asarray(length_m * (1 + 1e-6 * mean_n))
+
+    def _heights(self, position_m: Floats) -> Floats:
+        return position_m[:, 2] if self.frame == LOCAL else geodetic_from_ecef(position_m)[:, 2]
 
 
 def _spread(weather: tuple[float, float, float], off: tuple[float, float, float]) -> float:

@@ -1,5 +1,6 @@
 """Checks of a flight log's epochs: spikes, steps, frozen positions, rounded times and gaps."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -444,3 +445,116 @@ def _interpolation_m(time_s: Floats, position_m: Floats) -> float | None:
     error_m = position_spline(time_s[::2], position_m[::2])(time_s[1:-1:2]) - position_m[1:-1:2]
     inner = np.linalg.norm(error_m, axis=1)[2:-2] / np.sqrt(3)
     return float(np.sqrt(np.mean(inner**2))) / 16
+
+
+# ---- Yaw against the course
+
+_COURSE_STEP_M = 2.0  # over ground, from which a course is taken: 1 cm of noise turns it by 0.4°
+_LEAST_STEPS = 10
+_FOLLOWS = 0.85  # mean of phasors of yaw less course: within 33° rms, wind, slips and turns by hand included
+_LEAVES = 0.8  # the same where yaw does not follow it: 38° rms
+_CLOSER = 2.0  # times less must yaw scatter about the course by another convention than as logged
+_ROUND_DEG = 60.0  # no wider gap between courses: no heading held, or turned to the scene, does the same by chance
+_WHOLE_TURN = 1.01 * 2 * np.pi  # that no angle in radians exceeds
+_UPSIDE = 1.01 * np.pi / 2  # nor roll and pitch of a node that is not upside down
+_LEVEL = 0.6  # roll and pitch in radians stay below in level flight; in degrees none that flies stays as level
+_STILL = 1e-3  # roll and pitch that move less are those of a level, or of nothing
+_NEAR_DEG, _FAR_DEG = 20.0, 45.0  # of straight flight: yaw less course by the other convention, and as logged
+
+
+class YawFault(NamedTuple):
+    """Yaw that follows the course by another convention than degrees clockwise.
+
+    Attributes
+    ----------
+    convention
+        'in radians' or 'anticlockwise'.
+    certain
+        Whether the course turned through so many directions that nothing else explains it.
+    as_logged_deg, otherwise_deg
+        Scatter of yaw less course, RMS about its mean, as logged and by the convention; of a straight flight the mean.
+    """
+
+    convention: str
+    certain: bool
+    as_logged_deg: float
+    otherwise_deg: float
+
+    @property
+    def line(self) -> str:
+        """What was measured, in one line."""
+        return (
+            f"angles of attitude look {self.convention}: yaw is {self.otherwise_deg:.0f}° off the course so, "
+            f"{self.as_logged_deg:.0f}° as degrees clockwise from north"
+        )
+
+
+def check_yaw(position_m: Floats, attitude_rad: Floats, ned: Floats) -> YawFault | None:
+    """Return by which other convention yaw follows the course over ground, where it does not as logged.
+
+    A node that flies sideways or backwards, in wind, or with its heading held, is none: its yaw follows the course by
+    no convention, or as well as logged.
+
+    Parameters
+    ----------
+    position_m
+        (epoch, 3) float64, logged point, metres.
+    attitude_rad
+        (epoch, 3) float64, roll, pitch, yaw as they were read, from degrees to radians.
+    ned
+        (epoch, 3, 3) or (3, 3) float64, columns north, east, down in the frame of the positions.
+
+    Notes
+    -----
+    Source: docs/theory/tracks.md, eq. 2.
+
+    Examples
+    --------
+    >>> turn = np.linspace(0, 5, 200)  # rad of a circle, clockwise from north
+    >>> circle = 20 * np.stack([np.sin(turn), -np.cos(turn), 0 * turn], -1)  # north, east, down
+    >>> level = np.zeros((200, 2))
+    >>> logged = np.column_stack([level, turn])
+    >>> check_yaw(circle, logged, np.eye(3)) is None, check_yaw(circle, np.radians(logged), np.eye(3)).convention
+    (True, 'in radians')
+    """
+    known = np.isfinite(attitude_rad).all(axis=1)
+    attitude_rad, step = attitude_rad[known], np.diff(position_m[known], axis=0)
+    north, east = np.einsum("...ij,...i->...j", ned[known][1:] if ned.ndim == 3 else ned, step)[:, :2].T
+    places = np.cumsum(np.column_stack([north, east]), axis=0)
+    ends = _apart(places, _COURSE_STEP_M)
+    if len(ends) <= _LEAST_STEPS:
+        return None
+    flown = np.diff(places[ends], axis=0)
+    course = np.arctan2(flown[:, 1], flown[:, 0])
+    middle = (ends[1:] + ends[:-1]) // 2 + 1
+    yaw, logged = attitude_rad[middle, 2], np.degrees(attitude_rad)
+    small = bool((np.abs(logged) <= np.array([_UPSIDE, _UPSIDE, _WHOLE_TURN])).all())
+    ordered = np.sort(course)
+    certain = bool(np.degrees(np.diff(ordered, append=ordered[0] + 2 * np.pi).max()) < _ROUND_DEG)
+    others = {"in radians": logged[middle, 2]} if small else {}
+    others |= {"anticlockwise": -yaw} if certain else {}
+    as_logged, *otherwise = (complex(np.exp(1j * (angle - course)).mean()) for angle in (yaw, *others.values()))
+    for convention, mean in zip(others, otherwise, strict=True):
+        logged_deg, other_deg = _scatter_deg(as_logged), _scatter_deg(mean)
+        if abs(as_logged) < _LEAVES and abs(mean) > _FOLLOWS and _CLOSER * other_deg < logged_deg:
+            return YawFault(convention, certain, logged_deg, other_deg)
+    tilt = logged[:, :2]
+    if small and abs(as_logged) > _FOLLOWS and np.abs(tilt).max() <= _LEVEL and np.ptp(tilt, axis=0).max() > _STILL:
+        logged_deg, radians_deg = (abs(float(np.degrees(np.angle(mean)))) for mean in (as_logged, otherwise[0]))
+        if logged_deg > _FAR_DEG and radians_deg < _NEAR_DEG and abs(otherwise[0]) > _FOLLOWS:
+            return YawFault("in radians", False, logged_deg, radians_deg)
+    return None
+
+
+def _apart(places_m: Floats, least_m: float) -> NDArray[np.intp]:
+    """Return indices of places, each at least so far from the one before."""
+    kept, places = [0], places_m.tolist()
+    for index, place in enumerate(places):
+        if math.dist(place, places[kept[-1]]) >= least_m:
+            kept.append(index)
+    return np.array(kept)
+
+
+def _scatter_deg(mean: complex) -> float:
+    """Return the circular standard deviation of angles whose phasors have a mean, degrees."""
+    return float(np.degrees(np.sqrt(-2 * np.log(max(min(abs(mean), 1.0), 1e-9)))))

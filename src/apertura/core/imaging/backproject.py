@@ -9,22 +9,28 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.common.contracts import CF_SIGMA0, Window
 from apertura.common.documents import validated
+from apertura.common.errors import CampaignError, quoted
 from apertura.common.flags import Flags
 from apertura.core.antenna.beam import Beams
 from apertura.core.antenna.illumination import illuminate
 from apertura.core.focus.inputs import PhaseHistory, Profiles
 from apertura.core.focus.job import Job
+from apertura.core.geometry.aperture import Aperture
+from apertura.core.geometry.atmosphere import Atmosphere, SceneAir
+from apertura.core.geometry.geodesy import LOCAL, geodetic_from_ecef
 from apertura.core.imaging.choices import Degrees, ImagingChoices, Resolution
 from apertura.core.imaging.formation import Formation
 from apertura.core.imaging.job import check_inputs, imaging_job, profiles_job
+from apertura.core.imaging.radiometry import Calibration, cell_constant
 from apertura.core.imaging.range_profiles import RangeWindow, inputs_of, range_compress
 from apertura.core.planning.plan import memory_limit
 from apertura.core.planning.planner import make_plan
 from apertura.core.quality.budget import MOST_ACCURACY_DB
 from apertura.core.quality.error_check import CONFIDENCE, ErrorBound, error_bound
 from apertura.core.scene.grid import SceneGrid
-from apertura.core.scene.terrain import GroundModels, Terrain, ground_of
+from apertura.core.scene.terrain import FlatGround, GroundModels, Terrain, ground_of
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -38,6 +44,8 @@ def backproject(  # noqa: PLR0913 - each choice is a keyword, so that an editor 
     terrain: Terrain | float | None = None,
     engine: str = "auto",
     beams: Beams | None = None,
+    atmosphere: "Atmosphere | float | Literal['auto', 'vacuum'] | None" = None,
+    calibration: float | None = None,
     certified_pixels: int = 64,
     terrain_model: Literal["auto", "plane", "tilted_plane", "dem"] = "auto",
     window: Literal["hann", "none"] = "hann",
@@ -66,6 +74,12 @@ def backproject(  # noqa: PLR0913 - each choice is a keyword, so that an editor 
         'auto' or a key of `apertura.core.focus.engines.ENGINES`.
     beams
         Of the antennas; isotropic by default.
+    atmosphere
+        Air that the waves flew in, instead of the speed that `profiles` carry: 'auto', the standard atmosphere over the
+        ground; an `Atmosphere`; N units at the ground; 'vacuum'. One speed for the flight, by its heights.
+    calibration
+        K, |H|² of a target of 1 m² whose distances from both antennas multiply to 1 m², on both boresights:
+        ``ap.Link(...).constant(...)``, or measured on a reflector. The image then has coordinates `sigma0` and `rcs`.
     certified_pixels
         Random pixels also computed exactly at once, for the certificate; 0 for none. A setting that misses the
         accuracy on them is replaced by the plan's next.
@@ -93,7 +107,9 @@ def backproject(  # noqa: PLR0913 - each choice is a keyword, so that an editor 
         as JSON `models` (choice → value and reason) and `flags` (limit crossed → what was measured); the certificate:
         `numerical_error_db`, an upper bound at `numerical_error_confidence` for the whole image, and
         `numerical_error_estimate_db`, against the double sum over pulses and subcarriers, or from profiles alone
-        against their band-limited interpolation in float64.
+        against their band-limited interpolation in float64. With `calibration` lazy coordinates (y, x) float32:
+        `sigma0`, of ground, noise included, and `rcs`, the cross-section (m²) of a point at the pixel; NaN where no
+        pulse sees it.
 
     Raises
     ------
@@ -105,7 +121,8 @@ def backproject(  # noqa: PLR0913 - each choice is a keyword, so that an editor 
 
     Notes
     -----
-    Source: docs/theory.md, eq. 4 to 6; docs/theory/planner.md.
+    Source: docs/theory.md, eq. 4 to 6; docs/theory/planner.md; docs/theory/atmosphere.md, eq. 4;
+    docs/theory/radiometry.md, eq. 4 and 6.
 
     Examples
     --------
@@ -119,6 +136,9 @@ def backproject(  # noqa: PLR0913 - each choice is a keyword, so that an editor 
     >>> image.chunks, image.attrs["numerical_error_db"] < -60
     (((64, 36), (64, 36)), True)
     >>> abs(float(abs(image).max()) - 1) < 0.05
+    True
+    >>> seen = ap.backproject(history, ap.SceneGrid("local", -1.0, 1.0, 0.1, (20, 20)), calibration=1.0)
+    >>> 0.8 < float(seen.rcs.max()) / 500**2 < 1.1  # K = 1: an amplitude of 1 where R_tx·R_rx is 500 m²
     True
     """
     import xarray as xr
@@ -141,6 +161,9 @@ def backproject(  # noqa: PLR0913 - each choice is a keyword, so that an editor 
     )
     inputs = inputs_of(profiles, choices.window)
     ground = ground_of(terrain, grid)
+    if atmosphere is not None:
+        inputs = inputs.at_speed(_wave_speed(atmosphere, grid, ground, inputs.aperture))
+    _check_calibration(calibration, inputs)
     flags = check_inputs(inputs, grid, ground)
     history = inputs if isinstance(inputs, PhaseHistory) else None
     models = GroundModels.of(ground, None, grid)
@@ -170,7 +193,98 @@ def backproject(  # noqa: PLR0913 - each choice is a keyword, so that an editor 
         "models": json.dumps(formation.plan.reasons, ensure_ascii=False),
         "flags": json.dumps(Flags.merged(flags, plan.flags), ensure_ascii=False),
     }
-    return xr.DataArray(formation.image, grid.coordinates, ("y", "x"), name="image", attrs=attributes)
+    image = xr.DataArray(formation.image, grid.coordinates, ("y", "x"), name="image", attrs=attributes)
+    if calibration is None or history is None:
+        return image
+    return image.assign_coords(_calibrated(image.data, formation, history, ground, calibration))
+
+
+def _wave_speed(
+    atmosphere: "Atmosphere | float | Literal['auto', 'vacuum']", grid: SceneGrid, ground: Terrain, aperture: Aperture
+) -> float:
+    """Return the speed of waves between the middle of a scene and the antennas."""
+    middle_m = ground.positions_at(grid, *(np.array([size // 2]) for size in grid.shape))[0]
+    frame = LOCAL if grid.crs == LOCAL else "ecef"
+    ground_m = float(middle_m[2] if frame == LOCAL else geodetic_from_ecef(middle_m)[2])
+    if isinstance(atmosphere, str) and atmosphere not in {"auto", "vacuum"}:
+        raise CampaignError(
+            quoted(atmosphere),
+            where="backproject: atmosphere",
+            expected="auto, vacuum, an Atmosphere, or N units at the ground",
+            remedy="Take one of these.",
+        )
+    if atmosphere == "auto":
+        air = Atmosphere.standard(ground_m)
+    elif atmosphere == "vacuum":
+        air = Atmosphere.vacuum()
+    else:
+        air = (
+            atmosphere
+            if isinstance(atmosphere, Atmosphere)
+            else Atmosphere.stated(float(atmosphere), ground_m=ground_m)
+        )
+    return SceneAir(air, middle_m, frame).over(aperture).wave_speed_m_s
+
+
+def _check_calibration(constant: float | None, inputs: PhaseHistory | Profiles) -> None:
+    if constant is None:
+        return
+    if not 0 < constant < np.inf:
+        raise CampaignError(
+            f"a constant of {constant!r}",
+            where="backproject: calibration",
+            expected="a positive number: |H|² of 1 m² at R_tx·R_rx = 1 m²",
+            remedy="Take that of Link.constant, or measure it on a reflector.",
+        )
+    if isinstance(inputs, Profiles):
+        raise CampaignError(
+            "range profiles, whose window over the subcarriers is not known",
+            where="backproject: calibration",
+            expected="a PhaseHistory, or a stage echo",
+            remedy="Leave the compression in range to backproject.",
+        )
+
+
+def _calibrated(
+    image: Any, formation: Formation, history: PhaseHistory, ground: Terrain, constant: float
+) -> dict[str, tuple[tuple[str, str], Any, dict[str, str]]]:
+    """Return lazy σ⁰ and radar cross-section of an image, as coordinates."""
+    from apertura.core.scene.visibility import surface
+
+    grid, level = formation.grid, isinstance(ground, FlatGround)
+    found = Calibration.of(
+        grid,
+        ground,
+        history.aperture,
+        formation.beams,
+        constant=constant,
+        cell_m2=cell_constant(history.frequency_hz, history.weight),
+        count=formation.count,
+    )
+
+    def sigma0(window: Window) -> NDArray[np.float64]:
+        return found.power(window, "sigma0", None if level else surface(grid, ground, window)[1])
+
+    def scaled(block: NDArray[np.complex64], per_one: Any, block_info: Any) -> NDArray[np.float32]:
+        rows, columns = (slice(*ends) for ends in block_info[0]["array-location"])
+        return np.asarray(np.abs(block) ** 2 / per_one((rows, columns)), np.float32)
+
+    meaning = {
+        "sigma0": {
+            "standard_name": CF_SIGMA0,
+            "units": "1",
+            "long_name": "radar cross-section of ground per area of ground, with noise",
+        },
+        "rcs": {"units": "m2", "long_name": "radar cross-section of a point at the pixel"},
+    }
+    return {
+        name: (
+            ("y", "x"),
+            image.map_blocks(scaled, per_one, dtype=np.float32, meta=np.empty((0, 0), np.float32)),
+            {**meaning[name], "grid_mapping": "spatial_ref"},
+        )
+        for name, per_one in (("sigma0", sigma0), ("rcs", found.rcs_power))
+    }
 
 
 def _certified(formation: Formation, accuracy_db: float, count: int) -> tuple[Formation, ErrorBound]:

@@ -1,5 +1,6 @@
 """Radiometry of an image: from the power of a pixel to the radar cross-section of a point, and to σ⁰ of ground."""
 
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Literal
@@ -106,6 +107,53 @@ def cell_constant(frequency_hz: Floats, weight: Floats) -> float:
     """
     spacing_hz = (frequency_hz[-1] - frequency_hz[0]) / (len(frequency_hz) - 1)
     return float(SPEED_OF_LIGHT_M_S**2 / spacing_hz * (weight**2 / frequency_hz).sum())
+
+
+Turn = tuple[Floats, tuple[bool, bool]]
+"""One error of attitude: rotation vector (3,), rad, and whether it turns the transmitting and the receiving antenna."""
+
+
+def pointing_std_db(beams: Beams | None, aperture: Aperture, place_m: Floats, turns: Sequence[Turn]) -> float:
+    """Return what errors of attitude do to the power of a point, by beams that look elsewhere than they are taken to.
+
+    Parameters
+    ----------
+    beams, aperture
+        Weights as they formed the image, and every pulse.
+    place_m
+        (3,) float64, metres, in the frame of the aperture.
+    turns
+        Independent errors, each of one standard deviation.
+
+    Returns
+    -------
+    float
+        Standard deviation, dB; 0 without antennas that have a beam, or where none sees the place.
+
+    Notes
+    -----
+    Source: docs/theory/radiometry.md, eq. 19.
+    """
+    some = aperture.sample(_PULSES)
+    antennas, place = beams and beams[some].antennas, place_m[None]
+    if beams is None or antennas is None:
+        return 0.0
+    aperture = aperture[some]
+    spread_m2 = np.prod([np.linalg.norm(place_m - leg, axis=-1) for leg in aperture.legs], axis=0)
+    weight = beams[some].weight(aperture, place)[:, 0] / spread_m2
+
+    def amplitude(vector: Floats, turned: tuple[bool, bool]) -> float:
+        both = zip((antennas.transmit, antennas.receive), turned, strict=True)
+        transmit, receive = (beam.turned(vector) if beam and on else beam for beam, on in both)
+        moved = Beams(transmit, receive)
+        return float((weight * moved.weight(aperture, place)[:, 0]).sum())
+
+    right = amplitude(np.zeros(3), (False, False))
+    seen = np.array([[amplitude(sign * vector, turned) for sign in (1, -1)] for vector, turned in turns])
+    if not (right > 0 and seen.size):
+        return 0.0
+    changes_db = 20 * np.log10(np.maximum(seen, _LEAST * right) / right)
+    return float(np.sqrt((changes_db**2).mean(axis=1).sum()))
 
 
 # ---- Calibration of an image, on a lattice

@@ -52,7 +52,7 @@ class Reflector:
 
     Notes
     -----
-    Source: docs/theory/radiometry.md, eqs. 9 to 12.
+    Source: docs/theory/radiometry.md, eqs. 11 to 14.
 
     Examples
     --------
@@ -132,7 +132,7 @@ class Reflector:
 
 
 def _trihedral(size_m: Sequence[float], tx: Floats, rx: Floats, k: float) -> tuple[Floats, Floats, float]:
-    """Return effective area, share of the amplitude beside the first antenna, and the power of an edge: eq. 9."""
+    """Return effective area, share of the amplitude beside the first antenna, and the power of an edge: eq. 11."""
     (leg_m,) = size_m
     first, second, third = np.sort(_unit(tx + rx) @ _SEAMS.T, axis=-1).T
     total = first + second + third
@@ -145,7 +145,7 @@ def _trihedral(size_m: Sequence[float], tx: Floats, rx: Floats, k: float) -> tup
 
 
 def _dihedral(size_m: Sequence[float], tx: Floats, rx: Floats, k: float) -> tuple[Floats, Floats, float]:
-    """Return as `_trihedral`, of a dihedral: eq. 10."""
+    """Return as `_trihedral`, of a dihedral: eq. 12."""
     across_m, along_m = size_m
     between = _unit(tx + rx)
     off = np.abs(np.arctan2(between[:, 1], between[:, 2]))
@@ -157,7 +157,7 @@ def _dihedral(size_m: Sequence[float], tx: Floats, rx: Floats, k: float) -> tupl
 
 
 def _sphere(radius_m: float, cosine: Floats, k: float) -> tuple[Floats, Floats]:
-    """Return the cross-section of a conducting sphere by Mie's series at cosines of the scattering angle: eq. 11.
+    """Return the cross-section of a conducting sphere by Mie's series at cosines of the scattering angle: eq. 13.
 
     The mean of both polarisations, which are the same only straight back: half of their difference is in the deviation.
     """
@@ -236,7 +236,7 @@ def together(value: Floats, scatter: Floats, common: Floats, reflectors: Sequenc
 
     Notes
     -----
-    Source: docs/theory/radiometry.md, eqs. 14 and 15.
+    Source: docs/theory/radiometry.md, eqs. 16 and 17.
 
     Examples
     --------

@@ -8,6 +8,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.common.flags import Flags
 from apertura.core.quality.path_errors import Effect, PointPaths
 
 ARITHMETIC_BELOW_DB = 10.0
@@ -24,6 +25,23 @@ RECEIVER_STD_M = {"fix": 0.01, "float": 0.3, "sbas": 1.0, "dgps": 0.5, "single":
 """Metres in each axis that positions of a receiver's class err where nobody states it: a fixed RTK solution within a
 centimetre or two, a float one by decimetres, without RTK by metres; a log that does not say is taken as fixed, as
 positions must be for a radar image."""
+
+ATTITUDE_STD_DEG = {"log": (1.0, 3.0), "course": (8.0, 10.0)}
+"""Degrees, of the vertical (roll and pitch, each) and of heading, that body axes err by where nobody states it: a small
+inertial unit holds the vertical to about 1°, a magnetometer beside motors north to a few. Axes by the course are those
+of a level body that flies straight ahead, but multirotors lean by 5° to 15°, and wind makes all of them crab."""
+
+LEVER_ARM_STD_M = 0.01
+"""Metres in each axis that a lever arm errs by where nobody states it: measured with a ruler, to a phase centre that
+lies somewhere in its antenna."""
+
+LEAST_FIELD = 0.1
+"""Of the strongest pulse: weaker ones do not decide what the phase of a pattern does to a point."""
+
+UNTOLD_ANTENNA_DB = 0.2
+"""dB that the phase of antenna patterns may cost without a flag: what images tell of a loss."""
+
+_FEWEST_PULSES = 3  # that a shift over ground and a rest can be told apart from
 
 _FIXED = frozenset({"fix", "unknown"})
 _SLOW_S = 100.0
@@ -175,6 +193,125 @@ def _known(node: NodePositions) -> Literal["stated", "assumed", "nothing"]:
 def _sizes(node: NodePositions) -> str:
     sizes = " ".join(f"{100 * std:.2g}" for std in node.std_m or ())
     return f"{sizes} cm east north up for {node.correlation_s:g} s"
+
+
+@dataclass(frozen=True, eq=False)
+class NodeAttitude:
+    """Lever arms of a node, and the errors of what turns them.
+
+    Attributes
+    ----------
+    axes
+        (pulse, 3, 3) float64; columns are the body's forward, right and down in the frame of the phase centres.
+    arms_m
+        Lever arms, metres forward, right, down: of its radar antenna that sends, the one that receives, and its
+        sidelink antenna, of which each may be zero.
+    source
+        Where attitude comes from, a key of `ATTITUDE_STD_DEG`.
+    std_deg
+        Stated standard deviations of the vertical (roll and pitch, each) and of heading, degrees; None: unstated.
+    correlation_s
+        How long an error of attitude lasts, seconds, as `autocorrelation`.
+    arm_std_m
+        Stated standard deviation of lever arms in each axis, metres; None: unstated.
+    """
+
+    axes: NDArray[np.float64]
+    arms_m: tuple[tuple[float, float, float], ...]
+    source: str
+    std_deg: tuple[float, float] | None
+    correlation_s: float
+    arm_std_m: float | None
+
+
+Growth = Sequence[NDArray[np.float64]]
+"""What path grows by per metre that the antennas of `NodeAttitude.arms_m` are elsewhere, (pulse, 3) each."""
+
+
+def attitude_lines(paths: PointPaths, nodes: Sequence[NodeAttitude | None], *, sidelink: bool) -> list[BudgetLine]:
+    """Return the effect of errors of attitude on the ends of lever arms, and of errors of the arms; none without arms.
+
+    Parameters
+    ----------
+    paths
+        Of a point in the middle of the scene.
+    nodes
+        One for a node that does both, or transmitter and receiver, at the pulses of `paths`; None without lever arms.
+    sidelink
+        As `PointPaths.by_node`.
+
+    Notes
+    -----
+    Source: docs/theory/focus.md, eqs. 4a and 4b.
+    """
+    same = len(nodes) == 1
+    tx, rx, tx_sidelink, rx_sidelink = paths.by_point(sidelink=sidelink and not same)
+    none = np.zeros_like(tx)
+    growths: tuple[Growth, ...] = ((tx, rx, none),) if same else ((tx, none, tx_sidelink), (none, rx, rx_sidelink))
+    armed = [(node, growth) for node, growth in zip(nodes, growths, strict=True) if node and np.any(node.arms_m)]
+    lines = []
+    for cause, name, error in (("attitude", "std_deg", _turned), ("lever arms", "arm_std_m", _other_arms)):
+        for stated in (True, False):
+            some = [error(paths, *one) for one in armed if (getattr(one[0], name) is not None) == stated]
+            if some:
+                said = "; ".join(words for words, _ in some)
+                effect = paths.of_noise(*(part for _, parts in some for part in parts))
+                lines.append(BudgetLine(cause, said if stated else None, effect, assumed=None if stated else said))
+    return lines
+
+
+_Errors = tuple[str, list[tuple[NDArray[np.float64], float]]]
+
+
+def _turned(paths: PointPaths, node: NodeAttitude, growth: Growth) -> _Errors:
+    """Return errors of attitude in words, and the errors of path by them: about east, north and up."""
+    tilt, heading = node.std_deg or ATTITUDE_STD_DEG[node.source]
+    torque = sum(np.cross(node.axes @ arm, grown) for arm, grown in zip(np.array(node.arms_m), growth, strict=True))
+    words = f"{tilt:g}° of roll and pitch, {heading:g}° of heading by the {node.source} for {node.correlation_s:g} s"
+    sizes = np.radians([tilt, tilt, heading]) * (torque @ paths.axes.T)
+    return words, [(size, node.correlation_s) for size in sizes.T]
+
+
+def _other_arms(_: PointPaths, node: NodeAttitude, growth: Growth) -> _Errors:
+    """Return errors of lever arms in words, and the errors of path by them: of each antenna, along each body axis."""
+    std_m = LEVER_ARM_STD_M if node.arm_std_m is None else node.arm_std_m
+    sizes = [std_m * np.einsum("pc,pcb->bp", grown, node.axes) for grown in growth if grown.any()]
+    return f"{100 * std_m:.2g} cm in each axis", [(size, np.inf) for antenna in sizes for size in antenna]
+
+
+def antenna_line(paths: PointPaths, phase_rad: NDArray[np.float64], weight: NDArray[np.float64]) -> BudgetLine:
+    """Return the effect of the phase of antenna patterns, which no image is corrected for.
+
+    Parameters
+    ----------
+    paths
+        Of a point in the middle of the scene.
+    phase_rad, weight
+        (pulse,) float64: of both antennas towards the point, and their field; pulses that see it by less than
+        `LEAST_FIELD` of the strongest do not count.
+
+    Notes
+    -----
+    Source: docs/theory/focus.md, eq. 4c.
+    """
+    seen = weight >= LEAST_FIELD * weight.max()
+    if weight.max() <= 0 or seen.sum() < _FEWEST_PULSES:
+        return BudgetLine("antenna", None, NO_EFFECT, "a pattern that sees the middle of the scene")
+    part = replace(paths, aperture=paths.aperture[np.flatnonzero(seen)], time_s=paths.time_s[seen])
+    phase, mean = phase_rad[seen], float(phase_rad[seen].mean())  # a constant turns the point and moves it nowhere
+    effect = replace(part.of_offset(paths.wavelength_m / (2 * np.pi) * (mean - phase)), phase_rad=abs(mean))
+    turn = float(np.ptp(phase))
+    return BudgetLine("antenna", f"weighed by the beams stated, whose phase turns by {turn:.2g} rad over them", effect)
+
+
+def antenna_flags(lines: Iterable[BudgetLine]) -> Flags:
+    """Return the flag `antenna_phase` where the phase of the patterns costs more than `UNTOLD_ANTENNA_DB`."""
+    flags = Flags()
+    for line in lines:
+        if line.cause == "antenna" and line.effect.loss_db < -UNTOLD_ANTENNA_DB:
+            lost, off = f"{-line.effect.loss_db:.1f} dB", f"{100 * line.effect.shift_m:.2g} cm"
+            flags["antenna_phase"] = f"a point loses {lost} and lies {off} off: {line.stated}"
+    return flags
 
 
 def offset_line(

@@ -7,7 +7,8 @@ from numpy.typing import NDArray
 
 from apertura.core.geometry.aperture import Aperture
 
-_MOST_PULSES = 200
+MOST_PULSES = 200
+"""Pulses of `PointPaths`, evenly spread: effects of errors that last longer than a few of them are those of all."""
 
 
 def autocorrelation(lag_s: NDArray[np.float64], correlation_s: float) -> NDArray[np.float64]:
@@ -108,7 +109,7 @@ class PointPaths:
         wavelength_m: float,
     ) -> "PointPaths":
         """Return the paths of a point at evenly spread pulses; parameters as the attributes, of all pulses."""
-        some = aperture.sample(_MOST_PULSES)
+        some = aperture.sample(MOST_PULSES)
         return cls(aperture[some], time_s[some], point_m, axes, wavelength_m)
 
     @property
@@ -135,17 +136,37 @@ class PointPaths:
         -----
         Source: docs/theory/focus.md, eq. 4.
         """
+        tx, rx, tx_sidelink, rx_sidelink = self.by_point(sidelink=sidelink and not same)
+        legs = (tx + rx,) if same else (tx + tx_sidelink, rx + rx_sidelink)
+        return tuple(leg @ self.axes.T for leg in legs)
+
+    def by_point(self, *, sidelink: bool) -> tuple[NDArray[np.float64], ...]:
+        """Return the growth of the measured path per metre that an antenna lies elsewhere than taken.
+
+        Parameters
+        ----------
+        sidelink
+            As of `by_node`, of two nodes.
+
+        Returns
+        -------
+        tuple of ndarray
+            (pulse, 3) float64 each, in the frame of the phase centres: radar antennas of transmitter and receiver,
+            their sidelink antennas.
+
+        Notes
+        -----
+        Source: docs/theory/focus.md, eq. 4.
+        """
         legs = []
         for leg in self.aperture.legs:
             offset_m = leg - self.point_m
             legs.append(offset_m / np.linalg.norm(offset_m, axis=1, keepdims=True))
-        if same:
-            return ((legs[0] + legs[1]) @ self.axes.T,)
+        along = np.zeros_like(legs[0])
         if sidelink:
             between = self.aperture.tx_m - self.aperture.rx_m
             along = between / np.maximum(np.linalg.norm(between, axis=1, keepdims=True), 1e-9)
-            legs = [legs[0] - along, legs[1] + along]
-        return tuple(leg @ self.axes.T for leg in legs)
+        return legs[0], legs[1], -along, along
 
     def of_offset(self, error_m: NDArray[np.float64], *, common: bool = False) -> Effect:
         """Return the effect of an error of the path.

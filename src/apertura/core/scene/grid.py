@@ -95,7 +95,8 @@ class SceneGrid:
     def coordinates(self) -> dict[str, Any]:
         """Coordinates y, x and spatial_ref of an xarray raster on this grid, as CF wants them."""
         step, _, west, _, _, north = self.transform
-        reference = {**grid_mapping(self.crs_wkt), "GeoTransform": f"{west} {step} 0 {north} 0 {-step}"}
+        reference = {"long_name": "coordinate reference system", **grid_mapping(self.crs_wkt)}
+        reference |= {"GeoTransform": f"{west} {step} 0 {north} 0 {-step}"}
         y, x = (axis_attributes(side, projected=self.crs != LOCAL) for side in "yx")
         return {"y": ("y", self.y_m, y), "x": ("x", self.x_m, x), "spatial_ref": ((), 0, reference)}
 

@@ -1,6 +1,6 @@
 """Visibility of the scene: incidence, bistatic angle, shadow and layover."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numba
 import numpy as np
@@ -218,6 +218,34 @@ def surface_normals(position: Floats) -> Floats:
     """
     normal = np.cross(np.gradient(position, axis=0), np.gradient(position, axis=1))
     return np.asarray(normal / np.linalg.norm(normal, axis=-1, keepdims=True))
+
+
+def surface(grid: SceneGrid, terrain: Terrain, window: Window) -> tuple[Floats, Floats]:
+    """Return positions and unit normals of the ground in a window; its neighbours count, so that tiles leave no seams.
+
+    Parameters
+    ----------
+    grid, terrain
+        The scene.
+    window
+        Rows and columns of the grid.
+
+    Returns
+    -------
+    tuple of ndarray
+        (row, column, 3) float64 each: metres in the grid's processing frame; normals upward.
+    """
+    around = [
+        np.arange(max(0, part.start - 1), max(2, min(size, part.stop + 1)))
+        for part, size in zip(window, grid.shape, strict=True)
+    ]
+    rows, columns = around
+    wider = replace(grid, first=(grid.first[0] + rows[0], grid.first[1] + columns[0]), shape=(rows.size, columns.size))
+    known = terrain.heights(grid[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1])
+    lacking = [(0, axis.size - size) for axis, size in zip(around, known.shape, strict=True)]
+    position = wider.positions(np.pad(known, lacking, mode="edge"))  # a grid of one row or column is continued level
+    inner = tuple(slice(part.start - axis[0], part.stop - axis[0]) for part, axis in zip(window, around, strict=True))
+    return position[inner], surface_normals(position)[inner]
 
 
 def incidence_deg(position: Floats, normal: Floats, antenna: Floats) -> Floats:

@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass, field, replace
 from math import isnan, log10
 from typing import TYPE_CHECKING, Any
 
+from apertura.common.contracts import CF_SIGMA0
 from apertura.common.provenance import canonical_json
 
 if TYPE_CHECKING:
@@ -69,9 +70,6 @@ _COEFFICIENTS = {
     "beta0": ("beta0, radar cross-section per area of the slant plane", "1 m2 per m2 of the slant plane"),
     "gamma0": ("gamma0, radar cross-section per area across the line of sight", "1 m2 per m2 across the bisector"),
 }
-
-CF_SIGMA0 = "surface_backwards_scattering_coefficient_of_radar_wave"
-"""Standard name of σ⁰ in CF (Standard Name Table); γ⁰ and β⁰ have none."""
 
 
 def of_coefficient(name: str, *, std_db: float | None, noise: str = "in it") -> dict[str, Any]:

@@ -37,11 +37,25 @@ def check_tracks(examined: Examination) -> Iterator[CampaignError]:
 
 
 def check_attitude(examined: Examination) -> Iterator[CampaignError]:
-    """Yield nodes whose attitude the config takes from a log that holds none, where an arm or a beam needs it."""
+    """Yield nodes whose log holds no attitude, or one in radians or anticlockwise, where an arm or a beam needs it.
+
+    Only a course through most directions is sure; else the echo is flagged.
+    """
+    from apertura.pipeline.opening.node_log import yaw_fault_of
+
     campaign = examined.campaign
     for (flight, node), log in examined.logs.items():
-        stated = campaign.settings.nodes[node].attitude == "log"
-        if stated and _turned(campaign, flight, node) and not log.has_attitude:
+        if campaign.settings.nodes[node].attitude != "log" or not _turned(campaign, flight, node):
+            continue
+        fault = yaw_fault_of(examined.tracks[flight, node]) if log.has_attitude else None
+        if fault is not None and fault.certain:
+            yield CampaignError(
+                fault.line,
+                where=campaign.track_file(flight, node),
+                expected="degrees, yaw clockwise from north",
+                remedy=f"Export the log with such angles, or set nodes.{node}.attitude to course.",
+            )
+        if not log.has_attitude:
             yield CampaignError(
                 "no roll, pitch and yaw",
                 where=campaign.track_file(flight, node),

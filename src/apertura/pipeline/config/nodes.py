@@ -80,7 +80,8 @@ class Antenna(Section):
     )
     pattern: str | None = Field(
         None,
-        description="instead of beamwidth_deg a CSV of both cuts: columns cut (azimuth, elevation), angle_deg, gain_db",
+        description="instead of beamwidth_deg a CSV of both cuts: columns cut (azimuth, elevation), angle_deg, "
+        "gain_db, and phase_deg where it is known",
     )
     cutoff_db: float = Field(
         -20.0, ge=-80, le=-3, description="gain below which a cut ends: pulses beyond are left out, dB under its peak"
@@ -217,9 +218,28 @@ class Node(Section):
         description="slow error of position over a flight, offset, slope and bow, standard deviation in each axis, m: "
         "what a refinement of tracks may correct beside what position_std_m allows",
     )
+    attitude_std_deg: StandardDeviation | tuple[StandardDeviation, StandardDeviation] | None = Field(
+        None,
+        description="error of attitude, standard deviation, deg: one number, or [roll and pitch, heading]; null: "
+        "nobody knows, and the budget takes that of a small inertial unit, or of the course",
+    )
+    attitude_correlation_s: float = Field(
+        100.0, gt=0, description="how long an error of attitude lasts, as position_correlation_s, s"
+    )
+    lever_arm_std_m: StandardDeviation | None = Field(
+        None,
+        description="error of lever_arms_m in each axis, standard deviation, m; null: nobody knows, and the budget "
+        "takes 1 cm",
+    )
     time_tag_std_s: float = Field(
         3e-3, ge=0, description="error that all time tags of a flight share, standard deviation, s"
     )
+
+    @property
+    def attitude_error_deg(self) -> tuple[float, float] | None:
+        """Value of `attitude_std_deg` for the vertical and for heading."""
+        stated = self.attitude_std_deg
+        return stated if stated is None or isinstance(stated, tuple) else (stated, stated)
 
     @property
     def poorest_fix(self) -> str:

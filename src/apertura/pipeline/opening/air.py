@@ -1,15 +1,14 @@
 """Air of a campaign, from its config and the heights of its ground and its antennas: one refractivity for each pair."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from apertura.core.geometry.aperture import Aperture
-from apertura.core.geometry.atmosphere import Atmosphere, FlightAir
-from apertura.core.geometry.geodesy import LOCAL, frame_from_map, geodetic_from_ecef, map_from_frame
+from apertura.core.geometry.atmosphere import Atmosphere, FlightAir, SceneAir
+from apertura.core.geometry.geodesy import LOCAL, frame_from_map, map_from_frame
 from apertura.core.imaging.range_profiles import aperture_of
 from apertura.core.scene.auto_grid import utm_crs
 from apertura.core.scene.grid import SceneGrid
@@ -21,43 +20,6 @@ GROUND_STEP_M = 10.0
 """To which the ground's height is rounded here: 0.4 N units, so that a height of focus does not form echoes anew."""
 
 _SIDE = 16  # of a grid on which the mean height of a DEM is taken
-
-
-@dataclass(frozen=True, eq=False)
-class SceneAir:
-    """Air over a campaign's scene.
-
-    Attributes
-    ----------
-    atmosphere
-        Its refractivity by height.
-    middle_m
-        (3,) float64, metres, in the frame of the antennas: a place in the middle of the scene.
-    frame
-        'ecef', where heights are those above the ellipsoid, or 'local', where they are z.
-    """
-
-    atmosphere: Atmosphere
-    middle_m: NDArray[np.float64]
-    frame: str
-
-    def over(self, aperture: Aperture) -> FlightAir:
-        """Return the one refractivity of a pair's paths to the scene."""
-        tx_m, rx_m = (self._heights(leg) for leg in aperture.legs)
-        ranges = tuple(np.linalg.norm(leg - self.middle_m, axis=1) for leg in aperture.legs)
-        return self.atmosphere.over(tx_m, rx_m, (ranges[0], ranges[1]))
-
-    def electrical_m(self, one_m: NDArray[np.float64], other_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the electrical length (pulse,) of straight paths between antennas (pulse, 3), metres: c times delay.
-
-        By the air at their own height: that between antennas that fly is thinner than that down to the scene.
-        """
-        length_m = np.linalg.norm(one_m - other_m, axis=1)
-        mean_n = self.atmosphere.mean_n(self._heights(one_m), self._heights(other_m))
-        return np.asarray(length_m * (1 + 1e-6 * mean_n))
-
-    def _heights(self, position_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        return position_m[:, 2] if self.frame == LOCAL else geodetic_from_ecef(position_m)[:, 2]
 
 
 def scene_air(campaign: Campaign, position_m: NDArray[np.float64]) -> SceneAir:

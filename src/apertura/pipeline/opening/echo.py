@@ -18,11 +18,12 @@ from apertura.core.echo.pulse_filter import truncation_flags
 from apertura.core.echo.sidelink import DIVIDING
 from apertura.core.echo.transfer import Transfer, transfer_by_code, transfer_by_sidelink
 from apertura.core.geometry.aperture import Aperture
+from apertura.core.geometry.atmosphere import SceneAir
 from apertura.core.quality.budget import strictest_accuracy_db
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import Processing, PulseWaveform
 from apertura.pipeline.opening.acquisition import Acquisition, common_pulses
-from apertura.pipeline.opening.air import SceneAir, stated_air
+from apertura.pipeline.opening.air import stated_air
 from apertura.pipeline.opening.positions import PulsePositions, keep_segments, place
 from apertura.pipeline.opening.transmitted import Transmitted
 
@@ -229,13 +230,10 @@ def _counted(sent: int, pulses: Association, positions: PulsePositions, measured
 
 
 def _axes(nodes: tuple[Acquisition, Acquisition], at: Times) -> dict[str, tuple[tuple[str, ...], NDArray[np.float64]]]:
-    """Return the body axes of the nodes whose antennas have a beam."""
-    beams = nodes[0].settings.antennas.radar_tx, nodes[1].settings.antennas.radar_rx
-    return {
-        name: (("pulse", "axis", "body"), node.body_axes(at))
-        for name, node, beam in zip(("tx_axes", "rx_axes"), nodes, beams, strict=True)
-        if beam is not None
-    }
+    """Return the body axes of the nodes whose attitude counts."""
+    tx, rx = nodes
+    turning = {"tx_axes": tx.turns("radar_tx") and tx, "rx_axes": rx.turns("radar_rx") and rx}
+    return {name: (("pulse", "axis", "body"), node.body_axes(at)) for name, node in turning.items() if node}
 
 
 def _sidelink_vector(nodes: tuple[Acquisition, Acquisition], at: Times) -> dict[str, tuple[tuple[str, ...], Any]]:

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from apertura.common.arrays import Times
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.core.geometry.geodesy import LOCAL, LOCAL_NED, ned_axes
 from apertura.core.geometry.phase_centres import attitude_axes, phase_centres, position_spline
-from apertura.core.geometry.track_checks import CheckedTrack, check_track
+from apertura.core.geometry.track_checks import CheckedTrack, YawFault, check_track, check_yaw
 from apertura.formats.tracks.track import FIXES
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import Node
@@ -53,6 +54,12 @@ class NodeLog:
             tolerated_m=self.shortest_wave_m / 16,
             longest_gap_s=self.settings.log.longest_gap_s or np.inf,
         )
+
+    @cached_property
+    def yaw_fault(self) -> YawFault | None:
+        """What its attitude contradicts the course by, where it is the log's and turns antennas."""
+        turns = self.settings.attitude == "log" and (self.settings.antennas.any() or self.settings.lever_arms_m.any())
+        return yaw_fault_of(self.track.isel(epoch=self.checked.kept)) if turns else None
 
     def log_seconds(self, at: Times) -> NDArray[np.float64]:
         """Return times as seconds since the log's first epoch, float64."""
@@ -97,6 +104,10 @@ class NodeLog:
             self.settings.attitude == "log" and bool(np.isfinite(logged).all())
         )
 
+    def turns(self, name: Literal["radar_tx", "radar_rx"]) -> bool:
+        """Return whether attitude counts where this antenna is used: it has a beam, or the node has a lever arm."""
+        return getattr(self.settings.antennas, name) is not None or self.settings.lever_arms_m.any()
+
     def body_axes(self, at: Times) -> NDArray[np.float64]:
         """Return forward, right, down of the body in the log's frame at given times, (time, axis, body) float64."""
         return attitude_axes(*self._sound, at=at, **self._from_log)
@@ -120,6 +131,13 @@ def raw_log(campaign: Campaign, flight: str, node: str, wave_m: float) -> NodeLo
     """Return where a node was by its log as it lies in raw/; `wave_m` is the shortest wavelength."""
     file = str(campaign.track_file(flight, node))
     return NodeLog(node, campaign.node(flight, node), read_log(campaign, flight, node), file, wave_m)
+
+
+def yaw_fault_of(track: xr.Dataset) -> YawFault | None:
+    """Return what the attitude of a track contradicts its course by."""
+    position = track.position.values
+    ned = LOCAL_NED if track.attrs["frame"] == LOCAL else ned_axes(position)
+    return check_yaw(position, track.attitude.values, ned)
 
 
 def shortest_wave(frequency_hz: NDArray[np.float64]) -> float:

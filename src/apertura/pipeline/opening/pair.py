@@ -13,7 +13,7 @@ from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
 from apertura.common.flags import Flags
 from apertura.common.provenance import sha256_file
-from apertura.core.antenna.beam import LIMITS_RAD, Beam, Beams, antenna_axes, gaussian_cut, sampled_cut
+from apertura.core.antenna.beam import LIMITS_RAD, Beam, Beams, antenna_axes, gaussian_cut, sampled_cut, sampled_phase
 from apertura.core.antenna.illumination import Illumination, illuminate
 from apertura.core.echo.association import missing_flags
 from apertura.core.echo.compression import window_weights
@@ -76,14 +76,18 @@ def _beam(antenna: Antenna, pattern: Path | None, axes: NDArray[np.float64]) -> 
         if pattern is None:
             raise TypeError("an antenna has a beamwidth or a pattern")
         sampled = read_beam_pattern(pattern)
-        cuts = tuple(sampled_cut(*samples, cutoff_db=antenna.cutoff_db) for samples in sampled)
+        cuts = tuple(sampled_cut(angle, gain, cutoff_db=antenna.cutoff_db) for angle, gain, _ in sampled)
+        phases = [
+            None if phase is None else sampled_phase(angle, phase, cut[0])
+            for (angle, _, phase), cut in zip(sampled, cuts, strict=True)
+        ]
     else:
         widths = zip(antenna.beamwidth_deg, LIMITS_RAD.values(), strict=True)
         azimuth, elevation = (
             gaussian_cut(width, cutoff_db=antenna.cutoff_db, limit_rad=limit) for width, limit in widths
         )
-        cuts = azimuth, elevation
-    return Beam(antenna_axes(axes, antenna.boresight_deg), *cuts[0], *cuts[1])
+        cuts, phases = (azimuth, elevation), [None, None]
+    return Beam(antenna_axes(axes, antenna.boresight_deg), *cuts[0], *cuts[1], *phases)
 
 
 def antennas_report(campaign: Campaign, pair: str, illumination: Illumination | None) -> dict[str, Any]:
@@ -217,9 +221,9 @@ def _placed_by_logs(campaign: Campaign, flight: str, nodes: tuple[str, str], his
     history = history.isel(pulse=placed.good)
     at = history.time.values
     offset_s = rx.settings.path_offset_m.radar / SPEED_OF_LIGHT_M_S
-    beams = {"tx_axes": (tx, tx.settings.antennas.radar_tx), "rx_axes": (rx, rx.settings.antennas.radar_rx)}
+    turning = {"tx_axes": tx.turns("radar_tx") and tx, "rx_axes": rx.turns("radar_rx") and rx}
     axes: dict[str, Any] = {
-        name: (("pulse", "axis", "body"), log.body_axes(at)) for name, (log, beam) in beams.items() if beam
+        name: (("pulse", "axis", "body"), log.body_axes(at)) for name, log in turning.items() if log
     }
     left_out = {**history.attrs.get("dropped", {}), **placed.reasons}
     counts: dict[str, Any] = {"used": len(at), "dropped": sum(left_out.values()), "reasons": left_out}
@@ -270,6 +274,8 @@ class OpenPair:
         The echo itself; None before it is formed.
     beams
         Of the antennas; None where they are isotropic.
+    axes
+        As of `beams_of`, of antennas whose attitude counts.
     sidelink_m
         (pulse, 3) float64, metres, from the receiver's sidelink point to the transmitter's; None where the echo was not
         given back a sidelink's length, and before it is formed.
@@ -294,6 +300,7 @@ class OpenPair:
     positions: tuple[NodePositions, ...]
     history: PhaseHistory | None = None
     beams: Beams | None = None
+    axes: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
     sidelink_m: NDArray[np.float64] | None = None
     left: Effect | None = None
     report: Mapping[str, Any] = field(default_factory=dict)
@@ -323,7 +330,7 @@ def open_pair(campaign: Campaign, flight: str, pair: str, *, echo: xr.Dataset | 
         echo = keep_segments(campaign, flight, pair, recorded_echo(campaign, flight, pair))
     history = phase_history_of(echo, campaign.settings.processing.window, lazy=True)
     limit_m = float(echo.path_limit.values.min())
-    beams = beams_of(campaign, pair, body_axes(echo))
+    axes = body_axes(echo)
     stated = echo.attrs.get("positions", {})
     return OpenPair(
         flight,
@@ -336,7 +343,8 @@ def open_pair(campaign: Campaign, flight: str, pair: str, *, echo: xr.Dataset | 
         began=echo.time.values[0],
         positions=tuple(_positions(stated.get(leg, {})) for leg in _legs(pair)),
         history=history,
-        beams=beams,
+        beams=beams_of(campaign, pair, axes),
+        axes=axes,
         sidelink_m=echo.sidelink_vector.values if "sidelink_vector" in echo else None,
         report=echo.attrs,
         wave_speed_m_s=history.wave_speed_m_s,
@@ -354,8 +362,8 @@ def _expected(campaign: Campaign, flight: str, pair: str, waveform: SampledWavef
     recorded = campaign.clock(flight, tx.name).utc(recorded)
     times = _pulse_times(recorded, first, last, waveform.prf_hz)
     times = times[inside_segments(campaign, flight, pair, times)]
-    beams = {"radar_tx": tx, "radar_rx": rx}
-    axes = {antenna: beams[antenna].body_axes(times) for antenna in campaign.antennas(pair)}
+    turning = {"radar_tx": tx.turns("radar_tx") and tx, "radar_rx": rx.turns("radar_rx") and rx}
+    axes = {antenna: log.body_axes(times) for antenna, log in turning.items() if log}
     offset = rx.settings.path_offset_m
     beyond_m = offset.radar
     if tx.name != rx.name:
@@ -377,6 +385,7 @@ def _expected(campaign: Campaign, flight: str, pair: str, waveform: SampledWavef
         began=times[0],
         positions=tuple(known.values()),
         beams=beams_of(campaign, pair, axes),
+        axes=axes,
         wave_speed_m_s=flown.wave_speed_m_s,
         air=flown.report,
     )

@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from rich.filesize import decimal
 
 from apertura.common.errors import CampaignError
@@ -17,12 +18,22 @@ from apertura.core.imaging.job import decide_integration, imaging_job
 from apertura.core.planning.decisions import decide_accuracy
 from apertura.core.planning.plan import Decision, Plan, memory_limit
 from apertura.core.planning.planner import make_plan
-from apertura.core.quality.budget import BudgetLine, noise_loss, offset_line, position_lines, summed
-from apertura.core.quality.path_errors import Effect, PointPaths
+from apertura.core.quality.budget import (
+    NO_EFFECT,
+    BudgetLine,
+    NodeAttitude,
+    antenna_line,
+    attitude_lines,
+    noise_loss,
+    offset_line,
+    position_lines,
+    summed,
+)
+from apertura.core.quality.path_errors import MOST_PULSES, Effect, PointPaths
 from apertura.core.scene.clearance import check_antennas
 from apertura.core.scene.terrain import GroundModels
 from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.config import CONFIG, SampledWaveform
+from apertura.pipeline.config import CONFIG, Node, SampledWaveform
 from apertura.pipeline.opening.pair import OpenPair, scene_illumination
 from apertura.pipeline.opening.scene import OpenScene
 from apertura.pipeline.store import manifest_of
@@ -50,6 +61,7 @@ def budget_of(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> list[Budg
     monostatic, sidelink = pair.monostatic, pair.report.get("sidelink", {})
     lines = [
         *_positions(campaign, pair, paths),
+        *_attitude(campaign, pair, paths),
         offset_line(
             paths, "heights", -paths.gradient[:, 2], campaign.settings.scene.height_std_m, unit="m", common=True
         ),
@@ -70,7 +82,7 @@ def budget_of(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> list[Budg
         ),
         _air(campaign, pair, paths),
         _sampling(pair.report.get("pulses", {})),
-        _antenna(pair),
+        _antenna(pair, paths),
     ]
     if not monostatic:
         total = paths.aperture.path(paths.point_m)
@@ -103,8 +115,36 @@ def paths_to_middle(pair: OpenPair, scene: OpenScene) -> PointPaths:
 def _positions(campaign: Campaign, pair: OpenPair, paths: PointPaths) -> list[BudgetLine]:
     if pair.left is not None:
         return [BudgetLine("positions", "what the refined tracks leave", pair.left)]
-    sidelink = not pair.monostatic and isinstance(campaign.settings.waveform, SampledWaveform)
-    return position_lines(paths, pair.positions, sidelink=sidelink)
+    return position_lines(paths, pair.positions, sidelink=_by_sidelink(campaign, pair))
+
+
+def _by_sidelink(campaign: Campaign, pair: OpenPair) -> bool:
+    """Return whether echoes are divided by a sidelink whose length comes from the logs."""
+    return not pair.monostatic and isinstance(campaign.settings.waveform, SampledWaveform)
+
+
+def _attitude(campaign: Campaign, pair: OpenPair, paths: PointPaths) -> list[BudgetLine]:
+    """Return what errors of attitude and of lever arms do; nothing where refined tracks have moved the antennas."""
+    if pair.left is not None or not pair.axes:
+        return []
+    some = pair.aperture.sample(MOST_PULSES)
+    legs = dict(zip(pair.name.split("-"), ("radar_tx", "radar_rx"), strict=True))
+    nodes = [_attitude_of(campaign.settings.nodes[name], pair.axes.get(point), some) for name, point in legs.items()]
+    return attitude_lines(paths, nodes, sidelink=_by_sidelink(campaign, pair))
+
+
+def _attitude_of(node: Node, axes: NDArray[np.float64] | None, some: slice) -> NodeAttitude | None:
+    arms = node.lever_arms_m
+    if axes is None or not arms.any():
+        return None
+    return NodeAttitude(
+        axes[some],
+        (arms.radar_tx, arms.radar_rx, arms.sidelink),
+        node.attitude,
+        node.attitude_error_deg,
+        node.attitude_correlation_s,
+        node.lever_arm_std_m,
+    )
 
 
 def _between_epochs(paths: PointPaths, pair: OpenPair) -> list[BudgetLine]:
@@ -135,7 +175,7 @@ def _air(campaign: Campaign, pair: OpenPair, paths: PointPaths) -> BudgetLine:
     per_n, said = 1e-6 * float(pair.air["std_n"]), f"{pair.air['source']}: N = {pair.air['refractivity_n']:.1f}"
     tx_m, rx_m = (np.linalg.norm(leg - paths.point_m, axis=1) for leg in paths.aperture.legs)
     known_m, further_m = np.zeros(len(tx_m)), rx_m - tx_m
-    if not pair.monostatic and isinstance(campaign.settings.waveform, SampledWaveform):
+    if _by_sidelink(campaign, pair):
         known_m = np.linalg.norm(paths.aperture.tx_m - paths.aperture.rx_m, axis=1)
     effect = paths.of_offset(per_n * (tx_m + rx_m - known_m), common=True)
     phase_rad = 2 * np.pi / paths.wavelength_m * per_n * float(np.abs(further_m - known_m).mean())
@@ -183,10 +223,15 @@ def _sampling(pulses: Mapping[str, Any]) -> BudgetLine:
     return BudgetLine("missing pulses", stated, Effect(0.0, 0.0, 0.0), "nothing known")
 
 
-def _antenna(pair: OpenPair) -> BudgetLine:
-    """Return the line of the antennas: beams stated weigh the pulses; one that is not shades the aperture."""
-    stated = None if pair.beams is None else "weighed by the beams stated"
-    return BudgetLine("antenna", stated, Effect(0.0, 0.0, 0.0), "a beam without a phase of its own")
+def _antenna(pair: OpenPair, paths: PointPaths) -> BudgetLine:
+    """Return the line of the antennas: beams weigh the pulses; what phase their patterns have is not taken out."""
+    if pair.beams is None:
+        return BudgetLine("antenna", None, NO_EFFECT, "a beam without a phase of its own")
+    some, point = pair.beams[pair.aperture.sample(MOST_PULSES)], paths.point_m[None]
+    phase = some.phase(paths.aperture, point)
+    if phase is None:
+        return BudgetLine("antenna", "weighed by the beams stated", NO_EFFECT)
+    return antenna_line(paths, phase[:, 0], some.weight(paths.aperture, point)[:, 0])
 
 
 def _sidelink(report: Mapping[str, Any], *, subcarriers: int) -> list[BudgetLine]:

@@ -189,6 +189,8 @@ def _flags(node: NodeLog, at: Times, barred: dict[str, NDArray[np.bool_]]) -> di
             f"{node.name}: times of the log are written so coarsely that positions err by "
             f"{checked.faults['track_times'][0][1]:.2f} m along the flight"
         )
+    if node.yaw_fault is not None:
+        lines["attitude_suspect"] = f"{node.name}: {node.yaw_fault.line}"
     return lines
 
 

@@ -11,9 +11,10 @@ from apertura.common.contracts import Window
 from apertura.common.flags import Flags
 from apertura.core.antenna.beam import Beams
 from apertura.core.echo.compression import centre_frequency
-from apertura.core.imaging.radiometry import Calibration, Link, cell_constant
+from apertura.core.imaging.radiometry import Calibration, Link, Turn, cell_constant, pointing_std_db
 from apertura.core.imaging.reflectors import DRIFT_SIGMAS
 from apertura.core.quality.bright_points import BrightPoint
+from apertura.core.quality.budget import ATTITUDE_STD_DEG
 from apertura.core.quality.measures import BlockRaster
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import Node, Receiver, SampledWaveform, radio_of
@@ -52,6 +53,8 @@ class CalibratedPair:
         Power that thermal noise alone would have in a profile; None where no noise figure is stated.
     noise_figure_db
         Stated; None: unknown.
+    pointing_std_db
+        What errors of attitude do to a point in the middle of the scene, by the beams.
     """
 
     calibrated_by: str
@@ -62,6 +65,7 @@ class CalibratedPair:
     beams: Beams | None
     thermal_noise: float | None
     noise_figure_db: float | None
+    pointing_std_db: float
 
     def points(self, found: list[BrightPoint], scene: OpenScene, pulse_noise: float) -> list[dict[str, Any]]:
         """Return the radar cross-sections of bright points, for radiometry.json.
@@ -203,7 +207,8 @@ def calibrated_pair(
     if figure_db is not None and link and sent:
         filtered = (opened.weight * np.abs(sent.inverse)) ** 2
         thermal = link.pulse_noise(figure_db, spacing_hz=sent.numerology.spacing_hz, squares=float(filtered.sum()))
-    return CalibratedPair(by, link, std_db, flags, calibration, beams, thermal, figure_db)
+    pointing_db = pointing_std_db(beams, opened.aperture, scene.middle_m, _turns(campaign, opened, scene))
+    return CalibratedPair(by, link, std_db, flags, calibration, beams, thermal, figure_db, pointing_db)
 
 
 def image_weights(campaign: Campaign, opened: OpenPair, scene: OpenScene) -> tuple[Beams | None, int]:
@@ -211,6 +216,20 @@ def image_weights(campaign: Campaign, opened: OpenPair, scene: OpenScene) -> tup
     integration = integration_of(campaign, opened, scene)
     count = integration.count if integration.sector else None
     return Beams.within(integration.sector, opened.beams), count or len(opened.aperture)
+
+
+def _turns(campaign: Campaign, opened: OpenPair, scene: OpenScene) -> list[Turn]:
+    """Return the errors of attitude of a pair's nodes about east, north and up, as stated or of their source."""
+    legs, turns = opened.name.split("-"), list[Turn]()
+    for name in dict.fromkeys(legs):
+        node = campaign.settings.nodes[name]
+        if node.attitude != "none":
+            tilt, heading = node.attitude_error_deg or ATTITUDE_STD_DEG[node.attitude]
+            of = legs[0] == name, legs[1] == name
+            turns += [
+                (np.radians(size) * axis, of) for size, axis in zip((tilt, tilt, heading), scene.axes, strict=True)
+            ]
+    return turns
 
 
 def _disagreement(found: PairConstant, stated: float, std_db: float | None) -> dict[str, str]:

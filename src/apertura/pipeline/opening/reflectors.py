@@ -263,7 +263,7 @@ class _View:
     def _response(
         self, pulses: Aperture, path_m: NDArray[np.float64], part: NDArray[np.float64], row: float, column: float
     ) -> complex:
-        """Return what a pixel shows of a target of 1 m² with these paths where K is 1: eq. 13."""
+        """Return what a pixel shows of a target of 1 m² with these paths where K is 1: eq. 15."""
         k = 2 * np.pi * centre_frequency(self.opened.frequency_hz) / self.opened.wave_speed_m_s
         turned = np.exp(-1j * k * (path_m - pulses.path(self._ground(row, column))))
         return complex((part * turned).sum())

@@ -229,7 +229,7 @@ def cube(campaign: Campaign) -> Path:
     grid, side = settled_scene(campaign).grid, campaign.settings.processing.tile_px
     folder, windows = campaign.stage("cube"), list(grid.tiles(side))
     with undamaged(folder, expected="images as this version forms them", remedy="Run the workflow again."):
-        described = _empty(images, assessed, grid, windows)
+        described = _empty(campaign.settings.campaign, images, assessed, grid, windows)
     with writing(folder) as wip:
         empty = stamped(
             described,
@@ -346,9 +346,13 @@ def _between_flights(
 
 
 def _empty(
-    images: Images, assessed: Mapping[str, Mapping[str, Any]], grid: SceneGrid, windows: Sequence[Window]
+    campaign: str,
+    images: Images,
+    assessed: Mapping[str, Mapping[str, Any]],
+    grid: SceneGrid,
+    windows: Sequence[Window],
 ) -> xr.Dataset:
-    """Return the cube without the values of its rasters and of measures on them."""
+    """Return the cube of a campaign of this name without the values of its rasters and of measures on them."""
     pairs = sorted({pair for _, pair in images})
     named = labels(images, assessed, pairs)
     sizes = {**named.sizes, "y": grid.shape[0], "x": grid.shape[1]}
@@ -358,6 +362,8 @@ def _empty(
     references = {flight: images[flight, one["reference"]] for flight, one in assessed.items()}
     return named.assign_coords(grid.coordinates).assign_attrs(
         Conventions="CF-1.11",
+        title=f"SAR images of campaign {campaign}",
+        history="rule cube of apertura: runspec, inputs and code_sha256 say of what and how",
         flights=[*assessed],
         pairs=pairs,
         fusion={flight: one["fusion"] for flight, one in assessed.items()},

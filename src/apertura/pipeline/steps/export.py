@@ -69,9 +69,11 @@ def _calibrated(campaign: Campaign, flight: str, pair: str, report: Mapping[str,
     said = open_listed(campaign.result(flight, pair, CROSS_SECTIONS), manifest)
     std_db = said["std_db"]
     stated = None if std_db is None else f"{std_db:.2g} dB"
-    line = BudgetLine("amplitude", stated, NO_EFFECT, "an error of power or gain")
+    lines = [BudgetLine("amplitude", stated, NO_EFFECT, "an error of power or gain")]
+    if said["pointing_std_db"]:
+        lines.insert(0, BudgetLine("pointing", f"{said['pointing_std_db']:.2g} dB by attitude", NO_EFFECT))
     flags = Flags.merged(report["flags"], said["flags"])
-    return {"cross_sections": said, "budget": [*report["budget"], line.report], "flags": flags}
+    return {"cross_sections": said, "budget": [*report["budget"], *(one.report for one in lines)], "flags": flags}
 
 
 def export_fused(campaign: Campaign, flight: str) -> list[Path]:

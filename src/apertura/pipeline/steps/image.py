@@ -18,7 +18,7 @@ from apertura.core.imaging.focus_check import focus_flags, focus_report
 from apertura.core.imaging.formation import Formation
 from apertura.core.imaging.range_profiles import profiles_of
 from apertura.core.imaging.view import view_report
-from apertura.core.quality.budget import expected
+from apertura.core.quality.budget import antenna_flags, expected
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.lineage import result_of
 from apertura.pipeline.opening.autofocus import RefinedTrack, open_refined
@@ -74,7 +74,9 @@ def image(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Pa
         spoilt = expected(lines)
         focus |= {"expected_db": round(spoilt.loss_db, 3), "expected_std_db": round(spoilt.loss_std_db, 3)}
         of_stages = echo.attrs["flags"], work.track.stage.attrs["flags"]
-        quality["flags"] = Flags.merged(*of_stages, plan.flags, quality["flags"], focus_flags(focus, spoilt))
+        quality["flags"] = Flags.merged(
+            *of_stages, plan.flags, quality["flags"], antenna_flags(lines), focus_flags(focus, spoilt)
+        )
         finish(wip, folder, lineage=lineage, quality=quality, flags=quality["flags"])
     return folder
 

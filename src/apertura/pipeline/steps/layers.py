@@ -24,8 +24,8 @@ from apertura.core.imaging.range_profiles import profiles_of
 from apertura.core.imaging.speckle import Multilook
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.looks import BLOCK_PX, Looks
-from apertura.core.scene.terrain import FlatGround, Terrain
-from apertura.core.scene.visibility import Relief, bistatic_angle_deg, incidence_deg, surface_normals, visibility
+from apertura.core.scene.terrain import FlatGround
+from apertura.core.scene.visibility import Relief, bistatic_angle_deg, incidence_deg, surface, visibility
 from apertura.formats.export import product, remove_outdated, write_exports
 from apertura.formats.export.layers import OUTSIDE
 from apertura.formats.export.radiometry import CROSS_SECTIONS, ECHO, of_coefficient, of_multilooked
@@ -177,7 +177,7 @@ class GroundPower:
         if self.calibrated is None:
             return np.ones([part.stop - part.start for part in window])
         scene, flat = self.scene, isinstance(self.scene.terrain, FlatGround)
-        normal = None if flat and self.quantity == "sigma0" else _surface(scene.grid, scene.terrain, window)[1]
+        normal = None if flat and self.quantity == "sigma0" else surface(scene.grid, scene.terrain, window)[1]
         power = self.calibrated.calibration.power(window, self.quantity, normal)
         if flat or self.mask is None:
             return power
@@ -225,6 +225,7 @@ def _report(scene: OpenScene, image: xr.Dataset, calibrated: CalibratedPair, noi
         "calibrated_by": calibrated.calibrated_by,
         "constant_db": round(10 * float(np.log10(constant)), 3),
         "std_db": calibrated.std_db,
+        "pointing_std_db": round(calibrated.pointing_std_db, 3),
         "flags": calibrated.flags,
         "link": calibrated.link and asdict(calibrated.link),
         "noise": {"pulse": noise if np.isfinite(noise) else None, **calibrated.noise_report(noise)},
@@ -240,7 +241,7 @@ def _rasters(
     level = isinstance(terrain, FlatGround)
 
     def incidence(window: Window) -> NDArray[np.float64]:
-        return _inside(looks, window, incidence_deg(*_surface(grid, terrain, window), looks.centre(window)[0]))
+        return _inside(looks, window, incidence_deg(*surface(grid, terrain, window), looks.centre(window)[0]))
 
     def bistatic_angle(window: Window) -> NDArray[np.float64]:
         angle_deg = bistatic_angle_deg(terrain.positions(grid[window]), *looks.centre(window))
@@ -248,7 +249,7 @@ def _rasters(
 
     def nesz(window: Window) -> NDArray[np.float64]:
         if calibrated is not None:
-            calibration, normal = calibrated.calibration, None if level else _surface(grid, terrain, window)[1]
+            calibration, normal = calibrated.calibration, None if level else surface(grid, terrain, window)[1]
             power = (noise or np.nan) * calibration.pixel_noise(window) / calibration.power(window, "sigma0", normal)
             return _inside(looks, window, 10 * np.log10(power))
         effective = looks.effective(window).astype(np.float64)
@@ -285,18 +286,3 @@ def _mask(scene: OpenScene, looks: Looks) -> Callable[[Window], NDArray[np.uint8
         return marked
 
     return mask
-
-
-def _surface(grid: SceneGrid, terrain: Terrain, window: Window) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return positions and normals of a window; its neighbours count, so that tiles leave no seams."""
-    around = [
-        np.arange(max(0, part.start - 1), max(2, min(size, part.stop + 1)))
-        for part, size in zip(window, grid.shape, strict=True)
-    ]
-    rows, columns = around
-    wider = replace(grid, first=(grid.first[0] + rows[0], grid.first[1] + columns[0]), shape=(rows.size, columns.size))
-    known = terrain.heights(grid[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1])
-    lacking = [(0, axis.size - size) for axis, size in zip(around, known.shape, strict=True)]
-    position = wider.positions(np.pad(known, lacking, mode="edge"))  # a grid of one row or column is continued level
-    inner = tuple(slice(part.start - axis[0], part.stop - axis[0]) for part, axis in zip(window, around, strict=True))
-    return position[inner], surface_normals(position)[inner]

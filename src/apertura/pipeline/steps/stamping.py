@@ -7,7 +7,7 @@ from typing import Any
 import xarray as xr
 
 from apertura import __version__
-from apertura.common.contracts import STAGES, check
+from apertura.common.contracts import STAGES, STANDARD_NAMES, check
 from apertura.common.provenance import Provenance, canonical_json, joined, lock_sha256, packages, software
 from apertura.pipeline.digests import Lineage
 
@@ -98,6 +98,8 @@ def stamp(
         if promise.unit:
             stamped[name].attrs["units"] = promise.unit
         stamped[name].attrs["long_name"] = promise.meaning
+        if name in STANDARD_NAMES:
+            stamped[name].attrs["standard_name"] = STANDARD_NAMES[name]
     stamped.attrs |= {
         "apertura_stage": stage,
         "apertura_version": __version__,

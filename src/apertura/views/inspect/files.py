@@ -82,7 +82,7 @@ def log_report(path: Path, beside: Surroundings) -> Report:
         "flight log",
         log_format(path, beside.options),
         _log_rows(facts, track),
-        tuple(_log_lacks(path, facts, beside)),
+        (*_log_lacks(path, facts, beside), *_attitude_lacks(track)),
         picture=lambda: draw_log(track, path.name),
     )
 
@@ -128,6 +128,13 @@ def _log_lacks(path: Path, log: LogFacts, beside: Surroundings) -> list[str]:
     if log.fixes is None and log.stated_std_m is None:
         lacks.append(f"how far it errs: the log does not say; state nodes.{NODE}.position_std_m")
     return lacks
+
+
+def _attitude_lacks(track: "xr.Dataset") -> list[str]:
+    from apertura.pipeline.opening.node_log import yaw_fault_of
+
+    fault = yaw_fault_of(track)
+    return [] if fault is None else [f"an attitude in degrees, yaw clockwise from north: {fault.line}"]
 
 
 def recording_report(files: Sequence[Path], beside: Surroundings) -> Report:
