@@ -16,9 +16,10 @@ struct BeamJob {
 
 // The sector that pixels are integrated over, docs/theory/integration.md (1), (3) and (4).
 struct SectorJob {
-  const double* axis[2];        // of transmitter and receiver, (3, padded)
-  double centre, inner, outer;  // of s; from `inner` to `outer` off the centre the weight falls from 1 to 0
-  const float* moved;           // (rows, columns): centre of each pixel's sector less `centre`; null: none is moved
+  const double* axis[2];               // of transmitter and receiver, (3, padded)
+  double centre, inner, outer;         // of s; from `inner` to `outer` off the centre the weight falls from 1 to 0
+  const double *end[2], *end_axis[2];  // (ends, 3): pulses between which all was flown, and their axes
+  int64_t ends;                        // 0: the sector of every pixel is about `centre`
 };
 
 // A tile of pixels to be formed from tables. Lengths in metres unless they say "cells".

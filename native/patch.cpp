@@ -105,13 +105,46 @@ void describe_block(Patch& patch, int64_t block, const double height[kPixels]) {
   }
 }
 
+// Least and largest s of (1) at a point, and by how much they differ at most within some metres of it.
+struct Flown {
+  double first, last, slack;
+};
+
+Flown flown_past(const SectorJob& sector, const double* at, double reach) {
+  Flown out = {2, -2, 0};
+  for (int64_t end = 0; end < sector.ends; end++) {
+    double place = 0, slack = 0;
+    for (int64_t leg = 0; leg < 2; leg++) {
+      const double *antenna = sector.end[leg] + 3 * end, *axis = sector.end_axis[leg] + 3 * end;
+      const double w[3] = {at[0] - antenna[0], at[1] - antenna[1], at[2] - antenna[2]};
+      const double distance = std::sqrt(dot(w, w));
+      place += dot(w, axis) / distance;
+      if (reach > 0) slack += std::sqrt(dot(axis, axis)) * (reach < distance ? 1.5708 * reach / distance : 2);
+    }
+    out.first = std::fmin(out.first, place), out.last = std::fmax(out.last, place);
+    out.slack = std::fmax(out.slack, slack);
+  }
+  return out;
+}
+
 // How the centres of a sector lie over a patch: integration.md, (4). A block that is not whole is taken as level.
-void describe_centres(const SectorJob& sector, int64_t stride, Patch& patch) {
+void describe_centres(const ApertureJob& job, Patch& patch) {
+  const SectorJob& sector = *job.sector;
+  const Flown about = flown_past(sector, patch.origin, (patch.block_reach + patch.pixel_reach) / job.cells_per_metre);
+  const bool passed = about.first + about.slack <= sector.centre - sector.outer &&
+                      about.last - about.slack >= sector.centre + sector.outer;
+  if (passed && !patch.irregular) return;
   int64_t count = 0;
   double sum = 0;
   for (int64_t slot = 0; slot < kPixels; slot++) {
     if (!holds(patch, slot)) continue;
-    patch.moved[slot] = sector.moved[(patch.row + pixel_row(slot)) * stride + patch.column + pixel_column(slot)];
+    const int64_t row = patch.row + pixel_row(slot), column = patch.column + pixel_column(slot);
+    const Flown own = flown_past(sector, job.pixels + 3 * (row * job.columns + column), 0);
+    const double middle = 0.5 * (own.first + own.last);
+    const double lowest = std::fmin(own.first + sector.outer, middle),
+                 highest = std::fmax(own.last - sector.outer, middle);
+    const double centre = std::fmin(std::fmax(sector.centre, lowest), highest);
+    patch.moved[slot] = std::isfinite(middle) ? float(centre - sector.centre) : 0;
     sum += patch.moved[slot], count++;
   }
   patch.moved_mean = float(sum / count);
@@ -170,7 +203,7 @@ void fit(const ApertureJob& job, int64_t row, int64_t column, double deviation_c
   patch.third = kThirdOrder * inner * inner * inner;
   patch.shared = kSharedCurvatureError * reach * inner * inner;
   patch.own = kOwnCurvatureError * reach * reach * inner * inner;
-  if (job.sector && job.sector->moved) describe_centres(*job.sector, job.columns, patch);
+  if (job.sector && job.sector->ends) describe_centres(job, patch);
   // A block without pixels stands where one with pixels is, so that it never decides about its group.
   for (int64_t block = 0; block < kBlocks; block++)
     if (!patch.present[block]) {

@@ -13,7 +13,6 @@ TAPER = 0.1
 _SAMPLES = 4096  # of the window, and 64 times as many of its response
 _TRIED = 256  # pulses among which those are looked for that end what was flown
 _END = 0.01  # of the half width: how well these know it
-_CORNERS = 64  # points of a tile whose mean is its middle
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,20 +130,6 @@ class Sector:
         middle = (first + last) / 2
         lowest, highest = np.minimum(first + self.outer, middle), np.maximum(last - self.outer, middle)
         return np.asarray(np.clip(self.centre, lowest, highest))
-
-    def moved(self, points_m: NDArray[np.float64]) -> NDArray[np.float32] | None:
-        """Return the centre of s of each point less `centre`, (...) float32; None where none is moved."""
-        if self.ends is None:
-            return None
-        aperture, there = self.ends
-        corners = points_m.reshape(-1, 3)
-        middle = np.nanmean(corners[:: max(1, len(corners) // _CORNERS)], axis=0)
-        radius = np.nanmax(np.linalg.norm(corners - middle, axis=-1), initial=0.0)
-        place, slack = there.place(aperture, middle[None]), there.slack(aperture, middle[None], radius)
-        if np.isfinite(radius) and (place + slack).min() <= -self.outer and (place - slack).max() >= self.outer:
-            return None
-        moved = (self.centre_at(points_m) - self.centre).astype(np.float32)
-        return moved if np.nan_to_num(moved).any() else None
 
     def axis_change(self, other: "Sector") -> NDArray[np.float64]:
         """Return the largest change of s by other axes, of a sector of as many pulses, (pulse,)."""

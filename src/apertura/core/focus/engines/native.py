@@ -147,7 +147,7 @@ def form(
     image = np.empty(pixels.shape[:2], np.complex64)
     tally = np.zeros(4, np.int64)
     padded = tables.first_path_m.size
-    antennas, sector, _kept = weights_of(beams, len(tables.cells), padded, pixels)
+    antennas, sector, _kept = weights_of(beams, len(tables.cells), padded)
     job = ApertureJob(
         *(array.ctypes.data for array in (tables.cells, tables.transmitter_m, tables.receiver_m, tables.first_path_m)),
         pixels.ctypes.data, image.ctypes.data, tally.ctypes.data,

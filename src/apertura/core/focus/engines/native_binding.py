@@ -117,7 +117,8 @@ class SectorJob(ctypes.Structure):
     _fields_ = [
         ("axis", _pointer * 2),
         *((name, _double) for name in ("centre", "inner", "outer")),
-        ("moved", _pointer),
+        *((name, _pointer * 2) for name in ("end", "end_axis")),
+        ("ends", _int64),
     ]
 
 
@@ -385,9 +386,7 @@ KeptArrays = list[NDArray[np.generic]]
 """Arrays that a struct points into, kept alive as long as the struct is used."""
 
 
-def weights_of(
-    beams: Beams | None, pulses: int, padded: int, pixels: NDArray[np.float64]
-) -> tuple[Any, Any, KeptArrays]:
+def weights_of(beams: Beams | None, pulses: int, padded: int) -> tuple[Any, Any, KeptArrays]:
     """Return the pointers `beam` and `sector` of an `ApertureJob`, and the arrays that they point into.
 
     Parameters
@@ -396,8 +395,6 @@ def weights_of(
         Over as many pulses.
     pulses, padded
         Of the tables, without and with those that fill a batch.
-    pixels
-        (row, column, 3) float64, metres: of the tile.
 
     Raises
     ------
@@ -413,7 +410,7 @@ def weights_of(
             kept += arrays
     if beams.sector is None:
         return pointers, None, kept
-    sector, arrays = _sector(beams.sector, pulses, padded, pixels)
+    sector, arrays = _sector(beams.sector, pulses, padded)
     return pointers, ctypes.pointer(sector), kept + arrays
 
 
@@ -435,7 +432,7 @@ def _beam(beam: Beam, pulses: int, padded: int) -> tuple[BeamJob, KeptArrays]:
     return job, [axes, *gains]
 
 
-def _sector(sector: Sector, pulses: int, padded: int, pixels: NDArray[np.float64]) -> tuple[SectorJob, KeptArrays]:
+def _sector(sector: Sector, pulses: int, padded: int) -> tuple[SectorJob, KeptArrays]:
     if len(sector.tx_axis) != pulses:
         raise ValueError(f"{len(sector.tx_axis)=}: must be one for each of {pulses} pulses")
     filling = [(0, padded - pulses), (0, 0)]
@@ -443,9 +440,8 @@ def _sector(sector: Sector, pulses: int, padded: int, pixels: NDArray[np.float64
         np.ascontiguousarray(np.pad(axis, filling, mode="edge").T, np.float64)
         for axis in (sector.tx_axis, sector.rx_axis)
     ]
-    pointers = (ctypes.c_void_p * 2)(*(axis.ctypes.data for axis in axes))
-    moved = sector.moved(pixels)
-    if moved is None:
-        return SectorJob(pointers, sector.centre, sector.inner, sector.outer, None), [*axes]
-    moved = np.ascontiguousarray(np.nan_to_num(moved))
-    return SectorJob(pointers, sector.centre, sector.inner, sector.outer, moved.ctypes.data), [*axes, moved]
+    at = [] if sector.ends is None else [*sector.ends[0].legs, sector.ends[1].tx_axis, sector.ends[1].rx_axis]
+    kept: KeptArrays = [*axes, *(np.ascontiguousarray(array, np.float64) for array in at)]
+    pair, pointers = ctypes.c_void_p * 2, [one.ctypes.data for one in kept]
+    fields = pair(*pointers[:2]), sector.centre, sector.inner, sector.outer, pair(*pointers[2:4]), pair(*pointers[4:])
+    return SectorJob(*fields, len(at[0]) if at else 0), kept
