@@ -257,6 +257,10 @@ _OF_IMAGES = {
         "formed with it corrected",
         "the constant named: lever_arms_m or attitude, config/clocks.tsv, scene.height_m",
         "methods/autofocus/causes.py"),
+    "paths_differ": Flag(
+        "cm of path, and standard deviation",
+        "from the refined tracks, pairs show the same points a constant path apart, more than errors of the logs leave",
+        "nodes.<n>.path_offset_m of the pair's receiver, lever arms", "methods/autofocus/refine.py"),
     "prior_inconsistent": Flag(
         "how large the motions are against the errors stated",
         "motions that the images settle are much larger or smaller than the errors that logs or config state",

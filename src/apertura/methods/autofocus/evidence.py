@@ -227,9 +227,10 @@ class Evidence:
         low, high = chi2.ppf([_BY_CHANCE, 1 - _BY_CHANCE], count) / count
         if low / _SLACK < power < high * _SLACK:
             return ""
+        verdict = "is stated too large" if power < 1 else "is stated too small, or something else is wrong"
         return (
             f"the {count} motions that the image settles are {np.sqrt(power):.2f} times as large as the logs' errors "
-            "allow"
+            f"allow: what they err by {verdict}"
         )
 
     @property

@@ -1,7 +1,8 @@
 """Patches of the scene about bright places: which places may be points, and the pixels about each."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -328,10 +329,10 @@ def bright_places(
     power = np.zeros((len(rows), len(columns)))
     for one in records:
         image = np.zeros_like(power)
-        for part in _parts(len(rows), len(columns)):
-            row, column = np.meshgrid(rows[part[0]], columns[part[1]], indexing="ij")
-            places = terrain.positions_at(grid, row, column)
-            image[part] = sum(np.abs(look).astype(np.float64) ** 2 for look in _looks(one, places, looks))
+        for form in _looks(one, looks):
+            for part in _parts(len(rows), len(columns)):
+                row, column = np.meshgrid(rows[part[0]], columns[part[1]], indexing="ij")
+                image[part] += np.abs(form(terrain.positions_at(grid, row, column))).astype(np.float64) ** 2
         power += image / max(float(np.nanmean(image)), 1e-300)
     power = np.nan_to_num(power)
     reach = max(3, round(_ABOUT_CELLS * cell_m / (step * grid.spacing_m)))
@@ -360,8 +361,11 @@ def _parts(rows: int, columns: int) -> Iterator[tuple[slice, slice]]:
             yield slice(row, row + _SIDE_PX), slice(column, column + _SIDE_PX)
 
 
-def _looks(one: PairRecord, places: Floats, looks: int) -> Iterator[NDArray[np.complex64]]:
-    """Yield the image of each part of the aperture: parts of equal length, half of each in the next, Hann weights."""
+def _looks(one: PairRecord, looks: int) -> Iterator[Callable[[Floats], NDArray[np.complex64]]]:
+    """Yield what forms the image of each part of the aperture: of equal length, half of each in the next, Hann weights.
+
+    Tables are made once for each part, and serve all places.
+    """
     engine = load_engine("native")
     if not engine.available():
         engine = load_engine("numba")
@@ -371,4 +375,4 @@ def _looks(one: PairRecord, places: Floats, looks: int) -> Iterator[NDArray[np.c
         part = one.profiles[pulses]
         taper = np.hanning(last - first + 2)[1:-1, None].astype(np.float32)
         part = replace(part, samples=np.asarray(part.samples) * taper)
-        yield engine.form(engine.prepare(part), places, beams=None if one.beams is None else one.beams[pulses])
+        yield partial(engine.form, engine.prepare(part), beams=one.beams and one.beams[pulses])

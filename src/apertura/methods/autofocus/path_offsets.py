@@ -12,7 +12,7 @@ from apertura.core.focus.contributions import block_contributions
 from apertura.core.geometry.phase_centres import TrackCorrection
 from apertura.core.quality.budget import NodePositions, position_lines
 from apertura.core.quality.path_errors import Effect, PointPaths
-from apertura.methods.autofocus.evidence import FOLDS, MOST_RATIO, gains_db, mean_gain
+from apertura.methods.autofocus.evidence import FOLDS, LEAST_GAIN_DB, MOST_RATIO, gains_db, mean_gain
 from apertura.methods.autofocus.inputs import PairRecord, Refinement, TrackErrors
 from apertura.methods.autofocus.objective import PatchImage
 from apertura.methods.autofocus.one_phase import METHODS, Patches
@@ -72,9 +72,8 @@ def refine_one_phase(
         "gain_std_db": round(gain.std_db, 3),
         **_left(fits, [_of_logs(record, found, errors) for record in records]),
     }
-    return Refinement(
-        correction, std_m, gain.certain, why, report, {} if gain.certain else {"refinement_rejected": why}
-    )
+    promising = not gain.certain and abs(gain.mean_db) > LEAST_GAIN_DB  # else the logs are as good
+    return Refinement(correction, std_m, gain.certain, why, report, {"refinement_rejected": why} if promising else {})
 
 
 @dataclass(frozen=True, eq=False)

@@ -39,6 +39,7 @@ from apertura.methods.autofocus.solve import (
     Problem,
     State,
     effects,
+    effects_of_paths,
     find_gauge,
     prominent_point_start,
     unslipped_start,
@@ -57,11 +58,15 @@ _ROUNDS = 3  # of least squares in the gauge, linearised anew
 
 @dataclass(frozen=True, eq=False)
 class _MeasuredPlace:
-    """A point's place in a pair's image, east and north (m), its deviation, and its shift by the gauge's modes."""
+    """A point's place in a pair's image, east and north (m), its deviation, and its shift.
+
+    By the gauge's modes (2, mode), and per metre by which all paths are longer (2, 1).
+    """
 
     place_m: Floats
     std_m: float
     shift_m: Floats
+    longer: Floats
 
 
 def fix_gauge(
@@ -87,18 +92,45 @@ def fix_gauge(
         return unknowns, {}
     known = [_patch_of(problem, point, axes) for point in points]
     echoes = [blocks.echoes(known) if known else [] for blocks in problem.pairs]
-    step: Floats = np.zeros(len(problem.gauge.modes))
+    modes = len(problem.gauge.modes)
+    step: Floats = np.zeros(modes + len(problem.pairs) - 1)
     report: dict[str, Any] = {}
     for number in range(_ROUNDS):
-        tracks = problem.prior.tracks(unknowns + step @ problem.gauge.modes)
+        tracks = problem.prior.tracks(unknowns + step[:modes] @ problem.gauge.modes)
         matrix, residuals = _pair_residuals(problem, tracks, axes)
         rows, errors_sigma, measured = _reference_residuals(problem, points, echoes, tracks, axes)
         if not number:
             report = {"pairs_apart_sigma": _apart(residuals)} | ({"reference_points": measured} if points else {})
         matrix, residuals = np.concatenate([matrix, rows]), np.concatenate([residuals, errors_sigma])
         normal = matrix.T @ matrix + np.eye(len(step))
-        step = np.asarray(np.linalg.solve(normal, matrix.T @ (matrix @ step - residuals)), np.float64)
-    return unknowns + step @ problem.gauge.modes, report
+        # Lengths of paths are no part of the tracks: what they explain stays in the residual of the tracks moved.
+        apart = matrix[:, :modes] @ step[:modes] - residuals
+        step = np.asarray(np.linalg.solve(normal, matrix.T @ apart), np.float64)
+    std = np.sqrt(np.diag(np.linalg.inv(normal)))
+    report["paths_longer_m"] = {
+        blocks.record.pair: [round(float(PATH_STD_M * one[modes + number]), 4) for one in (step, std)]
+        for number, blocks in enumerate(problem.pairs[1:])
+    }
+    return unknowns + step[:modes] @ problem.gauge.modes, report
+
+
+def path_std_m(problem: Problem) -> dict[str, float]:
+    """Return by how much the mean path of each pair but the first may differ from the first's by errors of the logs.
+
+    Standard deviations at the first patch, metres, over draws from the prior.
+    """
+    draws = problem.prior.tracks(np.random.default_rng(0).standard_normal((_DRAWS, problem.prior.size)))
+    paths = []
+    for blocks, echoes in zip(problem.pairs, problem.echoes, strict=True):
+        moved = blocks.moves(problem.prior.tracks(np.zeros(problem.prior.size)))
+        patch = blocks.contribution(echoes[0], moved)
+        averaged = {node: blocks.average_of(draws[node])[:, patch.blocks] for node in patch.slopes}
+        path = sum(np.einsum("bi,mbi->m", slope, averaged[node]) for node, slope in patch.slopes.items())
+        paths.append(np.asarray(path) / max(1, patch.values.shape[1]))
+    return {
+        blocks.record.pair: float((path - paths[0]).std())
+        for blocks, path in zip(problem.pairs[1:], paths[1:], strict=True)
+    }
 
 
 def pair_disagreement(problem: Problem, tracks: Tracks, axes: Floats) -> tuple[float, float]:
@@ -116,8 +148,11 @@ def pair_disagreement(problem: Problem, tracks: Tracks, axes: Floats) -> tuple[f
 
 
 def _pair_residuals(problem: Problem, tracks: Tracks, axes: Floats) -> tuple[Floats, Floats]:
-    """Return rows and misses, in standard deviations, of each pair's points against those of the first."""
-    rows, residuals = [np.zeros((0, len(problem.gauge.modes)))], [np.zeros(0)]
+    """Return rows and misses, in standard deviations, of each pair's points against those of the first.
+
+    Rows have a column for each mode of the gauge, and one for the paths of each pair but the first.
+    """
+    rows, residuals = [np.zeros((0, len(problem.gauge.modes) + len(problem.pairs) - 1))], [np.zeros(0)]
     modes = problem.prior.tracks(problem.gauge.modes)
     for number in range(len(problem.patches)):
         statistics = [
@@ -125,10 +160,10 @@ def _pair_residuals(problem: Problem, tracks: Tracks, axes: Floats) -> tuple[Flo
             for blocks, echoes in zip(problem.pairs, problem.echoes, strict=True)
         ]
         first = statistics[0]
-        for other in statistics[1:]:
+        for at, other in enumerate(statistics[1:], 1):
             if first is not None and other is not None:
                 std_m = float(np.hypot(first.std_m, other.std_m))
-                rows.append((other.shift_m - first.shift_m) / std_m)
+                rows.append(np.hstack([other.shift_m - first.shift_m, _of_pair(other, at, problem)]) / std_m)
                 residuals.append((other.place_m - first.place_m) / std_m)
     return np.concatenate(rows), np.concatenate(residuals)
 
@@ -141,18 +176,26 @@ def _reference_residuals(
     axes: Floats,
 ) -> tuple[Floats, Floats, list[dict[str, Any]]]:
     """Return design rows and residuals of reference points, and their position errors as JSON values."""
-    rows, residuals, report = [np.zeros((0, len(problem.gauge.modes)))], [np.zeros(0)], []
+    rows, residuals, report = [np.zeros((0, len(problem.gauge.modes) + len(problem.pairs) - 1))], [np.zeros(0)], []
     modes = problem.prior.tracks(problem.gauge.modes)
-    for blocks, of_pair in zip(problem.pairs, echoes, strict=True):
+    for at, (blocks, of_pair) in enumerate(zip(problem.pairs, echoes, strict=True)):
         for point, echo in zip(points, of_pair, strict=True):
             statistics = _measured_place(blocks, echo, tracks, modes, axes)
             if statistics is not None:
                 apart_m = statistics.place_m - axes[:2] @ np.array(point.place_m)
-                rows.append(statistics.shift_m / point.std_m)
+                rows.append(np.hstack([statistics.shift_m, _of_pair(statistics, at, problem)]) / point.std_m)
                 residuals.append(apart_m / point.std_m)
                 rounded = [round(float(one), 4) for one in apart_m]
                 report.append({"name": point.name, "pair": blocks.record.pair, "apart_m": rounded})
     return np.concatenate(rows), np.concatenate(residuals), report
+
+
+def _of_pair(place: _MeasuredPlace, number: int, problem: Problem) -> Floats:
+    """Return the shift of a place per deviation of the paths of each pair but the first, (2, pair)."""
+    columns = np.zeros((2, len(problem.pairs) - 1))
+    if number:
+        columns[:, number - 1] = PATH_STD_M * place.longer[:, 0]
+    return columns
 
 
 def _measured_place(
@@ -167,6 +210,7 @@ def _measured_place(
         return None
     modes_of = {node: blocks.average_of(modes[node]) for node in moved}
     _, shift_m = effects(patch, modes_of, axes)
+    _, longer = effects_of_paths(patch, np.ones((patch.values.shape[1], 1)), axes)
     place, reach_m = echo.patch.pixels_m[int(np.abs(image).argmax())], _cell_m(echo) / 4
     for _ in range(_ZOOMS):
         side = np.linspace(-reach_m, reach_m, _SIDE)
@@ -176,7 +220,7 @@ def _measured_place(
         place = pixels[int(np.abs(blocks.contribution(near, moved).values.sum(axis=1)).argmax())]
         reach_m *= 2 / (_SIDE - 1)
     std_m = float(np.hypot(_LEAST_STD_M, _cell_m(echo) / (np.pi * np.sqrt(ratio))))
-    return _MeasuredPlace(axes[:2] @ place, std_m, shift_m)
+    return _MeasuredPlace(axes[:2] @ place, std_m, shift_m, longer)
 
 
 def _patch_of(problem: Problem, point: ReferencePoint, axes: Floats) -> Patch:
@@ -204,6 +248,15 @@ def _apart(residuals: Floats) -> float:
 
 # ---- Refinement of a flight's tracks --------------------------------------------------------------------------------
 
+
+PATH_STD_M = 0.1
+"""Metres of path by which one pair may differ from another for other reasons than tracks: offsets wrong by fractions of
+a wavelength must not bend tracks, and of ties between pairs along range little is lost."""
+
+PATH_SIGMAS = 3.0
+"""Standard deviations beyond which a difference of paths between pairs is none of the tracks."""
+
+_DRAWS = 200  # of the prior, from which the deviation of a mean path is taken
 
 _KNOTS_PER_CORRELATION_TIME = 10  # of corrections, by the shortest correlation time of an error
 _LEAST_KNOTS = 64  # of a flight
@@ -290,9 +343,17 @@ class _Model:
         left = remaining(search.problem, state)
         unknowns, ties = search.fix_gauge(state, points, apart_sigma=evidence.apart_sigma)
         found = {"patches": len(search.problem.patches), "rounds": self.best.number}
-        report = {**evidence.report, **left.report, **ties, **found}
+        turn = 2 * np.pi / search.wavelength_m
+        phases = {pair: round(turn * std_m, 4) for pair, std_m in path_std_m(search.problem).items()}
+        report = {**evidence.report, **left.report, **ties, **found, "pair_phase_std_rad": phases}
         correction = search.problem.correction(unknowns)
-        return Refinement(correction, left.std_m, evidence.accepted, evidence.why, report, evidence.flags)
+        flags = dict(evidence.flags)
+        longer = ties.get("paths_longer_m", {}) if evidence.accepted else {}
+        apart = [one for one, (longer_m, std_m) in longer.items() if abs(longer_m) > PATH_SIGMAS * std_m]
+        if apart:
+            lines = (f"{one} by {100 * longer[one][0]:+.1f} ± {100 * longer[one][1]:.1f} cm" for one in apart)
+            flags["paths_differ"] = f"against {search.problem.pairs[0].record.pair}: {', '.join(lines)}"
+        return Refinement(correction, left.std_m, evidence.accepted, evidence.why, report, flags)
 
     def evidence_against(self, plain: "_Model", cause: Explained) -> float:
         """Return by how much the objective of the logs' errors alone lies above that of these beside a cause.
@@ -407,7 +468,8 @@ class TrackSearch:
     def rounds(self, grid: SceneGrid, terrain: Terrain, errors: Mapping[str, TrackErrors]) -> Round:
         """Return the last round that was worth it."""
         best = self.solve()
-        while best.number < MOST_ROUNDS:
+        # Tracks that sharpen nothing leave the image as it is: looking for places in it again would find the same ones.
+        while best.number < MOST_ROUNDS and mean_gain(best.evidence.fitted_db).mean_db >= LEAST_FURTHER_DB:
             search = best.search.again(best.state, grid, terrain, errors)
             if search is None:
                 break

@@ -154,7 +154,15 @@ def effects(patch: Contribution, moved: Mapping[str, Floats], axes: Floats) -> t
     Source: docs/theory/autofocus.md, eq. 13: a constant phase does not blur, but over the band the path itself must be
     what a shift explains.
     """
-    path = sum(np.einsum("bi,mbi->bm", slope, moved[node][:, patch.blocks]) for node, slope in patch.slopes.items())
+    return effects_of_paths(
+        patch,
+        sum(np.einsum("bi,mbi->bm", slope, moved[node][:, patch.blocks]) for node, slope in patch.slopes.items()),
+        axes,
+    )
+
+
+def effects_of_paths(patch: Contribution, path: Floats, axes: Floats) -> tuple[Floats, Floats]:
+    """Return as `effects`, of paths that are longer by (block, mode) metres."""
     ground = np.asarray(sum(patch.slopes.values())) @ axes[:2].T
     weight = np.linalg.norm(patch.values, axis=0).astype(np.float64)
     weight = (weight / max(weight.sum(), 1e-300))[:, None]

@@ -129,13 +129,13 @@ def position_error(track: xr.Dataset, settings: Node, at: Times) -> dict[str, An
     Returns
     -------
     dict
-        std_m: [north, east, up], metres, the median over the pulses of what the log states, else the config's, else
+        std_m: [north, east, up], metres, of the config, else the median over the pulses of what the log states, else
         None; stated_by: log, config or nobody; correlation_s: how long an error lasts, seconds; drift_m: of
         a slow error; receiver: the kind of solution that most of these epochs have, a key of `RECEIVER_STD_M`.
     """
     epochs = np.searchsorted(track.time.values, at).clip(0, track.sizes["epoch"] - 1)
     receiver = {"receiver": _kind_of_solution(track.fix.values[epochs]) if "fix" in track else "unknown"}
-    if "position_std" in track:
+    if settings.position_std_m is None and "position_std" in track:
         stated = track.position_std.values[epochs]
         stated = stated[(stated > 0).all(axis=1)]
         if len(stated):

@@ -249,6 +249,9 @@ _LOOKS_WRONG = frozenset({"defocused", "echo_elsewhere", "pairs_apart", _PHASE, 
 
 _TIED = "as many pairs say the opposite, and their images do not show which is wrong"
 
+_EXPLAINED_SIGMAS = 3.0
+"""Standard deviations of the phase that errors of the logs make between pairs, beyond which it has another cause."""
+
 _VISIBLE_SNR_DB = 20.0
 """A bright point this far above the noise should show in every image of the scene."""
 
@@ -268,12 +271,14 @@ def assess(campaign: Campaign, flight: str) -> Path:
         if between.get((one, two), between.get((two, one))) is None and _hides(shown[one], shown[two], grid)
     }
     rank = {pair: _rank(one["focus"]) for pair, one in quality.items()}
-    refined = open_refined(campaign, flight).correction is not None
+    track = open_refined(campaign, flight)
+    refined = track.correction is not None
     as_formed = choose_fusion(rank, between, hidden=hidden, align=False)
     # A path that is constant for a pair is invisible to the refinement of tracks: its phase is removed here.
     align = refined or campaign.settings.processing.fusion.align_phase
     fusion = choose_fusion(rank, between, hidden=hidden, align=True) if align else as_formed
-    flags = _flags(pairs, as_formed, hidden, taken_off={_PHASE} if refined else set())
+    explained_rad = track.stage.attrs["report"].get("pair_phase_std_rad", {}) if refined else None
+    flags = _flags(pairs, as_formed, hidden, explained_rad=explained_rad)
     for pair, name, line in wrong_codes({pair: one.get("code", {}) for pair, one in quality.items()}):
         flags[pair][name] = line
     reference = fusion.reference
@@ -307,13 +312,18 @@ def _hides(first: ComparedImage, second: ComparedImage, grid: SceneGrid) -> bool
 
 
 def _flags(
-    pairs: Sequence[str], chosen: CoherentSum, hidden: Collection[tuple[str, str]], *, taken_off: Collection[str]
+    pairs: Sequence[str],
+    chosen: CoherentSum,
+    hidden: Collection[tuple[str, str]],
+    *,
+    explained_rad: Mapping[str, float] | None,
 ) -> dict[str, Flags]:
     """Return pair → flags of disagreement.
 
     Where most pairs agree, the others carry them; where as many say the opposite, as of two pairs that differ, their
-    images do not show which is wrong, and both sides do. Flags in `taken_off`, as the phase of refined tracks, are
-    corrected before pairs are added and not raised.
+    images do not show which is wrong, and both sides do. The phase of refined tracks is corrected before pairs are
+    added, and raised only where errors of the logs do not explain it: by `explained_rad`, pair → standard deviation
+    against the first pair; None: tracks are those of the logs.
     """
     flags = {pair: Flags() for pair in pairs}
     for pair in pairs:
@@ -325,9 +335,22 @@ def _flags(
         tied = {one for tie in chosen.ties for one in tie if pair in tie} or (len(chosen.agreeing) == 1 and blind)
         opposite = f"; {_TIED}" if tied else ""
         for side in (pair, *(chosen.agreeing if tied else ())):
-            lines = {name: line + opposite for name, line in raised.items() if name not in taken_off}
+            if explained_rad is not None and _explained(chosen, pair, explained_rad):
+                raised.pop(_PHASE, None)
+            lines = {name: line + opposite for name, line in raised.items()}
             flags[side] = Flags.merged(flags[side], lines)
     return flags
+
+
+def _explained(chosen: CoherentSum, pair: str, std_rad: Mapping[str, float]) -> bool:
+    """Return whether errors of the logs may turn a pair against the reference by the phase measured."""
+    one = chosen.apart.get(pair)
+    if one is None or not std_rad:  # one phase per pulse and pair takes any constant
+        return True
+    if one.incoherent:
+        return False
+    std = np.sqrt(sum(std_rad.get(of, 0.0) ** 2 for of in (pair, chosen.reference)) + one.phase_std_rad**2)
+    return abs(float(one.phase_rad)) <= _EXPLAINED_SIGMAS * float(std)
 
 
 def _hypotheses(
