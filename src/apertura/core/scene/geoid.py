@@ -28,6 +28,7 @@ HIGHEST_M = 150.0
 MOST_POSTS = 300_000_000
 """Posts of a grid at most: a grid of one arc minute over the Earth has 233 million."""
 
+_STEPS_DEG = (1e-4, 30.0)  # between posts, of any grid
 _GTX = struct.Struct(">4d2i")
 """Latitude and longitude of the first post, steps of both, degrees; rows, columns."""
 
@@ -41,7 +42,9 @@ def check_grid(path: Path) -> None:
     if path.suffix.lower() == ".tif":
         with opened_raster(path, expected=_EXPECTED, remedy=_REMEDY) as raster:
             posts, place = raster.width * raster.height, raster.transform
-        if posts > MOST_POSTS or not np.isfinite(place[:6]).all() or place.b or place.d or not place.a * place.e:
+        stepped = all(_STEPS_DEG[0] <= abs(step) <= _STEPS_DEG[1] for step in (place.a, place.e))  # NaN is neither
+        placed = stepped and abs(place.c) <= 2 * 360 and abs(place.f) <= 2 * 90
+        if posts > MOST_POSTS or place.b or place.d or not placed:
             wrong = f"{posts} posts placed by {[float(value) for value in place[:6]]}"
     elif path.suffix.lower() == ".gtx":
         with path.open("rb") as stream:
@@ -50,7 +53,9 @@ def check_grid(path: Path) -> None:
         size = path.stat().st_size
         if min(rows, columns) < 2 or rows * columns > MOST_POSTS or size != _GTX.size + 4 * rows * columns:
             wrong = f"{size} bytes for {rows} × {columns} posts"
-        elif not (abs(south) <= 90 and abs(west) <= 360 and all(1e-4 <= step <= 30 for step in steps)):
+        elif not (
+            abs(south) <= 90 and abs(west) <= 360 and all(_STEPS_DEG[0] <= step <= _STEPS_DEG[1] for step in steps)
+        ):
             wrong = f"a grid that begins at latitude {south:g}, longitude {west:g} in steps of {steps} degrees"
     else:
         wrong = f"a file of kind {quoted(path.suffix, 20)}"

@@ -203,8 +203,8 @@ class Node(Section):
     )
     position_std_m: StandardDeviation | tuple[StandardDeviation, StandardDeviation, StandardDeviation] | None = Field(
         None,
-        description="error of logged positions, standard deviation, m: one number, or [north, east, up]; null: what the "
-        "log itself states, if it does",
+        description="error of logged positions, standard deviation, m: one number, or [north, east, up]; null: what "
+        "the log itself states, if it does",
     )
     position_correlation_s: float = Field(
         1.0,
