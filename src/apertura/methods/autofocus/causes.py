@@ -73,10 +73,13 @@ def late_logs(nodes: Sequence[str], flown: Mapping[str, tuple[Floats, Floats]]) 
     flown
         Node → (sample,) seconds and (sample, 3) metres: where its log has it.
     """
-    moved = {node: np.gradient(flown[node][1], flown[node][0], axis=0)[None] for node in nodes}
+    time_s, moved = flown[nodes[0]][0], dict[str, Floats]()
+    for node in nodes:  # logs differ in epochs: all at those of the first
+        own_s, speed = flown[node][0], np.gradient(flown[node][1], flown[node][0], axis=0)
+        moved[node] = np.stack([np.interp(time_s, own_s, axis) for axis in speed.T], axis=-1)[None]
     logs = f"the log of {nodes[0]}" if len(nodes) == 1 else "all logs"
     what = f"the times of {logs} are {{size:.3f}} s {{late}}"
-    return Cause("time", what, np.array([TIME_STD_S]), flown[nodes[0]][0], moved)
+    return Cause("time", what, np.array([TIME_STD_S]), time_s, moved)
 
 
 def other_arm(node: str, time_s: Floats, body_axes: Floats) -> Cause:
