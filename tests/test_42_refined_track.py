@@ -280,7 +280,7 @@ def spoil_logs(root, std_m, said_m):
 
 @pytest.mark.slow
 def test_errors_of_a_quarter_of_the_wavelength_are_mended_or_told(tmp_path):
-    """At the edge of the method: tracks that gain as much may be a wavelength off over a part, and are then not taken."""
+    """At the edge of the method: tracks may be a wavelength off over a part, and are then not taken."""
     campaign = asked_on(tmp_path, pulses=600, half_m=6.0, std_m=0.05, said_m=0.05)
     refine.refine(campaign, "f01")
     stage = open_refined(campaign, "f01").stage
