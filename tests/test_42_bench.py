@@ -10,11 +10,18 @@ from folders import edit_config
 
 from apertura.common.errors import CampaignError
 from apertura.common.flag_table import FLAGS
+from apertura.core.echo.demodulate import Numerology
+from apertura.core.geometry.aperture import Aperture
+from apertura.core.planning.plan import no_aperture
 from apertura.methods.synchronisation.bench import measure_link
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.check import problems
 from apertura.pipeline.opening.bench import Bench, measure_bench
-from apertura.simulation import Impairments
+from apertura.pipeline.steps import echo, ingest
+from apertura.pipeline.store import open_stage
+from apertura.simulation import Impairments, preset
+from apertura.simulation.campaign import write_campaign
+from apertura.simulation.scene import Waypoints
 from apertura.views.report.bench import PAGE, PICTURE, REPORT, print_bench
 
 QUICK = ("reference unlocked", "sidelink leaks", "I and Q swapped", "cable warms up", "split unequal")
@@ -64,8 +71,6 @@ def test_paths_of_cables_are_measured(tmp_path):
 
 def test_white_phase_noise_has_the_allan_deviation_of_its_snr():
     rng, pulses = np.random.default_rng(2), 4000
-    from apertura.core.echo.demodulate import Numerology
-
     numerology = Numerology(1.2e9, 64e6, np.arange(32), prefix_samples=16, dft_samples=64)
     noise = 0.3 * (rng.normal(size=(pulses, 32)) + 1j * rng.normal(size=(pulses, 32)))
     echo = (1 + noise).astype(np.complex64)
@@ -100,3 +105,50 @@ def test_measured_paths_go_into_the_config_and_nothing_else_changes(tmp_path):
     assert float(changed[0][1].partition(": ")[2]) == pytest.approx(0.911, abs=2e-3)
     assert (RADAR_M, SIDELINK_M) == (10.0, 5.0)
     assert "path_disagrees" not in measure_bench(Campaign.load(root), FLIGHT).flags
+
+
+# Images need an aperture
+
+
+def test_a_radar_that_stands_still_is_refused_as_a_flight_with_the_question_whether_it_is_a_bench(tmp_path):
+    specification = cabled()
+    flight = replace(specification.flights[0], kind="image")
+    root = write_campaign(tmp_path / "c", replace(specification, flights=(flight,)), np.random.default_rng(1))
+    (first, *_) = [problem for problem in problems(root) if "bench" in str(problem)]
+    assert "no aperture, its nodes moved 0 cm" in str(first)
+
+
+@pytest.mark.parametrize(("length_m", "flagged"), [(0.3, True), (2.0, False)])
+def test_an_aperture_too_short_for_its_scene_is_flagged(length_m: float, flagged: bool):
+    """λR/2L against the scene: 4.2 m of 6 m for 0.3 m of track at 10 m, 0.6 m for 2 m."""
+    track = np.stack([np.linspace(0, length_m, 50) - length_m / 2, np.full(50, -10.0), np.full(50, 1.0)], -1)
+    ground = np.stack(np.meshgrid(np.linspace(-3, 3, 5), np.linspace(3, -3, 5), indexing="xy"), -1)
+    ground = np.concatenate([ground, np.zeros((5, 5, 1))], -1)
+    flown, wavelength = Aperture(track, track), 0.25
+    assert flown.cross_cell_m(ground, wavelength_m=wavelength) == pytest.approx(
+        wavelength * 10.1 / (2 * length_m), rel=0.05
+    )
+    assert bool(no_aperture(flown, ground, wavelength_m=wavelength)) is flagged
+
+
+@pytest.mark.slow
+def test_a_hover_inside_a_flight_is_left_out_unless_segments_say_what_images(tmp_path):
+    plan = preset("demo", pulses=400)
+    times = (-2.0, 5.0, 15.0, 22.0)
+    tracks = {
+        name: Waypoints(times, tuple((north / 2 + x, -11.0, 4.8) for north in (-7.0, 0.0, 0.0, 7.0)))
+        for name, x in (("uav1", 0.0), ("uav2", 4.7))
+    }
+    root = write_campaign(
+        tmp_path / "c", replace(plan, flights=(replace(plan.flights[0], tracks=tracks),)), np.random.default_rng(1)
+    )
+    campaign = Campaign.load(root)
+    for node in tracks:
+        ingest.ingest(campaign, "f01", node)
+    quality = open_stage(echo.echo(campaign, "f01", "uav1-uav2"), "echo").attrs
+    assert 100 < quality["pulses"]["reasons"]["hover"] < 240
+    assert "the antennas stood" in quality["flags"]["hover"]
+    segments = "flight\tpair\tstart\tend\nf01\tuav1-uav2\t2025-05-14T09:30:00\t2025-05-14T09:31:00\n"
+    (root / "config/segments.tsv").write_text(segments)
+    quality = open_stage(echo.echo(Campaign.load(root), "f01", "uav1-uav2"), "echo").attrs
+    assert "hover" not in quality["flags"]

@@ -91,6 +91,10 @@ _OF_RECORDINGS = {
         "pulses left out, outliers found, and the worst of them",
         "epochs of the log were not used, or pulses dropped at a step of it",
         "multipath, cycle slips, the log's export", "pipeline/opening/positions.py"),
+    "hover": Flag(
+        "pulses left out, of all, how long the antennas stood, and from when",
+        "antennas stood still while pulses were sent: all of these would weigh on one direction",
+        "config/segments.tsv, which decides alone where a pair is named there", "pipeline/opening/positions.py"),
     "track_frozen": Flag(
         "pulses left out, epochs found, and the worst of them",
         "epochs of the log repeat the position before them and were not used",
@@ -212,6 +216,10 @@ _OF_IMAGES = {
         "the track turns, or passes places more than once: they are seen under more than the integration angle, "
         "and are sharper along some direction",
         "config/segments.tsv, to image passes apart", "core/planning/decisions.py"),
+    "no_aperture": Flag(
+        "m that the antennas moved, and what that resolves across the line of sight",
+        "the antennas hardly moved as the scene sees it: there is an echo per range, and no image",
+        "kind bench in flights.tsv; the flight log; config/segments.tsv", "core/planning/plan.py"),
     "spacing_coarse": Flag(
         "spacing of pixels, and the finest resolution cell", "pixels are wider than the finest resolution cell",
         "scene.spacing_m", "core/planning/plan.py"),
