@@ -10,6 +10,7 @@ from apertura.core.geometry.track_checks import (
     find_frozen,
     find_spikes,
     find_steps,
+    hovering,
     misfits,
     rounded_time_m,
     scatter_m,
@@ -302,3 +303,44 @@ def test_of_drawn_flights_none_is_accused_and_radians_are_told():
         told.setdefault(group, []).append(found is not None and found.convention == "in radians")
     assert np.mean(told["turned"]) > 0.9
     assert np.mean(told["straight ahead"]) > 0.7
+
+
+# Hovers
+
+
+def _flown(*parts: tuple[float, float], interval_s: float = 0.05):
+    """Return times and positions of parts of a flight: how long, and at which speed, with 1 cm of noise in the log."""
+    speed = np.concatenate([np.full(round(lasts / interval_s), speed) for lasts, speed in parts])
+    east = np.cumsum(speed) * interval_s
+    noise = 0.01 * np.random.default_rng(1).standard_normal((len(east), 3))
+    return interval_s * np.arange(len(east)), np.stack([east, 0 * east, 0 * east], -1) + noise
+
+
+def test_a_hover_inside_a_flight_is_found_to_a_second():
+    time_s, leg = _flown((30, 0.5), (30, 0.0), (30, 0.5))
+    out = hovering(time_s, (leg, leg))
+    assert abs(time_s[out].min() - 30) < 1
+    assert abs(time_s[out].max() - 60) < 1
+    assert out[(time_s > 31) & (time_s < 59)].all()
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        ((60, 0.5),),
+        ((60, 0.0),),
+        ((30, 0.5), (4, 0.0), (30, 0.5)),
+        ((60, 0.5), (30, 0.2)),
+        ((200, 5.0), (6, 0.0), (200, 5.0)),
+    ],
+    ids=["no hover", "never moved", "shorter than 5 s", "slower, no hover", "3 % of the pulses"],
+)
+def test_what_is_no_hover_is_left_in(parts):
+    time_s, leg = _flown(*parts)
+    assert not hovering(time_s, (leg, leg)).any()
+
+
+def test_a_pair_of_which_one_node_flies_does_not_hover():
+    time_s, leg = _flown((60, 0.5))
+    still = np.zeros_like(leg)
+    assert not hovering(time_s, (still, leg)).any()

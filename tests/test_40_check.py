@@ -84,7 +84,7 @@ def test_config_flights_and_segments_are_reported_of_together(tiny):
     (tiny / "config/segments.tsv").write_text("flight\tpair\tstart\tend\nf01\tuav1-uav9\t2025-05-14\t2025-05-15\n")
     config, flights, segments = reported(tiny)
     assert "scene.spacing: unknown key (did you mean 'spacing_m'?)" in config
-    assert "kind 'picture' is neither image nor calibration" in flights
+    assert "kind 'picture' is none of bench, calibration, image" in flights
     assert "flight f01 has no pair 'uav1-uav9'" in segments
 
 

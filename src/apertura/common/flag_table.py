@@ -91,6 +91,10 @@ _OF_RECORDINGS = {
         "pulses left out, outliers found, and the worst of them",
         "epochs of the log were not used, or pulses dropped at a step of it",
         "multipath, cycle slips, the log's export", "pipeline/opening/positions.py"),
+    "hover": Flag(
+        "pulses left out, of all, how long the antennas stood, and from when",
+        "antennas stood still while pulses were sent: all of these would weigh on one direction",
+        "config/segments.tsv, which decides alone where a pair is named there", "pipeline/opening/positions.py"),
     "track_frozen": Flag(
         "pulses left out, epochs found, and the worst of them",
         "epochs of the log repeat the position before them and were not used",
@@ -212,6 +216,10 @@ _OF_IMAGES = {
         "the track turns, or passes places more than once: they are seen under more than the integration angle, "
         "and are sharper along some direction",
         "config/segments.tsv, to image passes apart", "core/planning/decisions.py"),
+    "no_aperture": Flag(
+        "m that the antennas moved, and what that resolves across the line of sight",
+        "the antennas hardly moved as the scene sees it: there is an echo per range, and no image",
+        "kind bench in flights.tsv; the flight log; config/segments.tsv", "core/planning/plan.py"),
     "spacing_coarse": Flag(
         "spacing of pixels, and the finest resolution cell", "pixels are wider than the finest resolution cell",
         "scene.spacing_m", "core/planning/plan.py"),
@@ -353,5 +361,64 @@ _OF_IMAGES = {
 }  # fmt: skip
 """Name → what it says; see `apertura.common.flags.FLAGS`."""
 
-FLAGS = _OF_RECORDINGS | _OF_IMAGES
-"""Name → what it says, in the order in which a recording becomes an image."""
+# ---- Flags of a radar that stands still ----------------------------------------------------------------------------
+
+_OF_BENCHES = {
+    "triggers_missed": Flag(
+        "pulses not recorded, of all that were due", "more than 1 % of the pulses started no capture",
+        "trigger level and its cable; the recorder's disk", "methods/synchronisation/bench.py"),
+    "triggers_false": Flag(
+        "captures between two pulses, of all", "the recorder was triggered by something else than the radar's pulses",
+        "trigger level; interference; waveform.prf_hz", "methods/synchronisation/bench.py"),
+    "channel_weak": Flag(
+        "counts rms of a channel", "the converter hardly sees a signal: quantisation adds to its noise",
+        "gain, attenuators, the cable of the channel", "methods/synchronisation/bench.py"),
+    "channel_dc": Flag(
+        "mean of I and Q, dB of the signal", "a constant in the samples: one subcarrier holds it, and all ranges",
+        "offset of the converter, leakage of the local oscillator", "methods/synchronisation/bench.py"),
+    "channel_image": Flag(
+        "dB of the mirror image", "I and Q are unequal, or not at 90°: subcarriers leak into their mirror images",
+        "balance of the mixer; clipping of one of both", "methods/synchronisation/bench.py"),
+    "spectrum_inverted": Flag(
+        "the node", "conjugates of the samples carry the code: I and Q are swapped, or a mixer is above the band",
+        "order of I and Q in the recorder; the local oscillator's side", "pipeline/opening/bench.py"),
+    "link_weak": Flag(
+        "dB of a compressed pulse", "the path is hardly above the noise: no coherence to speak of",
+        "attenuators, cables, gain; which channel is which", "methods/synchronisation/bench.py"),
+    "link_incoherent": Flag(
+        "Γ, what noise allows, and phase noise beyond it",
+        "the phase of the path scatters from pulse to pulse by more than noise does: images lose so much",
+        "the clock that feeds both channels; the sidelink's connection; a loose connector",
+        "methods/synchronisation/bench.py"),
+    "link_drifts": Flag(
+        "phase and delay over the recording", "path or delay changes while nothing moves",
+        "warming up: cables, amplifiers, filters; wait, or calibrate again", "methods/synchronisation/bench.py"),
+    "contact_loose": Flag(
+        "amplitude beyond noise, and pulses lost or 6 dB low", "amplitude is not steady while nothing moves",
+        "connectors of that channel; supply of the amplifiers", "methods/synchronisation/bench.py"),
+    "channel_leaks": Flag(
+        "dB of what arrives with the sidelink against the strongest path",
+        "the radar channel hears what the sidelink carries: an echo at short range that is none",
+        "shielding, cables side by side, isolation of the channels", "methods/synchronisation/bench.py"),
+    "channels_swapped": Flag(
+        "m that the echo arrives before the sidelink", "the strongest echo comes before the direct path",
+        "which channel is radar, which sidelink; bench.radar_m and bench.sidelink_m",
+        "methods/synchronisation/bench.py"),
+    "clock_unlocked": Flag(
+        "ppm against the transmitter's clock",
+        "the two clocks are not of one reference: samples are corrected by what is measured, if it keeps",
+        "lock of the node's reference (GNSS, 10 MHz)", "methods/synchronisation/bench.py"),
+    "clock_drifts": Flag(
+        "ppm over the recording", "the clock moves while it is recorded",
+        "warming up; lock of the node's reference", "methods/synchronisation/bench.py"),
+    "path_disagrees": Flag(
+        "path beyond the set-up, and the config's", "the config's path offset is not what the set-up says",
+        "nodes.<n>.path_offset_m; bench.radar_m, bench.sidelink_m", "methods/synchronisation/bench.py"),
+    "split_disagrees": Flag(
+        "gain, phase, and both over the band", "two channels that one signal feeds do not show the same",
+        "splitter and cables; filters of the two channels; path offsets", "methods/synchronisation/bench.py"),
+}  # fmt: skip
+"""Name → what it says; see `apertura.common.flags.FLAGS`."""
+
+FLAGS = _OF_BENCHES | _OF_RECORDINGS | _OF_IMAGES
+"""Name → what it says, in the order in which a recording becomes an image; those of a bench first."""

@@ -66,6 +66,17 @@ class Campaign(RawFolder):
         """Flights that become images."""
         return tuple(flight for flight in self.flights if flight.kind == "image")
 
+    def check_images(self) -> None:
+        """Raise CampaignError where no flight becomes an image: what shows images has nothing to show."""
+        if not self.image_flights:
+            kinds = ", ".join(dict.fromkeys(flight.kind for flight in self.flights))
+            raise CampaignError(
+                f"flights of kind {kinds} alone",
+                where=self.root / FLIGHTS,
+                expected="a flight of kind image",
+                remedy="`apertura bench` measures a radar that stands still; add a flight for images.",
+            )
+
     @cached_property
     def calibrated(self) -> bool:
         """Whether the radio of its pairs is stated, or their constants were measured, so that images are calibrated."""

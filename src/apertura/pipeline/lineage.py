@@ -17,6 +17,7 @@ from apertura.core.focus.engines import ENGINES
 from apertura.formats.export import EXPORTS, export_modules, exports_in
 from apertura.formats.names import FINDERS, PHASE_HISTORIES, RECORDERS, TRACKS, log_format
 from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.config import KINDS
 from apertura.pipeline.digests import Result
 from apertura.pipeline.rule_inputs import JobPlace, Scope, SettingSpec, SourceSpec, is_sampled
 from apertura.pipeline.rules import EVERY, RESULTS, Rule
@@ -81,8 +82,8 @@ def on_demand(manifest: str) -> bool:
 
 
 def places(campaign: Campaign, rule: Rule) -> list[tuple[str, ...]]:
-    """Return what each job of a rule runs on, values of its wildcards; calibration flights first."""
-    return [where for kind in ("calibration", "image") for where in _places(campaign, rule, kind)]
+    """Return what each job of a rule runs on, values of its wildcards; flights in the order of `KINDS`."""
+    return [where for kind in KINDS for where in _places(campaign, rule, kind)]
 
 
 def products_of(rule: Rule) -> list[str]:
@@ -92,7 +93,7 @@ def products_of(rule: Rule) -> list[str]:
 
 def _jobs(campaign: Campaign) -> Iterator[tuple[Rule, tuple[str, ...]]]:
     """Yield rule and place of every result: calibration flights first, which correct the echoes of others."""
-    for kind in ("calibration", "image"):
+    for kind in KINDS:
         for rule in RESULTS.values():
             yield from ((rule, where) for where in _places(campaign, rule, kind))
 
@@ -101,11 +102,11 @@ def _places(campaign: Campaign, rule: Rule, kind: str) -> list[tuple[str, ...]]:
     """Return the places of a rule that belong to flights of a kind; those of the campaign belong to its images."""
     if kind not in rule.kinds or not rule.needed(campaign):
         return []
+    flights = [flight for flight in campaign.flights if flight.kind == kind]
     if rule.of in {Scope.CAMPAIGN, Scope.CHARTED}:
-        return [()]
+        return [()] if flights else []
     if rule.of is Scope.TWO:
         return [(name,) for name in campaign.settings.interferometry.pairs]
-    flights = [flight for flight in campaign.flights if flight.kind == kind]
     if rule.of is Scope.FLIGHT:
         return [(flight.name,) for flight in flights]
     pairs = rule.of is Scope.PAIR

@@ -86,7 +86,14 @@ SettingSpec = str | Callable[[JobPlace], Mapping[str, Any]]
 
 
 def charted(campaign: "Campaign") -> tuple[str, str]:
-    """Return the flight and the pair that are charted: the last pair of the first flight, bistatic where one is."""
+    """Return the flight and the pair that are charted: the last pair of the first flight, bistatic where one is.
+
+    Raises
+    ------
+    CampaignError
+        If no flight becomes an image.
+    """
+    campaign.check_images()
     return campaign.image_flights[0].name, campaign.image_flights[0].pairs[-1]
 
 
@@ -100,6 +107,21 @@ def is_sampled(campaign: "Campaign") -> bool:
 def recording(place: JobPlace) -> Iterable[str]:
     """Return the files of what a node recorded."""
     return map(place.campaign.relative, place.campaign.recording_files(*place.where))
+
+
+def recorded_on_the_bench(place: JobPlace) -> Iterable[str]:
+    """Return the recordings of a flight, and what was transmitted."""
+    campaign, flight = place.campaign, place.campaign.flight(place.where[0])
+    if not is_sampled(campaign):
+        return []
+    files = (path for node in flight.nodes for path in campaign.recording_files(flight.name, node))
+    return map(campaign.relative, (*files, campaign.sent_file))
+
+
+def stated_paths(place: JobPlace) -> Mapping[str, Any]:
+    """Return what the config states of the electrical paths of a flight's nodes."""
+    nodes = place.campaign.values["nodes"]
+    return {"path_offset_m": {node: nodes[node]["path_offset_m"] for (_, node) in place.below(Scope.NODE)}}
 
 
 def log(place: JobPlace) -> Iterable[str]:

@@ -268,6 +268,19 @@ _ROWS = (
         _INGEST, result="track", manifest="", sources=(inputs.log,), settings=(inputs.log_settings,), reads=("logs",)
     ),
     Rule(
+        "bench",
+        Scope.FLIGHT,
+        "Measure channels, clocks and links of a radar that stands still, bench.json, bench.html and bench.png.",
+        "apertura.views.report.bench:bench",
+        sources=(inputs.recorded_on_the_bench,),
+        settings=("campaign", "waveform", "bench", "processing.sidelink", inputs.stated_paths),
+        products=("bench.json", "bench.html", "bench.png"),
+        reads=("recordings",),
+        kinds=("bench",),
+        demand=Demand(500, pulse_bytes=1000, recorded_s=240),
+        cost=Cost(2.0, mb_s=0.05, last=True),
+    ),
+    Rule(
         "echo",
         Scope.PAIR,
         "Turn recordings of a pair into calibrated transfer functions, echo.zarr.",

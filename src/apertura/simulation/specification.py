@@ -84,7 +84,7 @@ class SimulatedFlight:
     start_utc: Annotated[
         str, BeforeValidator(_utc_text), Field(pattern=r"^\d{4}-\d\d-\d\d(T\d\d:\d\d(:[\d.]+)?)?$")
     ] = Field(default="2025-05-14T09:30:00", description="UTC of the first pulse, ISO 8601")
-    kind: Literal["image", "calibration"] = Field(default="image", description="as in flights.tsv")
+    kind: Literal["image", "calibration", "bench"] = Field(default="image", description="as in flights.tsv")
     framing: Framing | None = Field(default=None, description="preamble and frame counter; null: no frame numbers")
     first_frame: int = Field(default=0, ge=0, description="number of the first frame")
     continuous: bool = Field(default=False, description="recorders run through instead of being triggered")

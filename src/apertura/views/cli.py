@@ -201,9 +201,10 @@ def run(
     status = run_workflow(given(campaign), cores, *context.args, paranoid=paranoid, show=show)
     if status == 0 and forms_results(["", *context.args]):
         opened = _opened(campaign)
-        from apertura.views.summary import is_finished, print_products, print_summary
+        from apertura.views.summary import is_finished, print_benches, print_products, print_summary
 
-        if is_finished(opened):  # not after `--until`
+        print_benches(opened)
+        if opened.image_flights and is_finished(opened):  # not after `--until`
             print_products(opened) if quiet else print_summary(opened)
     raise SystemExit(status)
 
@@ -292,6 +293,18 @@ def score(
 
 
 @app.command()
+def bench(
+    campaign: CampaignFolder = HERE,
+    write: Annotated[bool, typer.Option("--write", help="write the measured paths into config/config.yaml")] = False,
+) -> None:
+    """Measure a radar that stands still or is cabled: channels, clocks, coherence, paths; a verdict per line."""
+    opened = _opened(campaign)
+    from apertura.views.report.bench import print_bench
+
+    print_bench(opened, write=write)
+
+
+@app.command()
 def reflectors(
     campaign: CampaignFolder,
     to: Annotated[Path | None, typer.Option(metavar="FILE", help="by default calibration.json in that folder")] = None,
@@ -370,10 +383,11 @@ def report(
     from apertura.views.report.step import open_report
 
     campaign = given(campaign)
+    opened = Campaign.load(campaign)
+    opened.check_images()
     status = run_workflow(campaign, cores, "all", "pages")
     if status:
         raise SystemExit(status)
-    opened = Campaign.load(campaign)
     with open_report(opened) as (temporary, style):
         asked = ["--report", str(temporary), "--report-stylesheet", str(style)]
         status = run_workflow(campaign, 1, "all", "pages", *asked, show="errors")
@@ -391,6 +405,7 @@ def map_page(
 ) -> None:
     """Show a finished campaign as a map in a browser: served to this machine alone, until Ctrl-C."""
     opened = _opened(campaign)
+    opened.check_images()
     from apertura.views.webmap.server import served
 
     served(opened, port=port).show(in_browser=open_)

@@ -33,6 +33,7 @@ def first_flight(campaign: Campaign) -> Flown:
 
 def print_plan(campaign: Campaign, *, threads: int = 1) -> None:
     """Print every pair's decisions, reasons, predicted error, seconds and bytes; nothing is run or written."""
+    campaign.check_images()
     from rich.console import Console
     from rich.filesize import decimal
 

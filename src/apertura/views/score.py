@@ -134,6 +134,7 @@ def _along_track(campaign: Campaign, flight: Flight, grid: SceneGrid) -> tuple[f
 
 def print_findings(campaign: Campaign, *, paths: bool) -> None:
     """Print a short table of what `score` finds, and where the products lie."""
+    campaign.check_images()
     console = Console(width=120)
     table = Table(title=f"{campaign.settings.campaign}: found against put", title_justify="left")
     calibrated = ("RCS, dBsm", "put") if campaign.calibrated else ()

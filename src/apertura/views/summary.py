@@ -38,6 +38,7 @@ def print_summary(campaign: Campaign) -> None:
     """
     from rich.console import Console
 
+    campaign.check_images()
     reports = {
         f"{flight.name} {name}": report
         for flight in campaign.image_flights
@@ -56,6 +57,16 @@ def print_summary(campaign: Campaign) -> None:
         console.print(f"interferogram {name.removeprefix(f'{INTERFEROMETRY} ')}: {report['says']}", soft_wrap=True)
     _print_flags(console, {**reports, **interferograms})
     print_products(campaign)
+
+
+def print_benches(campaign: Campaign) -> None:
+    """Print a line for each flight of kind bench that was measured: how many lines carry a flag, and its page."""
+    for flight in campaign.flights:
+        report, page = (campaign.result(flight.name, name) for name in ("bench.json", "bench.html"))
+        if flight.kind == "bench" and report.is_file():
+            flags = open_listed(report, report.with_name("bench.manifest.json"))["flags"]
+            verdict = f"look at {', '.join(printable(flags))}" if flags else "every line within its limit"
+            print(f"bench {flight.name}: {verdict}: {campaign.relative(page)}")
 
 
 def print_products(campaign: Campaign) -> None:

@@ -230,6 +230,30 @@ class Aperture:
                 widest = max(widest, float((np.nanmax(cycles, axis=0) - np.nanmin(cycles, axis=0)).max()))
         return 1 / widest
 
+    def cross_cell_m(self, ground_m: NDArray[np.float64], *, wavelength_m: float) -> float:
+        """Return what changing directions to the scene's middle resolve there, metres; infinite where nothing moves.
+
+        Parameters
+        ----------
+        ground_m
+            (row, column, 3) float64, metres: points spread over the scene, corners included; rows go south.
+        wavelength_m
+            Of the middle of the band.
+
+        Notes
+        -----
+        Source: docs/theory.md, eq. 8 at one frequency: λ over the widest spread of the path's gradient on the ground,
+        λ/2Δθ of one node that turns by Δθ about a place.
+        """
+        middle = ground_m.reshape(-1, 3)[ground_m.size // 6]
+        gradient = self[self.sample(64)].path_gradient(middle[None])[:, 0]
+        sides = np.stack([ground_m[0, -1] - ground_m[0, 0], ground_m[-1, 0] - ground_m[0, 0]])
+        sides = sides / np.maximum(np.linalg.norm(sides, axis=1, keepdims=True), 1e-9)
+        flat = (gradient - gradient.mean(axis=0)) @ sides.T
+        _, _, main = np.linalg.svd(flat, full_matrices=False)
+        spread = float(np.ptp(flat @ main[0]))
+        return wavelength_m / spread if spread > 0 else float("inf")
+
     def spectrum(
         self,
         point_m: NDArray[np.float64],

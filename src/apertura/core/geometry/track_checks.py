@@ -1,7 +1,7 @@
 """Checks of a flight log's epochs: spikes, steps, frozen positions, rounded times and gaps."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -558,3 +558,54 @@ def _apart(places_m: Floats, least_m: float) -> NDArray[np.intp]:
 def _scatter_deg(mean: complex) -> float:
     """Return the circular standard deviation of angles whose phasors have a mean, degrees."""
     return float(np.degrees(np.sqrt(-2 * np.log(max(min(abs(mean), 1.0), 1e-9)))))
+
+
+# ---- Hovers: pulses sent while the antennas stood -------------------------------------------------------------------
+
+HOVER_SPEED = 0.2
+"""Of the speed of the flight: slower than a flight that turns or climbs, faster than a hover in wind."""
+
+HOVER_S, HOVER_SHARE = 5.0, 0.05
+"""Seconds that a hover lasts at least, and share of the pulses in all of them: fewer raise a pedestal below -26 dB."""
+
+_HOVER_WINDOW_S = 2.0  # over which speeds are taken: noise of a log of 1 cm makes 1 cm/s
+
+
+def hovering(time_s: Floats, legs: Sequence[Floats]) -> NDArray[np.bool_]:
+    """Return (pulse,) bool: pulses of long hovers within a flight; none of a recording that stands all along.
+
+    Parameters
+    ----------
+    time_s
+        (pulse,) float64, ascending, seconds.
+    legs
+        Positions of the transmitting and of the receiving antenna, (pulse, 3) float64 each, metres.
+
+    Notes
+    -----
+    Source: docs/theory/tracks.md, "Hovers".
+
+    Examples
+    --------
+    >>> time_s = np.arange(0, 40, 0.1)
+    >>> east = np.clip(time_s, 0, 20) * 0.5  # flies for 20 s, then hovers
+    >>> leg = np.stack([east, 0 * east, 0 * east], -1)
+    >>> out = hovering(time_s, (leg, leg))
+    >>> float(time_s[out].min().round(1)), int(out.sum())
+    (20.6, 194)
+    """
+    none = np.zeros(len(time_s), bool)
+    if len(time_s) < 2 or time_s[-1] - time_s[0] < HOVER_S:
+        return none
+    ends_s = [np.clip(time_s + half, time_s[0], time_s[-1]) for half in (-_HOVER_WINDOW_S / 2, _HOVER_WINDOW_S / 2)]
+    moved_m = np.zeros(len(time_s))
+    for leg in legs:
+        before, after = (np.stack([np.interp(at, time_s, axis) for axis in leg.T], axis=-1) for at in ends_s)
+        moved_m += np.linalg.norm(after - before, axis=-1)
+    speed = moved_m / (ends_s[1] - ends_s[0])
+    slow = speed < HOVER_SPEED * np.quantile(speed, 0.9)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], slow, [False]]).astype(np.int8)))
+    for first, last in edges.reshape(-1, 2):
+        if time_s[last - 1] - time_s[first] >= HOVER_S:
+            none[first:last] = True
+    return none if none.mean() >= HOVER_SHARE else np.zeros(len(time_s), bool)

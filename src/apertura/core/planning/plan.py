@@ -55,6 +55,8 @@ def check_geometry(job: Job) -> dict[str, str]:
         flags["spacing_coarse"] = (
             f"spacing {job.spacing_m:g} m, finest resolution cell {cell_m:.3g} m: targets fall between"
         )
+    if missing := no_aperture(aperture, ground_m, wavelength_m=2 * SPEED_OF_LIGHT_M_S / sum(job.band_hz)):
+        flags["no_aperture"] = missing
     if sparse := _sparse(job):
         flags["pulses_sparse"] = sparse
     beyond = _share_beyond(aperture, job.points_m, job.path_limit_m)
@@ -63,6 +65,36 @@ def check_geometry(job: Job) -> dict[str, str]:
             f"{100 * beyond:.0f} % of the scene arrives too late for all captures: after the cyclic prefix, or listen_s"
         )
     return flags
+
+
+_LEAST_CELLS = 2.0
+"""Cells across the line of sight that a scene must hold: with fewer, an image shows ranges, and no places."""
+
+
+def no_aperture(aperture: Aperture, ground_m: NDArray[np.float64], *, wavelength_m: float) -> str | None:
+    """Return one line where antennas move too little to resolve anything across the line of sight, else None.
+
+    Parameters
+    ----------
+    aperture
+        Of a pair.
+    ground_m, wavelength_m
+        As of `Aperture.cross_cell_m`.
+
+    Notes
+    -----
+    Source: docs/theory/planner.md, "No aperture".
+    """
+    cell_m = aperture.cross_cell_m(ground_m, wavelength_m=wavelength_m)
+    side_m = max(float(np.linalg.norm(ground_m[end] - ground_m[0, 0])) for end in ((0, -1), (-1, 0)))
+    if _LEAST_CELLS * cell_m <= side_m:
+        return None
+    moved_m = max(float(np.linalg.norm(leg - leg[0], axis=1).max()) for leg in aperture.legs)
+    resolved = f"resolves {cell_m:.3g} m" if np.isfinite(cell_m) else "resolves nothing"
+    return (
+        f"antennas moved {moved_m:.3g} m, which {resolved} across the line of sight, in a scene of {side_m:.3g} m: is "
+        "this a bench recording?"
+    )
 
 
 GHOST_DB, REACHED = -20.0, 0.1

@@ -57,6 +57,7 @@ CHECKS: Mapping[str, str] = {
     "spikes": "apertura.pipeline.check.scene:check_spikes",
     "apart": "apertura.pipeline.check.reach:check_nodes_apart",
     "distance": "apertura.pipeline.check.reach:check_distance",
+    "aperture": "apertura.pipeline.check.reach:check_aperture",
     "ground": "apertura.pipeline.check.reach:check_ground",
     "calibration": "apertura.pipeline.check.reach:check_calibration",
     "memory": "apertura.pipeline.check.resources:check_memory",

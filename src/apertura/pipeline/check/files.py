@@ -26,12 +26,12 @@ _RECORDS = ("metadata", "incomplete")
 
 
 def check_flights(examined: "Examination") -> Iterator[CampaignError]:
-    """Yield a problem where no flight becomes an image."""
-    if not examined.campaign.image_flights:
+    """Yield a problem where no flight becomes an image, and none is measured on a bench."""
+    if {flight.kind for flight in examined.campaign.flights} <= {"calibration"}:
         yield CampaignError(
             f"{len(examined.campaign.flights)} flights, none of kind image",
             where=examined.campaign.root / FLIGHTS,
-            expected="at least one flight of kind image",
+            expected="at least one flight of kind image, or bench",
             remedy="Add one, or correct its kind.",
         )
 
@@ -66,7 +66,7 @@ def _recorded(campaign: Campaign, flight: Flight) -> Iterator[CampaignError]:
         for node in flight.nodes:
             yield from _looked_up(lambda node=node: list(campaign.raw_files(flight.name, node).values()))  # type: ignore[misc]
         return
-    for node in flight.participants:
+    for node in flight.recorded:
         expected = f"the recording of node {node} in flight {flight.name}"
         remedy = f"Copy it there, or take {node} out of the nodes of {flight.name} in {FLIGHTS}."
         try:
@@ -81,7 +81,8 @@ def _recorded(campaign: Campaign, flight: Flight) -> Iterator[CampaignError]:
                 yield problem
                 continue
             yield from _readable(path, expected, remedy)
-        yield from _looked_up(lambda node=node: [campaign.track_file(flight.name, node)])  # type: ignore[misc]
+        if flight.kind != "bench":
+            yield from _looked_up(lambda node=node: [campaign.track_file(flight.name, node)])  # type: ignore[misc]
 
 
 def _looked_up(files: Callable[[], list[Path]]) -> Iterator[CampaignError]:

@@ -33,6 +33,9 @@ _LEAST_HEIGHT_M = 1000.0  # at which nodes are taken to be at least: heights cou
 HIGHEST_M = 30e3
 """Above the ground of the scene no node flies higher."""
 
+_STILL_M = 0.05  # that the log of a node scatters by while it stands
+_SOME_TIME = np.timedelta64(1, "s")  # of a recording that would show whether a node flies
+
 _CALIBRATION = f"{CONFIG}: calibration"
 
 
@@ -160,6 +163,31 @@ def scene_points(examined: Examination) -> tuple[NDArray[np.float64], float]:
 
 def _length(metres: float) -> str:
     return f"{metres / 1e3:.0f} km" if metres >= 1e4 else f"{metres:.1f} m"
+
+
+def check_aperture(examined: Examination) -> Iterator[CampaignError]:
+    """Yield pairs of image flights whose nodes stand still, by their logs, in reach of the scene."""
+    waveform, transmitted = examined.waveform, examined.transmitted
+    if waveform is None or transmitted is None:
+        return
+    wavelength_m = SPEED_OF_LIGHT_M_S / float(transmitted.numerology.frequency_hz.mean())
+    for flight in examined.campaign.image_flights:
+        for node in flight.nodes:
+            aperture, reach = pair_aperture(examined, flight, node, waveform), _reach(examined, flight, node, waveform)
+            if aperture is None or (reach and reach[1] > reach[2]):
+                continue
+            first, last = recorded_span(examined.recordings[flight.name, node])
+            if last - first < _SOME_TIME:
+                continue
+            moved_m = max(float(np.linalg.norm(leg - leg[0], axis=1).max()) for leg in aperture.legs)
+            if moved_m < max(wavelength_m, _STILL_M):
+                yield CampaignError(
+                    f"flight {flight.name}, pair {flight.transmitter}-{node}: no aperture, its nodes moved "
+                    f"{100 * moved_m:.2g} cm: is this a bench recording?",
+                    where=examined.campaign.root / FLIGHTS,
+                    expected=f"a flight past the scene, of more than a wavelength ({100 * wavelength_m:.0f} cm)",
+                    remedy="Set its kind to bench and run `apertura bench`, or check the logs of its nodes.",
+                )
 
 
 def check_ground(examined: Examination) -> Iterator[CampaignError]:

@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 from apertura.common import documents
 from apertura.common.documents import read_yaml
 from apertura.pipeline.config.nodes import Node
-from apertura.pipeline.config.processing import Calibration, Interferometry, Processing, Scene
+from apertura.pipeline.config.processing import Bench, Calibration, Interferometry, Processing, Scene
 from apertura.pipeline.config.section import Name, Section, Title
 from apertura.pipeline.config.waveform import PhaseHistoryWaveform, Waveform
 
@@ -27,7 +27,7 @@ class Settings(Section):
     calibration: Calibration | None = Field(
         None, description="path offsets from a calibration flight: flight, reflector_m, search_m; null: as stated above"
     )
-
+    bench: Bench = Field(default_factory=Bench, description="what is known of a set-up on the bench, before a flight")
     interferometry: Interferometry = Field(
         default_factory=Interferometry, description="images compared in phase, two by two, for coherence and heights"
     )

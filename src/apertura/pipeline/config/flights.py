@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 FLIGHTS = Path("config/flights.tsv")
 _COLUMNS = ["flight", "kind", "transmitter", "nodes"]
+KINDS = ("bench", "calibration", "image")
+"""Of flights: a radar that stands still; a flight past a reflector, which corrects the echoes of others; images."""
 _NAME: TypeAdapter[str] = TypeAdapter(Name)
 
 
@@ -44,6 +46,17 @@ class Flight:
         ('a', 'b')
         """
         return tuple(dict.fromkeys((self.transmitter, *self.nodes)))
+
+    @property
+    def recorded(self) -> tuple[str, ...]:
+        """Of which nodes there is a recording: of all, on a bench also without the transmitter's.
+
+        Examples
+        --------
+        >>> Flight("f01", "image", "a", ("b",)).recorded, Flight("b01", "bench", "a", ("b",)).recorded
+        (('a', 'b'), ('b',))
+        """
+        return self.nodes if self.kind == "bench" else self.participants
 
     @property
     def pairs(self) -> tuple[str, ...]:
@@ -89,8 +102,8 @@ def _flight(cells: dict[str, str], known: Collection[str], *, where: str) -> Fli
         _NAME.validate_python(cells["flight"])
     except ValidationError as error:
         problem = error.errors()[0]["msg"].removeprefix("Value error, ")
-    if cells["kind"] not in {"image", "calibration"}:
-        problem = f"kind {quoted(cells['kind'])} is neither image nor calibration"
+    if cells["kind"] not in KINDS:
+        problem = f"kind {quoted(cells['kind'])} is none of {', '.join(KINDS)}"
     unknown = [name for name in (cells["transmitter"], *nodes) if name not in known]
     if unknown:
         problem = f"node {quoted(unknown[0])} is not in {CONFIG}: nodes"
@@ -100,7 +113,7 @@ def _flight(cells: dict[str, str], known: Collection[str], *, where: str) -> Fli
         raise CampaignError(
             problem,
             where=where,
-            expected=f"flight, image|calibration, a transmitter and nodes among {sorted(known)}",
+            expected=f"flight, {'|'.join(KINDS)}, a transmitter and nodes among {sorted(known)}",
             remedy="Correct the line.",
         )
     return Flight(cells["flight"], cells["kind"], cells["transmitter"], nodes)

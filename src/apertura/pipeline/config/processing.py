@@ -94,6 +94,18 @@ class Calibration(Section):
     search_m: float = Field(10.0, gt=0, description="offsets of either sign up to this are considered, m")
 
 
+class Bench(Section):
+    """What is known of a set-up that stands still, in flights of kind bench."""
+
+    radar_m: float | None = Field(
+        None, description="path of the strongest echo, or of its cable, from transmitter to receiver, m; null: unknown"
+    )
+    sidelink_m: float | None = Field(
+        None, ge=0, description="path of the sidelink, or of its cable, without path_offset_m, m; null: unknown"
+    )
+    split: bool = Field(False, description="whether one signal is split to the radar channels of all nodes")
+
+
 # ---- Section `interferometry`: pairs of images for interferograms ---------------------------------------------------
 
 LEAST_WINDOW_PX = 3

@@ -74,9 +74,15 @@ class Examination:
 
     @property
     def keys(self) -> tuple[Key, ...]:
-        """Every flight and node of which a log is needed."""
-        every = ((flight.name, node) for flight in self.campaign.flights for node in flight.participants)
-        return tuple(key for key in every if self.waveform or self.campaign.logged(*key))
+        """Every flight and node of which something was recorded, or a log is needed."""
+        every = [(flight, node) for flight in self.campaign.flights for node in flight.recorded]
+        return tuple(
+            (flight.name, node) for flight, node in every if self.waveform or self.campaign.logged(flight.name, node)
+        )
+
+    def needs_log(self, key: Key) -> bool:
+        """Return whether a flight needs the logs of its nodes: on a bench nothing moves."""
+        return self.campaign.flight(key[0]).kind != "bench"
 
     @property
     def recordings(self) -> dict[Key, "Recording"]:
@@ -147,15 +153,20 @@ class Examination:
             return (self.campaign.track_file(flight, node),)
 
         options = {name: node.log.options for name, node in self.campaign.settings.nodes.items()}
-        return self._each(files, lambda logs, key: read_track(logs[0], node=key[1], options=options[key[1]]))
+        return self._each(
+            files, lambda logs, key: read_track(logs[0], node=key[1], options=options[key[1]]), self.needs_log
+        )
 
     def _each(
-        self, files: Callable[[str, str], tuple[Path, ...]], open_files: Callable[[tuple[Path, ...], Key], T]
+        self,
+        files: Callable[[str, str], tuple[Path, ...]],
+        open_files: Callable[[tuple[Path, ...], Key], T],
+        needed: Callable[[Key], bool] = lambda _: True,
     ) -> tuple[dict[Key, T], list[CampaignError]]:
         """Open files that are there and not empty; the check 'files' names the others."""
         opened: dict[Key, T] = {}
         problems: list[CampaignError] = []
-        for flight, node in self.keys:
+        for flight, node in filter(needed, self.keys):
             try:
                 paths = files(flight, node)
             except CampaignError:

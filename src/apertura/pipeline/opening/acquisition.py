@@ -1,7 +1,7 @@
 """Recording of one node in a flight: samples by channel, antennas by pulse, by the clocks of recorder and log."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -32,13 +32,13 @@ from apertura.pipeline.store import manifest_of, open_stage
 
 
 @dataclass(frozen=True)
-class Acquisition(NodeLog):
-    """What one node recorded in one flight, beside its log.
+class Captured:
+    """What one node recorded in one flight.
 
     Attributes
     ----------
     raw
-        Its stage.
+        Its stage, or what it would hold.
     samples
         The recorder's file.
     files
@@ -102,6 +102,40 @@ class Acquisition(NodeLog):
 
         return read
 
+    @classmethod
+    def of(cls, raw: xr.Dataset, samples: Path, files: Path, recording: str, sent: Transmitted) -> "Captured":
+        """Return captures of a file of samples; raise CampaignError unless carrier and rate are those of what was sent.
+
+        Parameters
+        ----------
+        raw
+            Stage `raw`, or what it would hold.
+        samples
+            The recorder's file.
+        files, recording
+            As the attributes.
+        sent
+            What was transmitted.
+        """
+        recorded = ("sample_rate_hz", raw.attrs["sample_rate_hz"]), ("carrier_hz", raw.attrs["frequency_hz"])
+        for key, value in recorded:
+            requested = getattr(sent.waveform, key)
+            if abs(value - requested) > 1e-9 * requested:
+                raise CampaignError(
+                    f"recorded with {key} {value:.6f}",
+                    where=recording,
+                    expected=f"{requested:.6f}, as config/config.yaml: waveform.{key}",
+                    remedy="Correct whichever is wrong; every node of a flight shares one waveform.",
+                )
+        opened = SampleFile(samples, len(raw.attrs["channels"]), SampleLayout.of(raw))
+        check_mixing(opened, sent.numerology, where=recording)
+        return cls(raw, opened, files, recording, sent.numerology)
+
+
+@dataclass(frozen=True)
+class Acquisition(Captured, NodeLog):
+    """What one node recorded in one flight, beside its log."""
+
 
 def open_acquisition(campaign: Campaign, flight: str, node: str, sent: Transmitted) -> Acquisition:
     """Return the finished raw and track stages of a node.
@@ -115,22 +149,12 @@ def open_acquisition(campaign: Campaign, flight: str, node: str, sent: Transmitt
     raw = raw.assign(time=("pulse", campaign.clock(flight, node).utc(raw.time.values)))
     files = Path("raw") / flight / node
     recording, log = (_read_from(stage, files) for stage in (raw, track))
-    for key, recorded in (("sample_rate_hz", raw.attrs["sample_rate_hz"]), ("carrier_hz", raw.attrs["frequency_hz"])):
-        requested = getattr(sent.waveform, key)
-        if abs(recorded - requested) > 1e-9 * requested:
-            raise CampaignError(
-                f"recorded with {key} {recorded:.6f}",
-                where=recording,
-                expected=f"{requested:.6f}, as config/config.yaml: waveform.{key}",
-                remedy="Correct whichever is wrong; every node of a flight shares one waveform.",
-            )
     path = inside(campaign.root, raw.attrs["samples"], where=campaign.stage("raw", flight, node))
-    samples = SampleFile(path, len(raw.attrs["channels"]), SampleLayout.of(raw))
+    captured = Captured.of(raw, path, files, recording, sent)
     _check_same(campaign, raw)
-    settings, numerology = campaign.node(flight, node), sent.numerology
-    check_mixing(samples, numerology, where=recording)
-    wave_m = shortest_wave(numerology.frequency_hz)
-    return Acquisition(node, settings, track, log, wave_m, raw, samples, files, recording, numerology)
+    wave_m = shortest_wave(sent.numerology.frequency_hz)
+    own = {field.name: getattr(captured, field.name) for field in fields(captured)}
+    return Acquisition(node, campaign.node(flight, node), track, log, wave_m, **own)
 
 
 def _check_same(campaign: Campaign, raw: xr.Dataset) -> None:

@@ -88,11 +88,16 @@ def pair_echo(
     processing: Processing,
     calibration: dict[str, Any] | None,
     air: SceneAir,
+    *,
+    hovers: bool = False,
 ) -> PairEcho:
-    """Return the echo of a pair from its nodes' recordings; path offsets are the calibration's, or the config's."""
+    """Return the echo of a pair from its nodes' recordings; path offsets are the calibration's, or the config's.
+
+    Pulses of a hover are left out unless `hovers`, as `apertura.pipeline.opening.positions.place` does.
+    """
     pulses = common_pulses(tx, rx, prf_hz=sent.waveform.prf_hz)
     paired = np.flatnonzero(~pulses.outlier)
-    positions = place(tx, rx, tx.raw.time.values[pulses.tx_index[paired]])
+    positions = place(tx, rx, tx.raw.time.values[pulses.tx_index[paired]], hovers=hovers)
     paired = paired[positions.good]
     at = tx.raw.time.values[pulses.tx_index[paired]]
     measured, sidelink_m = _transfer((tx, rx), pulses.rx_index[paired], at, sent, processing, air)

@@ -217,7 +217,8 @@ def _placed_by_logs(campaign: Campaign, flight: str, nodes: tuple[str, str], his
     wave_m = shortest_wave(history.frequency.values)
     logs = {node: raw_log(campaign, flight, node, wave_m) for node in nodes}
     tx, rx = (logs[node] for node in nodes)
-    placed = place(tx, rx, history.time.values)
+    segmented = bool(campaign.segments_of(flight, "-".join(nodes)))
+    placed = place(tx, rx, history.time.values, hovers=segmented)
     history = history.isel(pulse=placed.good)
     at = history.time.values
     offset_s = rx.settings.path_offset_m.radar / SPEED_OF_LIGHT_M_S

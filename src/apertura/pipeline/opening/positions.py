@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from apertura.common.arrays import Times
 from apertura.common.errors import CampaignError
 from apertura.common.flags import Flags
-from apertura.core.geometry.track_checks import CheckedTrack
+from apertura.core.geometry.track_checks import CheckedTrack, hovering
 from apertura.formats.tracks.track import FIXES
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import SEGMENTS, Node
@@ -84,8 +84,10 @@ class PulsePositions:
     report: dict[str, dict[str, Any]]
 
 
-def place(tx: NodeLog, rx: NodeLog, at: Times) -> PulsePositions:
+def place(tx: NodeLog, rx: NodeLog, at: Times, *, hovers: bool = False) -> PulsePositions:
     """Return which pulses, at the transmitter's tags `at`, both logs of a pair give positions for.
+
+    Pulses of a hover are left out unless `hovers`: segments of the pair say what images it.
 
     Raises
     ------
@@ -106,6 +108,14 @@ def place(tx: NodeLog, rx: NodeLog, at: Times) -> PulsePositions:
             expected="logs whose epochs are sound while there are pulses",
             remedy="Correct the log, or allow poorer solutions by nodes.<node>.worst_fix.",
         )
+    standing = np.zeros(len(at), bool)
+    if not hovers:
+        legs = tx.antenna("radar_tx", at[good]), rx.antenna("radar_rx", at[good])
+        standing[good] = hovering(tx.log_seconds(at[good]), legs)
+    if standing.any():
+        reasons["hover"] = int(standing.sum())
+        flags["hover"] = _hover(tx, at, standing)
+        good &= ~standing
     report = {
         leg: position_error(node.track, node.settings, at[good])
         | {"node": node.name, "interpolation_m": node.checked.interpolation_m}
@@ -192,6 +202,17 @@ def _flags(node: NodeLog, at: Times, barred: dict[str, NDArray[np.bool_]]) -> di
     if node.yaw_fault is not None:
         lines["attitude_suspect"] = f"{node.name}: {node.yaw_fault.line}"
     return lines
+
+
+def _hover(tx: NodeLog, at: Times, standing: NDArray[np.bool_]) -> str:
+    """Return how many pulses of hovers are left out, and when the longest was."""
+    time_s = tx.log_seconds(at)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], standing, [False]]).astype(np.int8))).reshape(-1, 2)
+    first, last = max(edges, key=lambda edge: time_s[edge[1] - 1] - time_s[edge[0]])
+    return (
+        f"{int(standing.sum())} of {len(at)} pulses left out: the antennas stood, longest "
+        f"{time_s[last - 1] - time_s[first]:.0f} s from {tx.log_time(float(time_s[first]))}"
+    )
 
 
 def _worst(node: NodeLog, faults: list[tuple[float, float]]) -> str:

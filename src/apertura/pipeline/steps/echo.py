@@ -36,7 +36,8 @@ def echo(campaign: Campaign, flight: str, pair: str) -> Path:
         nodes = {node: open_acquisition(campaign, flight, node, sent) for node in dict.fromkeys((tx, rx))}
         parents = [stage for node in nodes.values() for stage in (node.raw, node.track)]
         air = scene_air(campaign, nodes[tx].track.position.values)
-        formed = pair_echo(nodes[tx], nodes[rx], sent, campaign.settings.processing, calibration, air)
+        hovers = bool(campaign.segments_of(flight, pair))
+        formed = pair_echo(nodes[tx], nodes[rx], sent, campaign.settings.processing, calibration, air, hovers=hovers)
     formed = formed.within(campaign, flight, pair)
     inputs = {name: lineage.sources.digests[name] for name in map(campaign.relative, files)}
     if calibration:

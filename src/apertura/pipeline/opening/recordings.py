@@ -1,0 +1,81 @@
+"""Recordings of raw/ as captures: as their recorder was triggered, or found in samples that never stopped."""
+
+from pathlib import Path
+
+import xarray as xr
+
+from apertura.common.errors import CampaignError
+from apertura.common.paths import inside
+from apertura.core.echo.trigger import trigger_captures
+from apertura.formats.reading import open_recording
+from apertura.formats.recordings.recording import Recording
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.config import CONFIG, PulseWaveform, SampledWaveform
+from apertura.pipeline.digests import digest_of
+from apertura.pipeline.opening.transmitted import read_framing
+
+
+def checked_recording(campaign: Campaign, flight: str, node: str) -> Recording:
+    """Return a node's recording; raise CampaignError where its samples are not those that the recorder hashed."""
+    recording = open_recording(campaign.recording_files(flight, node))
+    recording.check_hash(lambda path: digest_of(campaign.root, campaign.relative(path), algorithm="sha512"))
+    return recording
+
+
+def preamble_files(recording: Recording, campaign: Campaign) -> tuple[Path, ...]:
+    """Return the file of chips that the recorder's metadata name, which must lie in the campaign; none of triggers."""
+    if recording.framing is None:
+        return ()
+    name = recording.framing["preamble"]
+    return (inside(campaign.root, name, where=f"{recording.files[0]}: apertura:framing.preamble"),)
+
+
+def captures_of(recording: Recording, campaign: Campaign, *, node: str) -> xr.Dataset:
+    """Return the `raw` stage of a recording.
+
+    Raises
+    ------
+    CampaignError
+        If a capture holds only zeros, the file ends before the last, or no preamble is found in samples that run
+        through.
+    """
+    if recording.framing is None:
+        dataset = recording.cut(recording.captures, node=node)
+    else:
+        dataset = _triggered(recording, campaign, node=node)
+    dataset.attrs["samples"] = campaign.relative(recording.samples.path)
+    return dataset
+
+
+def _triggered(recording: Recording, campaign: Campaign, *, node: str) -> xr.Dataset:
+    """Return the `raw` stage of a continuous recording, as a triggered recorder would have written it."""
+    waveform, described = campaign.settings.waveform, recording.framing or {}
+    if not isinstance(waveform, SampledWaveform):
+        raise TypeError("a recording of samples needs a waveform that was recorded as samples")
+    if isinstance(waveform, PulseWaveform) and waveform.lead_s:
+        raise CampaignError(
+            f"waveform.lead_s is {waveform.lead_s:g}, and {recording.files[0].name} never stopped",
+            where=CONFIG,
+            expected="0: its captures are cut where the pulse begins",
+            remedy="Set waveform.lead_s to 0.",
+        )
+    framing = read_framing(
+        preamble_files(recording, campaign)[0],
+        described,
+        sample_rate_hz=recording.sample_rate_hz,
+        where=recording.files[0],
+    )
+    rate = campaign.settings.processing.false_alarms_per_s
+    channel = "sidelink" if "sidelink" in recording.channels else "radar"
+    samples, length = recording.samples.channel(recording.channels.index(channel)), waveform.capture_samples
+    bits = 8 * recording.samples.sample_bytes // len(recording.channels)
+    captures = trigger_captures(samples, framing, symbol_samples=length, false_alarms_per_s=rate, sample_bits=bits)
+    if not captures.start.size:
+        raise CampaignError(
+            f"no preamble in {len(samples)} samples at a threshold for {rate} false alarms per second",
+            where=recording.files[-1],
+            expected=f"preambles of {described['preamble']} in channel {channel}",
+            remedy="Check the preamble file and apertura:framing, or record with more signal.",
+        )
+    dataset = recording.cut(recording.captures_at(captures.start, length, captures.frame), node=node)
+    return dataset.assign_attrs(trigger=captures.report)

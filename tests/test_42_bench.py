@@ -1,0 +1,154 @@
+"""A radar on the bench: a right set-up carries no flag, every spoilt one the flag of what is wrong with it."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bench_setups import FLIGHT, RADAR_M, RECEIVED, RIGHT, SIDELINK_M, SPOILT, Setup, cabled
+from folders import edit_config
+
+from apertura.common.errors import CampaignError
+from apertura.common.flag_table import FLAGS
+from apertura.core.echo.demodulate import Numerology
+from apertura.core.geometry.aperture import Aperture
+from apertura.core.planning.plan import no_aperture
+from apertura.methods.synchronisation.bench import measure_link
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.check import problems
+from apertura.pipeline.opening.bench import Bench, measure_bench
+from apertura.pipeline.steps import echo, ingest
+from apertura.pipeline.store import open_stage
+from apertura.simulation import Impairments, preset
+from apertura.simulation.campaign import write_campaign
+from apertura.simulation.scene import Waypoints
+from apertura.views.report.bench import PAGE, PICTURE, REPORT, print_bench
+
+QUICK = ("reference unlocked", "sidelink leaks", "I and Q swapped", "cable warms up", "split unequal")
+
+
+def measured(setup: Setup, folder: Path, seed: int = 3) -> Bench:
+    return measure_bench(Campaign.load(setup.write(folder, seed)), FLIGHT)
+
+
+def of(snr_db: float) -> Setup:
+    """Return a right set-up whose compressed pulses have a signal to noise ratio, by noise of the radar channels."""
+    per_subcarrier_db = snr_db - 10 * np.log10(512)
+    own = Impairments(radar_snr_db=per_subcarrier_db)
+    return replace(RIGHT, specification=cabled(own, replace(RECEIVED, radar_snr_db=per_subcarrier_db)))
+
+
+@pytest.mark.parametrize(
+    "name", [*QUICK, *(pytest.param(name, marks=pytest.mark.slow) for name in {*SPOILT} - {*QUICK})]
+)
+def test_a_spoilt_set_up_is_named(name: str, tmp_path):
+    bench = measured(SPOILT[name], tmp_path / "bench")
+    assert SPOILT[name].flags & bench.flags.keys(), dict(bench.flags)
+    assert any(set(line.flags) & SPOILT[name].flags for line in bench.lines)
+
+
+@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 21))])
+def test_a_right_set_up_is_never_flagged(seed: int, tmp_path):
+    snr_db = float(np.random.default_rng(seed).uniform(18.5, 45.0))
+    assert not measured(of(snr_db), tmp_path / "bench", seed).flags
+
+
+@pytest.mark.parametrize(("snr_db", "printed"), [(18.5, 0.986), (33.0, 0.9995), (40.0, 0.9999)])
+def test_coherence_over_a_cable_is_what_its_snr_allows(snr_db: float, printed: float, tmp_path):
+    """Γ of both pairs as the source paper prints it for its three recordings, within what chance and print leave."""
+    for node in measured(of(snr_db), tmp_path / "bench").nodes:
+        digit = 10.0 ** -len(str(printed).partition(".")[2])
+        assert abs(node.link.coherence - printed) < 4 * node.link.coherence_std + digit / 2
+        assert abs(10 * np.log10(node.link.snr) - snr_db) < 0.3
+        assert node.coherence_before is None or node.coherence_before < 0.05  # random phases: 1/M
+
+
+def test_paths_of_cables_are_measured(tmp_path):
+    offsets = measured(RIGHT, tmp_path / "bench").offsets
+    for node, true_m in (("uav1", 0.0), ("uav2", 0.911)):
+        assert abs(offsets[node].offset_m - true_m) < max(4 * offsets[node].std_m, 2e-3)  # 1/25 of a count of phase
+
+
+def test_white_phase_noise_has_the_allan_deviation_of_its_snr():
+    rng, pulses = np.random.default_rng(2), 4000
+    numerology = Numerology(1.2e9, 64e6, np.arange(32), prefix_samples=16, dft_samples=64)
+    noise = 0.3 * (rng.normal(size=(pulses, 32)) + 1j * rng.normal(size=(pulses, 32)))
+    echo = (1 + noise).astype(np.complex64)
+    link = measure_link("a", lambda some: echo[some], 0.1 * np.arange(pulses), numerology, divided=False)
+    white = np.sqrt(3) * link.noise_rad / (2 * np.pi * link.frequency_hz)
+    for averaged_s, deviation in link.deviation(0.1)[:4]:
+        assert deviation == pytest.approx(white / averaged_s, rel=0.1)
+
+
+def test_a_bench_needs_no_log_and_makes_no_image(tmp_path, capsys):
+    campaign = Campaign.load(SPOILT["cable warms up"].write(tmp_path / "bench", 1))
+    assert not problems(campaign.root)
+    assert print_bench(campaign) > 0
+    assert FLAGS["link_drifts"].look in capsys.readouterr().out
+    made = sorted(path.name for path in campaign.result(FLIGHT).iterdir())
+    assert made == sorted([REPORT, PAGE, PICTURE, "bench.manifest.json"])
+    with pytest.raises(CampaignError, match="a flight of kind image"):
+        campaign.check_images()
+
+
+def test_measured_paths_go_into_the_config_and_nothing_else_changes(tmp_path):
+    root = RIGHT.write(tmp_path / "bench", 1)
+    edit_config(root, lambda config: config["nodes"]["uav2"]["path_offset_m"].update(radar=0.5))
+    path = root / "config" / "config.yaml"
+    path.write_text("# mine\n" + path.read_text())
+    before = path.read_text().splitlines()
+    print_bench(Campaign.load(root), write=True)
+    after = path.read_text().splitlines()
+    changed = [(old, new) for old, new in zip(before, after, strict=True) if old != new]
+    assert len(changed) == 1
+    assert changed[0][0].strip() == "radar: 0.5"
+    assert float(changed[0][1].partition(": ")[2]) == pytest.approx(0.911, abs=2e-3)
+    assert (RADAR_M, SIDELINK_M) == (10.0, 5.0)
+    assert "path_disagrees" not in measure_bench(Campaign.load(root), FLIGHT).flags
+
+
+# Images need an aperture
+
+
+def test_a_radar_that_stands_still_is_refused_as_a_flight_with_the_question_whether_it_is_a_bench(tmp_path):
+    specification = cabled()
+    flight = replace(specification.flights[0], kind="image")
+    root = write_campaign(tmp_path / "c", replace(specification, flights=(flight,)), np.random.default_rng(1))
+    (first, *_) = [problem for problem in problems(root) if "bench" in str(problem)]
+    assert "no aperture, its nodes moved 0 cm" in str(first)
+
+
+@pytest.mark.parametrize(("length_m", "flagged"), [(0.3, True), (2.0, False)])
+def test_an_aperture_too_short_for_its_scene_is_flagged(length_m: float, flagged: bool):
+    """λR/2L against the scene: 4.2 m of 6 m for 0.3 m of track at 10 m, 0.6 m for 2 m."""
+    track = np.stack([np.linspace(0, length_m, 50) - length_m / 2, np.full(50, -10.0), np.full(50, 1.0)], -1)
+    ground = np.stack(np.meshgrid(np.linspace(-3, 3, 5), np.linspace(3, -3, 5), indexing="xy"), -1)
+    ground = np.concatenate([ground, np.zeros((5, 5, 1))], -1)
+    flown, wavelength = Aperture(track, track), 0.25
+    assert flown.cross_cell_m(ground, wavelength_m=wavelength) == pytest.approx(
+        wavelength * 10.1 / (2 * length_m), rel=0.05
+    )
+    assert bool(no_aperture(flown, ground, wavelength_m=wavelength)) is flagged
+
+
+@pytest.mark.slow
+def test_a_hover_inside_a_flight_is_left_out_unless_segments_say_what_images(tmp_path):
+    plan = preset("demo", pulses=400)
+    times = (-2.0, 5.0, 15.0, 22.0)
+    tracks = {
+        name: Waypoints(times, tuple((north / 2 + x, -11.0, 4.8) for north in (-7.0, 0.0, 0.0, 7.0)))
+        for name, x in (("uav1", 0.0), ("uav2", 4.7))
+    }
+    root = write_campaign(
+        tmp_path / "c", replace(plan, flights=(replace(plan.flights[0], tracks=tracks),)), np.random.default_rng(1)
+    )
+    campaign = Campaign.load(root)
+    for node in tracks:
+        ingest.ingest(campaign, "f01", node)
+    quality = open_stage(echo.echo(campaign, "f01", "uav1-uav2"), "echo").attrs
+    assert 100 < quality["pulses"]["reasons"]["hover"] < 240
+    assert "the antennas stood" in quality["flags"]["hover"]
+    segments = "flight\tpair\tstart\tend\nf01\tuav1-uav2\t2025-05-14T09:30:00\t2025-05-14T09:31:00\n"
+    (root / "config/segments.tsv").write_text(segments)
+    quality = open_stage(echo.echo(Campaign.load(root), "f01", "uav1-uav2"), "echo").attrs
+    assert "hover" not in quality["flags"]
