@@ -1,8 +1,8 @@
 """Steps as forks of one process that has imported what they need: what `apertura run` starts on this machine.
 
 ``python -m apertura.pipeline.runs.warm`` forks snakemake, with a journal, and then a process for every step that
-snakemake's shell asks for; it has no thread of its own. Log, benchmark, variables, signals and exit status of a step are
-those of the command in its rule, which plain snakemake and other machines start as it stands.
+snakemake's shell asks for; it has no thread of its own. Log, benchmark, variables, signals and exit status of a step
+are those of the command in its rule, which plain snakemake and other machines start as it stands.
 """
 
 import ctypes
@@ -86,7 +86,7 @@ def _serve(requests: socket.socket, snakemake: BaseProcess) -> None:
                 if step:
                     running[step.sentinel] = step, answer
             elif ready in running:
-                step, answer = running.pop(ready)  # type: ignore[call-overload]
+                step, answer = running.pop(ready)
                 step.join()
                 _tell(answer, _status(step))
                 answer.close()
