@@ -56,8 +56,19 @@ def import_closure(modules: Iterable[str], *, package: Path = PACKAGE) -> dict[s
         path = _source(name, package) if _is_ours(name) else _source_outside(name)
         if path is not None:
             closure[name] = path
-            waiting += _imports(path.read_text(encoding="utf-8"))
+            waiting += _imports(source_of(path))
     return closure
+
+
+def source_of(path: Path) -> str:
+    """Return the text of a source; it is read again only where its size or its time has changed."""
+    state = path.stat()
+    return _read(path, state.st_mtime_ns, state.st_size)
+
+
+@functools.cache
+def _read(path: Path, *_: int) -> str:
+    return path.read_text(encoding="utf-8")
 
 
 def _top(name: str) -> str:
@@ -68,10 +79,12 @@ def _is_ours(name: str) -> bool:
     return _top(name) == PACKAGE.name
 
 
+@functools.cache
 def _has_no_effect(name: str) -> bool:
     return any(name == one or name.startswith(f"{one}.") for one in WITHOUT_EFFECT)
 
 
+@functools.cache
 def _source(name: str, package: Path) -> Path | None:
     parts = name.split(".")[1:]
     if not parts:  # the package itself only hands out public names

@@ -1,5 +1,6 @@
 """Processes of a run: one at a time, apart from the folder's own code, and ended with what they opened closed."""
 
+import ctypes
 import fcntl
 import os
 import re
@@ -19,10 +20,15 @@ from apertura.common.errors import CampaignError, shown
 # ---- End of a command: signals, and the exit status for the run around it -------------------------------------------
 
 INTERRUPTED = 130
+SIGNALLED = 128
+"""Exit status of a process that a signal has ended, as shells count: this and the number of the signal."""
 STATUS_FILE = "APERTURA_STATUS_FILE"
 """Environment variable: where steps leave the exit status that snakemake does not pass on."""
 
-_ENDING = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
+ENDING = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
+"""Signals that end a run."""
+
+_PR_SET_PDEATHSIG = 1  # of prctl(2)
 
 
 class Interrupted(SystemExit):
@@ -36,16 +42,29 @@ def leave_status(status: int) -> None:
             file.write(f"{status}\n")
 
 
+def die_with_parent(parent: int) -> None:
+    """Ask the kernel to end this process with its parent, also where that is killed outright.
+
+    Parameters
+    ----------
+    parent
+        Number of the process that started this one: it may have ended by now.
+    """
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent:
+        os._exit(SIGNALLED + signal.SIGKILL)
+
+
 @contextmanager
 def ended_by_signals() -> Iterator[None]:
     """Turn SIGTERM, SIGINT and SIGHUP into `Interrupted`, so that whatever is open is closed on the way out."""
 
     def end(number: int, _: FrameType | None) -> None:
-        for other in _ENDING:
+        for other in ENDING:
             signal.signal(other, signal.SIG_IGN)
         raise Interrupted(f"interrupted by {signal.Signals(number).name}")
 
-    before = {number: signal.signal(number, end) for number in _ENDING}
+    before = {number: signal.signal(number, end) for number in ENDING}
     try:
         yield
     finally:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from apertura import __version__
-from apertura.common.code_imports import PACKAGE, built_from, import_closure, without_description
+from apertura.common.code_imports import PACKAGE, built_from, import_closure, source_of, without_description
 from apertura.common.paths import shipped
 
 # ---- Versions of the software and its lock file ---------------------------------------------------------------------
@@ -240,11 +240,16 @@ def code_sha256(*modules: str, package: Path = PACKAGE) -> str:
     digest = hashlib.sha256()
     closure = import_closure(modules, package=package)
     for name, path in sorted(closure.items()):
-        run = without_description(path.read_text(encoding="utf-8")).split("\n")
-        digest.update("\n".join([f"{name}\0", *(line for line in run if line.strip() != "..."), ""]).encode())
+        digest.update(f"{name}\0\n{_as_run(source_of(path))}".encode())
     for path in built_from(closure, package):
         digest.update(f"{path.name}\0{sha256_file(path)}\n".encode())
     return digest.hexdigest()
+
+
+@cache
+def _as_run(source: str) -> str:
+    """Return the lines of a source that run."""
+    return "".join(f"{line}\n" for line in without_description(source).split("\n") if line.strip() != "...")
 
 
 def chained_sha256(own: str, parents: Iterable[str]) -> str:

@@ -60,7 +60,7 @@ class Demand:
 
 @dataclass(frozen=True)
 class Cost:
-    """How long a job is expected to take on two cores of 2023; only the form counts once one has been timed.
+    """How long a job is expected to take on two cores of 2023: a run tells it in the measure of its own steps.
 
     Attributes
     ----------

@@ -54,6 +54,12 @@ def stale_results(campaign: Campaign, *, paranoid: bool = False) -> dict[str, st
     return stale
 
 
+def any_is_missing(campaign: Campaign) -> bool:
+    """Return whether a result that is not made on demand is not there."""
+    made = (result.manifest for name, result in results_of(campaign) if not RESULTS[name].on_demand)
+    return not all((campaign.root / manifest).is_file() for manifest in made)
+
+
 def settle_times(campaign: Campaign, stale: Collection[str]) -> None:
     """Give results that are not stale times that say so: not before what they were made from, and not after now.
 

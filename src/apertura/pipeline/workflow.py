@@ -1,6 +1,5 @@
 """The workflow on a campaign folder: checked first, run by one process group, and ended with all its steps."""
 
-import ctypes
 import os
 import re
 import signal
@@ -11,6 +10,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import IO, Literal
 
@@ -18,7 +18,7 @@ from apertura.common.atomic import remove
 from apertura.common.code_imports import PACKAGE
 from apertura.common.errors import CampaignError
 from apertura.common.paths import check_shell_name, shipped
-from apertura.common.processes import INTERRUPTED, STATUS_FILE, given, hold, isolate
+from apertura.common.processes import INTERRUPTED, STATUS_FILE, die_with_parent, given, hold, isolate
 from apertura.common.progress import RUN
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.check import print_problems
@@ -26,13 +26,14 @@ from apertura.pipeline.lineage import on_demand
 from apertura.pipeline.runs.journal import JOURNAL, NAME, RECORDER, JournalReader, failures, note
 from apertura.pipeline.runs.outlook import Outlook
 from apertura.pipeline.runs.screen import NOTHING, Screen, listed
-from apertura.pipeline.stale import forms_results, stale_lines, stale_results
+from apertura.pipeline.runs.warm import NAME as WARM_RUN
+from apertura.pipeline.runs.warm import WARM
+from apertura.pipeline.stale import any_is_missing, forms_results, stale_lines, stale_results
 
 Show = Literal["errors", "steps", "snakemake"]
 
 _GRACE_S = 3.0
 _LOOK_S, _REST = 0.2, 20  # looking at 10^5 jobs takes time: at most a twentieth of one core
-_LIBC = ctypes.CDLL(None)
 _COUNTERS = Path("/proc/vmstat")
 _ELSEWHERE = ("memory",)
 """Checks of this machine, of no use where steps run on others."""
@@ -127,8 +128,12 @@ def run_workflow(root: Path, cores: int, *arguments: str, paranoid: bool = False
         print(*stale_lines(stale), sep="\n", end="\n" if stale else "", file=sys.stderr, flush=True)
     overtaken = [manifest for manifest in stale if not on_demand(manifest)]
     forced = ["--forcerun", *overtaken] if overtaken else []  # in time for a dry run; the workflow says why
-    command = _command(root, cores, [*options, *forced])
+    warm = forms and not elsewhere
+    command = _command(WARM_RUN if warm else RECORDER, root, cores, [*options, *forced])
     if forms:
+        os.environ.pop(WARM, None)
+        if warm and (overtaken or any_is_missing(campaign)):
+            os.environ[WARM] = "1"
         files, at_once = _Files.of(campaign), 0 if elsewhere else cores
         note(files.journal, "start", cores=at_once)
         screen = Screen(campaign, Outlook(campaign, at_once), quiet=show != "steps")
@@ -185,11 +190,11 @@ def _say(*lines: str) -> None:
     print(*lines, sep="\n", file=sys.stderr, flush=True)
 
 
-def _command(root: Path, cores: int, arguments: Sequence[str]) -> list[str]:
+def _command(module: str, root: Path, cores: int, arguments: Sequence[str]) -> list[str]:
     folder = shipped()
     own = ["--snakefile", str(folder / "Snakefile"), "--directory", str(root), "--logger", NAME]
     own += ["--workflow-profile", str(folder / "profiles" / "default"), "--cores", str(cores)]
-    return [sys.executable, "-P", "-m", RECORDER, *own, *arguments]
+    return [sys.executable, "-P", "-m", module, *own, *arguments]
 
 
 def _killed_for_memory() -> int:
@@ -304,7 +309,7 @@ def _supervised(
         stdout=output,
         stderr=output,
         start_new_session=True,
-        preexec_fn=_die_with_parent,  # noqa: PLW1509 - this process has no other threads
+        preexec_fn=partial(die_with_parent, os.getpid()),  # noqa: PLW1509 - this process has no other threads
     )
     try:
         while process.poll() is None:
@@ -315,11 +320,6 @@ def _supervised(
         _end(process)
         raise
     return process.returncode
-
-
-def _die_with_parent() -> None:
-    """Ask the kernel (prctl, PR_SET_PDEATHSIG) to end snakemake with this run, also where that is killed outright."""
-    _LIBC.prctl(1, signal.SIGKILL)
 
 
 def _end(process: "subprocess.Popen[bytes]") -> None:

@@ -53,7 +53,12 @@ def _line(event: LogEvent | None, said: dict[str, Any]) -> tuple[str, dict[str, 
     return None
 
 
-if __name__ == "__main__":
+def record() -> None:
+    """Run snakemake with the arguments of this process."""
     LoggerPluginRegistry().register_plugin(f"snakemake_logger_plugin_{NAME}", sys.modules[__name__])
     sys.argv[0] = "snakemake"  # its messages begin with it
     main()
+
+
+if __name__ == "__main__":
+    record()

@@ -18,6 +18,7 @@ from apertura.pipeline.runs.results import states
 if TYPE_CHECKING:
     from rich.table import Table
 
+UNKNOWN = "time left unknown"
 NOTHING = "Nothing to be done: every result is there, and up to date."
 
 _MOST_BARS = 12
@@ -55,27 +56,27 @@ def about(seconds: float) -> str:
 
 @dataclass(frozen=True)
 class Bar:
-    """A line with a bar: what it is of, how far, and the seconds left."""
+    """A line with a bar: what it is of, how far, and the seconds left; None: unknown."""
 
     name: str
     told: str
     fraction: float
-    left_s: float
+    left_s: float | None
 
     @property
     def left(self) -> str:
         """The time left, in words."""
-        return f"about {about(self.left_s)} left"
+        return UNKNOWN if self.left_s is None else f"about {about(self.left_s)} left"
 
 
 def bars(campaign: Campaign, run: RunRecord, outlook: Outlook) -> list[Bar]:
     """Return a bar for each job under way, the oldest first, and in the end one of the whole run."""
     now_s = time.time()
     told = {number: StepProgress.of(campaign, job) for number, job in list(_running(run).items())[:_MOST_BARS]}
-    left = outlook.of_jobs(run, now_s, told)
+    left, whole_s = outlook.left(run, now_s, told)
     steps = [_bar(job, told.get(number), left[number], now_s) for number, job in _running(run).items()]
     done = len(run.finished) + sum(bar.fraction for bar in steps)
-    whole = Bar(f"{len(run.finished)} of {run.total} steps", "", done / max(run.total, 1), outlook.of_run(run, left))
+    whole = Bar(f"{len(run.finished)} of {run.total} steps", "", done / max(run.total, 1), whole_s)
     return [*steps, whole]
 
 
@@ -83,11 +84,11 @@ def _running(run: RunRecord) -> dict[int, JobRecord]:
     return {number: job for number, job in run.jobs.items() if job.running}
 
 
-def _bar(job: JobRecord, told: StepProgress | None, left_s: float, now_s: float) -> Bar:
+def _bar(job: JobRecord, told: StepProgress | None, left_s: float | None, now_s: float) -> Bar:
     if told:
         return Bar(job.name, f"{told.done} of {told.total} {told.what}", told.done / told.total, left_s)
     passed = max(job.seconds(now_s), 0.0)
-    return Bar(job.name, "", min(passed / max(passed + left_s, 0.1), 0.95), left_s)
+    return Bar(job.name, "", 0.0 if left_s is None else min(passed / max(passed + left_s, 0.1), 0.95), left_s)
 
 
 def table(rows: list[Bar]) -> "Table":
@@ -100,7 +101,7 @@ def table(rows: list[Bar]) -> "Table":
     grid.add_column(no_wrap=True, overflow="ellipsis", max_width=40)
     grid.add_column(ratio=1, min_width=8)
     grid.add_column(no_wrap=True, justify="right")
-    grid.add_column(no_wrap=True, justify="right", min_width=len("about 2.5 h left"))
+    grid.add_column(no_wrap=True, justify="right", min_width=len(UNKNOWN))
     *steps, whole = rows
     for row in steps[:_MOST_BARS]:
         grid.add_row(Text(f"{'':8}{row.name}"), ProgressBar(1.0, row.fraction), Text(row.told), Text(row.left))
