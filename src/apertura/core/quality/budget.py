@@ -339,6 +339,13 @@ def offset_line(
     return BudgetLine(cause, None if std is None else f"{std:.3g} {unit}", effect, f"1 {unit}")
 
 
+def arithmetic_line(error_db: float) -> BudgetLine:
+    """Return the loss by the measured numerical error."""
+    return BudgetLine(
+        "arithmetic", f"{error_db:.1f} dB measured", Effect(10 * np.log10(1 - 10 ** (error_db / 10)), 0, 0)
+    )
+
+
 def summed(effects: Iterable[Effect]) -> Effect:
     """Return the sum of independent effects: losses add in dB, shifts and phases by their squares.
 

@@ -159,13 +159,6 @@ def _between_epochs(paths: PointPaths, pair: OpenPair) -> list[BudgetLine]:
     return [BudgetLine("between epochs", f"{words} rms", paths.of_noise(*parts))]
 
 
-def arithmetic_line(error_db: float) -> BudgetLine:
-    """Return the loss by the measured numerical error."""
-    return BudgetLine(
-        "arithmetic", f"{error_db:.1f} dB measured", Effect(10 * np.log10(1 - 10 ** (error_db / 10)), 0, 0)
-    )
-
-
 def _air(campaign: Campaign, pair: OpenPair, paths: PointPaths) -> BudgetLine:
     """Return what the uncertainty of the air's refractivity does: all pairs lie wrong alike, less what paths differ by.
 
