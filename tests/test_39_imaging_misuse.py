@@ -197,6 +197,14 @@ def test_what_forms_an_image_of_nothing_is_flagged(name):
     assert flag is None or flag in flags
 
 
+def test_samples_of_the_other_sign_are_told_as_such():
+    for name in ("conjugated", "I and Q swapped", "conjugated profiles"):
+        (line,) = json.loads(ap.backproject(FLAGGED[name][0](), TARGET_GRID).attrs["flags"]).values()
+        assert "I and Q are swapped" in line
+    for name in ("paths one way", "square array transposed", "track half as long"):
+        assert "I and Q" not in ap.backproject(FLAGGED[name][0](), TARGET_GRID).attrs["flags"]
+
+
 def test_what_the_pulses_cannot_tell_is_not_called_focused():
     """Half-spectra swapped: two peaks in range, and nothing that tells them from two targets."""
     swapped = replace(HISTORY, transfer=np.fft.fftshift(ECHO, axes=1))

@@ -433,9 +433,12 @@ def focus_report(formation: Formation, target: Any) -> dict[str, Any]:
         measured = [None] * len(points)  # sidelobes of it
     if elsewhere or not found:
         verdict = judge_parts(parts, cell_m=cell_m)
+    peak = max((point.amplitude for point in points), default=0.0)
+    conjugated = elsewhere or verdict.loss_db < _CONJUGATED_LOSS_DB
     return {
         **_verdict_report(verdict),
         **({"elsewhere": elsewhere} if elsewhere else {}),
+        **({"conjugated": line} if conjugated and (line := _conjugated(formation, peak)) else {}),
         "cell_m": round(cell_m, 4),
         "spectrum_cycles2_m2": [[float(f"{value:.4g}") for value in row] for row in _spectrum(formation)],
         "maxima": len(points),
@@ -444,6 +447,37 @@ def focus_report(formation: Formation, target: Any) -> dict[str, Any]:
             _point_report(formation, point, focus) for point, focus in zip(points, measured, strict=True) if focus
         ],
     }
+
+
+_CONJUGATED_LOSS_DB = -6.0  # beyond which a defocused image may be one of conjugated samples
+_CONJUGATED_DB = 10.0  # that their image must be brighter by, which no wrong track of a right image is
+_CONJUGATED_S = 60.0  # that it may take
+
+
+def _conjugated(formation: Formation, peak: float) -> str | None:
+    """Return one line where the image of conjugated samples has a far brighter peak than that of the samples.
+
+    Notes
+    -----
+    Source: docs/theory/focus.md, "Conjugated samples".
+    """
+    if formation.plan.predicted_seconds > _CONJUGATED_S:
+        return None
+    history, profiles = formation.history, formation.profiles
+    if history is None:
+        other = replace(profiles, samples=np.conj(np.asarray(profiles.samples)))
+    else:
+        history = replace(history, transfer=np.conj(np.asarray(history.transfer)))
+        other = range_compress(history, formation.grid, formation.plan.terrain)
+    image = replace(formation, history=history, profiles=other).image
+    brightest = float(np.abs(image).max().compute(scheduler="synchronous"))
+    gained_db = 20 * float(np.log10(max(brightest, 1e-30) / max(peak, 1e-30)))
+    if gained_db < _CONJUGATED_DB:
+        return None
+    return (
+        f"with conjugated samples its brightest place is {min(gained_db, 99):.0f} dB brighter: "
+        "I and Q are swapped, waveform.iq says the other sign, or phases count the other way"
+    )
 
 
 UNEXPECTED_DB = 0.2
@@ -475,6 +509,8 @@ def focus_flags(report: dict[str, Any], expected: Effect) -> Flags:
         beyond_db = expected.loss_db - report["loss_db"]
         if beyond_db > max(UNEXPECTED_DB, _UNEXPECTED_SIGMAS * float(np.hypot(report["std_db"], expected.loss_std_db))):
             flags["loss_unexpected"] = f"{report['why']}; {told}: something is worse than the budget states"
+    if "conjugated" in report:
+        return Flags({name: f"{line}; {report['conjugated']}" for name, line in flags.items()})
     return flags
 
 
