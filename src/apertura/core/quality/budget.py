@@ -85,8 +85,9 @@ class BudgetLine:
             for name, value in asdict(self.effect).items()
             if name != "loss_std_db"
         }
-        otherwise = f"{self.unit} would do this" if self.assumed is None else f"{_ASSUMED} {self.assumed}"
-        return {"cause": self.cause, "stated": self.stated or f"{_NOT_STATED}; {otherwise}", **expected}
+        would = f"; {self.unit} would do this" if self.unit else ""
+        otherwise = would if self.assumed is None else f"; {_ASSUMED} {self.assumed}"
+        return {"cause": self.cause, "stated": self.stated or f"{_NOT_STATED}{otherwise}", **expected}
 
 
 def is_stated(report: Mapping[str, Any]) -> bool:

@@ -213,7 +213,7 @@ def _stated_tags_ms(campaign: Campaign, pair: OpenPair) -> float | None:
 def _sampling(pulses: Mapping[str, Any]) -> BudgetLine:
     used, dropped = pulses.get("used"), pulses.get("dropped", 0)
     stated = None if used is None else f"{dropped} of {used + dropped} pulses missing"
-    return BudgetLine("missing pulses", stated, Effect(0.0, 0.0, 0.0), "nothing known")
+    return BudgetLine("missing pulses", stated, NO_EFFECT)
 
 
 def _antenna(pair: OpenPair, paths: PointPaths) -> BudgetLine:
