@@ -109,7 +109,7 @@ def test_an_antenna_below_flat_ground_is_refused_and_below_a_dem_beside_it_is_fl
     track = UTM_GRID.positions_at(np.arange(5.0), -40.0, np.array([660.0, 651.0, 649.5, 655.0, 660.0]))
     high = UTM_GRID.positions_at(np.arange(5.0), 10.0, 700.0)
     with pytest.raises(
-        CampaignError, match=r"f01: at 1 pulses the receiver is in or below .* worst at pulse 2: -0.50 m"
+        CampaignError, match=r"f01: at 1 pulse the receiver is in or below .* worst at pulse 2: -0.50 m"
     ):
         check_antennas(UTM_GRID, FlatGround(650.0), Aperture(high, track), where="f01")
     low = UTM_GRID.positions_at(np.arange(5.0), 10.0, 649.0)

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from scenes import TARGET, TARGET_GRID, point_history
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
+from apertura.common.errors import CampaignError
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.imaging.range_profiles import GUARD_SAMPLES, RangeWindow, range_compress
 from apertura.core.scene.grid import SceneGrid
@@ -64,5 +65,5 @@ def test_the_window_covers_every_pixel_with_all_its_guard_samples(shape, relief_
 def test_a_scene_deeper_than_the_unambiguous_range_is_refused_with_both_numbers():
     """2 MHz between subcarriers: the total path repeats every 150 m, in 400 samples."""
     deep = SceneGrid("local", -50.0, 100.0, 1.0, (150, 100))
-    with pytest.raises(ValueError, match=r"spans \d+ samples of range: must be at most the 400 unambiguous"):
+    with pytest.raises(CampaignError, match=r"spans \d+ samples of range; expected at most the 400"):
         range_compress(point_history(4), deep, FLAT)

@@ -146,7 +146,9 @@ def test_a_mixer_of_the_other_sign_is_flagged(tmp_path):
     flight = replace(FLIGHT, sweep=replace(FAST, iq="complex"))
     root = written(tmp_path, flight, iq="conjugate")
     run_steps(root, exports=False)
-    assert {"echo_elsewhere", "defocused"} & set(image_of(root).attrs["quality"]["flags"])
+    raised = image_of(root).attrs["quality"]["flags"]
+    assert {"echo_elsewhere", "defocused"} & set(raised)
+    assert any("I and Q are swapped, waveform.iq" in line for line in raised.values())
 
 
 def test_sweeps_so_slow_that_the_antenna_moves_are_flagged(tmp_path):

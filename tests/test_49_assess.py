@@ -153,7 +153,7 @@ def trial(gain_db, kind, *, offset=False):
         ([trial(4.0, "time"), trial(1.0, "height")], [1.0], 7.0, None),  # less than most of what was lost
         ([trial(6.0, "time"), trial(3.1, "height")], [1.0], 7.0, None),  # another cause does as well
         ([trial(6.0, "time"), trial(1.0, "height")], [3.1], 7.0, None),  # so does chance
-        ([trial(0.9, "time")], [], 1.0, None),
+        ([trial(0.4, "time")], [], 0.5, None),
         ([trial(60.0, "height"), trial(37.0, "carrier_is")], [3.0], 22.0, "height"),  # beyond doubt
         ([trial(2.4, "range", offset=True), trial(2.3, "lever arm", offset=True)], [1.0], 2.6, "offset"),
         ([trial(2.4, "range", offset=True), trial(2.3, "time")], [1.0], 2.6, None),

@@ -36,7 +36,6 @@ TYPED = {
     "align": "align . f01 uav1 --point 500000 5300000 500",
     "chart": "chart . -n",
     "check": "check .",
-    "check-crate": "check-crate .",
     "clean": "clean . --yes",
     "diff": "diff results/f01/uav1-uav1/db.tif results/f01/uav1-uav2/db.tif",
     "init": "init new",

@@ -15,6 +15,7 @@ _GROUPS = {
 }
 _OF = {
     "backproject": "Images",
+    "judge": "Images",
     "gradient": "Images",
     "range_compress": "Images",
     "PhaseHistory": "Images",

@@ -12,8 +12,8 @@ from apertura.views.cli import app
 _HEAD = """# Command line
 
 `apertura COMMAND --help` says the same. Exit codes: 0, done; 2, something for you to fix, in one message;
-130, ended by a signal; 1, what `verify`, `diff`, `reproduce` or `check-crate` compared is
-not the same, or a defect of apertura. Written by `make pages` from the commands.
+130, ended by a signal; 1, what `verify`, `diff` or `reproduce` compared is
+not the same, or a defect of apertura. Where a campaign folder is an argument, it is the one in hand unless named. Written by `make pages` from the commands.
 """
 
 

@@ -31,6 +31,7 @@ _PUBLIC = {
     "SceneGrid": "apertura.core.scene.grid",
     "backproject": "apertura.core.imaging.backproject",
     "gradient": "apertura.core.imaging.gradient",
+    "judge": "apertura.core.imaging.judgement",
     "open_campaign": "apertura.pipeline.opening.results",
     "open_dem": "apertura.core.scene.dem",
     "range_compress": "apertura.core.imaging.range_profiles",

@@ -53,6 +53,17 @@ def shown(text: object, longest: int = 80) -> str:
     return line if whole and len(line) <= longest else line[:longest] + "…"
 
 
+def number_of(count: int, what: str) -> str:
+    """Return how many of something there are, in words.
+
+    Examples
+    --------
+    >>> number_of(1, "bright point"), number_of(3, "pulse")
+    ('1 bright point', '3 pulses')
+    """
+    return f"{count} {what}{'' if count == 1 else 's'}"
+
+
 def quoted(value: object, longest: int = 80) -> str:
     """Return a value that was read as Python writes it, in quotation marks if it is text, and no longer than that.
 

@@ -290,7 +290,8 @@ _OF_IMAGES = {
         "where the pulses hold the strong echo",
         "nothing bright in the image, and pulses hold a strong echo: at ranges that the scene does not have, or "
         "that no place gathers",
-        "heights and datum of log and scene; scene.bounds_m; path offsets", "core/imaging/focus_check.py"),
+        "heights and datum of log and scene; scene.bounds_m; path offsets; waveform.iq: I and Q swapped",
+        "core/imaging/focus_check.py"),
     "pairs_apart": Flag(
         "cm between the places of the points, with its uncertainty, east and north",
         "a pair shows the same points at other places than most, or as many say one place as the other",

@@ -53,14 +53,14 @@ class Commands(TyperGroup):
         for point in entry_points(group="apertura.commands"):
             if point.name not in self.commands:
                 self.commands[point.name] = group = get_group(point.load())
-                group.name = point.name
+                group.name, group.hidden = point.name, True
 
 
 app = typer.Typer(cls=Commands, no_args_is_help=True, help="SAR images from campaign folders.")
-app.add_typer(step, name="step")
+app.add_typer(step, name="step", hidden=True)  # for rules, and to paste what one runs
 
 
-CampaignFolder = Annotated[Path, typer.Argument(help="campaign folder")]
+CampaignFolder = Annotated[Path, typer.Argument(help="campaign folder, else the one in hand", show_default=False)]
 Cores = Annotated[int, typer.Option(min=1, help="cores to use")]
 Paranoid = Annotated[bool, typer.Option("--paranoid", help="read every input again, whatever its times say")]
 HERE = Path()
@@ -162,9 +162,13 @@ def inspect(
 
 @app.command()
 def align(
-    campaign: CampaignFolder,
-    flight: Annotated[str, typer.Argument(help="flight")],
-    node: Annotated[str, typer.Argument(help="node that sends and receives")],
+    words: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="[CAMPAIGN] FLIGHT NODE",
+            help="campaign folder, else the one in hand; flight; node that sends and receives",
+        ),
+    ],
     *,
     point: Annotated[
         tuple[float, float, float] | None,
@@ -177,7 +181,10 @@ def align(
     write: Annotated[bool, typer.Option("--write", help="write config/clocks.tsv")] = False,
 ) -> None:
     """Find the clock and the range of a recorder against its flight log: where echoes add up best."""
-    opened = _opened(campaign)
+    if len(words) not in {2, 3}:
+        raise CampaignError(" ".join(words), "align", "[CAMPAIGN] FLIGHT NODE", "Name flight and node.")
+    *folder, flight, node = words
+    opened = _opened(Path(*folder))
     from apertura.pipeline.steps.align import print_alignment
 
     asked = {"point": point, "search_s": search_s, "search_m": 0.0 if keep_path else search_m, "drift": drift}
@@ -187,19 +194,32 @@ def align(
 @app.command(cls=_PassesOn, context_settings=PASS_ON)
 def run(
     context: typer.Context,
-    campaign: CampaignFolder,
+    campaign: CampaignFolder = HERE,
     cores: Cores = ALL_CORES,
+    *,
     paranoid: Paranoid = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="only errors, and what to open")] = False,
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="all that snakemake says")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", "-n", help="tell which steps would run; run none")] = False,
+    until: Annotated[
+        list[str] | None, typer.Option("--until", "-U", metavar="STEP", help="last step: image, export, cube, …")
+    ] = None,
+    profile: Annotated[
+        str | None, typer.Option(metavar="PROFILE", help="where steps run: profiles/slurm, or a folder of yours")
+    ] = None,
+    set_scatter: Annotated[
+        list[str] | None, typer.Option("--set-scatter", metavar="tiles=N", help="form each image by N jobs")
+    ] = None,
 ) -> None:
-    """Run the workflow on a campaign folder; further options go to snakemake."""
+    """Run the workflow on a campaign folder; further options and targets go to snakemake."""
     from apertura.pipeline.stale import forms_results
     from apertura.pipeline.workflow import Show, run_workflow
 
     show: Show = "snakemake" if verbose else "errors" if quiet else "steps"
-    status = run_workflow(given(campaign), cores, *context.args, paranoid=paranoid, show=show)
-    if status == 0 and forms_results(["", *context.args]):
+    asked = [*context.args, *(["-n"] if dry_run else []), *(["--until", *until] if until else [])]
+    asked += [*(["--profile", profile] if profile else []), *(["--set-scatter", *set_scatter] if set_scatter else [])]
+    status = run_workflow(given(campaign), cores, *asked, paranoid=paranoid, show=show)
+    if status == 0 and forms_results(["", *asked]):
         opened = _opened(campaign)
         from apertura.views.summary import is_finished, print_benches, print_products, print_summary
 
@@ -229,7 +249,7 @@ def list_results(campaign: CampaignFolder = HERE) -> None:
 
 @app.command()
 def clean(
-    campaign: CampaignFolder,
+    campaign: CampaignFolder = HERE,
     wip: Annotated[bool, typer.Option("--wip", help="only work in progress that a killed run has left")] = False,
     yes: Annotated[bool, typer.Option("--yes", "-y", help="do not ask")] = False,
 ) -> None:
@@ -242,7 +262,7 @@ def clean(
 
 @app.command()
 def check(
-    campaign: CampaignFolder,
+    campaign: CampaignFolder = HERE,
     products: Annotated[bool, typer.Option("--products", help="read every byte of the results")] = False,
     paranoid: Paranoid = False,
 ) -> None:
@@ -253,7 +273,7 @@ def check(
 
 
 @app.command()
-def plan(campaign: CampaignFolder, threads: Threads = 1) -> None:
+def plan(campaign: CampaignFolder = HERE, threads: Threads = 1) -> None:
     """Print how each pair would be imaged, why, how exactly and at what cost; nothing is run."""
     opened = _opened(campaign)
     from apertura.views.plan import print_plan
@@ -262,7 +282,7 @@ def plan(campaign: CampaignFolder, threads: Threads = 1) -> None:
 
 
 @app.command(context_settings=PASS_ON)
-def chart(context: typer.Context, campaign: CampaignFolder, cores: Cores = ALL_CORES) -> None:
+def chart(context: typer.Context, campaign: CampaignFolder = HERE, cores: Cores = ALL_CORES) -> None:
     """Time and measure every engine and setting on the campaign: results/study/speed_accuracy.{png,html,csv}."""
     from apertura.pipeline.workflow import run_workflow
 
@@ -273,7 +293,7 @@ def chart(context: typer.Context, campaign: CampaignFolder, cores: Cores = ALL_C
 
 
 @app.command()
-def summary(campaign: Annotated[Path, typer.Argument(help="campaign folder")] = HERE) -> None:
+def summary(campaign: CampaignFolder = HERE) -> None:
     """Print what every finished image says of itself: focus, agreement, numerical error, flags."""
     opened = _opened(campaign)
     from apertura.views.summary import print_summary
@@ -283,7 +303,10 @@ def summary(campaign: Annotated[Path, typer.Argument(help="campaign folder")] = 
 
 @app.command()
 def score(
-    campaign: Annotated[Path, typer.Argument(help="campaign folder with truth.json")], paths: bool = True
+    campaign: Annotated[
+        Path, typer.Argument(help="campaign folder with truth.json, else the one in hand", show_default=False)
+    ] = HERE,
+    paths: bool = True,
 ) -> None:
     """Compare where point targets are found with where they were put, and print the products' paths."""
     opened = _opened(campaign)
@@ -306,7 +329,7 @@ def bench(
 
 @app.command()
 def reflectors(
-    campaign: CampaignFolder,
+    campaign: CampaignFolder = HERE,
     to: Annotated[Path | None, typer.Option(metavar="FILE", help="by default calibration.json in that folder")] = None,
 ) -> None:
     """Measure the constant of each pair at reflectors of known cross-section, and write it for later campaigns."""
@@ -318,14 +341,27 @@ def reflectors(
 
 @app.command()
 def verify(
-    product: Annotated[Path, typer.Argument(help="a file, a stage or a manifest of a campaign, or a campaign folder")],
+    product: Annotated[
+        Path,
+        typer.Argument(
+            help="a file, a stage or a manifest of a campaign, or a campaign folder, else the one in hand",
+            show_default=False,
+        ),
+    ] = HERE,
     *,
     campaign: Annotated[
         Path | None, typer.Option(metavar="FOLDER", help="the campaign of a file that lies elsewhere")
     ] = None,
+    crate: Annotated[
+        bool, typer.Option("--crate", help="results that were passed on: every file by their RO-Crate, and the catalog")
+    ] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="only what is not the same")] = False,
 ) -> None:
     """Walk from a product to the raw samples; say of each link whether it is the same, changed or missing."""
+    if crate:
+        from apertura.views.verify.crate import print_checked
+
+        raise typer.Exit(print_checked(given(product), quiet=quiet))
     there = None if campaign is None else given(campaign)
     from apertura.views.verify.chain import print_verified
 
@@ -334,7 +370,13 @@ def verify(
 
 @app.command()
 def reproduce(
-    product: Annotated[Path, typer.Argument(help="a file, a stage or a manifest of a campaign, or a campaign folder")],
+    product: Annotated[
+        Path,
+        typer.Argument(
+            help="a file, a stage or a manifest of a campaign, or a campaign folder, else the one in hand",
+            show_default=False,
+        ),
+    ] = HERE,
     *,
     cores: Cores = ALL_CORES,
     keep: Annotated[
@@ -362,18 +404,8 @@ def diff(
 
 
 @app.command()
-def check_crate(
-    folder: Annotated[Path, typer.Argument(help="campaign folder, or its results as they were passed on")],
-) -> None:
-    """Hold every file of a campaign's results against their RO-Crate, and the STAC catalog against its schemas."""
-    from apertura.views.verify.crate import print_checked
-
-    raise typer.Exit(print_checked(given(folder)))
-
-
-@app.command()
 def report(
-    campaign: CampaignFolder,
+    campaign: CampaignFolder = HERE,
     cores: Cores = ALL_CORES,
 ) -> None:
     """Write results/report.html: what was asked and decided, how images turned out, pictures; it needs no net."""
@@ -399,7 +431,7 @@ def report(
 
 @app.command("map")
 def map_page(
-    campaign: Annotated[Path, typer.Argument(help="campaign folder with results")],
+    campaign: CampaignFolder = HERE,
     port: Annotated[int, typer.Option(min=0, max=65535, help="to serve on; 0: a free one")] = 0,
     open_: Annotated[bool, typer.Option("--open", help="show it in the browser")] = False,
 ) -> None:
@@ -420,7 +452,8 @@ def init(
     from apertura.pipeline.config.template import config_template, flights_template
 
     folder = given(directory) / "config"
-    for path, text in ((folder / "config.yaml", config_template(kind)), (folder / "flights.tsv", flights_template())):
+    texts = {"config.yaml": config_template(kind), "flights.tsv": flights_template(kind)}
+    for path, text in ((folder / name, text) for name, text in texts.items()):
         if path.exists():
             raise CampaignError("exists already", path, "a new folder", "Choose another folder; nothing was changed.")
         path.parent.mkdir(parents=True, exist_ok=True)

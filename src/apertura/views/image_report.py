@@ -14,6 +14,8 @@ from apertura.pipeline.store import open_listed
 FUSED = "fused"
 """Name of the sums of a flight, among those of its pairs."""
 
+REPORT = "image.json"
+
 Report = Mapping[str, Any]
 Cells = tuple[str, ...]
 
@@ -92,7 +94,7 @@ def read_report(campaign: Campaign, flight: str, image: str) -> dict[str, Any]:
     CampaignError
         If it is not there, not as it was written, or lacks what every view shows.
     """
-    path = campaign.result(flight, image, "image.json")
+    path = campaign.result(flight, image, REPORT)
     report = open_listed(path, path.with_name("export.manifest.json"))
     with undamaged(path, expected="the report of an image", remedy="Run the workflow again."):
         report = {**report, "flags": printable(report["flags"])}
@@ -100,9 +102,10 @@ def read_report(campaign: Campaign, flight: str, image: str) -> dict[str, Any]:
     return report
 
 
-def read_reports(campaign: Campaign, flight: str) -> dict[str, dict[str, Any]]:
-    """Return image.json of each pair of a flight and of its sums; raises as `read_report`."""
-    return {name: read_report(campaign, flight, name) for name in (*campaign.flight(flight).pairs, FUSED)}
+def images_of(campaign: Campaign, flight: str) -> list[str]:
+    """Return the images of a flight: its pairs, and their sums where there are two pairs to add."""
+    pairs = campaign.flight(flight).pairs
+    return [*pairs, *([FUSED] if len(pairs) > 1 else [])]
 
 
 def printable(flags: Mapping[str, str]) -> dict[str, str]:

@@ -5,7 +5,7 @@ from dataclasses import replace
 from math import isfinite
 from typing import TYPE_CHECKING
 
-from apertura.common.errors import CampaignError
+from apertura.common.errors import CampaignError, number_of
 from apertura.core.planning.plan import Plan
 from apertura.core.quality.budget import BudgetLine, expected
 from apertura.core.quality.path_errors import Effect
@@ -48,11 +48,17 @@ def print_plan(campaign: Campaign, *, threads: int = 1) -> None:
             plan = replace(plan, decisions=(*plan.decisions, *autofocus))
             budget = _budget_table(budget_of(campaign, opened, scene))
             console.print(_table(plan, f"{flight.name}/{opened.name}"), budget)
+            if opened.history is None:
+                console.print(
+                    "before the samples were read: by the flight logs alone. What they hold, and the pulses that are "
+                    "left, may change models, errors and engine; the same command says so after the step echo."
+                )
             for name, line in plan.flags.items():
                 console.print(f"[yellow]{name}[/yellow]: {line}")
             seconds, disk = seconds + plan.predicted_seconds, disk + plan.disk_bytes
     console.print(
-        f"in all about {seconds:.2g} s of imaging on {threads} threads, {decimal(disk)} on disk before compression"
+        f"in all about {seconds:.2g} s of imaging on {number_of(threads, 'thread')}, {decimal(disk)} on disk before "
+        "compression"
     )
     free = shutil.disk_usage(campaign.root).free
     if disk > free and not campaign.results.is_dir():

@@ -23,7 +23,7 @@ from apertura.pipeline.opening.pair import open_pair
 from apertura.pipeline.opening.radiometry import calibrated_pair
 from apertura.pipeline.opening.scene import open_scene, settled_scene
 from apertura.pipeline.store import open_listed, open_stage
-from apertura.views.image_report import FUSED
+from apertura.views.image_report import FUSED, images_of
 from apertura.views.summary import print_summary
 
 REACH_M = 1.0
@@ -71,7 +71,7 @@ def score(campaign: Campaign) -> list[Finding]:
 def _flight(campaign: Campaign, flight: Flight, targets: list[dict[str, float]]) -> Iterator[Finding]:
     grid = settled_scene(campaign).grid
     along = _along_track(campaign, flight, grid)
-    sources = {**dict.fromkeys(flight.pairs, "image"), FUSED: "coherent"}
+    sources = {name: "coherent" if name == FUSED else "image" for name in images_of(campaign, flight.name)}
     files = {name: campaign.result(flight.name, name, product(of, "write_slc").file) for name, of in sources.items()}
     for name, file in files.items():
         if not file.is_file():

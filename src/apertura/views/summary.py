@@ -10,7 +10,17 @@ from apertura.formats.export import MAP, exports_in
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.rules import INTERFEROMETRY
 from apertura.pipeline.store import open_listed
-from apertura.views.image_report import FUSED, ImageValues, Report, decibels, printable, raised_flags, read_reports
+from apertura.views.image_report import (
+    FUSED,
+    REPORT,
+    ImageValues,
+    Report,
+    decibels,
+    images_of,
+    printable,
+    raised_flags,
+    read_report,
+)
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -25,7 +35,7 @@ _MOST_FLIGHTS = 3
 def is_finished(campaign: Campaign) -> bool:
     """Return whether every image has its report."""
     images = ((flight.name, name) for flight in campaign.image_flights for name in (*flight.pairs, FUSED))
-    return all(campaign.result(*image, "image.json").is_file() for image in images)
+    return all(campaign.result(*image, REPORT).is_file() for image in images)
 
 
 def print_summary(campaign: Campaign) -> None:
@@ -34,16 +44,14 @@ def print_summary(campaign: Campaign) -> None:
     Raises
     ------
     CampaignError
-        If an image is not there.
+        If no image is there.
     """
     from rich.console import Console
 
     campaign.check_images()
-    reports = {
-        f"{flight.name} {name}": report
-        for flight in campaign.image_flights
-        for name, report in read_reports(campaign, flight.name).items()
-    }
+    names = [(flight.name, name) for flight in campaign.image_flights for name in images_of(campaign, flight.name)]
+    there = [image for image in names if campaign.result(*image, REPORT).is_file()]
+    reports = {" ".join(image): read_report(campaign, *image) for image in there or names[:1]}
     values = {name: ImageValues.of(report) for name, report in reports.items()}
     console = Console(highlight=False)
     if not console.is_terminal:
@@ -56,6 +64,8 @@ def print_summary(campaign: Campaign) -> None:
     for name, report in interferograms.items():
         console.print(f"interferogram {name.removeprefix(f'{INTERFEROMETRY} ')}: {report['says']}", soft_wrap=True)
     _print_flags(console, {**reports, **interferograms})
+    if missing := [" ".join(image) for image in names if image not in there]:
+        console.print(f"not there yet: {_some(missing)}; apertura run makes what is missing", soft_wrap=True)
     print_products(campaign)
 
 
@@ -73,7 +83,10 @@ def print_products(campaign: Campaign) -> None:
     """Print which files to open, of the first flights."""
     print(f"what to open, in {campaign.root}:")
     flights = campaign.image_flights
-    folders = [("fused", flight.name, FUSED) for flight in flights[:_MOST_FLIGHTS]]
+    folders = []
+    for flight in flights[:_MOST_FLIGHTS]:
+        image = images_of(campaign, flight.name)[-1]
+        folders.append(("fused" if image == FUSED else "pair", flight.name, image))
     folders += [("interferogram", INTERFEROMETRY, name) for name in campaign.settings.interferometry.pairs]
     for kind, *folder in folders:
         for row in sorted(exports_in(kind), key=lambda row: row.pictured):  # rasters first

@@ -20,11 +20,10 @@ from apertura.core.imaging.job import imaging_job
 from apertura.core.imaging.range_profiles import range_compress
 from apertura.core.imaging.view import carriers_of
 from apertura.core.planning.planner import make_plan
-from apertura.core.quality.budget import NO_EFFECT
+from apertura.core.quality.budget import NO_EFFECT, arithmetic_line
 from apertura.core.quality.point_targets import locate_maximum
 from apertura.core.scene.terrain import GroundModels
 from apertura.pipeline.opening.images import ComparedImage, agreement_of
-from apertura.pipeline.opening.plan import arithmetic_line
 from apertura_research.error_atlas.causes import CAUSES
 from apertura_research.error_atlas.flight import GRID, PAIRS, AssumedFlight, Received, TrueFlight
 

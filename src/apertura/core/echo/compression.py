@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.common.errors import CampaignError
 from apertura.core.interpolation import kaiser_window
 
 # ---- Phasors along a band of equal steps
@@ -84,7 +85,7 @@ def range_step(
 
     Raises
     ------
-    ValueError
+    CampaignError
         If there is but one frequency, or they do not ascend in equal steps: a hundredth of one is let pass.
 
     Examples
@@ -95,7 +96,14 @@ def range_step(
     steps = np.diff(frequency_hz)
     spacing = float(steps.mean()) if len(steps) else 0.0
     if not (spacing > 0 and (np.abs(steps - spacing) <= 0.01 * spacing).all()):
-        raise ValueError(f"{len(frequency_hz)} frequencies: must be two or more that ascend in equal steps")
+        raise CampaignError(
+            f"{len(frequency_hz)} frequencies, in steps of {steps.min():.6g} to {steps.max():.6g} Hz"
+            if len(steps)
+            else f"{len(frequency_hz)} frequencies",
+            where="frequency_hz",
+            expected="two or more that ascend in equal steps",
+            remedy="Sort subcarriers by frequency; leave none out: a missing one is 0.",
+        )
     length = fft.next_fast_len(int(np.ceil(oversampling * len(frequency_hz))))
     return wave_speed_m_s / (spacing * length), length
 

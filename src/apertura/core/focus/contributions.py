@@ -13,7 +13,7 @@ from apertura.core.focus.engines.native_binding import KERNEL, EchoJob, availabl
 from apertura.core.focus.inputs import Profiles
 from apertura.core.interpolation import kaiser_sinc
 
-# ---- Image of profiles by band-limited interpolation in float64
+# ---- Contributions of profiles by band-limited interpolation in float64
 
 _HALF_TAPS = 24
 _KAISER_BETA = 22.0  # -190 dB with half the band free for the transition
@@ -23,7 +23,18 @@ _PULSES_AT_ONCE = 16
 def band_limited_image(
     profiles: Profiles, pixels: NDArray[np.float64], *, beams: Beams | None = None
 ) -> NDArray[np.complex128]:
-    """Return Σ p(ρ)·exp(+j2πf_mid ρ/c) over the pulses at each pixel, p between samples by a long windowed sinc.
+    """Return the sum of `band_limited_terms` over the pulses, (pixel,) complex128."""
+    image = np.zeros(len(pixels), np.complex128)
+    for first in range(0, len(profiles), _PULSES_AT_ONCE):
+        part = slice(first, first + _PULSES_AT_ONCE)
+        image += band_limited_terms(profiles[part], pixels, beams=beams and beams[part]).sum(axis=0)
+    return image
+
+
+def band_limited_terms(
+    profiles: Profiles, pixels: NDArray[np.float64], *, beams: Beams | None = None
+) -> NDArray[np.complex128]:
+    """Return p(ρ)·exp(+j2πf_mid ρ/c) of each pulse at each pixel, p between samples by a long windowed sinc.
 
     Parameters
     ----------
@@ -37,7 +48,7 @@ def band_limited_image(
     Returns
     -------
     ndarray
-        (pixel,) complex128.
+        (pulse, pixel) complex128.
 
     Notes
     -----
@@ -46,7 +57,7 @@ def band_limited_image(
     k = profiles.wavenumber_rad_m
     taps = np.arange(1 - _HALF_TAPS, _HALF_TAPS + 1)
     padded = np.pad(profiles.samples.astype(np.complex128), [(0, 0), (_HALF_TAPS, _HALF_TAPS)])
-    image = np.zeros(len(pixels), np.complex128)
+    terms = np.empty((len(profiles), len(pixels)), np.complex128)
     for first in range(0, len(profiles), _PULSES_AT_ONCE):
         part = slice(first, first + _PULSES_AT_ONCE)
         path = profiles.aperture[part].path(pixels)
@@ -59,8 +70,8 @@ def band_limited_image(
         value = (samples * weights).sum(-1) * np.exp(1j * np.remainder(k * path, 2 * np.pi))
         if beams is not None:
             value *= beams[part].weight(profiles.aperture[part], pixels)
-        image += value.sum(axis=0)
-    return image
+        terms[part] = value
+    return terms
 
 
 # ---- Echoes of single pulses at single places

@@ -1,6 +1,7 @@
 """Inputs of engines: phase history and range profiles as plain arrays, without settings or files."""
 
 from dataclasses import dataclass, replace
+from numbers import Real
 from typing import Any, cast
 
 import numpy as np
@@ -8,27 +9,28 @@ from numpy.typing import NDArray
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError, quoted
-from apertura.core.geometry.aperture import Aperture
+from apertura.core.geometry.aperture import Aperture, as_array
 
 
 def _as_arrays(one: Any, kinds: dict[str, type]) -> None:
-    """Make arrays of lists and numbers that an input was given; what has a shape, such as lazy samples, stays.
+    """Make arrays of lists that an input was given; what is an array, such as lazy samples, stays.
 
     Raises
     ------
     CampaignError
-        If something is no array of numbers, or `aperture` no `Aperture`.
+        If something is no array of numbers, `aperture` no `Aperture`, or the speed none of a radio wave.
     """
     where = type(one).__name__
     for name, kind in kinds.items():
-        value = getattr(one, name)
-        if not hasattr(value, "ndim"):
-            try:
-                object.__setattr__(one, name, np.asarray(value, kind))
-            except (TypeError, ValueError):
-                raise CampaignError(
-                    quoted(value), f"{where}: {name}", "an array of numbers", "Give it as a numpy array."
-                ) from None
+        object.__setattr__(one, name, as_array(getattr(one, name), kind, f"{where}: {name}"))
+    slowest, speed = SPEED_OF_LIGHT_M_S / 1.1, one.wave_speed_m_s
+    if not (isinstance(speed, Real) and slowest < float(speed) <= SPEED_OF_LIGHT_M_S):
+        raise CampaignError(
+            quoted(speed),
+            where=f"{where}: wave_speed_m_s",
+            expected=f"m/s of light, {slowest:.0f} in dense air to {SPEED_OF_LIGHT_M_S} in vacuum",
+            remedy="Take apertura.wave_speed(N units).",
+        )
     if not isinstance(one.aperture, Aperture):
         raise CampaignError(
             f"an object of type {type(one.aperture).__name__}",
@@ -101,9 +103,7 @@ class PhaseHistory:
     Raises
     ------
     CampaignError
-        If something is no array, or the shapes do not belong together.
-    ValueError
-        If the wave is faster than light.
+        If something is no array of numbers, the shapes do not belong together, or the wave is faster than light.
     """
 
     transfer: NDArray[np.complex64]
@@ -120,7 +120,6 @@ class PhaseHistory:
         vectors = {"reference_delay_s": (pulses,), "frequency_hz": (subcarriers,), "weight": (subcarriers,)}
         said = "transfer (pulse, subcarrier), reference_delay_s (pulse,), frequency_hz and weight (subcarrier,)"
         _check_shapes(self, {"transfer": (pulses, subcarriers), **vectors}, f"{said}, as many pulses of the aperture")
-        _check_wave_speed(self.wave_speed_m_s)
 
     def __len__(self) -> int:
         """Return the number of pulses."""
@@ -146,11 +145,6 @@ class PhaseHistory:
     def at_speed(self, wave_speed_m_s: float) -> "PhaseHistory":
         """Return the same delays as those of a wave of another speed, m/s."""
         return replace(self, wave_speed_m_s=wave_speed_m_s)
-
-
-def _check_wave_speed(wave_speed_m_s: float) -> None:
-    if not SPEED_OF_LIGHT_M_S / 1.1 < wave_speed_m_s <= SPEED_OF_LIGHT_M_S:
-        raise ValueError(f"{wave_speed_m_s=}: must be that of light in air, or in vacuum {SPEED_OF_LIGHT_M_S}")
 
 
 @dataclass(frozen=True)
@@ -181,9 +175,8 @@ class Profiles:
     Raises
     ------
     CampaignError
-        If something is no array, or the shapes do not belong together.
-    ValueError
-        If the step is not positive, or the wave is faster than light.
+        If something is no array of numbers, the shapes do not belong together, a step is not positive, samples are
+        further apart than their band allows, or the wave is faster than light.
     """
 
     samples: NDArray[np.complex64]
@@ -199,9 +192,11 @@ class Profiles:
         pulses, length = self.samples.shape if self.samples.ndim == 2 else (-1, -1)
         said = "samples (pulse, range), start_m (pulse,), as many pulses of the aperture"
         _check_shapes(self, {"samples": (pulses, length), "start_m": (pulses,)}, said)
-        if not 0 < self.step_m < np.inf:
-            raise ValueError(f"{self.step_m=}: must be positive")
-        _check_wave_speed(self.wave_speed_m_s)
+        for name, least in (("step_m", 0.0), ("oversampling", 1.0), ("centre_frequency_hz", -np.inf)):
+            value = getattr(self, name)
+            if not (isinstance(value, Real) and least < float(value) < np.inf):
+                more = f"a number above {least:g}" if np.isfinite(least) else "a number"
+                raise CampaignError(quoted(value), f"Profiles: {name}", more, "Take those of the compression.")
 
     @property
     def wavenumber_rad_m(self) -> float:

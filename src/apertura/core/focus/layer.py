@@ -22,10 +22,16 @@ class TilesLayer(MaterializedLayer):
         Rows and columns of tiles → key → task.
     places
         Row and column of every tile.
+
+    Attributes
+    ----------
+    origin
+        What the image is formed of, for whoever judges it; None in what a scheduler gets.
     """
 
     def __init__(self, name: str, graph: Callable[[Collection[Place]], dict[Any, Any]], places: Iterable[Place]):
         self.name, self.graph, self.places = name, graph, list(places)
+        self.origin: Any = None
         super().__init__(graph(self.places))
 
     def cull(self, keys: set[Any], all_hlg_keys: Collection[Any]) -> tuple[MaterializedLayer, dict[Any, set[Any]]]:

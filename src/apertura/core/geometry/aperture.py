@@ -3,12 +3,13 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
-from apertura.common.errors import CampaignError
+from apertura.common.errors import CampaignError, quoted
 
 Weigh = Callable[[slice, NDArray[np.float64]], NDArray[np.float64]]
 """Pulses and points (point, 3) → (pulse, point) float64."""
@@ -16,6 +17,46 @@ Weigh = Callable[[slice, NDArray[np.float64]], NDArray[np.float64]]
 _PULSES_AT_ONCE = 256
 _STRETCHES = 64  # of the aperture, in which phase rates are compared
 _STEPS_IN_A_ROW = 63  # of which the median is taken, so that missed pulses do not count
+
+
+def as_array(value: Any, kind: type, where: str) -> Any:
+    """Return what a caller gave as an array of real or complex numbers; what is one, or lazily, stays as it is.
+
+    Parameters
+    ----------
+    value
+        An array, a list, a number.
+    kind
+        ``np.float64`` or ``np.complex64``; real numbers are no complex samples: they have lost their phase.
+    where
+        Whose, for the message.
+
+    Raises
+    ------
+    CampaignError
+        If it is no array of such numbers.
+
+    Examples
+    --------
+    >>> as_array([1, 2], np.float64, "weight")
+    array([1., 2.])
+    """
+    try:
+        found = value if hasattr(value, "ndim") else np.asarray(value)
+        usable = found.dtype.kind in ("c" if kind is np.complex64 else "iuf")
+    except (TypeError, ValueError, AttributeError):
+        usable = False
+    if not usable:
+        of = {"i": "whole", "u": "whole", "f": "real", "c": "complex"}.get(
+            getattr(found, "dtype", np.dtype(object)).kind
+        )
+        raise CampaignError(
+            f"an array of {of} numbers" if of and found.ndim else quoted(value),
+            where=where,
+            expected=f"an array of {'complex numbers' if kind is np.complex64 else 'real numbers'}",
+            remedy="Keep the phase of samples: give I + jQ." if kind is np.complex64 and of else "Give a numpy array.",
+        )
+    return found if found is value else found.astype(kind)
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +71,7 @@ class Aperture:
     Raises
     ------
     CampaignError
-        If shapes differ or are not (pulse, 3).
+        If something is no array of numbers, or shapes differ or are not (pulse, 3).
 
     Examples
     --------
@@ -45,8 +86,7 @@ class Aperture:
 
     def __post_init__(self) -> None:
         for name in ("tx_m", "rx_m"):
-            if not hasattr(getattr(self, name), "ndim"):  # a list, say
-                object.__setattr__(self, name, np.asarray(getattr(self, name), np.float64))
+            object.__setattr__(self, name, as_array(getattr(self, name), np.float64, f"Aperture: {name}"))
         if self.tx_m.shape != self.rx_m.shape or self.tx_m.ndim != 2 or self.tx_m.shape[1] != 3:
             raise CampaignError(
                 f"tx_m {self.tx_m.shape}, rx_m {self.rx_m.shape}",

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Mapping
 from dataclasses import replace
+from numbers import Real
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -23,6 +24,7 @@ from apertura.core.geometry.geodesy import LOCAL, geodetic_from_ecef
 from apertura.core.imaging.choices import Degrees, ImagingChoices, Resolution
 from apertura.core.imaging.formation import Formation
 from apertura.core.imaging.job import check_inputs, imaging_job, profiles_job
+from apertura.core.imaging.judgement import Judgement, budget_by_hand, judgement
 from apertura.core.imaging.radiometry import Calibration, cell_constant
 from apertura.core.imaging.range_profiles import RangeWindow, inputs_of, range_compress
 from apertura.core.planning.plan import memory_limit
@@ -47,6 +49,7 @@ def backproject(  # noqa: PLR0913 - each choice is a keyword, so that an editor 
     atmosphere: "Atmosphere | float | Literal['auto', 'vacuum'] | None" = None,
     calibration: float | None = None,
     certified_pixels: int = 64,
+    judge: bool | Literal["auto"] = "auto",
     terrain_model: Literal["auto", "plane", "tilted_plane", "dem"] = "auto",
     window: Literal["hann", "none"] = "hann",
     integration: "Literal['auto', 'all'] | Degrees | Resolution | Mapping[str, float]" = "auto",
@@ -83,6 +86,9 @@ def backproject(  # noqa: PLR0913 - each choice is a keyword, so that an editor 
     certified_pixels
         Random pixels also computed exactly at once, for the certificate; 0 for none. A setting that misses the
         accuracy on them is replaced by the plan's next.
+    judge
+        Whether the image is formed at once, beside the lazy one, and judged by its focus and by echoes that it does not
+        show, as `apertura.judge` does at any time. 'auto': where the plan takes no more than ten seconds for it.
     terrain_model
         'auto', 'plane', 'tilted_plane' or 'dem': model of the ground.
     window
@@ -104,7 +110,8 @@ def backproject(  # noqa: PLR0913 - each choice is a keyword, so that an editor 
     xarray.DataArray
         (y, x) complex64, carrier kept, 1 is the amplitude of an echo in every pulse; a dask array on whatever
         scheduler the caller has. Attributes: units; `wave_speed_m_s`; the plan: `setting`, `predicted_error_db`, and
-        as JSON `models` (choice → value and reason) and `flags` (limit crossed → what was measured); the certificate:
+        as JSON `models` (choice → value and reason) and `flags` (limit crossed → what was measured); the judgement:
+        `verdict`, 'not judged' where it was left for later, `verdict_why`, and as JSON `budget`; the certificate:
         `numerical_error_db`, an upper bound at `numerical_error_confidence` for the whole image, and
         `numerical_error_estimate_db`, against the double sum over pulses and subcarriers, or from profiles alone
         against their band-limited interpolation in float64. With `calibration` lazy coordinates (y, x) float32:
@@ -115,9 +122,7 @@ def backproject(  # noqa: PLR0913 - each choice is a keyword, so that an editor 
     ------
     CampaignError
         If a choice is not one, positions, samples or heights are not finite, an antenna is in the ground, no echo of
-        the scene arrives, or what is asked cannot run here.
-    ValueError
-        If the scene is deeper than the unambiguous range.
+        the scene arrives, the scene is deeper than the unambiguous range, or what is asked cannot run here.
 
     Notes
     -----
@@ -135,6 +140,8 @@ def backproject(  # noqa: PLR0913 - each choice is a keyword, so that an editor 
     >>> image = ap.backproject(history, ap.SceneGrid("local", -5.0, 5.0, 0.1, (100, 100)), tile_px=64)
     >>> image.chunks, image.attrs["numerical_error_db"] < -60
     (((64, 36), (64, 36)), True)
+    >>> image.attrs["verdict"], image.attrs["flags"]
+    ('focused', '{}')
     >>> abs(float(abs(image).max()) - 1) < 0.05
     True
     >>> seen = ap.backproject(history, ap.SceneGrid("local", -1.0, 1.0, 0.1, (20, 20)), calibration=1.0)
@@ -160,6 +167,7 @@ def backproject(  # noqa: PLR0913 - each choice is a keyword, so that an editor 
         expected="choices of ImagingChoices",
     )
     inputs = inputs_of(profiles, choices.window)
+    _check_kinds(inputs, grid, beams, certified_pixels)
     ground = ground_of(terrain, grid)
     if atmosphere is not None:
         inputs = inputs.at_speed(_wave_speed(atmosphere, grid, ground, inputs.aperture))
@@ -183,6 +191,7 @@ def backproject(  # noqa: PLR0913 - each choice is a keyword, so that an editor 
         if error.bound_db > accuracy_db:
             sure = f"up to {error.bound_db:.1f} dB ({CONFIDENCE:.0%} sure)"
             flags["accuracy_missed"] = f"{sure}, {accuracy_db:g} dB asked"
+    told = _judged(formation, judge, error_db=attributes.get("numerical_error_db"))
     attributes |= {
         "units": "1",
         "wave_speed_m_s": inputs.wave_speed_m_s,
@@ -191,12 +200,59 @@ def backproject(  # noqa: PLR0913 - each choice is a keyword, so that an editor 
         "setting": formation.plan.setting.line,
         "predicted_error_db": round(formation.plan.predicted_error_db, 2),
         "models": json.dumps(formation.plan.reasons, ensure_ascii=False),
-        "flags": json.dumps(Flags.merged(flags, plan.flags), ensure_ascii=False),
+        "flags": json.dumps(Flags.merged(flags, plan.flags, told.flags), ensure_ascii=False),
+        "verdict": told.verdict,
+        "verdict_why": told.why,
+        "budget": json.dumps(told.budget, ensure_ascii=False),
     }
-    image = xr.DataArray(formation.image, grid.coordinates, ("y", "x"), name="image", attrs=attributes)
+    lazy = formation.image
+    lazy.dask.layers[lazy.name].origin = formation  # for apertura.judge
+    image = xr.DataArray(lazy, grid.coordinates, ("y", "x"), name="image", attrs=attributes)
     if calibration is None or history is None:
         return image
     return image.assign_coords(_calibrated(image.data, formation, history, ground, calibration))
+
+
+def _check_kinds(inputs: PhaseHistory | Profiles, grid: Any, beams: Any, certified_pixels: Any) -> None:
+    """Raise CampaignError unless grid, beams and number of pixels are such."""
+    if not isinstance(grid, SceneGrid):
+        raise CampaignError(
+            quoted(grid), "backproject: grid", "a SceneGrid", "Make one by SceneGrid.from_bounds(crs, bounds_m)."
+        )
+    if not isinstance(certified_pixels, int) or certified_pixels < 0:
+        raise CampaignError(
+            quoted(certified_pixels), "backproject: certified_pixels", "a number of pixels", "Give 0 for none."
+        )
+    if beams is None:
+        return
+    if not isinstance(beams, Beams):
+        raise CampaignError(
+            f"an object of type {type(beams).__name__}", "backproject: beams", "Beams", "Leave it out, or make one."
+        )
+    for name, beam in (("transmit", beams.transmit), ("receive", beams.receive)):
+        if beam is not None and len(beam.axes) != len(inputs):
+            raise CampaignError(
+                f"{len(beam.axes)} pulses",
+                where=f"backproject: Beams.{name}",
+                expected=f"the {len(inputs)} of the echo",
+                remedy="Give one set of axes for each pulse.",
+            )
+
+
+_AT_ONCE_S = 10.0
+"""Seconds that the plan may take for an image that is formed to be judged, where the caller does not say."""
+
+
+def _judged(formation: Formation, asked: bool | str, *, error_db: float | None) -> Judgement:
+    """Return the judgement of an image, or why there is none yet."""
+    if asked not in {True, False, "auto"}:
+        raise CampaignError(quoted(asked), "backproject: judge", "True, False or 'auto'", "Take one of these.")
+    lines = budget_by_hand(formation, error_db=error_db)
+    seconds = formation.plan.predicted_seconds
+    if asked is True or (asked == "auto" and seconds <= _AT_ONCE_S):
+        return judgement(formation, np.asarray(formation.image), lines)
+    why = "not asked for" if asked is False else f"the image takes {seconds:.2g} s"
+    return Judgement("not judged", f"{why}: apertura.judge forms it", Flags(), [line.report for line in lines], {})
 
 
 def _wave_speed(
@@ -206,7 +262,7 @@ def _wave_speed(
     middle_m = ground.positions_at(grid, *(np.array([size // 2]) for size in grid.shape))[0]
     frame = LOCAL if grid.crs == LOCAL else "ecef"
     ground_m = float(middle_m[2] if frame == LOCAL else geodetic_from_ecef(middle_m)[2])
-    if isinstance(atmosphere, str) and atmosphere not in {"auto", "vacuum"}:
+    if not isinstance(atmosphere, Atmosphere | Real) and atmosphere not in ("auto", "vacuum"):
         raise CampaignError(
             quoted(atmosphere),
             where="backproject: atmosphere",
@@ -229,9 +285,9 @@ def _wave_speed(
 def _check_calibration(constant: float | None, inputs: PhaseHistory | Profiles) -> None:
     if constant is None:
         return
-    if not 0 < constant < np.inf:
+    if not (isinstance(constant, Real) and 0 < constant < np.inf):
         raise CampaignError(
-            f"a constant of {constant!r}",
+            f"a constant of {quoted(constant)}",
             where="backproject: calibration",
             expected="a positive number: |H|² of 1 m² at R_tx·R_rx = 1 m²",
             remedy="Take that of Link.constant, or measure it on a reflector.",

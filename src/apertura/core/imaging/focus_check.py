@@ -127,52 +127,59 @@ _BY_CHANCE = 2.0  # times ln(pixels)/pulses, the largest coherence factor of con
 
 
 def echo_elsewhere(
-    history: PhaseHistory,
+    inputs: PhaseHistory | Profiles,
     grid: SceneGrid,
     terrain: Terrain,
     *,
     points: Sequence[NDArray[np.complex128]] = (),
+    measured: bool = False,
 ) -> str | None:
     """Return one line where pulses contain a strong echo that an image does not focus, else None.
 
-    To be asked where no point of the image dominates its range cell.
-
     Parameters
     ----------
-    history
-        Of every pulse; a sample of them is evaluated.
+    inputs
+        Of every pulse; a sample of them is evaluated. Profiles that are cropped to the scene show nothing beyond it.
     grid, terrain
         The scene.
     points
         `Formation.contributions` at each bright point of the image, (pulse,) complex128.
+    measured
+        Whether points of the image dominate their range cells: it is then wrong only where these are sidelobes, in
+        range, of the strongest echo outside.
 
     Notes
     -----
     Source: docs/theory/focus.md, "Echo elsewhere". The direct path between the antennas does not count.
     """
-    some = history[history.aperture.sample(_MOST_PULSES)]
-    step_m, length = range_step(some.frequency_hz, oversampling=1.0, wave_speed_m_s=some.wave_speed_m_s)
-    path_m, power = _profiles(some, step_m, length)
+    some = inputs[inputs.aperture.sample(_MOST_PULSES)]
+    path_m, power, cell_m, span_m = _profiles(some)
     nearest, farthest = swath(grid, terrain, some.aperture)
-    span_m = step_m * length
-    margin = _NEAR_CELLS * step_m
+    margin = _NEAR_CELLS * cell_m
     beyond = (path_m - (nearest[:, None] - margin)) % span_m > (farthest - nearest)[:, None] + 2 * margin
-    direct = np.linalg.norm(some.aperture.tx_m - some.aperture.rx_m, axis=1)
-    offset_m = (path_m - direct[:, None] + span_m / 2) % span_m - span_m / 2
+    offset_m = path_m - np.linalg.norm(some.aperture.tx_m - some.aperture.rx_m, axis=1)[:, None]
+    if np.isfinite(span_m):
+        offset_m = (offset_m + span_m / 2) % span_m - span_m / 2
     beside = np.where(beyond & (np.abs(offset_m) > margin), power, 0.0)
     outside = beside.max(axis=1)
     within = np.where(beyond, np.nan, power)
     inside = np.nanmax(within, axis=1)
     scene = f"the scene's are {nearest.min():.1f} to {farthest.max():.1f} m"
     above_db = _median_db(outside / np.maximum(inside, 1e-30))
-    if min(above_db, _median_db(outside / np.maximum(np.median(power, axis=1), 1e-30))) > OUTSIDE_ECHO_DB:
+    alone = min(above_db, _median_db(outside / np.maximum(np.median(power, axis=1), 1e-30))) > OUTSIDE_ECHO_DB
+    if alone and measured:
+        cells = np.abs(beside.argmax(axis=1) - np.nanargmax(within, axis=1)) * (path_m[0, 1] - path_m[0, 0]) / cell_m
+        alone = _median_db(inside / outside) < _sidelobe_db(inputs, float(np.median(cells)))
+    if alone:
         at_m = float(np.median(path_m[np.arange(len(some)), beside.argmax(axis=1)]))
         return (
             f"the strongest echo, {above_db:.0f} dB above all from the scene, has a total path of {at_m:.1f} m, while "
             f"{scene}: heights, positions or path offsets are wrong, or something bright is elsewhere"
         )
+    if measured:
+        return None
     alone_db = _median_db(inside / np.maximum(np.nanmedian(within, axis=1), 1e-30))
-    if len(history) < LEAST_PULSES or alone_db <= UNFOCUSED_ECHO_DB:
+    if len(inputs) < LEAST_PULSES or alone_db <= UNFOCUSED_ECHO_DB:
         return None
     gathered = _gathered(points, pixels=grid.shape[0] * grid.shape[1]) / max(float(np.median(inside)), 1e-30)
     if gathered >= LEAST_GATHERED:
@@ -184,6 +191,24 @@ def echo_elsewhere(
         f"pulses hold an echo {alone_db:.0f} dB above the median of the scene's ranges, and {found}: times, positions "
         "or heights are wrong, or it comes from beside the scene"
     )
+
+
+_SIDELOBE_MARGIN_DB = 6.0
+_LOBE_SAMPLES = 8  # of a response, per range cell
+
+
+def _sidelobe_db(inputs: PhaseHistory | Profiles, cells: float) -> float:
+    """Return the level of sidelobes, and a margin, against their echo so many range cells away; dB.
+
+    Of profiles, whose window is not known, those without one: 1/(π·cells).
+    """
+    if isinstance(inputs, Profiles):
+        return float(20 * np.log10(1 / (np.pi * max(cells, 1.0)))) + _SIDELOBE_MARGIN_DB
+    count = len(inputs.weight)
+    lobes = np.abs(np.fft.fft(inputs.weight / inputs.weight.sum(), _LOBE_SAMPLES * count))
+    first = int((cells % count) * _LOBE_SAMPLES)
+    about = np.take(lobes, np.arange(first - _LOBE_SAMPLES, first + _LOBE_SAMPLES), mode="wrap")
+    return float(20 * np.log10(max(about.max(), 1e-15))) + _SIDELOBE_MARGIN_DB
 
 
 def _gathered(points: Sequence[NDArray[np.complex128]], *, pixels: int) -> float:
@@ -199,20 +224,28 @@ def _median_db(ratio: NDArray[np.float64]) -> float:
     return 10 * float(np.log10(max(float(np.median(ratio)), 1e-30)))
 
 
-def _profiles(history: PhaseHistory, step_m: float, length: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return total paths and powers (pulse, range) over the whole unambiguous range."""
+def _profiles(
+    inputs: PhaseHistory | Profiles,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], float, float]:
+    """Return total paths and powers (pulse, range), a range cell, and the path after which they repeat."""
+    if isinstance(inputs, Profiles):
+        samples = np.asarray(inputs.samples)
+        path_m = inputs.start_m[:, None] + inputs.step_m * np.arange(samples.shape[1])
+        return path_m, np.abs(samples).astype(np.float64) ** 2, inputs.step_m * inputs.oversampling, np.inf
+    speed = inputs.wave_speed_m_s
+    step_m, length = range_step(inputs.frequency_hz, oversampling=1.0, wave_speed_m_s=speed)
     samples = compress(
-        history.transfer,
-        history.frequency_hz,
-        weight=history.weight,
-        reference_delay_s=history.reference_delay_s,
-        start_m=np.zeros(len(history)),
+        inputs.transfer,
+        inputs.frequency_hz,
+        weight=inputs.weight,
+        reference_delay_s=inputs.reference_delay_s,
+        start_m=np.zeros(len(inputs)),
         count=length,
         oversampling=1.0,
-        wave_speed_m_s=history.wave_speed_m_s,
+        wave_speed_m_s=speed,
     )
     path_m = np.broadcast_to(step_m * np.arange(length), samples.shape)
-    return path_m, np.abs(samples).astype(np.float64) ** 2
+    return path_m, np.abs(samples).astype(np.float64) ** 2, step_m, step_m * length
 
 
 # ---- Joint focus of several pairs, to compare hypotheses
@@ -330,14 +363,18 @@ def _sector_of(formation: Formation) -> Weigh | None:
 def _response(formation: Formation) -> PointResponse:
     """Return what of one point the image shows at other places."""
     history, profiles = formation.history, formation.profiles
-    if history is None:
-        raise ValueError("the response of a point needs a phase history, there are only profiles")
-    how = {"oversampling": _RESPONSE_OVERSAMPLING, "wave_speed_m_s": history.wave_speed_m_s}
-    step_m, length = range_step(history.frequency_hz, **how)
+    if history is None:  # a full and flat band, as the planner takes it
+        count = 2 * profiles.samples.shape[1]
+        frequency_hz = profiles.centre_frequency_hz + profiles.bandwidth_hz * (np.arange(count) / count - 0.5)
+        weight = np.full(count, 1 / count)
+    else:
+        frequency_hz, weight = history.frequency_hz, history.weight / history.weight.sum()
+    how = {"oversampling": _RESPONSE_OVERSAMPLING, "wave_speed_m_s": profiles.wave_speed_m_s}
+    step_m, length = range_step(frequency_hz, **how)
     envelope = compress(
-        np.ones((1, len(history.frequency_hz)), np.complex64),
-        history.frequency_hz,
-        weight=history.weight / history.weight.sum(),
+        np.ones((1, len(frequency_hz)), np.complex64),
+        frequency_hz,
+        weight=weight,
         reference_delay_s=np.zeros(1),
         start_m=np.array([-step_m * (length // 2)]),
         count=length,
@@ -371,7 +408,7 @@ def focus_report(formation: Formation, target: Any) -> dict[str, Any]:
     Parameters
     ----------
     formation
-        Formation of the image, with a phase history.
+        Formation of the image.
     target
         (y, x) complex64, the image as written.
 
@@ -390,13 +427,18 @@ def focus_report(formation: Formation, target: Any) -> dict[str, Any]:
     ]
     parts = _parts(formation, points, cell_m)
     verdict = judge([(point.amplitude, focus) for point, focus in zip(points, measured, strict=True)])
-    elsewhere = None
-    if verdict.points == 0 and formation.history is not None:
+    inputs, found = formation.history or formation.profiles, verdict.points > 0
+    elsewhere = echo_elsewhere(inputs, grid, formation.plan.terrain, points=terms, measured=found)
+    if elsewhere:
+        measured = [None] * len(points)  # sidelobes of it
+    if elsewhere or not found:
         verdict = judge_parts(parts, cell_m=cell_m)
-        elsewhere = echo_elsewhere(formation.history, grid, formation.plan.terrain, points=terms)
+    peak = max((point.amplitude for point in points), default=0.0)
+    conjugated = elsewhere or verdict.loss_db < _CONJUGATED_LOSS_DB
     return {
         **_verdict_report(verdict),
         **({"elsewhere": elsewhere} if elsewhere else {}),
+        **({"conjugated": line} if conjugated and (line := _conjugated(formation, peak)) else {}),
         "cell_m": round(cell_m, 4),
         "spectrum_cycles2_m2": [[float(f"{value:.4g}") for value in row] for row in _spectrum(formation)],
         "maxima": len(points),
@@ -405,6 +447,37 @@ def focus_report(formation: Formation, target: Any) -> dict[str, Any]:
             _point_report(formation, point, focus) for point, focus in zip(points, measured, strict=True) if focus
         ],
     }
+
+
+_CONJUGATED_LOSS_DB = -6.0  # beyond which a defocused image may be one of conjugated samples
+_CONJUGATED_DB = 10.0  # that their image must be brighter by, which no wrong track of a right image is
+_CONJUGATED_S = 60.0  # that it may take
+
+
+def _conjugated(formation: Formation, peak: float) -> str | None:
+    """Return one line where the image of conjugated samples has a far brighter peak than that of the samples.
+
+    Notes
+    -----
+    Source: docs/theory/focus.md, "Conjugated samples".
+    """
+    if formation.plan.predicted_seconds > _CONJUGATED_S:
+        return None
+    history, profiles = formation.history, formation.profiles
+    if history is None:
+        other = replace(profiles, samples=np.conj(np.asarray(profiles.samples)))
+    else:
+        history = replace(history, transfer=np.conj(np.asarray(history.transfer)))
+        other = range_compress(history, formation.grid, formation.plan.terrain)
+    image = replace(formation, history=history, profiles=other).image
+    brightest = float(np.abs(image).max().compute(scheduler="synchronous"))
+    gained_db = 20 * float(np.log10(max(brightest, 1e-30) / max(peak, 1e-30)))
+    if gained_db < _CONJUGATED_DB:
+        return None
+    return (
+        f"with conjugated samples its brightest place is {min(gained_db, 99):.0f} dB brighter: "
+        "I and Q are swapped, waveform.iq says the other sign, or phases count the other way"
+    )
 
 
 UNEXPECTED_DB = 0.2
@@ -436,6 +509,8 @@ def focus_flags(report: dict[str, Any], expected: Effect) -> Flags:
         beyond_db = expected.loss_db - report["loss_db"]
         if beyond_db > max(UNEXPECTED_DB, _UNEXPECTED_SIGMAS * float(np.hypot(report["std_db"], expected.loss_std_db))):
             flags["loss_unexpected"] = f"{report['why']}; {told}: something is worse than the budget states"
+    if "conjugated" in report:
+        return Flags({name: f"{line}; {report['conjugated']}" for name, line in flags.items()})
     return flags
 
 

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from apertura.common.contracts import Window
 from apertura.core.antenna.beam import Beams
 from apertura.core.antenna.illumination import illumination_mask
-from apertura.core.focus.contributions import band_limited_image
+from apertura.core.focus.contributions import band_limited_image, band_limited_terms
 from apertura.core.focus.engines import load_engine, pieces, reference
 from apertura.core.focus.engines.engine import Setting
 from apertura.core.focus.inputs import PhaseHistory, Profiles
@@ -164,19 +164,14 @@ class Formation:
     def contributions(self, row: ArrayLike, column: ArrayLike) -> list[NDArray[np.complex128]]:
         """Return the contributions of the pulses that illuminate each fractional pixel, (pulse,) complex128 each.
 
-        Raises
-        ------
-        ValueError
-            If there are only profiles.
+        By the sum over the history's subcarriers, or of profiles by their band-limited interpolation.
         """
-        if self.history is None:
-            raise ValueError("contributions of single pulses need a phase history, there are only profiles")
         places = self.positions_at(np.atleast_1d(row), np.atleast_1d(column))
         parts: list[list[NDArray[np.complex128]]] = [[np.empty(0, np.complex128)] for _ in places]
         for pulses, parts_of in self.illuminating_pulses(places):
-            some = self.history[pulses]
+            some = (self.history or self.profiles)[pulses]
             for part, inside in parts_of:
-                terms = reference.terms(some[part], places[inside], self.beams and self.beams[pulses][part])
+                terms = _terms(some[part], places[inside], self.beams and self.beams[pulses][part])
                 for place, column_of in zip(np.flatnonzero(inside), terms.T, strict=True):
                     parts[place].append(column_of[column_of != 0])
         return [np.concatenate(part) for part in parts]
@@ -227,6 +222,12 @@ class Formation:
 
 def _slices(window: tuple[int, int, int, int]) -> Window:
     return slice(*window[:2]), slice(*window[2:])
+
+
+def _terms(inputs: PhaseHistory | Profiles, places: NDArray[np.float64], beams: Beams | None) -> NDArray[np.complex128]:
+    if isinstance(inputs, PhaseHistory):
+        return reference.terms(inputs, places, beams)
+    return band_limited_terms(inputs, places, beams=beams)
 
 
 def _exact_sum(

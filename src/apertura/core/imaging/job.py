@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
 from apertura.core.antenna.beam import Beams
-from apertura.core.echo.compression import centre_frequency
+from apertura.core.echo.compression import centre_frequency, range_step
 from apertura.core.focus.engines import reference
 from apertura.core.focus.inputs import PhaseHistory, Profiles
 from apertura.core.focus.job import Integration, Job, Signal
@@ -54,6 +54,8 @@ def check_inputs(inputs: PhaseHistory | Profiles, grid: SceneGrid, terrain: Terr
     check_positions(inputs.aperture)
     _check_band(inputs)
     _check_samples(inputs)
+    if isinstance(inputs, PhaseHistory):
+        _check_spectrum(inputs)
     points = terrain.positions_at(grid, *grid.sample_pixels(_POINTS)).reshape(-1, 3)
     if not np.isfinite(points).all():
         raise CampaignError(
@@ -68,7 +70,8 @@ def check_inputs(inputs: PhaseHistory | Profiles, grid: SceneGrid, terrain: Terr
             "no echo of the scene is in the samples: its total paths lie beyond them at every pulse",
             where="backproject: grid",
             expected="phase centres and pixels in one frame, in metres, within the range that was recorded",
-            remedy="Check the grid's CRS and corner, the terrain's height, and the frame of the positions.",
+            remedy="Check the grid's CRS and corner, the terrain's height, the frame of the positions, and that delays "
+            "are in seconds.",
         )
     flags = check_antennas(grid, terrain, inputs.aperture, where="backproject")
     if outside:
@@ -103,6 +106,8 @@ def _check_band(inputs: PhaseHistory | Profiles) -> None:
                 expected="finite numbers",
                 remedy="Leave such pulses or subcarriers out.",
             )
+    if isinstance(inputs, PhaseHistory):
+        range_step(inputs.frequency_hz, oversampling=1.0)
     if isinstance(inputs, PhaseHistory) and not (inputs.weight.min() >= 0 < inputs.weight.max()):
         raise CampaignError(
             f"{inputs.weight.min():.6g} to {inputs.weight.max():.6g}",
@@ -123,6 +128,26 @@ def _check_samples(inputs: PhaseHistory | Profiles) -> None:
             where="backproject",
             expected="finite samples that hold an echo",
             remedy="Leave such pulses out.",
+        )
+
+
+_LEAST_BAND = 0.05
+"""Of the subcarriers that hold the energy of a pulse: an echo has it in all of its band, one in time in few samples."""
+
+
+def _check_spectrum(history: PhaseHistory) -> None:
+    """Raise CampaignError where samples are those of time, not of frequency: a pulse's energy lies in a few of them."""
+    some = np.asarray(history[history.aperture.sample(_PULSES)].transfer)
+    power = np.abs(some).astype(np.float64) ** 2
+    total = power.sum(axis=1)
+    used = total**2 / np.maximum((power**2).sum(axis=1), 1e-300)
+    many = float(np.median(used[total > 0])) if (total > 0).any() else 0.0
+    if many < _LEAST_BAND * power.shape[1]:
+        raise CampaignError(
+            f"the energy of a pulse lies in {many:.1f} of {power.shape[1]} subcarriers",
+            where="backproject: transfer",
+            expected="transfer functions over frequency, which an echo fills",
+            remedy="Are these samples over time, or range? Take their DFT (numpy.fft.fft), or give Profiles.",
         )
 
 

@@ -118,8 +118,10 @@ def range_compress(
 
     Raises
     ------
+    CampaignError
+        If the scene is deeper than the unambiguous range.
     ValueError
-        If the scene is deeper than the unambiguous range, or the window is of another wave's speed.
+        If the window is of another wave's speed.
 
     Notes
     -----
@@ -142,8 +144,11 @@ def range_compress(
     if window.wave_speed_m_s != speed:
         raise ValueError(f"{window.wave_speed_m_s=}: must be {speed}, that of the history")
     if window.samples > window.unambiguous:
-        raise ValueError(
-            f"the scene spans {window.samples} samples of range: must be at most the {window.unambiguous} unambiguous"
+        raise CampaignError(
+            f"the scene spans {window.samples} samples of range",
+            where="grid",
+            expected=f"at most the {window.unambiguous} after which echoes repeat themselves",
+            remedy="Make the scene smaller, or sample frequency more finely.",
         )
     samples = compress(
         history.transfer,

@@ -85,8 +85,9 @@ class BudgetLine:
             for name, value in asdict(self.effect).items()
             if name != "loss_std_db"
         }
-        otherwise = f"{self.unit} would do this" if self.assumed is None else f"{_ASSUMED} {self.assumed}"
-        return {"cause": self.cause, "stated": self.stated or f"{_NOT_STATED}; {otherwise}", **expected}
+        would = f"; {self.unit} would do this" if self.unit else ""
+        otherwise = would if self.assumed is None else f"; {_ASSUMED} {self.assumed}"
+        return {"cause": self.cause, "stated": self.stated or f"{_NOT_STATED}{otherwise}", **expected}
 
 
 def is_stated(report: Mapping[str, Any]) -> bool:
@@ -337,6 +338,13 @@ def offset_line(
     effect = paths.of_offset(slope * (1.0 if std is None else std), common=common)
     effect = replace(effect, loss_std_db=math.sqrt(2) * -effect.loss_db)  # of the square of one Gaussian number
     return BudgetLine(cause, None if std is None else f"{std:.3g} {unit}", effect, f"1 {unit}")
+
+
+def arithmetic_line(error_db: float) -> BudgetLine:
+    """Return the loss by the measured numerical error."""
+    return BudgetLine(
+        "arithmetic", f"{error_db:.1f} dB measured", Effect(10 * np.log10(1 - 10 ** (error_db / 10)), 0, 0)
+    )
 
 
 def summed(effects: Iterable[Effect]) -> Effect:

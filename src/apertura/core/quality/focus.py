@@ -7,6 +7,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.common.errors import number_of
 from apertura.core.quality.measures import coherence_factor, weighted_median
 
 # ---- Subapertures: noise, drift and entropy
@@ -274,7 +275,7 @@ def judge(points: Sequence[tuple[float, PointFocus | None]]) -> Focus:
     spread = 1.4826 * weighted_median(np.abs(losses - loss), weights)
     std = float(np.hypot(spread, np.median(stds)) / np.sqrt(len(measured)))
     bad = loss < DEFOCUSED_DB - 2 * std
-    line = f"{len(measured)} bright points lost {abs(loss):.2f} ± {std:.2f} dB of their peak to phase errors"
+    line = f"{number_of(len(measured), 'bright point')} lost {abs(loss):.2f} ± {std:.2f} dB of the peak to phase errors"
     if not bad and loss < DEFOCUSED_DB:
         line += f", not more than {-DEFOCUSED_DB:g} dB by two standard deviations"
     return Focus("defocused" if bad else "focused", loss, std, len(measured), line)

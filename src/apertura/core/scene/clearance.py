@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from apertura.common.errors import CampaignError
+from apertura.common.errors import CampaignError, number_of
 from apertura.common.flags import Flags
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.scene.grid import SceneGrid
@@ -67,7 +67,9 @@ def check_antennas(grid: SceneGrid, terrain: Terrain, aperture: Aperture, *, whe
     for antenna, which in zip(aperture.legs, ("transmitter", "receiver"), strict=True):
         above, ground = clearance(grid, terrain, antenna)
         if (above <= 0).any():
-            raise _below_ground(above, ground, f"{where}: at {int((above <= 0).sum())} pulses the {which}", terrain)
+            raise _below_ground(
+                above, ground, f"{where}: at {number_of(int((above <= 0).sum()), 'pulse')} the {which}", terrain
+            )
         if not isinstance(terrain, FlatGround):
             flags = Flags.merged(flags, _below_scene(grid, terrain, antenna, which))
     return flags

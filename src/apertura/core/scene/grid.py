@@ -3,12 +3,14 @@
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise, product
+from numbers import Integral, Real
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from apertura.common.arrays import Floats
+from apertura.common.errors import CampaignError, quoted
 from apertura.core.geometry.geodesy import LOCAL, frame_from_map, local_crs, map_from_frame
 from apertura.core.scene.map_crs import BLOCK_PX, axis_attributes, block, check_crs, grid_mapping
 
@@ -35,7 +37,7 @@ class SceneGrid:
 
     Raises
     ------
-    ValueError
+    CampaignError
         If the spacing or a side is not positive, or a corner is not finite.
 
     Examples
@@ -56,10 +58,18 @@ class SceneGrid:
     name: str = LOCAL
 
     def __post_init__(self) -> None:
-        if not (0 < self.spacing_m < np.inf and np.isfinite([self.west_m, self.north_m]).all() and min(self.shape) > 0):
-            raise ValueError(
-                f"{self.west_m=}, {self.north_m=}, {self.spacing_m=}, {self.shape=}: must be finite, the spacing and "
-                "both sides positive"
+        sides = np.asarray(self.shape, object)
+        if sides.shape != (2,) or not all(isinstance(side, Integral) and int(side) > 0 for side in sides):
+            raise CampaignError(
+                quoted(self.shape), "SceneGrid: shape", "numbers of rows and columns", "Give two whole numbers above 0."
+            )
+        metres = {"west_m": self.west_m, "north_m": self.north_m, "spacing_m": self.spacing_m}
+        wrong = [name for name, one in metres.items() if not (isinstance(one, Real) and np.isfinite(one))]
+        if wrong or self.spacing_m <= 0:
+            name = wrong[0] if wrong else "spacing_m"
+            above = " above 0" if name == "spacing_m" else ""
+            raise CampaignError(
+                quoted(metres[name]), f"SceneGrid: {name}", f"metres, finite{above}", "Correct what is named."
             )
 
     @classmethod

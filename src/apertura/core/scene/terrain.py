@@ -1,13 +1,14 @@
 """The ground under a scene: at one height, a plane, or heights from a DEM; and its two cheaper models."""
 
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from apertura.common.arrays import Floats
-from apertura.common.errors import CampaignError
+from apertura.common.errors import CampaignError, quoted
 from apertura.core.scene.grid import SceneGrid
 
 # ---- Ground models: flat, a plane, heights of a grid
@@ -164,7 +165,7 @@ def ground_of(terrain: Terrain | float | None, grid: SceneGrid) -> Terrain:
     Raises
     ------
     CampaignError
-        If it was left out of a grid on Earth.
+        If it was left out of a grid on Earth, or is none.
 
     Examples
     --------
@@ -178,7 +179,16 @@ def ground_of(terrain: Terrain | float | None, grid: SceneGrid) -> Terrain:
             expected=f"how high the ground of {grid.crs} is above its ellipsoid",
             remedy="Give a height in metres, or a terrain such as that of an opened campaign's scene.",
         )
-    return FlatGround(float(terrain or 0.0)) if terrain is None or isinstance(terrain, int | float) else terrain
+    if terrain is None or isinstance(terrain, int | float | np.floating):
+        return FlatGround(float(terrain or 0.0))
+    if not hasattr(terrain, "positions_at"):
+        raise CampaignError(
+            quoted(terrain) if isinstance(terrain, str | Path) else f"an object of type {type(terrain).__name__}",
+            where="terrain",
+            expected="a height in metres, a FlatGround, Plane or Dem",
+            remedy="Open a file of heights by apertura.open_dem(path, datum).",
+        )
+    return terrain
 
 
 class _Array(Protocol):

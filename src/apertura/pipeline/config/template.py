@@ -21,7 +21,9 @@ WAVEFORMS: dict[str, type[BaseModel]] = {
 }
 """waveform.kind and the section that it stands for."""
 
-_FLIGHTS = "flight\tkind\ttransmitter\tnodes\nf01\timage\tuav1\tuav1,uav2\n"
+_FLIGHTS = "flight\tkind\ttransmitter\tnodes\nf01\timage\tuav1\t{nodes}\n"
+_NODES = {"fmcw": ("uav1",), "phase_history": ("uav1",)}
+"""Kind of waveform → nodes of the example, where one radar sends and receives by itself; else two."""
 
 
 def config_template(kind: str = "ofdm") -> str:
@@ -46,14 +48,18 @@ def config_template(kind: str = "ofdm") -> str:
         raise CampaignError(
             f"kind {quoted(kind)}", where="apertura init", expected=", ".join(WAVEFORMS), remedy="Choose one of them."
         )
-    examples = {"waveform": WAVEFORMS[kind], "nodes": {"uav1": Node, "uav2": Node}}
+    examples = {"waveform": WAVEFORMS[kind], "nodes": dict.fromkeys(_nodes(kind), Node)}
     header = "# Generated from the settings model by `apertura init`; see config/README.md.\n\n"
     return header + "\n".join(_section(Settings, 0, examples)) + "\n"
 
 
-def flights_template() -> str:
-    """Return config/flights.tsv with one flight."""
-    return _FLIGHTS
+def flights_template(kind: str = "ofdm") -> str:
+    """Return config/flights.tsv with one flight, for a kind of waveform."""
+    return _FLIGHTS.format(nodes=",".join(_nodes(kind)))
+
+
+def _nodes(kind: str) -> tuple[str, ...]:
+    return _NODES.get(kind, ("uav1", "uav2"))
 
 
 def config_schema() -> str:

@@ -268,7 +268,7 @@ def _span(seconds: float) -> np.timedelta64:
 
 # ---- Which hypothesis explains what was lost -------------------------------------------------------------------------
 
-LEAST_GAIN_DB = 1.0
+LEAST_GAIN_DB = 0.5
 """Least gain of the measure at which a hypothesis is named."""
 
 LEAST_SHARE = 0.7

@@ -159,13 +159,6 @@ def _between_epochs(paths: PointPaths, pair: OpenPair) -> list[BudgetLine]:
     return [BudgetLine("between epochs", f"{words} rms", paths.of_noise(*parts))]
 
 
-def arithmetic_line(error_db: float) -> BudgetLine:
-    """Return the loss by the measured numerical error."""
-    return BudgetLine(
-        "arithmetic", f"{error_db:.1f} dB measured", Effect(10 * np.log10(1 - 10 ** (error_db / 10)), 0, 0)
-    )
-
-
 def _air(campaign: Campaign, pair: OpenPair, paths: PointPaths) -> BudgetLine:
     """Return what the uncertainty of the air's refractivity does: all pairs lie wrong alike, less what paths differ by.
 
@@ -220,7 +213,7 @@ def _stated_tags_ms(campaign: Campaign, pair: OpenPair) -> float | None:
 def _sampling(pulses: Mapping[str, Any]) -> BudgetLine:
     used, dropped = pulses.get("used"), pulses.get("dropped", 0)
     stated = None if used is None else f"{dropped} of {used + dropped} pulses missing"
-    return BudgetLine("missing pulses", stated, Effect(0.0, 0.0, 0.0), "nothing known")
+    return BudgetLine("missing pulses", stated, NO_EFFECT)
 
 
 def _antenna(pair: OpenPair, paths: PointPaths) -> BudgetLine:

@@ -107,16 +107,18 @@ def write_clock(
 def print_alignment(campaign: Campaign, flight: str, node: str, *, write: bool, **options: Any) -> None:
     """Align, print the result and the lines for the config, and with `write` write clocks.tsv."""
     found, stated = align(campaign, flight, node, **options)
+    path = f"path beyond geometry {stated['path_offset_m']:.4f} m"
+    path += f" ± {found.path_width_m:.4f} m" if options["search_m"] > 0 else ", as the config says: not measured"
     print(
         f"{flight} {node}: the recording begins {found.offset_s:.4f} s ± {found.offset_width_s:.4f} s after the first "
-        f"epoch of the log; path beyond geometry {stated['path_offset_m']:.4f} m ± {found.path_width_m:.4f} m"
+        f"epoch of the log; {path}"
     )
     print(
         f"by {found.report['method']}, on {found.report['pulses']} pulses, {found.contrast_db:.1f} dB above "
         f"{'other offsets' if options['point'] else 'the median of the image'}"
     )
     for name, line in found.flags.items():
-        print(f"{name}: {line}")
+        print(f"doubtful: {name}: {line}")
     if options["drift"]:
         print(f"drift {found.drift_ppm:.2f} ppm: {found.report['drift']}")
     cells = (flight, node, stated["offset_s"], stated["drift_ppm"], f"{found.offset_width_s:.6f}")

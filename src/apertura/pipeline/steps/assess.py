@@ -244,7 +244,7 @@ def _moved(
 # ---- Rule `assess`: agreement of a flight's images, and which are added ---------------------------------------------
 
 _PHASE = "pairs_out_of_phase"
-_LOOKS_WRONG = frozenset({"defocused", "echo_elsewhere", "pairs_apart", _PHASE, "pair_unconfirmed"})
+_LOOKS_WRONG = frozenset({"defocused", "loss_unexpected", "echo_elsewhere", "pairs_apart", _PHASE, "pair_unconfirmed"})
 """Flags that a wrong geometry raises; hypotheses are tried where one is raised."""
 
 _TIED = "as many pairs say the opposite, and their images do not show which is wrong"

@@ -14,16 +14,16 @@ from apertura.common.flags import Flags
 from apertura.core.focus.engines import instruction_set
 from apertura.core.focus.tiles import compute_tiles
 from apertura.core.imaging.certify import certified, measures
-from apertura.core.imaging.focus_check import focus_flags, focus_report
 from apertura.core.imaging.formation import Formation
+from apertura.core.imaging.judgement import judgement
 from apertura.core.imaging.range_profiles import profiles_of
 from apertura.core.imaging.view import view_report
-from apertura.core.quality.budget import antenna_flags, expected
+from apertura.core.quality.budget import arithmetic_line
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.lineage import result_of
 from apertura.pipeline.opening.autofocus import RefinedTrack, open_refined
 from apertura.pipeline.opening.pair import OpenPair, antennas_report, open_pair, pattern_digests
-from apertura.pipeline.opening.plan import arithmetic_line, budget_of, plan_pair
+from apertura.pipeline.opening.plan import budget_of, plan_pair
 from apertura.pipeline.opening.scene import OpenScene, open_scene
 from apertura.pipeline.steps.stamping import stamped
 from apertura.pipeline.store import finish, mark_rewritten, open_array, open_stage, resume, sharing, writing
@@ -68,15 +68,10 @@ def image(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Pa
             "view": view_report(work.formation, work.pair.began, work.pair.time_s),
             "autofocus": work.track.report(pair),
         }
-        lines = [*budget, arithmetic_line(quality["numerical_error_db"])]
-        focus = focus_report(work.formation, target)
-        quality |= {"focus": focus, "budget": [line.report for line in lines]}
-        spoilt = expected(lines)
-        focus |= {"expected_db": round(spoilt.loss_db, 3), "expected_std_db": round(spoilt.loss_std_db, 3)}
+        told = judgement(work.formation, target, [*budget, arithmetic_line(quality["numerical_error_db"])])
+        quality |= {"focus": told.focus, "budget": told.budget}
         of_stages = echo.attrs["flags"], work.track.stage.attrs["flags"]
-        quality["flags"] = Flags.merged(
-            *of_stages, plan.flags, quality["flags"], antenna_flags(lines), focus_flags(focus, spoilt)
-        )
+        quality["flags"] = Flags.merged(*of_stages, plan.flags, quality["flags"], told.flags)
         finish(wip, folder, lineage=lineage, quality=quality, flags=quality["flags"])
     return folder
 

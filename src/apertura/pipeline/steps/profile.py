@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from apertura.common.errors import CampaignError
+from apertura.common.errors import CampaignError, number_of
 from apertura.common.provenance import merged
 from apertura.core.echo.compression import centre_frequency
 from apertura.core.imaging.range_profiles import (
@@ -87,8 +87,8 @@ def _check_held(farthest: NDArray[np.float64], limit: NDArray[np.float64], campa
     if beyond.size:
         pulse = int((farthest - limit).argmax())
         raise CampaignError(
-            f"at {beyond.size} pulses echoes of the scene arrive after {limit_name}, worst at pulse {pulse}: "
-            f"total path {farthest[pulse]:.1f} m",
+            f"at {number_of(beyond.size, 'pulse')} echoes of the scene arrive after {limit_name}, worst at pulse "
+            f"{pulse}: total path {farthest[pulse]:.1f} m",
             where=where,
             expected=f"at most {limit[pulse]:.1f} m (c·{key} less the path offsets)",
             remedy=f"Make scene.bounds_m smaller, or check path_offset_m and {key}.",

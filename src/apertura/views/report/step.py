@@ -26,7 +26,8 @@ from apertura.views.image_report import (
     budget_rows,
     decision_rows,
     flag_rows,
-    read_reports,
+    images_of,
+    read_report,
     sentences,
     shared_rows,
     verdict_row,
@@ -47,11 +48,12 @@ _MOST_PANELS = 2  # pairs beside their sums
 def page(campaign: Campaign, flight: str) -> list[Path]:
     """Write results/<flight>/report.html, the panels of its images and the cuts of their sum; return their paths."""
     lineage = result_of(campaign, "page", flight).begin(campaign.root)
-    reports = read_reports(campaign, flight)
+    fused = read_report(campaign, flight, FUSED)
+    reports = {name: read_report(campaign, flight, name) for name in images_of(campaign, flight)}
     panels, cuts = (campaign.result(flight, FUSED, name) for name in (PANELS, SUM_CUTS))
     text = campaign.result(flight, PAGE)
-    _write_panels(panels, campaign, flight, reports[FUSED], lineage)
-    _write_cuts(cuts, campaign, flight, reports[FUSED], lineage)
+    _write_panels(panels, campaign, flight, fused, lineage)
+    _write_cuts(cuts, campaign, flight, fused, lineage)
     title = f"{campaign.settings.campaign}, flight {flight}"
     write_text(text, page_of(title, [Heading(1, title), *_blocks(campaign, flight, reports)]))
     written = [text, panels, cuts]
@@ -64,13 +66,11 @@ def _blocks(campaign: Campaign, flight: str, reports: Mapping[str, Mapping[str, 
         "What was asked, and the grid that it gave; all else is auto and decided below.", ASKED, asked_rows(campaign)
     )
     yield Table("What each image says of itself.", VERDICTS, [verdict_row(*one) for one in reports.items()])
-    yield Heading(2, "Pairs and their sums")
-    yield Paragraph(" ".join(sentences("Sum of the pairs", reports[FUSED])))
-    yield Picture(
-        campaign.result(flight, FUSED, PANELS).read_bytes(),
-        _caption("panels"),
-    )
-    yield Picture(campaign.result(flight, FUSED, SUM_CUTS).read_bytes(), _caption("sum_cuts"))
+    if FUSED in reports:
+        yield Heading(2, "Pairs and their sums")
+        yield Paragraph(" ".join(sentences("Sum of the pairs", reports[FUSED])))
+        yield Picture(campaign.result(flight, FUSED, PANELS).read_bytes(), _caption("panels"))
+        yield Picture(campaign.result(flight, FUSED, SUM_CUTS).read_bytes(), _caption("sum_cuts"))
     for pair in campaign.flight(flight).pairs:
         yield from _pair_blocks(campaign, flight, pair, reports[pair])
     raised = flag_rows(reports)
@@ -174,7 +174,9 @@ def _why(scene: OpenScene, name: str) -> str:
 def landing(campaign: Campaign) -> dict[str, Any]:
     """Return what the workflow's report opens with, as reStructuredText in which nothing is markup but the tables."""
     flights = {one.name: one.pairs for one in campaign.image_flights}
-    reports = {f"{one} {name}": report for one in flights for name, report in read_reports(campaign, one).items()}
+    reports = {
+        f"{one} {name}": read_report(campaign, one, name) for one in flights for name in images_of(campaign, one)
+    }
     first, pairs = next(iter(flights.items()))
     decided, raised = {pair: reports[f"{first} {pair}"] for pair in pairs}, flag_rows(reports)
     return {
@@ -183,7 +185,9 @@ def landing(campaign: Campaign) -> dict[str, Any]:
         "asked": rst_table(ASKED, asked_rows(campaign)),
         "verdicts": rst_table(VERDICTS, [verdict_row(*one) for one in reports.items()]),
         "sentences": [
-            rst_text(" ".join(sentences(f"Sum of the pairs of {one}", reports[f"{one} {FUSED}"]))) for one in flights
+            rst_text(" ".join(sentences(f"Sum of the pairs of {one}", reports[f"{one} {FUSED}"])))
+            for one in flights
+            if f"{one} {FUSED}" in reports
         ],
         "first": rst_text(first),
         "decisions": rst_table(("pairs", *DECISIONS), shared_rows(decided)),

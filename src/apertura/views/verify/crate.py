@@ -1,4 +1,4 @@
-"""`apertura check-crate`: results that were passed on, compared with the crate and the catalog that lie in them."""
+"""`apertura verify --crate`: results that were passed on, compared with the crate and the catalog that lie in them."""
 
 from pathlib import Path
 
@@ -41,13 +41,15 @@ def changed_files(root: Path, *, inputs: bool = True) -> dict[str, str]:
     return {one.name: "missing" if one.state == "missing" else "changed" for one in differences}
 
 
-def print_checked(folder: Path) -> int:
+def print_checked(folder: Path, *, quiet: bool = False) -> int:
     """Print which files are not what the crate says, and what is wrong with the catalog; return the exit code.
 
     Parameters
     ----------
     folder
         A campaign, or its results alone: recordings are compared where the campaign lies above them.
+    quiet
+        Only what is not the same.
 
     Returns
     -------
@@ -60,6 +62,8 @@ def print_checked(folder: Path) -> int:
         If there is no crate, or it is damaged.
     """
     root = folder if (folder / CRATE).is_file() else folder / "results"
+    if folder.is_file():
+        raise CampaignError("a file", folder, "a campaign folder, or its results", "Name the folder.")
     above = (root.parent / "config").is_dir()
     lines = [f"{name}: {state}" for name, state in changed_files(root, inputs=above).items()]
     if (root / "stac" / CATALOG).is_file():
@@ -68,7 +72,7 @@ def print_checked(folder: Path) -> int:
         print(shown(line, 500))
     if len(lines) > _MOST:
         print(f"and {len(lines) - _MOST} more")
-    if not lines:
+    if not lines and not quiet:
         beside = "recordings and config, too" if above else "recordings and config are not here to be compared"
         print(f"every file as the crate says ({beside}), the catalog valid")
     return 1 if lines else 0

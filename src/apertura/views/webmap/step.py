@@ -19,7 +19,7 @@ from apertura.pipeline.digests import digest_of
 from apertura.pipeline.lineage import result_of
 from apertura.pipeline.opening.scene import OpenScene, settled_scene
 from apertura.pipeline.store import check_listed, read_manifest, record_files
-from apertura.views.image_report import FUSED, read_report
+from apertura.views.image_report import FUSED, images_of, read_report
 from apertura.views.webmap.document import Layer, Place, found_places, image_entry, map_document, url_of
 
 _FEW = 512  # places along a raster's longer side that its range of values is taken from
@@ -55,7 +55,8 @@ def webmap(campaign: Campaign) -> list[Path]:
 
 def _images(campaign: Campaign) -> Iterator[tuple[str, str]]:
     for flight in campaign.image_flights:
-        yield from ((flight.name, image) for image in (FUSED, *flight.pairs))
+        images = images_of(campaign, flight.name)  # sums, the last, are what a map opens on
+        yield from ((flight.name, image) for image in (images[-1], *images[:-1]))
 
 
 def _layers(campaign: Campaign, flight: str, image: str, report: Mapping[str, Any]) -> list[Layer]:

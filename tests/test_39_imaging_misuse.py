@@ -1,0 +1,254 @@
+"""Ways to use the Python door wrongly: each is refused with one message, or its image carries a flag or a verdict."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import xarray as xr
+from scenes import TARGET, TARGET_GRID, point_history
+
+import apertura as ap
+from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.common.errors import CampaignError
+from apertura.core.antenna.beam import Beam, Beams
+
+HISTORY = point_history()
+SQUARE = point_history(200)
+APERTURE, ECHO, FREQUENCY = HISTORY.aperture, HISTORY.transfer, HISTORY.frequency_hz
+PROFILES = ap.range_compress(HISTORY, TARGET_GRID, ap.FlatGround(0.0))
+
+
+def of(**fields):
+    return lambda: replace(HISTORY, **fields)
+
+
+def profiles(**fields):
+    return lambda: replace(PROFILES, **fields)
+
+
+def flown(tx_m=APERTURE.tx_m, rx_m=APERTURE.rx_m):
+    return lambda: replace(HISTORY, aperture=ap.Aperture(tx_m, rx_m))
+
+
+def echo_of(path_m, **fields):
+    echo = np.exp(-2j * np.pi * FREQUENCY * path_m[:, None] / SPEED_OF_LIGHT_M_S)
+    return of(transfer=echo.astype(np.complex64), **fields)
+
+
+def wide(pulses):
+    """A beam of one gain everywhere, over some pulses."""
+    angle = np.linspace(-3, 3, 9)
+    return Beams(transmit=Beam(np.tile(np.eye(3), (pulses, 1, 1)), angle, np.ones(9), angle, np.ones(9)))
+
+
+PATH_M = APERTURE.path(TARGET)[:, 0]
+ALONG = np.linspace(-1, 1, len(HISTORY))[:, None]
+WRONG_TRACK = 0.05 * np.random.default_rng(1).standard_normal((len(HISTORY), 3))
+
+REFUSED = {
+    "GHz": (of(frequency_hz=FREQUENCY / 1e9), {}, "Is that in GHz"),
+    "MHz": (of(frequency_hz=FREQUENCY / 1e6), {}, "Is that in MHz"),
+    "frequencies negative": (of(frequency_hz=-FREQUENCY), {}, "in Hz"),
+    "frequencies NaN": (of(frequency_hz=np.full(200, np.nan)), {}, "in Hz"),
+    "frequencies falling": (of(frequency_hz=FREQUENCY[::-1].copy()), {}, "ascend in equal steps"),
+    "frequencies from zero": (of(frequency_hz=FREQUENCY - FREQUENCY[0]), {}, "in Hz"),
+    "frequencies uneven": (of(frequency_hz=FREQUENCY**2 / FREQUENCY[0]), {}, "ascend in equal steps"),
+    "one frequency": (
+        lambda: ap.PhaseHistory(ECHO[:, :1], FREQUENCY[:1], np.ones(1), np.zeros(96), APERTURE),
+        {},
+        "two or more",
+    ),
+    "carrier alone": (of(frequency_hz=1.2e9), {}, r"frequency_hz \(\)"),
+    "weights zero": (of(weight=np.zeros(200)), {}, "some above"),
+    "weights negative": (of(weight=np.linspace(-1, 1, 200)), {}, "no weight below 0"),
+    "weights NaN": (of(weight=np.full(200, np.nan)), {}, "not finite"),
+    "weights by pulse": (of(weight=np.ones(96)), {}, r"weight \(96,\)"),
+    "delay one number": (of(reference_delay_s=0.0), {}, r"reference_delay_s \(\)"),
+    "delay NaN": (of(reference_delay_s=np.full(96, np.nan)), {}, "not finite"),
+    "delay in ns": (of(reference_delay_s=np.full(96, 150.0)), {}, "seconds"),
+    "transposed": (of(transfer=ECHO.T), {}, "Transpose"),
+    "transfer flat": (of(transfer=ECHO.ravel()), {}, r"transfer \(19200,\)"),
+    "transfer of words": (of(transfer="echo.npy"), {}, "complex numbers"),
+    "transfer None": (of(transfer=None), {}, "complex numbers"),
+    "transfer of objects": (of(transfer=np.array([["a"] * 200] * 96)), {}, "complex numbers"),
+    "transfer NaN": (of(transfer=np.full_like(ECHO, np.nan)), {}, "96 of 96 pulses"),
+    "transfer zero": (of(transfer=np.zeros_like(ECHO)), {}, "all samples are zero"),
+    "real samples": (of(transfer=np.abs(ECHO)), {}, "complex"),
+    "fewer pulses": (of(transfer=ECHO[:95]), {}, "aperture of 96 pulses"),
+    "no pulses": (lambda: HISTORY[:0], {}, "zero pulses"),
+    "aperture an array": (of(aperture=APERTURE.tx_m), {}, "Make one by Aperture"),
+    "aperture None": (of(aperture=None), {}, "Make one by Aperture"),
+    "track of one place": (lambda: ap.Aperture([0.0, 0, 9], [0.0, 0, 9]), {}, "x, y and z of each pulse"),
+    "track transposed": (lambda: ap.Aperture(APERTURE.tx_m.T, APERTURE.rx_m.T), {}, "x, y and z of each pulse"),
+    "track in two dimensions": (flown(APERTURE.tx_m[:, :2], APERTURE.rx_m[:, :2]), {}, "x, y and z"),
+    "track of words": (lambda: ap.Aperture("track.csv", "track.csv"), {}, "real numbers"),
+    "track None": (lambda: ap.Aperture(APERTURE.tx_m, None), {}, "real numbers"),
+    "track complex": (flown(APERTURE.tx_m * 1j), {}, "real"),
+    "track NaN": (flown(APERTURE.tx_m + np.nan), {}, "phase centres are not finite"),
+    "track in mm": (flown(APERTURE.tx_m * 1e3, APERTURE.rx_m * 1e3), {}, "no echo of the scene|below the ground"),
+    "track of another frame": (flown(APERTURE.tx_m + 5e6, APERTURE.rx_m + 5e6), {}, "no echo of the scene"),
+    "track under ground": (flown(-APERTURE.tx_m, -APERTURE.rx_m), {}, "in or below the ground"),
+    "speed of sound": (of(wave_speed_m_s=343.0), {}, "light"),
+    "speed in km/s": (of(wave_speed_m_s=299792.458), {}, "light"),
+    "speed a word": (of(wave_speed_m_s="air"), {}, "light"),
+    "an array for the echo": (lambda: ECHO, {}, "expected a PhaseHistory"),
+    "a path for the echo": (lambda: "results/f01", {}, "expected a PhaseHistory"),
+    "another dataset": (lambda: xr.Dataset({"image": ("x", [1.0])}), {}, "a stage echo"),
+    "grid of bounds": (lambda: HISTORY, {"grid": (-4, -4, 4, 4)}, "a SceneGrid"),
+    "grid None": (lambda: HISTORY, {"grid": None}, "a SceneGrid"),
+    "grid in degrees": (lambda: HISTORY, {"grid": lambda: ap.SceneGrid("EPSG:4326", 5, 5, 0.5, (9, 9))}, "in metres"),
+    "grid unknown": (lambda: HISTORY, {"grid": lambda: ap.SceneGrid("UTM32", 5e5, 5e6, 0.5, (9, 9))}, "UTM32"),
+    "grid of no spacing": (lambda: HISTORY, {"grid": lambda: ap.SceneGrid("local", 0, 0, 0.0, (9, 9))}, "spacing_m"),
+    "grid of one side": (
+        lambda: HISTORY,
+        {"grid": lambda: ap.SceneGrid("local", 0.0, 0.0, 0.1, 9)},
+        "rows and columns",
+    ),
+    "grid of half pixels": (
+        lambda: HISTORY,
+        {"grid": lambda: ap.SceneGrid("local", 0.0, 0.0, 0.1, (9.5, 9.5))},
+        "rows and columns",
+    ),
+    "terrain a path": (lambda: HISTORY, {"terrain": "dem.tif"}, "open_dem"),
+    "terrain heights alone": (lambda: HISTORY, {"terrain": np.zeros((160, 160))}, "open_dem|a height"),
+    "terrain NaN": (lambda: HISTORY, {"terrain": np.nan}, "not finite"),
+    "terrain above the antennas": (lambda: HISTORY, {"terrain": 15.0}, "in or below the ground"),
+    "accuracy positive": (lambda: HISTORY, {"accuracy_db": 60.0}, "accuracy_db"),
+    "accuracy a word": (lambda: HISTORY, {"accuracy_db": "high"}, "accuracy_db"),
+    "accuracy None": (lambda: HISTORY, {"accuracy_db": None}, "accuracy_db"),
+    "engine unknown": (lambda: HISTORY, {"engine": "gpu"}, "no such engine"),
+    "engine None": (lambda: HISTORY, {"engine": None}, "engine"),
+    "option unknown": (lambda: HISTORY, {"engine_options": {"native": {"degree": 99}}}, "engine_options.native.degree"),
+    "beams a number": (lambda: HISTORY, {"beams": 30.0}, "Beams"),
+    "beams of other pulses": (
+        lambda: HISTORY,
+        {"beams": lambda: wide(50)},
+        "50 pulses",
+    ),
+    "atmosphere dry": (lambda: HISTORY, {"atmosphere": "dry"}, "atmosphere"),
+    "atmosphere an index": (lambda: HISTORY, {"atmosphere": [1.0003]}, "atmosphere"),
+    "calibration a word": (lambda: HISTORY, {"calibration": "auto"}, "calibration"),
+    "calibration negative": (lambda: HISTORY, {"calibration": -1.0}, "calibration"),
+    "pixels negative": (lambda: HISTORY, {"certified_pixels": -1}, "certified_pixels"),
+    "pixels a word": (lambda: HISTORY, {"certified_pixels": "all"}, "certified_pixels"),
+    "judge a word": (lambda: HISTORY, {"judge": "later"}, "judge"),
+    "integration unknown": (lambda: HISTORY, {"integration": {"metres": 3}}, "integration"),
+    "tile of no patch": (lambda: HISTORY, {"tile_px": 100}, "tile_px"),
+    "presum zero": (lambda: HISTORY, {"presum": 0}, "presum"),
+    "window unknown": (lambda: HISTORY, {"window": "hamming"}, "window"),
+    "carrier of profiles in GHz": (profiles(centre_frequency_hz=1.2), {}, "Is that in GHz"),
+    "step of profiles zero": (profiles(step_m=0.0), {}, "step_m"),
+    "step of profiles a word": (profiles(step_m="5 cm"), {}, "step_m"),
+    "profiles hardly sampled": (profiles(oversampling=0.5), {}, "oversampling"),
+    "profiles NaN": (profiles(samples=np.full_like(PROFILES.samples, np.nan)), {}, "pulses are not finite"),
+    "starts NaN": (profiles(start_m=np.full(96, np.nan)), {}, "not finite"),
+    "starts of other pulses": (profiles(start_m=PROFILES.start_m[:50]), {}, r"start_m \(50,\)"),
+    "echo over time": (of(transfer=np.fft.ifft(ECHO, axis=1).astype(np.complex64)), {}, "numpy.fft.fft"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_is_no_recording_is_refused_in_one_line(name):
+    given, options, complaint = REFUSED[name]
+
+    def formed():
+        made = {key: value() if callable(value) else value for key, value in options.items()}
+        return ap.backproject(given(), made.pop("grid", TARGET_GRID), **made)
+
+    with pytest.raises(CampaignError, match=complaint) as told:
+        formed()
+    assert "\n" not in str(told.value)
+    assert "self." not in str(told.value)
+
+
+FLAGGED = {
+    "conjugated": (of(transfer=ECHO.conj()), "echo_elsewhere"),
+    "I and Q swapped": (of(transfer=(ECHO.imag + 1j * ECHO.real).astype(np.complex64)), "echo_elsewhere"),
+    "paths one way": (echo_of(PATH_M / 2), "echo_elsewhere"),
+    "paths twice": (echo_of(2 * PATH_M), "echo_elsewhere"),
+    "square array transposed": (lambda: replace(SQUARE, transfer=SQUARE.transfer.T.copy()), "echo_elsewhere"),
+    "subcarriers backwards": (of(transfer=ECHO[:, ::-1].copy()), "echo_elsewhere"),
+    "delay of the other sign": (echo_of(PATH_M - 30, reference_delay_s=np.full(96, -1e-7)), "echo_elsewhere"),
+    "delay removed twice": (echo_of(PATH_M - 30, reference_delay_s=np.full(96, 2e-7)), "echo_elsewhere"),
+    "carrier 10 % off": (of(frequency_hz=FREQUENCY + 1.2e8), "defocused"),
+    "band twice as wide": (of(frequency_hz=FREQUENCY[0] + 2 * (FREQUENCY - FREQUENCY[0])), "echo_elsewhere"),
+    "track 5 cm wrong at random": (flown(APERTURE.tx_m + WRONG_TRACK, APERTURE.rx_m + WRONG_TRACK), "defocused"),
+    "track a pulse late": (flown(np.roll(APERTURE.tx_m, 9, 0), np.roll(APERTURE.rx_m, 9, 0)), None),
+    "track half as long": (
+        flown(APERTURE.tx_m * [0.5, 1, 1], APERTURE.rx_m * [0.5, 1, 1]),
+        "defocused",
+    ),
+    "conjugated profiles": (profiles(samples=PROFILES.samples.conj()), "defocused"),
+    "power for amplitude": (profiles(samples=np.abs(PROFILES.samples).astype(np.complex64) ** 2), None),
+    "starts of one leg": (profiles(start_m=PROFILES.start_m / 2), None),
+    "starts in km": (profiles(start_m=PROFILES.start_m / 1e3), "scene_beyond_samples"),
+    "pulses shuffled": (of(transfer=np.random.default_rng(2).permutation(ECHO)), None),
+    "step of one leg": (profiles(step_m=PROFILES.step_m / 2), None),
+}
+
+
+@pytest.mark.parametrize("name", FLAGGED)
+def test_what_forms_an_image_of_nothing_is_flagged(name):
+    given, flag = FLAGGED[name]
+    image = ap.backproject(given(), TARGET_GRID)
+    flags = json.loads(image.attrs["flags"])
+    assert flags, image.attrs["verdict"]
+    assert flag is None or flag in flags
+
+
+def test_samples_of_the_other_sign_are_told_as_such():
+    for name in ("conjugated", "I and Q swapped", "conjugated profiles"):
+        (line,) = json.loads(ap.backproject(FLAGGED[name][0](), TARGET_GRID).attrs["flags"]).values()
+        assert "I and Q are swapped" in line
+    for name in ("paths one way", "square array transposed", "track half as long"):
+        assert "I and Q" not in ap.backproject(FLAGGED[name][0](), TARGET_GRID).attrs["flags"]
+
+
+def test_what_the_pulses_cannot_tell_is_not_called_focused():
+    """Half-spectra swapped: two peaks in range, and nothing that tells them from two targets."""
+    swapped = replace(HISTORY, transfer=np.fft.fftshift(ECHO, axes=1))
+    assert ap.backproject(swapped, TARGET_GRID).attrs["verdict"] == "cannot tell"
+
+
+def test_a_right_image_is_called_focused_without_a_flag():
+    for inputs in (HISTORY, PROFILES):
+        attributes = ap.backproject(inputs, TARGET_GRID).attrs
+        assert (attributes["verdict"], attributes["flags"]) == ("focused", "{}")
+
+
+def test_an_echo_outside_is_no_fault_where_the_scene_has_points_of_its_own():
+    """A house 30 dB brighter than the scene's target, 40 m farther: its sidelobes are weaker still."""
+    window = np.hanning(202)[1:-1]
+    house = 30 * np.exp(-2j * np.pi * FREQUENCY * (PATH_M + 40)[:, None] / SPEED_OF_LIGHT_M_S)
+    beside = replace(HISTORY, transfer=(ECHO + house).astype(np.complex64), weight=window / window.sum())
+    assert "echo_elsewhere" not in json.loads(ap.backproject(beside, TARGET_GRID).attrs["flags"])
+    alone = replace(HISTORY, transfer=house.astype(np.complex64))
+    assert "echo_elsewhere" in json.loads(ap.backproject(alone, TARGET_GRID).attrs["flags"])
+
+
+def test_a_lazy_image_is_judged_when_asked_and_by_all_of_it():
+    lazy = ap.backproject(HISTORY, TARGET_GRID, judge=False, tile_px=64)
+    assert lazy.attrs["verdict"] == "not judged"
+    assert "apertura.judge" in lazy.attrs["verdict_why"]
+    told = ap.judge(abs(lazy)[:9, :9])
+    assert (told.verdict, dict(told.flags)) == ("focused", {})
+    assert told.focus["points"][0]["x_m"] == pytest.approx(TARGET[0, 0], abs=0.03)
+    assert [line["cause"] for line in told.budget] == ["positions", "heights", "calibration", "arithmetic"]
+    with pytest.raises(CampaignError, match="not computed"):
+        ap.judge(lazy.compute())
+    with pytest.raises(CampaignError, match="several images"):
+        ap.judge(lazy + ap.backproject(HISTORY, TARGET_GRID, judge=False))
+
+
+def test_errors_of_positions_that_are_stated_are_expected():
+    sent, received = 0.01 * np.random.default_rng(3).standard_normal((2, len(HISTORY), 3))
+    image = ap.backproject(flown(APERTURE.tx_m + sent, APERTURE.rx_m + received)(), TARGET_GRID)
+    assert "loss_unexpected" in json.loads(image.attrs["flags"])
+    told = ap.judge(image, position_std_m=0.01, time_s=10.0 * np.arange(len(HISTORY)))
+    assert told.focus["loss_db"] == pytest.approx(told.focus["expected_db"], abs=0.3)
+    assert not told.flags
+    with pytest.raises(CampaignError, match="with time_s"):
+        ap.judge(image, position_std_m=0.01)
+    with pytest.raises(CampaignError, match="seconds of each of 96 pulses"):
+        ap.judge(image, position_std_m=0.01, time_s=np.arange(3.0))

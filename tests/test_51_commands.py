@@ -1,0 +1,136 @@
+"""The command line as people type it: a folder or the one in hand, one message and one exit status for each mistake."""
+
+import os
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import yaml
+
+from apertura.common import processes
+from apertura.views import cli
+from apertura.views.image_report import FUSED, images_of
+
+
+@pytest.fixture
+def typed(monkeypatch, capsys):
+    """Type a command, in a folder if one is given; return its exit status, output and complaint."""
+
+    def run(*words, folder=None):
+        if folder is not None:
+            monkeypatch.chdir(folder)
+        monkeypatch.setattr(sys, "argv", ["apertura", *map(str, words)])
+        monkeypatch.setattr(processes, "_left", [])
+        here = Path.cwd()
+        try:
+            cli.main()
+            status = 0
+        except SystemExit as ended:
+            status = ended.code or 0
+        finally:
+            os.chdir(here)
+        said = capsys.readouterr()
+        return status, said.out, said.err
+
+    return run
+
+
+@pytest.mark.parametrize("words", ["check", "plan", "summary", "list", "status", "run -n", "score --no-paths"])
+def test_the_folder_in_hand_is_the_campaign(finished_tiny, typed, words):
+    status, out, err = typed(*words.split(), folder=finished_tiny.root)
+    assert (status, err) == (0, "")
+    assert out or words == "check"
+
+
+WRONG = [
+    "chek", "run nowhere", "check nowhere", "plan nowhere", "summary nowhere", "score nowhere",
+    "list nowhere",     "status nowhere", "clean nowhere --yes", "report nowhere", "map nowhere",
+    "chart nowhere", "reflectors nowhere",     "align nowhere f01 uav1", "align f01", "align a b c d",
+    "align . f01 uav9", "verify nowhere", "verify --crate nowhere",     "verify --crate", "reproduce nowhere",
+    "diff nowhere", "diff nowhere nowhere", "inspect nowhere", "inspect",     "init", "init new --kind radar",
+    "init config/..", "simulate", "simulate a b c",
+    "simulate new --preset none",     "simulate --print-spec none", "run --cores 0", "run --cores many",
+    "run --until", "map --port 99999", "plan --threads 0",     "run export", "align . f01 uav1 --point 1 2",
+    "align . f01 uav1 --search-s -1", "check --product", "step", "step nothing",     "step image f01",
+    "step image f01 uav1-uav9", "check-crate .",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("words", WRONG)
+def test_a_mistake_in_the_command_line_is_one_message_and_exit_status_2(typed, tmp_path, words):
+    """In a folder that is no campaign."""
+    (tmp_path / "config").mkdir()
+    (tmp_path / "config" / "config.yaml").write_text("campaign: x\n")
+    status, out, err = typed(*words.split(), folder=tmp_path)
+    assert status == 2
+    assert "Traceback" not in out + err
+    complaint = out if words.startswith(("check ", "step")) and not err else err
+    assert complaint.count("\n") == 1 or "Usage: " in complaint or "─ Error ─" in complaint
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["config"]
+
+
+def test_help_names_what_the_documents_use_and_hides_what_rules_use(typed):
+    status, out, _ = typed("run", "--help")
+    assert status == 0
+    for option in ("--until", "--dry-run", "-n", "--set-scatter", "--profile", "--quiet"):
+        assert option in out
+    status, out, _ = typed("--help")
+    listed = {line.split()[1] for line in out.splitlines() if line.startswith("│ ") and line[2] != " "}
+    assert {"run", "check", "verify", "inspect"} <= listed
+    assert not {"step", "study", "check-crate"} & listed
+    assert typed("step", "--help")[0] == 0
+
+
+def test_options_of_run_reach_snakemake(monkeypatch, typed, tiny):
+    given = []
+    monkeypatch.setattr("apertura.pipeline.workflow.run_workflow", lambda *words, **_: given.append(words[2:]) or 0)
+    typed("run", "--until", "export", "-n", "--set-scatter", "tiles=4", "--profile", "profiles/slurm", folder=tiny)
+    typed("run", tiny, "phase_history", "-np", "--batch=all=1/3")
+    assert given == [
+        ("-n", "--until", "export", "--profile", "profiles/slurm", "--set-scatter", "tiles=4"),
+        ("phase_history", "-p", "--batch", "all=1/3", "-n"),
+    ]
+
+
+def test_a_summary_shows_what_is_there_and_names_what_is_missing(finished_tiny, tiny, typed, monkeypatch):
+    flight, pair = "f01", finished_tiny.image_flights[0].pairs[0]
+    source, target = (one / "results" / flight / pair for one in (finished_tiny.root, tiny))
+    target.mkdir(parents=True)
+    for name in ("image.json", "export.manifest.json"):
+        (target / name).write_bytes((source / name).read_bytes())
+    status, out, err = typed("summary", tiny)
+    assert (status, err) == (0, "")
+    assert f"{flight} {pair}" in out
+    assert f"not there yet: f01 uav1-uav2, f01 {FUSED}; apertura run" in " ".join(out.split())
+
+
+def test_a_summary_of_nothing_says_what_to_run(tiny, typed):
+    status, _, err = typed("summary", tiny)
+    assert status == 2
+    assert "Run the workflow first" in err
+
+
+def test_a_pair_alone_is_not_fused_in_what_people_see(finished_tiny):
+    """One node alone: every view names the pair, none a sum of it."""
+    alone = SimpleNamespace(flight=lambda _: SimpleNamespace(pairs=["uav1-uav1"]))
+    assert images_of(alone, "f01") == ["uav1-uav1"]
+    assert images_of(finished_tiny, "f01")[-1] == FUSED
+
+
+def test_a_plan_says_what_it_was_made_from(tiny, finished_tiny, typed):
+    before, after = (typed("plan", root)[1] for root in (tiny, finished_tiny.root))
+    assert "before the samples were read" in before
+    assert "before the samples were read" not in after
+
+
+@pytest.mark.parametrize(
+    ("kind", "nodes"), [("ofdm", ["uav1", "uav2"]), ("fmcw", ["uav1"]), ("phase_history", ["uav1"])]
+)
+def test_init_writes_the_nodes_that_its_kind_has(tmp_path, typed, kind, nodes):
+    assert typed("init", "new", "--kind", kind, folder=tmp_path)[0] == 0
+    config = yaml.safe_load((tmp_path / "new/config/config.yaml").read_text())
+    assert list(config["nodes"]) == nodes
+    assert (tmp_path / "new/config/flights.tsv").read_text().splitlines()[1].split("\t") == [
+        "f01", "image", "uav1", ",".join(nodes)
+    ]  # fmt: skip
