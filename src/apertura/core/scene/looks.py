@@ -142,7 +142,7 @@ PITCHES_PX = (128, 64, 32, 16)
 
 _RANGE_SHARE = 48  # ranges to the scene: looks between nodes then err by 0.3 % in a beam of 20°
 _PULSES = 256  # summed for a block of the lattice, or up to twice as many
-_FEWEST, _MOST = 96, 2048  # of them that half of its nodes have a weight of, at least: else more are summed, up to
+_FEWEST, _MOST = 48, 2048  # of them that half of its nodes have a weight of, at least: else more are summed, up to
 AT_ONCE = 64  # pulses of a block whose illumination is decided together
 _EXACT = (AT_ONCE, 8)  # pulses that are left out together where none of them can illuminate the pixel
 _CELL_PX = 8  # side of the cells of which it is first asked whether a pulse can reach them
