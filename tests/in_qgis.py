@@ -10,14 +10,17 @@ import sys
 os.environ["QT_QPA_PLATFORM"] = "offscreen"
 from qgis.core import (
     QgsApplication,
+    QgsColorRampLegendNode,
     QgsContrastEnhancement,
+    QgsLayerTreeModel,
     QgsMapRendererParallelJob,
     QgsMapSettings,
     QgsPointXY,
     QgsProject,
     QgsRasterLayer,
+    QgsRasterSymbolLegendNode,
 )
-from qgis.PyQt.QtCore import QSize
+from qgis.PyQt.QtCore import QSize, Qt
 from qgis.PyQt.QtGui import QColor
 
 
@@ -37,6 +40,12 @@ def told(path: str) -> dict[str, object]:
         "nodata": provider.sourceNoDataValue(1) if provider.sourceHasNoDataValue(1) else None,
         "renderer": renderer.type(),
     }
+    root = QgsProject.instance().layerTreeRoot()
+    QgsProject.instance().addMapLayer(layer)
+    nodes = QgsLayerTreeModel(root).layerLegendNodes(root.findLayer(layer.id()))
+    found["legend"] = [node.data(Qt.DisplayRole) for node in nodes if isinstance(node, QgsRasterSymbolLegendNode)]
+    ramps = [node.settings() for node in nodes if isinstance(node, QgsColorRampLegendNode)]
+    found["legend"] += [settings.suffix() for settings in ramps]
     if renderer.type() == "singlebandgray" and renderer.contrastEnhancement():
         stretch: QgsContrastEnhancement = renderer.contrastEnhancement()
         found["stretch"] = [stretch.minimumValue(), stretch.maximumValue()]

@@ -8,10 +8,14 @@ from scenes import monostatic, straight_track
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
 from apertura.core.antenna.beam import Beams
+from apertura.core.echo.sidelink import DIVIDING, METHODS
 from apertura.core.focus.contributions import band_limited_image
-from apertura.core.focus.inputs import Profiles
+from apertura.core.focus.inputs import PhaseHistory, Profiles
 from apertura.core.geometry.sector import Sector
-from apertura.core.imaging.noise import noise_power
+from apertura.core.imaging.noise import noise_power, sidelink_noise
+from apertura.core.imaging.range_profiles import range_compress
+from apertura.core.scene.grid import SceneGrid
+from apertura.core.scene.terrain import FlatGround
 
 CENTRE_HZ, STEP_M = 1.2e9, 0.375 / 2
 FLOWN = monostatic(straight_track(2048, length_m=40.0))
@@ -54,3 +58,30 @@ def test_too_few_pulses_tell_nothing():
     few = profiles(1.0)[:12]
     assert np.isnan(noise_power(few, PLACES))
     assert np.isfinite(noise_power(replace(profiles(1.0)[:40]), PLACES))
+
+
+@pytest.mark.parametrize("method", ["divide", "wiener", "gated", "two_parameter"])
+def test_the_noise_of_a_sidelink_lies_on_the_echoes_as_its_correction_leaves_it(method):
+    """Eq. 8a: divided by a sidelink of 13 dB, echoes far above their receiver's noise bring noise of their own."""
+    subcarriers, snr_db, rng = 128, 13.0, np.random.default_rng(4)
+    frequency = CENTRE_HZ + 1.6e6 * (np.arange(subcarriers) - subcarriers // 2)
+    places, grid = np.array([[2.0, 35.0, 0.0], [-6.0, 48.0, 0.0]]), SceneGrid("local", -15.0, 60.0, 0.5, (80, 60))
+    echo = np.exp(-2j * np.pi / C * FLOWN.path(places)[..., None] * frequency).sum(axis=1)
+    receiver, sidelink = rng.standard_normal((2, *echo.shape, 2)) @ np.array([1, 1j]) / np.sqrt(2)
+    sidelink = 3 * (1 + 10 ** (-snr_db / 20) * sidelink)
+    radar = np.asarray(echo + 0.02 * receiver, np.complex64)
+    history = PhaseHistory(
+        METHODS[method](radar, sidelink.astype(np.complex64)),
+        frequency,
+        np.full(subcarriers, 1 / subcarriers),
+        np.zeros(len(FLOWN)),
+        FLOWN,
+    )
+    added = sidelink_noise(history, grid, FlatGround(0.0), PLACES, method=method, snr_db=snr_db)
+    thermal, measured = 0.02**2 / subcarriers, noise_power(range_compress(history, grid, FlatGround(0.0)), PLACES)
+    # What a method keeps on the echoes alone is seen by few places, whose median is not that of a sum.
+    least_db = 1.5 if method == "two_parameter" else 0.5
+    assert 10 * np.log10(measured / (thermal + added)) == pytest.approx(0, abs=least_db)
+    if method in DIVIDING:
+        assert added > 20 * thermal  # two echoes of 1 by a sidelink 13 dB above its noise: 0.1 of a subcarrier's
+        assert added == pytest.approx(2 * 10 ** (-snr_db / 10) / subcarriers, rel=0.15)

@@ -88,6 +88,26 @@ def test_the_noise_of_a_calibrated_image_is_that_of_the_noise_figure(flown):
 
 
 @pytest.mark.slow
+def test_a_receiver_stated_wrong_by_six_decibels_is_told_by_its_noise(flown, tmp_path):
+    """Eq. 8b: by its noise against the figure stated; without one, where it is below any receiver's."""
+    for pair in PAIRS:
+        noise = said(flown, pair)["noise"]
+        assert abs(noise["noise_figure_measured_db"] - 6) < 3 * noise["std_db"]
+        assert "noise_disagrees" not in said(flown, pair)["flags"]
+    root = copy_writable(flown.root, tmp_path / "campaign")
+    for wrong_db, figure_db, flagged in ((6.0, 6.0, True), (-6.0, 6.0, True), (6.0, None, False), (12.0, None, True)):
+
+        def change(document, wrong_db=wrong_db, figure_db=figure_db):
+            for node in document["nodes"].values():
+                node["receiver"] |= {"gain_db": 40.0 + wrong_db, "noise_figure_db": figure_db}
+
+        edit_config(root, change)
+        campaign = Campaign.load(root)
+        layers(campaign, "f01", "uav1-uav1")
+        assert ("noise_disagrees" in said(campaign, "uav1-uav1")["flags"]) is flagged, (wrong_db, figure_db)
+
+
+@pytest.mark.slow
 def test_sigma0_says_what_it_is_and_times_its_cell_is_the_image(flown):
     with rasterio.open(flown.result("f01", "uav1-uav1", "sigma0_db.tif")) as raster:
         means, sigma0_db = json.loads(raster.tags()["APERTURA_RADIOMETRY"]), raster.read(1)

@@ -1,5 +1,6 @@
 """Antenna patterns about their axes, and the weight of each pulse at each pixel."""
 
+from copy import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -189,7 +190,9 @@ class Beam:
 
     def __getitem__(self, pulses: slice | NDArray[np.int64]) -> "Beam":
         """Return the beam over some pulses."""
-        return replace(self, axes=self.axes[pulses])
+        some = copy(self)  # what holds of all of them needs no second check
+        object.__setattr__(some, "axes", self.axes[pulses])
+        return some
 
     def turned(self, vector_rad: NDArray[np.float64]) -> "Beam":
         """Return the beam turned by a rotation vector, (3,) rad, in the frame of the pixels."""
@@ -241,8 +244,11 @@ class Beam:
         """Return azimuth and elevation of each pixel from boresight, (2, pulse, pixel) rad; else as `gain`."""
         if len(self.axes) != len(position_m):
             raise ValueError(f"{len(self.axes)=}: must be one for each of {len(position_m)} pulses")
-        away = pixels - position_m[:, None]
-        ahead, right, above = np.moveaxis(np.einsum("pxc,pac->pxa", away, self.axes), -1, 0)
+        # Matrix products about a nearby origin, where coordinates keep their precision.
+        offset_m, antenna_m = (pixels - position_m[:1]).T, position_m - position_m[:1]
+        ahead, right, above = (
+            axis @ offset_m - (axis * antenna_m).sum(axis=1)[:, None] for axis in self.axes.swapaxes(0, 1)
+        )
         return np.stack([np.arctan2(right, ahead), np.arctan2(above, np.hypot(ahead, right))])
 
     @property

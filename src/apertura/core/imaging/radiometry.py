@@ -15,7 +15,7 @@ from apertura.core.antenna.beam import Beams
 from apertura.core.antenna.illumination import illumination_mask
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.scene.grid import SceneGrid
-from apertura.core.scene.looks import AT_ONCE, BLOCK_PX, Lattice, pulses_of
+from apertura.core.scene.looks import AT_ONCE, BLOCK_PX, Lattice, pitch_px, pulses_of
 from apertura.core.scene.swath import balls
 from apertura.core.scene.terrain import FlatGround, Terrain
 
@@ -158,7 +158,6 @@ def pointing_std_db(beams: Beams | None, aperture: Aperture, place_m: Floats, tu
 
 # ---- Calibration of an image, on a lattice
 
-_PITCHES_PX = (128, 64, 32, 16)  # of the lattice, the widest that is no wider than
 _RANGE_SHARE = 24  # ranges to the scene: logarithms of gain and area between nodes then err by 0.1 dB in a beam of 20°
 _PULSES = 128  # summed for a block of the lattice, or up to twice as many
 _POINT_PULSES = 8192  # summed for a point, or up to twice as many
@@ -242,7 +241,7 @@ class Calibration:
         >>> bool(abs(per_m2 / (2 / 580**2) - 1) < 0.2), level.round(2)  # about 2/R⁴
         (True, np.float64(0.28))
         """
-        lattice = Lattice.of(grid.shape, _pitch_px(grid, terrain, aperture))
+        lattice = Lattice.of(grid.shape, pitch_px(grid, terrain, aperture, share=_RANGE_SHARE))
         gain, area, noise = (np.full(lattice.shape, -np.inf) for _ in range(3))
         found = cls(
             grid,
@@ -399,14 +398,6 @@ def point_parts(
     return taken, parts * share, (weight**2).sum(axis=0) * share / count
 
 
-def _pitch_px(grid: SceneGrid, terrain: Terrain, aperture: Aperture) -> int:
-    middle = terrain.positions_at(grid, *(np.array([size // 2]) for size in grid.shape))
-    few = aperture[aperture.sample(_PULSES)]
-    nearest_m = min(float(np.linalg.norm(leg - middle, axis=-1).min()) for leg in few.legs)
-    most = nearest_m / _RANGE_SHARE / grid.spacing_m
-    return next((pitch for pitch in _PITCHES_PX if pitch <= most), _PITCHES_PX[-1])
-
-
 def _directions(gradient: Floats, parts: Floats, up: Floats) -> tuple[Floats, Floats]:
     """Return the normals of the slant planes, on the side of up, and directions towards the bisectors, (point, 3)."""
     size = np.abs(parts)
@@ -460,7 +451,9 @@ def _spread(gradient: Floats, parts: Floats, up: Floats) -> Floats:
     counted = np.arange(pulses) < many[:, None]
     steps = np.diff(azimuth, axis=1) * (squared[:, 1:] + squared[:, :-1]) / 2 * counted[:, 1:]
     place = np.concatenate([np.zeros((places, 1)), np.cumsum(steps, axis=1)], axis=1)
-    known = (many > 1) & (place[:, -1] > 0)
+    spread, known = np.full(places, np.nan), (many > 1) & (place[:, -1] > 0)
+    if not known.any():
+        return spread
     place, parts, many = place[known], parts[known], many[known, None]
     length, edge = place[:, -1:], 1 / (2 * (many - 1))  # a pulse stands for half a step on both sides
     place = np.concatenate([-edge, place / length, 1 + edge], axis=1)
@@ -474,6 +467,5 @@ def _spread(gradient: Floats, parts: Floats, up: Floats) -> Floats:
     density = np.diff(
         np.interp((at + apart).ravel(), (place + apart).ravel(), summed.ravel()).reshape(at.shape), axis=1
     )
-    spread = np.full(places, np.nan)
     spread[known] = (density**2).sum(axis=1) / ((1 + 2 * edge) * length / bins * total**2)[:, 0]
     return spread

@@ -137,9 +137,16 @@ def _cells(nodes: NDArray[np.int64], part: slice) -> tuple[NDArray[np.int64], ND
 SPREAD = 17
 """Pulses, evenly spread over those that illuminate a pixel, from which shadow is decided."""
 
-_PULSES = 1024  # summed for a block of the lattice, or up to twice as many
+PITCHES_PX = (128, 64, 32, 16)
+"""Of a lattice: the widest that is narrow enough for what lies on it."""
+
+_RANGE_SHARE = 48  # ranges to the scene: looks between nodes then err by 0.3 % in a beam of 20°
+_PULSES = 256  # summed for a block of the lattice, or up to twice as many
+_FEWEST, _MOST = 48, 2048  # of them that half of its nodes have a weight of, at least: else more are summed, up to
 AT_ONCE = 64  # pulses of a block whose illumination is decided together
-_EXACT = (64, 8, 1)  # steps between the pulses tried, coarse first, until one illuminates the pixel
+_EXACT = (AT_ONCE, 8)  # pulses that are left out together where none of them can illuminate the pixel
+_CELL_PX = 8  # side of the cells of which it is first asked whether a pulse can reach them
+_PIXELS = 4096  # that are decided together
 _DARK_PULSES = 64  # evaluated for the centres of a block that no pulse reaches: its neighbours interpolate with them
 _NO_WEIGHT_PENALTY = 1e6  # added to the distance of a pulse without weight: it is a centre only where none has weight
 _JUMP_PITCHES = 4.0  # node pitches: centres of neighbouring nodes further apart belong to different passes
@@ -203,7 +210,7 @@ class Looks:
         >>> looks.effective(window)[0, 0].item(), looks.centre(window)[0][0, 0].round(2).tolist()
         (37.0, [-1.75, 0.0, 10.0])
         """
-        lattice = Lattice.of(grid.shape)
+        lattice = Lattice.of(grid.shape, pitch_px(grid, terrain, aperture, share=_RANGE_SHARE))
         looks = cls(
             grid,
             terrain,
@@ -227,9 +234,15 @@ class Looks:
         points = self.terrain.positions_at(self.grid, *np.meshgrid(rows, columns, indexing="ij")).reshape(-1, 3)
         some = pulses_of(reaching, len(self.aperture))
         every = max(1, (some.stop - some.start) // (_PULSES if reaching.any() else _DARK_PULSES))
-        few = slice(some.start, some.stop, every)
-        aperture, beams = self.aperture[few], self.beams and self.beams[few]
-        weight = np.ones((len(aperture), len(points))) if beams is None else beams.weight(aperture, points)
+        while True:
+            few = slice(some.start, some.stop, every)
+            aperture, beams = self.aperture[few], self.beams and self.beams[few]
+            weight = np.ones((len(aperture), len(points))) if beams is None else beams.weight(aperture, points)
+            counted = (weight != 0).sum(axis=0)
+            found = int(np.median(counted[counted > 0])) if counted.any() else _FEWEST
+            if every == 1 or found >= _FEWEST or len(aperture) >= _MOST:
+                break
+            every = max(1, every * found // (2 * _FEWEST), (some.stop - some.start) // _MOST)
         shape, pulses_each = (len(rows), len(columns)), (some.stop - some.start) / len(aperture)
         self.total[block] = (np.abs(weight).sum(axis=0) * pulses_each).reshape(shape)
         self.squares[block] = ((weight**2).sum(axis=0) * pulses_each).reshape(shape)
@@ -259,16 +272,25 @@ class Looks:
 
     def _fill_mask(self, mask: NDArray[np.bool_], tile: Window) -> None:
         """Set the pixels of a tile that a pulse illuminates, cell by cell, from every pulse that may reach them."""
-        part, pitch = self.grid[tile], self.lattice.pitch_px
-        cells = [cell for cell in part.tiles(pitch) if not mask[cell].all()]
+        part = self.grid[tile]
+        cells = [cell for cell in part.tiles(_CELL_PX) if not mask[cell].all()]
         if not cells or self.beams is None:
             return
-        reaching = illumination_mask(self.beams, self.aperture, *balls(part, self.terrain, cells), pulses=AT_ONCE)
-        positions = self.terrain.positions(part)
-        for cell, blocks in zip(cells, reaching.T, strict=True):
-            undecided = ~mask[cell]
-            mine = np.flatnonzero(np.repeat(blocks, AT_ONCE)[: len(self.aperture)])
-            mask[cell][undecided] = _any(self.beams, self.aperture, positions[cell][undecided], mine)
+        middle_m, radius_m = balls(part, self.terrain, cells)
+        near, mine = np.arange(len(cells)), np.arange(len(self.aperture))
+        for size in _EXACT:
+            reaching = illumination_mask(
+                self.beams[mine], self.aperture[mine], middle_m[near], radius_m[near], pulses=size
+            )
+            near, mine = near[reaching.any(axis=0)], mine[np.repeat(reaching.any(axis=1), size)[: len(mine)]]
+        undecided = np.zeros(mask.shape, bool)
+        for number in near:
+            undecided[cells[number]] = ~mask[cells[number]]
+        rows, columns = np.nonzero(undecided)
+        points = self.terrain.positions_at(part, rows, columns)
+        for first in range(0, len(rows), _PIXELS):
+            some = slice(first, first + _PIXELS)
+            mask[rows[some], columns[some]] = _any(self.beams, self.aperture, points[some], mine)
 
     @cached_property
     def _has_pulses(self) -> NDArray[np.float32]:
@@ -305,16 +327,44 @@ def pulses_of(reaching: NDArray[np.bool_], pulses: int) -> slice:
     return slice(int(blocks[0]) * AT_ONCE, min(int(blocks[-1] + 1) * AT_ONCE, pulses))
 
 
-def _any(beams: Beams, aperture: Aperture, points: Floats, pulses: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Return at which points (point, 3) any of some pulses has a weight."""
-    illuminated = np.zeros(len(points), bool)
-    for every in _EXACT:
-        for first in range(0, len(pulses), AT_ONCE * every):
-            some, left = pulses[first : first + AT_ONCE * every : every], np.flatnonzero(~illuminated)
-            if not left.size:
-                return illuminated
-            illuminated[left] = (beams[some].weight(aperture[some], points[left]) != 0).any(axis=0)
-    return illuminated
+def pitch_px(grid: SceneGrid, terrain: Terrain, aperture: Aperture, *, share: float) -> int:
+    """Return the pitch of a lattice whose nodes are no farther apart than a share of the range to the scene.
+
+    Parameters
+    ----------
+    grid, terrain, aperture
+        As of `Looks`.
+    share
+        Ranges hold so many pitches, if one of `PITCHES_PX` is so narrow.
+    """
+    middle = terrain.positions_at(grid, *(np.array([size // 2]) for size in grid.shape))
+    few = aperture[aperture.sample(_PULSES)]
+    nearest_m = min(float(np.linalg.norm(leg - middle, axis=-1).min()) for leg in few.legs)
+    most = nearest_m / share / grid.spacing_m
+    return next((pitch for pitch in PITCHES_PX if pitch <= most), PITCHES_PX[-1])
+
+
+def _any(
+    beams: Beams, aperture: Aperture, points: Floats, pulses: NDArray[np.int64], sizes: tuple[int, ...] = _EXACT
+) -> NDArray[np.bool_]:
+    """Return at which points (point, 3) any of some pulses has a weight.
+
+    A pulse of each block is tried first. Then what none of a block can illuminate is left out, block by block in ever
+    smaller ones, so that every pulse is tried near the edges of beams alone.
+    """
+    if not pulses.size or not len(points):
+        return np.zeros(len(points), bool)
+    tried = pulses[sizes[0] // 2 :: sizes[0]] if sizes else pulses
+    illuminated = (beams[tried].weight(aperture[tried], points) != 0).any(axis=0)
+    if not sizes or illuminated.all():
+        return np.asarray(illuminated)
+    left = np.flatnonzero(~illuminated)
+    near = illumination_mask(beams[pulses], aperture[pulses], points[left], np.zeros(left.size), pulses=sizes[0])
+    for number in np.flatnonzero(near.any(axis=1)):
+        asked = left[near[number] & ~illuminated[left]]
+        block = pulses[number * sizes[0] : (number + 1) * sizes[0]]
+        illuminated[asked] = _any(beams, aperture, points[asked], block, sizes[1:])
+    return np.asarray(illuminated)
 
 
 def _centres(aperture: Aperture, beams: Beams | None, points: Floats, weight: Floats) -> Floats:

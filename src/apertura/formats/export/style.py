@@ -64,7 +64,7 @@ def write_db_style(path: Path, *_: object, **__: object) -> None:
     top, below = about.get("peak_db"), about.get("noise_floor_re_peak_db")
     if top is None or below is None:
         raise ContractError(f"{path.name}: no peak and noise floor in tag {TAG}")
-    _write(path, _grey(round(top + min(below, -_LEAST_DB), 2), round(top, 2)))
+    _write(path, _grey(round(top + min(below, -_LEAST_DB), 2), round(top, 2), unit="dB"))
 
 
 def write_linear_style(path: Path, *_: object, **__: object) -> None:
@@ -123,6 +123,8 @@ def _write_ramp(path: Path, low: float, high: float, unit: str, *, ramp: Sequenc
     ends = {"minimumValue": f"{low:g}", "maximumValue": f"{high:g}"}
     shader = ET.SubElement(ET.SubElement(renderer, "rastershader"), "colorrampshader", ends)
     shader.attrib |= {"colorRampType": "INTERPOLATED", "classificationMode": "1", "clip": "0"}
+    # Else QGIS draws the ramp with its two ends alone, and without the unit.
+    ET.SubElement(shader, "rampLegendSettings", useContinuousLegend="0", suffix=f" {unit}")
     for share, colour in zip(np.linspace(0, 1, len(ramp)), ramp, strict=True):
         value = f"{low + share * (high - low):g}"
         ET.SubElement(shader, "item", value=value, color=colour, alpha="255", label=f"{value} {unit}")
@@ -146,8 +148,10 @@ def _round_ends(values: NDArray[np.float32]) -> tuple[float, float]:
     return floor(low / step) * step, max(ceil(high / step), floor(low / step) + 1) * step
 
 
-def _grey(low: float, high: float) -> ET.Element:
+def _grey(low: float, high: float, *, unit: str = "") -> ET.Element:
     renderer = _renderer("singlebandgray", grayBand="1", gradient="BlackToWhite")
+    if unit:
+        ET.SubElement(renderer, "rampLegendSettings", useContinuousLegend="1", suffix=f" {unit}")
     stretch = ET.SubElement(renderer, "contrastEnhancement")
     for name, value in {"minValue": low, "maxValue": high, "algorithm": "StretchToMinimumMaximum"}.items():
         ET.SubElement(stretch, name).text = str(value)

@@ -11,6 +11,7 @@ from apertura.common.contracts import Window
 from apertura.common.flags import Flags
 from apertura.core.antenna.beam import Beams
 from apertura.core.echo.compression import centre_frequency
+from apertura.core.imaging.noise import noise_places, noise_std_db, sidelink_noise
 from apertura.core.imaging.radiometry import Calibration, Link, Turn, cell_constant, pointing_std_db
 from apertura.core.imaging.reflectors import DRIFT_SIGMAS
 from apertura.core.quality.bright_points import BrightPoint
@@ -28,6 +29,8 @@ from apertura.pipeline.opening.transmitted import transmitted
 LEAST_CONTRAST = 10.0
 """Power of a peak against noise and clutter around it, below which it is as likely one of theirs: no cross-section."""
 
+_UNSTATED_STD_DB, _FIGURE_STD_DB = 1.0, 0.5  # of a radio whose amplitude_std_db nobody states; of a noise figure
+_SIDELINK_STD_DB = 0.3  # of the noise that a sidelink adds, by its mean SNR
 _MOST_POINTS = 50  # whose cross-section is stated, the brightest
 
 
@@ -49,8 +52,12 @@ class CalibratedPair:
         Of its image.
     beams
         Weights of its pulses.
+    radio_std_db
+        Standard deviation of the radio as stated; None where nobody knows.
     thermal_noise
-        Power that thermal noise alone would have in a profile; None where no noise figure is stated.
+        Power that thermal noise would have in a profile by a receiver of 0 dB; None where no radio is stated.
+    sidelink_noise
+        Power that the noise of the sidelink has in a profile; 0 without one.
     noise_figure_db
         Stated; None: unknown.
     pointing_std_db
@@ -63,7 +70,9 @@ class CalibratedPair:
     flags: Flags
     calibration: Calibration
     beams: Beams | None
+    radio_std_db: float | None
     thermal_noise: float | None
+    sidelink_noise: float
     noise_figure_db: float | None
     pointing_std_db: float
 
@@ -142,12 +151,37 @@ class CalibratedPair:
             for one, one_db, std, scatter, doubt in zip(sigma, sigma_db, std_db, scatter_db, inverse, strict=True)
         ]
 
-    def noise_report(self, pulse_noise: float) -> dict[str, Any]:
-        """Return the noise measured against what the receiver alone would have."""
-        measured = None
-        if self.thermal_noise and self.noise_figure_db is not None and pulse_noise > 0:  # NaN is not
-            measured = round(self.noise_figure_db + 10 * float(np.log10(pulse_noise / self.thermal_noise)), 2)
-        return {"noise_figure_db": self.noise_figure_db, "noise_figure_measured_db": measured}
+    def noise_report(self, pulse_noise: float, *, bound: bool) -> tuple[dict[str, Any], Flags]:
+        """Return the noise measured against what the receiver alone would have, and the flag where they disagree.
+
+        Parameters
+        ----------
+        pulse_noise
+            Measured; NaN where it was not.
+        bound
+            Whether it is an upper bound, since echoes alias into it.
+
+        Notes
+        -----
+        Source: docs/theory/radiometry.md, eqs. 8, 8a and 8b.
+        """
+        own, pulses = pulse_noise - self.sidelink_noise, len(self.calibration.aperture)
+        said = {"noise_figure_db": self.noise_figure_db, "noise_figure_measured_db": None, "std_db": None}
+        said |= {"sidelink": self.sidelink_noise or None}
+        if not (self.thermal_noise and own > 0):  # NaN is not
+            return said, Flags()
+        figure_db = 10 * float(np.log10(own / self.thermal_noise))
+        of_own_db = float(np.hypot(noise_std_db(pulses) * pulse_noise, _SIDELINK_STD_DB * self.sidelink_noise)) / own
+        said |= {"noise_figure_measured_db": round(figure_db, 2), "std_db": round(of_own_db, 2)}
+        # Nobody who states no figure has a receiver below 0 dB.
+        apart_db = figure_db - (self.noise_figure_db or 0.0)
+        radio_db = _UNSTATED_STD_DB if self.radio_std_db is None else self.radio_std_db
+        std_db = float(np.hypot(of_own_db, np.hypot(radio_db, _FIGURE_STD_DB)))
+        if abs(apart_db) <= DRIFT_SIGMAS * std_db or (apart_db > 0 and (bound or self.noise_figure_db is None)):
+            return said, Flags()
+        than = "the noise figure stated" if self.noise_figure_db is not None else "a receiver of 0 dB"
+        line = f"the noise measured is that of {figure_db:.1f} dB, {apart_db:+.1f} dB of {than} ± {std_db:.1f} dB"
+        return said, Flags({"noise_disagrees": line})
 
 
 def stated_link(campaign: Campaign, pair: str) -> tuple[Link, float | None, float | None] | None:
@@ -181,8 +215,8 @@ def calibrated_pair(
     waveform, frequency = campaign.settings.waveform, opened.frequency_hz
     measured, stated = constant_of(campaign, opened), stated_link(campaign, opened.name)
     sent = transmitted(campaign, waveform) if stated and isinstance(waveform, SampledWaveform) else None
-    link, std_db, figure_db = stated if stated and sent else (None, None, None)
-    constant, by, flags = 0.0, "the radio that the config states", Flags()
+    link, radio_db, figure_db = stated if stated and sent else (None, None, None)
+    std_db, constant, by, flags = radio_db, 0.0, "the radio that the config states", Flags()
     if link and sent:
         wavelength_m = SPEED_OF_LIGHT_M_S / centre_frequency(frequency)
         constant = link.constant(wavelength_m=wavelength_m, sent_power=sent.mean_power)
@@ -203,12 +237,22 @@ def calibrated_pair(
         count=count,
         threads=threads,
     )
-    thermal = None
-    if figure_db is not None and link and sent:
+    thermal, added = None, 0.0
+    if link and sent:
         filtered = (opened.weight * np.abs(sent.inverse)) ** 2
-        thermal = link.pulse_noise(figure_db, spacing_hz=sent.numerology.spacing_hz, squares=float(filtered.sum()))
+        thermal = link.pulse_noise(0.0, spacing_hz=sent.numerology.spacing_hz, squares=float(filtered.sum()))
+    sidelink = opened.report.get("sidelink")
+    if sidelink and opened.history:
+        added = sidelink_noise(
+            opened.history,
+            scene.grid,
+            scene.terrain,
+            noise_places(scene.grid, scene.terrain),
+            method=sidelink["method"],
+            snr_db=sidelink["snr_db"],
+        )
     pointing_db = pointing_std_db(beams, opened.aperture, scene.middle_m, _turns(campaign, opened, scene))
-    return CalibratedPair(by, link, std_db, flags, calibration, beams, thermal, figure_db, pointing_db)
+    return CalibratedPair(by, link, std_db, flags, calibration, beams, radio_db, thermal, added, figure_db, pointing_db)
 
 
 def image_weights(campaign: Campaign, opened: OpenPair, scene: OpenScene) -> tuple[Beams | None, int]:

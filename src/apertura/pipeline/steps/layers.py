@@ -14,11 +14,10 @@ from rasterio import Affine
 
 from apertura.common.atomic import write_json
 from apertura.common.contracts import Window
+from apertura.common.flags import Flags
 from apertura.common.provenance import Provenance
 from apertura.common.raster import opened_raster
-from apertura.core.antenna.beam import Beams
-from apertura.core.focus.inputs import Profiles
-from apertura.core.imaging.noise import PLACES, noise_power
+from apertura.core.imaging.noise import noise_places, noise_power
 from apertura.core.imaging.radiometry import Quantity
 from apertura.core.imaging.range_profiles import profiles_of
 from apertura.core.imaging.speckle import Multilook
@@ -51,7 +50,7 @@ def layers(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> l
     opened = open_pair(campaign, flight, pair, echo=echo)
     beams, calibrated = weighing(campaign, opened, scene), calibrated_pair(campaign, opened, scene, threads=threads)
     looks = Looks.of(scene.grid, scene.terrain, profiles.aperture, beams, threads=threads)
-    noise = _noise(profiles, scene, beams)
+    noise = noise_power(profiles, noise_places(scene.grid, scene.terrain), beams=beams)
     asked, multilook = campaign.settings.processing.radiometry, campaign.settings.processing.multilook
     measured = calibrated is not None or multilook is not None
     image = open_stage(campaign.stage("image", flight, pair), "image") if measured else None
@@ -102,12 +101,6 @@ def layers(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> l
     remove_outdated(folder, written)
     record_files(campaign.root / lineage.result.manifest, written, lineage)
     return written
-
-
-def _noise(profiles: Profiles, scene: OpenScene, beams: Beams | None) -> float:
-    """Return the noise of one pulse, measured at random places of the scene."""
-    rows, columns = np.random.default_rng(0).integers(0, scene.grid.shape, (PLACES, 2)).T
-    return noise_power(profiles, scene.terrain.positions_at(scene.grid, rows, columns), beams=beams)
 
 
 @dataclass(frozen=True)
@@ -221,14 +214,15 @@ def _report(scene: OpenScene, image: xr.Dataset, calibrated: CalibratedPair, noi
     """Return what the radio says of an image, for radiometry.json."""
     found = points_of(image.image, image.attrs["quality"], scene, list(scene.grid.tiles(BLOCK_PX)))
     constant = calibrated.calibration.constant
+    noise_said, noise_flags = calibrated.noise_report(noise, bound="pulses_sparse" in image.attrs["flags"])
     return {
         "calibrated_by": calibrated.calibrated_by,
         "constant_db": round(10 * float(np.log10(constant)), 3),
         "std_db": calibrated.std_db,
         "pointing_std_db": round(calibrated.pointing_std_db, 3),
-        "flags": calibrated.flags,
+        "flags": Flags.merged(calibrated.flags, noise_flags),
         "link": calibrated.link and asdict(calibrated.link),
-        "noise": {"pulse": noise if np.isfinite(noise) else None, **calibrated.noise_report(noise)},
+        "noise": {"pulse": noise if np.isfinite(noise) else None, **noise_said},
         "points": calibrated.points(found, scene, noise),
     }
 
