@@ -73,6 +73,7 @@ def image(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Pa
         quality |= {"focus": focus, "budget": [line.report for line in lines]}
         spoilt = expected(lines)
         focus |= {"expected_db": round(spoilt.loss_db, 3), "expected_std_db": round(spoilt.loss_std_db, 3)}
+        focus |= {"expected_shift_m": round(spoilt.shift_m, 3)}
         of_stages = echo.attrs["flags"], work.track.stage.attrs["flags"]
         quality["flags"] = Flags.merged(
             *of_stages, plan.flags, quality["flags"], antenna_flags(lines), focus_flags(focus, spoilt)
