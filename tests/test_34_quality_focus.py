@@ -18,6 +18,7 @@ from apertura.core.quality.budget import (
     antenna_line,
     attitude_lines,
     expected,
+    height_line,
     is_counted,
     is_stated,
     position_lines,
@@ -126,6 +127,50 @@ def test_a_raised_point_moves_and_hardly_blurs():
     higher = straight().of_offset(-straight().gradient[:, 2], common=True)
     assert higher.shift_m == pytest.approx(8 / 12, rel=0.1)
     assert higher.loss_db > -0.5
+
+
+def bent(radius_m=12.0, aside_m=6.0):
+    """A flight around a place beside the point, which it sees under other angles of elevation."""
+    turn = np.linspace(0, 2 * np.pi, 300, endpoint=False)
+    track = np.stack([aside_m + radius_m * np.sin(turn), radius_m * np.cos(turn), np.full(300, 8.0)], -1)
+    return replace(straight(), aperture=Aperture(track, track), time_s=np.linspace(0, 30, 300))
+
+
+@pytest.mark.parametrize("apart_m", [0.0, 4.7])
+def test_no_image_of_a_straight_flight_shows_a_wrong_height_and_the_budget_says_how_far_points_may_be_off(apart_m):
+    """Paths of one line depend on the distance from it alone: eq. 2a, exactly, one and two nodes alike."""
+    paths = straight(apart_m=apart_m)
+    line = height_line(paths, None)
+    assert line.counts
+    assert not is_stated(line.report)
+    assert line.effect.loss_db == 0.0
+    assert line.effect.shift_m == pytest.approx(3.0 * 8 / 12, rel=0.05)
+    raised = np.array([[0.0, np.sqrt(12.0**2 + 8.0**2 - 6.5**2) - 12.0, 1.5]])  # as far from the track
+    assert np.abs(paths.aperture.path(raised) - paths.aperture.path(np.zeros((1, 3)))).max() < 1e-9
+
+
+def test_a_bent_flight_shows_a_wrong_height_and_the_budget_assumes_no_more():
+    paths = bent()
+    line = height_line(paths, None)
+    taken_m = float(line.report["stated"].split("assumed ")[1].split(" m")[0])
+    assert taken_m < 0.1
+    lost_db = [paths.of_offset(-paths.gradient[:, 2] * h).loss_db for h in (taken_m, 3 * taken_m)]
+    assert lost_db[0] == pytest.approx(-0.2, abs=0.03)
+    assert lost_db[1] < -1.5
+    assert line.effect.shift_m < 0.1
+
+
+def test_what_other_causes_may_cost_a_height_may_cost_unseen():
+    paths = bent()
+    alone, beside = (height_line(paths, None, expected_db=loss_db).effect.shift_m for loss_db in (0.0, -1.0))
+    assert beside / alone == pytest.approx(np.sqrt(1.2 / 0.2), rel=1e-3)
+
+
+def test_a_height_that_is_stated_counts_as_stated():
+    paths = straight()
+    stated = height_line(paths, 0.3)
+    assert stated.stated == "0.3 m"
+    assert stated.effect.shift_m == pytest.approx(0.3 * 8 / 12, rel=0.05)
 
 
 def test_a_constant_path_error_turns_the_phase_between_pairs():

@@ -9,18 +9,21 @@ from apertura_research.autofocus.cases import GRID, case
 from apertura_research.autofocus.outcomes import judge
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.core.antenna.beam import Beams
 from apertura.core.focus.contributions import block_contributions
 from apertura.core.focus.engines import reference
-from apertura.core.focus.inputs import PhaseHistory
+from apertura.core.focus.inputs import PhaseHistory, Profiles
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.phase_centres import TrackCorrection
+from apertura.core.geometry.sector import Sector
 from apertura.core.quality.focus import MOST_INTERFERENCE
 from apertura.core.quality.path_errors import autocorrelation
+from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import FlatGround
 from apertura.methods.autofocus.evidence import range_shifts, steadiness
-from apertura.methods.autofocus.inputs import NodePrior, Prior, ReferencePoint, TrackErrors
+from apertura.methods.autofocus.inputs import NodePrior, PairRecord, Prior, ReferencePoint, TrackErrors
 from apertura.methods.autofocus.objective import Sharpness
-from apertura.methods.autofocus.patches import LEAST_RATIO, bright_places, looks_of
+from apertura.methods.autofocus.patches import LEAST_RATIO, bright_places, looks_of, sampled_looks
 from apertura.methods.autofocus.refine import TrackSearch, refine
 from apertura.methods.autofocus.solve import effects
 from apertura.pipeline.config import Node
@@ -75,11 +78,35 @@ def search(two_centimetres):
 
 def test_points_are_found_where_they_are_whatever_blurs_them():
     one = case("five", "straight", "joint", 0.03, 10.0, 2)
-    places, ratio = bright_places(one.records, GRID, FlatGround(0.0), looks=looks_of(one.records, one.errors)[0])
+    places, ratio = bright_places(
+        one.records, GRID, FlatGround(0.0), looks=looks_of(one.records, one.errors, one.targets_m[0])[0]
+    )
     found = places[ratio > LEAST_RATIO]
     apart = np.linalg.norm(found[:, None] - one.targets_m, axis=2)
     assert apart.shape == (5, 5)
     assert apart.min(axis=1).max() < 0.3
+
+
+def test_parts_of_a_longer_flight_hold_no_more_pulses_and_pixels_sample_what_they_show():
+    """Eq. 10b: what a place is seen from is cut, not the flight; memory stays flat with its length."""
+    pulses, places = [], np.zeros(3)
+    for times in (1, 4):
+        time_s = np.arange(0, 60.0 * times, 0.1)
+        track = np.stack([2 * (time_s - 30 * times), np.full(len(time_s), -30.0), np.full(len(time_s), 10.0)], -1)
+        flown = Aperture(track, track)
+        silent = np.broadcast_to(np.zeros(1, np.complex64), (len(time_s), 200))
+        profiles = Profiles(silent, np.full(len(time_s), 40.0), 0.366, 1.4e9, 2.0, flown)
+        beams = Beams.within(Sector.of(flown, chord_m=2.0, centre=0.0, half=0.5), None)
+        record = PairRecord("a-a", profiles, time_s, beams=beams)
+        scene = SceneGrid("local", -5.0, 5.0, 0.1, (100, 100))
+        errors = {"a": TrackErrors((0.02,) * 3)}
+        counts = [looks_of([record], errors, places)[0], sampled_looks([record], scene, FlatGround(0.0))]
+        share = (beams.weight(flown, places[None]) > 0).mean()
+        pulses.append([2 * len(time_s) * share / count for count in counts])
+        lasts_s = time_s[-1] * share / counts[1]
+        turned = 2 * 2.0 / np.hypot(30, 10) * 2 * lasts_s * 1.4e9 / SPEED_OF_LIGHT_M_S  # of both halves, cycles/m
+        assert turned * scene.spacing_m < 1.05
+    assert pulses[1] == pytest.approx(pulses[0], rel=0.15)
 
 
 def test_blocks_add_what_their_pulses_do(search):

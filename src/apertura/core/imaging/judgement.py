@@ -18,6 +18,7 @@ from apertura.core.quality.budget import (
     antenna_flags,
     arithmetic_line,
     expected,
+    height_line,
     offset_line,
     position_lines,
 )
@@ -69,7 +70,12 @@ def judgement(formation: Formation, target: Any, lines: Sequence[BudgetLine]) ->
     """
     focus, spoilt = focus_report(formation, target), expected(lines)
     focus |= {"expected_db": round(spoilt.loss_db, 3), "expected_std_db": round(spoilt.loss_std_db, 3)}
-    flags = Flags.merged(antenna_flags(lines), focus_flags(focus, spoilt))
+    focus |= {"expected_shift_m": round(spoilt.shift_m, 3)}
+    still = formation.plan.flags.get("no_aperture")
+    if still:  # a range per echo and no place: nothing that points say of focus would be true
+        focus = {key: value for key, value in focus.items() if key not in {"loss_db", "std_db", "elsewhere", "points"}}
+        focus |= {"verdict": "cannot tell", "why": f"no aperture: {still}", "points": []}
+    flags = Flags.merged(antenna_flags(lines), {} if still else focus_flags(focus, spoilt))
     return Judgement(focus["verdict"], focus["why"], flags, [line.report for line in lines], focus)
 
 
@@ -165,7 +171,7 @@ def budget_by_hand(
     cm_of_path = np.full(len(paths.time_s), _CM)
     return [
         *position_lines(paths, nodes, sidelink=False),
-        offset_line(paths, "heights", -paths.gradient[:, 2], None, unit="m", common=True),
+        height_line(paths, None),
         offset_line(paths, "calibration", cm_of_path, None, unit="cm of path"),
         *([] if error_db is None else [arithmetic_line(error_db)]),
     ]

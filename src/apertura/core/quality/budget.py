@@ -38,8 +38,14 @@ lies somewhere in its antenna."""
 LEAST_FIELD = 0.1
 """Of the strongest pulse: weaker ones do not decide what the phase of a pattern does to a point."""
 
-UNTOLD_ANTENNA_DB = 0.2
-"""dB that the phase of antenna patterns may cost without a flag: what images tell of a loss."""
+UNTOLD_DB = 0.2
+"""dB that images do not tell of a loss: so much the phase of antenna patterns, or another height, may cost unseen."""
+
+GROUND_STD_M = 3.0
+"""Metres that the ground's height errs by where nobody states it and no image shows it: heights above a geoid and above
+an ellipsoid differ by tens of metres, which images end for; a map's contours, a barometer, crops and roofs by these."""
+
+_SMALL_M = 1e-2  # by which heights differ where a loss grows with their square
 
 _FEWEST_PULSES = 3  # that a shift over ground and a rest can be told apart from
 
@@ -306,10 +312,10 @@ def antenna_line(paths: PointPaths, phase_rad: NDArray[np.float64], weight: NDAr
 
 
 def antenna_flags(lines: Iterable[BudgetLine]) -> Flags:
-    """Return the flag `antenna_phase` where the phase of the patterns costs more than `UNTOLD_ANTENNA_DB`."""
+    """Return the flag `antenna_phase` where the phase of the patterns costs more than `UNTOLD_DB`."""
     flags = Flags()
     for line in lines:
-        if line.cause == "antenna" and line.effect.loss_db < -UNTOLD_ANTENNA_DB:
+        if line.cause == "antenna" and line.effect.loss_db < -UNTOLD_DB:
             lost, off = f"{-line.effect.loss_db:.1f} dB", f"{100 * line.effect.shift_m:.2g} cm"
             flags["antenna_phase"] = f"a point loses {lost} and lies {off} off: {line.stated}"
     return flags
@@ -345,6 +351,44 @@ def arithmetic_line(error_db: float) -> BudgetLine:
     return BudgetLine(
         "arithmetic", f"{error_db:.1f} dB measured", Effect(10 * np.log10(1 - 10 ** (error_db / 10)), 0, 0)
     )
+
+
+def height_line(paths: PointPaths, std_m: float | None, *, expected_db: float = 0.0) -> BudgetLine:
+    """Return the effect of another height of the ground; where none is stated, of the largest that no image shows.
+
+    Parameters
+    ----------
+    paths
+        Of a point in the middle of the scene.
+    std_m
+        Standard deviation of heights that somebody stated, metres; None: nobody did.
+    expected_db
+        Loss by other causes, 0 or less: of so much a height may be the reason instead, and nobody sees it.
+
+    Notes
+    -----
+    Source: docs/theory/focus.md, eq. 2a. What is assumed moves points and costs nothing: more would show in the image.
+
+    Examples
+    --------
+    >>> from apertura.core.geometry.aperture import Aperture
+    >>> along = np.linspace(-5, 5, 101)
+    >>> track = np.stack([along, np.full(101, -10.0), np.full(101, 10.0)], -1)
+    >>> paths = PointPaths(Aperture(track, track), along, np.zeros(3), np.eye(3), 0.2)
+    >>> print(height_line(paths, None).report["stated"])
+    not stated; assumed 3 m: along this track no image shows it
+    """
+    slope = -paths.gradient[:, 2]
+    if std_m is not None:
+        return offset_line(paths, "heights", slope, std_m, unit="m", common=True)
+    lost_db = -paths.of_offset(_SMALL_M * slope, common=True).loss_db / _SMALL_M**2  # per square metre
+    untold_db = UNTOLD_DB - expected_db
+    shown_m = math.sqrt(untold_db / max(lost_db, 1e-9))
+    taken_m, why = GROUND_STD_M, "along this track no image shows it"
+    if shown_m < taken_m:
+        taken_m, why = shown_m, f"more costs {untold_db:.2g} dB, which images show"
+    moved = replace(paths.of_offset(taken_m * slope, common=True), loss_db=0.0, loss_std_db=0.0)
+    return BudgetLine("heights", None, moved, assumed=f"{taken_m:.2g} m: {why}")
 
 
 def summed(effects: Iterable[Effect]) -> Effect:

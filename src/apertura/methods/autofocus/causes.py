@@ -246,14 +246,13 @@ def explained(
         if _Fit.of(problem, _drawn(problem, generator), axes).objective < best.objective + NEAR:
             return None
     lines = [fit.cause.line(fit.values) for fit in near if fit is not best]
-    return Explained(best.cause, best.values, lines, TrackCorrection(problem.knots_s, best.state.tracks), best.gain_db)
+    return Explained(best.cause, best.values, lines, best.correction, best.gain_db)
 
 
 def more_of(problem: Problem, found: Explained, axes: Floats) -> Explained:
     """Return a cause with what is left of it in a problem whose logs are corrected for it."""
     fit = _Fit.of(problem, found.cause, axes)
-    correction = TrackCorrection(problem.knots_s, fit.state.tracks)
-    return found.further(fit.values, correction, fit.gain_db) if fit.gain_db > 0 else found
+    return found.further(fit.values, fit.correction, fit.gain_db) if fit.gain_db > 0 else found
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,7 +261,7 @@ class _Fit:
 
     cause: Cause
     values: Floats
-    state: State
+    correction: TrackCorrection
     objective: float
     gain_db: float
 
@@ -276,7 +275,8 @@ class _Fit:
         values = [alone.value(state, used, start.statistics) for state in states]
         best = int(np.argmin(values))
         state = states[best]
-        return cls(cause, state.unknowns * cause.std, state, values[best], _gain_db(start, state))
+        correction = TrackCorrection(problem.knots_s, state.tracks)
+        return cls(cause, state.unknowns * cause.std, correction, values[best], _gain_db(start, state))
 
 
 def _gain_db(start: State, state: State) -> float:

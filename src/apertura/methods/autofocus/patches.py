@@ -10,8 +10,10 @@ from numpy.typing import NDArray
 
 from apertura.common.arrays import Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.core.antenna.beam import Beams
 from apertura.core.focus.engines import load_engine
 from apertura.core.focus.inputs import Profiles
+from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.geodesy import ned_axes
 from apertura.core.geometry.phase_centres import TrackCorrection
 from apertura.core.scene.grid import SceneGrid
@@ -175,14 +177,16 @@ _SHARE_OF_CLEAREST = 0.05  # beside clear points faint places are their sidelobe
 _APART = 0.6  # least distance of patches, in halves of a patch
 
 MOST_LOOKS = 128
-"""Parts of the aperture, at most: the shorter, the coarser their images."""
+"""Parts of what a place is seen from, at most: the shorter, the coarser their images."""
 
 REFINED_LOOKS = 4
-"""Parts of the aperture once tracks are refined: long parts separate neighbours, several average their sidelobes."""
+"""Parts once tracks are refined, at least: long parts separate neighbours, several average their sidelobes."""
 
 _BLURRED_RAD2 = 3.0  # growth of the phase errors' variance over a part: its image keeps most of a point's power
 _BY_CHANCE = 1e-3  # that speckle anywhere in the scene passes for a point
-_SIDE_PX = 512  # of parts of the image formed at once
+_SIDE_PX = 256  # of parts of the image formed at once
+_WEIGHED_PX, _WEIGHED_PULSES = 16, 8  # pixels from one weight of a part by antennas and sector to the next; its pulses
+_TREE_PULSES = 256  # of a part, from which trees are faster than the direct sum
 _ABOUT_CELLS = 12  # of range: radius of the surroundings
 _SIDELOBES = 1e-3  # of the brightest: fainter places may be its sidelobes
 _MOST_PLACES = 500  # of candidates kept
@@ -227,16 +231,18 @@ class Candidates:
         errors
             Node → error statistics of its log.
         looks
-            Parts of the aperture; by default of those that the logs' errors may require the shortest that show half as
-            many bright places as any.
+            Parts of what a place is seen from, or as many as the pixels want that are looked at; by default of those
+            that the logs' errors may require the shortest that show half as many bright places as any.
         """
         correlation_s = min(one.correlation_s for one in errors.values())
+        if looks:
+            looks = max(looks, sampled_looks(records, grid, terrain))
         seen = [
             (
                 *bright_places(records, grid, terrain, looks=some),
                 least_ratio(some * len(records), grid.shape[0] * grid.shape[1]),
             )
-            for some in ([looks] if looks else looks_of(records, errors))
+            for some in ([looks] if looks else looks_of(records, errors, _middle(grid, terrain)))
         ]
         clear = [float(np.minimum(ratio[ratio > least], CLEAR).sum()) for _, ratio, least in seen]
         places_m, ratio, least = next(one for one, sum_ in zip(seen, clear, strict=True) if 2 * sum_ >= max(clear))
@@ -261,8 +267,8 @@ class Candidates:
         return Refinement(still, std_m, False, line, report, {"refinement_no_bright_place": line})
 
 
-def looks_of(records: Sequence[PairRecord], errors: Mapping[str, TrackErrors]) -> list[int]:
-    """Return into how many parts the aperture may be cut, shortest parts first.
+def looks_of(records: Sequence[PairRecord], errors: Mapping[str, TrackErrors], place_m: Floats) -> list[int]:
+    """Return into how many parts the time may be cut for which a place is seen, shortest parts first.
 
     Notes
     -----
@@ -275,10 +281,30 @@ def looks_of(records: Sequence[PairRecord], errors: Mapping[str, TrackErrors]) -
         lasts_s, turned = one.turned(errors)
         longest_s.append(lasts_s)
         shortest_s.append(lasts_s * min(1.0, _BLURRED_RAD2 / (2 * turned**2)))
-        spans_s.append(float(one.time_s[-1] - one.time_s[0]))
+        spans_s.append(float(one.time_s[-1] - one.time_s[0]) * _seen(one, place_m))
     most, least = (int(np.clip(max(spans_s) / max(min(one), 1e-9), 1, MOST_LOOKS)) for one in (shortest_s, longest_s))
     steps = max(1, int(np.ceil(np.log2(most / least)))) if most > least else 0
     return [round(most * (least / most) ** (step / max(steps, 1))) for step in range(steps + 1)]
+
+
+def sampled_looks(records: Sequence[PairRecord], grid: SceneGrid, terrain: Terrain) -> int:
+    """Return the number of parts from which on no image is finer than the pixels that `bright_places` looks at.
+
+    Notes
+    -----
+    Source: docs/theory/autofocus.md, eq. 10b. Longer parts, of which pulses are the more the longer a flight is, would
+    show points between pixels and hold all of the flight in memory.
+    """
+    place_m, step_m = _middle(grid, terrain), _step(records, grid) * grid.spacing_m
+    most = 1.0
+    for one in records:
+        some = one.profiles.aperture.sample(_PULSES)
+        slope = one.profiles.aperture[some].path_gradient(place_m)
+        turned = np.linalg.norm(np.diff(slope, axis=0), axis=1) * one.profiles.centre_frequency_hz / SPEED_OF_LIGHT_M_S
+        lasts = np.diff(one.time_s[some])
+        fastest = float((turned / np.maximum(lasts, 1e-9)).max(initial=0.0))
+        most = max(most, 2 * fastest * step_m * float(one.time_s[-1] - one.time_s[0]) * _seen(one, place_m))
+    return int(np.ceil(most))
 
 
 def least_ratio(looks: int, cells: int) -> float:
@@ -324,15 +350,18 @@ def bright_places(
     from scipy.ndimage import maximum_filter, median_filter  # slow to import
 
     cell_m = min(SPEED_OF_LIGHT_M_S / bandwidth_hz(one.profiles) for one in records) / 2
-    step = max(1, int(cell_m / 2 / grid.spacing_m))
+    step = _step(records, grid)
     rows, columns = (np.arange(step // 2, size, step) for size in grid.shape)
     power = np.zeros((len(rows), len(columns)))
+    places = [
+        (part, terrain.positions_at(grid, *np.meshgrid(rows[part[0]], columns[part[1]], indexing="ij")))
+        for part in _parts(len(rows), len(columns))
+    ]
     for one in records:
         image = np.zeros_like(power)
-        for form in _looks(one, looks):
-            for part in _parts(len(rows), len(columns)):
-                row, column = np.meshgrid(rows[part[0]], columns[part[1]], indexing="ij")
-                image[part] += np.abs(form(terrain.positions_at(grid, row, column))).astype(np.float64) ** 2
+        for power_of in _looks(one, looks, _middle(grid, terrain)):
+            for part, pixels in places:
+                image[part] += power_of(pixels)
         power += image / max(float(np.nanmean(image)), 1e-300)
     power = np.nan_to_num(power)
     reach = max(3, round(_ABOUT_CELLS * cell_m / (step * grid.spacing_m)))
@@ -361,18 +390,60 @@ def _parts(rows: int, columns: int) -> Iterator[tuple[slice, slice]]:
             yield slice(row, row + _SIDE_PX), slice(column, column + _SIDE_PX)
 
 
-def _looks(one: PairRecord, looks: int) -> Iterator[Callable[[Floats], NDArray[np.complex64]]]:
-    """Yield what forms the image of each part of the aperture: of equal length, half of each in the next, Hann weights.
+def _step(records: Sequence[PairRecord], grid: SceneGrid) -> int:
+    """Return the distance of pixels that bright places are looked for in, in pixels of the grid: half a range cell."""
+    cell_m = min(SPEED_OF_LIGHT_M_S / bandwidth_hz(one.profiles) for one in records) / 2
+    return max(1, int(cell_m / 2 / grid.spacing_m))
 
-    Tables are made once for each part, and serve all places.
+
+def _middle(grid: SceneGrid, terrain: Terrain) -> Floats:
+    """Return (3,) float64, metres in the frame, the middle of the scene."""
+    return np.asarray(terrain.positions_at(grid, (grid.shape[0] - 1) / 2, (grid.shape[1] - 1) / 2))
+
+
+def _seen(one: PairRecord, place_m: Floats) -> float:
+    """Return the share of a flight that a place is seen from, by antennas and sector: 1 of all of it, more than 0."""
+    if one.beams is None:
+        return 1.0
+    some = one.profiles.aperture.sample(_PULSES)
+    share = float((one.beams[some].weight(one.profiles.aperture[some], place_m[None]) > 0).mean())
+    return share or 1.0
+
+
+def _looks(one: PairRecord, looks: int, place_m: Floats) -> Iterator[Callable[[Floats], Floats]]:
+    """Yield what gives the power of pixels (y, x, 3) in each part of a flight.
+
+    Parts are of equal length, half of each in the next; their pulses have Hann weights. Antennas and sector weigh the
+    image of a part as in the mean over it: they change slowly. Tables are made once for each, and serve all places.
     """
-    engine = load_engine("native")
-    if not engine.available():
-        engine = load_engine("numba")
-    ends = np.linspace(0, len(one.time_s), looks + 2 if looks > 1 else 2).astype(int)
-    for first, last in zip(ends, ends[2:] if looks > 1 else ends[1:], strict=False):
-        pulses = slice(int(first), int(last))
-        part = one.profiles[pulses]
+    count = max(1, round(looks / _seen(one, place_m)))
+    ends = np.linspace(0, len(one.time_s), count + 2 if count > 1 else 2).astype(int)
+    for first, last in zip(ends, ends[2:] if count > 1 else ends[1:], strict=False):
+        if last == first:
+            continue
+        part, many = one.profiles[int(first) : int(last)], last - first >= _TREE_PULSES
+        engine = next(
+            each for name in ("tree", "native", "numba")[not many :] if (each := load_engine(name)).available()
+        )
         taper = np.hanning(last - first + 2)[1:-1, None].astype(np.float32)
-        part = replace(part, samples=np.asarray(part.samples) * taper)
-        yield partial(engine.form, engine.prepare(part), beams=one.beams and one.beams[pulses])
+        tables = engine.prepare(replace(part, samples=np.asarray(part.samples) * taper))
+        some = np.linspace(first, last - 1, _WEIGHED_PULSES + 2)[1:-1].astype(int)
+        beams = None if one.beams is None else one.beams[some]
+        yield partial(_power, partial(engine.form, tables), beams, one.profiles.aperture[some])
+
+
+def _power(
+    form: Callable[[Floats], NDArray[np.complex64]], beams: Beams | None, some: Aperture, pixels: Floats
+) -> Floats:
+    """Return (y, x) float64, power of an image, weighted as `beams` do over some pulses; nothing is formed unseen."""
+    weight: Floats = np.ones((1, 1))
+    if beams is not None:
+        rows, columns = (
+            np.minimum(np.arange(0, size, _WEIGHED_PX) + _WEIGHED_PX // 2, size - 1) for size in pixels.shape[:2]
+        )
+        coarse = pixels[np.ix_(rows, columns)]
+        mean = beams.weight(some, coarse.reshape(-1, 3)).mean(axis=0).reshape(coarse.shape[:2])
+        weight = np.repeat(np.repeat(mean, _WEIGHED_PX, 0), _WEIGHED_PX, 1)[: pixels.shape[0], : pixels.shape[1]]
+        if not weight.any():
+            return np.zeros(pixels.shape[:2])
+    return np.asarray((weight * np.abs(form(pixels))) ** 2, np.float64)

@@ -123,16 +123,21 @@ def _smooth_unknowns(
     inside = np.clip(knots_s, grid[0], np.nextafter(grid[-1], grid[0]))
     splines = BSpline.design_matrix(inside, ends, 3).toarray()
     flown = _logged_places(pairs)
-    fields = []
-    for node in prior.nodes:
+    modes, begin = [], 0
+    for node, own in prior.nodes.items():  # unknowns of one node move no other: nodes are orthogonal
         shape = flown[node] - flown[node].mean(axis=0)
         basis = np.concatenate([splines, shape / max(float(np.abs(shape).max()), 1e-9)], axis=1)
-        for axis in np.eye(3):
-            for one in basis.T:
-                zero = {name: np.zeros((len(knots_s), 3)) for name in prior.nodes}
-                fields.append(prior.adjoint({**zero, node: one[:, None] * axis}))
-    left, size, _ = np.linalg.svd(np.stack(fields, axis=1), full_matrices=False)
-    return np.asarray(left[:, size > 1e-6 * size[0]].T)
+        fields = np.concatenate([own.adjoint(basis.T[:, :, None] * axis) for axis in np.eye(3)])
+        _, size, right = np.linalg.svd(fields, full_matrices=False)
+        modes.append((begin, size, right))
+        begin += own.size
+    largest = max(size[0] for _, size, _ in modes)
+    some = [(first, right[size > 1e-6 * largest]) for first, size, right in modes]
+    unknowns = np.zeros((sum(len(rows) for _, rows in some), prior.size))
+    ends = np.cumsum([0, *(len(rows) for _, rows in some)])
+    for (first, rows), row in zip(some, ends, strict=False):
+        unknowns[row : row + len(rows), first : first + rows.shape[1]] = rows
+    return unknowns
 
 
 def _logged_places(pairs: Sequence[Blocks]) -> Mapping[str, Floats]:

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,9 @@ from apertura.methods.autofocus.inputs import PairRecord, Prior, Refinement
 from apertura.methods.autofocus.objective import Blocks, Contribution, PatchEcho, Tracks, phases
 from apertura.methods.autofocus.patches import Patch, bandwidth_hz
 from apertura.methods.autofocus.solve import Gauge, minimise
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 # ---- Tiles of the scene on which two pairs are compared -------------------------------------------------------------
 
@@ -145,6 +148,8 @@ def _tile(
 WEIGHT = 0.2
 """Of a resolution cell that two pairs share; docs/theory/autofocus.md, "Speckle"."""
 
+_BLOCKS = 64  # of the first pair, multiplied at once with those of the second that they share something with
+
 
 @dataclass(frozen=True, eq=False)
 class TileCoherence:
@@ -153,8 +158,8 @@ class TileCoherence:
     Attributes
     ----------
     product
-        (block of the first, block of the second) complex64: Σ conj(B)·B' over the tile, by its two images' energies and
-        weighed by the spatial frequencies that both blocks share.
+        (block of the first, block of the second) sparse complex64: Σ conj(B)·B' over the tile, by its two images'
+        energies and weighed by the spatial frequencies that both blocks share.
     cells
         Resolution cells that count: all of a tile of speckle; few where a point stands out, whose spatial frequencies
         are not independent.
@@ -164,7 +169,7 @@ class TileCoherence:
         Blocks of each pair that illuminate it and their path slopes, without values.
     """
 
-    product: NDArray[np.complex64]
+    product: "csr_array"
     cells: float
     brightness: float
     contributions: tuple[Contribution, Contribution]
@@ -176,10 +181,14 @@ class TileCoherence:
         energy = np.maximum(powers.sum(axis=1), 1e-300)
         even = 2 * energy**2 / np.maximum((powers**2).sum(axis=1), 1e-300)
         between = float(np.sqrt(energy.prod()))
-        product = first.values.conj().T @ second.values / np.float32(between) * _overlap(tile, first, second)
         pixels, nothing = len(first.values), np.zeros((0, 0), np.complex64)
         cells = SAMPLING**2 * min(pixels, float(even.min()))
-        return cls(product, cells, between / pixels, (replace(first, values=nothing), replace(second, values=nothing)))
+        return cls(
+            _product(tile, first, second) / np.float32(between),
+            cells,
+            between / pixels,
+            (replace(first, values=nothing), replace(second, values=nothing)),
+        )
 
     def coherence(self, moved: Sequence[Tracks]) -> tuple[complex, list[NDArray[np.complex64]]]:
         """Return Σ conj(I)·I' by the images' energies, and the part of each block of both pairs in it.
@@ -191,15 +200,34 @@ class TileCoherence:
             for sign, contribution, one in zip((-1, 1), self.contributions, moved, strict=True)
         )
         by_first = first * (self.product @ second)
-        return complex(by_first.sum()), [by_first, second * (first @ self.product)]
+        return complex(by_first.sum()), [by_first, second * (self.product.T @ first)]
 
 
-def _overlap(tile: SpeckleTile, first: Contribution, second: Contribution) -> NDArray[np.float32]:
-    """Return (block, block) float32: 1 where both blocks look along one line, 0 from a resolvable angle on."""
+def _product(tile: SpeckleTile, first: Contribution, second: Contribution) -> "csr_array":
+    """Return (block, block) complex64, O ∘ BᴴB' of eq. 21.
+
+    O is 1 where both blocks look along one line, 0 from a resolvable angle on. Only blocks that share spatial
+    frequencies are multiplied and kept: of a block as many as there are while an error lasts, however long the flight.
+    """
+    from scipy.sparse import csr_array  # slow to import
+
     cycles = [one.wavenumber / (2 * np.pi) * sum(one.slopes.values()) @ tile.sides_m.T for one in (first, second)]
     across = cycles[0][:, ::-1] * [-1, 1] / np.linalg.norm(cycles[0], axis=1, keepdims=True)
-    apart = np.sum(across * cycles[0], axis=1)[:, None] - across @ cycles[1].T
-    return np.asarray(np.maximum(1 - np.abs(apart), 0), np.float32)
+    along = np.sum(across * cycles[0], axis=1)[:, None]
+    values, rows, columns = [np.zeros(0, np.complex64)], [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
+    for begin in range(0, len(across), _BLOCKS):
+        some = slice(begin, begin + _BLOCKS)
+        shared = np.maximum(1 - np.abs(along[some] - across[some] @ cycles[1].T), 0).astype(np.float32)
+        seen = np.flatnonzero(shared.any(axis=0))
+        if seen.size:
+            near = slice(int(seen[0]), int(seen[-1]) + 1)
+            row, column = np.nonzero(shared[:, near])
+            product = first.values[:, some].conj().T @ second.values[:, near] * shared[:, near]
+            values.append(product[row, column])
+            rows.append(row + begin)
+            columns.append(column + near.start)
+    at = np.concatenate(rows), np.concatenate(columns)
+    return csr_array((np.concatenate(values), at), shape=(len(across), len(cycles[1])))
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,6 +24,8 @@ from apertura.core.quality.budget import (
     NodeAttitude,
     antenna_line,
     attitude_lines,
+    expected,
+    height_line,
     noise_loss,
     offset_line,
     position_lines,
@@ -59,12 +61,10 @@ def budget_of(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> list[Budg
     """
     paths = paths_to_middle(pair, scene)
     monostatic, sidelink = pair.monostatic, pair.report.get("sidelink", {})
+    flown = [*_positions(campaign, pair, paths), *_attitude(campaign, pair, paths)]
     lines = [
-        *_positions(campaign, pair, paths),
-        *_attitude(campaign, pair, paths),
-        offset_line(
-            paths, "heights", -paths.gradient[:, 2], campaign.settings.scene.height_std_m, unit="m", common=True
-        ),
+        *flown,
+        height_line(paths, campaign.settings.scene.height_std_m, expected_db=expected(flown).loss_db),
         offset_line(
             paths,
             "time tags",
