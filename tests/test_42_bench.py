@@ -8,6 +8,7 @@ import pytest
 from bench_setups import FLIGHT, RADAR_M, RECEIVED, RIGHT, SIDELINK_M, SPOILT, Setup, cabled
 from folders import edit_config
 
+import apertura as ap
 from apertura.common.errors import CampaignError
 from apertura.common.flag_table import FLAGS
 from apertura.core.echo.demodulate import Numerology
@@ -152,3 +153,16 @@ def test_a_hover_inside_a_flight_is_left_out_unless_segments_say_what_images(tmp
     (root / "config/segments.tsv").write_text(segments)
     quality = open_stage(echo.echo(Campaign.load(root), "f01", "uav1-uav2"), "echo").attrs
     assert "hover" not in quality["flags"]
+
+
+def test_an_image_without_an_aperture_cannot_tell_its_focus():
+    """Antennas that stand: an echo per range, told by no aperture and by nothing else."""
+    frequency, still = 1.2e9 + 1e6 * np.arange(128), np.tile([0.0, -20.0, 10.0], (64, 1))
+    flown, grid = Aperture(still, still), ap.SceneGrid("local", -5.0, 5.0, 0.1, (100, 100))
+    echo = np.exp(-2j * np.pi * frequency * flown.path(np.zeros((1, 3))) / 299792458.0).astype(np.complex64)
+    image = ap.backproject(ap.PhaseHistory(echo, frequency, np.full(128, 1 / 128), np.zeros(64), flown), grid)
+    told = ap.judge(image)
+    assert told.verdict == "cannot tell"
+    assert told.why.startswith("no aperture: antennas moved 0 m, which resolves nothing")
+    assert "no_aperture" in image.attrs["flags"]
+    assert not told.flags.keys() & {"defocused", "echo_elsewhere"}
