@@ -127,8 +127,8 @@ def print_alignment(campaign: Campaign, flight: str, node: str, *, write: bool, 
         print(f"{CONFIG}: nodes.{node}.path_offset_m.radar: {stated['path_offset_m']:.4f}")
     if write:
         clock = {name: stated[name] for name in ("offset_s", "drift_ppm")}
-        path = write_clock(campaign, flight, node, std_s=found.offset_width_s, **clock)
-        print(f"{path} is written")
+        written = write_clock(campaign, flight, node, std_s=found.offset_width_s, **clock)
+        print(f"{written} is written")
 
 
 def _within(given: Unaligned, search_s: float | None) -> tuple[float, float]:
