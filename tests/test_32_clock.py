@@ -186,3 +186,20 @@ def test_a_clock_whose_scatter_is_unknown_is_not_trusted():
 def test_captures_without_a_repetition_are_refused():
     with pytest.raises(ValueError, match="repeat only 20"):
         estimate_clock(np.ones((3, 1024 + 160 + 20), np.complex64), NUMEROLOGY)
+
+
+def test_captures_that_begin_late_and_end_after_the_symbol_measure_the_same_clock():
+    """A chirp-like code, whose end holds one edge of the band: 8 samples of silence there are no clock offset."""
+    chirp = np.exp(1j * np.pi * NUMBERS**2 / NUMBERS.size)  # Newman's phases
+    rng = np.random.default_rng(3)
+    captures = np.zeros((400, SYMBOL), np.complex64)
+    t = np.arange(SYMBOL) / NUMEROLOGY.sample_rate_hz
+    tones = np.exp(2j * np.pi * np.outer(t, NUMBERS * NUMEROLOGY.spacing_hz)) @ chirp
+    for pulse, late in enumerate(rng.integers(0, 9, len(captures))):
+        capture = np.zeros(SYMBOL, complex)
+        capture[: SYMBOL - late] = tones[late:]
+        noise = rng.normal(size=(2, SYMBOL)) / np.sqrt(2) * 10 ** (-30 / 20) * np.sqrt(NUMBERS.size)
+        captures[pulse] = capture * np.exp(-2j * np.pi * 12.0 * t + 1j * rng.uniform(0, 6)) + noise[0] + 1j * noise[1]
+    offset = estimate_clock(captures, NUMEROLOGY)
+    assert abs(offset.cfo_hz - 12.0) < 5 * offset.cfo_std_hz
+    assert offset.one_clock
