@@ -28,7 +28,7 @@ GROUPS = 16
 
 _SMALLEST_REPEAT = 32  # samples of a capture that repeat, at least
 _TAPERED = 0.25
-"""Share of what repeats that a taper takes at its two ends. A capture that was triggered late ends after the symbol: what
+"""Share of what repeats that a taper takes at its ends. A capture that was triggered late ends after the symbol: what
 is cut off there turned the phase of a chirp-like code by 70 standard deviations, as a tenth of a ppm or more."""
 
 
