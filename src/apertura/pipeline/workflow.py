@@ -155,8 +155,8 @@ def _ahead(root: Path) -> Iterator["subprocess.Popen[bytes]"]:
     try:
         yield process
     finally:
-        if process.poll() is None:
-            _end(process)
+        with process:  # closes what nothing was written to
+            process.kill()
 
 
 def _formed(
