@@ -34,7 +34,7 @@ MARK := demo/.simulated-by-make
 demo: $(SETUP)
 	@test ! -e demo || test -e $(MARK) || { echo "error: demo/ was not made by make demo: move it away" >&2; exit 2; }
 	test -e demo || { rm -rf build/demo && $(BIN)/apertura simulate build/demo && touch build/$(MARK) && mv build/demo demo; }
-	$(BIN)/apertura clean demo --yes
+	test ! -e demo/results || $(BIN)/apertura clean demo --yes
 	$(BIN)/apertura run demo
 	$(BIN)/apertura score demo
 

@@ -1,5 +1,6 @@
 """The workflow as a user runs it: nothing to do twice, nothing lost to a kill, one message for what is wrong."""
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -274,6 +275,50 @@ def test_a_signal_ends_a_run_with_all_its_steps_within_five_seconds(tiny, number
     hold(tiny).close()
 
 
+def below(pid):
+    """Return the process numbers of what a process has started, directly or not, with their command lines."""
+    parents = {}
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        with contextlib.suppress(OSError):
+            state, parent = path.read_text().rpartition(")")[2].split()[:2]
+            if state != "Z":
+                parents[int(path.parent.name)] = int(parent)
+    found = {pid}
+    while more := {child for child, parent in parents.items() if parent in found} - found:
+        found |= more
+    return {one: Path(f"/proc/{one}/cmdline").read_bytes() for one in sorted(found - {pid})}
+
+
+def lives(pid):
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("killed", ["the run", "what steps are forks of", "snakemake"])
+def test_steps_are_forks_that_end_with_the_run_whatever_is_killed_outright(tiny, unbroken, killed):
+    larger(tiny)
+    run = apertura("run", tiny, "--cores", 2)
+    wait_for_tiles(tiny, run, count=2)
+    processes = below(run.pid)
+    assert all(b"apertura.pipeline.runs.warm" in command for command in processes.values())
+    warm, snakemake_itself, *steps = processes
+    assert steps
+    os.kill({"the run": run.pid, "snakemake": snakemake_itself}.get(killed, warm), signal.SIGKILL)
+    run.communicate(timeout=60)
+    assert run.returncode != 0
+    until = time.monotonic() + 10
+    while any(map(lives, processes)):
+        assert time.monotonic() < until, "a step lives on"
+        time.sleep(0.05)
+    hold(tiny).close()
+    code, output = finished(apertura("run", tiny))
+    assert code == 0, output
+    assert contents(tiny) == unbroken
+
+
 @pytest.mark.slow
 def test_a_run_tells_each_step_and_ends_with_what_its_images_say(tiny):
     code, output = finished(apertura("run", tiny, "-n"))
@@ -287,6 +332,13 @@ def test_a_run_tells_each_step_and_ends_with_what_its_images_say(tiny):
     for word, count in (("begun", 23), ("done", 23), ("failed", 0)):
         assert sum(len(cells) > 2 and cells[1].strip() == word for cells in told) == count
     assert "23 steps done in " in output
+    timed = list((tiny / "results/benchmarks").rglob("*.tsv"))
+    logs = {path.with_suffix("") for path in (tiny / "results/logs").rglob("*.log")}
+    assert len(timed) == 23
+    assert {
+        tiny / "results/logs" / path.relative_to(tiny / "results/benchmarks").with_suffix("") for path in timed
+    } < logs
+    assert all(float(path.read_text().splitlines()[1].split()[0]) > 0 for path in timed)
     assert "f01 uav1-uav2" in output
     assert "results/f01/fused/coherent_db.tif" in output
     assert "\x1b" not in output

@@ -7,8 +7,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -26,8 +26,8 @@ from apertura.pipeline.lineage import on_demand
 from apertura.pipeline.runs.journal import JOURNAL, NAME, RECORDER, JournalReader, failures, note
 from apertura.pipeline.runs.outlook import Outlook
 from apertura.pipeline.runs.screen import NOTHING, Screen, listed
-from apertura.pipeline.runs.warm import NAME as WARM_RUN
-from apertura.pipeline.runs.warm import WARM
+from apertura.pipeline.runs.warm import AT_ONCE, Order
+from apertura.pipeline.runs.warm import NAME as WARM
 from apertura.pipeline.stale import any_is_missing, forms_results, stale_lines, stale_results
 
 Show = Literal["errors", "steps", "snakemake"]
@@ -117,37 +117,58 @@ def run_workflow(root: Path, cores: int, *arguments: str, paranoid: bool = False
         os.environ[_PROFILE] = _whole(root, _PROFILE, os.environ[_PROFILE])
     if elsewhere:
         check_shell_name(root.absolute())
-    if print_problems(root, without=_ELSEWHERE if elsewhere else (), stream=sys.stderr):
-        return 2
-    root = root.absolute()
-    campaign, forms = Campaign.load(root), forms_results(["", *arguments])
-    if forms:
-        hold(root).close()
-    stale = stale_results(campaign, paranoid=paranoid)
-    if show == "steps":
-        print(*stale_lines(stale), sep="\n", end="\n" if stale else "", file=sys.stderr, flush=True)
-    overtaken = [manifest for manifest in stale if not on_demand(manifest)]
-    forced = ["--forcerun", *overtaken] if overtaken else []  # in time for a dry run; the workflow says why
-    warm = forms and not elsewhere
-    command = _command(WARM_RUN if warm else RECORDER, root, cores, [*options, *forced])
-    if forms:
-        os.environ.pop(WARM, None)
-        if warm and (overtaken or any_is_missing(campaign)):
-            os.environ[WARM] = "1"
-        files, at_once = _Files.of(campaign), 0 if elsewhere else cores
-        note(files.journal, "start", cores=at_once)
-        screen = Screen(campaign, Outlook(campaign, at_once), quiet=show != "steps")
-        return _formed(root, command, files, screen, aloud=show == "snakemake")
+    forms = forms_results(["", *arguments])
+    with _ahead(root) if forms and not elsewhere else nullcontext() as warm:
+        if print_problems(root, without=_ELSEWHERE if elsewhere else (), stream=sys.stderr):
+            return 2
+        root = root.absolute()
+        campaign = Campaign.load(root)
+        if forms:
+            hold(root).close()
+        stale = stale_results(campaign, paranoid=paranoid)
+        if show == "steps":
+            print(*stale_lines(stale), sep="\n", end="\n" if stale else "", file=sys.stderr, flush=True)
+        overtaken = [manifest for manifest in stale if not on_demand(manifest)]
+        forced = ["--forcerun", *overtaken] if overtaken else []  # in time for a dry run; the workflow says why
+        words = _words(root, cores, [*options, *forced])
+        if forms:
+            files, at_once = _Files.of(campaign), 0 if elsewhere else cores
+            note(files.journal, "start", cores=at_once)
+            screen = Screen(campaign, Outlook(campaign, at_once), quiet=show != "steps")
+            return _formed(root, words, files, screen, warm, aloud=show == "snakemake")
     with tempfile.TemporaryDirectory() as scratch:
         files = _Files.apart(scratch)
         dry = any(map(_DRY_RUN.fullmatch, arguments))
         if show == "errors" or (dry and show == "steps"):
-            return _looked_at(root, command, files, told=dry)
-        return files.status_of(_supervised(command, files.environment))
+            return _looked_at(root, words, files, told=dry)
+        return files.status_of(_watched(_started([RECORDER, *words], files.environment)))
 
 
-def _formed(root: Path, command: Sequence[str], files: "_Files", screen: Screen, *, aloud: bool) -> int:
-    """Run snakemake with its output in a file, and show what its journal tells."""
+@contextmanager
+def _ahead(root: Path) -> Iterator["subprocess.Popen[bytes]"]:
+    """Start the process that steps are forks of, which imports while the campaign is checked; end it in any case."""
+    isolate()
+    at_once = []
+    with suppress(CampaignError):  # the check tells it
+        at_once = [AT_ONCE] if any_is_missing(Campaign.load(root)) else []
+    process = _started([WARM, *at_once], os.environ, stdin=subprocess.PIPE)
+    try:
+        yield process
+    finally:
+        with process:  # closes what nothing was written to
+            process.kill()
+
+
+def _formed(
+    root: Path,
+    words: Sequence[str],
+    files: "_Files",
+    screen: Screen,
+    warm: "subprocess.Popen[bytes] | None",
+    *,
+    aloud: bool,
+) -> int:
+    """Run snakemake, by the process that waits for its order if any, and show what its journal tells."""
     reader, killed, status = JournalReader(files.journal), _killed_for_memory(), INTERRUPTED
     try:
         with files.log.open("wb") as output, files.log.open("rb") as said, screen:
@@ -157,7 +178,11 @@ def _formed(root: Path, command: Sequence[str], files: "_Files", screen: Screen,
                 if aloud:
                     print(said.read().decode("utf-8", "replace"), end="", file=sys.stderr, flush=True)
 
-            status = files.status_of(_supervised(command, files.environment, output, look))
+            if warm and warm.stdin:
+                Order(words, files.environment, str(files.log)).give(warm.stdin)
+            status = files.status_of(
+                _watched(warm or _started([RECORDER, *words], files.environment, output=output), look)
+            )
             look()
     finally:
         note(files.journal, "end", status=status)
@@ -174,10 +199,10 @@ def _formed(root: Path, command: Sequence[str], files: "_Files", screen: Screen,
     return status
 
 
-def _looked_at(root: Path, command: Sequence[str], files: "_Files", *, told: bool) -> int:
+def _looked_at(root: Path, words: Sequence[str], files: "_Files", *, told: bool) -> int:
     """Have snakemake look at the workflow, and say briefly what a run would do where that is to be `told`."""
     with files.log.open("wb") as output:
-        status = files.status_of(_supervised(command, files.environment, output))
+        status = files.status_of(_watched(_started([RECORDER, *words], files.environment, output=output)))
     run = JournalReader(files.journal).news()
     if status:
         _say(*failures(root, run, files.log))
@@ -190,11 +215,12 @@ def _say(*lines: str) -> None:
     print(*lines, sep="\n", file=sys.stderr, flush=True)
 
 
-def _command(module: str, root: Path, cores: int, arguments: Sequence[str]) -> list[str]:
+def _words(root: Path, cores: int, arguments: Sequence[str]) -> list[str]:
+    """Return the arguments of snakemake."""
     folder = shipped()
     own = ["--snakefile", str(folder / "Snakefile"), "--directory", str(root), "--logger", NAME]
     own += ["--workflow-profile", str(folder / "profiles" / "default"), "--cores", str(cores)]
-    return [sys.executable, "-P", "-m", module, *own, *arguments]
+    return [*own, *arguments]
 
 
 def _killed_for_memory() -> int:
@@ -295,22 +321,24 @@ def _runs_elsewhere(arguments: Sequence[str]) -> bool:
     return named or _PROFILE in os.environ
 
 
-def _supervised(
-    command: Sequence[str],
-    environment: Mapping[str, str],
-    output: IO[bytes] | None = None,
-    look: Callable[[], None] = lambda: None,
-) -> int:
-    """Run a command and all that it starts in a process group of its own; a signal ends the group within seconds."""
-    process = subprocess.Popen(
-        command,
+def _started(
+    words: Sequence[str], environment: Mapping[str, str], *, stdin: int | None = None, output: IO[bytes] | None = None
+) -> "subprocess.Popen[bytes]":
+    """Start a module with its arguments, in a process group of its own that all which it starts is in, too."""
+    return subprocess.Popen(
+        [sys.executable, "-P", "-m", *words],
         cwd=PACKAGE,  # never the campaign's: see `apertura.common.processes`
         env=environment,
+        stdin=stdin,
         stdout=output,
         stderr=output,
         start_new_session=True,
         preexec_fn=partial(die_with_parent, os.getpid()),  # noqa: PLW1509 - this process has no other threads
     )
+
+
+def _watched(process: "subprocess.Popen[bytes]", look: Callable[[], None] = lambda: None) -> int:
+    """Wait for a process, and look at what it does; a signal ends its group within seconds."""
     try:
         while process.poll() is None:
             began_s = time.monotonic()

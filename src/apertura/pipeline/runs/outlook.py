@@ -6,9 +6,9 @@ what was timed in this run to that, it is expected to take
     ρ_r (b + w)       where a job of its rule has ended, or tells how far it is;
     ρ_b b + ρ_w w     elsewhere: ρ_b by jobs that are mostly start, ρ_w by the others.
 
-The last is only told of a job that is mostly start, w ≤ b, when such jobs were timed: starts are alike. A sum over a
-run is told while no more than a fifth of it is of jobs of which that is not: where these take nothing it is 1.25 times
-the truth, where they take six times as much, half of it.
+The last is only told of a job that is mostly start, w ≤ b, when such jobs of two rules were timed: starts are alike,
+but the first of a run wait for what all of them import. A sum over a run is told while no more than a fifth of it is of
+jobs of which that is not: where these take nothing it is 1.25 times the truth, where six times as much, half of it.
 """
 
 import json
@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
-from statistics import fmean, median
+from statistics import fmean, median, median_low
 
 from apertura.common.errors import CampaignError, shown
 from apertura.common.progress import progress_path
@@ -71,7 +71,7 @@ class Measure:
     of_start, of_work
         The same of the start of any job, and of what grows with its work; None where nothing was timed.
     starts
-        Whether jobs were timed that are mostly start.
+        Whether jobs of two rules were timed that are mostly start.
     """
 
     of_rule: dict[str, float]
@@ -83,16 +83,19 @@ class Measure:
     def of(cls, timed: Sequence[tuple[str, float, float, float]]) -> "Measure":
         """Return that of jobs: rule, seconds, and the seconds expected for its start and for its work."""
         ratios: dict[str, list[float]] = defaultdict(list)
-        starts, works = list[float](), list[float]()
+        grows: dict[str, list[bool]] = defaultdict(list)
         for rule, seconds, start_s, work_s in timed:
             ratios[rule].append(seconds / (start_s + work_s))
-            (starts if work_s <= start_s else works).append(ratios[rule][-1])
-        every = median([*starts, *works]) if timed else None
+            grows[rule].append(work_s > start_s)
+        of_rule = {rule: median(found) for rule, found in ratios.items()}
+        starts = [ratio for rule, ratio in of_rule.items() if not any(grows[rule])]
+        works = [ratio for rule, ratio in of_rule.items() if any(grows[rule])]
+        every = median_low(of_rule.values()) if timed else None
         return cls(
-            {rule: median(found) for rule, found in ratios.items()},
-            median(starts) if starts else every,
-            median(works) if works else every,
-            bool(starts),
+            of_rule,
+            median_low(starts) if starts else every,
+            median_low(works) if works else every,
+            len(starts) > 1,
         )
 
     def seconds(self, rule: str, start_s: float, work_s: float) -> tuple[float, bool]:

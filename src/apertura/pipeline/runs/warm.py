@@ -1,8 +1,8 @@
 """Steps as forks of one process that has imported what they need: what `apertura run` starts on this machine.
 
-``python -m apertura.pipeline.runs.warm`` forks snakemake, with a journal, and then a process for every step that
-snakemake's shell asks for; it has no thread of its own. Log, benchmark, variables, signals and exit status of a step
-are those of the command in its rule, which plain snakemake and other machines start as it stands.
+``python -m apertura.pipeline.runs.warm`` reads what to run, forks snakemake, with a journal, and then a process for
+each step that snakemake's shell asks for; it has no thread of its own. Log, benchmark, variables, signals and exit
+status of a step are those of the command in its rule, which plain snakemake and other machines start as it stands.
 """
 
 import ctypes
@@ -13,24 +13,30 @@ import multiprocessing
 import os
 import pkgutil
 import re
+import select
 import signal
 import socket
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from multiprocessing.connection import wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
-from types import ModuleType
-from typing import Any
+from typing import IO, Any
 
 from apertura.common.processes import ENDING, SIGNALLED, die_with_parent
 from apertura.pipeline.rules import RULES
 
-WARM, NAME = "APERTURA_WARM", "apertura.pipeline.runs.warm"
-"""Environment variable: import what steps need before the first is asked for; and this module."""
+NAME = "apertura.pipeline.runs.warm"
+"""This module."""
+AT_ONCE = "--at-once"
+"""Argument: steps will be asked for, so import what they need without being asked."""
+
+_BOTH = ("apertura.pipeline.check", "apertura.pipeline.headers", "apertura.pipeline.stale")
+"""What snakemake imports, too."""
 
 _LIBRARIES = (
     "dask.array",
@@ -59,21 +65,62 @@ _GRACE_S = 2.0
 _fork = multiprocessing.get_context("fork").Process
 
 
+@dataclass(frozen=True)
+class Order:
+    """What snakemake is to be run with, as JSON on standard input; nothing is run where that ends without it.
+
+    Attributes
+    ----------
+    arguments
+        Of snakemake.
+    environment
+        Variables beside those of this process.
+    output
+        File that all output goes to.
+    """
+
+    arguments: Sequence[str]
+    environment: Mapping[str, str]
+    output: str
+
+    def give(self, stream: IO[bytes]) -> None:
+        """Write it, and close the stream."""
+        with stream:
+            stream.write(json.dumps(vars(self)).encode())
+
+
 def main() -> int:
-    """Run snakemake with the arguments of this process, and its steps; return its exit status."""
+    """Run snakemake as ordered, and its steps; return its exit status."""
     os.environ[_THREADS] = "1"  # else numpy starts threads when it is imported
     for number in ENDING:  # the whole group gets them: this process ends when the others have
         signal.signal(number, signal.SIG_IGN)
-    for module in ("apertura.pipeline.check", "apertura.pipeline.headers", "apertura.pipeline.stale"):
-        importlib.import_module(module)  # of both
     here, there = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    snakemake = _fork(target=_child, args=(_snakemake, there))
-    snakemake.start()
+    for module in _BOTH:
+        importlib.import_module(module)
+    snakemake: BaseProcess | None = None
+    for module in _modules() if AT_ONCE in sys.argv else ():  # while the campaign is checked
+        if snakemake is None and select.select([sys.stdin], [], [], 0)[0]:
+            snakemake = _begun(there)
+        importlib.import_module(module)
+    snakemake = snakemake or _begun(there)
     there.close()
-    if WARM in os.environ:
+    if AT_ONCE in sys.argv:
         _import()
     _serve(here, snakemake)
     return _status(snakemake)
+
+
+def _begun(requests: socket.socket) -> BaseProcess:
+    """Start snakemake as ordered."""
+    said = sys.stdin.buffer.read()
+    if not said:  # the campaign is not fit to run
+        sys.exit(2)
+    order = Order(**json.loads(said))
+    os.environ.update(order.environment)
+    _redirect(order.output)
+    snakemake = _fork(target=_child, args=(_snakemake, requests, order.arguments))
+    snakemake.start()
+    return snakemake
 
 
 def _serve(requests: socket.socket, snakemake: BaseProcess) -> None:
@@ -124,20 +171,35 @@ def _status(process: BaseProcess) -> int:
     return code if code >= 0 else SIGNALLED - code
 
 
+def _modules() -> Sequence[str]:
+    steps = sorted({rule.module for rule in RULES.values() if not rule.on_demand})
+    return *_LIBRARIES, *steps, "apertura.__main__", "apertura.views.cli"
+
+
 def _import() -> None:
-    """Import what steps need, once, and read the code that their results are made by."""
+    """Import what steps need, once, and do what each of them would do first."""
     if gc.get_freeze_count():
         return
-    modules = sorted({rule.module for rule in RULES.values() if not rule.on_demand})
-    for name in (*_LIBRARIES, *modules, "apertura.__main__", "apertura.views.cli"):
+    for name in _modules():
         importlib.import_module(name)
-    from apertura.common.provenance import code_sha256, lock_sha256, software
+    from numba.core.registry import cpu_target
 
+    from apertura.common.provenance import code_sha256, software
+
+    cpu_target.typing_context.refresh()
+    cpu_target.target_context.refresh()
     software()
-    lock_sha256()
-    code_sha256(*modules)
+    code_sha256(*(rule.module for rule in RULES.values()))
     gc.collect()
     gc.freeze()  # what stands here is never looked at again: pages stay shared
+
+
+def _redirect(file: str) -> None:
+    """Have standard output and error go to a file."""
+    output = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o666)
+    for stream in (1, 2):
+        os.dup2(output, stream)
+    os.close(output)
 
 
 def _child(work: Callable[..., None], *arguments: Any) -> None:
@@ -151,8 +213,9 @@ def _child(work: Callable[..., None], *arguments: Any) -> None:
 # ---- In the process of snakemake ------------------------------------------------------------------------------------
 
 
-def _snakemake(requests: socket.socket) -> None:
+def _snakemake(requests: socket.socket, arguments: Sequence[str]) -> None:
     """Be snakemake with a journal, whose shell asks for steps."""
+    sys.argv[1:] = arguments
     module: Any = importlib.import_module("snakemake.shell")  # of which the package has a class of that name
     module.sp = Shell(requests)
     importlib.import_module("apertura.pipeline.runs.recorder").record()
@@ -235,10 +298,7 @@ def _step(asked: Mapping[str, Any], answer: socket.socket) -> None:
     os.environ.update(asked["environment"])
     tempfile.tempdir = None  # the environment says where
     os.chdir(asked["folder"])
-    log = os.open(asked["log"], os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o666)
-    for stream in (1, 2):
-        os.dup2(log, stream)
-    os.close(log)
+    _redirect(asked["log"])
     _use_threads(int(os.environ.get(_THREADS, "1")))
     sys.argv = ["apertura", *asked["words"]]
     pkgutil.resolve_name("apertura.__main__:main")()
@@ -247,15 +307,11 @@ def _step(asked: Mapping[str, Any], answer: socket.socket) -> None:
 def _use_threads(count: int) -> None:
     """Have linear algebra use so many threads, as the environment of a new process would."""
     for name in ("numpy.linalg._umath_linalg", "scipy.linalg._fblas") if count > 1 else ():
-        library = ctypes.CDLL(str(_module(name).__file__))
+        library = ctypes.CDLL(str(importlib.import_module(name).__file__))
         for function in _SET_THREADS:
             if hasattr(library, function):
                 getattr(library, function)(count)
                 break
-
-
-def _module(name: str) -> ModuleType:
-    return importlib.import_module(name)
 
 
 if __name__ == "__main__":
