@@ -95,7 +95,7 @@ def _groups(places: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the pulses of some whole groups, spread over a flight; of a flight shorter than one, all."""
     count = len(places) // LEAF
     numbers = np.unique(np.linspace(0, count - 1, min(count, _GROUPS)).astype(int))
-    return places[: count * LEAF].reshape(count, LEAF)[numbers].ravel() if count else places
+    return np.asarray(places[: count * LEAF].reshape(count, LEAF)[numbers].ravel()) if count else places
 
 
 def _starts(
@@ -376,10 +376,10 @@ def _by_tree(job: Job, pulses: int, options: _Options, side: int, direct_s: floa
         ]
         for here, node_counts, edges, has in zip(sampled.views, counts, at_edge, weights, strict=True)
     ]
+    too_steep = [[edge is not None and not edge.nodes for edge in edges] for edges in at_edge]
     directly = [
-        1
-        - (1 - has.directly) * (1 - has.edge * float(np.mean([edge is not None and not edge.nodes for edge in edges])))
-        for has, edges in zip(weights, at_edge, strict=True)
+        1 - (1 - has.directly) * (1 - has.edge * float(np.mean(steep)))
+        for has, steep in zip(weights, too_steep, strict=True)
     ]
     once, read_s = float(np.mean([one for each in costs for one in each] or [np.inf])), _READ_S * side**2
     pay = min(MOST_SHEETS, int(pulses * side**2 * direct_s / (once + read_s))) if direct_s else 0
