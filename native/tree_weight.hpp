@@ -12,7 +12,7 @@ using apertura::kSilently;
 using apertura::kTreeGroup;
 using apertura::kTreeWeights;
 
-constexpr double kKink = 0.28647889757;  // 9 / (10 pi) of (12)
+constexpr double kKink = 0.28647889757;  // 9 / (10 pi) of (13)
 constexpr int64_t kTerms = 4;            // of a polynomial of weights, along xi and along eta
 constexpr int64_t kBetween = 5;          // places along an axis at which it is checked
 constexpr int64_t kChecked = 8;          // one of so many pulses
@@ -69,8 +69,8 @@ struct Centres {
   double slack = 0;
 };
 
-// How far s may leave its values at neighbouring places between these: half the square of their half distance times its
-// second derivative, 2 / sqrt 3 |a| / R^2 at most.
+// (12): how far s may leave its values at neighbouring places between these: half the square of their half distance
+// times its second derivative, 2 / sqrt 3 |a| / R^2 at most.
 inline double dip_of(const Seen& seen, double axis, double range) {
   const double nearest = range - seen.radius;
   return nearest > 0 ? axis * (0.58 * seen.bend / nearest + seen.relief) / nearest : 2;
@@ -195,7 +195,7 @@ inline void weigh_by_sector(const TreeJob& job, TreeTile& tile, const Seen& seen
   }
 }
 
-// (12): rad by which an edge widens the band, at axis 0 (xi), 1 (eta) or 2 (the pulses of a leaf), of content up to
+// (13): rad by which an edge widens the band, at axis 0 (xi), 1 (eta) or 2 (the pulses of a leaf), of content up to
 // `band`.
 inline double widened(const TreeJob& job, double slope, double band) {
   const double content = std::max(band, 1.0) * job.node_error * job.node_error;

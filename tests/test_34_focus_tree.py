@@ -12,7 +12,7 @@ from tree_flights import WAVENUMBERS, counted, flown, formed, heard, seen, setti
 from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
 from apertura.core.antenna.beam import Beam, Beams
 from apertura.core.focus.engines import native, pieces, reference, tree
-from apertura.core.focus.engines.tree_inputs import roughness
+from apertura.core.focus.engines.tree_inputs import roughness, weighed
 from apertura.core.focus.engines.tree_nodes import nodes, supports, surfaces_of, weights, widest_band
 from apertura.core.focus.engines.tree_view import nodes_for, peak_band, widened_rad
 from apertura.core.geometry.aperture import Aperture
@@ -226,9 +226,36 @@ def test_the_edges_of_a_sector_go_by_tree(isa, plain, centre, half, nodes_db):
     assert decibels(image - formed(plain, nodes_db=nodes_db)[0], image) > -25  # the sector matters
 
 
+@pytest.mark.parametrize("relief_m", [0.0, 0.4])
+@pytest.mark.parametrize("antenna", [False, True])
+def test_what_counts_as_a_whole_or_not_at_all_does_so_at_every_pixel(antenna, relief_m):
+    """Eq. 12, over random tiles of a flight that sways: inside a sector weights are one, silent pulses have none."""
+    generator, along = np.random.default_rng(3), np.linspace(-60, 60, 3200)
+    sway = np.stack([along, 2 * np.sin(along / 9), 20 + np.cos(along / 5)], -1)
+    aperture = Aperture(sway, sway + [3.0, 0.5, 1.0])
+    beam = swaying_beam(sway, (20, 0, 0), 60, sway_deg=0.0) if antenna else None
+    plainly = Sector.of(aperture, chord_m=3.0, centre=0.05, half=0.3)
+    found = np.zeros(3, int)
+    for place in generator.uniform([-70, 15, -2], [70, 60, 4], (8, 3)):
+        pixels = place + generator.uniform(1, 3) * pixel_grid(12, 12, spacing_m=0.27, turned_deg=20.0, range_m=0.0)
+        pixels[..., 2] += relief_m * np.sin(pixels[..., 0]) * np.cos(1.3 * pixels[..., 1])
+        (surface,) = surfaces_of(pixels, [(slice(0, 12), slice(0, 12))])
+        ahead = replace(plainly, centre=0.9).following(aperture, pixels[::11, ::11].reshape(-1, 3))
+        for sector in (plainly, ahead):
+            seen = weighed(Beams(beam, None, sector), aperture, surface, -74)
+            whole = Beams(beam, None, sector).weight(aperture, pixels.reshape(-1, 3)).reshape(len(seen.variant), 64, -1)
+            inside = sector.weight(aperture, pixels.reshape(-1, 3)).reshape(whole.shape)
+            silent = seen.variant == 2
+            assert not whole[silent].any()
+            assert (inside[~silent & ~seen.edge] == 1).all()
+            assert seen.edge[((inside > 0) & (inside < 1)).any(axis=(1, 2)) & ~silent].all()
+            found += [silent.sum(), (~silent & ~seen.edge).sum(), seen.edge.sum()]
+    assert (found > 20).all()
+
+
 @pytest.mark.parametrize(("half", "nodes_db"), [(0.04, -74), (0.01, -50)])
 def test_edges_too_steep_for_nodes_go_directly(plain, half, nodes_db):
-    """Eq. 12: they would take more than 128 nodes along a tile; what lies beyond them is left out still."""
+    """Eq. 13: they would take more than 128 nodes along a tile; what lies beyond them is left out still."""
     beams = sector_of(plain, half)
     image, share = formed(plain, beams=beams, nodes_db=nodes_db)
     assert share[0] == 0
@@ -247,7 +274,7 @@ def test_where_the_centre_changes_what_it_follows_an_edge_goes_directly(plain):
 @pytest.mark.parametrize("nodes_db", [-50, -74, -98])
 @pytest.mark.parametrize("slope", [0.3, 0.8])
 def test_the_edge_of_a_sector_widens_a_band_as_predicted(slope, nodes_db):
-    """Eq. 12: the second derivative of the edge jumps; nodes of the band widened err by what they are made for."""
+    """Eq. 13: the second derivative of the edge jumps; nodes of the band widened err by what they are made for."""
     at, generator, band_rad = np.linspace(-1, 1, 1001), np.random.default_rng(5), 15.0
     waves, kinks, tops = (generator.uniform(low, high, 150) for low, high in ((-15.0, 15.0), (-1, 1), (0, 1)))
 

@@ -95,7 +95,7 @@ def _groups(places: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the pulses of some whole groups, spread over a flight; of a flight shorter than one, all."""
     count = len(places) // LEAF
     numbers = np.unique(np.linspace(0, count - 1, min(count, _GROUPS)).astype(int))
-    return np.asarray(places[: count * LEAF].reshape(count, LEAF)[numbers].ravel()) if count else places
+    return places[: count * LEAF].reshape(count, LEAF)[numbers].ravel() if count else places
 
 
 def _starts(
@@ -107,7 +107,7 @@ def _starts(
         found = weighed(job.beams[groups], job.aperture[groups], surface, _TYPICAL_DB)
         first = np.searchsorted(places, groups[::LEAF][found.variant != WITHOUT_ECHO])
         starts = np.unique(first // chunk * chunk) if len(first) else starts
-    return starts[np.unique(np.linspace(0, len(starts) - 1, _CHUNKS).astype(int))]
+    return np.asarray(starts[np.unique(np.linspace(0, len(starts) - 1, _CHUNKS).astype(int))])
 
 
 def _sheets(
@@ -207,7 +207,7 @@ _LEAF_S = 6e-6  # a leaf over a tile: its plan
 _SURFACE_S = 1.6e-8  # a pixel's place, fitted
 _TILE_S = 4e-5  # a tile of a chunk
 _PIECEWISE = 1.1  # cost of direct sums tile by tile and chunk by chunk, relative to one call
-_ANTENNA_S = 4e-7  # a pulse's gains of one antenna over a tile, and their polynomial
+_ANTENNA_S = 5e-7  # a pulse's gains of one antenna over a tile, and their polynomial
 _EDGE = 1.6  # a look-up at the edge of a sector, relative to one inside
 _FORM_S = 4e-4  # a block of pixels
 _TYPICAL_DB = -74  # error of nodes by which chunks are chosen

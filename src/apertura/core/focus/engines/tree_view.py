@@ -303,7 +303,7 @@ def widened_rad(slope: float, band_rad: NDArray[np.float64], nodes_db: float) ->
 
     Notes
     -----
-    Source: docs/theory/tree.md, eq. 12.
+    Source: docs/theory/tree.md, eq. 13.
 
     Examples
     --------
