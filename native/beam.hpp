@@ -2,6 +2,7 @@
 // pixel by pixel where that would not do. docs/theory/engine.md, "Antennas", says how well; equation numbers are its.
 #pragma once
 #include "batch.hpp"
+#include "pattern.hpp"
 #include "sector.hpp"
 
 namespace {
@@ -24,42 +25,6 @@ struct NodeGains {
 struct BeamFrame {
   alignas(64) float origin[3][kBatch], step_x[3][kBatch], step_y[3][kBatch], up[3][kBatch];
 };
-
-// atan2 to 1e-7 rad, without a branch: an odd polynomial of the smaller ratio, then the octants.
-inline float angle(float y, float x) {
-  const float a = magnitude(x), b = magnitude(y);
-  const float z = (a < b ? a : b) / ((a < b ? b : a) + 1e-30f), s = z * z;
-  const float high = -0.13908629f + s * (0.09642196f + s * (-0.05591232f + s * (0.02186295f + s * -0.00405457f)));
-  float turn = z * (0.99999934f + s * (-0.33329861f + s * (0.19946566f + s * high)));
-  turn = b > a ? 1.57079633f - turn : turn;
-  turn = x < 0 ? 3.14159265f - turn : turn;
-  return y < 0 ? -turn : turn;
-}
-
-// Place in the azimuth (0) or elevation (1) cut of a pattern, in samples from its first.
-inline float place_of(const BeamJob& beam, int64_t cut, float radians) {
-  return (radians - float(beam.first_rad[cut])) * float(beam.samples_per_rad[cut]);
-}
-
-// The same for the direction (v0, v1, v2) along the antenna's axes: azimuth = atan2(v1, v0), elevation above it.
-inline float azimuth_place(const BeamJob& beam, float v0, float v1) { return place_of(beam, 0, angle(v1, v0)); }
-inline float elevation_place(const BeamJob& beam, float v0, float v1, float v2) {
-  return place_of(beam, 1, angle(v2, __builtin_sqrtf(v0 * v0 + v1 * v1)));
-}
-
-inline double last_rad(const BeamJob& beam, int64_t cut) {
-  return beam.first_rad[cut] + double(beam.count[cut] - 1) / beam.samples_per_rad[cut];
-}
-
-// Gain at a place of a cut, linear between samples and zero beyond.
-inline float look_up(const BeamJob& beam, int64_t cut, float place) {
-  const int64_t last = beam.count[cut] - 1;
-  const bool inside = place >= 0 && place <= float(last);
-  const float held = inside ? place : 0;
-  const int32_t at = int32_t(held) < int32_t(last) ? int32_t(held) : int32_t(last) - 1;  // AVX2 converts no 64 bits
-  const float *gain = beam.gain[cut] + at, part = held - float(at);
-  return inside ? gain[0] + part * (gain[1] - gain[0]) : 0;
-}
 
 inline void turn_to_axes(const BeamJob& beam, const double* antenna, const ApertureJob& job, const Patch& patch,
                          int64_t pulse, BeamFrame& to) {

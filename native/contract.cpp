@@ -95,6 +95,8 @@ constexpr Field kFields[] = {
     APERTURA_FIELD(TreeTile, way),
     APERTURA_FIELD(TreeTile, nodes),
     APERTURA_FIELD(TreeTile, fewer),
+    APERTURA_FIELD(TreeTile, edge),
+    APERTURA_FIELD(TreeTile, slope),
     APERTURA_FIELD(TreeTile, centre),
     APERTURA_FIELD(TreeTile, rest),
     APERTURA_FIELD(TreeTile, first_path),
@@ -138,6 +140,9 @@ constexpr Field kFields[] = {
     APERTURA_FIELD(TreeJob, wavenumber),
     APERTURA_FIELD(TreeJob, band),
     APERTURA_FIELD(TreeJob, smooth),
+    APERTURA_FIELD(TreeJob, node_error),
+    APERTURA_FIELD(TreeJob, beam),
+    APERTURA_FIELD(TreeJob, sector),
     APERTURA_FIELD(TreeJob, phase_coefficients),
     {"TreeJob", 0, sizeof(TreeJob)},
 };

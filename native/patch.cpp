@@ -4,6 +4,8 @@
 #include <cstring>
 #include <initializer_list>
 
+#include "centre.hpp"
+
 namespace apertura {
 namespace {
 
@@ -105,28 +107,6 @@ void describe_block(Patch& patch, int64_t block, const double height[kPixels]) {
   }
 }
 
-// Least and largest s of (1) at a point, and by how much they differ at most within some metres of it.
-struct Flown {
-  double first, last, slack;
-};
-
-Flown flown_past(const SectorJob& sector, const double* at, double reach) {
-  Flown out = {2, -2, 0};
-  for (int64_t end = 0; end < sector.ends; end++) {
-    double place = 0, slack = 0;
-    for (int64_t leg = 0; leg < 2; leg++) {
-      const double *antenna = sector.end[leg] + 3 * end, *axis = sector.end_axis[leg] + 3 * end;
-      const double w[3] = {at[0] - antenna[0], at[1] - antenna[1], at[2] - antenna[2]};
-      const double distance = std::sqrt(dot(w, w));
-      place += dot(w, axis) / distance;
-      if (reach > 0) slack += std::sqrt(dot(axis, axis)) * (reach < distance ? 1.5708 * reach / distance : 2);
-    }
-    out.first = std::fmin(out.first, place), out.last = std::fmax(out.last, place);
-    out.slack = std::fmax(out.slack, slack);
-  }
-  return out;
-}
-
 // How the centres of a sector lie over a patch: integration.md, (4). A block that is not whole is taken as level.
 void describe_centres(const ApertureJob& job, Patch& patch) {
   const SectorJob& sector = *job.sector;
@@ -140,11 +120,8 @@ void describe_centres(const ApertureJob& job, Patch& patch) {
     if (!holds(patch, slot)) continue;
     const int64_t row = patch.row + pixel_row(slot), column = patch.column + pixel_column(slot);
     const Flown own = flown_past(sector, job.pixels + 3 * (row * job.columns + column), 0);
-    const double middle = 0.5 * (own.first + own.last);
-    const double lowest = std::fmin(own.first + sector.outer, middle),
-                 highest = std::fmax(own.last - sector.outer, middle);
-    const double centre = std::fmin(std::fmax(sector.centre, lowest), highest);
-    patch.moved[slot] = std::isfinite(middle) ? float(centre - sector.centre) : 0;
+    const double centre = centre_of(sector, own);
+    patch.moved[slot] = std::isfinite(centre) ? float(centre - sector.centre) : 0;
     sum += patch.moved[slot], count++;
   }
   patch.moved_mean = float(sum / count);

@@ -82,9 +82,15 @@ void form(const TreeJob& job) {
 
 }  // namespace
 
-// Fills `top`, `way`, `nodes`, `fewer` and the samples of the tiles.
+// Fills `top`, `way`, `nodes`, `fewer`, the samples of the tiles, and what their weights are.
 extern "C" void APERTURA_JOIN(apertura_plan_tree_, APERTURA_ISA)(TreeJob* job) {
   for (int64_t n = 0; n < job->count; n++) plan_tile(*job, job->tiles[n]);
+}
+
+// Fills `way`, `edge`, `slope`, `weight` and, where pulses must go each for itself, `fewer` of the tiles by their
+// weights alone.
+extern "C" void APERTURA_JOIN(apertura_weigh_tree_, APERTURA_ISA)(TreeJob* job) {
+  for (int64_t n = 0; n < job->count; n++) weigh_leaves(*job, job->tiles[n], seen_of(*job, job->tiles[n]));
 }
 
 // Fills `rest` of the tiles.

@@ -4,6 +4,8 @@
 #pragma once
 #include <cstdint>
 
+#include "job.hpp"
+
 namespace apertura {
 
 constexpr int64_t kTreeNodes = 128;    // along one axis of a tile, at most
@@ -17,9 +19,9 @@ constexpr int64_t kTreeTerms = 21;     // of the track over a leaf, one more tha
 constexpr int64_t kTreeMore = 4;       // pulses that a curve takes beyond its degree
 constexpr int64_t kTreeSlots = 136;    // 0 … kTreeNodes: that many nodes; above: pixels of one of the sides of tiles
 constexpr int64_t kTreeDegree = 6;     // of a tile's surface, at most
-constexpr int64_t kTreeWeights = 16;   // of a beam's polynomial over a tile: ξ^a η^b at 4 b + a, a and b up to 3
+constexpr int64_t kTreeWeights = 16;   // of the antennas' polynomial over a tile: ξ^a η^b at 4 b + a, a and b up to 3
 constexpr int64_t kTreeMargin = 2;     // samples around those that a tile's paths reach
-constexpr double kTreeWeighted = 1.5;  // rad that a beam's weight adds to the band at a tile's nodes
+constexpr double kTreeWeighted = 1.5;  // rad that smooth weights add to the band at a tile's nodes
 
 // How a group of pulses is taken over a tile.
 enum TreeWay : uint8_t { kByTree, kDirectly, kSilently };
@@ -30,10 +32,12 @@ struct TreeTile {
   const double* surface;  // (degree + 1 along η, degree + 1 along ξ, 3): Legendre coefficients of the pixels' places
   const double* pixels;   // its first one; rows are TreeJob.stride pixels apart
   float* image;           // the same, (re, im)
-  const float* weight;    // (pulse, kTreeWeights): gain of both antennas over the tile; null: one everywhere
+  float* weight;          // (pulse, kTreeWeights): gain of both antennas over the tile, set by the plan; null: no beams
   uint8_t* way;           // (group): TreeWay; those not kByTree on entry are left
   uint8_t* nodes;         // (subaperture of each level in turn, 2): nodes along ξ and η
-  uint8_t* fewer;         // (leaf): how many pulses stand for those of a leaf; 0: each for itself; on entry 1: must
+  uint8_t* fewer;         // (leaf): how many pulses stand for those of a leaf; 0: each for itself; zero on entry
+  uint8_t* edge;          // (leaf): 1 where the sector ends within the tile; zero on entry
+  float* slope;           // (leaf, 3): there, how much depth changes along ξ, η and the leaf's pulses, per half of them
   double centre[3];
   double rest;        // mean square of the pixels' distances from the surface; set by apertura_rest_tree
   double first_path;  // of the first sample, more than that of the centre; set by the plan
@@ -64,6 +68,9 @@ struct TreeJob {
   int64_t sizes[apertura::kTreeLevels];  // pulses of a subaperture
   double step, wavenumber, band;         // metres; 2 pi f / c; half the band in the same unit
   double smooth;                         // rad that pulses may leave a smooth curve by, RMS, to be made fewer
+  double node_error;                     // that one interpolation between nodes may make, RMS, relative
+  const BeamJob* beam[2];                // as of ApertureJob, their axes `pulses` apart
+  const SectorJob* sector;
   float phase_coefficients[9];
 };
 

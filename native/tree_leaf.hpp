@@ -7,19 +7,19 @@
 
 #include "phase.hpp"
 #include "tree_merge.hpp"
+#include "tree_weight.hpp"
 
 namespace {
 
 using apertura::kTreeDelays;
 using apertura::kTreeTerms;
-using apertura::kTreeWeights;
 
 constexpr int64_t kRecord = 4;                // floats of a cell: level and slope, re and im each
 constexpr int64_t kCells = kLanes / kRecord;  // that a vector holds
 
 // What leaves are computed in. Lines are rows of pairs: samples of the pulses over one tile, aligned to its centre.
 struct LeafScratch {
-  Floats taken, lines, fewer, cells, pairs, along_xi[2], along_eta[2];
+  Floats taken, lines, fewer, cells, pairs, gain, along_xi[2], along_eta[2];
 };
 
 // Cells of a pulse about a tile: that at the path of its centre, how far the path lies beyond it, and where they end.
@@ -99,16 +99,9 @@ inline void expand(const TreeJob& job, const float* line, int64_t samples, const
     }
 }
 
-// Gain of both antennas at a vector of nodes.
-inline Lanes weight_at(const float* w, Lanes xi, Lanes eta) {
-  Lanes along[4];
-  for (int64_t b = 0; b < 4; b++) along[b] = w[4 * b] + xi * (w[4 * b + 1] + xi * (w[4 * b + 2] + xi * w[4 * b + 3]));
-  return along[0] + eta * (along[1] + eta * (along[2] + eta * along[3]));
-}
-
-// Adds what one pulse has at the nodes of a leaf: (2) of engine.md at the path of each.
+// Adds what one pulse has at the nodes of a leaf: (2) of engine.md at the path of each, times a gain.
 template <class Phase, bool kMono>
-inline void add_pulse(const TreeJob& job, const LeafNodes& leaf, const Legs& legs, const float* weight,
+inline void add_pulse(const TreeJob& job, const LeafNodes& leaf, const Legs& legs, const float* gain,
                       const Cells& cells, float* re, float* im) {
   const float scale = float(double(job.up) / job.step);
   const Lanes low = splat(cells.low), high = splat(cells.high);
@@ -128,10 +121,7 @@ inline void add_pulse(const TreeJob& job, const LeafNodes& leaf, const Legs& leg
     load_records(cells.middle, at, fields);
     Lanes vr = fields[0] + u * fields[2], vi = fields[1] + u * fields[3];
     phase(u, cosine, sine);
-    if (weight) {
-      const Lanes gain = weight_at(weight, load(&leaf.xi[n]), load(&leaf.eta[n]));
-      vr *= gain, vi *= gain;
-    }
+    if (gain) vr *= load(gain + n), vi *= load(gain + n);
     store(re + n, load(re + n) + vr * cosine - vi * sine);
     store(im + n, load(im + n) + vr * sine + vi * cosine);
   }
@@ -182,9 +172,9 @@ struct Between {
   }
 };
 
-// The pulses that stand for those of a leaf: phase centres on a smooth curve through its own, and antennas' weights.
+// The pulses that stand for those of a leaf: phase centres on a smooth curve through its own, and their weights.
 struct Virtual {
-  Legs legs;
+  Look look;
   float weight[kTreeWeights];
 };
 
@@ -198,10 +188,18 @@ inline Virtual virtual_pulse(const TreeJob& job, const TreeTile& tile, int64_t b
   for (int64_t leg = 0; leg < 2; leg++, track += 3 * kTreeTerms)
     for (int64_t term = 0; term < terms; term++)
       for (int64_t axis = 0; axis < 3; axis++) antenna[leg][axis] += curve[term] * track[3 * term + axis];
-  out.legs = legs_between(tile.centre, antenna[0], antenna[1]);
-  if (!tile.weight) return out;
+  out.look.legs = legs_between(tile.centre, antenna[0], antenna[1]);
+  const bool edge = tile.edge[begin / apertura::kTreeGroup];
+  if (!tile.weight && !edge) return out;
   const Between between(0.5 * double(apertura::kTreeGroup - 1) * (1 + job.places[fewer][n]));
-  for (int64_t near = 0; near < 4; near++)
+  double axis[2][3] = {};
+  for (int64_t leg = 0; edge && leg < 2; leg++)
+    for (int64_t near = 0; near < 4; near++)
+      for (int64_t i = 0; i < 3; i++)
+        axis[leg][i] +=
+            double(between.share[near]) * job.sector->axis[leg][i * job.pulses + begin + between.first + near];
+  if (edge) put_axes(tile.centre, antenna[0], antenna[1], axis, out.look);
+  for (int64_t near = 0; tile.weight && near < 4; near++)
     for (int64_t term = 0; term < kTreeWeights; term++)
       out.weight[term] += between.share[near] * tile.weight[(begin + between.first + near) * kTreeWeights + term];
   return out;
@@ -237,8 +235,9 @@ inline void sum_fewer(const TreeJob& job, TileState& state, const LeafNodes& lea
   for (int64_t n = 0; n < fewer; n++) {
     const Virtual pulse = virtual_pulse(job, tile, begin, fewer, n);
     expand(job, lines + n * wide, tile.samples, state.cosines.data(), state.sines.data(), work.cells.data());
-    add_pulse<Phase, kMono>(job, leaf, pulse.legs, tile.weight ? pulse.weight : nullptr, cells, state.re.data(),
-                            state.im.data());
+    const float* gain = node_gains(job, leaf, pulse.look, tile.edge[begin / apertura::kTreeGroup],
+                                   tile.weight ? pulse.weight : nullptr, work.gain);
+    add_pulse<Phase, kMono>(job, leaf, pulse.look.legs, gain, cells, state.re.data(), state.im.data());
   }
 }
 

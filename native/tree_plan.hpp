@@ -1,13 +1,10 @@
 // How many nodes each subaperture of a tile needs, and which pulses its tree can take. docs/theory/tree.md, "Support".
 #pragma once
-#include "tree_seen.hpp"
+#include "tree_weight.hpp"
 
 namespace {
 
-using apertura::kDirectly;
-using apertura::kSilently;
 using apertura::kTreeCurves;
-using apertura::kTreeGroup;
 using apertura::kTreeMore;
 using apertura::kTreeNodes;
 using apertura::kTreeWeighted;
@@ -59,7 +56,7 @@ inline int64_t nodes_for(const TreeJob& job, double band) {
 // How many pulses stand for those of a leaf: what holds the turn of the carrier at any place against the centre.
 inline uint8_t fewer_of(const TreeJob& job, const TreeTile& tile, const Seen& seen, const Sight& sight, int64_t leaf) {
   const int64_t begin = leaf * kTreeGroup;
-  if (tile.fewer[leaf] || begin + kTreeGroup > job.pulses) return 0;
+  if (tile.fewer[leaf] || begin + kTreeGroup > job.pulses) return 0;  // weights that jump
   const Legs legs = legs_of(job, tile.centre, begin + kTreeGroup / 2);
   const double turns = (1 / legs.ranges[0] + 1 / legs.ranges[1]) * (job.wavenumber + job.band) * seen.radius;
   // What a place off the centre sees of a pulse off its curve, RMS over the tile: 1/sqrt 3 of what its corner sees.
@@ -74,7 +71,8 @@ inline uint8_t fewer_of(const TreeJob& job, const TreeTile& tile, const Seen& se
                  last = sight.reach[2].further[n];
     most = std::max(most, 0.5 * std::fabs(last - first) + std::fabs(first + last - 2 * middle));
   }
-  const double band = (job.wavenumber + job.band) * most + job.stray[leaf] * turns + (tile.weight ? kTreeWeighted : 0);
+  double band = (job.wavenumber + job.band) * most + job.stray[leaf] * turns + (tile.weight ? kTreeWeighted : 0);
+  if (tile.edge[leaf]) band += widened(job, tile.slope[3 * leaf + 2], band);
   const int64_t count = std::max(kCurves[terms] + kTreeMore, nodes_for(job, band));
   return count <= apertura::kTreeFewer ? uint8_t(count) : 0;
 }
@@ -82,6 +80,7 @@ inline uint8_t fewer_of(const TreeJob& job, const TreeTile& tile, const Seen& se
 // Looks at each leaf: whether it goes by tree, over which samples, and as how many pulses.
 inline void plan_leaves(const TreeJob& job, TreeTile& tile, const Seen& seen) {
   double low = 0, high = 0;
+  weigh_leaves(job, tile, seen);
   for (int64_t leaf = 0; leaf * kTreeGroup < job.pulses; leaf++) {
     if (tile.way[leaf] != apertura::kByTree) continue;
     const int64_t begin = leaf * kTreeGroup, end = std::min(begin + kTreeGroup, job.pulses);
@@ -199,15 +198,24 @@ inline bool plan_level(const TreeJob& job, TreeTile& tile, const Seen& seen, con
     const Slopes middle = slopes_at(legs_of(job, tile.centre, apertura::middle_of(job, begin, size)), seen);
     const Reference reference(middle, mixed, seen);
     Band band;
-    float stray_xi = 0, stray_eta = 0;
+    float stray_xi = 0, stray_eta = 0, slope_xi = 0, slope_eta = 0;
+    bool edge = false;
     for (int64_t n = begin / leaf; n * leaf < end; n++) {
       if (tile.way[n * leaf / kTreeGroup] != apertura::kByTree) continue;
       for (int64_t i = 0; i < 3; i++) band.include(job, leaves.slopes[3 * n + i], reference, seen);
       stray_xi = std::max(stray_xi, leaves.stray_xi[n]), stray_eta = std::max(stray_eta, leaves.stray_eta[n]);
+      if (!tile.edge[n]) continue;
+      edge = true;
+      slope_xi = std::max(slope_xi, tile.slope[3 * n]), slope_eta = std::max(slope_eta, tile.slope[3 * n + 1]);
     }
-    const double more = tile.weight ? kTreeWeighted : 0;
-    const int64_t xi = nodes_for(job, Band::most(band.xi, seen, 1) + stray_xi + more);
-    const int64_t eta = nodes_for(job, Band::most(band.eta, seen, seen.side) + stray_eta + more);
+    double wide_xi = Band::most(band.xi, seen, 1) + stray_xi + (tile.weight ? kTreeWeighted : 0);
+    double wide_eta = Band::most(band.eta, seen, seen.side) + stray_eta + (tile.weight ? kTreeWeighted : 0);
+    if (edge) wide_xi += widened(job, slope_xi, wide_xi), wide_eta += widened(job, slope_eta, wide_eta);
+    const int64_t xi = nodes_for(job, wide_xi), eta = nodes_for(job, wide_eta);
+    if (level == 0 && edge && (xi > kTreeNodes || eta > kTreeNodes)) {
+      tile.way[begin / kTreeGroup] = kDirectly;  // the rest of the tile need not follow
+      continue;
+    }
     holds &= xi <= kTreeNodes && eta <= kTreeNodes;
     nodes[0] = uint8_t(std::min(xi, kTreeNodes)), nodes[1] = uint8_t(std::min(eta, kTreeNodes));
   }

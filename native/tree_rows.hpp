@@ -9,7 +9,7 @@ constexpr int64_t kRows = 16;  // pulses expanded at once: what the second-level
 // Some pulses as cells: cell 0 of a row lies at sample `first` of its pulse.
 struct Rows {
   int64_t first[kRows], samples = 0;
-  Floats held, cells, cosines, sines;
+  Floats held, cells, gain, cosines, sines;
   int64_t low = 0, high = 0;  // samples of a profile that the carrier is there for: no cell depends on other tiles
 };
 
@@ -69,14 +69,17 @@ inline void sum_each(const TreeJob& job, const std::vector<TileState*>& tiles, i
     for (TileState* state : tiles)
       for (int64_t p = 0; p < count; p++) {
         const int64_t pulse = first + p;
-        const Legs legs = legs_of(job, state->tile.centre, pulse);
-        const double place = (legs.range - job.start[pulse]) * double(job.up) / job.step;
+        const TreeTile& tile = state->tile;
+        const bool edge = tile.edge[pulse / kTreeGroup];
+        const Look look = edge ? look_of(job, tile.centre, pulse) : Look{legs_of(job, tile.centre, pulse)};
+        const double place = (look.legs.range - job.start[pulse]) * double(job.up) / job.step;
         const Cells cells(&rows.cells[kRecord * p * width], rows.first[p] * job.up, width, place);
-        const float* weight = state->tile.weight ? state->tile.weight + pulse * kTreeWeights : nullptr;
+        const float* weight = tile.weight ? tile.weight + pulse * kTreeWeights : nullptr;
+        const float* gain = node_gains(job, *state->leaf, look, edge, weight, rows.gain);
         if (job.mono)
-          add_pulse<Phase, true>(job, *state->leaf, legs, weight, cells, state->re.data(), state->im.data());
+          add_pulse<Phase, true>(job, *state->leaf, look.legs, gain, cells, state->re.data(), state->im.data());
         else
-          add_pulse<Phase, false>(job, *state->leaf, legs, weight, cells, state->re.data(), state->im.data());
+          add_pulse<Phase, false>(job, *state->leaf, look.legs, gain, cells, state->re.data(), state->im.data());
       }
   }
 }

@@ -3,6 +3,7 @@
 #include <memory>
 #include <vector>
 
+#include "centre.hpp"
 #include "tree_paths.hpp"
 
 namespace {
@@ -24,7 +25,8 @@ struct LeafNodes {
   int64_t columns, rows, count;
   Points at;
   Floats cosine, sine;  // of -k m
-  Floats xi, eta;       // places in the tile, for weights
+  Floats xi, eta;       // places in the tile, for weights of antennas
+  Floats centre;        // of the sector; empty where that is the same everywhere
 };
 
 struct TileState {
@@ -122,12 +124,14 @@ inline void put_mixed_turns(const TreeJob& job, TileState& state, LeafNodes& lea
 inline const LeafNodes& leaf_of(const TreeJob& job, TileState& state, int64_t columns, int64_t rows) {
   for (const auto& leaf : state.leaves)
     if (leaf->columns == columns && leaf->rows == rows) return *leaf;
-  state.leaves.emplace_back(new LeafNodes{columns, rows, columns * rows, {}, {}, {}, {}, {}});
+  state.leaves.emplace_back(new LeafNodes{columns, rows, columns * rows, {}, {}, {}, {}, {}, {}});
   LeafNodes& leaf = *state.leaves.back();
   const TreeTile& tile = state.tile;
   const int64_t m = tile.degree + 1;
   leaf.at.resize(leaf.count);
   leaf.xi.assign(leaf.at.count, 0.0f), leaf.eta = leaf.xi;
+  const bool centred = job.sector && job.sector->ends;
+  if (centred) leaf.centre.assign(leaf.at.count, float(job.sector->centre));
   std::vector<double> along_xi(size_t(columns) * (kTreeDegree + 2));
   for (int64_t n = 0; n < columns; n++) legendre(job.places[columns][n], tile.degree, &along_xi[n * (kTreeDegree + 2)]);
   for (int64_t row = 0; row < rows; row++) {
@@ -142,6 +146,10 @@ inline const LeafNodes& leaf_of(const TreeJob& job, TileState& state, int64_t co
         for (int64_t e = 0; e < m; e++) offset[axis] += along_xi[n * (kTreeDegree + 2) + e] * line[3 * e + axis];
       }
       leaf.at.put(row * columns + n, offset);
+      if (centred) {
+        const double at[3] = {tile.centre[0] + offset[0], tile.centre[1] + offset[1], tile.centre[2] + offset[2]};
+        leaf.centre[row * columns + n] = float(centre_of(*job.sector, flown_past(*job.sector, at, 0)));
+      }
       leaf.xi[row * columns + n] = float(job.places[columns][n]);
       leaf.eta[row * columns + n] = float(job.places[rows][row]);
     }

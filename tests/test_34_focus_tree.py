@@ -12,11 +12,11 @@ from tree_flights import WAVENUMBERS, counted, flown, formed, heard, seen, setti
 from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
 from apertura.core.antenna.beam import Beam, Beams
 from apertura.core.focus.engines import native, pieces, reference, tree
-from apertura.core.focus.engines.tree_inputs import roughness
+from apertura.core.focus.engines.tree_inputs import roughness, weighed
 from apertura.core.focus.engines.tree_nodes import nodes, supports, surfaces_of, weights, widest_band
-from apertura.core.focus.engines.tree_view import nodes_for, peak_band
+from apertura.core.focus.engines.tree_view import nodes_for, peak_band, widened_rad
 from apertura.core.geometry.aperture import Aperture
-from apertura.core.geometry.sector import Sector
+from apertura.core.geometry.sector import Sector, edge
 
 pytestmark = compiled
 
@@ -203,27 +203,122 @@ def test_smooth_weights_are_applied_at_the_leaves(isa, plain, sway_deg):
     assert decibels(image - formed(plain)[0], image) > -30  # the weight matters
 
 
-@pytest.mark.parametrize(("centre", "half"), [(0.02, 0.25), (0.7, 0.2)])
-def test_the_edges_of_a_sector_go_directly(plain, centre, half):
-    """Also where the centre of each place is where the flight came nearest to it."""
-    sector = Sector.of(plain.aperture, chord_m=1.2, centre=centre, half=half)
-    if centre > 0.5:
-        sector = sector.following(plain.aperture, ecef(plain.pixels)[::10, ::10].reshape(-1, 3))
-    beams = Beams(None, None, sector)
+def sector_of(flight, half, centre=0.02):
+    """The sector of a flight; one far ahead of it is centred, place by place, on where the flight came nearest."""
+    sector = Sector.of(flight.aperture, chord_m=1.2, centre=centre, half=half)
+    if centre < 0.3:
+        return Beams(None, None, sector)
+    return Beams(None, None, sector.following(flight.aperture, ecef(flight.pixels)[::10, ::10].reshape(-1, 3)))
+
+
+@pytest.mark.quick("*-0.02-0.1--74", "*-0.7-0.2--74")
+@pytest.mark.parametrize("nodes_db", [-50, -74])
+@pytest.mark.parametrize(("centre", "half"), [(0.02, 0.25), (0.02, 0.1), (0.7, 0.2), (0.7, 0.05)])
+def test_the_edges_of_a_sector_go_by_tree(isa, plain, centre, half, nodes_db):
+    """Also where the centre of each place is its own; what lies beyond the edges is left out, and costs nothing."""
+    beams = sector_of(plain, half, centre)
+    assert (beams.sector.ends is None) == (centre < 0.3)
+    image, share = formed(plain, beams=beams, nodes_db=nodes_db)
+    assert share[1] == 0
+    assert share[0] > 0.2
+    assert share[2] > 0.2 or half >= 0.2
+    assert weighed_error_db(plain, image, beams) <= setting(plain, nodes_db=nodes_db).error_db
+    assert decibels(image - formed(plain, nodes_db=nodes_db)[0], image) > -25  # the sector matters
+
+
+@pytest.mark.parametrize("relief_m", [0.0, 0.4])
+@pytest.mark.parametrize("antenna", [False, True])
+def test_what_counts_as_a_whole_or_not_at_all_does_so_at_every_pixel(antenna, relief_m):
+    """Eq. 12, over random tiles of a flight that sways: inside a sector weights are one, silent pulses have none."""
+    generator, along = np.random.default_rng(3), np.linspace(-60, 60, 3200)
+    sway = np.stack([along, 2 * np.sin(along / 9), 20 + np.cos(along / 5)], -1)
+    aperture = Aperture(sway, sway + [3.0, 0.5, 1.0])
+    beam = swaying_beam(sway, (20, 0, 0), 60, sway_deg=0.0) if antenna else None
+    plainly = Sector.of(aperture, chord_m=3.0, centre=0.05, half=0.3)
+    found = np.zeros(3, int)
+    for place in generator.uniform([-70, 15, -2], [70, 60, 4], (8, 3)):
+        pixels = place + generator.uniform(1, 3) * pixel_grid(12, 12, spacing_m=0.27, turned_deg=20.0, range_m=0.0)
+        pixels[..., 2] += relief_m * np.sin(pixels[..., 0]) * np.cos(1.3 * pixels[..., 1])
+        (surface,) = surfaces_of(pixels, [(slice(0, 12), slice(0, 12))])
+        ahead = replace(plainly, centre=0.9).following(aperture, pixels[::11, ::11].reshape(-1, 3))
+        for sector in (plainly, ahead):
+            seen = weighed(Beams(beam, None, sector), aperture, surface, -74)
+            whole = Beams(beam, None, sector).weight(aperture, pixels.reshape(-1, 3)).reshape(len(seen.variant), 64, -1)
+            inside = sector.weight(aperture, pixels.reshape(-1, 3)).reshape(whole.shape)
+            silent = seen.variant == 2
+            assert not whole[silent].any()
+            assert (inside[~silent & ~seen.edge] == 1).all()
+            assert seen.edge[((inside > 0) & (inside < 1)).any(axis=(1, 2)) & ~silent].all()
+            found += [silent.sum(), (~silent & ~seen.edge).sum(), seen.edge.sum()]
+    assert (found > 20).all()
+
+
+@pytest.mark.parametrize(("half", "nodes_db"), [(0.04, -74), (0.01, -50)])
+def test_edges_too_steep_for_nodes_go_directly(plain, half, nodes_db):
+    """Eq. 13: they would take more than 128 nodes along a tile; what lies beyond them is left out still."""
+    beams = sector_of(plain, half)
+    image, share = formed(plain, beams=beams, nodes_db=nodes_db)
+    assert share[0] == 0
+    assert (share[1:] > 0.3).all()
+    assert weighed_error_db(plain, image, beams) <= setting(plain, nodes_db=nodes_db).error_db
+
+
+def test_where_the_centre_changes_what_it_follows_an_edge_goes_directly(plain):
+    """From where the flight covered a whole sector to where it did not: a kink that no nodes hold."""
+    beams = sector_of(plain, 0.25, 0.6)
     image, share = formed(plain, beams=beams)
-    assert (share[:2] > 0.2).all()  # inside, at the edge
-    assert weighed_error_db(plain, image, beams) <= -62
+    assert (share[:2] > 0.2).all()
+    assert weighed_error_db(plain, image, beams) <= -64
+
+
+@pytest.mark.parametrize("nodes_db", [-50, -74, -98])
+@pytest.mark.parametrize("slope", [0.3, 0.8])
+def test_the_edge_of_a_sector_widens_a_band_as_predicted(slope, nodes_db):
+    """Eq. 13: the second derivative of the edge jumps; nodes of the band widened err by what they are made for."""
+    at, generator, band_rad = np.linspace(-1, 1, 1001), np.random.default_rng(5), 15.0
+    waves, kinks, tops = (generator.uniform(low, high, 150) for low, high in ((-15.0, 15.0), (-1, 1), (0, 1)))
+
+    def left_db(band):
+        count = int(nodes_for(np.array([band]), nodes_db)[0])
+        some = nodes(count, nodes_db)
+        to_all = weights(count, at, nodes_db, float(supports(nodes_db)[count]))
+
+        def content(x):
+            x = x[:, None]
+            return edge((x - kinks) * slope + np.round(tops)) * np.exp(1j * waves * x)
+
+        return float(10 * np.log10(np.mean(np.abs(to_all @ content(some) - content(at)) ** 2)))
+
+    wider_rad = float(widened_rad(slope, np.array([band_rad]), nodes_db)[0])
+    assert nodes_db - 8 < left_db(band_rad + wider_rad) <= nodes_db + 1
+    assert left_db(band_rad) > nodes_db + 4 or wider_rad < 4
 
 
 def test_what_a_tile_cannot_take_goes_to_its_quarters(monkeypatch):
-    """The edge of a sector crosses a large tile for longer than each of its quarters."""
+    """The edge of a sector is twice as steep over a large tile as over each of its quarters."""
     flight = flown(pixel_grid(140, 150), pulses=300)
-    beams = Beams(None, None, Sector.of(flight.aperture, chord_m=1.2, centre=0.02, half=0.25))
+    beams = sector_of(flight, 0.1)
     image, share = formed(flight, beams=beams, side_px=256)
     monkeypatch.setattr(tree, "LEAST_QUARTER_PX", 256)
     whole, less = formed(flight, beams=beams, side_px=256)
-    assert share[0] > less[0] + 0.1
-    assert max(weighed_error_db(flight, one, beams) for one in (image, whole)) <= -62
+    assert share[1] == 0
+    assert less[1] == 1
+    assert max(weighed_error_db(flight, one, beams) for one in (image, whole)) <= -64
+
+
+def test_weighed_tiles_and_threads_give_the_same_bits(isa, plain):
+    """Antennas and a sector together: a tile alone has the bits of the whole, by whatever thread."""
+    sector = Sector.of(plain.aperture, chord_m=1.2, centre=0.02, half=0.15)
+    beams = Beams(swaying_beam(plain.scene.tx, (12, 1, 0), 30, sway_deg=0.0), None, sector)
+    chosen, places = setting(plain, nodes_db=-74), ecef(plain.pixels)
+    trees = tree.prepare(plain.profiles, **chosen.options)
+    whole = tree.form(trees, places, beams=beams, **chosen.form_options)
+    assert weighed_error_db(plain, whole, beams) <= -64
+    windows = pieces("tree", whole.shape, chosen.form_options)
+    with ThreadPoolExecutor(2) as pool:
+        alone = pool.map(lambda part: tree.form(trees, places[part], beams=beams, **chosen.form_options), windows)
+        for window, image in zip(windows, alone, strict=True):
+            np.testing.assert_array_equal(image.view(np.uint32), whole[window].view(np.uint32))
 
 
 @pytest.mark.parametrize("pulses", [65, 68, 129, 130, 193])

@@ -93,9 +93,10 @@ _int64 = ctypes.c_int64
 _double = ctypes.c_double
 
 TREE_NODES, TREE_SLOTS, TREE_LEVELS, TREE_GROUP, TREE_SIDE, TREE_DELAYS, TREE_FEWER = 128, 136, 4, 64, 256, 12, 28
-TREE_TERMS, TREE_MORE, TREE_WEIGHTS = 21, 4, 16
+TREE_TERMS, TREE_MORE, TREE_WEIGHTS, TREE_WEIGHTED = 21, 4, 16, 1.5
 """As in native/tree_job.hpp: nodes along an axis; places of them and of pixels; levels; pulses of
-a leaf; pixels along a tile; taps that align a pulse; pulses that replace those of a leaf, at most."""
+a leaf; pixels along a tile; taps that align a pulse; pulses that replace those of a leaf, at most; rad that smooth
+weights add to a band."""
 
 
 class BeamJob(ctypes.Structure):
@@ -163,6 +164,7 @@ class TreeTile(ctypes.Structure):
 
     _fields_ = [
         *((name, _pointer) for name in ("surface", "pixels", "image", "weight", "way", "nodes", "fewer")),
+        *((name, _pointer) for name in ("edge", "slope")),
         ("centre", _double * 3),
         ("rest", _double),
         ("first_path", _double),
@@ -180,7 +182,9 @@ class TreeJob(ctypes.Structure):
         *((name, _int64) for name in ("pulses", "length", "up", "lead", "stride", "count", "levels", "mono")),
         *((name, _int64) for name in ("phase_polynomial", "taps_count", "delay_terms")),
         ("sizes", _int64 * TREE_LEVELS),
-        *((name, _double) for name in ("step", "wavenumber", "band", "smooth")),
+        *((name, _double) for name in ("step", "wavenumber", "band", "smooth", "node_error")),
+        ("beam", ctypes.POINTER(BeamJob) * 2),
+        ("sector", ctypes.POINTER(SectorJob)),
         ("phase_coefficients", ctypes.c_float * 9),
     ]
 
@@ -387,7 +391,7 @@ KeptArrays = list[NDArray[np.generic]]
 
 
 def weights_of(beams: Beams | None, pulses: int, padded: int) -> tuple[Any, Any, KeptArrays]:
-    """Return the pointers `beam` and `sector` of an `ApertureJob`, and the arrays that they point into.
+    """Return the pointers `beam` and `sector` of a job, and the arrays that they point into.
 
     Parameters
     ----------
@@ -417,8 +421,7 @@ def weights_of(beams: Beams | None, pulses: int, padded: int) -> tuple[Any, Any,
 def _beam(beam: Beam, pulses: int, padded: int) -> tuple[BeamJob, KeptArrays]:
     if len(beam.axes) != pulses:
         raise ValueError(f"{len(beam.axes)=}: must be one for each of {pulses} pulses")
-    axes = np.pad(beam.axes, [(0, padded - pulses), (0, 0), (0, 0)], mode="edge")
-    axes = np.ascontiguousarray(np.moveaxis(axes, 0, -1), np.float64)
+    axes = np.ascontiguousarray(np.moveaxis(_filled(beam.axes, padded), 0, -1), np.float64)
     angles = (beam.azimuth_rad, beam.elevation_rad)
     gains = [np.ascontiguousarray(gain, np.float32) for gain in (beam.azimuth_gain, beam.elevation_gain)]
     job = BeamJob(
@@ -432,14 +435,15 @@ def _beam(beam: Beam, pulses: int, padded: int) -> tuple[BeamJob, KeptArrays]:
     return job, [axes, *gains]
 
 
+def _filled(axes: NDArray[np.float64], padded: int) -> NDArray[np.float64]:
+    """Return the axes of pulses, the last one repeated."""
+    return np.concatenate([axes, np.repeat(axes[-1:], padded - len(axes), axis=0)]) if padded > len(axes) else axes
+
+
 def _sector(sector: Sector, pulses: int, padded: int) -> tuple[SectorJob, KeptArrays]:
     if len(sector.tx_axis) != pulses:
         raise ValueError(f"{len(sector.tx_axis)=}: must be one for each of {pulses} pulses")
-    filling = [(0, padded - pulses), (0, 0)]
-    axes = [
-        np.ascontiguousarray(np.pad(axis, filling, mode="edge").T, np.float64)
-        for axis in (sector.tx_axis, sector.rx_axis)
-    ]
+    axes = [np.ascontiguousarray(_filled(axis, padded).T, np.float64) for axis in (sector.tx_axis, sector.rx_axis)]
     at = [] if sector.ends is None else [*sector.ends[0].legs, sector.ends[1].tx_axis, sector.ends[1].rx_axis]
     kept: KeptArrays = [*axes, *(np.ascontiguousarray(array, np.float64) for array in at)]
     pair, pointers = ctypes.c_void_p * 2, [one.ctypes.data for one in kept]

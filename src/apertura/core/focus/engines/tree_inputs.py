@@ -24,18 +24,18 @@ from apertura.core.focus.engines.native_binding import (
     TreeJob,
     TreeTile,
     call,
+    weights_of,
 )
 from apertura.core.focus.engines.native_tables import BAND, TableDesign, Tables, design_table
 from apertura.core.focus.engines.tree_nodes import (
     BY_TREE,
     DIRECTLY,
-    UNWEIGHTED,
+    WITHOUT_ECHO,
     Surface,
     matrices,
     nodes,
     pixel_places,
     supports,
-    weights_over,
 )
 from apertura.core.focus.engines.tree_view import LEAF, curve, leaf_roughness, leaves_of, parabola_deviation, tracks
 from apertura.core.focus.inputs import Profiles
@@ -306,6 +306,68 @@ def prepare(profiles: Profiles, *, oversampling: int = 24, taps: int = 8) -> Tre
     )
 
 
+# ---- Weights of antennas and of the sector over a tile
+
+
+class Weighed(NamedTuple):
+    """What weights make of groups of 64 pulses over a tile.
+
+    Attributes
+    ----------
+    variant
+        (group,) uint8.
+    edge
+        (group,) bool: the sector ends within the tile.
+    slope
+        (group, 3) float32: change of the depth in its edge along ξ, along η and over the pulses, per half of them.
+    each
+        (group,) bool: weights jump from pulse to pulse, so that no fewer pulses can replace them.
+    """
+
+    variant: NDArray[np.uint8]
+    edge: NDArray[np.bool_]
+    slope: NDArray[np.float32]
+    each: NDArray[np.bool_]
+
+
+def weighed(beams: Beams, aperture: Aperture, surface: Surface, nodes_db: float) -> Weighed:
+    """Return what weights make of the groups of an aperture over a tile with this surface.
+
+    Notes
+    -----
+    Source: docs/theory/tree.md, "Weights".
+    """
+    pulses, groups = len(aperture), -(-len(aperture) // TREE_GROUP)
+    tx, rx = (np.ascontiguousarray(leg, np.float64) for leg in aperture.legs)
+    stray = np.ascontiguousarray(sum(parabola_deviation(leaves_of(leg)) for leg in aperture.legs), np.float32)
+    variant, each, edge = np.zeros((3, groups), np.uint8)
+    slope, weight = np.zeros((groups, 3), np.float32), np.zeros((pulses, TREE_WEIGHTS), np.float32)
+    coefficients = np.ascontiguousarray(surface.coefficients)
+    tile = TreeTile(
+        *(coefficients.ctypes.data, None, None, weight.ctypes.data, variant.ctypes.data, None, each.ctypes.data),
+        edge.ctypes.data,
+        slope.ctypes.data,
+        degree=len(coefficients) - 1,
+    )
+    tile.centre[:] = surface.centre_m.tolist()
+    beam, sector, _kept = weights_of(beams, pulses, pulses)
+    call(
+        "apertura_weigh_tree",
+        TreeJob(
+            transmitter=tx.ctypes.data,
+            receiver=rx.ctypes.data,
+            stray=stray.ctypes.data,
+            tiles=ctypes.addressof(tile),
+            pulses=pulses,
+            count=1,
+            node_error=10 ** (nodes_db / 20),
+            beam=beam,
+            sector=sector,
+        ),
+    )
+    return Weighed(variant, edge.astype(bool), slope, each.astype(bool))
+
+
 # ---- Trees of one chunk of pulses over the tiles of a block
 
 
@@ -320,10 +382,6 @@ class JobTile:
 
 Task = tuple[JobTile, NDArray[np.bool_]]
 """A tile, and the groups of 64 pulses to add to it, (group,) bool."""
-
-_Weighting = tuple[
-    NDArray[np.float32] | None, NDArray[np.uint8], NDArray[np.uint8]
-]  # weights, variant of each group, groups whose pulses are summed one by one
 
 
 @dataclass(eq=False)
@@ -355,13 +413,17 @@ class Chunk:
 
     def add(self, tasks: list[Task]) -> list[NDArray[np.uint8]]:
         """Add by tree the groups of 64 pulses given for each tile; return the variant of each group."""
-        weightings = [self._weighting(*task) for task in tasks]
-        variants = [variant for _, variant, _ in weightings]
-        self._fewer = [fewer for *_, fewer in weightings]
+        variants = [
+            np.where(selected, BY_TREE if tile.by_tree else DIRECTLY, WITHOUT_ECHO).astype(np.uint8)
+            for tile, selected in tasks
+        ]
         array = (TreeTile * len(tasks))(
-            *(self._struct(tile, *weighting) for (tile, _), weighting in zip(tasks, weightings, strict=True))
+            *(self._struct(tile, variant) for (tile, _), variant in zip(tasks, variants, strict=True))
         )
         job = self._job(array)
+        beam, sector, kept = weights_of(self.beams, len(self.trees), len(self.trees))
+        job.beam, job.sector = beam, sector
+        self._kept += kept
         call("apertura_plan_tree", job)
         for struct, variant in zip(array, variants, strict=True):
             if struct.top < 0:
@@ -374,37 +436,24 @@ class Chunk:
         self._kept.append(array)
         return array.ctypes.data
 
-    def _weighting(self, tile: JobTile, selected: NDArray[np.bool_]) -> _Weighting:
-        """Return the weights of the pulses over a tile, the variant of each group, and groups summed pulse by pulse."""
-        variant, each = (
-            np.where(selected, BY_TREE if tile.by_tree else DIRECTLY, UNWEIGHTED),
-            np.zeros(len(selected), np.uint8),
-        )
-        if self.beams is None or not tile.by_tree:
-            return None, variant.astype(np.uint8), each
-        first, last = np.flatnonzero(selected)[[0, -1]]
-        groups, pulses = slice(first, last + 1), slice(first * TREE_GROUP, (last + 1) * TREE_GROUP)
-        weight = np.zeros((len(self.trees), TREE_WEIGHTS), np.float32)
-        aperture = self.trees.profiles.aperture[pulses]
-        weight[pulses], by_group, each[groups] = weights_over(self.beams[pulses], aperture, tile.surface, self.nodes_db)
-        variant[groups] = np.where(selected[groups], by_group, UNWEIGHTED)
-        return weight, variant.astype(np.uint8), each
-
-    def _struct(
-        self, tile: JobTile, weight: NDArray[np.float32] | None, variant: NDArray[np.uint8], fewer: NDArray[np.uint8]
-    ) -> TreeTile:
+    def _struct(self, tile: JobTile, variant: NDArray[np.uint8]) -> TreeTile:
         rows, columns = tile.window
         surface, at = tile.surface, rows.start * self.image.shape[1] + columns.start
         counts = np.zeros(sum(2 * -(-len(self.trees) // size) for size in self.sizes), np.uint8)
         self._counts.append(counts)
+        fewer, edge = np.zeros((2, len(variant)), np.uint8)
+        self._fewer.append(fewer)
+        antennas = self.beams and self.beams.antennas
         struct = TreeTile(
             surface=self._pointer_to(np.ascontiguousarray(surface.coefficients)),
             pixels=self.pixels.ctypes.data + 24 * at,
             image=self.image.ctypes.data + 8 * at,
-            weight=None if weight is None else self._pointer_to(weight),
+            weight=self._pointer_to(np.zeros((len(self.trees), TREE_WEIGHTS), np.float32)) if antennas else None,
             way=self._pointer_to(variant),
             nodes=self._pointer_to(counts),
             fewer=self._pointer_to(fewer),
+            edge=self._pointer_to(edge),
+            slope=self._pointer_to(np.zeros((len(variant), 3), np.float32)),
             degree=len(surface.coefficients) - 1,
             rows=rows.stop - rows.start,
             columns=columns.stop - columns.start,
@@ -445,6 +494,7 @@ class Chunk:
             wavenumber=self.trees.wavenumber_rad_m,
             band=self.trees.band_rad_m,
             smooth=10 ** (self.presum_db / 20),
+            node_error=10 ** (self.nodes_db / 20),
         )
         job.sizes[: len(self.sizes)] = self.sizes
         job.phase_coefficients[:] = design.phase_coefficients.tolist()

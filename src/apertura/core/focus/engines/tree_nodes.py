@@ -1,4 +1,4 @@
-"""Nodes along the axes of a tile, the surface through its pixels, and polynomials of weights over it."""
+"""Nodes along the axes of a tile, and the surface through its pixels."""
 
 import ctypes
 from collections.abc import Iterator
@@ -11,10 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.common.contracts import Window
-from apertura.core.antenna.beam import Beams
-from apertura.core.antenna.illumination import illumination_mask
-from apertura.core.focus.engines.native_binding import TREE_GROUP, TreeJob, TreeTile, call
-from apertura.core.geometry.aperture import Aperture
+from apertura.core.focus.engines.native_binding import TreeJob, TreeTile, call
 
 # ---- Nodes along an axis of a tile, and interpolation between them
 #
@@ -182,6 +179,9 @@ def _sinc(band_rad: float, a: NDArray[np.float64], b: NDArray[np.float64]) -> ND
 
 # ---- Tiles, and the smooth surface through their pixels
 
+BY_TREE, DIRECTLY, WITHOUT_ECHO = range(3)
+"""Variant by which a group of pulses is summed over a tile: native/tree_job.hpp, TreeWay."""
+
 DEGREE = 6
 """Degree of a surface that is no plane."""
 
@@ -307,95 +307,3 @@ def _across(coefficients: NDArray[np.float64]) -> NDArray[np.float64]:
     across = np.cross(coefficients[0, 1], coefficients[1, 0])
     length = np.linalg.norm(across)
     return np.asarray(across / length if length else np.array([0.0, 0.0, 1.0]))
-
-
-# ---- Weights of antennas and sectors over tiles, as polynomials
-
-BY_TREE, DIRECTLY, UNWEIGHTED = range(3)
-"""Variant by which a group of pulses is summed over a tile: native/tree_job.hpp, TreeWay."""
-
-_TERMS = 4  # of ξ and of η
-_PLACES = np.cos(np.pi * (np.arange(_TERMS) + 0.5) / _TERMS)
-_BETWEEN = np.array([-1.0, -0.65, 0.0, 0.65, 1.0])
-_CURVE = 5  # degree of weights over the pulses of a leaf
-_CHECKED = 8  # of so many pulses one is evaluated between the places
-
-
-def weights_over(
-    beams: Beams, aperture: Aperture, surface: Surface, error_db: float
-) -> tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.uint8]]:
-    """Return the weight of each pulse over a tile, the variant of each group, and the groups that fewer cannot replace.
-
-    Parameters
-    ----------
-    beams, aperture
-        Of the same pulses.
-    surface
-        Of the tile.
-    error_db
-        Tolerated error of the polynomials, relative to the largest weight.
-
-    Returns
-    -------
-    weights
-        (pulse, 16) float32: factor of ξ^a η^b at 4·b + a.
-    variant
-        (group of 64 pulses,) uint8: by tree where polynomials are exact enough, unweighted where no pulse has weight.
-    each
-        (group,) uint8: 1 where weights do not change smoothly from pulse to pulse, so that fewer pulses cannot replace
-        them.
-
-    Notes
-    -----
-    Source: docs/theory/tree.md, "Weights".
-    """
-    at, between, to_terms, terms_between = _matrices()
-    values = beams.weight(aperture, _positions(surface, at))
-    terms = values @ to_terms.T
-    limit = 10 ** (error_db / 20) * 3  # the largest of an error is about three times its RMS
-    groups = -(-len(values) // TREE_GROUP)
-    largest, each = _by_group(values.max(axis=1)), np.zeros(groups, bool)
-    full = len(values) // TREE_GROUP  # pulses of an incomplete group are summed one by one anyway
-    each[:full] = _jumps(values[: full * TREE_GROUP]) > limit * largest[:full]
-    each[full:] = True
-    # Where weights jump every pulse is evaluated: polynomials may fail at one between two where they are exact.
-    some = np.flatnonzero(each[np.arange(len(values)) // TREE_GROUP] | (np.arange(len(values)) % _CHECKED == 0))
-    error, checked = np.zeros(len(values)), beams[some].weight(aperture[some], _positions(surface, between))
-    error[some] = np.abs(terms[some] @ terms_between.T - checked).max(axis=1)
-    radius_m = np.linalg.norm(_positions(surface, _BETWEEN) - surface.centre_m, axis=-1).max(keepdims=True)
-    illuminated = illumination_mask(beams, aperture, surface.centre_m[None], radius_m, pulses=TREE_GROUP)[:, 0]
-    # A beam may be narrower than what lies between the places, and end between two of them.
-    all_or_none = _by_group(((values == 0).any(axis=1) & (values != 0).any(axis=1)).astype(float)) == 0
-    exact = all_or_none & (largest > 0) & (_by_group(error) <= limit * largest)
-    variant = np.where(illuminated, np.where(exact, BY_TREE, DIRECTLY), UNWEIGHTED)
-    return np.ascontiguousarray(terms, np.float32), variant.astype(np.uint8), each.astype(np.uint8)
-
-
-def _by_group(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the largest value of each group of pulses."""
-    return np.asarray(np.maximum.reduceat(values, np.arange(0, len(values), TREE_GROUP)))
-
-
-def _jumps(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the largest deviation of the weights of groups of pulses from a curve over them, (group,)."""
-    grouped = values.reshape(len(values) // TREE_GROUP, TREE_GROUP, values.shape[1])
-    return np.asarray(np.abs(grouped - _curve() @ (_curve().T @ grouped)).max(axis=(1, 2)))
-
-
-@lru_cache
-def _curve() -> NDArray[np.float64]:
-    basis = np.polynomial.legendre.legvander(np.linspace(-1, 1, TREE_GROUP), _CURVE)
-    return np.asarray(np.linalg.qr(basis)[0])
-
-
-def _positions(surface: Surface, places: NDArray[np.float64]) -> NDArray[np.float64]:
-    basis = np.polynomial.legendre.legvander(places, len(surface.coefficients) - 1)
-    return np.asarray(np.einsum("ia,abk,jb->ijk", basis, surface.coefficients, basis).reshape(-1, 3))
-
-
-@lru_cache
-def _matrices() -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return places along an axis, those between them, values → terms, and terms → values between."""
-    powers, between = (np.vander(at, _TERMS, increasing=True) for at in (_PLACES, _BETWEEN))
-    inverse = np.linalg.inv(powers)
-    return _PLACES, _BETWEEN, np.asarray(np.kron(inverse, inverse)), np.asarray(np.kron(between, between))

@@ -10,11 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.core.focus.engines import native_prediction
-from apertura.core.focus.engines.engine import BEAM_S, Setting, option_values, power_sum_db
+from apertura.core.focus.engines.engine import Setting, option_values, power_sum_db
 from apertura.core.focus.engines.native_binding import TREE_DELAYS
 from apertura.core.focus.engines.native_prediction import pixel_steps
-from apertura.core.focus.engines.tree_inputs import LEAST_QUARTER_PX, cells, cells_per_sample, direct_setting, roughness
-from apertura.core.focus.engines.tree_nodes import DIRECTLY, UNWEIGHTED, Surface, surfaces_of, weights_over
+from apertura.core.focus.engines.tree_inputs import (
+    LEAST_QUARTER_PX,
+    cells,
+    cells_per_sample,
+    direct_setting,
+    roughness,
+    weighed,
+)
+from apertura.core.focus.engines.tree_nodes import BY_TREE, DIRECTLY, WITHOUT_ECHO, Surface, surfaces_of
 from apertura.core.focus.engines.tree_view import (
     LEAF,
     MOST_SHEETS,
@@ -31,6 +38,7 @@ from apertura.core.focus.job import Job, Signal
 # ---- Sample of tiles and chunks
 
 _TILES, _CHUNKS = 5, 3  # sampled for a prediction
+_GROUPS = 96  # of 64 pulses, whose weights over a tile are evaluated
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +49,7 @@ class SampledTiles:
     views: tuple[tuple[TileView, ...], ...]
     rough: tuple[float, ...]  # mean squared error by pixels off their surface
     sheets_rad: tuple[tuple[float, float], ...]  # band along heights, and phase of the deviation across them
-    groups: tuple[NDArray[np.int64], ...]  # some pulses of each chunk
+    groups: NDArray[np.int64]  # pulses of some groups of 64, spread over the flight
 
     @property
     def phase_rad(self) -> float:
@@ -58,25 +66,48 @@ def sample_tiles(job: Job, pulses: int, side_px: int, chunk: int) -> SampledTile
     patches = [np.ascontiguousarray(patch[seconds_of_image[0]]) for patch in _patches(job, side)]
     surfaces = tuple(surfaces_of(patch, seconds_of_image)[0] for patch in patches)
     places = np.linspace(0, len(job.aperture) - 1, pulses).astype(int)
-    starts = np.arange(0, pulses, chunk)
-    starts = starts[np.unique(np.linspace(0, len(starts) - 1, _CHUNKS).astype(int))]
+    groups = _groups(places)
     k, b = job.signal.wavenumber_rad_m, np.pi / (job.signal.step_m * job.signal.oversampling)
-    chunks = [job.aperture[places[start : start + chunk]] for start in starts]
     views = tuple(
         tuple(
-            view_of_tile(part, surface, subaperture_sizes(chunk), wavenumber_rad_m=k, band_rad_m=b) for part in chunks
+            view_of_tile(
+                job.aperture[places[start : start + chunk]],
+                surface,
+                subaperture_sizes(chunk),
+                wavenumber_rad_m=k,
+                band_rad_m=b,
+            )
+            for start in _starts(job, surface, groups, places, chunk)
         )
         for surface in surfaces
         if np.isfinite(surface.rough_m)
     )
     some = job.aperture[job.aperture.sample(64)]
-    groups = [places[start + at : start + at + LEAF] for start in starts for at in (0, chunk // 2 // LEAF * LEAF)]
     rough = tuple(roughness(some, surface, wavenumber_rad_m=k, band_rad_m=b) for surface in surfaces)
     sheets = tuple(
         _sheets(job, surface, patch, wavenumber_rad_m=k, band_rad_m=b)
         for surface, patch in zip(surfaces, patches, strict=True)
     )
-    return SampledTiles(surfaces, views, rough, sheets, tuple(group for group in groups if len(group)))
+    return SampledTiles(surfaces, views, rough, sheets, groups)
+
+
+def _groups(places: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the pulses of some whole groups, spread over a flight; of a flight shorter than one, all."""
+    count = len(places) // LEAF
+    numbers = np.unique(np.linspace(0, count - 1, min(count, _GROUPS)).astype(int))
+    return places[: count * LEAF].reshape(count, LEAF)[numbers].ravel() if count else places
+
+
+def _starts(
+    job: Job, surface: Surface, groups: NDArray[np.int64], places: NDArray[np.int64], chunk: int
+) -> NDArray[np.int64]:
+    """Return where some chunks begin that illuminate a tile."""
+    starts = np.arange(0, len(places), chunk)
+    if job.beams is not None:
+        found = weighed(job.beams[groups], job.aperture[groups], surface, _TYPICAL_DB)
+        first = np.searchsorted(places, groups[::LEAF][found.variant != WITHOUT_ECHO])
+        starts = np.unique(first // chunk * chunk) if len(first) else starts
+    return np.asarray(starts[np.unique(np.linspace(0, len(starts) - 1, _CHUNKS).astype(int))])
 
 
 def _sheets(
@@ -90,20 +121,47 @@ def _sheets(
     return band, wavenumber_rad_m * relief.aside_m
 
 
+@dataclass(frozen=True, eq=False)
+class SampledWeights:
+    """What weights make of some groups of pulses that illuminate a tile.
+
+    Attributes
+    ----------
+    directly
+        Share that goes to smaller tiles or directly.
+    edge
+        Share of the others at the edge of the sector.
+    slope
+        (3,) RMS of the depth there, as `Weighed.slope`; None without an edge.
+    each
+        Whether most have weights that jump from pulse to pulse.
+    """
+
+    directly: float = 0.0
+    edge: float = 0.0
+    slope: NDArray[np.floating] | None = None
+    each: bool = False
+
+
 @lru_cache(maxsize=256)
-def unsmooth_share(job: Job, sampled: SampledTiles, nodes_db: int) -> float:
-    """Return the share of the groups of pulses illuminating a tile whose weights are not polynomial over it."""
-    if job.beams is None:
-        return 0.0
+def sample_weights(job: Job, sampled: SampledTiles, nodes_db: int) -> tuple[SampledWeights, ...]:
+    """Return what weights make of the groups of pulses over each tile with a surface."""
     smooth = [surface for surface in sampled.surfaces if np.isfinite(surface.rough_m)]
-    variants = [
-        weights_over(job.beams[group], job.aperture[group], surface, nodes_db)[1]
-        for surface in smooth
-        for group in sampled.groups
-    ]
-    taken = np.concatenate([*variants, np.empty(0, np.uint8)])
-    taken = taken[taken != UNWEIGHTED]
-    return float((taken == DIRECTLY).mean()) if len(taken) else 0.0
+    return tuple(_sampled_weights(job, surface, sampled.groups, nodes_db) for surface in smooth)
+
+
+def _sampled_weights(job: Job, surface: Surface, groups: NDArray[np.int64], nodes_db: int) -> SampledWeights:
+    if job.beams is None:
+        return SampledWeights()
+    found = weighed(job.beams[groups], job.aperture[groups], surface, nodes_db)
+    illuminated, taken = found.variant != WITHOUT_ECHO, found.variant == BY_TREE
+    edge = taken & found.edge
+    return SampledWeights(
+        float((found.variant == DIRECTLY).sum() / max(1, illuminated.sum())),
+        float(edge.sum() / max(1, taken.sum())),
+        np.sqrt((found.slope[edge] ** 2).mean(axis=0)) if edge.any() else None,
+        bool(found.each[taken].mean() > 0.5) if taken.any() else False,
+    )
 
 
 def _patches(job: Job, side: int) -> list[NDArray[np.float64]]:
@@ -149,8 +207,10 @@ _LEAF_S = 6e-6  # a leaf over a tile: its plan
 _SURFACE_S = 1.6e-8  # a pixel's place, fitted
 _TILE_S = 4e-5  # a tile of a chunk
 _PIECEWISE = 1.1  # cost of direct sums tile by tile and chunk by chunk, relative to one call
-_WEIGHTS = 18  # of a pulse over a tile, each as `Beams.weight` takes it
+_ANTENNA_S = 5e-7  # a pulse's gains of one antenna over a tile, and their polynomial
+_EDGE = 1.6  # a look-up at the edge of a sector, relative to one inside
 _FORM_S = 4e-4  # a block of pixels
+_TYPICAL_DB = -74  # error of nodes by which chunks are chosen
 _SMALL = 1e8  # pixels × pulses that the direct kernel sums in less than that
 _START_S = 0.03  # the weights of all numbers of nodes that a job takes, once
 
@@ -274,7 +334,7 @@ def _cost(job: Job, pulses: int, options: _Options, direct_s: float) -> _Cost:
     seconds_of_image = _SURFACE_S * job.pixels + _FORM_S * job.tiles
     left, presum = 1.0, 0.0  # share that larger tiles did not sum
     while True:
-        weighed_s = job.weights * job.share * job.pixels / side**2 * pulses * _WEIGHTS * BEAM_S
+        weighed_s = job.antennas * job.share * job.pixels / side**2 * pulses * _ANTENNA_S
         taken = max(0.0, left - part.directly)
         seconds_of_image, presum = (
             seconds_of_image + taken * part.seconds + left * weighed_s,
@@ -292,23 +352,42 @@ def _by_tree(job: Job, pulses: int, options: _Options, side: int, direct_s: floa
     """Return the cost of tiles of one side; sheets are considered where `direct_s` is given."""
     sampled, chunks = sample_tiles(job, pulses, side, options.chunk), -(-pulses // options.chunk)
     work = _Work(min(pulses, options.chunk), side, min(job.tile_px, *job.shape) / side)
-    edge, limit = unsmooth_share(job, sampled, options.nodes_db), 10 ** (options.nodes_db / 20)
-    counted = partial(counts_of, nodes_db=options.nodes_db, presum_db=options.presum_db, weighted=job.beams is not None)
-    counts = [[counted(one) for one in here] for here in sampled.views]
+    weights, limit = sample_weights(job, sampled, options.nodes_db), 10 ** (options.nodes_db / 20)
+    counted = partial(counts_of, nodes_db=options.nodes_db, presum_db=options.presum_db, weighted=job.antennas > 0)
+    counts = [[counted(one, each=has.each) for one in here] for here, has in zip(sampled.views, weights, strict=True)]
+    at_edge = [
+        [counted(one, each=has.each, slope=has.slope) if has.edge else None for one in here]
+        for here, has in zip(sampled.views, weights, strict=True)
+    ]
+
+    def seconds_of(view: TileView, inside: Counts, edge: Counts | None, share: float) -> float:
+        parts = [(1 - share, inside, 1.0)] + ([(share, edge, _EDGE)] if edge and edge.nodes else [])
+        return chunks * sum(
+            part * cost * amount
+            for part, one_count, dearer in parts
+            for cost, amount in features(view, one_count, options, job.signal, work, dearer=dearer)
+        )
+
     costs = [
         [
-            chunks * sum(cost * amount for cost, amount in features(one, one_count, options, job.signal, work))
-            for one, one_count in zip(here, node_counts, strict=True)
+            seconds_of(one, one_count, edge, has.edge)
+            for one, one_count, edge in zip(here, node_counts, edges, strict=True)
             if one_count.nodes
         ]
-        for here, node_counts in zip(sampled.views, counts, strict=True)
+        for here, node_counts, edges, has in zip(sampled.views, counts, at_edge, weights, strict=True)
+    ]
+    too_steep = [[edge is not None and not edge.nodes for edge in edges] for edges in at_edge]
+    directly = [
+        1 - (1 - has.directly) * (1 - has.edge * float(np.mean(steep)))
+        for has, steep in zip(weights, too_steep, strict=True)
     ]
     once, read_s = float(np.mean([one for each in costs for one in each] or [np.inf])), _READ_S * side**2
     pay = min(MOST_SHEETS, int(pulses * side**2 * direct_s / (once + read_s))) if direct_s else 0
     sheets = pay if options.sheets is None or not direct_s else options.sheets
-    spent, share, presum, most, tiles = list[float](), list[float](), [0.0], 1, iter(zip(counts, costs, strict=True))
+    spent, share, presum, most = list[float](), list[float](), [0.0], 1
+    tiles = iter(zip(counts, costs, directly, strict=True))
     for surface, rough, (band, aside) in zip(sampled.surfaces, sampled.rough, sampled.sheets_rad, strict=True):
-        node_counts, cost = next(tiles) if np.isfinite(surface.rough_m) else ([], [])
+        node_counts, cost, edge = next(tiles) if np.isfinite(surface.rough_m) else ([], [], 0.0)
         layers = 1 if rough <= 2 * limit**2 else sheets_for(band, options.nodes_db) if aside <= limit else sheets + 1
         if layers > max(1, sheets):
             cost = []
@@ -321,9 +400,12 @@ def _by_tree(job: Job, pulses: int, options: _Options, side: int, direct_s: floa
 
 
 def features(
-    view: TileView, counts: Counts, options: _Options, signal: Signal, work: "_Work"
+    view: TileView, counts: Counts, options: _Options, signal: Signal, work: "_Work", *, dearer: float = 1.0
 ) -> list[tuple[float, float]]:
-    """Return the operations of a tree over one tile and one chunk: seconds of each, and their number."""
+    """Return the operations of a tree over one tile and one chunk: seconds of each, and their number.
+
+    `dearer` is the cost of a look-up relative to one inside a sector.
+    """
     leaves = [-(-work.pulses // size) for size in subaperture_sizes(options.chunk)]
     samples = view.span_m / signal.step_m + 6
     looked_up = leaves[0] * counts.fewer if counts.fewer else work.pulses
@@ -332,7 +414,7 @@ def features(
     columns, rows = counts.nodes[0]
     expand_s = _EXPAND_S if counts.fewer else _EACH_EXPAND_S / work.beside
     return [
-        (_NODE_S, looked_up * (-(-columns * rows // 16) * 16)),
+        (dearer * _NODE_S, looked_up * (-(-columns * rows // 16) * 16)),
         (expand_s, looked_up * samples * cells_of * options.taps / 16),
         (_ALIGN_S, aligned),
         (_MIX_S, _mixed(counts, leaves, work.side)),

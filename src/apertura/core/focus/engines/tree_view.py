@@ -7,7 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.common.contracts import Window
-from apertura.core.focus.engines.native_binding import TREE_FEWER, TREE_GROUP, TREE_MORE, TREE_TERMS
+from apertura.core.focus.engines.native_binding import (
+    TREE_FEWER,
+    TREE_GROUP,
+    TREE_MORE,
+    TREE_TERMS,
+    TREE_WEIGHTED,
+)
 from apertura.core.focus.engines.tree_nodes import MOST_NODES, Surface, nodes, pixel_places, supports, weights
 from apertura.core.geometry.aperture import Aperture
 
@@ -44,13 +50,13 @@ def parabola_deviation(leaves_m: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return (leaf,) largest distance of pulses from the parabola through the first, middle and last one, metres."""
     x, three = np.linspace(-1, 1, LEAF), [0, (LEAF - 1) // 2, LEAF - 1]
     to_all = np.vander(x, 3) @ np.linalg.inv(np.vander(x[three], 3))
-    rest = leaves_m - np.einsum("pt,ntc->npc", to_all, leaves_m[:, three])
+    rest = leaves_m - to_all @ leaves_m[:, three]
     return np.asarray(np.linalg.norm(rest, axis=-1).max(axis=1))
 
 
 def tracks(leaves_m: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return (leaf, term, 3) float64: the track over each leaf as orthonormal polynomials of the pulses' numbers."""
-    return np.asarray(np.einsum("pt,npc->ntc", _polynomials()[0], leaves_m))
+    return np.asarray(_polynomials()[0].T @ leaves_m)
 
 
 def leaf_roughness(one_m: NDArray[np.float64], other_m: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -82,8 +88,8 @@ def _widest(leaves_m: NDArray[np.float64]) -> NDArray[np.float64]:
     shifted, widest = leaves_m - leaves_m[:, :1], np.empty((len(leaves_m), len(DEGREES)))
     terms = tracks(shifted)
     for number, degree in enumerate(DEGREES):
-        rest = shifted - np.einsum("pt,ntc->npc", _polynomials()[0][:, : degree + 1], terms[:, : degree + 1])
-        widest[:, number] = np.linalg.eigvalsh(np.einsum("npc,npd->ncd", rest, rest) / LEAF)[:, -1]
+        rest = shifted - _polynomials()[0][:, : degree + 1] @ terms[:, : degree + 1]
+        widest[:, number] = np.linalg.eigvalsh(rest.swapaxes(1, 2) @ rest / LEAF)[:, -1]
     return np.maximum(widest, 0)
 
 
@@ -116,7 +122,6 @@ def _polynomials() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 _FEW, _MANY = 4, 8  # places along an axis at which a tile is evaluated
 _NEARBY = 0.5  # of the nearest antenna's distance that a plane tile's half diagonal may be for few
 _AIRY = 3.0  # units of eq. 4b
-_WEIGHTED = 1.5  # rad that weights add to a band: native/tree_job.hpp
 _SAMPLED_SUBAPERTURES = 3  # subapertures of a level, at most
 
 
@@ -286,6 +291,29 @@ def nodes_for(band_rad: NDArray[np.float64], error_db: int) -> NDArray[np.int64]
     return np.maximum(2, np.searchsorted(supports(error_db), band_rad))
 
 
+def widened_rad(slope: float, band_rad: NDArray[np.float64], nodes_db: float) -> NDArray[np.float64]:
+    """Return by how much the edge of a sector widens bands, rad: native/tree_weight.hpp.
+
+    Parameters
+    ----------
+    slope
+        Change of the depth in the edge per half tile.
+    band_rad
+        Without it, rad per half tile.
+
+    Notes
+    -----
+    Source: docs/theory/tree.md, eq. 13.
+
+    Examples
+    --------
+    >>> widened_rad(0.77, np.array([15.0]), -74).round(1)
+    array([20.3])
+    """
+    content = np.maximum(band_rad, 1.0) * 10 ** (nodes_db / 10)
+    return np.maximum(TREE_WEIGHTED, slope * (9 / (10 * np.pi) / content) ** 0.25)
+
+
 @dataclass(frozen=True)
 class Counts:
     """Numbers of nodes and pulses of one tile and one chunk.
@@ -305,18 +333,49 @@ class Counts:
     presum_rad: float
 
 
-def counts_of(view: TileView, *, nodes_db: int, presum_db: float, weighted: bool) -> Counts:
-    """Return the numbers of nodes of each level, and of pulses that replace those of a leaf."""
-    more = _WEIGHTED if weighted else 0.0
+def counts_of(
+    view: TileView,
+    *,
+    nodes_db: int,
+    presum_db: float,
+    weighted: bool,
+    slope: NDArray[np.floating] | None = None,
+    each: bool = False,
+) -> Counts:
+    """Return the numbers of nodes of each level, and of pulses that replace those of a leaf.
+
+    Parameters
+    ----------
+    view
+        Of the tile.
+    nodes_db, presum_db
+        Tolerated errors.
+    weighted
+        By antennas.
+    slope
+        (3,) of the depth in the edge of a sector, as `Weighed.slope`; None: inside of it.
+    each
+        Whether the pulses of a leaf are summed one by one.
+    """
+    more = TREE_WEIGHTED if weighted else 0.0
+
+    def wide(band_rad: NDArray[np.float64], *axes: int) -> NDArray[np.float64]:
+        band_rad = band_rad + more
+        if slope is None:
+            return band_rad
+        return band_rad + [
+            float(widened_rad(slope[axis], band, nodes_db)) for axis, band in zip(axes, band_rad, strict=True)
+        ]
+
     levels: list[tuple[int, int]] = []
     for band in view.bands_rad:
-        along, across = nodes_for(band + more, nodes_db)
+        along, across = nodes_for(wide(band, 0, 1), nodes_db)
         if max(along, across) > MOST_NODES:
             break
         levels.append((int(along), int(across)))
     smooth = np.flatnonzero(view.rough_rad <= 10 ** (presum_db / 20))
-    if len(smooth):
-        for_carrier = int(nodes_for(np.array([view.turn_rad + more]), nodes_db)[0])
+    if len(smooth) and not each:
+        for_carrier = int(nodes_for(wide(np.array([view.turn_rad]), 2), nodes_db)[0])
         fewer = max(DEGREES[smooth[0]] + TREE_MORE, for_carrier)
         if fewer <= TREE_FEWER:
             curve_followed = np.searchsorted(DEGREES, fewer - TREE_MORE, "right") - 1
