@@ -43,6 +43,17 @@ def test_every_flag_is_named_in_the_file_that_is_said_to_raise_it():
     assert lacking == []
 
 
+def test_the_page_from_symptom_to_remedy_names_flags_that_exist_and_those_that_say_an_image_is_wrong():
+    page = (ROOT / "docs/howto/me_or_the_radar.md").read_text(encoding="utf-8")
+    rows = [line.split(" | ") for line in page.splitlines() if line.startswith("| ") and "`" in line]
+    named = {flag for row in rows for flag in re.findall(r"`(\w+)`", row[1])}
+    assert all(re.findall(r"`\w+`", row[1]) and row[2].strip(" |") for row in rows)
+    assert named <= set(FLAGS)
+    from apertura.pipeline.steps.assess import _LOOKS_WRONG
+
+    assert {*_LOOKS_WRONG, "attitude_suspect", "outside_swath", "accuracy_missed", "wrong_code"} <= named
+
+
 def test_pages_that_come_from_the_code_are_as_they_would_be_written_now():
     other = [name for name, page in PAGES.items() if (ROOT / name).read_text(encoding="utf-8") != page()]
     assert other == [], "run: make pages"

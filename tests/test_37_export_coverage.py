@@ -1,7 +1,10 @@
 """What a campaign covers: polygons, GeoJSON and the picture of it."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from rasterio import Affine
 
 from apertura.formats.export.coverage import Covered, feature_collection, footprint, write_coverage
@@ -59,3 +62,45 @@ def test_the_picture_is_the_same_to_the_byte_and_shows_what_is_there(tmp_path):
         tmp_path / "less.png", several[2:], TRANSFORM, crs_name="UTM", title="campaign · coverage", tags=tags
     )
     assert (tmp_path / "less.png").read_bytes() != (tmp_path / "one.png").read_bytes()
+
+
+def drawn(monkeypatch, tmp_path, several, **how):
+    """Texts of the picture's panels: labels of axes and colour bars, and of the figure."""
+    figures = []
+    monkeypatch.setattr(Figure, "savefig", lambda self, path, **_: figures.append(self) or Path(path).write_bytes(b""))
+    tags = {"APERTURA_VERSION": "0.1.0"}
+    write_coverage(tmp_path / "map.png", several, TRANSFORM, crs_name="UTM", title="coverage", tags=tags, **how)
+    (figure,) = figures
+    labels = [text for axes in figure.axes for text in (axes.get_xlabel(), axes.get_ylabel()) if text]
+    return labels, [text.get_text() for text in figure.texts], figure
+
+
+def test_one_pair_has_one_panel_and_a_distant_scene_is_drawn_once_more(monkeypatch, tmp_path):
+    labels, words, figure = drawn(monkeypatch, tmp_path, [covered()])
+    assert labels == ["Easting, m", "Northing, m", "pulses that make a pixel"]
+    assert words[-2].startswith("80.0 % of the scene is seen by 1 pair of 1 flight;")
+    assert not figure.legends
+    far = np.stack([np.linspace(-400, 900, 9), np.full(9, -600.0), np.full(9, 30.0)], -1)
+    one = Covered("f01", "a-a", {"transmitter": far}, 7 * RING)
+    labels, _, figure = drawn(monkeypatch, tmp_path, [one])
+    assert labels[-1] == "pulses that make a pixel, the scene alone"
+    assert figure.axes[2].get_xlim() == (100, 120)
+
+
+def test_many_flights_have_a_legend_off_the_data_and_whole_numbers_of_pairs(monkeypatch, tmp_path):
+    several = [covered(f"f{number // 2:02d}") for number in range(40)]
+    _, words, figure = drawn(monkeypatch, tmp_path, several)
+    assert "seen by 40 pairs of 20 flights" in " ".join(words)
+    (legend,) = figure.legends
+    figure.canvas.draw()
+    box = legend.get_window_extent()
+    assert not any(box.overlaps(axes.get_tightbbox()) for axes in figure.axes)
+    assert not any(box.overlaps(text.get_window_extent()) for text in figure.texts)
+    ticks = figure.axes[3].get_yticks()
+    np.testing.assert_array_equal(ticks, ticks.round())
+
+
+def test_a_local_frame_has_x_and_y_and_no_north(monkeypatch, tmp_path):
+    labels, words, _ = drawn(monkeypatch, tmp_path, [covered()], local=True)
+    assert labels[:2] == ["x, m", "y, m"]
+    assert "N" not in words

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import xarray as xr
 import yaml
-from folders import complaint, run_steps
+from folders import complaint, edit_config, run_steps
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.geometry.geodesy import ecef_from_projected, geodetic_from_ecef
@@ -126,6 +126,13 @@ def test_the_check_tells_of_pulses_that_no_log_places(campaign):
     assert "begins 3.440 s after the first pulse" in told[0]
     (campaign / "raw/f01/uav1.track.csv").unlink()
     assert "samples without positions" in str(problems(campaign)[0])
+
+
+def test_a_track_at_the_height_of_the_ground_is_refused_before_the_run(campaign):
+    """A planar rail: its log alone tells that the antenna lies in the ground."""
+    edit_config(campaign, lambda document: document["scene"].update(height_m=510.0))
+    told = [str(problem) for problem in problems(campaign)]
+    assert any("uav1: 0.0 m above the ground" in one or "uav1: -0.0 m above the ground" in one for one in told)
 
 
 def test_a_log_that_does_not_cover_the_pulses_is_told_of_with_the_clock(campaign):

@@ -13,7 +13,8 @@ _HEAD = """# Command line
 
 `apertura COMMAND --help` says the same. Exit codes: 0, done; 2, something for you to fix, in one message;
 130, ended by a signal; 1, what `verify`, `diff` or `reproduce` compared is
-not the same, or a defect of apertura. Where a campaign folder is an argument, it is the one in hand unless named. Written by `make pages` from the commands.
+not the same, or a defect of apertura. A campaign folder that is not named is the one in hand.
+Written by `make pages` from the commands.
 """
 
 

@@ -36,7 +36,8 @@ def main() -> None:
     if reason:
         print(f"no cluster test: {reason}")
         return
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # daemons are ended on the way out
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, lambda one, _: sys.exit(128 + one))  # daemons are ended on the way out
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(sys.argv[1] if sys.argv[1:] else scratch)
         campaign = simulated(folder)

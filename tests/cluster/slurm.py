@@ -46,7 +46,7 @@ def running(root: Path) -> Iterator[None]:
     """Run a Slurm whose files lie in a folder."""
     for folder in ("ctld", "log", *(f"spool/{node}" for node in NODES)):
         (root / folder).mkdir(parents=True, exist_ok=True)
-    _munge()
+    munged = _munge()
     template = Path(__file__).with_name("slurm.conf.in").read_text(encoding="utf-8")
     host = said("hostname", "-s")
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2**20 // 2 - 256
@@ -62,12 +62,18 @@ def running(root: Path) -> Iterator[None]:
         wait_for("both nodes idle", lambda: all(state(node) == "idle" for node in NODES))
         yield
     finally:
+        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+            signal.signal(number, signal.SIG_IGN)  # a second one, as `make` sends it, leaves no daemon behind
         for name in (*(f"slurmd.{node}" for node in NODES), "slurmctld"):
             _end(root / f"{name}.pid", signal.SIGTERM)
-        CONF.unlink()
+        if munged:
+            _end(Path("/run/munge/munged.pid"), signal.SIGTERM)
+        CONF.unlink(missing_ok=True)
 
 
-def _munge() -> None:
+def _munge() -> bool:
+    """See to it that munge works; return whether it was started here."""
+
     def works() -> bool:
         return subprocess.run("munge -n | unmunge", shell=True, capture_output=True, check=False).returncode == 0
 
@@ -76,6 +82,8 @@ def _munge() -> None:
         shutil.chown("/run/munge", "munge", "munge")
         said("su", "-s", "/bin/sh", "munge", "-c", "/usr/sbin/munged")
         wait_for("munge", works)
+        return True
+    return False
 
 
 def start(node: str) -> None:

@@ -42,8 +42,9 @@ export class Places {
     return errors.length ? Math.max(...errors) : Infinity;
   }
 
-  /** Easting and northing in words. */
+  /** Easting and northing in words; x and y where nothing is north. */
   words([x, y]) {
+    if (!this.toGeographic) return `x ${number(x, this.decimals)} m  y ${number(y, this.decimals)} m`;
     return `E ${number(x, this.decimals)} m  N ${number(y, this.decimals)} m`;
   }
 

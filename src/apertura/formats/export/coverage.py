@@ -16,12 +16,14 @@ from rasterio.features import shapes
 from rasterio.transform import array_bounds
 
 from apertura.common.atomic import replacement
+from apertura.common.errors import number_of
 from apertura.formats.export.map_layout import DPI, MapLayout
 
 MARGIN = 0.04
 """Left free around tracks and scene, of the longer side."""
 
 _NAMED = 8  # flights in the legend
+_SMALL = 0.25  # of the map's longer side: a smaller scene is drawn once more by itself
 _COLOURS = tuple(colormaps["tab10"](number) for number in range(10))
 
 Ring = NDArray[np.float64]
@@ -137,9 +139,16 @@ def _rounded(places: NDArray[np.float64], *, heights: bool = False) -> list[list
 
 
 def write_coverage(
-    path: Path, covered: Sequence[Covered], transform: Affine, *, crs_name: str, title: str, tags: Mapping[str, str]
+    path: Path,
+    covered: Sequence[Covered],
+    transform: Affine,
+    *,
+    crs_name: str,
+    title: str,
+    tags: Mapping[str, str],
+    local: bool = False,
 ) -> None:
-    """Draw two maps as a PNG: pulses of all pairs at each place, and how many pairs illuminate it.
+    """Draw as a PNG the pulses of all pairs at each place, and beside it how many pairs see it, or the scene by itself.
 
     Parameters
     ----------
@@ -155,28 +164,35 @@ def write_coverage(
         What is drawn.
     tags
         Provenance, name → text; lies in the file.
+    local
+        Whether the map has no place on Earth.
     """
     total = np.sum([one.looks for one in covered], axis=0)
     pairs = np.sum([one.looks > 0 for one in covered], axis=0)
     flights = {name: number for number, name in enumerate(dict.fromkeys(one.flight for one in covered))}
+    bounds, scene = _bounds(covered, total.shape, transform), array_bounds(*total.shape, transform)
+    small = max(scene[2] - scene[0], scene[3] - scene[1]) < _SMALL * max(bounds[2] - bounds[0], bounds[3] - bounds[1])
+    looks_label = f"pulses that make a pixel{', all pairs' if len(covered) > 1 else ''}"
     with matplotlib.style.context("default"):
-        first = MapLayout.for_bounds(_bounds(covered, total.shape, transform), maps=2)
-        second = first.beside()
-        _draw(first, total, transform, "viridis", "pulses that make a pixel, all pairs")
-        _draw(second, pairs, transform, "YlGnBu", f"pairs that see a pixel, of {len(covered)}", counts=True)
-        for layout in (first, second):
+        maps = [MapLayout.for_bounds(bounds, maps=2 if small or len(covered) > 1 else 1, local=local)]
+        _draw(maps[0], total, transform, "viridis", looks_label)
+        if small or len(covered) > 1:
+            maps.append(maps[0].beside(scene if small else None))
+        if len(covered) > 1:
+            _draw(maps[1], pairs, transform, "YlGnBu", f"pairs that see a pixel, of {len(covered)}", counts=True)
+        elif small:
+            _draw(maps[1], total, transform, "viridis", f"{looks_label}, the scene alone")
+        for number, layout in enumerate(maps):
             _draw_lines(layout, covered, transform, flights)
-        first.draw_frame(crs_name)
-        second.draw_frame("")
-        first.draw_scale_and_north()
-        second.axes.legend(*_legend(flights), loc="upper left", fontsize=7, framealpha=0.85)
-        share = (
-            f"{100 * float((pairs > 0).mean()):.1f} % of the scene is seen by {len(covered)} pairs of {len(flights)}"
-        )
-        subtitle = f"{share} flight{'s' if len(flights) > 1 else ''}; lines: tracks (dashed: receiver) and footprints"
-        first.write_words(title, subtitle, f"apertura {tags['APERTURA_VERSION']}")
+            layout.draw_frame("" if number else crs_name)
+        maps[0].draw_scale_and_north()
+        if len(flights) > 1:
+            maps[0].draw_legend(*_legend(flights))
+        share = f"{100 * float((pairs > 0).mean()):.1f} % of the scene is seen by {number_of(len(covered), 'pair')}"
+        subtitle = f"{share} of {number_of(len(flights), 'flight')}; lines: tracks (dashed: receiver) and footprints"
+        maps[0].write_words(title, subtitle, f"apertura {tags['APERTURA_VERSION']}")
         with replacement(path) as temporary:
-            first.figure.savefig(temporary, dpi=DPI, metadata={"Title": title, **dict(sorted(tags.items()))})
+            maps[0].figure.savefig(temporary, dpi=DPI, metadata={"Title": title, **dict(sorted(tags.items()))})
 
 
 def _bounds(covered: Sequence[Covered], shape: tuple[int, ...], transform: Affine) -> tuple[float, float, float, float]:

@@ -7,6 +7,7 @@ from pathlib import Path
 import matplotlib.style
 import numpy as np
 from numpy.typing import NDArray
+from pyproj import CRS
 from rasterio import Affine
 from rasterio.transform import array_bounds
 
@@ -102,8 +103,9 @@ def write_panels(
     placed(first, transform, crs)
     every = -(-max(first.shape) // PICTURE_DOTS)
     west, south, east, north = array_bounds(*first.shape, transform)
+    known = CRS.from_user_input(crs)
     with matplotlib.style.context("default"):
-        layout = whole = MapLayout.for_bounds((west, south, east, north), maps=len(_PANELS))
+        layout = whole = MapLayout.for_bounds((west, south, east, north), maps=len(_PANELS), local=known.is_engineering)
         for at, (name, words, colours, ends) in enumerate(_PANELS):
             layout = layout.beside() if at else whole
             thin = panels[name][::every, ::every]

@@ -40,6 +40,8 @@ class MapLayout:
         Scale of the picture.
     left
         Margin left of it.
+    local
+        Whether its axes are x and y of a frame of its own, where no direction is north.
     """
 
     figure: Figure
@@ -47,9 +49,12 @@ class MapLayout:
     bounds: tuple[float, float, float, float]
     inch_per_m: float
     left: float = LEFT
+    local: bool = False
 
     @classmethod
-    def for_bounds(cls, bounds: tuple[float, float, float, float], *, maps: int = 1) -> "MapLayout":
+    def for_bounds(
+        cls, bounds: tuple[float, float, float, float], *, maps: int = 1, local: bool = False
+    ) -> "MapLayout":
         """Return an empty layout on which the longer side of `bounds` is `LONGER_SIDE`, with room for `maps`."""
         west, south, east, north = bounds
         scale = LONGER_SIDE / max(east - west, north - south)
@@ -60,24 +65,28 @@ class MapLayout:
         FigureCanvasAgg(figure)
         bottom = height - TOP - high
         axes = figure.add_axes((LEFT / width, bottom / height, wide / width, high / height))
-        return cls(figure, axes, bounds, scale)
+        return cls(figure, axes, bounds, scale, local=local)
 
-    def beside(self) -> "MapLayout":
-        """Return the layout of the next map of the same place, right of this one."""
-        place = self.axes.get_position()
-        wide = (self.bounds[2] - self.bounds[0]) * self.inch_per_m
-        left = self.left + max(wide, LEAST_WIDTH) + RIGHT + LEFT
-        width = self.figure.get_size_inches()[0]
-        axes = self.figure.add_axes((left / width, place.y0, place.width, place.height))
-        return replace(self, axes=axes, left=left)
+    def beside(self, bounds: tuple[float, float, float, float] | None = None) -> "MapLayout":
+        """Return the layout of the next map, right of this one: of the same place, or of a part as large as fits."""
+        width, height = self.figure.get_size_inches()
+        room = [(self.bounds[2 + side] - self.bounds[side]) * self.inch_per_m for side in (0, 1)]
+        left = self.left + max(room[0], LEAST_WIDTH) + RIGHT + LEFT
+        shown, scale = bounds or self.bounds, self.inch_per_m
+        if bounds is not None:
+            room = [max(room[0], LEAST_WIDTH), max(room[1], LEAST_HEIGHT)]
+            scale = min(one / (shown[2 + side] - shown[side]) for side, one in enumerate(room))
+        wide, high = ((shown[2 + side] - shown[side]) * scale for side in (0, 1))
+        place = (left / width, (height - TOP - high) / height, wide / width, high / height)
+        return replace(self, axes=self.figure.add_axes(place), left=left, bounds=shown, inch_per_m=scale)
 
     def draw_frame(self, crs_name: str) -> None:
         """Label the axes in metres from a round number, so that UTM coordinates stay readable."""
         west, south, east, north = self.bounds
         self.axes.set(xlim=(west, east), ylim=(south, north), aspect="equal")
         for name, axis, low, high in (
-            ("Easting", self.axes.xaxis, west, east),
-            ("Northing", self.axes.yaxis, south, north),
+            ("x" if self.local else "Easting", self.axes.xaxis, west, east),
+            ("y" if self.local else "Northing", self.axes.yaxis, south, north),
         ):
             origin = round_origin(low, high)
             length = (high - low) * self.inch_per_m
@@ -98,7 +107,7 @@ class MapLayout:
         return bar
 
     def draw_scale_and_north(self) -> None:
-        """Draw a bar of a round length and an arrow to grid north below the picture, where they hide nothing."""
+        """Draw a bar of a round length and, on a map, an arrow to grid north below the picture."""
         metres = round_length(2.0 / self.inch_per_m)
         length = metres * self.inch_per_m
         for part, colour in enumerate(("black", "white")):
@@ -107,6 +116,8 @@ class MapLayout:
             bar.set_transform(self.figure.dpi_scale_trans)
             self.figure.add_artist(bar)
         self._write(LEFT + length + 0.1, 0.85, f"{number(metres)} m", size=9)
+        if self.local:
+            return
         x = self.figure.get_size_inches()[0] - 0.4
         arrow = Polygon(
             [(x, 0.98), (x - 0.09, 0.62), (x, 0.7), (x + 0.09, 0.62)],
@@ -115,6 +126,13 @@ class MapLayout:
         )
         self.figure.add_artist(arrow)
         self._write(x, 1.02, "N", size=10, weight="bold", ha="center")
+
+    def draw_legend(self, lines: Sequence[Any], names: Sequence[str]) -> None:
+        """Draw a legend below the picture, beside the scale bar."""
+        width, height = self.figure.get_size_inches()
+        self.figure.legend(
+            lines, names, loc="center right", bbox_to_anchor=((width - 0.7) / width, 0.78 / height), ncols=3, fontsize=7
+        )
 
     def draw_markers(self, markers: Iterable[Marker]) -> None:
         """Ring and label places of the scene."""

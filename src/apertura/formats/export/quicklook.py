@@ -75,7 +75,9 @@ def write_quicklook(
     rows, columns = (factor * size for size in mean.shape)  # the last groups may reach beyond the image
     north, west = transform.f, transform.c
     with matplotlib.style.context("default"):
-        layout = MapLayout.for_bounds(array_bounds(*image.shape, transform))
+        layout = MapLayout.for_bounds(
+            array_bounds(*image.shape, transform), local=CRS.from_user_input(crs).is_engineering
+        )
         picture = layout.axes.imshow(
             np.ma.masked_invalid(decibel),
             extent=(west, west + columns * transform.a, north + rows * transform.e, north),

@@ -191,14 +191,18 @@ def check_aperture(examined: Examination) -> Iterator[CampaignError]:
 
 
 def check_ground(examined: Examination) -> Iterator[CampaignError]:
-    """Yield image flights of which a node is below the ground at most of its pulses, or higher than 30 km above it."""
+    """Yield image flights of which a node is in or below the ground at most pulses, or higher than 30 km above it."""
     waveform, grid, ground = examined.waveform, examined.grid, examined.ground
-    if waveform is None or grid is None or ground is None:
+    if grid is None or ground is None:
         return
     terrain: Terrain = ground.dem or FlatGround(examined.level_m)
     for flight in examined.campaign.image_flights:
         places: dict[str, NDArray[np.float64]] = {}
         for node in flight.nodes:
+            if waveform is None:  # pulses carry their times in files that are not read here: all epochs, then
+                track = examined.tracks.get((flight.name, node))
+                places |= {} if track is None else {node: track.position.values}
+                continue
             aperture = pair_aperture(examined, flight, node, waveform)
             places |= dict(zip((flight.transmitter, node), aperture.legs, strict=True)) if aperture else {}
         wrong = {}

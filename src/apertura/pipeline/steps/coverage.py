@@ -36,7 +36,8 @@ def coverage(campaign: Campaign) -> list[Path]:
     picture, features = written = [campaign.result(name) for name in COVERAGE]
     tags = tags_of(Provenance.of(lineage.modules, settings=scene.spec, inputs=scene.inputs), lineage)
     title = f"{campaign.settings.campaign} · coverage"
-    write_coverage(picture, covered, transform, crs_name=crs_name(scene.grid), title=title, tags=tags)
+    local = scene.grid.crs == LOCAL
+    write_coverage(picture, covered, transform, crs_name=crs_name(scene.grid), title=title, tags=tags, local=local)
     found = feature_collection(covered, transform, place_of(scene), height_m=scene.level.height_m)
     with replacement(features) as temporary:
         temporary.write_text(canonical_json(found) + "\n", encoding="utf-8")

@@ -73,7 +73,7 @@ def draw_points(points: Sequence[Point], path: Path, *, title: str, accuracy_db:
     axes.set_ylabel("Error against the double sum: upper bound at 95 %, dB")
     axes.set_title(title, fontsize=11)
     axes.grid(which="both", alpha=0.25)
-    axes.legend(fontsize=9)
+    figure.legend(loc="outside lower center", ncols=2, fontsize=9)
     save_png(figure, path)
 
 

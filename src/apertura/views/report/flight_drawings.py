@@ -45,6 +45,8 @@ class FlownGeometry:
         Rings (vertex, 2) of map metres about what the pulses make.
     crs_name
         Of the map.
+    local
+        Whether it has no place on Earth.
     """
 
     time_s: NDArray[np.float64]
@@ -54,6 +56,7 @@ class FlownGeometry:
     target_m: NDArray[np.float64]
     footprint: Sequence[NDArray[np.float64]]
     crs_name: str
+    local: bool = False
 
     @property
     def middle_m(self) -> NDArray[np.float64]:
@@ -110,22 +113,25 @@ def _draw_plan(axes: Axes, flown: FlownGeometry) -> None:
         axes.plot(*track[:, :2].T, label=name, **_STYLES[name])
         axes.plot(*track[0, :2], "o", color=_STYLES[name]["color"], markersize=4)
     axes.plot(*flown.target_m[:2], "*", color=RED, markersize=9, label="brightest target")
-    for name, axis, at in (("Easting", axes.xaxis, x), ("Northing", axes.yaxis, y)):
+    names = ("x", "y") if flown.local else ("Easting", "Northing")
+    for name, axis, at in zip(names, (axes.xaxis, axes.yaxis), (x, y), strict=True):
         origin = round_origin(at - half, at + half)
         axis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
         axis.set_major_formatter(FuncFormatter(partial(from_origin, origin)))
         axis.set_label_text(f"{name} − {number(origin)}, m" if origin else f"{name}, m")
-    _draw_scale_and_north(axes)
+    _draw_scale_and_north(axes, north=not flown.local)
     axes.set_xlabel(f"{axes.get_xlabel()}\n{flown.crs_name}")
 
 
-def _draw_scale_and_north(axes: Axes) -> None:
-    """Draw a bar of a round length and an arrow to grid north, inside the lower corners."""
+def _draw_scale_and_north(axes: Axes, *, north: bool) -> None:
+    """Draw a bar of a round length and, where there is one, an arrow to grid north, inside the lower corners."""
     low, high = axes.get_xlim()
     metres = round_length((high - low) / 4)
     part = metres / (high - low)
     axes.add_patch(Rectangle((0.05, 0.04), part, 0.015, transform=axes.transAxes, facecolor="black", zorder=5))
     axes.text(0.05 + part / 2, 0.07, f"{number(metres)} m", transform=axes.transAxes, ha="center", fontsize=7)
+    if not north:
+        return
     arrow = {"arrowstyle": "-|>", "color": "black"}
     axes.annotate("", (0.94, 0.13), (0.94, 0.02), xycoords="axes fraction", arrowprops=arrow)
     axes.text(0.94, 0.13, "N", transform=axes.transAxes, ha="center", fontsize=8, weight="bold")

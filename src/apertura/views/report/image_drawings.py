@@ -265,6 +265,9 @@ def draw_budget(
         figure.legend(handles, labels, loc="outside lower center", ncols=2, frameon=False)
 
 
+_SHORT = 0.01  # below which a number is written with its exponent: three labels find room below an axis
+
+
 def _draw_causes(axes: Axes, lines: Sequence[Mapping[str, Any]], measure: str) -> None:
     least, places = _LEAST[measure], np.arange(len(lines))
     sizes = [abs(line[measure]) if line[measure] is not None else 0.0 for line in lines]
@@ -278,9 +281,11 @@ def _draw_causes(axes: Axes, lines: Sequence[Mapping[str, Any]], measure: str) -
             axes.text(1.2 * least, place, words, va="center", fontsize=6, color=GREY)
     axes.set_yticks(places, [line["cause"] for line in lines])
     axes.set(xscale="log", xlim=(least, 2 * highest), ylim=(len(lines) - 0.4, -0.6), xlabel=_LABELS[measure])
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _position: f"{value:g}"))
+    axes.xaxis.set_major_formatter(
+        FuncFormatter(lambda value, _position: f"{value:.0e}" if value < _SHORT else f"{value:g}")
+    )
     axes.xaxis.set_minor_formatter(NullFormatter())
-    axes.xaxis.set_major_locator(LogLocator(numticks=5))
+    axes.xaxis.set_major_locator(LogLocator(numticks=4))
     axes.grid(visible=False, axis="y")
 
 

@@ -14,7 +14,7 @@ from apertura.common.arrays import Floats
 from apertura.common.progress import progress
 from apertura.common.provenance import Provenance
 from apertura.core.focus.contributions import block_contributions
-from apertura.core.geometry.geodesy import map_from_frame
+from apertura.core.geometry.geodesy import LOCAL, map_from_frame
 from apertura.core.imaging.range_profiles import aperture_of, profiles_of
 from apertura.formats.export.coverage import footprint
 from apertura.pipeline.campaign import Campaign
@@ -146,6 +146,7 @@ class Shown:
             np.array(map_from_frame(grid.crs, self._target_m[0])),
             [ring for polygon in rings for ring in polygon],
             crs_name(grid),
+            grid.crs == LOCAL,
         )
 
     def record(self) -> PulseRecord:
