@@ -254,6 +254,13 @@ def multilook(place: JobPlace) -> Mapping[str, Any]:
     return {"multilook": stated} if stated else {}
 
 
+def noise_of_sums(place: JobPlace) -> Iterable[str]:
+    """Return the manifests of what states the noise of a flight's images, where it is taken off their sums."""
+    asked = place.campaign.settings.processing.multilook
+    subtracted = asked is not None and asked.subtract_noise
+    return [place.campaign.manifest("layers", *pair) for pair in place.pairs] if subtracted else []
+
+
 def measured_image(place: JobPlace) -> Iterable[str]:
     """Return the image that is calibrated, with what was sent and the file of constants, or averaged; else nothing."""
     campaign, files = place.campaign, list[Path]()

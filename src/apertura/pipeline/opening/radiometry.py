@@ -173,11 +173,13 @@ class CalibratedPair:
         figure_db = 10 * float(np.log10(own / self.thermal_noise))
         of_own_db = float(np.hypot(noise_std_db(pulses) * pulse_noise, _SIDELINK_STD_DB * self.sidelink_noise)) / own
         said |= {"noise_figure_measured_db": round(figure_db, 2), "std_db": round(of_own_db, 2)}
+        # Jitter of tags and positions spreads bright echoes, too: of a bistatic pair the noise is an upper bound.
+        bound = bound or self.noise_figure_db is None or self.sidelink_noise > 0
         # Nobody who states no figure has a receiver below 0 dB.
         apart_db = figure_db - (self.noise_figure_db or 0.0)
         radio_db = _UNSTATED_STD_DB if self.radio_std_db is None else self.radio_std_db
         std_db = float(np.hypot(of_own_db, np.hypot(radio_db, _FIGURE_STD_DB)))
-        if abs(apart_db) <= DRIFT_SIGMAS * std_db or (apart_db > 0 and (bound or self.noise_figure_db is None)):
+        if abs(apart_db) <= DRIFT_SIGMAS * std_db or (apart_db > 0 and bound):
             return said, Flags()
         than = "the noise figure stated" if self.noise_figure_db is not None else "a receiver of 0 dB"
         line = f"the noise measured is that of {figure_db:.1f} dB, {apart_db:+.1f} dB of {than} ± {std_db:.1f} dB"
