@@ -443,3 +443,24 @@ def test_a_reflector_is_stated_whole(tiny, keys, told):
 
 def test_reflectors_are_stated_before_they_are_measured(tiny):
     assert "no reflectors" in complaint(lambda: measured_constants(Campaign.load(tiny)))
+
+
+@pytest.mark.slow
+def test_a_reflector_measures_no_polarisation_that_it_does_not_return(measured, tmp_path):
+    """What a trihedral or sphere sends back of H is H: in HV only leaks are seen, and no constant follows."""
+    root = copy_writable(measured.root, tmp_path / "campaign")
+
+    def received(letter):
+        def change(document):
+            for node in document["nodes"].values():
+                node["antennas"] |= {"radar_tx_polarisation": "H", "radar_rx_polarisation": letter}
+
+        edit_config(root, change)
+        return Campaign.load(root)
+
+    assert "HV: such a reflector sends nothing back" in complaint(lambda: measured_constants(received("V")))
+    constants, _ = measured_constants(received("H"))
+    own = constants.pairs["uav1-uav1"].radar
+    assert own.polarisation == "HH"
+    assert own.differs(own.model_copy(update={"polarisation": "VV"})) == "polarisation is VV and was HH"
+    assert own.differs(own.model_copy(update={"polarisation": None})) is None

@@ -225,7 +225,7 @@ _RADIO = frozenset({"antennas", "transmit_power_dbm", "receiver", "amplitude_std
 
 def radio(place: JobPlace) -> Mapping[str, Any]:
     """Return the radios of the pairs and what is made of them; nothing where images are relative."""
-    from apertura.pipeline.config import Receiver, radio_of
+    from apertura.pipeline.config import Receiver, polarisation_of, radio_of
 
     campaign = place.campaign
     if not campaign.calibrated:
@@ -236,6 +236,7 @@ def radio(place: JobPlace) -> Mapping[str, Any]:
         for _, pair in place.pairs
         for key, value in radio_of(nodes, pair).items()
     }
+    stated |= {pair: label for _, pair in place.pairs if (label := polarisation_of(nodes, pair))}
     stated |= {f"nodes.{node}.amplitude_std_db": nodes[node].amplitude_std_db for (_, node) in place.below(Scope.NODE)}
     processing = campaign.settings.processing
     measured = {"radiometric_calibration": named} if (named := processing.radiometric_calibration) else {}

@@ -24,6 +24,7 @@ from apertura.pipeline.config.nodes import (
     PathOffsets,
     Receiver,
     check_radio,
+    polarisation_of,
     radio_of,
 )
 from apertura.pipeline.config.processing import (
@@ -76,6 +77,7 @@ __all__ = [
     "check_interferometry",
     "check_radio",
     "located",
+    "polarisation_of",
     "radio_of",
     "read_clocks",
     "read_flights",

@@ -11,7 +11,7 @@ from apertura.common.errors import CampaignError
 from apertura.common.provenance import sha256_file
 from apertura.core.echo.compression import centre_frequency
 from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.config import SampledWaveform
+from apertura.pipeline.config import SampledWaveform, polarisation_of
 from apertura.pipeline.opening.pair import OpenPair
 from apertura.pipeline.opening.transmitted import transmitted
 
@@ -49,6 +49,7 @@ class Radar(_Part):
     subcarriers: int
     sent_power: float | None
     antennas: Mapping[str, AntennaShape]
+    polarisation: Annotated[str, Field(pattern="^[HVLR]{2}$")] | None = None
 
     @classmethod
     def of(cls, campaign: Campaign, opened: OpenPair) -> "Radar":
@@ -68,6 +69,7 @@ class Radar(_Part):
             subcarriers=len(frequency),
             sent_power=sent,
             antennas=shapes,
+            polarisation=polarisation_of(campaign.settings.nodes, opened.name),
         )
 
     def differs(self, other: "Radar") -> str | None:
@@ -81,6 +83,8 @@ class Radar(_Part):
         """
         for name in type(self).model_fields:
             was, now = getattr(self, name), getattr(other, name)
+            if name == "polarisation" and None in (was, now):
+                continue  # nobody said that it is another
             numbers = isinstance(was, float) and isinstance(now, float)
             if not (abs(was - now) <= _SAME * abs(was) if numbers else was == now):
                 words = [f"{one:g}" if isinstance(one, float) else str(one) for one in (now, was)]

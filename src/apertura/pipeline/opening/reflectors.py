@@ -35,6 +35,10 @@ REACH_CELLS = 2.0
 """How far from where it is expected a reflector is searched for, resolution cells, beside three standard deviations of
 its place."""
 
+_ODD = {"HH", "VV", "LR", "RL"}
+RETURNED = {"trihedral": _ODD, "sphere": _ODD, "dihedral": {"HH", "VV", "LL", "RR"}}
+"""Polarisations, sent and received, in which the formulas hold: a reflection turns the other way round."""
+
 _LEAST_CHANCE = 0.0027  # of reflectors that differ as much: three standard deviations
 _FOLLOWED_M = 1e-4  # pixels: where the place that focuses a reflector above ground is settled
 _ROUNDS = 12
@@ -96,7 +100,11 @@ def measured_constants(campaign: Campaign) -> tuple[Constants, list[str]]:
             radars.setdefault(pair, Radar.of(campaign, opened))
             view, measured = _View.of(campaign, opened, scene), list[Measurement]()
             for one in stated:
-                result = view.at(one)
+                label = radars[pair].polarisation
+                if label and label not in RETURNED[one.kind]:
+                    result: Measurement | str = f"{label}: such a reflector sends nothing back in it"
+                else:
+                    result = view.at(one)
                 if isinstance(result, str):
                     left_out.append(f"{flight.name} {pair} {one.name}: {result}")
                 else:

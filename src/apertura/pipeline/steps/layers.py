@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,7 @@ from apertura.formats.export import product, remove_outdated, write_exports
 from apertura.formats.export.layers import OUTSIDE
 from apertura.formats.export.radiometry import CROSS_SECTIONS, ECHO, of_coefficient
 from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.config import polarisation_of
 from apertura.pipeline.config.processing import Multilooking
 from apertura.pipeline.lineage import result_of
 from apertura.pipeline.opening.pair import open_pair, pattern_digests
@@ -77,19 +79,20 @@ def layers(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> l
             )
         )
 
-    std_db = None if calibrated is None else calibrated.std_db
-    absolute = {} if calibrated is None else {"nesz": of_coefficient("sigma0", std_db=std_db, noise="alone")}
+    label, std_db = polarisation_of(campaign.settings.nodes, pair), None if calibrated is None else calibrated.std_db
+    means_of = partial(of_coefficient, std_db=std_db, polarisation=label)
+    absolute = {} if calibrated is None else {"nesz": means_of("sigma0", noise="alone")}
     write("layers", _rasters(scene, looks, noise, calibrated, threads=threads), absolute)
     if image is not None:
         powers, means = dict[str, GroundPower](), dict[str, Mapping[str, Any]]()
         if calibrated is not None:
             mask = folder / product("mask", "write_mask").file
             powers = {name: GroundPower(scene, image, calibrated, mask, name) for name in asked}
-            means = {name: of_coefficient(name, std_db=std_db) for name in asked}
+            means = {name: means_of(name) for name in asked}
             images = ((name, one.amplitude) for name, one in powers.items())
             write("radiometry", {name: LazyLayer(scene.grid, np.complex64, of, threads) for name, of in images}, means)
             written.append(folder / CROSS_SECTIONS)
-            write_json(written[-1], _report(scene, image, calibrated, noise))
+            write_json(written[-1], _report(scene, image, calibrated, noise) | {"polarisation": label})
         if multilook is not None:
             per_weight = noise / integration_of(campaign, opened, scene).count ** 2
             averaged = {f"multilook_{name}": (power, means[name]) for name, power in powers.items()}
