@@ -464,3 +464,20 @@ def test_a_reflector_measures_no_polarisation_that_it_does_not_return(measured, 
     assert own.polarisation == "HH"
     assert own.differs(own.model_copy(update={"polarisation": "VV"})) == "polarisation is VV and was HH"
     assert own.differs(own.model_copy(update={"polarisation": None})) is None
+
+
+@pytest.mark.slow
+def test_a_receiver_whose_gain_was_changed_since_is_told_by_its_noise(later, tmp_path):
+    """The file is of a gain 6 dB higher or lower: every cross-section would be wrong by as much."""
+    for wrong, flagged in ((1.0, False), (4.0, True), (0.25, True)):
+        root = copy_writable(later.root, tmp_path / f"{wrong:g}")
+        change_file(
+            root,
+            lambda document, wrong=wrong: document["pairs"]["uav1-uav1"].update(
+                profile_noise=document["pairs"]["uav1-uav1"]["profile_noise"] * wrong
+            ),
+        )
+        campaign = Campaign.load(root)
+        layers.layers(campaign, "f01", "uav1-uav1")
+        said = json.loads(campaign.result("f01", "uav1-uav1", "radiometry.json").read_text())
+        assert ("noise_disagrees" in said["flags"]) is flagged

@@ -93,7 +93,10 @@ class Radar(_Part):
 
 
 class PairConstant(_Part):
-    """Constant of a pair, and its phase against `reference` of the file, rad; None where they share no image."""
+    """Constant of a pair, and its phase against `reference` of the file, rad; None where they share no image.
+
+    `profile_noise` is the noise of a pulse per Σw² of the window: of another gain of the receiver it is another.
+    """
 
     radar: Radar
     constant_db: Decibels
@@ -103,6 +106,7 @@ class PairConstant(_Part):
     flights: Annotated[int, Field(ge=1)]
     phase_rad: float | None
     phase_std_rad: Deviation | None
+    profile_noise: Annotated[float, Field(gt=0)] | None = None
     flags: Mapping[Annotated[str, Field(pattern="^(constant_drifts|reflectors_disagree)$")], Line]
 
     @property

@@ -59,6 +59,8 @@ class Measurement:
         Of the peak against that of the reflector's place.
     gradient
         Of the path with the place, mean over the image, metres per metre.
+    profile_noise
+        Of a pulse, per Σw² of the window.
     report
         For the file.
     """
@@ -72,6 +74,7 @@ class Measurement:
     phase_rad: float
     phase_scatter_rad: float
     gradient: NDArray[np.float64]
+    profile_noise: float
     report: Mapping[str, Any]
 
 
@@ -223,6 +226,7 @@ class _View:
             phase,
             float(np.hypot(np.sqrt(inverse / 2), numerical)),
             (part[:, None] * pulses.path_gradient(place)).sum(axis=0) / part.sum(),
+            self.pulse_noise / float((self.opened.weight**2).sum()),
             report,
         )
 
@@ -306,6 +310,7 @@ def _of_pair(pair: str, radar: Radar, found: list[Measurement], reference: str, 
     both = [(one, against[at]) for one in own if (at := (one.flight, one.reflector)) in against]
     phase = _phase_of(both, radar.centre_hz, campaign) if both else None
     flags = Flags.merged(_flags(mean, "dB"), {} if phase is None else _flags(phase, "rad"))
+    noise = float(np.mean([one.profile_noise for one in own]))
     return PairConstant(
         radar=radar,
         constant_db=round(mean.value, 3),
@@ -315,6 +320,7 @@ def _of_pair(pair: str, radar: Radar, found: list[Measurement], reference: str, 
         flights=len({one.flight for one in own}),
         phase_rad=None if phase is None else round(float(np.angle(np.exp(1j * phase.value))), 4),
         phase_std_rad=None if phase is None else round(phase.std, 4),
+        profile_noise=float(f"{noise:.4g}") or None,
         flags=flags,
     )
 
