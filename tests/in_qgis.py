@@ -42,7 +42,8 @@ def told(path: str) -> dict[str, object]:
     }
     root = QgsProject.instance().layerTreeRoot()
     QgsProject.instance().addMapLayer(layer)
-    nodes = QgsLayerTreeModel(root).layerLegendNodes(root.findLayer(layer.id()))
+    model = QgsLayerTreeModel(root)  # must outlive its nodes
+    nodes = model.layerLegendNodes(root.findLayer(layer.id()))
     found["legend"] = [node.data(Qt.DisplayRole) for node in nodes if isinstance(node, QgsRasterSymbolLegendNode)]
     ramps = [node.settings() for node in nodes if isinstance(node, QgsColorRampLegendNode)]
     found["legend"] += [settings.suffix() for settings in ramps]

@@ -1,12 +1,14 @@
 """Radar cross-sections of points and σ⁰ of ground, from images of echoes whose truth is known."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scenes import side_beam, straight_track
 
 import apertura as ap
 from apertura.common.errors import CampaignError
-from apertura.core.antenna.beam import Beams
+from apertura.core.antenna.beam import Beam, Beams
 from apertura.core.echo.compression import window_weights
 from apertura.core.focus.engines import reference
 from apertura.core.focus.inputs import PhaseHistory
@@ -268,3 +270,26 @@ def test_an_attitude_error_changes_the_power_of_a_point_by_the_slope_of_its_beam
     level = np.array([0.0, 12.0 / np.tan(below - np.radians(15.0)), 0.0])
     flat_db = pointing_std_db(Beams(beam, beam), aperture, level, [(roll, both)])
     assert flat_db == pytest.approx(2 * 12.04 * (2.0 / 40.0) ** 2, rel=0.02)  # on the axis the square is left
+
+
+def test_the_example_of_the_how_to_has_the_cross_section_that_it_put():
+    page = Path(__file__).parents[1] / "docs/howto/calibrate_radiometry.md"
+    names = {}
+    exec(page.read_text().split("```python\n")[1].split("```")[0], names)
+    assert names["largest_m2"] == pytest.approx(2.0, rel=0.03)
+    assert names["image"].sigma0.attrs["units"] == "1"
+    assert names["image"].rcs.attrs["units"] == "m2"
+    assert float(names["sigma0_db"].max()) > 10
+
+
+def test_a_block_of_ground_that_no_beam_reaches_has_no_calibration_and_stops_nothing():
+    """Of 300 pixels along the track the far ones lie in a block of their own, which the beam does not reach."""
+    track = np.stack([np.linspace(-2, 2, 40), np.full(40, -20.0), np.full(40, 10.0)], -1)
+    flown, width = Aperture(track, track), np.radians([-10.0, 0.0, 10.0])
+    axes = np.tile(np.array([[0.0, 1, 0], [-1.0, 0, 0], [0.0, 0, 1]]), (40, 1, 1))
+    beam = Beam(axes, width, np.array([0.5, 1, 0.5]), 6 * width, np.ones(3))
+    grid = SceneGrid("local", -5.0, 5.0, 0.25, (20, 600))
+    found = Calibration.of(grid, FlatGround(0.0), flown, Beams(beam, beam), constant=1.0, cell_m2=0.1)
+    power = found.power((slice(0, 20), slice(0, 600)), "sigma0")
+    assert np.isfinite(power[10, 20])
+    assert np.isnan(power[:, 512:]).all()

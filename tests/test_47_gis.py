@@ -76,6 +76,10 @@ def test_qgis_agrees_with_rasterio_on_every_raster_finds_every_style_and_changes
             radiometry = json.loads(rasterio.open(path).tags()["APERTURA_RADIOMETRY"])
             top = radiometry["peak_db"]
             assert found["stretch"] == pytest.approx([top + radiometry["noise_floor_re_peak_db"], top], abs=0.01)
+            assert found["legend"] == [" dB"]  # after each end of the ramp
+        if name.endswith("nesz.tif"):
+            assert len(found["legend"]) == 5
+            assert all(label.endswith(" dB") for label in found["legend"])
         if name.endswith("mask.tif"):
             assert found["classes"]["2"] == ["layover", 255]
             assert found["classes"]["0"] == ["valid", 0]

@@ -443,3 +443,41 @@ def test_a_reflector_is_stated_whole(tiny, keys, told):
 
 def test_reflectors_are_stated_before_they_are_measured(tiny):
     assert "no reflectors" in complaint(lambda: measured_constants(Campaign.load(tiny)))
+
+
+@pytest.mark.slow
+def test_a_reflector_measures_no_polarisation_that_it_does_not_return(measured, tmp_path):
+    """What a trihedral or sphere sends back of H is H: in HV only leaks are seen, and no constant follows."""
+    root = copy_writable(measured.root, tmp_path / "campaign")
+
+    def received(letter):
+        def change(document):
+            for node in document["nodes"].values():
+                node["antennas"] |= {"radar_tx_polarisation": "H", "radar_rx_polarisation": letter}
+
+        edit_config(root, change)
+        return Campaign.load(root)
+
+    assert "HV: such a reflector sends nothing back" in complaint(lambda: measured_constants(received("V")))
+    constants, _ = measured_constants(received("H"))
+    own = constants.pairs["uav1-uav1"].radar
+    assert own.polarisation == "HH"
+    assert own.differs(own.model_copy(update={"polarisation": "VV"})) == "polarisation is VV and was HH"
+    assert own.differs(own.model_copy(update={"polarisation": None})) is None
+
+
+@pytest.mark.slow
+def test_a_receiver_whose_gain_was_changed_since_is_told_by_its_noise(later, tmp_path):
+    """The file is of a gain 6 dB higher or lower: every cross-section would be wrong by as much."""
+    for wrong, flagged in ((1.0, False), (4.0, True), (0.25, True)):
+        root = copy_writable(later.root, tmp_path / f"{wrong:g}")
+        change_file(
+            root,
+            lambda document, wrong=wrong: document["pairs"]["uav1-uav1"].update(
+                profile_noise=document["pairs"]["uav1-uav1"]["profile_noise"] * wrong
+            ),
+        )
+        campaign = Campaign.load(root)
+        layers.layers(campaign, "f01", "uav1-uav1")
+        said = json.loads(campaign.result("f01", "uav1-uav1", "radiometry.json").read_text())
+        assert ("noise_disagrees" in said["flags"]) is flagged

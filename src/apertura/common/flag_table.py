@@ -334,7 +334,7 @@ _OF_IMAGES = {
         "what the config states of power, gains and receiver is not what reflectors said; theirs was used",
         "transmit_power_dbm, gains of antennas, receiver of the nodes", "pipeline/opening/radiometry.py"),
     "noise_disagrees": Flag(
-        "noise figure by the noise measured, dB of the one stated (of 0 dB where none is), and what may be wrong",
+        "dB of the noise measured against the figure stated (0 dB where none is), or that over the reflectors, ± std",
         "above: interference, too little gain before the converter, or a gain or full scale stated wrong; below: only "
         "the latter, and then every cross-section and coefficient is wrong alike",
         "gain_db, full_scale_dbm or full_scale_v, full_scale_counts and noise_figure_db of nodes.<n>.receiver",

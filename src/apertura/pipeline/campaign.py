@@ -92,7 +92,9 @@ class Campaign(RawFolder):
         written = processing.radiometry if self.calibrated else ()
         if processing.multilook is None:
             return written
-        return (*written, *([f"multilook_{name}" for name in written] or ["multilook"]))
+        averaged = [f"multilook_{name}" for name in written] or ["multilook"]
+        noise = ["multilook_noise"] * processing.multilook.subtract_noise
+        return (*written, *averaged, *noise, "multilook_coherent", "multilook_noncoherent")
 
     def check_radio(self) -> None:
         """Raise CampaignError where the radio of its pairs is stated in parts, unless their constants were measured."""

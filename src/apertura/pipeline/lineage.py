@@ -163,8 +163,9 @@ def modules_of(campaign: Campaign, result: str, *where: str) -> tuple[str, ...]:
 def _written(rule: Rule, *, measured: bool) -> tuple[str, ...]:
     styles = {row.module for row in EXPORTS if row.style} if rule.styles else set()
     exports = [*export_modules(rule.exports)] if rule.exports else []
-    if rule.exports == "layers" and measured:
-        more = (module for kind in ("radiometry", "multilook") for module in export_modules(kind))
+    if measured:
+        kinds = {"layers": ("radiometry", "multilook"), "fused": ("multilook_fused",)}
+        more = (module for kind in kinds.get(rule.exports, ()) for module in export_modules(kind))
         exports += [module for module in dict.fromkeys(more) if module not in exports]
     return (*sorted(styles), *exports)
 

@@ -247,7 +247,7 @@ _RADIO = frozenset({"antennas", "transmit_power_dbm", "receiver", "amplitude_std
 
 def radio(place: JobPlace) -> Mapping[str, Any]:
     """Return the radios of the pairs and what is made of them; nothing where images are relative."""
-    from apertura.pipeline.config import Receiver, radio_of
+    from apertura.pipeline.config import Receiver, polarisation_of, radio_of
 
     campaign = place.campaign
     if not campaign.calibrated:
@@ -258,6 +258,7 @@ def radio(place: JobPlace) -> Mapping[str, Any]:
         for _, pair in place.pairs
         for key, value in radio_of(nodes, pair).items()
     }
+    stated |= {pair: label for _, pair in place.pairs if (label := polarisation_of(nodes, pair))}
     stated |= {f"nodes.{node}.amplitude_std_db": nodes[node].amplitude_std_db for (_, node) in place.below(Scope.NODE)}
     processing = campaign.settings.processing
     measured = {"radiometric_calibration": named} if (named := processing.radiometric_calibration) else {}
@@ -274,6 +275,13 @@ def multilook(place: JobPlace) -> Mapping[str, Any]:
     """Return how power is averaged; nothing where it is not."""
     stated = place.campaign.values["processing"]["multilook"]
     return {"multilook": stated} if stated else {}
+
+
+def noise_of_sums(place: JobPlace) -> Iterable[str]:
+    """Return the manifests of what states the noise of a flight's images, where it is taken off their sums."""
+    asked = place.campaign.settings.processing.multilook
+    subtracted = asked is not None and asked.subtract_noise
+    return [place.campaign.manifest("layers", *pair) for pair in place.pairs] if subtracted else []
 
 
 def measured_image(place: JobPlace) -> Iterable[str]:

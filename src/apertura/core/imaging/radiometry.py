@@ -1,7 +1,6 @@
 """Radiometry of an image: from the power of a pixel to the radar cross-section of a point, and to σ⁰ of ground."""
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Literal
 
@@ -12,11 +11,9 @@ from apertura.common.arrays import Floats
 from apertura.common.constants import BOLTZMANN_J_K, REFERENCE_K, SPEED_OF_LIGHT_M_S
 from apertura.common.contracts import Window
 from apertura.core.antenna.beam import Beams
-from apertura.core.antenna.illumination import illumination_mask
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.scene.grid import SceneGrid
-from apertura.core.scene.looks import AT_ONCE, BLOCK_PX, Lattice, pitch_px, pulses_of
-from apertura.core.scene.swath import balls
+from apertura.core.scene.looks import Lattice, fill, pitch_px, pulses_of
 from apertura.core.scene.terrain import FlatGround, Terrain
 
 Quantity = Literal["sigma0", "beta0", "gamma0"]
@@ -257,10 +254,7 @@ class Calibration:
             noise,
             np.zeros((*lattice.shape, 3, 3)),
         )
-        tiles = list(grid.tiles(BLOCK_PX))
-        blocks = illumination_mask(beams, aperture, *balls(grid, terrain, tiles), pulses=AT_ONCE)
-        with ThreadPoolExecutor(threads) as pool:
-            list(pool.map(found._fill, lattice.blocks, blocks.T))
+        fill(lattice, found._fill, grid, terrain, aperture, beams, threads=threads)
         return found
 
     def _fill(self, block: Window, reaching: NDArray[np.bool_]) -> None:

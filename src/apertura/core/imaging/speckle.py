@@ -341,6 +341,10 @@ class Multilook:
         )
         return np.asarray((power - noise)[inner])
 
+    def mean_noise(self, window: Window) -> Floats:
+        """Return the mean power of the noise of a window of squares, (row, column) float64; NaN as of `mean`."""
+        return np.asarray(self._parts(window)[1])
+
     def _parts(self, window: Window) -> Floats:
         """Return power and noise of a window of squares, read in parts no larger than a tile, or a square."""
         step, (rows, columns) = max(1, BLOCK_PX // self.side), window

@@ -1,5 +1,6 @@
 """Looks of each pixel and the centre of its aperture, computed on a lattice over the scene."""
 
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -132,6 +133,32 @@ def _cells(nodes: NDArray[np.int64], part: slice) -> tuple[NDArray[np.int64], ND
     return before, after, (at - nodes[before]) / np.maximum(1, nodes[after] - nodes[before])
 
 
+def fill(
+    lattice: Lattice,
+    block: Callable[[Window, NDArray[np.bool_]], None],
+    grid: SceneGrid,
+    terrain: Terrain,
+    aperture: Aperture,
+    beams: Beams | None,
+    *,
+    threads: int,
+) -> None:
+    """Call a function for each of `Lattice.blocks`, with the blocks of `AT_ONCE` pulses that may illuminate it.
+
+    Parameters
+    ----------
+    lattice, grid, terrain, aperture, beams
+        As of `Looks`.
+    block
+        Of the window of nodes, and (block of pulses,) bool.
+    threads
+        Blocks in work at once.
+    """
+    reaching = illumination_mask(beams, aperture, *balls(grid, terrain, list(grid.tiles(BLOCK_PX))), pulses=AT_ONCE)
+    with ThreadPoolExecutor(threads) as pool:
+        list(pool.map(block, lattice.blocks, reaching.T))
+
+
 # ---- Looks, and centre of the aperture of each pixel
 
 SPREAD = 17
@@ -222,10 +249,7 @@ class Looks:
             np.zeros((*lattice.shape, 2, 3)),
             np.zeros((*lattice.shape, SPREAD), np.int32),
         )
-        tiles = list(grid.tiles(BLOCK_PX))
-        blocks = illumination_mask(beams, aperture, *balls(grid, terrain, tiles), pulses=AT_ONCE)
-        with ThreadPoolExecutor(threads) as pool:
-            list(pool.map(looks._fill, lattice.blocks, blocks.T))
+        fill(lattice, looks._fill, grid, terrain, aperture, beams, threads=threads)
         return looks
 
     def _fill(self, block: Window, reaching: NDArray[np.bool_]) -> None:

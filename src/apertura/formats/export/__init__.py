@@ -34,6 +34,9 @@ SOURCES: Mapping[str, str] = {
     "multilook_sigma0": "multilook",
     "multilook_gamma0": "multilook",
     "multilook_beta0": "multilook",
+    "multilook_noise": "multilook",
+    "multilook_coherent": "multilook_fused",
+    "multilook_noncoherent": "multilook_fused",
     "phase": "interferogram",
     "coherence": "interferogram",
     "unwrapped": "interferogram",
@@ -44,7 +47,8 @@ SOURCES: Mapping[str, str] = {
 """Raster that a file may be written from → kind of folder the file lies in.
 
 Those of radiometry lie beside layers where a pair is calibrated: complex, of the power that they are named after; those
-of multilook, where they are asked for: mean power of squares of pixels, real, on a coarser grid.
+of multilook, where they are asked for: mean power of squares of pixels, real, on a coarser grid; ``multilook_noise`` is
+the mean power of the noise in those of the echoes, where it is subtracted.
 ``image`` is a pair's, complex; ``coherent`` the complex and ``noncoherent`` the power sum of a flight's pairs, as a
 complex amplitude without phase, ``magnitude`` the sum of their magnitudes; layers explain a pair's image, real, and
 lie beside it; those of an interferogram are of two images, ``panels`` all of them by name.
@@ -150,7 +154,7 @@ EXPORTS: tuple[Export, ...] = (
     Export("beta0_db.qml", "beta0", "apertura.formats.export.style:write_backscatter_style"),
     *(
         Export(f"{source}{end}", source, f"apertura.formats.export.{function}")
-        for source in (source for source, kind in SOURCES.items() if kind == "multilook")
+        for source in (source for source, kind in SOURCES.items() if kind.startswith("multilook"))
         for end, function in (
             ("_power.tif", "multilook:write_mean_power"),
             ("_power.qml", "style:write_linear_style"),
@@ -178,7 +182,7 @@ EXPORTS: tuple[Export, ...] = (
 )
 """Every product of a pair or of a flight's sums, in the order in which they are written."""
 
-_OPTIONAL = ("radiometry", "multilook")  # kinds of which those rows are written that are asked for
+_OPTIONAL = ("radiometry", "multilook", "multilook_fused")  # kinds of which those rows are written that are asked for
 
 PHASE_HISTORY = "phase_history.cphd"
 """Transfer functions of a pair; as large as its echo, and so written for those who ask for it."""
@@ -263,8 +267,8 @@ def mosaic_files(pairs: Mapping[str, Sequence[str]], coefficients: Sequence[str]
 
 def _folders(pairs: Sequence[str]) -> Iterator[tuple[str, tuple[str, ...]]]:
     """Yield the folders of a flight, and the kinds of rows that lie in each."""
-    yield from ((pair, ("pair", "layers", *_OPTIONAL)) for pair in pairs)
-    yield "fused", ("fused",)
+    yield from ((pair, ("pair", "layers", "radiometry", "multilook")) for pair in pairs)
+    yield "fused", ("fused", "multilook_fused")
 
 
 def _written(kinds: Iterable[str], coefficients: Sequence[str]) -> Iterator[Export]:
@@ -312,7 +316,7 @@ def write_exports(
     Parameters
     ----------
     kind
-        ``pair``, ``fused``, ``layers``, ``radiometry``, ``multilook`` or ``interferogram``.
+        A value of `SOURCES`.
     folder
         Where they go.
     rasters, titles

@@ -72,7 +72,9 @@ _COEFFICIENTS = {
 }
 
 
-def of_coefficient(name: str, *, std_db: float | None, noise: str = "in it") -> dict[str, Any]:
+def of_coefficient(
+    name: str, *, std_db: float | None, polarisation: str | None = None, noise: str = "in it"
+) -> dict[str, Any]:
     """Return the radiometry of a calibrated raster, for `TAG`.
 
     Parameters
@@ -81,6 +83,8 @@ def of_coefficient(name: str, *, std_db: float | None, noise: str = "in it") -> 
         sigma0, beta0 or gamma0.
     std_db
         Standard deviation of the calibration; None: not stated.
+    polarisation
+        Sent and received, such as HV; None: not stated.
     noise
         What became of noise.
 
@@ -91,7 +95,8 @@ def of_coefficient(name: str, *, std_db: float | None, noise: str = "in it") -> 
     """
     power, one_is = _COEFFICIENTS[name]
     standard = {"standard_name": CF_SIGMA0} if name == "sigma0" else {}
-    stated = {"calibration_std_db": std_db} if std_db is not None else {"calibration_std": "not stated"}
+    stated: dict[str, Any] = {"calibration_std_db": std_db} if std_db is not None else {"calibration_std": "not stated"}
+    stated |= {"polarisation": polarisation or "not stated"}
     return {"amplitude": f"root of {power}", "power": power, "one_is": one_is, "noise": noise, **standard, **stated}
 
 

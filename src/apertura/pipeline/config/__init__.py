@@ -25,6 +25,7 @@ from apertura.pipeline.config.nodes import (
     PathOffsets,
     Receiver,
     check_radio,
+    polarisation_of,
     radio_of,
 )
 from apertura.pipeline.config.processing import (
@@ -78,6 +79,7 @@ __all__ = [
     "check_interferometry",
     "check_radio",
     "located",
+    "polarisation_of",
     "radio_of",
     "read_clocks",
     "read_flights",

@@ -96,6 +96,7 @@ class Antenna(Section):
 
 Decibels = Annotated[float, Field(ge=-300, le=300)]
 Gain = Annotated[float, Field(ge=-60, le=80)]
+Polarisation = Literal["H", "V", "L", "R"]
 
 _BEAM = "null (isotropic), or boresight_deg with beamwidth_deg or pattern, and cutoff_db"
 
@@ -110,6 +111,12 @@ class Antennas(Section):
     )
     radar_rx_gain_dbi: Gain | None = Field(
         None, description="peak gain of the receiving radar antenna, to which its beam is relative, dBi"
+    )
+    radar_tx_polarisation: Polarisation | None = Field(
+        None, description="what the transmitting radar antenna sends: H, V, L or R; null: not stated"
+    )
+    radar_rx_polarisation: Polarisation | None = Field(
+        None, description="what the receiving radar antenna takes in: H, V, L or R; null: not stated"
     )
 
     def any(self) -> bool:
@@ -279,6 +286,20 @@ def radio_of(nodes: Mapping[str, Node], pair: str) -> dict[str, object]:
         f"nodes.{rx}.antennas.radar_rx_gain_dbi": nodes[rx].antennas.radar_rx_gain_dbi,
         f"nodes.{rx}.receiver": nodes[rx].receiver,
     }
+
+
+def polarisation_of(nodes: Mapping[str, Node], pair: str) -> str | None:
+    """Return the polarisations of a pair, as sent and as received; None unless both are stated.
+
+    Examples
+    --------
+    >>> own = Node(antennas=Antennas(radar_tx_polarisation="H", radar_rx_polarisation="V"))
+    >>> polarisation_of({"a": own, "b": Node()}, "a-a"), polarisation_of({"a": own, "b": Node()}, "a-b")
+    ('HV', None)
+    """
+    tx, rx = pair.split("-")
+    sent, received = nodes[tx].antennas.radar_tx_polarisation, nodes[rx].antennas.radar_rx_polarisation
+    return f"{sent}{received}" if sent and received else None
 
 
 def check_radio(nodes: Mapping[str, Node], pairs: Iterable[str], *, sampled: bool, where: Path) -> None:

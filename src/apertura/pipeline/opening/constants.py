@@ -11,7 +11,7 @@ from apertura.common.errors import CampaignError
 from apertura.common.provenance import sha256_file
 from apertura.core.echo.compression import centre_frequency
 from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.config import SampledWaveform
+from apertura.pipeline.config import SampledWaveform, polarisation_of
 from apertura.pipeline.opening.pair import OpenPair
 from apertura.pipeline.opening.transmitted import transmitted
 
@@ -49,6 +49,7 @@ class Radar(_Part):
     subcarriers: int
     sent_power: float | None
     antennas: Mapping[str, AntennaShape]
+    polarisation: Annotated[str, Field(pattern="^[HVLR]{2}$")] | None = None
 
     @classmethod
     def of(cls, campaign: Campaign, opened: OpenPair) -> "Radar":
@@ -68,6 +69,7 @@ class Radar(_Part):
             subcarriers=len(frequency),
             sent_power=sent,
             antennas=shapes,
+            polarisation=polarisation_of(campaign.settings.nodes, opened.name),
         )
 
     def differs(self, other: "Radar") -> str | None:
@@ -81,6 +83,8 @@ class Radar(_Part):
         """
         for name in type(self).model_fields:
             was, now = getattr(self, name), getattr(other, name)
+            if name == "polarisation" and None in (was, now):
+                continue  # nobody said that it is another
             numbers = isinstance(was, float) and isinstance(now, float)
             if not (abs(was - now) <= _SAME * abs(was) if numbers else was == now):
                 words = [f"{one:g}" if isinstance(one, float) else str(one) for one in (now, was)]
@@ -89,7 +93,10 @@ class Radar(_Part):
 
 
 class PairConstant(_Part):
-    """Constant of a pair, and its phase against `reference` of the file, rad; None where they share no image."""
+    """Constant of a pair, and its phase against `reference` of the file, rad; None where they share no image.
+
+    `profile_noise` is the noise of a pulse per Σw² of the window: of another gain of the receiver it is another.
+    """
 
     radar: Radar
     constant_db: Decibels
@@ -99,6 +106,7 @@ class PairConstant(_Part):
     flights: Annotated[int, Field(ge=1)]
     phase_rad: float | None
     phase_std_rad: Deviation | None
+    profile_noise: Annotated[float, Field(gt=0)] | None = None
     flags: Mapping[Annotated[str, Field(pattern="^(constant_drifts|reflectors_disagree)$")], Line]
 
     @property

@@ -35,6 +35,10 @@ REACH_CELLS = 2.0
 """How far from where it is expected a reflector is searched for, resolution cells, beside three standard deviations of
 its place."""
 
+_ODD = {"HH", "VV", "LR", "RL"}
+RETURNED = {"trihedral": _ODD, "sphere": _ODD, "dihedral": {"HH", "VV", "LL", "RR"}}
+"""Polarisations, sent and received, in which the formulas hold: a reflection turns the other way round."""
+
 _LEAST_CHANCE = 0.0027  # of reflectors that differ as much: three standard deviations
 _FOLLOWED_M = 1e-4  # pixels: where the place that focuses a reflector above ground is settled
 _ROUNDS = 12
@@ -55,6 +59,8 @@ class Measurement:
         Of the peak against that of the reflector's place.
     gradient
         Of the path with the place, mean over the image, metres per metre.
+    profile_noise
+        Of a pulse, per Σw² of the window.
     report
         For the file.
     """
@@ -68,6 +74,7 @@ class Measurement:
     phase_rad: float
     phase_scatter_rad: float
     gradient: NDArray[np.float64]
+    profile_noise: float
     report: Mapping[str, Any]
 
 
@@ -96,7 +103,11 @@ def measured_constants(campaign: Campaign) -> tuple[Constants, list[str]]:
             radars.setdefault(pair, Radar.of(campaign, opened))
             view, measured = _View.of(campaign, opened, scene), list[Measurement]()
             for one in stated:
-                result = view.at(one)
+                label = radars[pair].polarisation
+                if label and label not in RETURNED[one.kind]:
+                    result: Measurement | str = f"{label}: such a reflector sends nothing back in it"
+                else:
+                    result = view.at(one)
                 if isinstance(result, str):
                     left_out.append(f"{flight.name} {pair} {one.name}: {result}")
                 else:
@@ -215,6 +226,7 @@ class _View:
             phase,
             float(np.hypot(np.sqrt(inverse / 2), numerical)),
             (part[:, None] * pulses.path_gradient(place)).sum(axis=0) / part.sum(),
+            self.pulse_noise / float((self.opened.weight**2).sum()),
             report,
         )
 
@@ -298,6 +310,7 @@ def _of_pair(pair: str, radar: Radar, found: list[Measurement], reference: str, 
     both = [(one, against[at]) for one in own if (at := (one.flight, one.reflector)) in against]
     phase = _phase_of(both, radar.centre_hz, campaign) if both else None
     flags = Flags.merged(_flags(mean, "dB"), {} if phase is None else _flags(phase, "rad"))
+    noise = float(np.mean([one.profile_noise for one in own]))
     return PairConstant(
         radar=radar,
         constant_db=round(mean.value, 3),
@@ -307,6 +320,7 @@ def _of_pair(pair: str, radar: Radar, found: list[Measurement], reference: str, 
         flights=len({one.flight for one in own}),
         phase_rad=None if phase is None else round(float(np.angle(np.exp(1j * phase.value))), 4),
         phase_std_rad=None if phase is None else round(phase.std, 4),
+        profile_noise=float(f"{noise:.4g}") or None,
         flags=flags,
     )
 

@@ -1,32 +1,37 @@
 """Rules `export` and `export_fused`: rasters, pictures and report of one image, or of the sums of a flight's images."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import rasterio.windows
 import xarray as xr
 from rasterio import Affine
 
+from apertura.common.arrays import Floats
 from apertura.common.atomic import write_json
 from apertura.common.contracts import Window
 from apertura.common.flags import Flags
 from apertura.common.provenance import Provenance, canonical_json, chained_sha256
+from apertura.common.raster import opened_raster
 from apertura.core.combination import InPhase, in_phase
 from apertura.core.quality.budget import NO_EFFECT, BudgetLine
 from apertura.core.quality.focus import DEFOCUSED_DB
 from apertura.core.quality.measures import Amplitude, BlockRaster, image_statistics
 from apertura.core.quality.point_targets import CUT_REACH_M, cuts_report, find_peak
 from apertura.core.scene.grid import SceneGrid
-from apertura.formats.export import write_exports
+from apertura.formats.export import product, remove_outdated, write_exports
 from apertura.formats.export.radiometry import CROSS_SECTIONS, ECHO, Radiometry, of_sums
 from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.config.processing import Multilooking
 from apertura.pipeline.digests import Lineage
 from apertura.pipeline.lineage import result_of
 from apertura.pipeline.opening.images import ComparedImage, bright_places
 from apertura.pipeline.opening.results import assessment_of
 from apertura.pipeline.opening.scene import settled_scene
+from apertura.pipeline.steps.multilook import LazyLayer, coarse, multilook_of, said_of
 from apertura.pipeline.steps.stamping import tags_of
 from apertura.pipeline.store import open_listed, open_stage, record_files
 
@@ -113,16 +118,73 @@ def export_fused(campaign: Campaign, flight: str) -> list[Path]:
         "noncoherent": f"non-coherent sum of {' + '.join(pairs)}",
         "magnitude": f"sum of magnitudes of {' + '.join(pairs)}",
     }
+    tags = tags_of(_fused_provenance(lineage, cube, images, assessed), lineage) | _quality_tags(report)
     written = write_exports(
         "fused",
         folder,
         {**sums, "magnitude": cube.magnitude[index]},
         radiometry=report["radiometry"],
         titles={source: f"{name} · {words}" for source, words in titles.items()},
-        tags=tags_of(_fused_provenance(lineage, cube, images, assessed), lineage) | _quality_tags(report),
+        tags=tags,
         **_georeference(grid),
     )
+    if asked := campaign.settings.processing.multilook:
+        for source, raster in sums.items():
+            noise = _noise_of_sum(campaign, flight, source, report["radiometry"][source]["divided_by"])
+            layer, said = _averaged_sum(raster, grid, asked, report["radiometry"][source], noise)
+            written += write_exports(
+                "multilook_fused",
+                folder,
+                {f"multilook_{source}": layer},
+                radiometry={f"multilook_{source}": said},
+                titles={f"multilook_{source}": f"{name} · mean power of the {titles[source]}"},
+                tags=tags,
+                **_georeference(layer.grid),
+            )
+    remove_outdated(folder, written)
     return _finish(folder, written, {"flight": flight, "pairs": list(pairs), **report}, lineage)
+
+
+def _averaged_sum(
+    raster: BlockRaster,
+    grid: SceneGrid,
+    asked: Multilooking,
+    means: Mapping[str, Any],
+    noise: Callable[[Window], Floats] | None,
+) -> tuple[LazyLayer, dict[str, Any]]:
+    """Return the mean power of a sum on a coarser grid, less its noise, and what it means."""
+    cells = multilook_of(lambda window: np.asarray(raster[window], np.complex64), grid, asked)
+
+    def less(window: Window) -> Floats:
+        return cells.mean(window) - (0.0 if noise is None else noise(window))
+
+    said = said_of(cells, means, noise="in it" if noise is None else "subtracted")
+    return coarse(grid, cells, threads=1, of=less), said
+
+
+def _noise_of_sum(
+    campaign: Campaign, flight: str, source: str, divisors: Mapping[str, float]
+) -> Callable[[Window], Floats] | None:
+    """Return the mean power of the noise in squares of pixels of a sum; None where it is not taken off or not known.
+
+    Source: docs/theory/speckle.md, eq. 6.
+    """
+    asked, kept = campaign.settings.processing.multilook, product("multilook_noise", "write_mean_power").file
+    paths = [campaign.result(flight, pair, kept) for pair in divisors]
+    if asked is None or not asked.subtract_noise or not all(path.is_file() for path in paths):
+        return None
+    # Noise of pairs is independent: powers add up, over n² where amplitudes are averaged and over n where powers are.
+    count = len(divisors) ** (2 if source == "coherent" else 1)
+
+    def noise(window: Window) -> Floats:
+        total = np.zeros([part.stop - part.start for part in window])
+        for path, divisor in zip(paths, divisors.values(), strict=True):
+            with opened_raster(path, expected="what step layers wrote", remedy="Run the workflow again.") as one:
+                part = one.read(1, window=rasterio.windows.Window.from_slices(*window)).astype(np.float64)
+            total += np.nan_to_num(part) / divisor**2 / count
+        return total
+
+    return noise
 
 
 def _finish(folder: Path, written: list[Path], report: Mapping[str, Any], lineage: Lineage) -> list[Path]:

@@ -1,8 +1,8 @@
 """Rule `layers`: angles, mask, looks, noise, σ⁰ and mean power of a pair, as GeoTIFFs."""
 
 from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ import xarray as xr
 from numpy.typing import NDArray
 from rasterio import Affine
 
+from apertura.common.arrays import Floats
 from apertura.common.atomic import write_json
 from apertura.common.contracts import Window
 from apertura.common.flags import Flags
@@ -21,20 +22,21 @@ from apertura.core.imaging.noise import noise_places, noise_power
 from apertura.core.imaging.radiometry import Quantity
 from apertura.core.imaging.range_profiles import profiles_of
 from apertura.core.imaging.speckle import Multilook
-from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.looks import BLOCK_PX, Looks
 from apertura.core.scene.terrain import FlatGround
 from apertura.core.scene.visibility import Relief, bistatic_angle_deg, incidence_deg, surface, visibility
 from apertura.formats.export import product, remove_outdated, write_exports
 from apertura.formats.export.layers import OUTSIDE
-from apertura.formats.export.radiometry import CROSS_SECTIONS, ECHO, of_coefficient, of_multilooked
+from apertura.formats.export.radiometry import CROSS_SECTIONS, ECHO, of_coefficient
 from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.config import polarisation_of
 from apertura.pipeline.config.processing import Multilooking
 from apertura.pipeline.lineage import result_of
 from apertura.pipeline.opening.pair import open_pair, pattern_digests
 from apertura.pipeline.opening.plan import integration_of, weighing
 from apertura.pipeline.opening.radiometry import CalibratedPair, calibrated_pair, points_of
 from apertura.pipeline.opening.scene import OpenScene, open_scene
+from apertura.pipeline.steps.multilook import LazyLayer, coarse, multilook_of, said_of, side_of
 from apertura.pipeline.steps.stamping import tags_of
 from apertura.pipeline.store import open_stage, record_files
 
@@ -77,19 +79,20 @@ def layers(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> l
             )
         )
 
-    std_db = None if calibrated is None else calibrated.std_db
-    absolute = {} if calibrated is None else {"nesz": of_coefficient("sigma0", std_db=std_db, noise="alone")}
+    label, std_db = polarisation_of(campaign.settings.nodes, pair), None if calibrated is None else calibrated.std_db
+    means_of = partial(of_coefficient, std_db=std_db, polarisation=label)
+    absolute = {} if calibrated is None else {"nesz": means_of("sigma0", noise="alone")}
     write("layers", _rasters(scene, looks, noise, calibrated, threads=threads), absolute)
     if image is not None:
         powers, means = dict[str, GroundPower](), dict[str, Mapping[str, Any]]()
         if calibrated is not None:
             mask = folder / product("mask", "write_mask").file
             powers = {name: GroundPower(scene, image, calibrated, mask, name) for name in asked}
-            means = {name: of_coefficient(name, std_db=std_db) for name in asked}
+            means = {name: means_of(name) for name in asked}
             images = ((name, one.amplitude) for name, one in powers.items())
             write("radiometry", {name: LazyLayer(scene.grid, np.complex64, of, threads) for name, of in images}, means)
             written.append(folder / CROSS_SECTIONS)
-            write_json(written[-1], _report(scene, image, calibrated, noise))
+            write_json(written[-1], _report(scene, image, calibrated, noise) | {"polarisation": label})
         if multilook is not None:
             per_weight = noise / integration_of(campaign, opened, scene).count ** 2
             averaged = {f"multilook_{name}": (power, means[name]) for name, power in powers.items()}
@@ -98,52 +101,11 @@ def layers(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> l
             ).items():
                 raster, said = _multilooked(power, meaning, looks, per_weight, multilook, threads=threads)
                 write("multilook", {source: raster}, {source: said})
+            if multilook.subtract_noise and np.isfinite(noise):
+                write("multilook", *_noise_of_echoes(scene, image, looks, per_weight, multilook, threads=threads))
     remove_outdated(folder, written)
     record_files(campaign.root / lineage.result.manifest, written, lineage)
     return written
-
-
-@dataclass(frozen=True)
-class LazyLayer:
-    """A raster whose blocks are computed on reading, tile by tile, in threads.
-
-    Attributes
-    ----------
-    grid
-        Its pixels.
-    dtype
-        Of the values.
-    of
-        Window of the grid → values (row, column).
-    threads
-        Tiles computed at once.
-    tile_px
-        Side of a tile.
-    """
-
-    grid: SceneGrid
-    dtype: type[np.generic]
-    of: Callable[[Window], NDArray[Any]]
-    threads: int
-    tile_px: int = BLOCK_PX
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Rows and columns."""
-        return self.grid.shape
-
-    def __getitem__(self, block: Window) -> NDArray[Any]:
-        """Return the values of a block of rows and columns."""
-        part = self.grid[block]
-        values = np.empty(part.shape, self.dtype)
-
-        def work(tile: Window) -> None:
-            rows, columns = (slice(at.start + by, at.stop + by) for at, by in zip(tile, part.first, strict=True))
-            values[tile] = self.of((rows, columns))
-
-        with ThreadPoolExecutor(self.threads) as pool:
-            list(pool.map(work, part.tiles(self.tile_px)))
-        return values
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,31 +145,36 @@ class GroundPower:
             return np.asarray(self.image.image[window].values / np.sqrt(self.per_one(window)), np.complex64)
 
 
-_FEWEST_CELLS = 64  # along a tile of mean power: those around it that the filter reads, too, are few
-
-
 def _multilooked(
     power: GroundPower, means: Mapping[str, Any], looks: Looks, pulse_noise: float, asked: Multilooking, *, threads: int
 ) -> tuple[LazyLayer, dict[str, Any]]:
     """Return mean power on a coarser grid, float32, and what it means; `pulse_noise` is noise per Σw² of a pixel."""
-    grid = power.scene.grid
-    side = max(1, round(asked.spacing_m / grid.spacing_m))
 
-    def noise(window: Window) -> NDArray[np.float64]:
+    def noise(window: Window) -> Floats:
         return pulse_noise * looks.weight_squares(window) / power.per_one(window)
 
     subtracted = noise if asked.subtract_noise and np.isfinite(pulse_noise) else None
-    cells = Multilook.of(power.amplitude, grid.shape, side, noise=subtracted, filtered=asked.speckle_filter == "lee")
-    said = of_multilooked(
-        means,
-        side_px=side,
-        looks=cells.looks,
-        found=cells.found,
-        noise="in it" if subtracted is None else "subtracted",
-        speckle="Lee" if cells.filtered else "none",
+    cells = multilook_of(power.amplitude, power.scene.grid, asked, noise=subtracted)
+    noise_is = "in it" if subtracted is None else "subtracted"
+    return coarse(power.scene.grid, cells, threads=threads), said_of(cells, means, noise=noise_is)
+
+
+def _noise_of_echoes(
+    scene: OpenScene, image: xr.Dataset, looks: Looks, pulse_noise: float, asked: Multilooking, *, threads: int
+) -> tuple[dict[str, LazyLayer], dict[str, dict[str, Any]]]:
+    """Return mean power of the noise in the pixels of power.tif, on the coarser grid, which sums of pairs are told."""
+    side = side_of(scene.grid, asked)
+    cells = Multilook(
+        GroundPower(scene, image).amplitude,
+        scene.grid.shape,
+        side,
+        lambda window: pulse_noise * looks.weight_squares(window),
+        False,
+        *3 * [float("nan")],
     )
-    coarse = replace(grid, spacing_m=side * grid.spacing_m, shape=cells.shape)
-    return LazyLayer(coarse, np.float32, cells.mean, threads, max(_FEWEST_CELLS, BLOCK_PX // side)), said
+    raster = coarse(scene.grid, cells, threads=threads, of=cells.mean_noise)
+    means = {"amplitude": "root of the power of noise", "power": f"mean power of noise of {side} x {side} pixels"}
+    return {"multilook_noise": raster}, {"multilook_noise": ECHO.report | means}
 
 
 def _report(scene: OpenScene, image: xr.Dataset, calibrated: CalibratedPair, noise: float) -> dict[str, Any]:

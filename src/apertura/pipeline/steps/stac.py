@@ -27,6 +27,7 @@ from apertura.formats.catalog.stac import (
 )
 from apertura.formats.export.coverage import Covered, feature_collection
 from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.config import polarisation_of
 from apertura.pipeline.lineage import result_of
 from apertura.pipeline.opening.scene import OpenScene, settled_scene
 from apertura.pipeline.steps.coverage import few_looks, place_of, transform_of
@@ -68,12 +69,15 @@ class _Described:
 
     def _pair(self, flight: str, pair: str, looks: NDArray[np.float32]) -> Image:
         files = self._listed(flight, pair, "export") | self._listed(flight, pair, "layers")
-        facts = {
+        facts: dict[str, Any] = {
             "sar:instrument_mode": _mode(pair),
             "sar:product_type": "SLC",
             "sar:looks_range": 1,
             "sar:looks_azimuth": 1,
         }
+        label = polarisation_of(self.campaign.settings.nodes, pair)
+        if label and {*label} <= {"H", "V"}:
+            facts["sar:polarizations"] = [label]
         return Image(
             flight,
             pair,
