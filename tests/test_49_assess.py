@@ -1,6 +1,7 @@
 """Images of a flight hold each other: what is wrong with one is said of it, with what would mend it."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -69,6 +70,7 @@ def test_the_summary_says_each_flag_once_and_whole(finished_sample, capsys, tmp_
     said = capsys.readouterr().out
     assert said.count("a line [with brackets]") == 1
     assert "not stated, so not in the budget" in said
+    assert re.search(r"points may lie \d\.\d+ m off, mostly by heights, not stated; assumed 3 m", said)
 
 
 def flip_right_arm(document):

@@ -40,6 +40,8 @@ class ImageValues:
         Of the causes stated, the one that the budget expects to cost most.
     not_stated
         Causes of the budget whose size nobody has stated and nothing is assumed for.
+    place_m, place_cause
+        Deviation of the places of points that the budget expects, metres, and the cause that moves them most.
     error_db
         Bound of the numerical error, dB.
     used, recorded
@@ -56,6 +58,8 @@ class ImageValues:
     expected_db: float | None
     worst_cause: str
     not_stated: tuple[str, ...]
+    place_m: float
+    place_cause: str
     error_db: float
     used: int | None
     recorded: int
@@ -69,6 +73,7 @@ class ImageValues:
         focus, pulses, coherence, fusion = (report.get(key) or {} for key in ("focus", "pulses", "coherence", "fusion"))
         budget = report.get("budget", ())
         worst = min((line for line in budget if is_counted(line)), key=lambda line: line["loss_db"], default=None)
+        far = max((line for line in budget if is_counted(line)), key=lambda line: line["shift_m"] or 0.0, default=None)
         used = pulses.get("used")
         return cls(
             str(focus.get("verdict", "")),
@@ -77,6 +82,8 @@ class ImageValues:
             focus.get("expected_db"),
             worst["cause"] if worst else "",
             tuple(line["cause"] for line in budget if not is_counted(line)),
+            focus.get("expected_shift_m") or 0.0,
+            f"{far['cause']}, {far['stated']}" if far else "",
             float(report["numerical_error_db"]),
             used,
             (used or 0) + (pulses.get("dropped") or 0),

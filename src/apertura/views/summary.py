@@ -57,6 +57,9 @@ def print_summary(campaign: Campaign) -> None:
     if not console.is_terminal:
         console = Console(highlight=False, width=max(_WIDE, console.width))
     console.print(_table(values))
+    unsure = max(values.values(), key=lambda one: one.place_m, default=None)
+    if unsure and unsure.place_m:
+        console.print(f"points may lie {unsure.place_m:.2g} m off, mostly by {unsure.place_cause}", soft_wrap=True)
     not_stated = dict.fromkeys(cause for one in values.values() for cause in one.not_stated)
     if not_stated:
         console.print(f"not stated, so not in the budget; image.json says what they would do: {', '.join(not_stated)}")

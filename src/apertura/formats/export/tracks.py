@@ -141,6 +141,7 @@ def write_pos(path: Path, log: RefinedLog, *, outcome: str, version: str) -> Non
         outcome,
         f"the logged point of {log.node}, no antenna{beyond if log.refined.any() else ''}",
         "deviation 0: nobody states it; Q 5: also for kinds of solution that are not logged",
+        "ns, age, ratio and covariances 0: not known, for images moved the positions; Q is the log's; filter by none",
     ]
     with replacement(path) as temporary:
         write_rtklib_pos(

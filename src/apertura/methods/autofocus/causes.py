@@ -51,8 +51,8 @@ class Cause:
 
     def line(self, values: Floats) -> str:
         """Return what is wrong, with its size."""
-        late = "late" if values[0] > 0 else "early"
-        return self.what.format(*values, late=late, size=abs(float(values[0])))
+        late, above = ("late", "above") if values[0] > 0 else ("early", "below")
+        return self.what.format(*values, late=late, above=above, size=abs(float(values[0])))
 
     def prior(self, flight: Prior, knots_s: Floats) -> "CausePrior":
         """Return the prior of a flight with no other error."""
@@ -103,7 +103,7 @@ def other_arm(node: str, time_s: Floats, body_axes: Floats) -> Cause:
 def other_height(nodes: Sequence[str], time_s: Floats, up: Floats) -> Cause:
     """Return the cause that the ground lies higher than stated, as if all nodes flew lower; `up` (3,) in the frame."""
     moved = {node: np.broadcast_to(-up, (1, len(time_s), 3)) for node in nodes}
-    what = "the ground lies {0:+.2f} m from where the config has it"
+    what = "the ground lies {size:.2f} m {above} where the config has it"
     return Cause("height", what, np.array([HEIGHT_STD_M]), time_s, moved)
 
 

@@ -1,6 +1,6 @@
 """Tracks that make the patches sharpest: search, its two starts, and the gauge that only the log determines."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -25,6 +25,7 @@ LEAST_SHIFT_M = 3e-4
 LEAST_INFORMATION = 10.0
 """Information of the image over that of the log, 1, from which the image alone determines a mode."""
 
+_MODES = 32  # smooth motions that are followed at once
 _PIECES = 5  # cubic pieces of a smooth mode in the time for which a patch is illuminated
 
 
@@ -38,8 +39,9 @@ class Gauge:
         (mode, unknown) float64, orthonormal, in the prior's unknowns.
     shift_m
         (mode, pair and patch, 2) float64, metres per unit of each: how the image of every patch moves east and north.
-    blurs_rad2, blurring
-        (other,) and (other, unknown) float64: mean square of the phase that orthonormal modes turn, largest last.
+    blurs_rad2, shapes, smooth
+        (other,) mean square of the phase that orthonormal modes turn, largest last; (other, smooth) float64, each as a
+        sum of smooth motions, and these.
 
     Notes
     -----
@@ -49,7 +51,8 @@ class Gauge:
     modes: Floats
     shift_m: Floats
     blurs_rad2: Floats
-    blurring: Floats
+    shapes: Floats
+    smooth: "SmoothMotions"
 
     def project_out(self, unknowns: Floats) -> Floats:
         """Return unknowns, or a gradient, without their part along the modes."""
@@ -63,7 +66,9 @@ class Gauge:
     @classmethod
     def none(cls, unknowns: int) -> "Gauge":
         """Return the gauge without modes."""
-        return cls(np.zeros((0, unknowns)), np.zeros((0, 1, 2)), np.zeros(0), np.zeros((0, unknowns)))
+        return cls(
+            np.zeros((0, unknowns)), np.zeros((0, 1, 2)), np.zeros(0), np.zeros((0, 0)), SmoothMotions([], unknowns)
+        )
 
     def settled(self, unknowns: Floats, *, known: float) -> Floats:
         """Return (mode,) float64, the unknowns that the image alone determines.
@@ -76,7 +81,7 @@ class Gauge:
             Information of the phases on a mode that turns them by a radian: 2·power of points over their surroundings,
             summed over pairs and patches.
         """
-        return np.asarray(self.blurring[self.blurs_rad2 * known > LEAST_INFORMATION] @ unknowns)
+        return np.asarray(self.shapes[self.blurs_rad2 * known > LEAST_INFORMATION] @ self.smooth.parts(unknowns))
 
 
 def find_gauge(
@@ -87,17 +92,20 @@ def find_gauge(
     axes: Floats,
 ) -> Gauge:
     """Return the gauge of patches over pairs; rows of `axes` are east, north, up."""
-    unknowns = _smooth_unknowns(pairs, cached, prior, knots_s)
-    blurs, shifts = [], []
-    tracks = prior.tracks(unknowns)
+    smooth = SmoothMotions.of(pairs, cached, prior, knots_s)
+    count = sum(len(patches) for patches in cached)
+    focus, shifts = np.zeros((len(smooth), len(smooth))), []
     for blocks, patches in zip(pairs, cached, strict=True):
-        moved = {node: blocks.average_of(tracks[node]) for node in dict.fromkeys(blocks.record.nodes)}
-        for patch in patches:
-            blur, shift = effects(patch, moved, axes)
-            blurs.append(blur)
+        paths = [np.empty((patch.blocks.stop - patch.blocks.start, len(smooth))) for patch in patches]
+        for some, unknowns in smooth.rows():
+            tracks = prior.tracks(unknowns)
+            moved = {node: blocks.average_of(tracks[node]) for node in dict.fromkeys(blocks.record.nodes)}
+            for patch, path in zip(patches, paths, strict=True):
+                path[:, some] = longer_paths(patch, moved)
+        for patch, path in zip(patches, paths, strict=True):
+            blur, shift = effects_of_paths(patch, path, axes)
+            focus += blur.T @ blur / count
             shifts.append(shift)
-    count = len(blurs)
-    focus = np.sum([blur.T @ blur for blur in blurs], axis=0) / count
     shift = np.concatenate(shifts) / np.sqrt(count)
     spread = np.linalg.solve(focus + LEAST_PHASE_RAD**2 * np.eye(len(focus)), shift.T)
     power, turn = np.linalg.eigh(shift @ spread)
@@ -105,39 +113,75 @@ def find_gauge(
     inside, _ = np.linalg.qr(spread @ turn[:, keep])
     moves = np.stack([one @ inside for one in shifts])
     blurred, shapes = np.linalg.eigh(focus)
-    return Gauge(inside.T @ unknowns, np.moveaxis(moves, -1, 0), blurred, shapes.T @ unknowns)
+    return Gauge(smooth.sums(inside.T), np.moveaxis(moves, -1, 0), blurred, shapes.T, smooth)
 
 
-def _smooth_unknowns(
-    pairs: Sequence[Blocks], cached: Sequence[Sequence[Contribution]], prior: Prior, knots_s: Floats
-) -> Floats:
-    """Return (mode, unknown) float64, orthonormal: smooth tracks, and those that turn and stretch each node's own."""
-    from scipy.interpolate import BSpline
+@dataclass(frozen=True, eq=False)
+class SmoothMotions:
+    """Smooth tracks of each node, and those that turn and stretch its own, orthonormal in the prior's unknowns.
 
-    lengths = [patch.blocks.stop - patch.blocks.start for patches in cached for patch in patches]
-    length = max(4, int(np.median([one for one in lengths if one] or [len(knots_s)])) // _PIECES)
-    number = max(1, round(len(knots_s) / length))
-    grid = np.linspace(knots_s[0], knots_s[-1], number + 1)
-    step = grid[1] - grid[0]
-    ends = np.concatenate([grid[0] - step * np.arange(3, 0, -1), grid, grid[-1] + step * np.arange(1, 4)])
-    inside = np.clip(knots_s, grid[0], np.nextafter(grid[-1], grid[0]))
-    splines = BSpline.design_matrix(inside, ends, 3).toarray()
-    flown = _logged_places(pairs)
-    modes, begin = [], 0
-    for node, own in prior.nodes.items():  # unknowns of one node move no other: nodes are orthogonal
-        shape = flown[node] - flown[node].mean(axis=0)
-        basis = np.concatenate([splines, shape / max(float(np.abs(shape).max()), 1e-9)], axis=1)
-        fields = np.concatenate([own.adjoint(basis.T[:, :, None] * axis) for axis in np.eye(3)])
-        _, size, right = np.linalg.svd(fields, full_matrices=False)
-        modes.append((begin, size, right))
-        begin += own.size
-    largest = max(size[0] for _, size, _ in modes)
-    some = [(first, right[size > 1e-6 * largest]) for first, size, right in modes]
-    unknowns = np.zeros((sum(len(rows) for _, rows in some), prior.size))
-    ends = np.cumsum([0, *(len(rows) for _, rows in some)])
-    for (first, rows), row in zip(some, ends, strict=False):
-        unknowns[row : row + len(rows), first : first + rows.shape[1]] = rows
-    return unknowns
+    Attributes
+    ----------
+    of_nodes
+        First of a node's unknowns, and (mode, unknown of the node) float64: modes of one node move no other.
+    size
+        How many unknowns all nodes have.
+    """
+
+    of_nodes: Sequence[tuple[int, Floats]]
+    size: int
+
+    @classmethod
+    def of(
+        cls, pairs: Sequence[Blocks], cached: Sequence[Sequence[Contribution]], prior: Prior, knots_s: Floats
+    ) -> "SmoothMotions":
+        """Return those that patches can tell apart while they are illuminated."""
+        from scipy.interpolate import BSpline
+
+        lengths = [patch.blocks.stop - patch.blocks.start for patches in cached for patch in patches]
+        length = max(4, int(np.median([one for one in lengths if one] or [len(knots_s)])) // _PIECES)
+        number = max(1, round(len(knots_s) / length))
+        grid = np.linspace(knots_s[0], knots_s[-1], number + 1)
+        step = grid[1] - grid[0]
+        ends = np.concatenate([grid[0] - step * np.arange(3, 0, -1), grid, grid[-1] + step * np.arange(1, 4)])
+        inside = np.clip(knots_s, grid[0], np.nextafter(grid[-1], grid[0]))
+        splines = BSpline.design_matrix(inside, ends, 3).toarray()
+        flown = _logged_places(pairs)
+        found, first = [], 0
+        for node, own in prior.nodes.items():
+            shape = flown[node] - flown[node].mean(axis=0)
+            basis = np.concatenate([splines, shape / max(float(np.abs(shape).max()), 1e-9)], axis=1)
+            fields = np.concatenate([own.adjoint(basis.T[:, :, None] * axis) for axis in np.eye(3)])
+            found.append((first, *np.linalg.svd(fields, full_matrices=False)[1:]))
+            first += own.size
+        largest = max(float(size[0]) for _, size, _ in found)
+        return cls([(begin, modes[size > 1e-6 * largest]) for begin, size, modes in found], first)
+
+    def __len__(self) -> int:
+        """Return the number of modes."""
+        return sum(len(modes) for _, modes in self.of_nodes)
+
+    def rows(self) -> Iterator[tuple[slice, Floats]]:
+        """Yield which modes, a few at a time, and (some, unknown) float64, what they are."""
+        row = 0
+        for first, modes in self.of_nodes:
+            for begin in range(0, len(modes), _MODES):
+                some = modes[begin : begin + _MODES]
+                unknowns = np.zeros((len(some), self.size))
+                unknowns[:, first : first + some.shape[1]] = some
+                yield slice(row, row + len(some)), unknowns
+                row += len(some)
+
+    def parts(self, unknowns: Floats) -> Floats:
+        """Return (mode,) float64, how much of each is in some unknowns."""
+        some = [modes @ unknowns[first : first + modes.shape[1]] for first, modes in self.of_nodes]
+        return np.concatenate([np.zeros(0), *some])
+
+    def sums(self, shares: Floats) -> Floats:
+        """Return (sum, unknown) float64 of (sum, mode) shares."""
+        split = np.cumsum([len(modes) for _, modes in self.of_nodes])[:-1]
+        of_nodes = zip(np.split(shares, split, axis=1), self.of_nodes, strict=True)
+        return np.concatenate([some @ modes for some, (_, modes) in of_nodes], axis=1)
 
 
 def _logged_places(pairs: Sequence[Blocks]) -> Mapping[str, Floats]:
@@ -159,11 +203,13 @@ def effects(patch: Contribution, moved: Mapping[str, Floats], axes: Floats) -> t
     Source: docs/theory/autofocus.md, eq. 13: a constant phase does not blur, but over the band the path itself must be
     what a shift explains.
     """
-    return effects_of_paths(
-        patch,
-        sum(np.einsum("bi,mbi->bm", slope, moved[node][:, patch.blocks]) for node, slope in patch.slopes.items()),
-        axes,
-    )
+    return effects_of_paths(patch, longer_paths(patch, moved), axes)
+
+
+def longer_paths(patch: Contribution, moved: Mapping[str, Floats]) -> Floats:
+    """Return (block, mode) float64, metres by which paths grow with modes of the nodes, (mode, block, 3) each."""
+    grown = (np.einsum("bi,mbi->bm", slope, moved[node][:, patch.blocks]) for node, slope in patch.slopes.items())
+    return np.asarray(sum(grown), np.float64)
 
 
 def effects_of_paths(patch: Contribution, path: Floats, axes: Floats) -> tuple[Floats, Floats]:

@@ -22,6 +22,7 @@ MOST_PULSES = 512
 """Pulses of a pair on which hypotheses are tried, evenly spread."""
 
 _SHIFTS_S = (18.0, 37.0, 19.0, 17.0, 5.0, 3.0, 2.0, 1.0, 0.7, 0.5, 0.3, 0.2, 0.1, 0.05)
+_UNDULATION_M = 10.0  # from here on heights above a geoid may have been taken for ellipsoidal ones, or the reverse
 _HEIGHTS_M = (50.0, 47.0, 20.0, 10.0, 5.0, 2.0, 1.0, 0.5)
 _PREFIX_SAMPLES = (1, 2, 3, 5, 10, 20, 50)
 _TIME_SYSTEMS = {
@@ -122,7 +123,8 @@ def hypotheses_of(nodes: Mapping[str, Acquisition], found: Sequence[PairGeometry
     yield from _other_arms(nodes, found)
     yield from _swapped_tracks(nodes, found)
     for height_m in (sign * size for size in _HEIGHTS_M for sign in (1, -1)):
-        what = f"the ground lies {height_m:+.1f} m from where the config has it: another datum?"
+        what = f"the ground lies {abs(height_m):.1f} m {'above' if height_m > 0 else 'below'} where the config has it"
+        what += ": another vertical datum?" if abs(height_m) >= _UNDULATION_M else ""
         yield Hypothesis(what, "height", tuple(one.history for one in found), height_m)
     yield from _longer_paths(nodes, found)
 
