@@ -79,7 +79,7 @@ def fusion_claims(folder: Path) -> list[Claim]:
     """Return what fusing gains and costs in the UAV experiment that lies in a folder of campaigns."""
     experiment = open_experiment(folder, "uav")
     images = open_images(experiment)
-    return [_phase(experiment), *_widths(images), *_clutter(images), *_sidelobes(images), _envelope(images)]
+    return [_phase(experiment), *_widths(images), *_clutter(images), *_sidelobes(images)]
 
 
 def _phase(experiment: Experiment) -> Claim:
@@ -191,18 +191,3 @@ def two_segment_sidelobe_db(length_m: float, gap_m: float) -> float:
     response = np.abs(np.sinc(u) * np.cos(np.pi * (1 + gap_m / length_m) * u))
     beyond = int(np.argmax(np.diff(response) > 0))
     return float(20 * np.log10(response[beyond:].max()))
-
-
-def _envelope(images: Images) -> Claim:
-    row, _ = images.brightest("coherent")
-    coherent, noncoherent = (np.abs(images.amplitude[name][row]) for name in ("coherent", "noncoherent"))
-    above_db = float(20 * np.log10((coherent / np.maximum(noncoherent, 1e-9)).max()))
-    return require(
-        "the noncoherent cut is the envelope of the coherent one",
-        above_db,
-        "dB",
-        limit="at most 0.5 dB above it anywhere along the cut",
-        met=above_db <= 0.5,
-        style=".2f",
-        note="largest excess of the coherent cut; both relative to their peaks: |a + b| ≤ |a| + |b|",
-    )
