@@ -11,6 +11,9 @@ from apertura_research.commands import (
 
 CAMPAIGN = "results/study/paper/campaigns/{experiment}"
 STUDY = {name: study_of(name) for name in STUDIES}
+STEPS = ("ingest f01 uav1", "ingest f01 uav2", "echo f01 uav1-uav1", "echo f01 uav1-uav2")
+STANDS = " && ".join(f"apertura step {step}" for step in STEPS)  # a radar that did not move has no image
+PROCESSED = {"lab": STANDS, "static": STANDS, "uav": "apertura run . --cores 1"}
 
 
 def parts(study, names):
@@ -58,16 +61,17 @@ rule paper_campaign:
         mem_mb=lambda wildcards, attempt: 3000 * attempt,
     params:
         folder=CAMPAIGN,
+        processed=lambda wildcards: PROCESSED[wildcards.experiment],
         code=code_sha256(
             "apertura.simulation.presets",
             "apertura.pipeline.steps.echo",
             "apertura.pipeline.steps.cube",
         ),
     message:
-        "the paper's experiment {wildcards.experiment}, through the ordinary pipeline"
+        "the paper's experiment {wildcards.experiment}, through the ordinary steps"
     shell:
         "(rm -rf {params.folder} && apertura simulate {params.folder} --preset paper-{wildcards.experiment}"
-        " && apertura run {params.folder} --cores {threads} && touch {output}) > {log} 2>&1"
+        " && (cd {params.folder} && {params.processed}) && touch {output}) > {log} 2>&1"
 
 
 rule paper_part:

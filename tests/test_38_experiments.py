@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from apertura_research import commands
 from apertura_research.paper import figures
-from apertura_research.paper.claims import AGREES, UNTESTABLE, VERDICTS
+from apertura_research.paper.claims import AGREES, DISAGREES, EXPLAINED, PAPER, VERDICTS
 from apertura_research.paper.experiments import (
     BISTATIC,
     MONOSTATIC,
@@ -13,15 +13,21 @@ from apertura_research.paper.experiments import (
     profiles_at,
     terms_at,
 )
-from apertura_research.paper.fusion import Images, fusion_claims, two_segment_sidelobe_db
+from apertura_research.paper.fusion import (
+    MAGNITUDES_CONTRAST,
+    MAGNITUDES_DB,
+    Images,
+    fusion_claims,
+    two_segment_sidelobe_db,
+)
 from apertura_research.paper.losses import ERRORS
-from folders import run_steps
+from folders import recordings_of, run_steps
 
 from apertura.core.quality.measures import coherence_factor
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.steps import echo, ingest
 from apertura.simulation import preset, simulate
-from apertura.simulation.presets import CABLE_M, GAP_M, SEGMENT_M
+from apertura.simulation.presets import GAP_M, SEGMENT_M
 
 PULSES = 16
 
@@ -45,7 +51,7 @@ def test_the_sidelink_makes_random_phases_coherent_through_cable_and_air(campaig
     experiment = open_experiment(campaigns, name)
     place = experiment.places_m[0]
     assert coherence_factor(terms_at(experiment.uncorrected(), place)) < 0.3
-    assert coherence_factor(terms_at(experiment.history(BISTATIC), place)) > 0.999
+    assert coherence_factor(terms_at(experiment.history(BISTATIC), place)) > 0.95
 
 
 @pytest.mark.slow
@@ -60,32 +66,49 @@ def test_a_target_stands_in_the_profile_where_it_was_put(campaigns, name, pair):
     assert found_m == pytest.approx(true_m, abs=0.08)  # clutter moves it by a fraction of a cell of 37 cm
 
 
-@pytest.mark.slow
-def test_the_sidelink_of_the_lab_is_the_cable_alone(campaigns):
-    raw = open_experiment(campaigns, "lab").opened.campaign.settings.nodes["uav2"]
-    assert raw.path_offset_m.sidelink == CABLE_M
-    track = preset("paper-lab").flights[0].tracks
-    apart = np.subtract(track["uav2"].start_m, track["uav1"].start_m)
-    np.testing.assert_allclose(apart[0] + raw.lever_arms_m.sidelink[1], 0.0, atol=1e-12)  # yaw 0: right is east
+def test_the_lab_is_ten_metres_of_cable_beside_five_and_no_target():
+    specification = preset("paper-lab")
+    (joint,) = specification.targets
+    tracks = specification.flights[0].tracks
+    assert tracks["uav1"] == tracks["uav2"]
+    assert tracks["uav1"].velocity_m_s == (0.0, 0.0, 0.0)
+    assert joint.position_m[:2] == tracks["uav1"].start_m[:2]
+    for name, recorded in recordings_of(preset("paper-lab", pulses=2))[0].items():
+        path_m = 299792458 * recorded.channels["radar"].paths.delay_s
+        np.testing.assert_allclose(path_m, 10.0, atol=1e-6)
+        assert abs(recorded.channels["radar"].paths.amplitude) == pytest.approx(1.0, rel=1e-5)
+        if name == "uav2":
+            np.testing.assert_allclose(299792458 * recorded.channels["sidelink"].paths.delay_s, 5.0, atol=1e-6)
+
+
+def test_one_receive_signal_is_split_to_both_nodes_of_the_static_recording():
+    recorded, _ = recordings_of(preset("paper-static", pulses=2))
+    mono, bistatic = (recorded[name].channels["radar"].paths for name in ("uav1", "uav2"))
+    np.testing.assert_array_equal(mono.delay_s, bistatic.delay_s)
+    np.testing.assert_array_equal(mono.amplitude, bistatic.amplitude)
+    first, second = (abs(mono.amplitude[0, part].sum()) for part in (slice(4), slice(4, 8)))
+    assert 20 * np.log10(first / second) == pytest.approx(7.0, abs=0.1)
 
 
 @pytest.mark.slow
-def test_coherence_is_judged_by_the_noise_of_echo_free_ranges_and_by_chance(campaigns):
-    claims = coherence_claims(campaigns)
-    assert {claim.verdict for claim in claims} <= set(VERDICTS)
-    uncorrected = [claim for claim in claims if "without correction" in claim.claim]
-    assert [claim.independent_model for claim in uncorrected] == [f"{1 / PULSES:g}"] * 2
-    printed = [claim for claim in claims if "printed" in claim.claim]
-    assert [(claim.paper, claim.verdict) for claim in printed] == [
-        (value, UNTESTABLE) for value in ("0.986", "0.9999", "0.9995")
-    ]
-    spread = next(claim for claim in claims if claim.claim.startswith("phase spread"))
-    assert float(spread.computed) > 2  # the weak reflector is a quarter as strong
-    absolute = [claim for claim in claims if claim.claim.startswith("absolute")]
-    assert {claim.verdict for claim in absolute} == {AGREES}
-    for claim in claims:
-        if claim.claim.startswith("lack of coherence"):
-            assert float(claim.computed) == pytest.approx(float(claim.independent_model), rel=0.7)
+def test_coherence_is_that_of_the_printed_recordings_and_of_the_noise_of_echo_free_ranges(campaigns):
+    claims = {claim.claim: claim for claim in coherence_claims(campaigns)}
+    assert {claim.verdict for claim in claims.values()} <= set(VERDICTS)
+    before = claims["coherence factor without correction"]
+    assert (before.paper, before.independent_model) == ("0.0034", f"{1 / PULSES:g}")
+    printed = {name: claim for name, claim in claims.items() if "after correction" in name}
+    assert {name.partition("correction, ")[2]: (claim.paper, claim.verdict) for name, claim in printed.items()} == {
+        "lab, cables": ("0.986", EXPLAINED),
+        "static, first cylinder": ("0.9999", EXPLAINED),
+        "static, second cylinder": ("0.9995", EXPLAINED),
+    }
+    assert all("by construction" in claim.note for claim in printed.values())
+    assert float(claims["phase spread at the second cylinder over that at the first"].computed) > 1.5
+    for name, claim in claims.items():
+        if name.startswith("lack of coherence"):
+            assert float(claim.computed) == pytest.approx(1.0, abs=0.7)
+    alike = [claims[f"{what} monostatic, static"] for what in ("phase of bistatic less", "gain of bistatic over")]
+    assert [(claim.about, claim.verdict) for claim in alike] == [(PAPER, AGREES)] * 2
 
 
 @pytest.mark.slow
@@ -108,7 +131,7 @@ def test_every_figure_of_the_paper_has_what_draws_it():
     drawn = {*figures.SHOWN, "scene", *figures.DRAWN}
     assert drawn == set(commands.PAPER_FIGURES)
     assert len(drawn) == 14
-    assert {error for error, _ in figures.SHOWN.values()} == set(ERRORS)
+    assert set(figures.SHOWN) == {"no_errors", *ERRORS}
     campaigns_read = {name for names in commands.PAPER_FIGURES.values() for name in names}
     assert campaigns_read == {name for names in commands.PAPER_READS.values() for name in names}
 
@@ -138,6 +161,13 @@ def test_two_adjacent_segments_have_the_sidelobe_of_one_aperture_and_a_gap_raise
     assert (np.diff(levels) > 0).all()
 
 
+def test_magnitudes_of_two_clutters_add_up_to_half_a_decibel_less_and_smoother():
+    parts = np.random.default_rng(1).standard_normal((2, 200_000, 2)) @ [1, 1j] / np.sqrt(2)
+    power = (np.abs(parts).sum(axis=0) / 2) ** 2
+    assert -10 * np.log10(power.mean()) == pytest.approx(MAGNITUDES_DB, abs=0.02)
+    assert power.std() / power.mean() == pytest.approx(MAGNITUDES_CONTRAST, abs=0.01)  # of one image: 1
+
+
 def test_clutter_is_measured_away_from_every_target():
     images = Images({"mono": np.zeros((100, 100), np.complex64)}, np.array([[20.0, 20.0], [70.0, 50.0]]), 0.1)
     mask = images.clutter()
@@ -151,6 +181,10 @@ def test_clutter_is_measured_away_from_every_target():
 def test_the_flight_through_the_pipeline_fuses_as_its_segments_say(tmp_path):
     run_steps(simulate(tmp_path / "uav", "paper-uav"), exports=False)
     claims = {claim.claim: claim for claim in fusion_claims(tmp_path)}
-    assert {claim.verdict for name, claim in claims.items() if "width" not in name} == {AGREES}
+    comparable = claims.pop("clutter suppression by the coherent sum over that by the noncoherent one")
+    assert (comparable.about, comparable.verdict) == (PAPER, DISAGREES)
+    gained = claims["UAV experiment: width of the noncoherent sum over that of the monostatic image"]
+    assert (gained.about, gained.verdict) == (PAPER, AGREES)
+    assert {claim.verdict for name, claim in claims.items() if "coherent sum" not in name} == {AGREES}
     width = float(claims["UAV experiment: cross-range width, coherent sum"].computed)
     assert 10 < width < 14  # a third of one segment's

@@ -1,10 +1,10 @@
 """Simulations to start from, each a specification: the demo, the paper's scene and its three experiments.
 
-What the paper does not print of its experiments (targets, clutter, noise, which parts of the track) is chosen here,
-plainly, and not so that a result of the paper comes out: docs/theory/study.md, "Experiments".
+A docstring of an experiment says what the paper prints of it and what it does not: what is not printed is chosen here,
+plainly, and not so that a result of the paper comes out; docs/theory/study.md, "Experiments".
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -27,59 +27,97 @@ from apertura.simulation.waveform import TransmitWaveform, WaveformSpecification
 
 PAPER_WAVEFORM = WaveformSpecification(4096, 1.2e9, 100e3, 12.5e-6, 3.125e-6, 1.024e9, 100.0, code="newman")
 EXPERIMENT_ORIGIN = Origin(48.42255, 9.95509, 620.0)
+_UTM = "EPSG:32632"
 STATIC_PULSES = 200
-CABLE_M = 10.0
-"""Electrical length of the cable that carries the sidelink in the lab."""
+RADAR_CABLE_M, SIDELINK_CABLE_M = 10.0, 5.0
+"""Of the lab's two paths, taken as electrical lengths."""
+
+COHERENT_SNR_DB = {"cables": 18.5, "first cylinder": 40.0, "second cylinder": 33.0}
+"""SNR per compressed pulse at which M = 200 pulses have the coherence factors that the paper prints: 0.986 of the
+cables, 0.9999 and 0.9995 of the cylinders. It prints no SNR; docs/theory/study.md, "Coherence factor"."""
+
+_JOINT_M = 1e-3  # an echo needs a point: the cable ends 1 mm from its connectors, as strong as if it were none
 
 SEPARATION_M = 4.7
-"""Between the two nodes outdoors and in flight."""
+"""Between the two nodes in flight."""
 
 SEGMENT_M, GAP_M, SPEED_M_S, FLIGHT_PRF_HZ = 3.4, 2.4, 0.5, 20.0
 """Each image's part of the track, and how far the two parts lie apart, both counted at the pair's midpoint."""
 
 
-def paper_lab(*, pulses: int = STATIC_PULSES) -> CampaignSpecification:
-    """Return two nodes 0.6 m apart on a table, wired by a cable, before two cylinders on a bare floor.
+def paper_lab(*, pulses: int = STATIC_PULSES, snr_db: float = COHERENT_SNR_DB["cables"]) -> CampaignSpecification:
+    """Return the lab: nothing but coaxial cables and attenuators between two nodes.
 
-    The points of the sidelink coincide: nothing but the cable, `CABLE_M` of electrical length, is between them.
+    Parameters
+    ----------
+    pulses
+        M = 200 in the paper's coherence experiments.
+    snr_db
+        Of the radar channel per compressed pulse, all subcarriers weighted alike.
+
+    Notes
+    -----
+    Printed, in the paper's laboratory experiment: coaxial cables and attenuators, a radar path of 10 m, a sidelink of
+    5 m, no target; Γ = 0.986 after correction. In its table of parameters: the waveform, at 100 Hz. Of its text on
+    clocks: 10 ppb. Not printed: any SNR (that of the radar channel is what Γ needs, that of the sidelink 40 dB per
+    subcarrier), start and phase of the secondary's captures (±40 ns, ±π), losses of the cables, and whether their
+    lengths are electrical (so here).
     """
-    targets = (
-        Line((0.0, 0.0, 0.0), (0.0, 0.0, 1.5), 30, 1.0),
-        Line((0.9, 1.6, 0.0), (0.9, 1.6, 1.5), 30, 0.5),
-        Clutter((-3.0, -2.5, 3.0, 3.0), 5e-4, 6.0),
-    )
-    wired = SimulatedNode(
-        {"sidelink": (0.0, -0.6, 0.0)}, {"radar": 0.911, "sidelink": CABLE_M}, impairments=_own_clock(10.0, 40.0)
-    )
-    nodes = {"uav1": SimulatedNode(impairments=Impairments(radar_snr_db=10.0)), "uav2": wired}
-    places = {"uav1": (-0.3, -4.0, 0.75), "uav2": (0.3, -4.0, 0.75)}
-    return _standing("paper-lab", targets, nodes, places, pulses)
+    joint = (PointTarget((0.0, 0.0, 1.0 - _JOINT_M), _JOINT_M**2),)
+    return _standing("paper-lab", joint, (0.0, 0.0, 1.0), RADAR_CABLE_M - 2 * _JOINT_M, _per_subcarrier(snr_db), pulses)
 
 
 def paper_static(*, pulses: int = STATIC_PULSES) -> CampaignSpecification:
-    """Return two nodes standing 4.7 m apart outdoors, before a strong and a weak reflector and clutter."""
-    targets = (
-        PointTarget((0.0, 0.0, 0.0)),
-        PointTarget((1.0, 2.2, 0.0), 0.25),
-        Clutter((-4.0, -4.0, 4.0, 6.0), 1e-3, 4.0),
+    """Return the chamber: two cylinders before one receiving antenna, whose signal is split to both nodes.
+
+    Notes
+    -----
+    Printed, in the paper's static experiment: an anechoic chamber (no clutter), cylinders of 15 cm, mono- and bistatic
+    recordings of one split receive signal; Γ = 0.9999 at the first, 0.9995 at the second. Not printed: where the
+    cylinders stand (4 m and 6.5 m), whether 15 cm is their height (so here) or diameter, the SNR (what each Γ needs),
+    noise that the split signal has in common (none), how the sidelink is led (the lab's cable), the clock of the
+    secondary (the lab's).
+    """
+    near_m, far_m, antenna_up_m = 4.0, 6.5, 1.0
+    weaker_db = COHERENT_SNR_DB["first cylinder"] - COHERENT_SNR_DB["second cylinder"]
+    cylinders = (
+        _cylinder(near_m - 6.0, antenna_up_m, near_m**2),
+        _cylinder(far_m - 6.0, antenna_up_m, far_m**2 * 10 ** (-weaker_db / 20)),
     )
-    secondary = SimulatedNode({}, {"radar": 0.911, "sidelink": 0.402}, impairments=_own_clock(0.0, 30.0))
-    nodes = {"uav1": SimulatedNode(impairments=Impairments(radar_snr_db=0.0)), "uav2": secondary}
-    places = {"uav1": (-SEPARATION_M / 2, -14.0, 1.5), "uav2": (SEPARATION_M / 2, -14.0, 1.5)}
-    return _standing("paper-static", targets, nodes, places, pulses)
+    both_db = 10 * float(np.log10(1 + 10 ** (-weaker_db / 10)))  # of their mean power over that of the first
+    snr_db = _per_subcarrier(COHERENT_SNR_DB["first cylinder"]) + both_db
+    return _standing("paper-static", cylinders, (0.0, -6.0, antenna_up_m), 0.911, snr_db, pulses)
+
+
+def _cylinder(north_m: float, up_m: float, amplitude: float) -> Line:
+    return Line((0.0, north_m, up_m - 0.075), (0.0, north_m, up_m + 0.075), 4, amplitude)
+
+
+def _per_subcarrier(compressed_db: float) -> float:
+    """Return the SNR per subcarrier (dB) of that per compressed pulse, whose subcarriers add up in phase."""
+    return compressed_db - 10 * float(np.log10(PAPER_WAVEFORM.subcarriers))
 
 
 def paper_uav(*, pulses: int = 275) -> CampaignSpecification:
-    """Return the flight: 20 Hz, 0.5 m/s, 4.8 m high, 11.5 m from the scene, 4.7 m apart, a segment for each image.
+    """Return the flight: a segment for each image, past 12 m × 4 m of ground with an extended target.
 
     The monostatic pair takes the first 3.4 m of the track, the bistatic pair the last; 275 pulses make 53 MB.
+
+    Notes
+    -----
+    Printed, in the paper's table of the flight: 20 Hz, 0.5 m/s, height 4.5 to 5 m (4.8 m here), ground range 11.5 m,
+    L = 3.4 m, 4.7 m between the UAVs, one behind the other; of its images: 12 m × 4 m (12 m along the track here), an
+    extended target. Not printed: what the target is (rough, 1.2 m × 1.2 m, here), what else stands there (four points,
+    to measure widths and phases at), the clutter (17 dB under a point per m²), any SNR (0 dB per subcarrier, 30 dB in
+    the sidelink), lever arms, wobble, and which parts of the track image: theirs lie 2.4 m apart at their midpoints.
     """
     targets = (
         PointTarget((0.0, 0.0, 0.0)),
         PointTarget((-2.0, 1.2, 0.0), 0.7),
         PointTarget((1.8, -1.6, 0.0), 0.7),
-        PointTarget((1.2, 2.2, 0.0), 0.5),  # the foot of a cylinder, where it and the ground are a dihedral
-        Clutter((-5.0, -5.0, 5.0, 5.0), 0.02, 15.0),
+        PointTarget((-4.2, -0.8, 0.0), 0.6),  # the foot of a cylinder, where it and the ground are a dihedral
+        Clutter((3.6, -0.6, 4.8, 0.6), 0.5, 60.0),
+        Clutter((-7.0, -3.0, 7.0, 3.0), 0.02, 15.0),
     )
     secondary = SimulatedNode(
         {}, {"radar": 0.911, "sidelink": 0.402}, attitude="none", log_format="pos", impairments=_own_clock(0.0, 30.0)
@@ -96,7 +134,7 @@ def paper_uav(*, pulses: int = 275) -> CampaignSpecification:
     later_s = (GAP_M / 2 - SEPARATION_M / 2 - start_m) / SPEED_M_S  # its midpoint is half the separation ahead
     segments = {"uav1-uav1": ((0.0, long_s),), "uav1-uav2": ((later_s, later_s + long_s),)}
     flight = SimulatedFlight("f01", "uav1", tracks, pulses, segments=segments)
-    grid = ImageGrid("EPSG:32632", half_width_m=4.0, spacing_m=0.05)
+    grid = ImageGrid(_UTM, bounds_m=(570655.3, 5363705.2, 570667.3, 5363709.2), spacing_m=0.05)  # about the origin
     waveform = replace(PAPER_WAVEFORM, prf_hz=FLIGHT_PRF_HZ)
     return CampaignSpecification(
         "paper-uav", EXPERIMENT_ORIGIN, waveform, targets, {"uav1": primary, "uav2": secondary}, (flight,), grid
@@ -116,15 +154,15 @@ def _own_clock(radar_snr_db: float, sidelink_snr_db: float) -> Impairments:
 
 
 def _standing(
-    name: str,
-    targets: tuple[Target, ...],
-    nodes: Mapping[str, SimulatedNode],
-    places: Mapping[str, Vector],
-    pulses: int,
+    name: str, targets: tuple[Target, ...], place: Vector, radar_m: float, snr_db: float, pulses: int
 ) -> CampaignSpecification:
-    tracks = {node: Straight(place, (0.0, 0.0, 0.0)) for node, place in places.items()}
-    flight = SimulatedFlight("f01", "uav1", tracks, pulses)
-    grid = ImageGrid("EPSG:32632", half_width_m=3.0, spacing_m=0.1)
+    """Return two nodes on a table whose antennas are at one place, the sidelink a cable, SNR that of a subcarrier."""
+    wired = SimulatedNode({}, {"radar": radar_m, "sidelink": SIDELINK_CABLE_M}, impairments=_own_clock(snr_db, 40.0))
+    first = SimulatedNode({}, {"radar": radar_m}, impairments=Impairments(radar_snr_db=snr_db))
+    still = Straight(place, (0.0, 0.0, 0.0))
+    flight = SimulatedFlight("f01", "uav1", {"uav1": still, "uav2": still}, pulses)
+    grid = ImageGrid(_UTM, half_width_m=3.0, spacing_m=0.1)
+    nodes = {"uav1": first, "uav2": wired}
     return CampaignSpecification(name, EXPERIMENT_ORIGIN, PAPER_WAVEFORM, targets, nodes, (flight,), grid)
 
 
@@ -202,7 +240,7 @@ def continuous(*, pulses: int = 60) -> CampaignSpecification:
         (PointTarget((0.0, 0.0, 0.0)), PointTarget((6.0, 12.0, 0.0), 0.7)),
         {"uav1": SimulatedNode(impairments=own), "uav2": SimulatedNode(impairments=late)},
         (SimulatedFlight("f01", "uav1", tracks, pulses, framing=Framing(), continuous=True),),
-        ImageGrid("EPSG:32632", half_width_m=20.0, spacing_m=0.25),
+        ImageGrid(_UTM, half_width_m=20.0, spacing_m=0.25),
     )
 
 
@@ -220,7 +258,7 @@ def paper(*, pulses: int = 600) -> CampaignSpecification:
         tuple(PointTarget((cross, ground - 15.0, 0.0)) for cross, ground in _PAPER_TARGETS),
         {"uav1": SimulatedNode()},
         (SimulatedFlight("f01", "uav1", {"uav1": track}, pulses),),
-        ImageGrid("EPSG:32632", half_width_m=12.0, spacing_m=0.04),
+        ImageGrid(_UTM, half_width_m=12.0, spacing_m=0.04),
     )
 
 
@@ -242,7 +280,7 @@ def flight(*, pulses: int = 300_000) -> CampaignSpecification:
     }
     targets = tuple(PointTarget((x, y, 0.0)) for x in (-150.0, -50.0, 50.0, 150.0) for y in (-160.0, -40.0, 80.0))
     flown = SimulatedFlight("f01", "uav1", tracks, pulses)
-    grid = ImageGrid("EPSG:32632", half_width_m=204.8, spacing_m=0.1)
+    grid = ImageGrid(_UTM, half_width_m=204.8, spacing_m=0.1)
     return CampaignSpecification("flight", DEMO_ORIGIN, waveform, targets, nodes, (flown,), grid, synthesis="periodic")
 
 
@@ -253,7 +291,7 @@ PRESETS: dict[str, Callable[..., CampaignSpecification]] = {
 
 
 def _over_the_demo_scene(name: str, nodes: dict[str, SimulatedNode], flight: SimulatedFlight) -> CampaignSpecification:
-    grid = ImageGrid("EPSG:32632", half_width_m=6.0, spacing_m=0.05)
+    grid = ImageGrid(_UTM, half_width_m=6.0, spacing_m=0.05)
     return CampaignSpecification(name, DEMO_ORIGIN, _DEMO_WAVEFORM, _DEMO_TARGETS, nodes, (flight,), grid)
 
 

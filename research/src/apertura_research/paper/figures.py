@@ -1,6 +1,6 @@
 """The paper's figures with data: simulated scenes and experiments."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -17,21 +17,22 @@ from apertura.core.quality.measures import coherence_factor
 from apertura.core.quality.point_targets import BandLimitedPatch, find_peak
 from apertura.core.scene.grid import SceneGrid
 from apertura.views.chart.png import save_png
-from apertura_research.paper.experiments import BISTATIC, MONOSTATIC, Experiment, open_experiment, profiles_at, terms_at
+from apertura_research.paper.experiments import (
+    BISTATIC,
+    MONOSTATIC,
+    PRINTED,
+    Experiment,
+    open_experiment,
+    profiles_at,
+    terms_at,
+)
 from apertura_research.paper.fusion import Images, open_images
 from apertura_research.paper.losses import ERRORS, history_of
 from apertura_research.paper_scene import UNDISTURBED, PaperScene, receive_pair
 from apertura_research.point_response import amplitude_db, find_peaks, range_tables, undisturbed_tables
 
-SHOWN: Mapping[str, tuple[str, float]] = {
-    "no_errors": ("timing", 0.0),
-    "sfo": ("sfo", 400.0),
-    "cfo": ("cfo", 50.0),
-    "carrier_phase": ("carrier_phase", 0.5),
-    "timing": ("timing", 0.5),
-    "localization": ("localization", 2.0),
-}
-"""Figure → the error that is drawn, and its size in its unit."""
+SHOWN = ("no_errors", "sfo", "cfo", "carrier_phase", "timing", "localization")
+"""Figures of data and image: without error, and of each of `ERRORS` at all sizes of its table of losses."""
 
 RANGE_DB = 50.0
 PULSES = 600
@@ -44,25 +45,32 @@ _COLUMNS = 500
 
 
 def draw_simulated(name: str, path: Path, *, seed: int = 1) -> Path:
-    """Draw data and image with one error, a key of `SHOWN`, as PNG; return its path.
+    """Draw data above image at every size of one error, of `SHOWN`, as PNG; return its path.
 
-    Both panels are in dB against the peak of the same scene without error, so that losses are visible.
+    All panels are in dB against the peak of the same scene without error, so that losses are visible.
     """
-    key, size = SHOWN[name]
-    error = ERRORS[key]
+    error = ERRORS["timing" if name == "no_errors" else name]
+    title, either = error.sweep.title.removesuffix(" ±"), error.sweep.title.endswith(" ±")
+    sizes = [0.0] if name == "no_errors" else list(error.independent_model_db)
     scene = error.scene(max(error.pulses, PULSES))
-    disturbance = error.disturbance(size) if size else UNDISTURBED
-    radar, sidelink, _ = receive_pair(scene, disturbance, np.random.default_rng(seed))
-    history, targets = history_of(scene, radar, sidelink, divided=error.divided), scene.scatterers.position_m
-    clean = undisturbed_tables(scene)
-    figure = Figure(figsize=(11, 5), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    _draw_data(left, scene, range_tables(history, _CORNERS_M), float(np.abs(clean.samples).max()))
-    image = backproject(history, _GRID, certified_pixels=0).values
-    picture = _draw_image(right, image, float(find_peaks(clean, targets)[1].max()))
-    words = f"{error.sweep.title}: {size:g} {error.sweep.unit}".replace("±:", "±")
-    figure.suptitle(words if size else "No errors")
-    figure.colorbar(picture, ax=(left, right), label="dB re peak without error", extend="min", fraction=0.04)
+    clean, targets = undisturbed_tables(scene), scene.scatterers.position_m
+    strongest, peak = float(np.abs(clean.samples).max()), float(find_peaks(clean, targets)[1].max())
+    figure = Figure(figsize=(2 + 3.6 * len(sizes), 8), layout="constrained")
+    panels = figure.subplots(2, len(sizes), squeeze=False, sharex="row", sharey="row")
+    for column, size in enumerate(sizes):
+        disturbance = error.disturbance(size) if size else UNDISTURBED
+        radar, sidelink, _ = receive_pair(scene, disturbance, np.random.default_rng(seed))
+        history = history_of(scene, radar, sidelink, divided=error.divided)
+        _draw_data(panels[0, column], scene, range_tables(history, _CORNERS_M), strongest)
+        picture = _draw_image(panels[1, column], backproject(history, _GRID, certified_pixels=0).values, peak)
+        words = f"{'±' * either}{size:g} {error.sweep.unit}: " if size else ""
+        for row, what in enumerate(("range-compressed data", "image")):
+            letter = chr(ord("a") + row * len(sizes) + column)
+            panels[row, column].set_title(f"({letter}) {words}{what}", loc="left", fontsize=10)
+    panels[0, 0].set_ylabel("Half of the total path, m")
+    panels[1, 0].set_ylabel("Ground range, m")
+    figure.suptitle("No errors" if name == "no_errors" else title)
+    figure.colorbar(picture, ax=panels, label="dB re peak without error", extend="min", fraction=0.04)
     save_png(figure, path)
     return path
 
@@ -75,8 +83,7 @@ def _draw_data(axes: Axes, scene: PaperScene, data: numba.OversampledTables, pea
     extent = (along[0], along[-1], _PATH_M[0] / 2, _PATH_M[-1] / 2)
     shades = amplitude_db(np.array(levels).T / peak)
     axes.imshow(shades, extent=extent, origin="lower", aspect="auto", cmap="viridis", vmin=-RANGE_DB, vmax=0)
-    axes.set(xlabel="Position along the track, m", ylabel="Half of the total path, m")
-    axes.set_title("(a) Range-compressed data", loc="left")
+    axes.set_xlabel("Position along the track, m")
 
 
 def _level_at(data: numba.OversampledTables, pulse: int) -> Floats:
@@ -92,8 +99,7 @@ def _draw_image(axes: Axes, image: Complexes, peak: float) -> AxesImage:
     picture = axes.imshow(
         shades, extent=(west, east, south, north), aspect="auto", cmap="viridis", vmin=-RANGE_DB, vmax=0
     )
-    axes.set(xlabel="Cross-range, m", ylabel="Ground range, m")
-    axes.set_title("(b) Image", loc="left")
+    axes.set_xlabel("Cross-range, m")
     return picture
 
 
@@ -128,10 +134,9 @@ BLUE, ORANGE, GREEN, BLACK = "#0072B2", "#D55E00", "#009E73", "black"
 """Okabe and Ito's, which the colour-blind tell apart."""
 
 DEPTH_DB = 40.0
-SPANS_M = {"lab": (2.0, 10.0), "static": (8.0, 22.0)}
-"""Halves of total paths that are drawn."""
+SPANS_M = {"lab": (-6.0, 10.0), "static": (0.0, 12.0)}
+"""Halves of total paths, beyond those of the cables, that are drawn."""
 
-NAMES = {"lab": ("cylinder 1", "cylinder 2"), "static": ("strong reflector", "weak reflector")}
 TITLES = ("(a) Monostatic", "(b) Bistatic, code alone", "(c) Bistatic, divided by the sidelink")
 
 
@@ -147,9 +152,9 @@ def draw_profile(name: str, folder: Path, path: Path) -> Path:
         axes.plot(slant_m, level_db.T, color=BLUE, alpha=0.05, linewidth=0.6, rasterized=True)
         axes.plot(slant_m, level_db[0], color=BLACK, linewidth=0.8, label="first pulse")
         axes.plot([], [], color=BLUE, label=f"all {len(level)} pulses")
-        for place, words, colour in zip(experiment.places_m, NAMES[name], (ORANGE, GREEN), strict=True):
+        for place, words, colour in zip(experiment.places_m, _names(name), (ORANGE, GREEN), strict=False):
             axes.axvline(_half_path_m(history, place), color=colour, linestyle="--", linewidth=1, label=words)
-        axes.set(xlabel="Half of the total path, m", xlim=SPANS_M[name], ylim=(-60, 3))
+        axes.set(xlabel="Half of the total path beyond cables, m", xlim=SPANS_M[name], ylim=(-60, 3))
         axes.set_title(title, loc="left", fontsize=10)
         axes.grid(alpha=0.3)
     panels[0].set_ylabel("Magnitude, dB re peak of all pulses")
@@ -164,8 +169,8 @@ def draw_phase(name: str, folder: Path, path: Path) -> Path:
     figure = Figure(figsize=(12, 4.2), layout="constrained")
     panels = figure.subplots(1, 3)
     limits: list[float] = []
-    for axes, history, title in zip(panels, _three(experiment), TITLES, strict=True):
-        for place, words, colour, mark in zip(experiment.places_m, NAMES[name], (ORANGE, GREEN), "o^", strict=True):
+    for axes, history, title in zip(panels, _three(experiment, "none"), TITLES, strict=True):
+        for place, words, colour, mark in zip(experiment.places_m, _names(name), (ORANGE, GREEN), "o^", strict=False):
             terms = terms_at(history, place)
             phase_deg = np.degrees(np.angle(terms / terms.mean()))
             limits.append(float(np.abs(phase_deg).max()))
@@ -175,8 +180,9 @@ def draw_phase(name: str, folder: Path, path: Path) -> Path:
         axes.set_title(title, loc="left", fontsize=10)
         axes.legend(fontsize=8, loc="upper left")
         axes.grid(alpha=0.3)
+    count = len(experiment.places_m)
     panels[1].set(ylim=(-190, 250), yticks=range(-180, 181, 90))
-    reach = 1.15 * max(limits[:2] + limits[4:])
+    reach = 1.15 * max(limits[:count] + limits[2 * count :])
     for axes in (panels[0], panels[2]):
         axes.set_ylim(-reach, 1.35 * reach)
     panels[0].set_ylabel("Phase about its mean, degrees")
@@ -184,8 +190,12 @@ def draw_phase(name: str, folder: Path, path: Path) -> Path:
     return path
 
 
-def _three(experiment: Experiment) -> Sequence[PhaseHistory]:
-    return experiment.history(MONOSTATIC), experiment.uncorrected(), experiment.history(BISTATIC)
+def _names(name: str) -> list[str]:
+    return [target for target, _ in PRINTED[name]]
+
+
+def _three(experiment: Experiment, window: str = "hann") -> Sequence[PhaseHistory]:
+    return experiment.history(MONOSTATIC, window), experiment.uncorrected(window), experiment.history(BISTATIC, window)
 
 
 def _half_path_m(history: PhaseHistory, place_m: Floats) -> float:
@@ -225,7 +235,7 @@ PANELS = {
     "mono": "(a) Monostatic",
     "bistatic": "(b) Bistatic",
     "coherent": "(c) Coherent sum",
-    "noncoherent": "(d) Noncoherent sum",
+    "noncoherent": "(d) Noncoherent sum, magnitudes",
 }
 
 
@@ -236,7 +246,7 @@ def draw_images(folder: Path, path: Path) -> Path:
     middle_m = grid.map_at(*images.pixel[0])
     west, south, east, north = grid.bounds_m
     extent = (west - middle_m[0], east - middle_m[0], south - middle_m[1], north - middle_m[1])
-    figure = Figure(figsize=(10, 8.6), layout="compressed")
+    figure = Figure(figsize=(11, 5), layout="compressed")
     panels = figure.subplots(2, 2, sharex=True, sharey=True)
     for axes, (name, title) in zip(panels.flat, PANELS.items(), strict=True):
         shades = 20 * np.log10(np.maximum(np.abs(images.amplitude[name]), 1e-6))
@@ -244,8 +254,7 @@ def draw_images(folder: Path, path: Path) -> Path:
         axes.set_title(title, loc="left")
     for axes in panels[1]:
         axes.set_xlabel("Cross-range (east), m")
-    for axes in panels[:, 0]:
-        axes.set_ylabel("Ground range (north), m")
+    figure.supylabel("Ground range (north), m", fontsize="medium")
     figure.colorbar(picture, ax=panels, label="dB re peak of each image", extend="min", fraction=0.04)
     save_png(figure, path)
     return path

@@ -7,13 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.common.arrays import Floats
-from apertura.core.quality.measures import Amplitude
 from apertura.core.quality.point_targets import Cut, cut_through, find_peak
 from apertura.simulation.presets import GAP_M, SEGMENT_M
 from apertura_research.paper.claims import Claim, compare, require
 from apertura_research.paper.experiments import (
     BISTATIC,
-    LARGEST_PHASE_RAD,
     MONOSTATIC,
     Experiment,
     by_pair,
@@ -26,6 +24,7 @@ REACH_M = 1.5
 """How far cuts go, and what is left out about each target where clutter is measured."""
 
 WITHIN = 0.05
+LARGEST_PHASE_RAD = 0.3
 
 
 @dataclass(frozen=True)
@@ -35,9 +34,9 @@ class Images:
     Attributes
     ----------
     amplitude
-        `mono`, `bistatic`, `coherent` (complex64) and `noncoherent` (magnitude).
+        `mono`, `bistatic`, `coherent` (complex64) and `noncoherent`, the sum of magnitudes as the paper has it.
     pixel
-        (target, 2) float64, row and column of each target.
+        (target, 2) float64, row and column of each target, rough ones last.
     """
 
     amplitude: dict[str, NDArray[np.complex64]]
@@ -69,8 +68,8 @@ def open_images(experiment: Experiment) -> Images:
     cube, grid = experiment.opened.stage("cube"), experiment.opened.scene.grid
     pairs = dict(zip(cube.attrs["pairs"], cube.image.values[0], strict=True))
     amplitude = {"mono": pairs[MONOSTATIC], "bistatic": pairs[BISTATIC], "coherent": cube.coherent.values[0]}
-    amplitude["noncoherent"] = Amplitude(cube.noncoherent.values[0])[:, :]
-    pixel = grid.pixel_below(experiment.places_m)[:, :2]
+    amplitude["noncoherent"] = cube.magnitude.values[0].astype(np.complex64)
+    pixel = grid.pixel_below(np.concatenate([experiment.places_m, experiment.rough_m]))[:, :2]
     images = Images(amplitude, pixel, grid.spacing_m)
     peaks = {name: abs(find_peak(image, *images.brightest(name)).value) for name, image in amplitude.items()}
     return replace(images, amplitude={name: image / np.float32(peaks[name]) for name, image in amplitude.items()})
@@ -80,7 +79,7 @@ def fusion_claims(folder: Path) -> list[Claim]:
     """Return what fusing gains and costs in the UAV experiment that lies in a folder of campaigns."""
     experiment = open_experiment(folder, "uav")
     images = open_images(experiment)
-    return [_phase(experiment), *_widths(images), *_clutter(images), *_sidelobes(images), _envelope(images)]
+    return [_phase(experiment), *_widths(images), *_clutter(images), *_sidelobes(images)]
 
 
 def _phase(experiment: Experiment) -> Claim:
@@ -105,11 +104,27 @@ def _widths(images: Images) -> list[Claim]:
         "the paper does not print which parts it used"
     )
     rows = []
-    for what, direction, printed in (("cross-range", EAST, 11.0), ("ground-range", NORTH, 49.0)):
+    for what, direction, printed in (("cross-range", EAST, "11"), ("ground-range", NORTH, "49")):
         width_cm = 100 * images.cut("coherent", direction).width_m
         name = f"UAV experiment: {what} width, coherent sum"
         rows.append(compare(name, width_cm, "cm", paper=printed, within=WITHIN, style=".3g", reason=why))
+    single_m, noncoherent_m = (
+        [images.cut(name, direction).width_m for direction in (EAST, NORTH)] for name in ("mono", "noncoherent")
+    )
+    finer = min(noncoherent / single for noncoherent, single in zip(noncoherent_m, single_m, strict=True))
+    rows.append(
+        require("UAV experiment: width of the noncoherent sum over that of the monostatic image", finer, "1",
+                limit="at least 0.9", met=finer >= 0.9, words="noncoherent fusion gains no resolution", style=".2f",
+                note="the smaller of cross- and ground-range, cm: "
+                + " against ".join(f"{100 * one[0]:.0f} × {100 * one[1]:.0f}" for one in (noncoherent_m, single_m)))
+    )  # fmt: skip
     return rows
+
+
+MAGNITUDES_DB, MAGNITUDES_CONTRAST = 0.49, 0.72
+"""Of the sum of magnitudes of two independent Rayleigh clutters of equal power: (|a| + |b|)²/4 has the mean (1 + π/4)/2
+and the contrast √((10 + 3π)/(2 + π/2)² − 1); docs/theory/study.md, "Where the paper holds
+less than it says"."""
 
 
 def _clutter(images: Images) -> list[Claim]:
@@ -118,10 +133,11 @@ def _clutter(images: Images) -> list[Claim]:
     level_db = {name: 10 * np.log10(values.mean()) for name, values in power.items()}
     contrast = {name: float(values.std() / values.mean()) for name, values in power.items()}
     single_db = 10 * np.log10((power["mono"].mean() + power["bistatic"].mean()) / 2)
+    gained_db = {kind: single_db - level_db[kind] for kind in ("coherent", "noncoherent")}
     rows = [
         compare(
             f"clutter suppression by the {kind} sum: mean clutter against targets",
-            single_db - level_db[kind],
+            gained_db[kind],
             "dB",
             independent_model=expected,
             within=1.0,
@@ -132,24 +148,26 @@ def _clutter(images: Images) -> list[Claim]:
         )
         for kind, expected, why in (
             ("coherent", 3.0, "targets add in amplitude, clutter of two look angles in power: 3 dB"),
-            ("noncoherent", 0.0, "both add in power: none, the clutter only becomes smoother"),
+            ("noncoherent", MAGNITUDES_DB, "magnitudes add: the clutter only becomes smoother"),
         )
     ]
-    looks = compare(
-        "contrast of clutter in the noncoherent sum over that of one image",
-        2 * contrast["noncoherent"] / (contrast["mono"] + contrast["bistatic"]),
-        "1",
-        independent_model=0.71,
-        within=0.15,
-        style=".2f",
-        note="standard deviation of power over its mean: 1/√2 of two independent looks",
-    )
-    return [*rows, looks]
+    apart_db = gained_db["coherent"] - gained_db["noncoherent"]
+    return [
+        *rows,
+        require("clutter suppression by the coherent sum over that by the noncoherent one", apart_db, "dB",
+                limit="within ±1 dB", met=abs(apart_db) <= 1.0, words='that of the noncoherent sum is "comparable"',
+                style=".2f", note=f"{gained_db['coherent']:.1f} dB against {gained_db['noncoherent']:.1f} dB; what is "
+                "comparable is how smooth it looks: the next row"),
+        compare("contrast of clutter in the noncoherent sum over that of one image",
+                2 * contrast["noncoherent"] / (contrast["mono"] + contrast["bistatic"]), "1",
+                independent_model=MAGNITUDES_CONTRAST, within=0.15, style=".2f",
+                note="standard deviation of power over its mean, of two independent looks"),
+    ]  # fmt: skip
 
 
 def _sidelobes(images: Images) -> list[Claim]:
     cuts = {name: images.cut(name, EAST) for name in ("mono", "coherent")}
-    expected_db = float(f"{two_segment_sidelobe_db(SEGMENT_M, GAP_M):.2g}")
+    expected_db = two_segment_sidelobe_db(SEGMENT_M, GAP_M)
     note = (
         f"mono {cuts['mono'].pslr_db:.1f} dB; the model is sin(πLu)/(πLu)·cos(πDu), D = L + gap, without clutter and "
         "for equal segments seen at right angles"
@@ -173,18 +191,3 @@ def two_segment_sidelobe_db(length_m: float, gap_m: float) -> float:
     response = np.abs(np.sinc(u) * np.cos(np.pi * (1 + gap_m / length_m) * u))
     beyond = int(np.argmax(np.diff(response) > 0))
     return float(20 * np.log10(response[beyond:].max()))
-
-
-def _envelope(images: Images) -> Claim:
-    row, _ = images.brightest("coherent")
-    coherent, noncoherent = (np.abs(images.amplitude[name][row]) for name in ("coherent", "noncoherent"))
-    above_db = float(20 * np.log10((coherent / np.maximum(noncoherent, 1e-9)).max()))
-    return require(
-        "the noncoherent cut is the envelope of the coherent one",
-        above_db,
-        "dB",
-        limit="at most 0.5 dB above it anywhere along the cut",
-        met=above_db <= 0.5,
-        style=".2f",
-        note="largest excess of the coherent cut; both relative to their peaks: |a + b|/2 ≤ √((|a|² + |b|²)/2)",
-    )

@@ -4,7 +4,7 @@ import numpy as np
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.simulation.presets import paper_waveform
-from apertura_research.paper.claims import EXPLAINED, UNTESTABLE, Claim, compare, require
+from apertura_research.paper.claims import PAPER, UNTESTABLE, Claim, compare, require
 
 HALF_POWER_OF_SINC = 0.886
 """−3 dB width of |sinc(x)|²."""
@@ -95,43 +95,52 @@ ADC_RATE_HZ = 4.096e9
 """Before decimation by 4."""
 
 CLOCK_ERROR = 1e-8
-EXACT = 1e-6
 
 
 def parameter_claims() -> list[Claim]:
-    """Return bandwidth, duty cycles, data rates, clock limits, timing requirements and chirp bandwidth.
+    """Return bandwidth, duty cycles, data rates, clock limits, timing requirements, sampling and chirp bandwidth.
 
     Examples
     --------
     >>> [claim.claim for claim in parameter_claims() if claim.verdict != "agrees"]
-    ['OFDM symbol T against 1/Δf', 'effective chirp ...', 'SFO limit in ppm of f_s', 'CFO of a ...', 'SFO of a ...']
+    ['OFDM symbol T against 1/Δf', 'effective chirp ...', 'CFO of a clock ...', 'SFO of a clock ...', 'data rate ...']
     """
-    return [*_waveform(), *_clocks(), *_timing(), *_sampling()]
+    return [*_waveform(), *_clocks(), *_timing(), *_storage()]
 
 
 def _waveform() -> list[Claim]:
     wave = paper_waveform()
     band_mhz = len(wave.codes) * wave.subcarrier_spacing_hz / 1e6
-    rows = [compare("bandwidth N·Δf", band_mhz, "MHz", paper=409.6, within=EXACT)]
-    for prf_hz, percent, mbit_s in ((100.0, 0.15625, 44.8), (20.0, 0.03125, 8.96)):
-        duty = (wave.symbol_s + wave.cyclic_prefix_s) * prf_hz
-        rate_mbit_s, at = 2 * wave.sample_rate_hz * BITS * duty / 1e6, f"at {prf_hz:.0f} Hz"
+    rows = [compare("bandwidth N·Δf", band_mhz, "MHz", paper="409.6")]
+    for prf_hz, percent, mbit_s in ((100.0, "0.156", "44.8"), (20.0, "0.031", "9.0")):
+        duty, at = (wave.symbol_s + wave.cyclic_prefix_s) * prf_hz, f"at {prf_hz:.0f} Hz"
         note = "γ = (T + T_cp)·f_prf, not T alone"
-        rows.append(compare(f"duty cycle {at}", 100 * duty, "%", paper=percent, within=EXACT, style=".5g", note=note))
+        rows.append(compare(f"duty cycle {at}", 100 * duty, "%", paper=percent, style=".5g", note=note))
         note = "2·f_s·ν·γ: I and Q both counted"
-        rows.append(compare(f"mean data rate {at}", rate_mbit_s, "Mbit/s", paper=mbit_s, within=EXACT, note=note))
+        rows.append(compare(f"mean data rate {at}", _recorded_mbit_s() * duty, "Mbit/s", paper=mbit_s, note=note))
     period_us, symbol_us = 1e6 / wave.subcarrier_spacing_hz, 1e6 * wave.symbol_s
     contradiction = (
         f"the paper contradicts itself: T is {symbol_us / period_us:g} periods of 1/Δf; the symbol is "
         f"periodic, so a DFT of f_s/Δf = {wave.dft_samples} samples (not N = {len(wave.codes)}) still separates "
         f"the subcarriers exactly; prefix and symbol together are {wave.capture_samples} samples"
     )
-    name, texts = "OFDM symbol T against 1/Δf", ("12.5", "", f"{period_us:g}")
-    rows.append(Claim(name, *texts, "µs", EXPLAINED, contradiction))
+    rows.append(compare("OFDM symbol T against 1/Δf", period_us, "µs", paper="12.5", reason=contradiction))
     kept = (wave.symbol_s - wave.cyclic_prefix_s) / wave.symbol_s
     share = f"{100 * kept:g} % of B; the paper prints the formula and names no delay"
     name = "effective chirp bandwidth B(T − Δt_max)/T, Δt_max = T_cp"
-    return [*rows, Claim(name, "", "", f"{band_mhz * kept:g}", "MHz", UNTESTABLE, share)]
+    rows.append(Claim(name, "", "", f"{band_mhz * kept:g}", "MHz", PAPER, UNTESTABLE, share))
+    top_ghz, half_ghz = float(wave.frequency_hz[-1]) / 1e9, ADC_RATE_HZ / 2e9
+    return [
+        *rows,
+        require("upper edge of the band, sampled at 4.096 GS/s", top_ghz, "GHz",
+                limit=f"below half the converter's rate, {half_ghz:g} GHz", met=top_ghz < half_ghz,
+                words="direct sampling of the RF signal is alias-free", note="carrier and band in the first zone"),
+    ]  # fmt: skip
+
+
+def _recorded_mbit_s() -> float:
+    """Return 2·f_s·ν, the rate at which one channel arises while it is recorded."""
+    return 2 * paper_waveform().sample_rate_hz * BITS / 1e6
 
 
 def _clocks() -> list[Claim]:
@@ -140,47 +149,45 @@ def _clocks() -> list[Claim]:
     sfo_hz, cfo_hz = sfo_limit_hz(wave.sample_rate_hz, band_hz, wave.symbol_s), cfo_limit_hz(wave.subcarrier_spacing_hz)
     sfo_ppm, cfo_ppm = 1e6 * sfo_hz / wave.sample_rate_hz, 1e6 * cfo_hz / wave.carrier_hz
     at_carrier_hz, at_converter_hz = CLOCK_ERROR * wave.carrier_hz, CLOCK_ERROR * ADC_RATE_HZ
-    halved = (
-        f"the paper's 200 kHz are {sfo_ppm:.0f} ppm of f_s = 1.024 GS/s between the two nodes; 100 ppm would be about "
-        f"the half of it that each of two clocks may be off in opposite directions ({sfo_ppm / 2:.1f} ppm)"
-    )
-    first = "is reached first where one clock feeds both"
+    opposite = f"two clocks off in opposite directions differ by {sfo_ppm:.0f} ppm of f_s = 1.024 GS/s, the 200 kHz"
+    first = f"{cfo_ppm:.1f} ppm of the carrier: reached first where one clock feeds carrier and converter"
     swapped = (
         "the paper contradicts itself: it prints 41 Hz for the CFO at the carrier of 1.2 GHz and 12 Hz for the SFO at "
         "the converter's 4.096 GS/s; each is computed where the other is printed"
     )
     return [
-        compare("SFO limit f_s(1 − 1/(1 + 1/BT))", sfo_hz / 1e3, "kHz", paper=200, within=1e-3, style=".5g"),
-        compare("SFO limit in ppm of f_s", sfo_ppm, "ppm", paper=100, within=0.05, note=halved),
-        compare("CFO limit Δf/10", cfo_hz / 1e3, "kHz", paper=10, within=EXACT),
-        compare("CFO limit in ppm of the carrier", cfo_ppm, "ppm", paper=8.3, within=0.005, style=".3g", note=first),
-        compare("CFO of a clock off by 10 ppb", at_carrier_hz, "Hz", paper=41, within=0.01, reason=swapped),
-        compare("SFO of a clock off by 10 ppb", at_converter_hz, "Hz", paper=12, within=0.01, reason=swapped),
-    ]
+        compare("SFO limit f_s(1 − 1/(1 + 1/BT))", sfo_hz / 1e3, "kHz", paper="200", style=".5g"),
+        compare("clock error of each node at the SFO limit, ±", sfo_ppm / 2, "ppm", paper="100", within=0.05,
+                note=opposite),
+        compare("CFO limit Δf/10", cfo_hz / 1e3, "kHz", paper="10", note=first),
+        compare("CFO of a clock off by 10 ppb", at_carrier_hz, "Hz", paper="41", reason=swapped),
+        compare("SFO of a clock off by 10 ppb", at_converter_hz, "Hz", paper="12", reason=swapped),
+    ]  # fmt: skip
 
 
 def _timing() -> list[Claim]:
     range_error_m, speed_m_s, prf_hz = 0.02, 10.0, 100.0
     samples_ps, tags_ms = 2e12 * range_error_m / SPEED_OF_LIGHT_M_S, 2e3 * range_error_m / speed_m_s
     return [
-        compare("timing of the samples 2δR/c, δR = 2 cm", samples_ps, "ps", paper=133, within=0.005),
-        compare("association of pulses 1/f_prf at 100 Hz", 1e3 / prf_hz, "ms", paper=10, within=EXACT),
-        compare("time tags 2δR/v at 10 m/s", tags_ms, "ms", paper=4, within=EXACT),
+        compare("timing of the samples 2δR/c, δR = 2 cm", samples_ps, "ps", paper="133"),
+        compare("association of pulses 1/f_prf at 100 Hz", 1e3 / prf_hz, "ms", paper="10"),
+        compare("time tags 2δR/v at 10 m/s", tags_ms, "ms", paper="4"),
     ]
 
 
-def _sampling() -> list[Claim]:
-    """Return the pulses' spacing along the track against a quarter of the shortest wave: no look angle is aliased."""
-    shortest_m = SPEED_OF_LIGHT_M_S / float(paper_waveform().frequency_hz[-1])
-    limit = f"at most λ/4 = {25 * shortest_m:.2f} cm at the upper band edge, two ways"
+def _storage() -> list[Claim]:
+    """Return what the trigger saves, and what a file of int16 pairs takes for what the paper counts as 14 bits."""
+    wave = paper_waveform(prf_hz=20.0)
+    duty = (wave.symbol_s + wave.cyclic_prefix_s) * float(wave.prf_hz)
+    continuous, stored = _recorded_mbit_s(), 2 * 16 * wave.capture_samples * float(wave.prf_hz) / 1e6
+    wider = (
+        f"recordings hold 16 bits for 14; a secondary node stores two channels, {2 * stored:.1f} Mbit/s, of which the "
+        f"rate as printed counts one: {2 * stored * 3600 / 8e3:.1f} GB an hour"
+    )
     return [
-        require(
-            f"alias-free sampling along the track: {what}",
-            100 * speed_m_s / prf_hz,
-            "cm",
-            limit=limit,
-            met=speed_m_s / prf_hz <= shortest_m / 4,
-            note=f"{speed_m_s:g} m/s at {prf_hz:g} Hz; enough in every direction, whatever the beam",
-        )
-        for what, speed_m_s, prf_hz in (("simulation", 1.0, 100.0), ("UAV flight", 0.5, 20.0))
-    ]
+        require("data rate of a channel without trigger over its mean rate at 20 Hz", 1 / duty, "1",
+                limit="above 1000", met=1 / duty > 1000,
+                words="the trigger lowers the mean data rate to what is stored on board",
+                note=f"{continuous / 1e3:.1f} Gbit/s against {continuous * duty:.2f} Mbit/s"),
+        compare("data rate of a channel at 20 Hz as it is stored", stored, "Mbit/s", paper="9.0", reason=wider),
+    ]  # fmt: skip

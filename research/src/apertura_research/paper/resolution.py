@@ -8,7 +8,7 @@ import numpy as np
 from apertura.common.arrays import Complexes, Floats
 from apertura.simulation.scene import Scatterers
 from apertura.simulation.synthesis import straight_pair
-from apertura_research.paper.claims import EXPLAINED, Claim, compare
+from apertura_research.paper.claims import Claim, compare, fitted_to
 from apertura_research.paper.parameters import (
     HALF_POWER_OF_HANN,
     cross_range_resolution_m,
@@ -75,10 +75,10 @@ def uav_table(*, pulses: int = 200) -> list[Claim]:
     )
     other_length = (
         f"the paper contradicts itself: its table's L = 3.4 m gives {100 * short_m:.1f} cm by the closed form; "
-        f"L = 4.7 m would give {100 * long_m:.1f} cm"
+        f"L = 4.7 m, which it prints as R_sl, would give {100 * long_m:.1f} cm"
     )
     fitted = (
-        "agrees by construction: mono segment at −1.88 m, bistatic midpoint at +4.38 m and L = 4.7 m, which the paper "
+        "mono segment at −1.88 m, bistatic midpoint at +4.38 m and L = 4.7 m, which the paper "
         "does not give, were chosen for 11 cm × 49 cm; other plausible segments give 11–24 cm × 48–57 cm"
     )
     middle_m = BISTATIC_MIDPOINT_M - SEPARATION_M / 2
@@ -87,13 +87,11 @@ def uav_table(*, pulses: int = 200) -> list[Claim]:
     fused = _uav_widths_cm([_segment(scene, MONO_SEGMENT_M, SEGMENT_LENGTH_M), bistatic])
     across, along = "UAV flight: ground-range width", "UAV flight: cross-range width"
     return [
-        compare(f"{across}, Hann, mono", mono[0], "cm", paper=57.6, within=WITHIN, note=closed),
-        compare(f"{along} of L = 3.4 m", mono[1], "cm", independent_model=34.8, within=WITHIN),
-        compare(f"{along} as printed", mono[1], "cm", paper=25, within=WITHIN, note=other_length),
-        replace(compare(f"{along}, fused, fitted segments", fused[1], "cm", paper=11, within=WITHIN, note=fitted),
-                verdict=EXPLAINED),
-        replace(compare(f"{across}, fused, fitted segments", fused[0], "cm", paper=49, within=WITHIN, note=fitted),
-                verdict=EXPLAINED),
+        compare(f"{across}, Hann, mono", mono[0], "cm", paper="58", within=WITHIN, note=closed),
+        compare(f"{along} of L = 3.4 m", mono[1], "cm", independent_model=100 * short_m, within=WITHIN),
+        compare(f"{along} as printed", mono[1], "cm", paper="25", within=WITHIN, note=other_length),
+        fitted_to(compare(f"{along}, fused, fitted segments", fused[1], "cm", paper="11", within=WITHIN, note=fitted)),
+        fitted_to(compare(f"{across}, fused, fitted segments", fused[0], "cm", paper="49", within=WITHIN, note=fitted)),
     ]  # fmt: skip
 
 
@@ -104,9 +102,9 @@ def _printed_table(ground_cm: list[float], cross_cm: list[float]) -> list[Claim]
         "is not known here which of them the paper's 9 cm are"
     )
     return [
-        compare("ground-range width, closed form, farthest target", ground_cm[-1], "cm", paper=35, within=WITHIN),
-        compare("ground-range width, closed form, nearest target", ground_cm[0], "cm", paper=73, within=WITHIN),
-        compare("cross-range width", cross_cm[-1], "cm", paper=9, within=WITHIN, style=".3g", reason=far),
+        compare("ground-range width, closed form, farthest target", ground_cm[-1], "cm", paper="35", within=WITHIN),
+        compare("ground-range width, closed form, nearest target", ground_cm[0], "cm", paper="73", within=WITHIN),
+        compare("cross-range width", cross_cm[-1], "cm", paper="9", within=WITHIN, style=".3g", reason=far),
     ]  # fmt: skip
 
 
