@@ -64,6 +64,7 @@ def _write_config(root: Path, campaign: DrawnCampaign) -> None:
             "height_datum": "ellipsoid",
             **_stated_air(specification),
         },
+        **({"bench": {**specification.bench}} if specification.bench else {}),
     }
     write_config(
         root,

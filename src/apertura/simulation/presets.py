@@ -21,7 +21,7 @@ from apertura.simulation.impairments import (
     UniformPhase,
 )
 from apertura.simulation.scene import Clutter, Line, Origin, PointTarget, Scatterers, Straight, Target, Vector, Wobble
-from apertura.simulation.specification import CampaignSpecification, ImageGrid, SimulatedFlight, SimulatedNode
+from apertura.simulation.specification import Bench, CampaignSpecification, ImageGrid, SimulatedFlight, SimulatedNode
 from apertura.simulation.synthesis import Geometry, straight_pair
 from apertura.simulation.waveform import TransmitWaveform, WaveformSpecification
 
@@ -64,7 +64,9 @@ def paper_lab(*, pulses: int = STATIC_PULSES, snr_db: float = COHERENT_SNR_DB["c
     lengths are electrical (so here).
     """
     joint = (PointTarget((0.0, 0.0, 1.0 - _JOINT_M), _JOINT_M**2),)
-    return _standing("paper-lab", joint, (0.0, 0.0, 1.0), RADAR_CABLE_M - 2 * _JOINT_M, _per_subcarrier(snr_db), pulses)
+    cable_m = RADAR_CABLE_M - 2 * _JOINT_M
+    known: Bench = {"radar_m": 2 * _JOINT_M, "sidelink_m": 0.0}
+    return _standing("paper-lab", joint, (0.0, 0.0, 1.0), cable_m, _per_subcarrier(snr_db), pulses, bench=known)
 
 
 def paper_static(*, pulses: int = STATIC_PULSES) -> CampaignSpecification:
@@ -86,7 +88,8 @@ def paper_static(*, pulses: int = STATIC_PULSES) -> CampaignSpecification:
     )
     both_db = 10 * float(np.log10(1 + 10 ** (-weaker_db / 10)))  # of their mean power over that of the first
     snr_db = _per_subcarrier(COHERENT_SNR_DB["first cylinder"]) + both_db
-    return _standing("paper-static", cylinders, (0.0, -6.0, antenna_up_m), 0.911, snr_db, pulses)
+    known: Bench = {"radar_m": 2 * near_m, "sidelink_m": 0.0, "split": True}
+    return _standing("paper-static", cylinders, (0.0, -6.0, antenna_up_m), 0.911, snr_db, pulses, bench=known)
 
 
 def _cylinder(north_m: float, up_m: float, amplitude: float) -> Line:
@@ -154,16 +157,16 @@ def _own_clock(radar_snr_db: float, sidelink_snr_db: float) -> Impairments:
 
 
 def _standing(
-    name: str, targets: tuple[Target, ...], place: Vector, radar_m: float, snr_db: float, pulses: int
+    name: str, targets: tuple[Target, ...], place: Vector, radar_m: float, snr_db: float, pulses: int, *, bench: Bench
 ) -> CampaignSpecification:
     """Return two nodes on a table whose antennas are at one place, the sidelink a cable, SNR that of a subcarrier."""
     wired = SimulatedNode({}, {"radar": radar_m, "sidelink": SIDELINK_CABLE_M}, impairments=_own_clock(snr_db, 40.0))
     first = SimulatedNode({}, {"radar": radar_m}, impairments=Impairments(radar_snr_db=snr_db))
     still = Straight(place, (0.0, 0.0, 0.0))
-    flight = SimulatedFlight("f01", "uav1", {"uav1": still, "uav2": still}, pulses)
+    flight = SimulatedFlight("f01", "uav1", {"uav1": still, "uav2": still}, pulses, kind="bench")
     grid = ImageGrid(_UTM, half_width_m=3.0, spacing_m=0.1)
     nodes = {"uav1": first, "uav2": wired}
-    return CampaignSpecification(name, EXPERIMENT_ORIGIN, PAPER_WAVEFORM, targets, nodes, (flight,), grid)
+    return CampaignSpecification(name, EXPERIMENT_ORIGIN, PAPER_WAVEFORM, targets, nodes, (flight,), grid, bench=bench)
 
 
 DEMO_ORIGIN = EXPERIMENT_ORIGIN  # flat ground by the Danube
