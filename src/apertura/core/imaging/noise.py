@@ -96,6 +96,7 @@ def sidelink_noise(
     terrain: Terrain,
     places_m: NDArray[np.float64],
     *,
+    beams: Beams | None = None,
     method: str,
     snr_db: float,
 ) -> float:
@@ -107,7 +108,7 @@ def sidelink_noise(
         Transfer functions as they were corrected, with noise and all; some are read.
     grid, terrain
         The scene.
-    places_m
+    places_m, beams
         As of `noise_power`, which measures it together with all other noise.
     method
         A key of `apertura.core.echo.sidelink.METHODS`, by which they were corrected.
@@ -119,7 +120,8 @@ def sidelink_noise(
     Source: docs/theory/radiometry.md, eq. 8a. Noise is drawn and goes through the correction itself, so that what each
     method keeps, and where, is its own.
     """
-    some, generator = history[history.aperture.sample(_DRAWN)], np.random.default_rng(0)
+    some_pulses, generator = history.aperture.sample(_DRAWN), np.random.default_rng(0)
+    some = history[some_pulses]
     draws = generator.standard_normal((*some.transfer.shape, 2)) @ np.array([1, 1j])
     noisy = 1 + draws * 10 ** (-snr_db / 20) / np.sqrt(2)
     left = METHODS[method](np.ones(noisy.shape, np.complex64), noisy.astype(np.complex64))
@@ -129,6 +131,11 @@ def sidelink_noise(
     profiles = range_compress(replace(some, transfer=some.transfer * left), grid, terrain)
     at = np.rint((some.aperture.path(places_m) - profiles.start_m[:, None]) / profiles.step_m).astype(np.int64)
     power = np.abs(np.take_along_axis(profiles.samples, np.clip(at, 0, profiles.samples.shape[1] - 1), axis=1)) ** 2
-    local = np.array([part.mean(axis=0) for part in np.array_split(power, max(1, len(power) // _ALIKE))])
+    weight = np.ones(power.shape) if beams is None else beams[some_pulses].weight(some.aperture, places_m) ** 2
+    parts = max(1, len(power) // _ALIKE)
+    local, seen = (np.array([part.mean(axis=0) for part in np.array_split(of, parts)]) for of in (power, weight))
+    if not seen.any():
+        return 0.0
+    local = local[seen > _LEAST_WEIGHT * seen.max()]
     # Summed over a block of pulses it is exponential about this mean; of all, the median is what is measured.
     return float(np.median(local * generator.exponential(size=(_BLOCKS_DRAWN, *local.shape))) / np.log(2))

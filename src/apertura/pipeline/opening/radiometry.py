@@ -261,6 +261,7 @@ def calibrated_pair(
             scene.grid,
             scene.terrain,
             noise_places(scene.grid, scene.terrain),
+            beams=beams,
             method=sidelink["method"],
             snr_db=sidelink["snr_db"],
         )
