@@ -107,11 +107,11 @@ def write_clock(
 def print_alignment(campaign: Campaign, flight: str, node: str, *, write: bool, **options: Any) -> None:
     """Align, print the result and the lines for the config, and with `write` write clocks.tsv."""
     found, stated = align(campaign, flight, node, **options)
-    path = f"path beyond geometry {stated['path_offset_m']:.4f} m"
-    path += f" ± {found.path_width_m:.4f} m" if options["search_m"] > 0 else ", as the config says: not measured"
+    length = f"path beyond geometry {stated['path_offset_m']:.4f} m"
+    length += f" ± {found.path_width_m:.4f} m" if options["search_m"] > 0 else ", as the config says: not measured"
     print(
         f"{flight} {node}: the recording begins {found.offset_s:.4f} s ± {found.offset_width_s:.4f} s after the first "
-        f"epoch of the log; {path}"
+        f"epoch of the log; {length}"
     )
     print(
         f"by {found.report['method']}, on {found.report['pulses']} pulses, {found.contrast_db:.1f} dB above "
