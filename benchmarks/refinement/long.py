@@ -99,7 +99,7 @@ class Recorded:
     def __array__(self, dtype: object = None, copy: bool | None = None) -> NDArray[np.complex64]:
         offset = self.first * self.shape[1] * self.dtype.itemsize
         read: NDArray[np.complex64] = np.fromfile(self.path, self.dtype, self.shape[0] * self.shape[1], offset=offset)
-        return read.reshape(self.shape)
+        return np.asarray(read.reshape(self.shape), np.complex64)
 
 
 def _record(
