@@ -98,8 +98,8 @@ class Recorded:
 
     def __array__(self, dtype: object = None, copy: bool | None = None) -> NDArray[np.complex64]:
         offset = self.first * self.shape[1] * self.dtype.itemsize
-        read: NDArray[np.complex64] = np.fromfile(self.path, self.dtype, self.shape[0] * self.shape[1], offset=offset)
-        return read.reshape(self.shape)
+        read = np.fromfile(self.path, self.dtype, self.shape[0] * self.shape[1], offset=offset)
+        return np.asarray(read.reshape(self.shape), np.complex64)
 
 
 def _record(
@@ -135,7 +135,7 @@ def _echo(
     """Return (pulse, range): the targets by spreading, their sidelink's length given back, and noise."""
     generator, pulse = np.random.default_rng(seed), np.arange(len(longer_m))[:, None]
     noise = generator.standard_normal((2, len(longer_m), samples))
-    echo = (NOISE * (noise[0] + 1j * noise[1])).astype(np.complex64)
+    echo: NDArray[np.complex64] = np.asarray(NOISE * (noise[0] + 1j * noise[1]), np.complex64)
     for place in TARGETS_M:
         path = aperture.path(place[None])[:, 0] - longer_m
         at = (path - start_m) / step_m
