@@ -20,6 +20,7 @@ from apertura.pipeline.examination.times import common_pulses, recorded_span
 _TAGS = 256  # of a pair at which distances are taken
 _POINTS = 9  # along each side of the scene
 _CURVATURE = 0.99  # of a straight path: ground under a scene of unknown height bends away from the track
+_LEAST_M = 1e-3  # above the ground: an antenna at its height lies in it at every other pulse
 _MOSTLY = 0.9  # of the distance: then it is one of heights
 _CHECK = (
     "Check scene.crs and scene.bounds_m (easting before northing), the place in the logs, waveform.{key} and "
@@ -211,7 +212,7 @@ def check_ground(examined: Examination) -> Iterator[CampaignError]:
             known = np.isfinite(above)
             arms = examined.campaign.settings.nodes[node].lever_arms_m
             arm_m = float(np.linalg.norm([arms.radar_tx, arms.radar_rx, arms.sidelink], axis=1).max())
-            if known.any() and not -arm_m < np.median(above[known]) <= HIGHEST_M:
+            if known.any() and not _LEAST_M - arm_m < np.median(above[known]) <= HIGHEST_M:
                 wrong[node] = (float(np.median(above[known])), float(np.median(below[known])))
         if wrong:
             yield _problem(flight.name, wrong, dem=ground.dem is not None)
