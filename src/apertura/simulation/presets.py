@@ -118,7 +118,7 @@ def paper_uav(*, pulses: int = 275) -> CampaignSpecification:
         PointTarget((0.0, 0.0, 0.0)),
         PointTarget((-2.0, 1.2, 0.0), 0.7),
         PointTarget((1.8, -1.6, 0.0), 0.7),
-        PointTarget((-4.2, -0.8, 0.0), 0.6),  # the foot of a cylinder, where it and the ground are a dihedral
+        PointTarget((1.2, 1.8, 0.0), 0.5),  # the foot of a cylinder, where it and the ground are a dihedral
         Clutter((3.6, -0.6, 4.8, 0.6), 0.5, 60.0),
         Clutter((-7.0, -3.0, 7.0, 3.0), 0.02, 15.0),
     )
