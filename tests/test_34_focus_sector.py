@@ -193,7 +193,7 @@ def test_tiles_beyond_the_swath_are_not_formed():
     profiles, read = range_compress(history, grid, FLAT, window=window), []
 
     class Read:
-        shape, ndim = profiles.samples.shape, 2
+        shape, ndim, dtype = profiles.samples.shape, 2, profiles.samples.dtype
 
         def __len__(self):
             return self.shape[0]

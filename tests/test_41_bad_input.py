@@ -307,7 +307,7 @@ def test_a_node_with_another_sample_rate_is_refused(tiny):
     [
         ("f-1\timage\tuav1\tuav1", "only letters, digits"),
         ("fused\timage\tuav1\tuav1", "taken by the results folder"),
-        ("f02\tphoto\tuav1\tuav1", "neither image nor calibration"),
+        ("f02\tphoto\tuav1\tuav1", "is none of bench, calibration, image"),
         ("f02\timage\tuav9\tuav1", "'uav9' is not in"),
         ("f01\timage\tuav1\tuav1", "a second time"),
     ],

@@ -38,7 +38,7 @@ def test_a_table_of_windows_is_read_as_one_of_unix(tiny):
         ("f02\timage\tuav1\tuav1\tmore", "5 cells, the last 'more'"),
         ('f02\timage\tuav1\t"uav1', "not readable as a table"),
         ("f02\timage\tuav1\t" + "x" * 200_000, "field larger than field limit"),
-        ("f02\t\x1b[31mred\tuav1\tuav1", r"kind '\x1b[31mred' is neither"),
+        ("f02\t\x1b[31mred\tuav1\tuav1", r"kind '\x1b[31mred' is none of"),
         ("f02\timage\tuav1\t" + "x" * 2000, "xxx…' is not in"),
     ],
 )

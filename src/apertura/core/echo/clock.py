@@ -127,11 +127,14 @@ def clock_of(groups: Iterable[Complexes], numerology: Numerology, *, pulses: int
     joint_ppm = -phase * ppm / (numerology.carrier_hz + centre_hz)  # if one clock feeds both
     one_clock = abs(sfo_ppm - joint_ppm) <= 3 * sfo_std_ppm
     sfo_ppm = joint_ppm if one_clock else sfo_ppm
+    cfo_std_hz = phase_std / (2 * np.pi * period_s)
+    if not one_clock:  # the carrier is extrapolated from the middle of the band by a slope that is known so well
+        cfo_std_hz = float(np.hypot(cfo_std_hz, centre_hz * sfo_std_ppm * 1e-6))
     return ClockOffset(
         cfo_hz=-phase / (2 * np.pi * period_s) - centre_hz * sfo_ppm * 1e-6,
         cfo_slope_hz=-growth * len(parts) / (2 * np.pi * period_s * pulses),
         sfo_ppm=sfo_ppm,
-        cfo_std_hz=phase_std / (2 * np.pi * period_s),
+        cfo_std_hz=cfo_std_hz,
         sfo_std_ppm=sfo_std_ppm,
         one_clock=bool(one_clock),
     )

@@ -214,7 +214,11 @@ def settled_scene(campaign: Campaign) -> OpenScene:
         grid, level = document["grid"], FlatGround(_number(document["height_m"]))
         places = {name: _number(grid[name]) for name in ("west_m", "north_m", "spacing_m")}
         shape, first = ((operator.index(grid[name][0]), operator.index(grid[name][1])) for name in ("shape", "first"))
-        whole = SceneGrid(plain_crs(_text(grid["crs"])), **places, shape=shape, first=first, name=_text(grid["name"]))
+        crs, name = plain_crs(_text(grid["crs"])), _text(grid["name"])
+        try:
+            whole = SceneGrid(crs, **places, shape=shape, first=first, name=name)
+        except CampaignError as none:
+            raise ValueError(none.found) from none
         return OpenScene(whole, level, level, (), dict(document["inputs"]), dict(document["chosen"]))
 
 
