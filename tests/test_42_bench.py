@@ -40,7 +40,7 @@ def of(snr_db: float) -> Setup:
 
 
 @pytest.mark.parametrize(
-    "name", [*QUICK, *(pytest.param(name, marks=pytest.mark.slow) for name in {*SPOILT} - {*QUICK})]
+    "name", [*QUICK, *(pytest.param(name, marks=pytest.mark.slow) for name in SPOILT if name not in QUICK)]
 )
 def test_a_spoilt_set_up_is_named(name: str, tmp_path):
     bench = measured(SPOILT[name], tmp_path / "bench")
