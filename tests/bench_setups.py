@@ -150,6 +150,16 @@ def _lost(captures: list, iq: NDArray[np.int16]) -> tuple[list, NDArray[np.int16
     return [captures[one] for one in kept], iq[kept]
 
 
+def _stopped(captures: list, iq: NDArray[np.int16]) -> tuple[list, NDArray[np.int16]]:
+    return captures[:90], iq[:90]
+
+
+def _tone(x: Samples) -> Samples:
+    """Add a tone at a fifth of the band, 10 dB below the signal, of another phase in each capture."""
+    turns = 2 * np.pi * (80e6 * np.arange(x.shape[1]) / _RATE_HZ + np.random.default_rng(2).random((len(x), 1)))
+    return x + 0.3 * np.sqrt((np.abs(x) ** 2).mean()) * np.exp(1j * turns)
+
+
 def _false(captures: list, iq: NDArray[np.int16]) -> tuple[list, NDArray[np.int16]]:
     """Put a capture of noise between two pulses, five times."""
     rng, listed, rows = np.random.default_rng(6), [], []
@@ -271,6 +281,15 @@ SPOILT = {
             TRANSMITTER, 0, _turning(lambda x: 0.06 * np.random.default_rng(9).normal(size=(len(x), 1)).cumsum(0))
         ),
     ),
+    "captures of the transmitter late": Setup(
+        frozenset({"delay_jumps"}),
+        spoil=channel(TRANSMITTER, 0, lambda x: np.where(_along(x) > 0.6, np.roll(x, -20, axis=1), x)),
+    ),
+    "amplifier steps by 1 dB": Setup(
+        frozenset({"contact_loose"}), spoil=channel(RECEIVER, 0, lambda x: np.where(_along(x) > 0.5, 0.89, 1.0) * x)
+    ),
+    "receiver stops early": Setup(frozenset({"triggers_missed"}), spoil=_captures(RECEIVER, _stopped)),
+    "another transmitter": Setup(frozenset({"interference"}), spoil=channel(RECEIVER, 0, _tone)),
     "split unequal": Setup(frozenset({"split_disagrees"}), spoil=_split),
 }
 """What is wrong → a set-up with it, and which flags name it."""

@@ -92,6 +92,26 @@ def test_a_bench_needs_no_log_and_makes_no_image(tmp_path, capsys):
         campaign.check_images()
 
 
+def test_one_signal_in_two_channels_agrees_whatever_the_noise(tmp_path):
+    """Noise of 20 pulses at 18.5 dB scatters phases over the band by 0.3 rad and more: no disagreement."""
+    noisy = of(18.5)
+    short = replace(
+        noisy, specification=replace(noisy.specification, flights=(replace(noisy.specification.flights[0], pulses=20),))
+    )
+    root = short.write(tmp_path / "bench", 2)
+    edit_config(root, lambda config: config["bench"].update(split=True))
+    assert not measure_bench(Campaign.load(root), FLIGHT).flags
+
+
+def test_no_path_of_a_link_that_carries_a_flag_goes_into_the_config(tmp_path, capsys):
+    root = SPOILT["clocks of the two channels apart"].write(tmp_path / "bench", 1)
+    edit_config(root, lambda config: config["nodes"]["uav2"]["path_offset_m"].update(radar=0.5))
+    before = (root / "config/config.yaml").read_text()
+    print_bench(Campaign.load(root), write=True)
+    assert "nodes.uav2.path_offset_m: not of a link with link_incoherent" in capsys.readouterr().out
+    assert (root / "config/config.yaml").read_text() == before
+
+
 def test_measured_paths_go_into_the_config_and_nothing_else_changes(tmp_path):
     root = RIGHT.write(tmp_path / "bench", 1)
     edit_config(root, lambda config: config["nodes"]["uav2"]["path_offset_m"].update(radar=0.5))

@@ -400,8 +400,18 @@ _OF_BENCHES = {
     "link_drifts": Flag(
         "phase and delay over the recording", "path or delay changes while nothing moves",
         "warming up: cables, amplifiers, filters; wait, or calibrate again", "methods/synchronisation/bench.py"),
+    "delay_jumps": Flag(
+        "pulses that arrive at another delay, and how far from the others",
+        "pulses arrive at several delays while nothing moves: captures that begin elsewhere, or another path",
+        "trigger of the transmitter; cables that were changed; two reflectors as strong as each other",
+        "methods/synchronisation/bench.py"),
+    "interference": Flag(
+        "dB by which one subcarrier changes more than the others, and its frequency",
+        "a narrow signal lies in the band: it adds noise to every range",
+        "other transmitters; spurs of the node's own clocks", "methods/synchronisation/bench.py"),
     "contact_loose": Flag(
-        "amplitude beyond noise, and pulses lost or 6 dB low", "amplitude is not steady while nothing moves",
+        "amplitude beyond noise, from pulse to pulse and over the recording; pulses lost or 6 dB low",
+        "amplitude is not steady while nothing moves",
         "connectors of that channel; supply of the amplifiers", "methods/synchronisation/bench.py"),
     "channel_leaks": Flag(
         "dB of what arrives with the sidelink against the strongest path",

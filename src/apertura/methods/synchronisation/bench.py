@@ -53,6 +53,9 @@ DROPOUT_DB, DROPOUT_SHARE = -6.0, 0.01
 LEAKAGE_DB, APART_CELLS = -20.0, 3.0
 """dB of what arrives at the sidelink's delay against the strongest arrival; and how far this must lie from it."""
 
+TONE_DB = 13.0
+"""Of the change of one subcarrier from pulse to pulse, above that of the median: chance makes 5 dB of 20 pulses."""
+
 UNLOCKED_PPM = 0.3
 """Between two oscillators: disciplined ones (GNSS, a cable of 10 MHz) keep below 0.1 ppm, free quartzes do not."""
 
@@ -77,18 +80,27 @@ class Triggers:
     ----------
     recorded, missed, false
         Captures; pulses between them that are not there; captures that lie between two pulses.
+    beyond
+        Pulses that another node recorded before its first capture, or after its last.
     """
 
     recorded: int
     missed: int
     false: int
+    beyond: int = 0
+
+    @property
+    def due(self) -> int:
+        """Pulses from its first capture to its last."""
+        return self.recorded - self.false + self.missed
 
     @property
     def flags(self) -> dict[str, str]:
         """Flags of limits that are crossed."""
-        flags, due = {}, self.recorded - self.false + self.missed
-        if self.missed > MISSED_SHARE * due:
-            flags["triggers_missed"] = f"{self.missed} of {due} pulses were not recorded"
+        flags, due, lost = {}, self.due + self.beyond, self.missed + self.beyond
+        if lost > MISSED_SHARE * due:
+            ends = f", {self.beyond} of them before its first capture or after its last" if self.beyond else ""
+            flags["triggers_missed"] = f"{lost} of {due} pulses were not recorded{ends}"
         if self.false > 0:
             flags["triggers_false"] = f"{self.false} of {self.recorded} captures lie between two pulses"
         return flags
@@ -221,6 +233,8 @@ class Contact:
         Of the path, for messages.
     scatter_db
         Beyond what noise allows, rms; 0 where that is chance.
+    moves_db
+        Largest difference between eighths of the recording; 0 where that is chance.
     dropouts, pulses
         Pulses that do not lock or lie 6 dB below the median; and all.
     snr_db
@@ -229,6 +243,7 @@ class Contact:
 
     name: str
     scatter_db: float
+    moves_db: float
     dropouts: int
     pulses: int
     snr_db: float
@@ -243,17 +258,29 @@ class Contact:
         low = int((amplitude < usual * 10 ** (DROPOUT_DB / 20)).sum())
         # of a weak path noise alone falls so far
         lost = pulses - len(amplitude) + (low if snr_db > 2 * WEAK_DB else 0)
-        return cls(name, float(20 * np.log10(1 + scatter)), lost, pulses, float(snr_db))
+        parts = np.array([np.median(part) for part in np.array_split(amplitude, _PARTS) if part.size])
+        spread = float(np.ptp(parts)) / usual
+        # a median errs by 1.25 times a mean, a difference of two by 1.4 of that
+        local = float(np.std(np.diff(amplitude))) / np.sqrt(2) / usual  # scatter without what moves slowly
+        chance = SIGMAS * np.sqrt(2) * 1.25 * max(noise, local) / np.sqrt(max(len(amplitude) / _PARTS, 1))
+        moves_db = float(20 * np.log10(1 + spread)) if spread > chance else 0.0
+        return cls(name, float(20 * np.log10(1 + scatter)), moves_db, lost, pulses, float(snr_db))
 
     @property
     def flags(self) -> dict[str, str]:
         """A flag of a path whose amplitude is not steady."""
-        if self.dropouts <= DROPOUT_SHARE * self.pulses and self.scatter_db <= AMPLITUDE_DB:
+        steady = max(self.scatter_db, self.moves_db) <= AMPLITUDE_DB
+        if self.dropouts <= DROPOUT_SHARE * self.pulses and steady:
             return {}
-        return {
-            "contact_loose": f"{self.name}: amplitude scatters by {self.scatter_db:.1f} dB rms beyond noise, "
-            f"{self.dropouts} of {self.pulses} pulses are lost or 6 dB low"
-        }
+        return {"contact_loose": f"{self.name}: {self.line}"}
+
+    @property
+    def line(self) -> str:
+        """What was measured."""
+        return (
+            f"amplitude scatters by {self.scatter_db:.2f} dB rms beyond noise, moves by {self.moves_db:.2f} dB, "
+            f"{self.dropouts} of {self.pulses} pulses lost or 6 dB low"
+        )
 
 
 def measure_contact(name: str, form: Callable[[Pulses], Complexes], pulses: int) -> Contact | None:
@@ -313,6 +340,10 @@ class Link:
         What arrives with the sidelink, dB of the path; None where that is the path, or less than its sidelobes.
     mean
         (subcarrier,) complex128, mean of the pulses.
+    jumped, jump_m
+        Pulses that lock at another delay, and the median of how far from it, metres.
+    tone_hz, tone_db
+        Where the band changes most from pulse to pulse, and by how much more than elsewhere, dB.
     """
 
     name: str
@@ -327,6 +358,10 @@ class Link:
     arrivals: tuple[Arrival, ...]
     direct_db: float | None
     mean: NDArray[np.complex128]
+    jumped: int
+    jump_m: float
+    tone_hz: float
+    tone_db: float
     delay_ps: Floats = field(repr=False)
 
     @property
@@ -400,7 +435,7 @@ class Link:
     @property
     def contact(self) -> "Contact":
         """How steady its amplitude is."""
-        return Contact.of(self.name, np.abs(self.terms), self.noise_rad, self.pulses)
+        return Contact.of(self.name, np.abs(self.terms), self.noise_rad, self.pulses - self.jumped)
 
     @property
     def _centred_s(self) -> Floats:
@@ -441,6 +476,15 @@ class Link:
         flags, snr_db = {}, 10 * np.log10(self.snr)
         if snr_db < WEAK_DB:
             flags["link_weak"] = f"{self.name}: {snr_db:.1f} dB in a compressed pulse"
+        if self.jumped > MISSED_SHARE * self.pulses and snr_db > WEAK_DB:
+            flags["delay_jumps"] = (
+                f"{self.name}: {self.jumped} of {self.pulses} pulses arrive {self.jump_m:+.2f} m from the "
+                "others, which all else here is of"
+            )
+        if self.tone_db > TONE_DB:
+            flags["interference"] = (
+                f"{self.name}: {self.tone_db:.0f} dB above the other subcarriers at {self.tone_hz / 1e6:.2f} MHz"
+            )
         excess = self.phase_excess_rad
         random = 1 - self.coherence > 0.5 > 1 - self.coherence_limit
         if excess > PHASE_RAD or random:
@@ -452,7 +496,7 @@ class Link:
         if abs(drift) > max(PHASE_RAD, SIGMAS * std) and not random:
             moved, moved_std = self.delay_drift_ps
             flags["link_drifts"] = (
-                f"{self.name}: phase moves by {drift:+.3f} ± {std:.3f} rad in {self.lasts_s:.0f} s, delay by "
+                f"{self.name}: phase moves by {drift:+.3f} ± {std:.3f} rad in {self.lasts_s:.3g} s, delay by "
                 f"{moved:+.1f} ± {moved_std:.1f} ps"
             )
         if self.direct_db is not None and self.direct_db > LEAKAGE_DB:
@@ -463,6 +507,7 @@ class Link:
 
 
 _FEWEST_DIFFERENCES = 8
+_PARTS = 8  # of a recording, whose amplitudes are compared
 _SHOWN = 4  # arrivals
 _HANN_STD = 1.51  # deviation of a delay by noise of the fit under a Hann window, over that without: measured
 _STANDS_OUT = 20.0  # times the noise of the mean: 13 dB
@@ -518,15 +563,29 @@ def measure_link(
     # 2. One delay for all: the median about the first, for it is counted modulo the length of the profile.
     first = float(paths.delay_cells[locked][0])
     off = (paths.delay_cells - first + subcarriers / 2) % subcarriers - subcarriers / 2
-    delay = first + float(np.median(off[locked]))
+    #    Where pulses arrive at several, that of most: a median would lie between them.
+    ordered = np.sort(off[locked])
+    held = np.searchsorted(ordered, ordered + 1.0, side="right") - np.arange(ordered.size)
+    most = int(held.argmax())
+    middle = float(np.median(ordered[most : most + held[most]]))
+    delay = first + middle
+    apart = locked & (np.abs(off - middle) > 1.0)
+    jump_m = float(np.median(off[apart] - middle)) * cell_m if apart.any() else 0.0
+    locked = locked & ~apart
+    if locked.sum() < 2:
+        return None
     if prefix_cells is not None:
         delay %= subcarriers
     # 3. Every pulse at that delay: what an image would add; and the noise by how cells far from it change.
     align = phasors(np.array([delay / subcarriers]), subcarriers, first=-(subcarriers - 1) / 2)
     power, total = np.zeros(subcarriers), np.zeros(subcarriers, np.complex128)
+    band, band_total = np.zeros(subcarriers), np.zeros(subcarriers, np.complex128)
     terms = np.zeros(count, np.complex128)
     for some in blocks_of(every[locked]):
-        profile = fft.ifft(form(some) * align, axis=1).astype(np.complex128)
+        aligned = form(some) * align
+        profile = fft.ifft(aligned, axis=1).astype(np.complex128)
+        band += (np.abs(aligned) ** 2).sum(axis=0)
+        band_total += aligned.sum(axis=0)
         terms[some] = profile[:, 0]
         power += (np.abs(profile) ** 2).sum(axis=0)
         total += profile.sum(axis=0)
@@ -535,12 +594,13 @@ def measure_link(
     # of few pulses the median over cells of a mean of exponential variables lies below its mean
     noise = float(np.median(changes)) / (1 - 1 / (9 * (used - 1))) ** 3
     mean = total / used
-    within = np.abs(off[locked] - np.median(off[locked])) < 1.0
-    scatter = float(np.std(off[locked][within])) if within.any() else 0.0
+    scatter = float(np.std(off[locked]))
+    changing = np.maximum(band - np.abs(band_total) ** 2 / used, 1e-30)
+    tone = int(changing.argmax())
     direct = _at_sidelink(mean, delay, noise / used) if divided else None
     # 4. The path again, of the mean under a Hann window: sidelobes of other arrivals move it by millimetres without.
-    aligned = fft.fft(mean) * np.hanning(subcarriers)
-    path_m = (delay + float(fit_block(aligned.astype(np.complex64)[None])[0].delay_cells[0])) * cell_m
+    bell = (fft.fft(mean) * np.hanning(subcarriers)).astype(np.complex64)
+    path_m = (delay + float(fit_block(bell[None])[0].delay_cells[0])) * cell_m
     return Link(
         name,
         time_s[locked],
@@ -554,7 +614,11 @@ def measure_link(
         _arrivals(mean, noise / used, cell_m),
         direct,
         fft.fft(mean) * np.conj(align[0]),
-        (off[locked] - float(np.median(off[locked]))) * cell_m / SPEED_OF_LIGHT_M_S * 1e12,
+        int(apart.sum()),
+        jump_m,
+        float(numerology.frequency_hz[tone]),
+        _db(changing[tone] / float(np.median(changing))),
+        (off[locked] - middle) * cell_m / SPEED_OF_LIGHT_M_S * 1e12,
     )
 
 
@@ -654,7 +718,7 @@ class SplitAgreement:
     phase_rad, phase_std_rad
         Phase at the middle of the band beyond what that difference turns it by, and standard deviation.
     band_rad, band_db
-        RMS over the band of what one path leaves, phase and amplitude.
+        RMS over the band of what one path and noise leave, phase and amplitude.
     """
 
     gain_db: float
@@ -699,11 +763,19 @@ def split_agreement(first: Link, second: Link) -> SplitAgreement:
     along = phasors(path.delay_cells / subcarriers, subcarriers, first=-(subcarriers - 1) / 2)[0]
     left = np.angle(ratio * along * np.exp(-1j * float(path.phase_rad[0])))
     size_db = 20 * np.log10(np.maximum(np.abs(second.mean), 1e-30) / np.maximum(np.abs(first.mean), 1e-30))
+    noise = sum(_band_noise(link) for link in (first, second))  # of a subcarrier's phase, squared
+    beyond = [np.sqrt(max(0.0, float(rms) ** 2 - (1 + SIGMAS * np.sqrt(2 / subcarriers)) * noise * per**2))
+              for rms, per in ((np.sqrt(np.mean(left**2)), 1.0), (np.std(size_db), 20 / np.log(10)))]  # fmt: skip
     return SplitAgreement(
         float(20 * np.log10(np.abs(second.terms).mean() / np.abs(first.terms).mean())),
         delay_s * SPEED_OF_LIGHT_M_S,
         phase,
         float(np.hypot(2 * np.pi * first.frequency_hz * std_s, np.sqrt(1 / len(first.terms)) * first.noise_rad)),
-        float(np.sqrt(np.mean(left**2))),
-        float(np.std(size_db)),
+        float(beyond[0]),
+        float(beyond[1]),
     )
+
+
+def _band_noise(link: Link) -> float:
+    """Return the variance of the phase of a link's mean transfer function in a subcarrier, by noise, rad²."""
+    return link.noise * link.mean.size / len(link.terms) / (2 * float(np.mean(np.abs(link.mean) ** 2)))

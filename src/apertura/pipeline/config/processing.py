@@ -98,7 +98,9 @@ class Bench(Section):
     """What is known of a set-up that stands still, in flights of kind bench."""
 
     radar_m: float | None = Field(
-        None, description="path of the strongest echo, or of its cable, from transmitter to receiver, m; null: unknown"
+        None,
+        ge=0,
+        description="path of the strongest echo, or of its cable, from transmitter to receiver, m; null: unknown",
     )
     sidelink_m: float | None = Field(
         None, ge=0, description="path of the sidelink, or of its cable, without path_offset_m, m; null: unknown"

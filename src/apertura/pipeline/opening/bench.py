@@ -1,7 +1,7 @@
 """A flight of kind bench as measured: channels and clocks of its nodes, links of its pairs, and a verdict per line."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -151,11 +151,11 @@ class Bench:
             return Line(of, what, measured, limit, tuple(name for name in names if name in raised))
 
         count = node.triggers
-        due = count.recorded - count.false + count.missed
+        lost, due = count.missed + count.beyond, count.due + count.beyond
         yield line(
             node.name,
             "pulses",
-            f"{count.recorded} recorded, {count.missed} of {due} missed, {count.false} false",
+            f"{count.recorded} recorded, {lost} of {due} missed, {count.false} false",
             f"missed {100 * limits.MISSED_SHARE:g} %, false 0",
             "triggers_missed",
             "triggers_false",
@@ -210,10 +210,8 @@ class Bench:
             yield self._steady(node.contact, of)
 
     def _steady(self, contact: Contact, of: str) -> Line:
-        measured = (
-            f"{contact.scatter_db:.2f} dB rms beyond noise, {contact.dropouts} of {contact.pulses} pulses lost or low"
-        )
-        return Line(of, "amplitude", measured, f"{limits.AMPLITUDE_DB:g} dB, {100 * limits.DROPOUT_SHARE:g} %",
+        return Line(of, "amplitude", contact.line.removeprefix("amplitude "),
+                    f"{limits.AMPLITUDE_DB:g} dB, {100 * limits.DROPOUT_SHARE:g} %",
                     tuple(contact.flags))  # fmt: skip
 
     def _link(self, node: BenchNode, link: Link, line: Any) -> Iterator[Line]:
@@ -245,7 +243,10 @@ class Bench:
             "link_drifts",
         )
         yield self._steady(link.contact, pair)
-        yield line(pair, "path", f"{link.path_m:+.4f} ± {link.path_std_m:.4f} m", "", "channels_swapped")
+        path = f"{link.path_m:+.4f} ± {link.path_std_m:.4f} m"
+        yield line(pair, "path", path, "one of all pulses", "channels_swapped", "delay_jumps")
+        yield line(pair, "strongest tone", f"{link.tone_db:.1f} dB at {link.tone_hz / 1e6:.2f} MHz",
+                   f"{limits.TONE_DB:g} dB of the noise", "interference")  # fmt: skip
         if (offset := self.offsets.get(node.name)) is not None:
             yield line(
                 pair,
@@ -265,7 +266,8 @@ class Bench:
                 pair,
                 f"against {self.pair(self.transmitter)}, one signal",
                 f"{split.gain_db:+.2f} dB, {split.phase_rad:+.3f} ± {split.phase_std_rad:.3f} rad, paths "
-                f"{split.path_m:+.3f} m apart; over the band {split.band_db:.2f} dB, {split.band_rad:.3f} rad rms",
+                f"{split.path_m:+.3f} m apart, the receiver's beyond its "
+                f"sidelink; over the band {split.band_db:.2f} dB, {split.band_rad:.3f} rad rms",
                 f"{limits.SPLIT_DB:g} dB, {limits.SPLIT_RAD:g} rad",
                 "split_disagrees",
             )
@@ -279,11 +281,24 @@ class Bench:
             "lines": [vars(line) | {"flags": list(line.flags)} for line in self.lines],
             "links": {self.pair(node.name): _link_report(node, self.interval_s) for node in self.nodes if node.link},
             "path_offset_m": {
-                name: {"offset_m": round(one.offset_m, 5), "std_m": round(one.std_m, 5), "stated_m": one.stated_m}
-                for name, one in self.offsets.items()
+                node.name: {
+                    "offset_m": round(self.offsets[node.name].offset_m, 5),
+                    "std_m": round(self.offsets[node.name].std_m, 5),
+                    "stated_m": self.offsets[node.name].stated_m,
+                    "doubts": sorted(_DOUBTS & node.flags.keys()),
+                }
+                for node in self.nodes
+                if node.name in self.offsets
             },
             "flags": self.flags,
         }
+
+
+_DOUBTS = frozenset({
+    "link_weak", "link_incoherent", "contact_loose", "delay_jumps", "wrong_code", "code_unconfirmed",
+    "spectrum_inverted", "saturated_radar", "saturated_sidelink", "sidelink_lost", "interference",
+})  # fmt: skip
+"""Flags of a node whose measured path goes into no config."""
 
 
 def _link_report(node: BenchNode, interval_s: float) -> dict[str, Any]:
@@ -326,6 +341,8 @@ def measure_bench(campaign: Campaign, flight: str) -> Bench:
     flown, sent = campaign.flight(flight), transmitted(campaign, waveform)
     names = [name for name in flown.participants if name in flown.nodes]
     nodes = tuple(_node(campaign, flight, name, sent, own=name == flown.transmitter) for name in names)
+    due = max((node.triggers.due for node in nodes), default=0)
+    nodes = tuple(_with_ends(node, due) for node in nodes)
     stated, offsets, further = campaign.settings.bench, {}, []
     for node in nodes:
         own = node.name == flown.transmitter
@@ -353,6 +370,12 @@ def measure_bench(campaign: Campaign, flight: str) -> Bench:
     )  # fmt: skip
 
 
+def _with_ends(node: BenchNode, due: int) -> BenchNode:
+    """Return a node with the pulses that others recorded before it began or after it stopped."""
+    counted = replace(node.triggers, beyond=due - node.triggers.due)
+    return replace(node, triggers=counted, flags=Flags.merged(node.flags, counted.flags))
+
+
 def _less(radar_m: float, sidelink_m: float | None) -> float | None:
     return None if sidelink_m is None else radar_m - sidelink_m
 
@@ -368,12 +391,12 @@ def _node(campaign: Campaign, flight: str, name: str, sent: Transmitted, *, own:
     every = np.arange(len(time_s))
     read = captured.reader(present if own else list(_CHANNELS), every)
     channels, saturation = _channels(read, present, captured, len(every))
-    flags = [channel.flags for channel in channels] + [saturation.flags, counted.flags]
+    flags = [channel.flags for channel in channels] + [saturation.flags]
     pair = f"{campaign.flight(flight).transmitter}-{name}"
     inverted = _is_inverted(read, sent, "radar" if own else "sidelink", len(every))
     if inverted:
         read = _conjugated(read)
-        flags.append({"spectrum_inverted": f"{name}: the conjugates of its samples carry the code, they do not"})
+        flags.append({"spectrum_inverted": f"{name}: the code is in the conjugates of its samples, not in the samples"})
     before, clock, contact, state = None, None, None, None
     measured: Transfer | None = None
     if own:

@@ -74,12 +74,7 @@ def print_bench(campaign: Campaign, *, write: bool = False) -> int:
         for name in (PAGE, PICTURE):
             print(f"  {campaign.relative(campaign.result(flight, name))}")
         flagged += sum(bool(line["flags"]) for line in report["lines"])
-        offsets = report["path_offset_m"]
-        if offsets and write:
-            write_offsets(campaign, flight, offsets)
-        elif offsets:
-            print(f"paths for {CONFIG}, or `apertura bench --write`:")
-            print(*(f"  {line}" for line in offset_lines(campaign, flight, offsets)), sep="\n")
+        _offer(campaign, flight, report["path_offset_m"], write=write)
     return flagged
 
 
@@ -111,7 +106,11 @@ def _blocks(title: str, report: Mapping[str, Any], picture: bytes) -> Iterator[B
     flags = report["flags"]
     yield Paragraph(
         "Nothing moved: whatever changes from pulse to pulse is the radar's own. "
-        + (f"{len(flags)} things to look at, below." if flags else "Every line is within its limit.")
+        + (
+            f"{len(flags)} thing{'s' * (len(flags) > 1)} to look at, below."
+            if flags
+            else "Every line is within its limit."
+        )
     )
     if flags:
         rows = [(name, line, FLAGS[name].means, FLAGS[name].look) for name, line in flags.items()]
@@ -165,14 +164,27 @@ def _around(paths_m: list[float], cell_m: float) -> tuple[float, float]:
 # ---- Measured paths into the config ---------------------------------------------------------------------------------
 
 
-def offset_lines(campaign: Campaign, flight: str, offsets: Mapping[str, Any]) -> list[str]:
-    """Return what the config would say of the measured paths, a line per node."""
-    transmitter = campaign.flight(flight).transmitter
-    lines = []
-    for node, offset in offsets.items():
-        radar_m = _radar_m(campaign, node, offset["offset_m"], own=node == transmitter)
-        lines.append(f"nodes.{node}.path_offset_m.radar: {radar_m}  # ± {offset['std_m']:.4f}")
-    return lines
+def _offer(campaign: Campaign, flight: str, offsets: Mapping[str, Any], *, write: bool) -> None:
+    """Print what the config would say of the measured paths, or write it; nothing of links that carry a flag."""
+    if not offsets:
+        print(f"{CONFIG}: bench.radar_m and bench.sidelink_m are not stated: no path beyond the set-up")
+        return
+    for node, one in offsets.items():
+        if one["doubts"]:
+            print(f"nodes.{node}.path_offset_m: not of a link with {', '.join(one['doubts'])}")
+    differing = {
+        node: one
+        for node, one in offsets.items()
+        if not one["doubts"] and abs(one["offset_m"] - one["stated_m"]) > SIGMAS * one["std_m"]
+    }
+    if write:
+        write_offsets(campaign, flight, differing)
+    elif differing:
+        print(f"paths for {CONFIG}, or `apertura bench --write`:")
+        transmitter = campaign.flight(flight).transmitter
+        for node, one in differing.items():
+            radar_m = _radar_m(campaign, node, one["offset_m"], own=node == transmitter)
+            print(f"  nodes.{node}.path_offset_m.radar: {radar_m}  # ± {one['std_m']:.4f}")
 
 
 def _radar_m(campaign: Campaign, node: str, offset_m: float, *, own: bool) -> float:
@@ -181,14 +193,10 @@ def _radar_m(campaign: Campaign, node: str, offset_m: float, *, own: bool) -> fl
 
 
 def write_offsets(campaign: Campaign, flight: str, offsets: Mapping[str, Any]) -> None:
-    """Write measured paths into config/config.yaml, where they differ beyond noise; all else stays letter by letter."""
+    """Write measured paths into config/config.yaml; all else stays letter by letter."""
     path, transmitter = campaign.root / CONFIG, campaign.flight(flight).transmitter
     text = path.read_text(encoding="utf-8")
-    found = {
-        node: _radar_m(campaign, node, one["offset_m"], own=node == transmitter)
-        for node, one in offsets.items()
-        if abs(one["offset_m"] - one["stated_m"]) > SIGMAS * one["std_m"]
-    }
+    found = {node: _radar_m(campaign, node, one["offset_m"], own=node == transmitter) for node, one in offsets.items()}
     for node, value in found.items():
         text = with_value(text, ("nodes", node, "path_offset_m", "radar"), value)
         print(f"{CONFIG}: nodes.{node}.path_offset_m.radar: {value}")
@@ -196,7 +204,7 @@ def write_offsets(campaign: Campaign, flight: str, offsets: Mapping[str, Any]) -
         validated(yaml.safe_load(text), where=path)
         write_text(path, text)
     else:
-        print(f"{CONFIG}: says what was measured")
+        print(f"{CONFIG}: nothing to write: it says what was measured")
 
 
 def with_value(text: str, keys: tuple[str, ...], value: float) -> str:
