@@ -112,7 +112,7 @@ def triggers(time_s: Floats, *, prf_hz: float) -> Triggers:
     Examples
     --------
     >>> triggers(np.array([0.0, 0.1, 0.2, 0.25, 0.3, 0.5]), prf_hz=10.0)
-    Triggers(recorded=6, missed=1, false=1)
+    Triggers(recorded=6, missed=1, false=1, beyond=0)
     """
     missed, false, last = 0, 0, float(time_s[0])
     for time in time_s[1:].tolist():
@@ -755,24 +755,45 @@ def split_agreement(first: Link, second: Link) -> SplitAgreement:
     weight = np.abs(first.mean) * np.abs(second.mean)
     ratio = (second.mean * np.conj(first.mean) / np.maximum(weight, 1e-30)).astype(np.complex64)
     path, _ = fit_block(ratio[None])
-    subcarriers = len(ratio)
     delay_s = float(path.delay_cells[0]) * first.cell_m / SPEED_OF_LIGHT_M_S
     turn = 2 * np.pi * first.frequency_hz * delay_s
     phase = float(np.angle(np.exp(1j * (float(path.phase_rad[0]) + turn))))
     std_s = np.hypot(first.path_std_m, second.path_std_m) / SPEED_OF_LIGHT_M_S
-    along = phasors(path.delay_cells / subcarriers, subcarriers, first=-(subcarriers - 1) / 2)[0]
-    left = np.angle(ratio * along * np.exp(-1j * float(path.phase_rad[0])))
-    size_db = 20 * np.log10(np.maximum(np.abs(second.mean), 1e-30) / np.maximum(np.abs(first.mean), 1e-30))
-    noise = sum(_band_noise(link) for link in (first, second))  # of a subcarrier's phase, squared
-    beyond = [np.sqrt(max(0.0, float(rms) ** 2 - (1 + SIGMAS * np.sqrt(2 / subcarriers)) * noise * per**2))
-              for rms, per in ((np.sqrt(np.mean(left**2)), 1.0), (np.std(size_db), 20 / np.log(10)))]  # fmt: skip
     return SplitAgreement(
         float(20 * np.log10(np.abs(second.terms).mean() / np.abs(first.terms).mean())),
         delay_s * SPEED_OF_LIGHT_M_S,
         phase,
         float(np.hypot(2 * np.pi * first.frequency_hz * std_s, np.sqrt(1 / len(first.terms)) * first.noise_rad)),
-        float(beyond[0]),
-        float(beyond[1]),
+        *_over_the_band(first, second),
+    )
+
+
+_GROUP_NOISE = 0.005  # rad², of the phase of a group of subcarriers: where noise is small, it is what is predicted
+
+
+def _over_the_band(first: Link, second: Link) -> tuple[float, float]:
+    """Return how phase and amplitude of one link over another change over the band beyond noise, rms, rad and dB.
+
+    Of groups of subcarriers, each as many as its noise asks for; zero where fewer than four are left.
+    """
+    subcarriers = first.mean.size
+    noise = sum(map(_band_noise, (first, second)))
+    groups = int(min(subcarriers, subcarriers * _GROUP_NOISE / max(noise, 1e-30)))
+    if groups < 4:
+        return 0.0, 0.0
+    edges = np.linspace(0, subcarriers, groups + 1).astype(np.int64)[:-1]
+    flat = []
+    for link in (first, second):
+        delay = np.array([link.path_m / link.cell_m / subcarriers])
+        aligned = link.mean * phasors(delay, subcarriers, first=-(subcarriers - 1) / 2)[0]
+        flat.append(np.add.reduceat(aligned, edges))
+    ratio = flat[1] * np.conj(flat[0])
+    left = np.angle(ratio * np.conj(ratio.sum()))
+    size_db = 20 * np.log10(np.maximum(np.abs(flat[1]), 1e-30) / np.maximum(np.abs(flat[0]), 1e-30))
+    chance = (1 + SIGMAS * np.sqrt(2 / groups)) * noise * groups / subcarriers
+    return (
+        float(np.sqrt(max(0.0, float(np.mean(left**2)) - chance))),
+        float(np.sqrt(max(0.0, float(np.var(size_db)) - chance * (20 / np.log(10)) ** 2))),
     )
 
 
