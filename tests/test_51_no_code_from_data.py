@@ -78,7 +78,7 @@ TYPED = {
 }
 """Command → what is typed in the campaign folder, where that is more than the command."""
 
-MAY_REFUSE = {"align", "reflectors", "step calibrate", "step interferogram", "step page"}
+MAY_REFUSE = {"align", "bench", "step bench", "reflectors", "step calibrate", "step interferogram", "step page"}
 """Commands that ask for what such a campaign does not have."""
 
 QUICK = ("check", "init", "plan", "step scene")
