@@ -660,7 +660,7 @@ def clock_flags(name: str, clock: ClockOffset, numerology: Numerology, pulses: i
     """
     ppm, std = clock.ppm(numerology)
     flags, moved_ppm = {}, clock.cfo_slope_hz * pulses / numerology.carrier_hz * 1e6
-    if abs(ppm) > max(UNLOCKED_PPM, SIGMAS * (std or 0.0)):
+    if abs(ppm) > UNLOCKED_PPM + SIGMAS * (std or 0.0):
         flags["clock_unlocked"] = f"{name}: {ppm:+.3f} ± {std or 0.0:.3f} ppm against the transmitter's clock"
     if abs(moved_ppm) > DRIFT_PPM:
         flags["clock_drifts"] = f"{name}: the clock moves by {moved_ppm:+.3f} ppm over the recording"
