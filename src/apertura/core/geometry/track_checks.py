@@ -604,8 +604,18 @@ def hovering(time_s: Floats, legs: Sequence[Floats]) -> NDArray[np.bool_]:
         moved_m += np.linalg.norm(after - before, axis=-1)
     speed = moved_m / (ends_s[1] - ends_s[0])
     slow = speed < HOVER_SPEED * np.quantile(speed, 0.9)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], slow, [False]]).astype(np.int8)))
-    for first, last in edges.reshape(-1, 2):
+    for first, last in stretches(slow):
         if time_s[last - 1] - time_s[first] >= HOVER_S:
             none[first:last] = True
     return none if none.mean() >= HOVER_SHARE else np.zeros(len(time_s), bool)
+
+
+def stretches(marked: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Return (stretch, 2) int64: first and behind the last of each run of (pulse,) bool that are marked.
+
+    Examples
+    --------
+    >>> stretches(np.array([True, False, True, True])).tolist()
+    [[0, 1], [2, 4]]
+    """
+    return np.flatnonzero(np.diff(np.concatenate([[False], marked, [False]]).astype(np.int8))).reshape(-1, 2)

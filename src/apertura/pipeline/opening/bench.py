@@ -84,8 +84,6 @@ class BenchNode:
         Its strongest path: own echo of the transmitter, else the echo divided by the sidelink; None where none locks.
     coherence_before
         Γ of the radar channel as if there were no sidelink.
-    inverted
-        Whether the samples carry the code as their conjugates do.
     flags
         Of all that.
     """
@@ -99,7 +97,6 @@ class BenchNode:
     contact: Contact | None
     link: Link | None
     coherence_before: float | None
-    inverted: bool
     flags: Flags
 
 
@@ -393,8 +390,7 @@ def _node(campaign: Campaign, flight: str, name: str, sent: Transmitted, *, own:
     channels, saturation = _channels(read, present, captured, len(every))
     flags = [channel.flags for channel in channels] + [saturation.flags]
     pair = f"{campaign.flight(flight).transmitter}-{name}"
-    inverted = _is_inverted(read, sent, "radar" if own else "sidelink", len(every))
-    if inverted:
+    if _is_inverted(read, sent, "radar" if own else "sidelink", len(every)):
         read = _conjugated(read)
         flags.append({"spectrum_inverted": f"{name}: the code is in the conjugates of its samples, not in the samples"})
     before, clock, contact, state = None, None, None, None
@@ -431,7 +427,7 @@ def _node(campaign: Campaign, flight: str, name: str, sent: Transmitted, *, own:
             )  # fmt: skip
             flags.append(link.flags if link else {"link_weak": f"{pair}: no path above the noise"})
     return BenchNode(
-        name, counted, channels, saturation.shares, clock, state, contact, link, before, inverted,
+        name, counted, channels, saturation.shares, clock, state, contact, link, before,
         Flags.merged(*flags),
     )  # fmt: skip
 

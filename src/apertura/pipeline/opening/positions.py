@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from apertura.common.arrays import Times
 from apertura.common.errors import CampaignError
 from apertura.common.flags import Flags
-from apertura.core.geometry.track_checks import CheckedTrack, hovering
+from apertura.core.geometry.track_checks import CheckedTrack, hovering, stretches
 from apertura.formats.tracks.track import FIXES
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import SEGMENTS, Node
@@ -207,8 +207,7 @@ def _flags(node: NodeLog, at: Times, barred: dict[str, NDArray[np.bool_]]) -> di
 def _hover(tx: NodeLog, at: Times, standing: NDArray[np.bool_]) -> str:
     """Return how many pulses of hovers are left out, and when the longest was."""
     time_s = tx.log_seconds(at)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], standing, [False]]).astype(np.int8))).reshape(-1, 2)
-    first, last = max(edges, key=lambda edge: time_s[edge[1] - 1] - time_s[edge[0]])
+    first, last = max(stretches(standing), key=lambda edge: time_s[edge[1] - 1] - time_s[edge[0]])
     return (
         f"{int(standing.sum())} of {len(at)} pulses left out: the antennas stood, longest "
         f"{time_s[last - 1] - time_s[first]:.0f} s from {tx.log_time(float(time_s[first]))}"
