@@ -87,9 +87,13 @@ def test_options_of_run_reach_snakemake(monkeypatch, typed, tiny):
     monkeypatch.setattr("apertura.pipeline.workflow.run_workflow", lambda *words, **_: given.append(words[2:]) or 0)
     typed("run", "--until", "export", "-n", "--set-scatter", "tiles=4", "--profile", "profiles/slurm", folder=tiny)
     typed("run", tiny, "phase_history", "-np", "--batch=all=1/3")
+    typed("run", "--until", "echo", "scene", "terrain", tiny)
+    typed("run", tiny, "-U", "echo", "scene")
     assert given == [
         ("-n", "--until", "export", "--profile", "profiles/slurm", "--set-scatter", "tiles=4"),
         ("phase_history", "-p", "--batch", "all=1/3", "-n"),
+        ("--until", "echo", "scene", "terrain"),
+        ("--until", "echo", "scene"),
     ]
 
 
