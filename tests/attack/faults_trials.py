@@ -69,9 +69,7 @@ class Bench:
                 self.before[step] = self.root.parent / f"before {step}"
                 shutil.copytree(self.results, self.before[step])
             arm(self.page, self.results, COUNT)
-            ended = self.run(
-                step, limit_s=10 * LIMIT_S
-            )  # in a fresh clone it compiles what the next ones take from there
+            ended = self.run(step, limit_s=10 * LIMIT_S)  # in a fresh clone it compiles first
             if ended.status:
                 raise RuntimeError(f"{step} fails undisturbed:\n{ended.said}")
             self.calls[step], self.after[step] = self.page.count, files(self.results)
