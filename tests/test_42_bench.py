@@ -14,7 +14,7 @@ from apertura.common.flag_table import FLAGS
 from apertura.core.echo.demodulate import Numerology
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.planning.plan import no_aperture
-from apertura.methods.synchronisation.bench import measure_link
+from apertura.methods.synchronisation.links import measure_link
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.check import problems
 from apertura.pipeline.opening.bench import Bench, measure_bench
