@@ -386,6 +386,9 @@ _OF_BENCHES = {
     "channel_image": Flag(
         "dB of the mirror image", "I and Q are unequal, or not at 90°: subcarriers leak into their mirror images",
         "balance of the mixer; clipping of one of both", "methods/synchronisation/channels.py"),
+    "channel_bits_stuck": Flag(
+        "bits of the samples that never change", "the converter or its bus holds a bit: its weight is added or lost",
+        "data lines of the converter; the recorder's format", "methods/synchronisation/channels.py"),
     "spectrum_inverted": Flag(
         "the node", "conjugates of the samples carry the code: I and Q are swapped, or a mixer is above the band",
         "order of I and Q in the recorder; the local oscillator's side", "pipeline/opening/bench.py"),

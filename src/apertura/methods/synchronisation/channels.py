@@ -109,6 +109,8 @@ class Channel:
         What the code itself looks like where both sidebands are occupied, dB.
     integers
         Whether samples are integers.
+    stuck
+        Bits that never change while both a lower and a higher one do, 0 for the least significant; eq. 1a.
     """
 
     name: str
@@ -117,6 +119,7 @@ class Channel:
     image_db: float
     image_floor_db: float
     integers: bool
+    stuck: tuple[int, ...] = ()
 
     @property
     def flags(self) -> dict[str, str]:
@@ -128,6 +131,8 @@ class Channel:
             flags["channel_dc"] = f"channel {self.name}: mean of I and Q {self.dc_db:.1f} dB of the signal"
         if self.image_db > max(IMAGE_DB, self.image_floor_db):
             flags["channel_image"] = f"channel {self.name}: mirror image at {self.image_db:.1f} dB"
+        if self.stuck:
+            flags["channel_bits_stuck"] = f"channel {self.name}: {', '.join(f'bit {bit}' for bit in self.stuck)}"
         return flags
 
 
@@ -145,7 +150,7 @@ def measure_channel(name: str, blocks: Iterable[Samples], numerology: Numerology
 
     Notes
     -----
-    Source: docs/theory/bench.md, eq. 1 and 2.
+    Source: docs/theory/bench.md, eqs. 1, 1a and 2.
 
     Examples
     --------
@@ -158,8 +163,11 @@ def measure_channel(name: str, blocks: Iterable[Samples], numerology: Numerology
     """
     window = slice(numerology.prefix_samples, numerology.prefix_samples + numerology.dft_samples)
     captures, power, square, mean, integers = 0, 0.0, 0j, 0.0, True
+    ones, zeros = 0, 0  # bits that were 1, and 0, in any sample
     for block in blocks:
-        integers = block.dtype.kind == "i"
+        if integers := block.dtype.kind == "i":
+            ones |= int(np.bitwise_or.reduce(block, axis=None))
+            zeros |= int(np.bitwise_or.reduce(~block, axis=None))
         samples = np.ascontiguousarray(block[:, window], np.float32).view(np.complex64)[..., 0].astype(np.complex128)
         level = samples.mean(axis=1)
         captures += len(samples)
@@ -179,4 +187,10 @@ def measure_channel(name: str, blocks: Iterable[Samples], numerology: Numerology
         2 * decibels(abs(square) / (2 * power)),
         2 * decibels(floor),
         integers,
+        tuple(bit for bit in range((ones & zeros).bit_length()) if _stuck(ones & zeros, bit)),
     )
+
+
+def _stuck(changing: int, bit: int) -> bool:
+    """Return whether a bit stays between bits that change; below the lowest of these, samples are shifted up."""
+    return changing & ((1 << bit) - 1) != 0 and not changing >> bit & 1

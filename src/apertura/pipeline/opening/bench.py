@@ -185,6 +185,9 @@ class Bench:
                 f"{100 * SATURATED_SHARE:g} %",
                 *([f"saturated_{channel.name}"] if share > SATURATED_SHARE else []),
             )
+            if channel.stuck:
+                bits = ", ".join(map(str, channel.stuck))
+                yield line(of, "bits that never change", bits, "none", *({"channel_bits_stuck"} & {*mine}))
             yield line(of, "DC", f"{channel.dc_db:.1f} dB", f"{DC_DB:g} dB", *({"channel_dc"} & {*mine}))
             worst = max(IMAGE_DB, channel.image_floor_db)
             yield line(
