@@ -283,8 +283,8 @@ _OF_IMAGES = {
         "the hypothesis named behind it; positions, lever arms, heights, times", "core/imaging/focus_check.py"),
     "loss_unexpected": Flag(
         "dB lost at bright points, and dB that the budget expects, both with their deviation",
-        "bright points lost less than 1 dB or hardly more, yet more than the budget expects by three deviations, or what "
-        "a cause named for another image of the flight brings back",
+        "bright points lost less than 1 dB or hardly more, yet more than the budget expects by three deviations, or "
+        "what a cause named for another image of the flight brings back",
         "nodes.<n>.position_std_m, scene.height_std_m, time_tag_std_s: is what they state true?",
         "core/imaging/focus_check.py"),
     "echo_elsewhere": Flag(
