@@ -271,7 +271,9 @@ def test_mean_power_of_sums_is_told_without_the_noise_of_their_pairs(finished_ti
     noise = {"coherent": 0.0, "noncoherent": 0.0}
     for subtracted in (False, True):
         campaign = state(root, "processing", multilook={"spacing_m": 0.4, "subtract_noise": subtracted})
-        assert "f01/fused/multilook_coherent_db.tif" in set(product_files({"f01": PAIRS}, campaign.coefficients))
+        assert "f01/fused/multilook_coherent_db.tif" in set(
+            product_files({"f01": (*PAIRS, "fused")}, campaign.coefficients)
+        )
         for pair in PAIRS:
             layers(campaign, "f01", pair)
         export_fused(campaign, "f01")
@@ -297,7 +299,7 @@ def test_mean_power_is_mosaicked_and_in_the_catalog_at_its_own_place(finished_ti
     root = copy_writable(finished_tiny.root, tmp_path / "campaign")
     campaign = state(root, "processing", multilook={"spacing_m": 0.4})
     files = {f"uav1-uav1/multilook_{name}" for name in ("power.tif", "power.qml", "db.tif", "db.qml")}
-    named = set(product_files({"f01": PAIRS}, campaign.coefficients))
+    named = set(product_files({"f01": (*PAIRS, "fused")}, campaign.coefficients))
     assert {f"f01/{name}" for name in files} | {"mosaic/uav1-uav1/multilook_db.vrt"} <= named
     for pair in PAIRS:
         layers(campaign, "f01", pair)
