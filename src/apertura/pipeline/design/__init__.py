@@ -6,7 +6,6 @@ a formula of its own that an image's description has.
 """
 
 from collections.abc import Mapping
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -16,26 +15,7 @@ import xarray as xr
 from apertura.common.documents import validated
 from apertura.pipeline.config.flight_plan import FlightPlan, read_flight_plan
 from apertura.pipeline.design.computed import Design, designed
-from apertura.pipeline.design.judgement import judge
-
-UNITS: Mapping[str, tuple[str, str]] = {
-    "resolution": ("m", "−3 dB width of a point in its coarsest direction"),
-    "resolution_fine": ("m", "−3 dB width of a point in its finest direction"),
-    "orientation": ("deg", "azimuth of the finest direction, clockwise from grid north"),
-    "looks": ("pulses", "effective number of pulses that make the pixel"),
-    "incidence": ("deg", "incidence at closest approach, from the terrain's normal"),
-    "bistatic_angle": ("deg", "angle between transmitter and receiver at closest approach"),
-    "mask": ("bits", "0 seen, 1 shadow, 2 layover, 3 both, 255 outside"),
-    "nesz": ("dB", "noise-equivalent sigma0"),
-    "snr": ("dB", "ground of expect.sigma0_db over noise"),
-    "point_snr": ("dB", "point of expect.rcs_dbsm over noise"),
-    "ambiguity": ("1", "share of the scene's echo that folds onto the place"),
-    "path_margin": ("m", "total path left before the prefix or the recording ends"),
-    "loss": ("dB", "expected loss of a point's peak by all causes of the error budget"),
-    "coherence": ("1", "of still ground between two images: common spectrum and noise"),
-    "height_ambiguity": ("m", "height that turns the phase between two images once"),
-}
-"""Layer → unit and meaning."""
+from apertura.pipeline.design.writing import UNITS, report_of
 
 
 def design(
@@ -115,15 +95,7 @@ def dataset_of(design: Design) -> xr.Dataset:
         variables,
         coords={"image": images, "x": grid.x_m, "y": grid.y_m}
         | ({"interferogram": list(design.interferograms)} if between else {}),
-        attrs={
-            "campaign": design.opened.campaign.settings.campaign,
-            "crs": grid.crs,
-            "judgement": [verdict.report for verdict in judge(design)],
-            "recording": asdict(design.recording),
-            "budget": {name: [line.report for line in image.budget] for name, image in design.images.items()},
-            "flags": {name: dict(image.flags) for name, image in design.images.items()},
-            "doppler_hz": {name: image.doppler_hz for name, image in design.images.items() if image.budget},
-        },
+        attrs={"campaign": design.opened.campaign.settings.campaign, "crs": grid.crs, **report_of(design)},
     )
     for name in data.data_vars:
         unit, meaning = UNITS[str(name)]

@@ -258,7 +258,8 @@ def _between(scene: OpenScene, count: int, values: Callable[[Floats], Floats]) -
     points = scene.terrain.positions_at(scene.grid, np.round(row), np.round(column)).reshape(-1, 3)
     found = np.asarray(values(points)).reshape(1, count, count)
     at = [np.arange(size) * (count - 1) / max(size - 1, 1) for size in scene.grid.shape]
-    return bilinear(found, at[0][:, None], at[1][None])[0].astype(np.float32)
+    values_px: Layer = bilinear(found, at[0][:, None], at[1][None])[0].astype(np.float32)
+    return values_px
 
 
 def _seen_from(pair: OpenPair, beams: Beams | None, place_m: Floats) -> OpenPair:
