@@ -13,8 +13,8 @@ from apertura.core.quality.budget import expected
 from apertura.formats.export.layers import OUTSIDE
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config.flight_plan import FlightPlan, read_flight_plan
-from apertura.pipeline.design import as_plan, designed
-from apertura.pipeline.design.computed import Design
+from apertura.pipeline.design import as_plan
+from apertura.pipeline.design.computed import Design, designed
 from apertura.pipeline.design.judgement import AXES, Change, Tried, Verdict, helpful_changes, judge, search
 from apertura.pipeline.design.layers import PlannedImage, planned_image
 from apertura.pipeline.design.writing import UNITS, plan_text, tags_of, write_design
@@ -97,7 +97,7 @@ def _table(title: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> "P
 
 def value_rows(design: Design) -> list[tuple[str, ...]]:
     """Return each layer of the images that requirements are of: median of what is seen, what 95 % have, unit."""
-    rows = []
+    rows = list[tuple[str, ...]]()
     for image in design.judged:
         seen = image.layers["mask"] == 0
         for name in ("resolution", "resolution_fine", "looks", "incidence", "nesz", "snr", "point_snr", "loss"):
@@ -282,10 +282,8 @@ def print_comparison(path: Path, folder: Path, *, threads: int = 1) -> None:
     Console(width=max(120, Console().width)).print(_table("planned and flown", head, rows))
 
 
-def comparison_rows(
-    plan: FlightPlan, root: Path, campaign: Campaign, *, threads: int = 1
-) -> list[tuple[str, str, str, str, str]]:
-    """Return image, quantity, planned, flown and measured of every pair that both have.
+def comparison_rows(plan: FlightPlan, root: Path, campaign: Campaign, *, threads: int = 1) -> list[tuple[str, ...]]:
+    """Return image, quantity, planned, flown and measured of every pair that both have, as text.
 
     Parameters
     ----------
@@ -303,7 +301,7 @@ def comparison_rows(
     """
     design = designed(plan, root, threads=threads)
     scene = expected_scene(campaign, lambda: first_flight(campaign))
-    rows = []
+    rows = list[tuple[str, ...]]()
     for flight in campaign.image_flights:
         for pair in flight.pairs:
             planned = design.images.get(f"{flight.name}/{pair}")

@@ -19,8 +19,8 @@ from apertura.pipeline.design.layers import PlannedImage
 SHARE = 95.0
 """Per cent of the pixels seen that must have what is required: edges of a scene are worse than what is flown for."""
 
-COARSE_PX = 24
-"""Pixels along the longer side of the grid on which changes are compared: layers are smooth on it, edges err by 2 %."""
+COARSE_PX = 64
+"""Pixels along the longer side of the grid on which changes are compared: its outermost lie 1 % of the side inside."""
 
 _LAYERS = {
     "resolution_m": ("resolution", "most"),

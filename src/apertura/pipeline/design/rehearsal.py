@@ -1,4 +1,4 @@
-"""A flight plan as a simulation: the same radar, tracks and errors, to be sampled and processed before anybody flies."""
+"""A flight plan as a simulation: the same radar, tracks and errors, sampled and processed before anybody flies."""
 
 import shutil
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ from apertura.formats.campaign_files import write_config
 from apertura.pipeline.config import Node, OfdmWaveform
 from apertura.pipeline.opening.planned import OpenPlan
 from apertura.simulation.campaign import write_campaign
-from apertura.simulation.impairments import Adc, Impairments, Localization, Radio
+from apertura.simulation.impairments import Adc, Impairments, Localization, RadarPoint, Radio
 from apertura.simulation.scene import GaussianBeam, Origin, Target, Waypoints
 from apertura.simulation.specification import CampaignSpecification, ImageGrid, SimulatedFlight, SimulatedNode
 from apertura.simulation.waveform import WaveformSpecification
@@ -30,7 +30,7 @@ def rehearse(
     opened
         Of an OFDM radar, on Earth.
     targets
-        What stands there: metres east, north and up of the scene's middle; amplitudes are roots of cross-sections in m².
+        What stands there, metres from the scene's middle; amplitudes are roots of cross-sections in m².
     directory
         New or empty.
     seed
@@ -62,7 +62,7 @@ def rehearse(
             tracks[node] = Waypoints(tuple(course.time_s.tolist()), tuple(map(tuple, place.tolist())))
         course = opened.courses[flight.name][flight.transmitter]
         pulses = int(course.imaged_s[-1][1] * plan.waveform.prf_hz + 1e-9) + 1
-        several = {pair: course.imaged_s for pair in flight.pairs} if len(course.imaged_s) > 1 else {}
+        several = dict.fromkeys(flight.pairs, course.imaged_s) if len(course.imaged_s) > 1 else {}
         flights.append(SimulatedFlight(flight.name, flight.transmitter, tracks, pulses, segments=several))
     specification = CampaignSpecification(
         plan.campaign,
@@ -97,7 +97,8 @@ def _simulated(node: Node, *, erring: bool) -> SimulatedNode:
             receiver.gain_db,
             receiver.noise_figure_db,
         )
-    beams = {point: getattr(antennas, point) for point in ("radar_tx", "radar_rx")}
+    points: tuple[RadarPoint, ...] = ("radar_tx", "radar_rx")
+    beams = {point: getattr(antennas, point) for point in points}
     sigma = float(np.mean(node.position_std_m)) if node.position_std_m else 0.0
     wrong = Localization(sigma, node.position_correlation_s) if erring and sigma else None
     arms = node.lever_arms_m
