@@ -1,8 +1,9 @@
 """Predicted by `apertura design`, and measured after the same plan was sampled and processed: twelve plans.
 
-`python benchmarks/design.py WORKFOLDER [--only NAME …] [--draws 8]`. Points of 1 m² stand on 3 × 3 places of the scene; each
-plan is simulated to raw samples and goes through every step. Of plans that state position_std_m, logs err by as much,
-and the loss is the mean over draws; of those that name an interferogram, the scene is clutter, too.
+`python benchmarks/design.py WORKFOLDER [--only NAME …] [--draws 8]`. Five points of 1 m² stand in the scene;
+each plan is simulated to raw samples and goes through the steps. Noise is the mean power of an image without targets.
+Of plans that state position_std_m, logs err by as much, and the loss is the mean over draws and points; of one that
+names an interferogram, the scene is clutter.
 """
 
 import argparse
@@ -16,8 +17,9 @@ import rasterio
 from rich.console import Console
 from rich.table import Table
 
-from apertura.common.documents import read_json
+from apertura.core.geometry.geodesy import frame_from_map, geodetic_from_ecef
 from apertura.core.quality.point_targets import cut_through, find_peak
+from apertura.core.scene.visibility import surface
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config.flight_plan import FlightPlan
 from apertura.pipeline.design import designed
@@ -27,7 +29,7 @@ from apertura.pipeline.opening.radiometry import calibrated_pair
 from apertura.pipeline.opening.scene import open_scene
 from apertura.pipeline.steps import assess, echo, image, ingest, interferogram, layers, profile, refine, scene
 from apertura.pipeline.store import open_stage
-from apertura.simulation.scene import Clutter, PointTarget
+from apertura.simulation.scene import Clutter, Origin, PointTarget
 
 EAST, NORTH = 570661.0, 5363707.0
 CRS = "EPSG:32632"
@@ -59,7 +61,7 @@ def line(length=16.0, away=30.0, height=30.0, speed=1.0, heading=0.0, **more):
 def plan(tracks, *, half=8.0, spacing=0.1, waveform=L_BAND, nodes=("uav1",), more=None, flights=None, **scene_keys):
     edges = [EAST - half, NORTH - half, EAST + half, NORTH + half]
     one = {"transmitter": nodes[0], "receivers": list(nodes), "tracks": tracks, **(more or {})}
-    document = {
+    return {
         "campaign": "rehearsal",
         "waveform": waveform,
         "nodes": {name: node() for name in nodes},
@@ -67,7 +69,6 @@ def plan(tracks, *, half=8.0, spacing=0.1, waveform=L_BAND, nodes=("uav1",), mor
         "processing": {"autofocus": "off"},
         "flights": flights or {"f01": one},
     }
-    return document
 
 
 def erring(document, std_m):
@@ -105,24 +106,56 @@ def two_flights(apart):
 
 
 SWARM = ("uav1", "uav2", "uav3", "uav4", "uav5")
+AROUND = {"kind": "circle", "centre_m": [EAST, NORTH], "radius_m": 25.0, "height_m": 25.0, "speed_m_s": 2.0}
+TWO = ("uav1", "uav2")
+
+
+def formed(shape, spacing_m):
+    return {"formation": {"shape": shape, "leader": "uav1", "spacing_m": spacing_m}}
+
+
+HILL = {"height_datum": "ellipsoid", "dem": "dem.tif", "dem_datum": "ellipsoid"}
+QUARTER = {"start_deg": 135.0, "turn_deg": 90.0}
+FAR = line(length=60.0, away=2100.0, height=2100.0, speed=15.0)
+STRONG = {"transmit_power_dbm": 50.0, "antennas": {"radar_tx_gain_dbi": 30.0, "radar_rx_gain_dbi": 30.0}}
+ASIDE = plan({"uav1": line(length=30.0, away=22.0, height=20.0)})
 PLANS = {
     "line": plan({"uav1": line()}),
-    "circle": plan({"uav1": {"kind": "circle", "centre_m": [EAST, NORTH], "radius_m": 25.0, "height_m": 25.0, "speed_m_s": 2.0}}, half=3.0, spacing=0.05, waveform=L_BAND | {"prf_hz": 12.0}),
-    "arc of a quarter": plan({"uav1": {"kind": "circle", "centre_m": [EAST, NORTH], "radius_m": 25.0, "height_m": 25.0, "speed_m_s": 2.0, "start_deg": 135.0, "turn_deg": 90.0}}, half=4.0, spacing=0.05),
+    "circle": plan({"uav1": AROUND}, half=3.0, spacing=0.05, waveform=L_BAND | {"prf_hz": 12.0}),
+    "arc of a quarter": plan({"uav1": AROUND | QUARTER}, half=4.0, spacing=0.05),
     "racetrack": plan({"uav1": line(kind="racetrack", legs=2, spacing_m=2.0, length=12.0)}),
-    "tandem": plan({"uav1": line()}, nodes=("uav1", "uav2"), more={"formation": {"shape": "column", "leader": "uav1", "spacing_m": 6.0}}),
-    "five nodes": plan({"uav1": line(length=8.0)}, nodes=SWARM, more={"formation": {"shape": "vee", "leader": "uav1", "spacing_m": 4.0}}, half=6.0),
-    "hill": plan({"uav1": line(away=40.0, height=18.0)}, half=12.0, spacing=0.2, height_datum="ellipsoid", dem="dem.tif", dem_datum="ellipsoid"),
-    "X band at 3 km": plan({"uav1": line(length=60.0, away=2100.0, height=2100.0, speed=15.0)}, half=40.0, spacing=0.5, waveform=X_BAND),
-    "L band at 30 m, beams": beamed(plan({"uav1": line(length=30.0, away=22.0, height=20.0)}, half=8.0), -90.0, -42.0, [30.0, 30.0]),
+    "tandem": plan({"uav1": line()}, nodes=TWO, more=formed("column", 6.0)),
+    "five nodes": plan({"uav1": line(length=8.0)}, nodes=SWARM, more=formed("vee", 4.0), half=6.0),
+    "hill": plan({"uav1": line(away=40.0, height=18.0)}, half=12.0, spacing=0.2, **HILL),
+    "X band at 3 km": plan({"uav1": FAR}, half=40.0, spacing=0.5, waveform=X_BAND)
+    | {"nodes": {"uav1": node(**STRONG)}},
+    "L band at 30 m, beams": beamed(ASIDE, -90.0, -42.0, [30.0, 30.0]),
     "positions of 1 cm": erring(plan({"uav1": line(length=24.0)}), 0.01),
-    "bistatic, positions of 1 cm": erring(plan({"uav1": line(length=24.0)}, nodes=("uav1", "uav2"), more={"formation": {"shape": "row", "leader": "uav1", "spacing_m": 5.0}}), 0.01),
+    "bistatic, positions of 1 cm": erring(plan({"uav1": line(length=24.0)}, nodes=TWO, more=formed("row", 5.0)), 0.01),
     "two heights": two_flights(0.5),
-}  # fmt: skip
+}
 
 
-def points(half):
-    return [PointTarget((e * half, n * half, 0.0), 1.0) for e in (-0.55, 0.0, 0.55) for n in (-0.55, 0.0, 0.55)]
+LAYERS = ("resolution_fine", "resolution", "nesz", "point_snr")
+
+
+def points(opened, half):
+    """Return easting, northing and height of five places on the ground, none in the sidelobes of another."""
+    found = []
+    for east, north in ((0.0, 0.0), (0.6, 0.35), (-0.35, 0.6), (-0.6, -0.35), (0.35, -0.6)):
+        pixel = opened.grid.pixel_of(EAST + east * half, NORTH + north * half)
+        row, column = (round(float(one)) for one in pixel)
+        x, y = opened.grid.map_at(row, column)
+        found.append((float(x), float(y), float(opened.terrain.heights_at(opened.grid, row, column))))
+    return found
+
+
+def standing(opened, half):
+    """Return the same as targets of 1 m², east, north and up of the scene's middle."""
+    latitude, longitude, height = map(float, geodetic_from_ecef(opened.middle_m))
+    origin = Origin(latitude, longitude, height)
+    placed = [origin.enu(frame_from_map(CRS, *place)) for place in points(opened, half)]
+    return [PointTarget(tuple(place.tolist()), 1.0) for place in placed]
 
 
 def processed(root: Path) -> Campaign:
@@ -150,107 +183,94 @@ def processed(root: Path) -> Campaign:
     return campaign
 
 
-def measured(campaign: Campaign, flight: str, pair: str, design):
-    """Return predicted and measured at the points: widths along both axes, NESZ, SNR; and coverage."""
+def measured(campaign: Campaign, empty: Campaign, flight: str, pair: str, design):
+    """Return predicted and measured at the points: widths along both axes, NESZ, SNR; and coverage.
+
+    Noise is the mean power of the same image without anything in its scene.
+    """
     opened, planned = open_scene(campaign), design.images[f"{flight}/{pair}"]
-    pixels = open_stage(campaign.stage("image", flight, pair), "image").image.values
-    calibrated = calibrated_pair(campaign, open_pair(campaign, flight, pair), opened)
-    noise = read_json(campaign.result(flight, pair, "radiometry.json"), expected="", remedy="")["noise"]["pulse"]
-    with rasterio.open(campaign.result(flight, pair, "nesz.tif")) as raster:
-        nesz = raster.read(1)
+    grid = opened.grid
+    whole = slice(0, grid.shape[0]), slice(0, grid.shape[1])
+    pixels, nothing = (open_stage(one.stage("image", flight, pair), "image").image.values for one in (campaign, empty))
+    calibration = calibrated_pair(campaign, open_pair(campaign, flight, pair), opened).calibration
+    noise = float(np.nanmean(np.abs(nothing) ** 2 / calibration.pixel_noise(whole)))
+    flat = campaign.settings.scene.dem is None
+    normal = None if flat else surface(grid, opened.terrain, whole)[1]
+    with np.errstate(invalid="ignore"):
+        nesz = 10 * np.log10(noise * calibration.pixel_noise(whole) / calibration.power(whole, "sigma0", normal))
     with rasterio.open(campaign.result(flight, pair, "mask.tif")) as raster:
         seen = raster.read(1) == 0
-    rows, grid = [], opened.grid
-    half = grid.shape[0] * grid.spacing_m / 2
-    for target in points(half):
-        east, north, _ = target.position_m
-        row, column = (round(float(one)) for one in grid.pixel_of(EAST + east, NORTH + north))
-        if campaign.settings.scene.dem or not seen[row, column]:
+    rows, half = [], grid.shape[0] * grid.spacing_m / 2
+    for target in points(opened, half):
+        row, column = (round(float(one)) for one in grid.pixel_of(*target[:2]))
+        if not seen[row, column]:
             continue
         peak = find_peak(pixels, row, column)
         azimuth = np.radians(planned.layers["orientation"][row, column])
         ways = (np.sin(azimuth), np.cos(azimuth)), (np.cos(azimuth), -np.sin(azimuth))
-        widths = [
-            cut_through(pixels, peak, direction=way, spacing_m=grid.spacing_m, reach_m=half / 2).width_m for way in ways
-        ]
+        cuts = [cut_through(pixels, peak, direction=way, spacing_m=grid.spacing_m, reach_m=half / 2) for way in ways]
         place = opened.terrain.positions_at(grid, np.array([row]), np.array([column]))
-        share = calibrated.calibration.at(place)[1][0]
-        snr_db = 10 * np.log10(abs(peak.value) ** 2 / (noise * share))
-        names = ("resolution_fine", "resolution", "nesz", "point_snr")
-        predicted = [planned.layers[name][row, column] for name in names]
-        rows.append((predicted, [*widths, nesz[row, column], snr_db]))
+        snr_db = 10 * np.log10(abs(peak.value) ** 2 / (noise * calibration.at(place)[1][0]))
+        predicted = [planned.layers[name][row, column] for name in LAYERS]
+        rows.append((predicted, [cuts[0].width_m, cuts[1].width_m, nesz[row, column], snr_db]))
     cover = 100 * np.array([(planned.layers["mask"] == 0).mean(), seen.mean()])
     return np.array(rows), cover
 
 
 def peaks_db(campaign: Campaign, flight: str, pair: str):
-    grid = open_scene(campaign).grid
+    opened = open_scene(campaign)
     pixels = open_stage(campaign.stage("image", flight, pair), "image").image.values
-    half = grid.shape[0] * grid.spacing_m / 2
-    found = []
-    for target in points(half):
-        row, column = (
-            round(float(one)) for one in grid.pixel_of(EAST + target.position_m[0], NORTH + target.position_m[1])
-        )
-        found.append(20 * np.log10(abs(find_peak(pixels, row, column).value)))
-    return np.array(found)
+    half = opened.grid.shape[0] * opened.grid.spacing_m / 2
+    at = [opened.grid.pixel_of(*place[:2]) for place in points(opened, half)]
+    return np.array([20 * np.log10(abs(find_peak(pixels, *map(round, map(float, one))).value)) for one in at])
 
 
 def compare(name: str, folder: Path, draws: int):
-    """Yield rows: pair, quantity, predicted, measured."""
-    document, half = PLANS[name], (PLANS[name]["scene"]["bounds_m"][2] - PLANS[name]["scene"]["bounds_m"][0]) / 2
+    """Yield rows: pair, quantity, predicted, measured, apart."""
+    bounds = PLANS[name]["scene"]["bounds_m"]
+    half = (bounds[2] - bounds[0]) / 2
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    if "dem" in document["scene"]:
+    if "dem" in PLANS[name]["scene"]:
         hill(folder)
-    planned = FlightPlan.model_validate(document)
+    planned = FlightPlan.model_validate(PLANS[name])
     design = designed(planned, folder)
-    standing = points(half)
     if design.interferograms:
-        standing = [Clutter((-half, -half, half, half), 10.0, 40.0)]
-    campaign = processed(rehearse(design.opened, standing, folder / "right"))
-    for flight in campaign.image_flights:
-        for pair in flight.pairs:
-            if design.interferograms:
-                continue
-            rows, cover = measured(campaign, flight.name, pair, design)
-            if len(rows):
-                predicted, found = rows[:, 0], rows[:, 1]
-                for at, (what, unit) in enumerate(
-                    (("finer width", "m"), ("coarser width", "m"), ("NESZ", "dB"), ("SNR", "dB"))
-                ):
-                    off = found[:, at] - predicted[:, at] if at > 1 else 100 * (found[:, at] / predicted[:, at] - 1)
-                    worst = off[np.nanargmax(np.abs(off))]
-                    yield (
-                        pair,
-                        f"{what}, {unit}",
-                        np.median(predicted[:, at]),
-                        np.nanmedian(found[:, at]),
-                        f"{np.nanmean(off):+.2f}, worst {worst:+.2f} {'dB' if at > 1 else '%'}",
-                    )
-            yield pair, "coverage, %", *cover, f"{cover[1] - cover[0]:+.2f} %"
-            if planned.nodes["uav1"].position_std_m:
-                right, lost = peaks_db(campaign, flight.name, pair), []
-                for seed in range(draws):
-                    wrong = processed(
-                        rehearse(design.opened, standing, folder / f"draw{seed}", seed=seed + 2, erring=True)
-                    )
-                    lost.append((right - peaks_db(wrong, flight.name, pair)).mean())
-                    shutil.rmtree(folder / f"draw{seed}")
-                predicted_db = float(np.median(design.images[f"{flight.name}/{pair}"].layers["loss"]))
-                yield (
-                    pair,
-                    "loss, dB",
-                    predicted_db,
-                    np.mean(lost),
-                    f"{100 * (np.mean(lost) / predicted_db - 1):+.0f} %, ± {100 * np.std(lost) / predicted_db / draws**0.5:.0f} %",
-                )
-    for two, own in design.interferograms.items():
-        with rasterio.open(campaign.result("interferometry", two, "coherence.tif")) as raster:
-            values = raster.read(1)
-        inner = tuple(slice(size // 5, -size // 5) for size in values.shape)
-        both = float(np.median(own["coherence"][inner])), float(np.nanmedian(values[inner]))
-        yield two, "coherence", *both, f"{both[1] - both[0]:+.3f}"
+        clutter = [Clutter((-half - 2, -half - 2, half + 2, half + 2), 10.0, 40.0)]
+        campaign = processed(rehearse(design.opened, clutter, folder / "right"))
+        for two, own in design.interferograms.items():
+            with rasterio.open(campaign.result("interferometry", two, "coherence.tif")) as raster:
+                values = raster.read(1)
+            inner = tuple(slice(size // 5, -size // 5) for size in values.shape)
+            both = float(np.median(own["coherence"][inner])), float(np.nanmedian(values[inner]))
+            yield two, "coherence", *both, f"{both[1] - both[0]:+.3f}"
+        return
+    targets = standing(design.opened.scene, half)
+    campaign = processed(rehearse(design.opened, targets, folder / "right"))
+    empty = processed(rehearse(design.opened, [PointTarget((0.0, 0.0, 0.0), 1e-9)], folder / "empty"))
+    pairs = [(flight.name, pair) for flight in campaign.image_flights for pair in flight.pairs]
+    for flight, pair in pairs:
+        rows, cover = measured(campaign, empty, flight, pair, design)
+        for at, what in enumerate(("finer width, m", "coarser width, m", "NESZ, dB", "SNR, dB")):
+            predicted, found = rows[:, 0, at], rows[:, 1, at]
+            off = found - predicted if at > 1 else 100 * (found / predicted - 1)
+            worst = off[np.nanargmax(np.abs(off))]
+            unit = "dB" if at > 1 else "%"
+            line = f"{np.nanmean(off):+.2f} {unit}, worst {worst:+.2f}"
+            yield pair, what, np.median(predicted), np.nanmedian(found), line
+        yield pair, "coverage, %", *cover, f"{cover[1] - cover[0]:+.2f} %"
+    if planned.nodes["uav1"].position_std_m:
+        lost = {pair: [] for _, pair in pairs}
+        for seed in range(draws):
+            wrong = processed(rehearse(design.opened, targets, folder / "draw", seed=seed + 2, erring=True))
+            for flight, pair in pairs:
+                lost[pair].append((peaks_db(campaign, flight, pair) - peaks_db(wrong, flight, pair)).mean())
+            shutil.rmtree(folder / "draw")
+        for flight, pair in pairs:
+            predicted = float(np.median(design.images[f"{flight}/{pair}"].layers["loss"]))
+            mean, std = float(np.mean(lost[pair])), float(np.std(lost[pair])) / draws**0.5
+            line = f"{100 * (mean / predicted - 1):+.0f} %, ± {100 * std / predicted:.0f} %"
+            yield pair, "loss, dB", predicted, mean, line
 
 
 def main() -> None:
