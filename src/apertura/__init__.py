@@ -30,6 +30,7 @@ _PUBLIC = {
     "RecordedNode": "apertura.pipeline.opening.writing",
     "SceneGrid": "apertura.core.scene.grid",
     "backproject": "apertura.core.imaging.backproject",
+    "design": "apertura.pipeline.design",
     "gradient": "apertura.core.imaging.gradient",
     "judge": "apertura.core.imaging.judgement",
     "open_campaign": "apertura.pipeline.opening.results",

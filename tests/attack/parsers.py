@@ -27,8 +27,10 @@ from apertura.formats.reading import open_recording, read_track
 from apertura.formats.recordings.sigmf import check_listed
 from apertura.formats.tracks import ardupilot, dataflash_fields, px4_ulog, ulog_fields
 from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions
+from apertura.formats.tracks.missions import read_mission
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import Flight, PulseWaveform, read_clocks, read_flights, read_segments, read_settings
+from apertura.pipeline.config.flight_plan import read_flight_plan
 from apertura.pipeline.opening.constants import read_constants
 from apertura.pipeline.opening.results import OpenCampaign, assessment_of
 from apertura.pipeline.opening.scene import settled_scene
@@ -329,6 +331,10 @@ PARSERS: dict[str, Parser] = {
     "dem.tif": Parser("dem.tif", seeds.dems, _dem, (), _TIFF),
     "geoid.gtx": Parser("egm96.gtx", seeds.gtx_grids, _geoid),
     "geoid.tif": Parser("egm96.tif", seeds.tif_grids, _geoid, (), _TIFF),
+    "flight plan": Parser("plan.yaml", seeds.flight_plans, read_flight_plan, _YAML_TREE, f"{_YAML} kind: line circle"),
+    "mission.plan": Parser("a.plan", seeds.missions, read_mission, _JSON_TREE, "SimpleItem null 16 178 3 0 1e400"),
+    "mission.waypoints": Parser("a.waypoints", seeds.waypoints, read_mission, (mutators.cells("\t"),), "QGC WPL nan 3"),
+    "mission.kml": Parser("a.kml", seeds.kmls, read_mission, (), "<coordinates> </LineString> , nan 1e400"),
     "simulation.yaml": Parser("spec.yaml", seeds.specifications, read_specification, _YAML_TREE, f"{_YAML} 1+2j kind:"),
     "scene.json": Parser(
         "results/scene.json",

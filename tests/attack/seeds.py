@@ -389,6 +389,40 @@ def tif_grids() -> list[bytes]:
     return [_tiff(_undulations()[::-1].astype(np.float32), from_origin(6.75, 51.25, 0.5, 0.5), "EPSG:4326")]
 
 
+def flight_plans() -> list[bytes]:
+    """Return flight plans."""
+    track = {"kind": "racetrack", "start_m": [0, 0], "end_m": [9, 0], "legs": 2, "speed_m_s": 2, "height_m": 9}
+    flight = {"transmitter": "uav1", "receivers": ["uav1"], "tracks": {"uav1": track}}
+    waveform = {"kind": "samples", "pulse_s": 1e-6, "listen_s": 2e-6} | {
+        f"{key}_hz": value for key, value in (("carrier", 1e9), ("sample_rate", 1e8), ("prf", 10))
+    }
+    plan = {"campaign": "x", "waveform": waveform, "nodes": {"uav1": {}}, "scene": {"crs": "local"}}
+    return [json.dumps(plan | {"flights": {"f01": flight}, "require": {"coverage": 0.9}}).encode()]
+
+
+def missions() -> list[bytes]:
+    """Return missions of QGroundControl."""
+    items = [
+        {"type": "SimpleItem", "command": 16, "frame": 3, "params": [0, 0, 0, None, 48.0 + step, 9.0, 30.0]}
+        for step in (0.0, 1e-3)
+    ]
+    mission = {"vehicleType": 2, "hoverSpeed": 5, "plannedHomePosition": [48.0, 9.0, 480], "items": items}
+    return [json.dumps({"fileType": "Plan", "mission": mission}).encode()]
+
+
+def waypoints() -> list[bytes]:
+    """Return missions of ArduPilot's ground stations."""
+    rows = ["0\t1\t0\t16\t0\t0\t0\t0\t48\t9\t480\t1"]
+    rows += [f"{number}\t0\t3\t16\t0\t0\t0\t0\t48.00{number}\t9\t40\t1" for number in (1, 2)]
+    return ["\n".join(["QGC WPL 110", *rows]).encode()]
+
+
+def kmls() -> list[bytes]:
+    """Return lines of KML."""
+    line = "<altitudeMode>absolute</altitudeMode><coordinates>9,48,500 9.01,48,500</coordinates>"
+    return [f"<kml><Placemark><LineString>{line}</LineString></Placemark></kml>".encode()]
+
+
 def specifications() -> list[bytes]:
     """Return specifications of simulations."""
     return [specification_text(preset(name)).encode() for name in ("demo", "continuous", "paper-uav")]

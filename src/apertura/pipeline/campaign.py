@@ -33,6 +33,13 @@ from apertura.pipeline.raw_folder import RawFolder
 class Campaign(RawFolder):
     """A validated campaign folder.
 
+    Attributes
+    ----------
+    flights, segments, clocks
+        Lines of the tables beside the config.
+    planned
+        Whether it is a flight plan: nothing was recorded, and what is sent may not be there yet.
+
     Examples
     --------
     >>> Campaign.load("nowhere")
@@ -44,6 +51,7 @@ class Campaign(RawFolder):
     flights: tuple[Flight, ...]
     segments: tuple[Segment, ...] = ()
     clocks: tuple[ClockRow, ...] = ()
+    planned: bool = False
 
     @classmethod
     def load(cls, root: str | Path) -> "Campaign":

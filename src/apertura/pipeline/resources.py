@@ -5,6 +5,7 @@ Estimates are from above; a job that was killed for want of memory or time asks 
 """
 
 import math
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache, cached_property
@@ -62,6 +63,13 @@ _SLOWER = 3  # than the machine that the constants are from
 class Resources:
     """What the jobs of a campaign's rules ask for; rules quote its methods, and Snakemake calls them.
 
+    Attributes
+    ----------
+    campaign
+        Settings and flights.
+    planned
+        Flight and node → bytes and pulses of recordings that are not there yet; None: they lie in raw/.
+
     Examples
     --------
     >>> Resources(Campaign.load("nowhere"))
@@ -71,6 +79,7 @@ class Resources:
     """
 
     campaign: Campaign
+    planned: Mapping[tuple[str, str], tuple[int, int]] | None = None
 
     def __getitem__(self, rule: str) -> "RuleResources":
         """Return what the jobs of a rule ask for."""
@@ -144,6 +153,8 @@ class Resources:
 
     def _bytes_and_pulses(self, flight: str, node: str) -> tuple[int, int]:
         """Return the bytes of a recording and how many pulses it has at most."""
+        if self.planned is not None:
+            return self.planned[flight, node]
         waveform = self.campaign.settings.waveform
         if not isinstance(waveform, SampledWaveform):
             size = sum(path.stat().st_size for path in self.campaign.raw_files(flight, node).values())

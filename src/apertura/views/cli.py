@@ -291,6 +291,39 @@ def plan(campaign: CampaignFolder = HERE, threads: Threads = 1) -> None:
     print_plan(opened, threads=threads)
 
 
+@app.command()
+def design(
+    plan: Annotated[Path, typer.Argument(metavar="PLAN.yaml", help="radar, nodes with planned tracks, scene")],
+    out: Annotated[
+        Path | None, typer.Argument(help="folder for layers, tracks, map and report", show_default=False)
+    ] = None,
+    *,
+    optimise: Annotated[
+        str | None,
+        typer.Option(metavar="WORDS", help="move tracks within the plan's bounds first: height,offset,spacing,heading"),
+    ] = None,
+    threads: Threads = 1,
+) -> None:
+    """Tell before a flight what it will give: resolution, noise, coverage, volume; whether it is what is required."""
+    path, folder = given(plan), None if out is None else given(out)
+    from apertura.views.design import print_design
+
+    raise typer.Exit(0 if print_design(path, folder, optimise=optimise, threads=threads) else 2)
+
+
+@app.command()
+def compare(
+    plan: Annotated[Path, typer.Argument(metavar="PLAN.yaml", help="as of `apertura design`")],
+    campaign: CampaignFolder = HERE,
+    threads: Threads = 1,
+) -> None:
+    """Print planned and flown side by side, by the campaign's logs and, where there are any, its images."""
+    path, folder = given(plan), given(campaign)
+    from apertura.views.design import print_comparison
+
+    print_comparison(path, folder, threads=threads)
+
+
 @app.command(context_settings=PASS_ON)
 def chart(context: typer.Context, campaign: CampaignFolder = HERE, cores: Cores = ALL_CORES) -> None:
     """Time and measure every engine and setting on the campaign: results/study/speed_accuracy.{png,html,csv}."""
@@ -460,8 +493,18 @@ def map_page(
 def init(
     directory: Annotated[Path, typer.Argument(help="folder to make")],
     kind: Annotated[str, typer.Option(help="of waveform: ofdm, samples, fmcw, phase_history")] = "ofdm",
+    from_: Annotated[
+        Path | None, typer.Option("--from", metavar="PLAN.yaml", help="the config of a flight that was planned")
+    ] = None,
 ) -> None:
-    """Write the commented config of a new campaign folder."""
+    """Write the commented config of a new campaign folder, or that of a flight plan, ready for its recordings."""
+    if from_ is not None:
+        path, folder = given(from_), given(directory)
+        from apertura.pipeline.config.flight_plan import read_flight_plan
+        from apertura.pipeline.design.writing import write_campaign_config
+
+        print(*map(as_typed, write_campaign_config(read_flight_plan(path), folder)), sep="\n")
+        return
     from apertura.pipeline.config.template import config_template, flights_template
 
     folder = given(directory) / "config"

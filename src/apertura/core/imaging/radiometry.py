@@ -280,7 +280,7 @@ class Calibration:
         self.directions[block] = np.stack([up, slant, towards], axis=1).reshape(*shape, 3, 3)
 
     def _parts(self, pulses: slice, points: Floats) -> tuple[Floats, Floats]:
-        return _parts(self.aperture[pulses], self.beams and self.beams[pulses], points)
+        return point_weights(self.aperture[pulses], self.beams and self.beams[pulses], points)
 
     def at(self, points: Floats) -> tuple[Floats, Floats]:
         """Return the power of 1 m² in the image, K·A², and of the noise in units of a pulse's, at points.
@@ -352,8 +352,17 @@ class Calibration:
         return np.asarray(sigma0 * np.where(cosine > 0, cosine, np.nan))
 
 
-def _parts(aperture: Aperture, beams: Beams | None, points: Floats) -> tuple[Floats, Floats]:
-    """Return what each pulse adds to a point target, w·f/(R_tx·R_rx), and w, (pulse, point) each."""
+def point_weights(aperture: Aperture, beams: Beams | None, points: Floats) -> tuple[Floats, Floats]:
+    """Return what each pulse adds to a point target, w·f/(R_tx·R_rx), and w, (pulse, point) each.
+
+    Parameters as of `point_parts`, which divides them by the count of pulses.
+
+    Examples
+    --------
+    >>> track = np.array([[0.0, 0.0, 10.0]])
+    >>> [one.tolist() for one in point_weights(Aperture(track, track), None, np.zeros((1, 3)))]
+    [[[0.01]], [[1.0]]]
+    """
     there, back = (np.linalg.norm(points - leg[:, None], axis=-1) for leg in aperture.legs)
     antennas, sector = beams and beams.antennas, beams and beams.sector
     field = np.ones(there.shape) if antennas is None else antennas.weight(aperture, points)
@@ -388,7 +397,7 @@ def point_parts(
     """
     some = aperture.sample(_POINT_PULSES)
     taken, share = aperture[some], some.step / count
-    parts, weight = _parts(taken, beams and beams[some], points)
+    parts, weight = point_weights(taken, beams and beams[some], points)
     return taken, parts * share, (weight**2).sum(axis=0) * share / count
 
 

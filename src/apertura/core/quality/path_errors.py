@@ -211,8 +211,8 @@ class PointPaths:
             covariance += autocorrelation(lag, correlation_s) * np.multiply.outer(std_m, std_m)
         ground = self.gradient[:, :2]
         inverse = np.linalg.pinv(ground)
-        keep = np.eye(len(ground)) - ground @ inverse
-        rest = keep @ covariance @ keep
+        moved = ground @ (inverse @ covariance)  # of a projection onto two columns no square matrix is multiplied
+        rest = covariance - moved - moved.T + (moved @ ground) @ inverse
         wavenumber = 2 * np.pi / self.wavelength_m
         centred = rest - rest.mean(axis=0) - rest.mean(axis=1)[:, None] + rest.mean()
         power = float(np.trace(centred)) / len(rest)

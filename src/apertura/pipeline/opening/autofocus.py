@@ -21,7 +21,7 @@ from apertura.methods.autofocus.one_phase import SpaceVariance, space_variance
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.opening.acquisition import Acquisition
 from apertura.pipeline.opening.pair import OpenPair
-from apertura.pipeline.opening.plan import paths_to_middle, positions_loss_db
+from apertura.pipeline.opening.plan import paths_to, positions_loss_db
 from apertura.pipeline.opening.scene import OpenScene
 from apertura.pipeline.store import manifest_of, open_stage
 
@@ -101,7 +101,7 @@ def _variance(pair: OpenPair, scene: OpenScene, errors: Mapping[str, TrackErrors
     rows, columns = np.array([0, 0, last_row, last_row]), np.array([0, last_column, 0, last_column])
     corners_m = scene.terrain.positions_at(scene.grid, rows, columns)
     of_nodes = [errors[node] for node in dict.fromkeys(pair.name.split("-"))]
-    return space_variance(paths_to_middle(pair, scene), corners_m, of_nodes)
+    return space_variance(paths_to(pair, scene, scene.middle_m), corners_m, of_nodes)
 
 
 def _stated(known: NodePositions) -> tuple[float, float, float]:

@@ -29,7 +29,7 @@ from apertura.formats.reading import open_recording
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import CONFIG, Antenna, SampledWaveform
 from apertura.pipeline.opening.air import in_air, scene_air
-from apertura.pipeline.opening.node_log import raw_log, shortest_wave
+from apertura.pipeline.opening.node_log import NodeLog, raw_log, shortest_wave
 from apertura.pipeline.opening.positions import inside_segments, keep_segments, place, position_error, stated_error
 from apertura.pipeline.opening.reading import read_history
 from apertura.pipeline.opening.scene import Flown, OpenScene
@@ -363,6 +363,34 @@ def _expected(campaign: Campaign, flight: str, pair: str, waveform: SampledWavef
     recorded = campaign.clock(flight, tx.name).utc(recorded)
     times = _pulse_times(recorded, first, last, waveform.prf_hz)
     times = times[inside_segments(campaign, flight, pair, times)]
+    return expected_pair(campaign, flight, (tx, rx), times, frequency_hz=frequency, delay_s=waveform.longest_delay_s)
+
+
+def expected_pair(
+    campaign: Campaign,
+    flight: str,
+    nodes: tuple[NodeLog, NodeLog],
+    times: NDArray[np.datetime64],
+    *,
+    frequency_hz: NDArray[np.float64],
+    delay_s: float,
+) -> OpenPair:
+    """Return a pair before its echo is formed, or flown.
+
+    Parameters
+    ----------
+    campaign, flight
+        Settings, and which flight.
+    nodes
+        Where transmitter and receiver were, or are meant to be.
+    times
+        (pulse,) datetime64[ns], UTC, within both logs.
+    frequency_hz
+        (subcarrier,) float64, ascending.
+    delay_s
+        Longest delay whose echo is recorded whole.
+    """
+    tx, rx = nodes
     turning = {"radar_tx": tx.turns("radar_tx") and tx, "radar_rx": rx.turns("radar_rx") and rx}
     axes = {antenna: log.body_axes(times) for antenna, log in turning.items() if log}
     offset = rx.settings.path_offset_m
@@ -370,16 +398,17 @@ def _expected(campaign: Campaign, flight: str, pair: str, waveform: SampledWavef
     if tx.name != rx.name:
         length_m = np.linalg.norm(tx.antenna("sidelink", times) - rx.antenna("sidelink", times), axis=1)
         beyond_m -= offset.sidelink + float(length_m.min())
-    weight = window_weights(campaign.settings.processing.window, len(frequency))
+    weight = window_weights(campaign.settings.processing.window, len(frequency_hz))
     aperture = Aperture(tx.antenna("radar_tx", times), rx.antenna("radar_rx", times))
     flown = scene_air(campaign, aperture.tx_m).over(aperture)
-    limit_m = flown.wave_speed_m_s * waveform.longest_delay_s - beyond_m
+    limit_m = flown.wave_speed_m_s * delay_s - beyond_m
     known = {log.name: _positions(position_error(log.track, log.settings, times)) for log in (tx, rx)}
+    pair = f"{tx.name}-{rx.name}"
     return OpenPair(
         flight,
         pair,
         aperture,
-        frequency,
+        frequency_hz,
         weight,
         limit_m,
         time_s=_seconds(times),

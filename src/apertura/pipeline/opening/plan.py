@@ -47,19 +47,24 @@ _USUAL_N = 300.0  # of air at the ground: what vacuum is told by
 _SHOWN_CELLS = 0.01  # of a range cell: a shift below it is lost in any peak of 20 dB (docs/theory/focus.md, eq. 6)
 
 
-def budget_of(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> list[BudgetLine]:
+def budget_of(
+    campaign: Campaign, pair: OpenPair, scene: OpenScene, *, place_m: NDArray[np.float64] | None = None
+) -> list[BudgetLine]:
     """Return what is expected to spoil an image of a pair, but for arithmetic: one line per cause.
 
     Parameters
     ----------
     campaign, pair, scene
         Settings, pair and ground; before the echo is formed, by the config and the logs.
+    place_m
+        (3,) float64, metres in the frame of the pixels: the point that the effects are those on; the middle of the
+        scene by default.
 
     Notes
     -----
-    Source: docs/theory/focus.md, "Budget". The effects are those on a point in the middle of the scene.
+    Source: docs/theory/focus.md, "Budget".
     """
-    paths = paths_to_middle(pair, scene)
+    paths = paths_to(pair, scene, scene.middle_m if place_m is None else place_m)
     monostatic, sidelink = pair.monostatic, pair.report.get("sidelink", {})
     flown = [*_positions(campaign, pair, paths), *_attitude(campaign, pair, paths)]
     lines = [
@@ -97,16 +102,16 @@ def budget_of(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> list[Budg
 
 def positions_loss_db(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> float:
     """Return what errors of position that somebody stated are expected to cost an image of a pair, dB, 0 or less."""
-    lines = _positions(campaign, pair, paths_to_middle(pair, scene))
+    lines = _positions(campaign, pair, paths_to(pair, scene, scene.middle_m))
     return summed(line.effect for line in lines if line.stated is not None).loss_db
 
 
-def paths_to_middle(pair: OpenPair, scene: OpenScene) -> PointPaths:
-    """Return the paths of a pair to the middle of the scene."""
+def paths_to(pair: OpenPair, scene: OpenScene, place_m: NDArray[np.float64]) -> PointPaths:
+    """Return the paths of a pair to a place of the scene, (3,) float64 metres in the frame of the pixels."""
     return PointPaths.of(
         pair.aperture,
         pair.time_s,
-        point_m=scene.middle_m,
+        point_m=place_m,
         axes=scene.axes,
         wavelength_m=pair.wave_speed_m_s / centre_frequency(pair.frequency_hz),
     )

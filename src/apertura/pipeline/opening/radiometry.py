@@ -211,7 +211,12 @@ def stated_link(campaign: Campaign, pair: str) -> tuple[Link, float | None, floa
 
 
 def calibrated_pair(
-    campaign: Campaign, opened: OpenPair, scene: OpenScene, *, threads: int = 1
+    campaign: Campaign,
+    opened: OpenPair,
+    scene: OpenScene,
+    *,
+    weights: tuple[Beams | None, int] | None = None,
+    threads: int = 1,
 ) -> CalibratedPair | None:
     """Return the calibration of an open pair's image; None where neither radio nor constant is known.
 
@@ -219,6 +224,8 @@ def calibrated_pair(
     ----------
     campaign, opened, scene
         Settings, the pair by its echo, and the campaign's grid and ground.
+    weights
+        As of `image_weights`, which by default says them.
     threads
         Blocks of the lattice in work at once.
     """
@@ -236,7 +243,7 @@ def calibrated_pair(
         constant, std_db = found.constant, found.std_db
     elif not link:
         return None
-    beams, count = image_weights(campaign, opened, scene)
+    beams, count = weights or image_weights(campaign, opened, scene)
     calibration = Calibration.of(
         scene.grid,
         scene.terrain,

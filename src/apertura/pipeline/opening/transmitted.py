@@ -93,16 +93,21 @@ class Transmitted:
 def transmitted(campaign: Campaign, waveform: SampledWaveform) -> Transmitted:
     """Return the transmitted signal, from a waveform and the campaign's file of codes or samples.
 
+    Of a flight plan without that file: codes of one power, or a linear chirp over the band.
+
     Raises
     ------
     CampaignError
         If the file is missing or contradicts the waveform.
     """
     if isinstance(waveform, OfdmWaveform):
-        codes = read_codes(campaign.sent_file, waveform.subcarriers)
+        count, unsaid = waveform.subcarriers, campaign.planned and not campaign.sent_file.is_file()
+        codes = np.ones(count, np.complex64) if unsaid else read_codes(campaign.sent_file, count)
         return Transmitted(waveform, symbol_numerology(waveform), 1 / codes, float((np.abs(codes) ** 2).sum()))
     if isinstance(waveform, PulseWaveform):
-        return _pulse_sent(campaign.sent_file, waveform)
+        unsaid = campaign.planned and not campaign.sent_file.is_file()
+        pulse = _chirp(waveform) if unsaid else read_pulse(campaign.sent_file, waveform)
+        return _pulse_sent(pulse, waveform, where=campaign.sent_file)
     raise TypeError(f"no way to take out what a {type(waveform).__name__} sends")
 
 
@@ -117,11 +122,18 @@ def symbol_numerology(waveform: OfdmWaveform) -> Numerology:
     )
 
 
-def _pulse_sent(path: Path, waveform: PulseWaveform) -> Transmitted:
+def _chirp(waveform: PulseWaveform) -> NDArray[np.complex128]:
+    """Return a linear chirp over the band of a waveform, or over 0.8 of all that its samples carry."""
+    half = 0.4 * waveform.sample_rate_hz
+    low, high = waveform.band_hz or (-half, half)
+    time = np.arange(round(waveform.pulse_s * waveform.sample_rate_hz)) / waveform.sample_rate_hz
+    return np.asarray(np.exp(2j * np.pi * (low * time + (high - low) / waveform.pulse_s * time**2 / 2)))
+
+
+def _pulse_sent(pulse: NDArray[np.complex128], waveform: PulseWaveform, *, where: Path) -> Transmitted:
     """Return a pulse that is sent once: a DFT of the whole capture, and its filter (docs/theory/waveforms.md)."""
     length = waveform.capture_samples
     lead = waveform.lead_s * waveform.sample_rate_hz
-    pulse = read_pulse(path, waveform)
     spectrum = pulse_spectrum(pulse, lead=lead, length=length)
     power = np.abs(spectrum) ** 2
     if waveform.band_hz is None:
@@ -135,7 +147,7 @@ def _pulse_sent(path: Path, waveform: PulseWaveform) -> Transmitted:
     if numbers.size < _FEWEST_BINS or inside < _LEAST_INSIDE:
         raise CampaignError(
             f"{max(numbers.size, 0)} bins of {waveform.sample_rate_hz / length:g} Hz hold {inside:.2g} of its energy",
-            where=path,
+            where=where,
             expected=f"at least {_FEWEST_BINS} bins and {_LEAST_INSIDE} of the energy, as {CONFIG}: waveform.band_hz",
             remedy="Correct band_hz (baseband: what the carrier is subtracted from), or the file.",
         )

@@ -74,7 +74,7 @@ def open_two(campaign: Campaign, name: str, scene: OpenScene) -> TwoImages:
         opened = open_pair(campaign, flight, pair, echo=echo)
         bands.append((float(opened.frequency_hz.min()), float(opened.frequency_hz.max())))
         looks.append(Looks.of(scene.grid, scene.terrain, aperture_of(profile), weighing(campaign, opened, scene)))
-        legs.append(_legs(looks[-1]))
+        legs.append(legs_of(looks[-1]))
         began = began or opened.began
         antennas += _antennas(campaign, opened, looks[-1], sign=sign, began=began)
     if not np.allclose(bands[0], bands[1], rtol=_SAME, atol=0):
@@ -83,7 +83,7 @@ def open_two(campaign: Campaign, name: str, scene: OpenScene) -> TwoImages:
         raise CampaignError(f"images of {found}", where, "two images of one band", "Name two of one band.")
     first, second = ("/".join(image) for image in images)
     stages = [open_stage(campaign.stage("image", *image), "image") for image in images]
-    sensed = _sensed(scene, looks[0], legs, bands[0])
+    sensed = sensed_heights(scene, looks[0], legs, bands[0])
     visible = np.logical_and(*(_plain(campaign, *image) for image in images))
     ground = _ground(campaign, scene, sensed, visible)
     if antennas:
@@ -135,15 +135,25 @@ def _track_std(phase: TrackPhase, lattice: Lattice, known: Sequence[KnownHeight]
     return lattice.between(phase.std(nearest).reshape(lattice.shape), whole)
 
 
-def _legs(looks: Looks) -> Legs:
+def legs_of(looks: Looks) -> Legs:
     """Return phase centres of some pulses of each node of the lattice, (node, pulse, 3)."""
     pulses = looks.pulses.reshape(-1, looks.pulses.shape[-1])
     tx, rx = (leg[pulses] for leg in looks.aperture.legs)
     return tx, rx
 
 
-def _sensed(scene: OpenScene, looks: Looks, legs: Sequence[Legs], band_hz: tuple[float, float]) -> Sensitivity:
-    """Return the sensitivity to height at every pixel: computed at nodes of the lattice, bilinear between them."""
+def sensed_heights(scene: OpenScene, looks: Looks, legs: Sequence[Legs], band_hz: tuple[float, float]) -> Sensitivity:
+    """Return the sensitivity to height at every pixel: computed at nodes of the lattice, bilinear between them.
+
+    Parameters
+    ----------
+    scene, looks
+        Grid and ground; whose lattice.
+    legs
+        Of both images at the nodes of that lattice, as `legs_of`.
+    band_hz
+        Lowest and highest frequency.
+    """
     lattice, grid, places = looks.lattice, scene.grid, _nodes(scene, looks)
     at_nodes = sensitivity(places, scene.axes, legs[0], legs[1], band_hz=band_hz)
     whole: Window = (slice(0, grid.shape[0]), slice(0, grid.shape[1]))

@@ -84,7 +84,7 @@ def layers(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> l
     label, std_db = polarisation_of(campaign.settings.nodes, pair), None if calibrated is None else calibrated.std_db
     means_of = partial(of_coefficient, std_db=std_db, polarisation=label)
     absolute = {} if calibrated is None else {"nesz": means_of("sigma0", noise="alone")}
-    write("layers", _rasters(scene, looks, noise, calibrated, threads=threads), absolute)
+    write("layers", layer_rasters(scene, looks, noise, calibrated, threads=threads), absolute)
     if image is not None:
         powers, means = dict[str, GroundPower](), dict[str, Mapping[str, Any]]()
         if calibrated is not None:
@@ -196,10 +196,22 @@ def _report(scene: OpenScene, image: xr.Dataset, calibrated: CalibratedPair, noi
     }
 
 
-def _rasters(
+def layer_rasters(
     scene: OpenScene, looks: Looks, noise: float, calibrated: CalibratedPair | None, *, threads: int
 ) -> dict[str, LazyLayer]:
-    """Return the layers; `noise` is that of one pulse."""
+    """Return the layers of a pair.
+
+    Parameters
+    ----------
+    scene, looks
+        Grid and ground; pulses that make each pixel.
+    noise
+        Of one pulse in its range profile, power; NaN where nobody knows.
+    calibrated
+        Of the pair; None: its noise is relative.
+    threads
+        Tiles computed at once.
+    """
     grid, terrain = scene.grid, scene.terrain
     level = isinstance(terrain, FlatGround)
 

@@ -1,0 +1,206 @@
+"""Missions of ground stations, before they are flown: QGroundControl, ArduPilot, KML and tables of waypoints."""
+
+import math
+import re
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from apertura.common.arrays import Floats
+from apertura.common.atomic import write_text
+from apertura.common.documents import read_json, read_text
+from apertura.common.errors import CampaignError, quoted
+from apertura.formats.tracks.csv_track import read_table
+
+Reference = Literal["home", "sea", "ground", "ellipsoid"]
+"""What heights count from: the ground at the start, mean sea level, the ground below, the ellipsoid."""
+
+LARGEST_MISSION = 4_000_000
+"""Bytes of a mission's file."""
+
+_MOST_WAYPOINTS = 20_000
+_FRAMES: Mapping[int, Reference] = {0: "sea", 3: "home", 5: "sea", 6: "home", 10: "ground", 11: "ground"}
+_PASSED = {16, 17, 18, 19, 22, 82}  # MAV_CMD that fly through a place: waypoints, loiters, take-off, splines
+_SPEED = 178  # MAV_CMD_DO_CHANGE_SPEED, its second parameter
+_REMEDY = "Export the mission again, or give the track as a line, racetrack or circle."
+
+
+@dataclass(frozen=True, eq=False)
+class Mission:
+    """The waypoints of a mission.
+
+    Attributes
+    ----------
+    place
+        (waypoint, 3) float64: latitude, longitude (degrees, WGS 84), metres above `reference`.
+    reference
+        What the heights count from.
+    speed_m_s
+        (waypoint,) float64, on the way to each; NaN where the mission does not say.
+    home_deg
+        Latitude and longitude of the start; None where it does not say: the first waypoint.
+    """
+
+    place: Floats
+    reference: Reference
+    speed_m_s: Floats
+    home_deg: tuple[float, float] | None = None
+
+
+def read_mission(path: Path) -> Mission:
+    """Return the mission in a file, by its suffix.
+
+    Parameters
+    ----------
+    path
+        ``.plan`` of QGroundControl, ``.waypoints`` or ``.txt`` of ArduPilot's ground stations (QGC WPL 110), ``.kml``
+        with a LineString, ``.csv`` with columns latitude_deg, longitude_deg, height_m and, if it varies, speed_m_s.
+
+    Raises
+    ------
+    CampaignError
+        If there is no such file, it is none of these, or it has fewer than two waypoints.
+    """
+    reader = _READERS.get(path.suffix.lower())
+    expected = f"a mission: {', '.join(_READERS)}"
+    if reader is None:
+        raise CampaignError(f"suffix {quoted(path.suffix)}", path, expected, _REMEDY)
+    if not path.is_file():
+        raise CampaignError("no such file", path, expected, "Copy it beside the plan.")
+    try:
+        mission = reader(path)
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
+        if isinstance(error, CampaignError):
+            raise
+        raise CampaignError(f"no mission ({quoted(str(error), 120)})", path, expected, _REMEDY) from error
+    latitude, longitude, height = mission.place.T
+    good = (np.abs(latitude) <= 90) & (np.abs(longitude) <= 360) & (np.abs(height) < 1e5)
+    if not 2 <= len(mission.place) <= _MOST_WAYPOINTS or not good.all():
+        found = f"{len(mission.place)} waypoints, {int((~good).sum())} of them nowhere"
+        raise CampaignError(found, path, f"2 to {_MOST_WAYPOINTS} waypoints on Earth", _REMEDY)
+    return mission
+
+
+def _items(mission: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
+    """Yield the simple items of a QGroundControl mission; surveys and corridors hold theirs inside."""
+    for item in mission["items"]:
+        if item.get("type") == "SimpleItem":
+            yield item
+        else:
+            yield from _items({"items": item.get("TransectStyleComplexItem", item).get("Items", [])})
+
+
+def _of_commands(rows: list[tuple[int, int, list[float]]], speed: float, home: tuple[float, float] | None) -> Mission:
+    """Return the mission of MAVLink commands: command, frame, seven parameters; NaN where one is not given."""
+    places, references, speeds = [], [], []
+    for command, frame, parameters in rows:
+        if command == _SPEED and parameters[1] > 0:
+            speed = parameters[1]
+        elif command in _PASSED and frame in _FRAMES and any(parameters[4:6]):
+            places.append(parameters[4:7])
+            references.append(_FRAMES[frame])
+            speeds.append(speed)
+    if len(set(references)) > 1:
+        raise ValueError(f"heights count from {' and '.join(sorted(set(references)))} in one mission")
+    return Mission(np.array(places, float).reshape(-1, 3), (references or ["home"])[0], np.array(speeds, float), home)
+
+
+def _number(value: Any) -> float:
+    return math.nan if value is None else float(value)
+
+
+def _plan(path: Path) -> Mission:
+    document = read_json(path, expected="a QGroundControl plan", remedy=_REMEDY, largest=LARGEST_MISSION)
+    mission = document["mission"]
+    rows = [
+        (int(item["command"]), int(item["frame"]), [_number(one) for one in item["params"]]) for item in _items(mission)
+    ]
+    copter = mission.get("vehicleType") in {2, 13, 14, 15}  # MAV_TYPE of quadrotor, hexa-, octo-, tricopter
+    home = mission.get("plannedHomePosition")
+    return _of_commands(
+        rows, _number(mission["hoverSpeed" if copter else "cruiseSpeed"]), home and (float(home[0]), float(home[1]))
+    )
+
+
+def _waypoints(path: Path) -> Mission:
+    first, *lines = read_text(path, expected="a mission", remedy=_REMEDY, largest=LARGEST_MISSION).splitlines()
+    if not first.startswith("QGC WPL"):
+        raise ValueError("the first line is not QGC WPL 110")
+    cells = [line.split() for line in lines if line.strip()]
+    rows = [(int(one[3]), int(one[2]), [float(cell) for cell in one[4:11]]) for one in cells]
+    _, _, home = rows[0]  # line 0 is home
+    return _of_commands(rows[1:], math.nan, (home[4], home[5]) if any(home[4:6]) else None)
+
+
+def _kml(path: Path) -> Mission:
+    text = read_text(path, expected="KML", remedy=_REMEDY, largest=LARGEST_MISSION)
+    # By its text: a parser of XML would expand entities of strangers.
+    line = re.search(r"<LineString[^>]*>(.*?)</LineString>", text, re.DOTALL)
+    if line is None:
+        raise ValueError("no LineString")
+    listed = re.search(r"<coordinates>(.*?)</coordinates>", line[1], re.DOTALL)
+    if listed is None:
+        raise ValueError("a LineString without coordinates")
+    mode = re.search(r"<altitudeMode>\s*(\w+)\s*</altitudeMode>", line[1])
+    references: Mapping[str, Reference] = {"absolute": "sea", "relativeToGround": "ground"}
+    named = mode[1] if mode else "clampToGround"
+    if named not in references:
+        raise ValueError(f"altitudeMode {named}: a flight has heights, absolute or relativeToGround")
+    place = np.array([[float(one) for one in triple.split(",")] for triple in listed[1].split()], float)
+    return Mission(place[:, [1, 0, 2]], references[named], np.full(len(place), np.nan))
+
+
+def _csv(path: Path) -> Mission:
+    columns = ["latitude_deg", "longitude_deg", "height_m"]
+    table = read_table(path, columns, optional=("speed_m_s",))
+    speed = table["speed_m_s"].to_numpy(float) if "speed_m_s" in table else np.full(len(table), np.nan)
+    return Mission(table[columns].to_numpy(float), "ground", speed)
+
+
+_READERS: Mapping[str, Callable[[Path], Mission]] = {
+    ".plan": _plan,
+    ".waypoints": _waypoints,
+    ".txt": _waypoints,
+    ".kml": _kml,
+    ".csv": _csv,
+}
+
+
+def write_kml(path: Path, name: str, lines: Mapping[str, Floats], areas: Mapping[str, list[list[Floats]]]) -> None:
+    """Write planned tracks and footprints as KML.
+
+    Parameters
+    ----------
+    path
+        ``….kml``.
+    name
+        Of the document.
+    lines
+        Name → (vertex, 3) float64, longitude, latitude (degrees), height (m).
+    areas
+        Name → polygons, each its rings (vertex, 3) of the same, the outer one first.
+    """
+
+    def ring(place: Floats) -> str:
+        return " ".join(f"{east:.8f},{north:.8f},{up:.2f}" for east, north, up in place)
+
+    marks = [
+        f"<Placemark><name>{escape(of)}</name><LineString><altitudeMode>absolute</altitudeMode><coordinates>"
+        f"{ring(place)}</coordinates></LineString></Placemark>"
+        for of, place in lines.items()
+    ]
+    for of, polygons in areas.items():
+        for outer, *holes in polygons:
+            edges = [("outer", outer), *(("inner", hole) for hole in holes)]
+            bounds = "".join(
+                f"<{side}BoundaryIs><LinearRing><coordinates>{ring(edge)}</coordinates></LinearRing></{side}BoundaryIs>"
+                for side, edge in edges
+            )
+            marks.append(f"<Placemark><name>{escape(of)}</name><Polygon>{bounds}</Polygon></Placemark>")
+    body = "\n".join(marks)
+    heading = '<?xml version="1.0" encoding="UTF-8"?>\n<kml xmlns="http://www.opengis.net/kml/2.2"><Document>'
+    write_text(path, f"{heading}<name>{escape(name)}</name>\n{body}\n</Document></kml>\n")

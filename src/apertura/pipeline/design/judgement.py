@@ -1,0 +1,403 @@
+"""Whether a plan gives what is required: the first cause where it does not, and which change helps most."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from apertura.common.errors import CampaignError
+from apertura.core.quality.budget import RECEIVER_STD_M
+from apertura.formats.export.layers import LAYOVER, OUTSIDE, SHADOW
+from apertura.pipeline.config import OfdmWaveform
+from apertura.pipeline.config.flight_plan import BesideTrack, FlightPlan, LineTrack
+from apertura.pipeline.design.computed import Design, designed
+from apertura.pipeline.design.layers import PlannedImage
+
+SHARE = 95.0
+"""Per cent of the pixels seen that must have what is required: edges of a scene are worse than what is flown for."""
+
+COARSE_PX = 64
+"""Pixels along the longer side of the grid on which changes are compared: its outermost lie 1 % of the side inside."""
+
+_LAYERS = {
+    "resolution_m": ("resolution", "most"),
+    "nesz_db": ("nesz", "most"),
+    "snr_db": ("snr", "least"),
+    "point_snr_db": ("point_snr", "least"),
+    "loss_db": ("loss", "most"),
+}
+"""Requirement → layer, and whether the requirement is the most or the least of it."""
+
+_LEAST = {"snr_db", "point_snr_db", "coverage", "coherence"}
+_IN_DB = {"nesz_db", "snr_db", "point_snr_db", "loss_db"}
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """A requirement against what the plan gives.
+
+    Attributes
+    ----------
+    requirement
+        A key of `require`.
+    asked, found
+        In its unit; found is NaN where the plan does not say.
+    image
+        Which is the worst.
+    cause
+        What it comes from first, in a few words.
+    """
+
+    requirement: str
+    asked: float | None
+    found: float
+    image: str
+    cause: str
+
+    @property
+    def short_db(self) -> float:
+        """How far it is missed, dB; negative where there is some to spare."""
+        if self.asked is None:
+            return -np.inf
+        if not np.isfinite(self.found):
+            return 100.0
+        sign = -1 if self.requirement in _LEAST else 1
+        if self.requirement in _IN_DB:
+            return sign * (self.found - self.asked)
+        return sign * 10 * float(np.log10(max(self.found, 1e-9) / self.asked))
+
+    @property
+    def met(self) -> bool:
+        """Whether it is met."""
+        return self.short_db <= 0
+
+    @property
+    def report(self) -> dict[str, Any]:
+        """As JSON values."""
+        found = float(f"{self.found:.4g}") if np.isfinite(self.found) else None
+        named = {"requirement": self.requirement, "asked": self.asked, "found": found, "met": self.met}
+        return named | {"image": self.image, "cause": self.cause}
+
+
+def judge(design: Design, *, every: bool = False) -> list[Verdict]:
+    """Return a verdict on each requirement that the plan states, worst image first; `every`: on all there are."""
+    found = [*_of_images(design), *_of_interferograms(design), *_of_recording(design)]
+    required = design.opened.plan.require
+    verdicts = []
+    for name in type(required).model_fields:
+        asked, some = getattr(required, name), [one for one in found if one[0] == name]
+        if some and (every or asked is not None):
+            worst = (min if name in _LEAST else max)(some, key=lambda one: (np.isnan(one[1]), one[1]))
+            verdicts.append(Verdict(name, asked, *worst[1:]))
+        elif asked is not None:
+            verdicts.append(Verdict(name, asked, float("nan"), "none", "nothing of the plan says it"))
+    return verdicts
+
+
+_Found = tuple[str, float, str, str]
+
+
+def _of_images(design: Design) -> Iterator[_Found]:
+    for image in design.judged:
+        seen = image.layers["mask"] == 0
+        for name, (layer, side) in _LAYERS.items():
+            if layer in image.layers:
+                values = image.layers[layer][seen]
+                values = values[~np.isnan(values)]
+                at = SHARE if side == "most" else 100 - SHARE
+                value = float(np.percentile(values, at, method="nearest")) if values.size else float("nan")
+                yield name, value, image.name, _cause(name, design, image, seen, value)
+        yield "coverage", float(seen.mean()), image.name, _unseen(image)
+
+
+def _of_interferograms(design: Design) -> Iterator[_Found]:
+    for name, layers in design.interferograms.items():
+        values = layers["coherence"][np.isfinite(layers["coherence"])]
+        value = float(np.percentile(values, 100 - SHARE)) if values.size else float("nan")
+        one, other = design.opened.campaign.settings.interferometry.pairs[name]
+        yield "coherence", value, name, f"spectra that {one} and {other} have in common, and their noise"
+
+
+def _of_recording(design: Design) -> Iterator[_Found]:
+    recording = design.recording
+    flight, lasting_s = max(recording.flight_s.items(), key=lambda item: item[1])
+    yield "flight_s", lasting_s, flight, "length of the tracks over their speed"
+    pulses = sum(recording.pulses.values())
+    yield "recorded_gb", recording.recorded_bytes / 1e9, "all", f"{pulses} pulses of all flights, by each node"
+
+
+def _cause(name: str, design: Design, image: PlannedImage, seen: np.ndarray, value: float) -> str:
+    if not seen.any() or not np.isfinite(value):
+        return "nothing is seen" if not seen.any() else "power, gains, receiver or its noise figure are not stated"
+    if name == "resolution_m":
+        return _coarsest(image)
+    if name == "loss_db":
+        pairs = [one for one in design.images.values() if one.budget and one.name.startswith(image.name.split("/")[0])]
+        lines = [line for one in pairs for line in one.budget if line.counts]
+        worst = min(lines, key=lambda line: line.effect.loss_db)
+        return f"{worst.cause}: {worst.stated or worst.assumed}"
+    looks = float(np.median(image.layers["looks"][seen]))
+    return f"noise of {looks:.0f} pulses at the far side, by power, gains and range"
+
+
+def _coarsest(image: PlannedImage) -> str:
+    """Return whether the band or the aperture makes the coarsest direction in the middle of the scene."""
+    shape = image.layers["mask"].shape
+    pixel = tuple(slice(size // 2, size // 2 + 1) for size in shape)
+    _, _, fine_deg = image.resolution.axes((pixel[0], pixel[1]))
+    ahead = image.resolution.look_azimuth_deg((pixel[0], pixel[1]))
+    apart = abs((float(fine_deg[0, 0]) - float(ahead[0, 0]) + 90) % 180 - 90)
+    if apart > 45:  # the finest direction is across the line of sight
+        return "range: bandwidth over the sine of incidence"
+    return "cross-range: wavelength over the angle that the aperture turns about the scene"
+
+
+def _unseen(image: PlannedImage) -> str:
+    mask = image.layers["mask"]
+    late = image.layers["path_margin"] < 0
+    shares = {
+        "beyond the prefix or the listening time": late.mean(),
+        "outside the beams": ((mask == OUTSIDE) & ~late).mean(),
+        "in shadow": ((mask != OUTSIDE) & (mask & SHADOW > 0)).mean(),
+        "in layover": ((mask != OUTSIDE) & (mask & LAYOVER > 0)).mean(),
+    }
+    worst = max(shares, key=lambda name: shares[name])
+    return f"{100 * shares[worst]:.1f} % {worst}" if shares[worst] > 0 else "all of it is seen"
+
+
+# ---- Changes that help ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Change:
+    """One change of a plan, and what it brings.
+
+    Attributes
+    ----------
+    words
+        What to do.
+    gain_db
+        By how much less the requirements are missed, all together, dB.
+    meets
+        Whether all are then met.
+    found
+        Requirement → what the plan then gives.
+    """
+
+    words: str
+    gain_db: float
+    meets: bool
+    found: Mapping[str, float]
+
+
+def shortfall_db(verdicts: Sequence[Verdict]) -> float:
+    """Return by how much requirements are missed, all together, dB."""
+    return sum(max(0.0, one.short_db) for one in verdicts)
+
+
+def helpful_changes(plan: FlightPlan, root: Path, *, threads: int = 1) -> list[Change]:
+    """Return single changes that bring a plan nearer to what is required, the one that helps most first."""
+    before = judge(designed(plan, root, threads=threads, coarse=COARSE_PX))
+    missed_db, found = shortfall_db(before), []
+    if not missed_db:
+        return []
+    for words, change in _candidates(plan):
+        try:
+            after = judge(designed(change(plan), root, threads=threads, coarse=COARSE_PX))
+        except (CampaignError, ValueError):  # a change that makes another plan impossible helps nobody
+            continue
+        gain = missed_db - shortfall_db(after)
+        if gain > 0.01:
+            values = {one.requirement: one.found for one in after}
+            found.append(Change(words, gain, all(one.met for one in after), values))
+    return sorted(found, key=lambda change: -change.gain_db)
+
+
+_Changing = Callable[[FlightPlan], FlightPlan]
+
+
+def _candidates(plan: FlightPlan) -> Iterator[tuple[str, _Changing]]:
+    several = any(len(flight.participants) > 1 for flight in plan.flights.values())
+    lines = any(isinstance(track, LineTrack) for flight in plan.flights.values() for track in flight.tracks.values())
+    for factor in (0.5, 0.75, 1.5):
+        yield f"fly at {factor:g} of the speed", partial(_faster, factor=factor)
+    for height_m in (-10.0, 10.0, 20.0):
+        way = "higher" if height_m > 0 else "lower"
+        yield f"fly {abs(height_m):g} m {way}", partial(moved, height_m=height_m)
+    for offset_m in (-10.0, 10.0, 20.0):
+        way = "farther from" if offset_m > 0 else "nearer to"
+        yield f"fly {abs(offset_m):g} m {way} the scene", partial(moved, offset_m=offset_m)
+    for factor in (0.5, 2.0) if several else ():
+        yield f"separations times {factor:g}", partial(moved, spacing=plan.moved.spacing * factor)
+    if lines:
+        yield "lines longer by half", partial(_longer, factor=1.5)
+    prf_hz = getattr(plan.waveform, "prf_hz", None)
+    if prf_hz:
+        yield "twice the pulse rate", partial(_radar, prf_hz=2 * prf_hz)
+    if isinstance(plan.waveform, OfdmWaveform):
+        yield "twice the bandwidth", partial(_radar, subcarriers=2 * plan.waveform.subcarriers)
+    yield "3 dB more power", _louder
+    yield "positions known twice as well (RTK quality)", _surer
+
+
+def moved(plan: FlightPlan, **changes: float) -> FlightPlan:
+    """Return a plan whose tracks are moved: height_m, offset_m, heading_deg to be added, spacing as it will be."""
+    values = plan.moved.model_dump()
+    values = {key: changes[key] if key == "spacing" else values[key] + changes[key] for key in changes}
+    return plan.model_copy(update={"moved": plan.moved.model_copy(update=values)})
+
+
+def _faster(plan: FlightPlan, factor: float) -> FlightPlan:
+    return _tracks(
+        plan, lambda track: {"speed_m_s": factor * track.speed_m_s} if getattr(track, "speed_m_s", None) else {}
+    )
+
+
+def _longer(plan: FlightPlan, factor: float) -> FlightPlan:
+    def stretched(track: Any) -> dict[str, Any]:
+        if not isinstance(track, LineTrack):
+            return {}
+        ends = np.array([track.start_m, track.end_m])
+        start, end = ends.mean(axis=0) + factor * (ends - ends.mean(axis=0))
+        return {"start_m": tuple(start.tolist()), "end_m": tuple(end.tolist())}
+
+    return _tracks(plan, stretched)
+
+
+def _tracks(plan: FlightPlan, change: Callable[[Any], dict[str, Any]]) -> FlightPlan:
+    flights = {
+        name: flight.model_copy(
+            update={
+                "tracks": {
+                    node: track if isinstance(track, BesideTrack) else track.model_copy(update=change(track))
+                    for node, track in flight.tracks.items()
+                }
+            }
+        )
+        for name, flight in plan.flights.items()
+    }
+    return plan.model_copy(update={"flights": flights})
+
+
+def _radar(plan: FlightPlan, **changes: Any) -> FlightPlan:
+    waveform = type(plan.waveform).model_validate(plan.waveform.model_dump() | changes)
+    return plan.model_copy(update={"waveform": waveform})
+
+
+def _louder(plan: FlightPlan) -> FlightPlan:
+    nodes = {
+        name: node
+        if node.transmit_power_dbm is None
+        else node.model_copy(update={"transmit_power_dbm": node.transmit_power_dbm + 3})
+        for name, node in plan.nodes.items()
+    }
+    return plan.model_copy(update={"nodes": nodes})
+
+
+def _surer(plan: FlightPlan) -> FlightPlan:
+    solutions = {node: flight.solution for flight in plan.flights.values() for node in flight.participants}
+    nodes = {}
+    for name, node in plan.nodes.items():
+        stated = node.position_std_m or RECEIVER_STD_M[solutions.get(name, "fix")]
+        half = tuple(one / 2 for one in stated) if isinstance(stated, tuple) else stated / 2
+        nodes[name] = node.model_copy(update={"position_std_m": half})
+    return plan.model_copy(update={"nodes": nodes})
+
+
+# ---- Search within bounds -------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Tried:
+    """A plan that a search tried.
+
+    Attributes
+    ----------
+    moved
+        Key of `moved` → value.
+    verdicts
+        On every requirement there is.
+    objective
+        What is minimised, dB: what is missed, tenfold, and the scarcest margin.
+    on_front
+        Whether none that was tried is better in one requirement and as good in the others.
+    """
+
+    moved: Mapping[str, float]
+    verdicts: tuple[Verdict, ...]
+    objective: float
+    on_front: bool = False
+
+
+AXES = {"height": "height_m", "offset": "offset_m", "spacing": "spacing", "heading": "heading_deg"}
+"""Word of `--optimise` → key of `moved`."""
+
+IMPOSSIBLE_DB = 1000.0
+"""Objective of a plan that cannot be flown."""
+
+
+def search(
+    plan: FlightPlan, root: Path, words: Sequence[str], *, most: int = 150, threads: int = 1
+) -> tuple[FlightPlan, list[Tried]]:
+    """Return the best plan found by moving tracks within the plan's bounds, and all that were tried; deterministic.
+
+    Parameters
+    ----------
+    plan, root
+        As `designed`.
+    words
+        Of `AXES`.
+    most
+        Plans tried, about.
+    threads
+        Tiles computed at once.
+
+    Raises
+    ------
+    CampaignError
+        If a word is unknown, no requirement is stated, or none of the plans can be flown.
+
+    Notes
+    -----
+    Source: DIRECT (D. R. Jones, C. D. Perttunen, B. E. Stuckman, J. Optim. Theory Appl. 79, 1993), which draws nothing.
+    """
+    from scipy.optimize import direct
+
+    unknown = [word for word in words if word not in AXES]
+    if unknown or not words:
+        raise CampaignError(",".join(words) or "nothing", "--optimise", f"some of {','.join(AXES)}", "Correct it.")
+    if not plan.require.model_fields_set:
+        raise CampaignError("no requirement", "the plan: require", "what the flight must give", "State some of it.")
+    keys, tried = [AXES[word] for word in words], list[Tried]()
+
+    def objective(place: np.ndarray) -> float:
+        values = dict(zip(keys, map(float, place), strict=True))
+        one = plan.model_copy(update={"moved": plan.moved.model_copy(update=values)})
+        try:
+            verdicts = judge(designed(one, root, threads=threads, coarse=COARSE_PX), every=True)
+        except CampaignError:
+            return IMPOSSIBLE_DB
+        asked = [verdict for verdict in verdicts if verdict.asked is not None]
+        missed = 10 * shortfall_db(asked) + max(verdict.short_db for verdict in asked)
+        tried.append(Tried(values, tuple(verdicts), missed))
+        return missed
+
+    limits = [getattr(plan.bounds, key) for key in keys]
+    direct(objective, limits, maxfun=most, locally_biased=True, len_tol=1e-2, vol_tol=0.0)
+    if not tried:
+        raise CampaignError(
+            "no plan within the bounds can be flown", "the plan: bounds", "some that can", "Widen them."
+        )
+    best = min(tried, key=lambda one: one.objective)
+    found = plan.model_copy(update={"moved": plan.moved.model_copy(update=dict(best.moved))})
+    return found, with_front(tried)
+
+
+def with_front(tried: Sequence[Tried]) -> list[Tried]:
+    """Return plans marked where no other is as good in all that is asked and better in some."""
+    short = np.array([[v.short_db for v in one.verdicts if v.asked is not None] for one in tried])
+    front = [not ((short <= own).all(axis=1) & (short < own).any(axis=1)).any() for own in short]
+    return [replace(one, on_front=on) for one, on in zip(tried, front, strict=True)]

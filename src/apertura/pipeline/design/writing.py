@@ -1,0 +1,173 @@
+"""A design as files: layers as GeoTIFFs on the later campaign's grid, tracks and footprints, the campaign's config."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from rasterio import Affine
+
+from apertura import __version__
+from apertura.common.arrays import Floats
+from apertura.common.atomic import write_json, write_text
+from apertura.common.errors import CampaignError
+from apertura.common.provenance import canonical_json
+from apertura.core.geometry.geodesy import LOCAL
+from apertura.formats.campaign_files import write_config
+from apertura.formats.export.cog import Band, write_cog
+from apertura.formats.export.coverage import Covered, feature_collection, footprint, write_coverage
+from apertura.formats.export.layers import BISTATIC_ANGLE, INCIDENCE, LOOKS, MASK
+from apertura.formats.export.style import write_layer_style, write_mask_style
+from apertura.formats.tracks.missions import write_kml
+from apertura.pipeline.config import FLIGHTS
+from apertura.pipeline.config.flight_plan import FlightPlan
+from apertura.pipeline.design.computed import Design
+from apertura.pipeline.design.judgement import judge
+from apertura.pipeline.steps.coverage import crs_name, place_of, transform_of
+
+UNITS: Mapping[str, tuple[str, str]] = {
+    "resolution": ("m", "−3 dB width of a point in its coarsest direction"),
+    "resolution_fine": ("m", "−3 dB width of a point in its finest direction"),
+    "orientation": ("deg", "azimuth of the finest direction, clockwise from grid north"),
+    "looks": ("pulses", "effective number of pulses that make the pixel"),
+    "incidence": ("deg", "incidence at closest approach, from the terrain's normal"),
+    "bistatic_angle": ("deg", "angle between transmitter and receiver at closest approach"),
+    "mask": ("bits", "0 seen, 1 shadow, 2 layover, 3 both, 255 outside"),
+    "nesz": ("dB", "noise-equivalent sigma0"),
+    "snr": ("dB", "ground of expect.sigma0_db over noise"),
+    "point_snr": ("dB", "point of expect.rcs_dbsm over noise"),
+    "ambiguity": ("1", "share of the scene's echo that folds onto the place"),
+    "path_margin": ("m", "total path left before the prefix or the recording ends"),
+    "loss": ("dB", "expected loss of a point's peak by all causes of the error budget"),
+    "coherence": ("1", "of still ground between two images: common spectrum and noise"),
+    "height_ambiguity": ("m", "height that turns the phase between two images once"),
+}
+"""Layer → unit and meaning."""
+
+_BANDS = {"incidence": INCIDENCE, "bistatic_angle": BISTATIC_ANGLE, "mask": MASK, "looks": LOOKS}
+_DOTS = 480  # of the longer side of the scene, in footprints
+_VERTICES = 400  # of a track
+
+
+def write_design(design: Design, folder: Path) -> list[Path]:
+    """Write layers, tracks, footprints, a map and design.json into a folder; return their paths.
+
+    Parameters
+    ----------
+    design
+        As computed on the grid itself.
+    folder
+        Made where it is not there; files of the same names are replaced.
+    """
+    grid, written = design.opened.scene.grid, list[Path]()
+    place = {"transform": Affine(*grid.transform), "crs": grid.crs_wkt}
+    tags = tags_of(design)
+    images = {name: image.layers for name, image in design.images.items()}
+    for name, layers in {
+        **images,
+        **{f"interferometry/{one}": own for one, own in design.interferograms.items()},
+    }.items():
+        for layer, values in layers.items():
+            path = folder / name / f"{layer}.tif"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            unit, meaning = UNITS[layer]
+            band = _BANDS.get(layer) or Band("float32", np.nan, unit, meaning, "AVERAGE")
+            title = f"{design.opened.campaign.settings.campaign} · {name} · {layer}, planned"
+            write_cog(path, values.astype(band.dtype), band, **place, tags=tags, title=title)
+            style = path.with_suffix(".qml")
+            (write_mask_style if layer == "mask" else write_layer_style)(style)
+            written += [path, style]
+    return [*written, *_write_tracks(design, folder, tags), _write_report(design, folder)]
+
+
+def tags_of(design: Design) -> dict[str, str]:
+    """Return what files of a design say of where they come from."""
+    plan = design.opened.plan.model_dump(mode="json", exclude_unset=True)
+    return {"APERTURA_VERSION": __version__, "APERTURA_PLAN": canonical_json(plan), "APERTURA_PLANNED": "true"}
+
+
+def report_of(design: Design) -> dict[str, Any]:
+    """Return what a design says in numbers, as JSON values."""
+    return {
+        "judgement": [verdict.report for verdict in judge(design)],
+        "recording": asdict(design.recording),
+        "budget": {name: [line.report for line in image.budget] for name, image in design.images.items()},
+        "flags": {name: dict(image.flags) for name, image in design.images.items()},
+        "doppler_hz": {name: image.doppler_hz for name, image in design.images.items() if image.looks is not None},
+    }
+
+
+def _write_report(design: Design, folder: Path) -> Path:
+    write_json(folder / "design.json", report_of(design))
+    return folder / "design.json"
+
+
+def _write_tracks(design: Design, folder: Path, tags: Mapping[str, str]) -> list[Path]:
+    """Write coverage.png, tracks.geojson and, of a scene on Earth, tracks.kml."""
+    scene, covered = design.opened.scene, list(_covered(design))
+    transform = transform_of(scene.grid, covered[0].looks)
+    title = f"{design.opened.campaign.settings.campaign} · planned"
+    picture, features = folder / "coverage.png", folder / "tracks.geojson"
+    name, local = crs_name(scene.grid), scene.grid.crs == LOCAL
+    shown = {key: value for key, value in tags.items() if key != "APERTURA_PLAN"}
+    write_coverage(picture, covered, transform, crs_name=name, title=title, tags=shown, local=local)
+    on_earth = place_of(scene)
+    found = feature_collection(covered, transform, on_earth, height_m=scene.level.height_m)
+    write_text(features, canonical_json(found) + "\n")
+    if on_earth is None:
+        return [picture, features]
+
+    def ring(place_m: Floats) -> Floats:
+        return np.asarray(on_earth(np.c_[place_m, np.full(len(place_m), scene.level.height_m)]))
+
+    lines = {
+        f"{flight} {node}": np.asarray(on_earth(course.place_m[:: max(1, len(course.place_m) // _VERTICES)]))
+        for flight, nodes in design.opened.courses.items()
+        for node, course in nodes.items()
+    }
+    areas = {
+        f"{one.flight} {one.pair}": [[ring(part) for part in rings] for rings in footprint(one.looks, transform)]
+        for one in covered
+    }
+    write_kml(folder / "tracks.kml", title, lines, areas)
+    return [picture, features, folder / "tracks.kml"]
+
+
+def _covered(design: Design) -> Iterator[Covered]:
+    for pair in design.opened.pairs:
+        image = design.images[f"{pair.flight}/{pair.name}"]
+        step = max(1, max(image.layers["mask"].shape) // _DOTS)
+        looks = np.where(image.layers["mask"] == 0, image.layers["looks"], 0)[::step, ::step].astype(np.float32)
+        courses, nodes = design.opened.courses[pair.flight], pair.name.split("-")
+        legs = dict(zip(("transmitter", "receiver"), dict.fromkeys(nodes), strict=False))
+        tracks = {
+            leg: courses[node].place_m[:: max(1, len(courses[node].place_m) // _VERTICES)] for leg, node in legs.items()
+        }
+        yield Covered(pair.flight, pair.name, tracks, looks)
+
+
+def write_campaign_config(plan: FlightPlan, directory: Path) -> list[Path]:
+    """Write the config of the campaign that a plan becomes, ready for its recordings.
+
+    Raises
+    ------
+    CampaignError
+        If a config is there already; nothing is changed then.
+    """
+    paths = [directory / "config" / "config.yaml", directory / FLIGHTS]
+    for path in paths:
+        if path.exists():
+            raise CampaignError("exists already", path, "a new folder", "Choose another folder; nothing was changed.")
+    (directory / "config").mkdir(parents=True, exist_ok=True)
+    for flight in plan.image_flights:
+        (directory / "raw" / flight.name).mkdir(parents=True, exist_ok=True)
+    flights = [(one.name, one.kind, one.transmitter, one.nodes) for one in plan.image_flights]
+    write_config(directory, plan.document, flights)
+    return paths
+
+
+def plan_text(plan: FlightPlan) -> str:
+    """Return a plan as YAML, without what is at its default; `read_flight_plan` reads it back."""
+    return yaml.safe_dump(plan.model_dump(mode="json", exclude_unset=True), sort_keys=False, width=110)

@@ -1,0 +1,370 @@
+"""`apertura design` and `apertura compare`: what a planned flight will give, and what it gave."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apertura.common.atomic import write_text
+from apertura.common.errors import CampaignError
+from apertura.core.quality.budget import expected
+from apertura.formats.export.layers import OUTSIDE
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.config.flight_plan import FlightPlan, read_flight_plan
+from apertura.pipeline.design import as_plan
+from apertura.pipeline.design.computed import Design, designed
+from apertura.pipeline.design.judgement import AXES, Change, Tried, Verdict, helpful_changes, judge, search
+from apertura.pipeline.design.layers import PlannedImage, planned_image
+from apertura.pipeline.design.writing import UNITS, plan_text, tags_of, write_design
+from apertura.pipeline.opening.pair import open_pair
+from apertura.pipeline.opening.scene import expected_scene
+from apertura.views.image_report import read_report
+from apertura.views.plan import first_flight
+from apertura.views.report.page import Block, Heading, Paragraph, Picture, Table, page
+from apertura.views.report.sheet import BLUE, GREY, ORANGE, RED, sheet
+
+if TYPE_CHECKING:
+    from rich.table import Table as PrintedTable
+
+PAGE, PLAN, PANELS, PARETO = "design.html", "plan.yaml", "layers.png", "pareto.png"
+_SHOWN = ("resolution", "nesz", "point_snr", "incidence", "loss", "mask")
+_DOTS = 400  # of the longer side of a panel
+_MOST_CHANGES = 5
+_JUDGED = ("requirement", "asked", "given", "met", "image", "first cause")
+_VALUES = ("image", "middle of what is seen", "95 % have", "unit")
+
+
+def print_design(path: Path, out: Path | None, *, optimise: str | None = None, threads: int = 1) -> bool:
+    """Print what a plan gives, write it where a folder is named; return whether all that is required is met.
+
+    Parameters
+    ----------
+    path
+        PLAN.yaml.
+    out
+        Folder for layers, tracks, map, report and the plan as it is; None: nothing is written.
+    optimise
+        Words of `AXES`, joined by commas: tracks are moved by them within the plan's bounds first.
+    threads
+        Tiles computed at once.
+    """
+    from rich.console import Console
+
+    console = Console(width=max(120, Console().width))
+    plan, root = as_plan(path, None)
+    tried: list[Tried] = []
+    if optimise is not None:
+        plan, tried = search(plan, root, [word for word in optimise.split(",") if word], threads=threads)
+        moved = ", ".join(f"{key}: {getattr(plan.moved, key):.3g}" for key in AXES.values())
+        console.print(f"best of {len(tried)} plans tried: moved: {{{moved}}}", highlight=False)
+    design = designed(plan, root, threads=threads)
+    verdicts = judge(design)
+    changes = helpful_changes(plan, root, threads=threads)
+    console.print(_table("what images will be", _VALUES, value_rows(design)))
+    if verdicts:
+        console.print(_table("what is required", _JUDGED, [verdict_row(one) for one in verdicts]))
+    for line in (*recording_lines(design), *change_lines(changes)):
+        console.print(line, highlight=False)
+    for name, image in design.images.items():
+        for flag, line in image.flags.items() if image.looks is not None else ():
+            console.print(f"[yellow]{flag}[/yellow]: {name}: {line}", highlight=False)
+    if out is not None:
+        write_design(design, out)
+        write_text(out / PLAN, plan_text(plan))
+        _draw_layers(out / PANELS, design)
+        if tried:
+            draw_pareto(out / PARETO, tried, design)
+        write_text(out / PAGE, page(f"{plan.campaign}, planned", _blocks(design, verdicts, changes, out)))
+        console.print(*(out / name for name in (PAGE, "coverage.png", PLAN)), sep="\n", highlight=False)
+    return all(verdict.met for verdict in verdicts)
+
+
+def _table(title: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> "PrintedTable":
+    from rich.table import Table
+
+    table = Table(title=title, title_justify="left")
+    for heading in head:
+        table.add_column(heading, overflow="fold")
+    for row in rows:
+        table.add_row(*row)
+    return table
+
+
+# ---- Words ----------------------------------------------------------------------------------------------------------
+
+
+def value_rows(design: Design) -> list[tuple[str, ...]]:
+    """Return each layer of the images that requirements are of: median of what is seen, what 95 % have, unit."""
+    rows = list[tuple[str, ...]]()
+    for image in design.judged:
+        seen = image.layers["mask"] == 0
+        for name in ("resolution", "resolution_fine", "looks", "incidence", "nesz", "snr", "point_snr", "loss"):
+            values = image.layers.get(name, np.empty(0))
+            values = values[seen] if values.size else values
+            values = values[np.isfinite(values)]
+            if values.size:
+                worst = np.percentile(values, 5 if name in {"looks", "snr", "point_snr"} else 95)
+                rows.append((f"{image.name} {name}", f"{np.median(values):.4g}", f"{worst:.4g}", UNITS[name][0]))
+        rows.append((f"{image.name} coverage", f"{100 * seen.mean():.1f}", "", "%"))
+    for name, layers in design.interferograms.items():
+        for layer, values in layers.items():
+            rows.append((f"{name} {layer}", f"{np.nanmedian(values):.4g}", "", UNITS[layer][0]))
+    return rows
+
+
+def verdict_row(verdict: Verdict) -> tuple[str, ...]:
+    """Return a verdict as text."""
+    met = "yes" if verdict.met else f"no, {verdict.short_db:.1f} dB short"
+    return verdict.requirement, f"{verdict.asked:g}", f"{verdict.found:.4g}", met, verdict.image, verdict.cause
+
+
+def recording_lines(design: Design) -> Iterator[str]:
+    """Yield what recording and processing take."""
+    recording = design.recording
+    for flight, lasting_s in recording.flight_s.items():
+        rates = recording.node_bytes_s[flight]
+        each = ", ".join(f"{node} {rate / 1e6:.3g} MB/s" for node, rate in rates.items())
+        yield f"{flight}: {lasting_s:.0f} s in the air, {recording.pulses[flight]} pulses; {each}"
+    dopplers = [f"{one.name} {one.doppler_hz:.0f}" for one in design.images.values() if one.looks is not None]
+    prf = getattr(design.opened.plan.waveform, "prf_hz", None)
+    yield f"Doppler over the scene, Hz: {', '.join(dopplers)}; {prf:g} pulses per second"
+    yield (
+        f"recorded {recording.recorded_bytes / 1e9:.3g} GB; processing about {recording.processing_s / 3600:.2g} h, "
+        f"{recording.memory_bytes / 1e9:.2g} GB of memory"
+    )
+
+
+def change_lines(changes: Sequence[Change]) -> Iterator[str]:
+    """Yield the single changes that help most."""
+    for number, change in enumerate(changes[:_MOST_CHANGES], 1):
+        found = ", ".join(f"{name} {value:.3g}" for name, value in change.found.items())
+        yield f"{number}. {change.words}: {change.gain_db:.1f} dB nearer{', all met' if change.meets else ''} ({found})"
+
+
+def _blocks(design: Design, verdicts: Sequence[Verdict], changes: Sequence[Change], out: Path) -> Iterator[Block]:
+    plan = design.opened.plan
+    yield Heading(1, f"{plan.campaign}: what the flight will give")
+    if verdicts:
+        unmet = [one.requirement for one in verdicts if not one.met]
+        outcome = f"Not met: {', '.join(unmet)}." if unmet else "All that is required is met."
+        yield Paragraph(f"{outcome} Requirements hold where 95 % of what is seen has them.")
+        yield Table("What is required.", _JUDGED, [verdict_row(one) for one in verdicts])
+    if changes:
+        yield Table(
+            "Single changes, the one that helps most first.",
+            ("change", "nearer", "then all met", "then"),
+            [
+                (
+                    change.words,
+                    f"{change.gain_db:.1f} dB",
+                    "yes" if change.meets else "no",
+                    ", ".join(f"{name} {value:.3g}" for name, value in change.found.items()),
+                )
+                for change in changes[:_MOST_CHANGES]
+            ],
+        )
+    yield Picture((out / "coverage.png").read_bytes(), "Tracks and what they see.")
+    yield Picture((out / PANELS).read_bytes(), f"Layers of {design.judged[0].name}; white: not seen.")
+    if (out / PARETO).is_file():
+        yield Picture((out / PARETO).read_bytes(), "Plans that the search tried, and those that no other beats.")
+    yield Table("What images will be.", _VALUES, value_rows(design))
+    yield Paragraph(" ".join(f"{line}." for line in recording_lines(design)))
+    for image in design.images.values():
+        if image.budget:
+            counted = [one for one in image.budget if one.counts]
+            sizes = [one.stated or one.assumed or "" for one in counted]
+            effects = [(f"{one.effect.loss_db:.2f}", f"{100 * one.effect.shift_m:.2g}") for one in counted]
+            lines = [(one.cause, size, *effect) for one, size, effect in zip(counted, sizes, effects, strict=True)]
+            caption = (
+                f"Error budget of {image.name}, in the middle of the scene: {expected(image.budget).loss_db:.2f} dB."
+            )
+            yield Table(caption, ("cause", "size", "loss, dB", "shift, cm"), lines)
+            break
+    raised = [
+        (flag, name, line) for name, one in design.images.items() if one.looks for flag, line in one.flags.items()
+    ]
+    if raised:
+        yield Table("Limits crossed.", ("flag", "image", "found"), raised)
+
+
+# ---- Pictures -------------------------------------------------------------------------------------------------------
+
+
+def _draw_layers(path: Path, design: Design) -> None:
+    """Draw the layers of the first image that requirements are of, north-up."""
+    from matplotlib.colors import BoundaryNorm, ListedColormap
+
+    image, grid = design.judged[0], design.opened.scene.grid
+    pair = next(one for one in design.images.values() if one.looks is not None)
+    layers = {name: image.layers.get(name, pair.layers.get(name)) for name in _SHOWN}
+    found: dict[str, NDArray[Any]] = {name: values for name, values in layers.items() if values is not None}
+    found = {name: values for name, values in found.items() if np.isfinite(values.astype(np.float64)).any()}
+    west, south, east, north = grid.bounds_m
+    size = east - west, north - south
+    rows = -(-len(found) // 2)
+    high = 2.1 * min(1.6, max(0.45, size[1] / size[0]))
+    step = max(1, max(grid.shape) // _DOTS)
+    tags = {key: value for key, value in tags_of(design).items() if key != "APERTURA_PLAN"}
+    with sheet(path, 0.5 + rows * (high + 0.55), title=f"layers of {image.name}", tags=tags) as figure:
+        drawn = figure.subplots(rows, 2, squeeze=False)
+        for axes, (name, values) in zip(drawn.flat, found.items(), strict=False):
+            axes.grid(visible=False)
+            extent = (0, size[0], 0, size[1])
+            shown = np.ma.masked_invalid(values[::step, ::step].astype(np.float64))
+            if name == "mask":
+                colours = ListedColormap(["#dddddd", "#2d3773", "#e17814", "#96143c", "#ffffff"])
+                shown = np.ma.masked_invalid(np.where(shown == OUTSIDE, 4, shown))
+                norm = BoundaryNorm(np.arange(-0.5, 5), 5)
+                picture = axes.imshow(shown, extent=extent, cmap=colours, norm=norm, interpolation="nearest")
+                bar = figure.colorbar(picture, ax=axes, ticks=range(5), shrink=0.8)
+                bar.ax.set_yticklabels(["seen", "shadow", "layover", "both", "outside"])
+            else:
+                seen = np.ma.masked_where(image.layers["mask"][::step, ::step] == OUTSIDE, shown)
+                picture = axes.imshow(seen, extent=extent, cmap="viridis", interpolation="nearest")
+                figure.colorbar(picture, ax=axes, shrink=0.8).set_label(UNITS[name][0])
+            axes.set_title(name.replace("_", " "))
+        for axes in list(drawn.flat)[len(found) :]:
+            axes.set_axis_off()
+        for axes in drawn[-1]:
+            axes.set_xlabel("east, m")
+        for axes in drawn[:, 0]:
+            axes.set_ylabel("north, m")
+
+
+def draw_pareto(path: Path, tried: Sequence[Tried], design: Design) -> None:
+    """Draw the plans that a search tried over two requirements, those that no other beats, and the one taken."""
+    asked = [one.requirement for one in tried[0].verdicts if one.asked is not None]
+    names = [*asked, *(one.requirement for one in tried[0].verdicts if one.requirement not in asked)]
+    spread = {name: np.ptp([_found(one, name) for one in tried]) for name in names}
+    names = [name for name in names if np.isfinite(spread[name]) and spread[name] > 0] or names
+    across, up = (*names, *names)[:2]
+    limits = {one.requirement: one.asked for one in tried[0].verdicts}
+    tags = {key: value for key, value in tags_of(design).items() if key != "APERTURA_PLAN"}
+    with sheet(path, 4.2, title="plans tried", tags=tags) as figure:
+        axes = figure.add_subplot()
+        for front, colour, label in ((False, GREY, "tried"), (True, BLUE, "none is better in all that is required")):
+            some = [one for one in tried if one.on_front == front]
+            axes.plot(
+                *_at(some, across, up), "o", color=colour, markersize=5 if front else 3, linestyle="none", label=label
+            )
+        best = min(tried, key=lambda one: one.objective)
+        axes.plot(*_at([best], across, up), "*", color=RED, markersize=14, linestyle="none", label="taken")
+        if limits[across] is not None:
+            axes.axvline(float(limits[across] or 0), color=ORANGE, linestyle="--", label="required")
+        if limits[up] is not None:
+            axes.axhline(float(limits[up] or 0), color=ORANGE, linestyle="--")
+        axes.set_xlabel(across)
+        axes.set_ylabel(up)
+        axes.legend()
+
+
+def _found(one: Tried, name: str) -> float:
+    return next((verdict.found for verdict in one.verdicts if verdict.requirement == name), float("nan"))
+
+
+def _at(tried: Sequence[Tried], across: str, up: str) -> tuple[list[float], list[float]]:
+    return [_found(one, across) for one in tried], [_found(one, up) for one in tried]
+
+
+# ---- Planned and flown ----------------------------------------------------------------------------------------------
+
+
+def print_comparison(path: Path, folder: Path, *, threads: int = 1) -> None:
+    """Print planned and flown side by side: by the logs of the campaign, and by its images where there are any."""
+    from rich.console import Console
+
+    plan, campaign = read_flight_plan(path), Campaign.load(folder)
+    campaign.check_images()
+    rows = comparison_rows(plan, path.absolute().parent, campaign, threads=threads)
+    head = ("image", "quantity", "planned", "flown, by the logs", "measured in the image")
+    Console(width=max(120, Console().width)).print(_table("planned and flown", head, rows))
+
+
+def comparison_rows(plan: FlightPlan, root: Path, campaign: Campaign, *, threads: int = 1) -> list[tuple[str, ...]]:
+    """Return image, quantity, planned, flown and measured of every pair that both have, as text.
+
+    Parameters
+    ----------
+    plan, root
+        The plan, and its folder.
+    campaign
+        With logs and recordings.
+    threads
+        Tiles computed at once.
+
+    Raises
+    ------
+    CampaignError
+        If they have no flight and pair in common.
+    """
+    design = designed(plan, root, threads=threads)
+    scene = expected_scene(campaign, lambda: first_flight(campaign))
+    rows = list[tuple[str, ...]]()
+    for flight in campaign.image_flights:
+        for pair in flight.pairs:
+            planned = design.images.get(f"{flight.name}/{pair}")
+            if planned is None:
+                continue
+            opened = open_pair(campaign, flight.name, pair)
+            asked = {"sigma0_db": plan.expect.sigma0_db, "rcs_dbsm": plan.expect.rcs_dbsm}
+            flown = planned_image(campaign, opened, scene, **asked, threads=threads)
+            measured = _measured(campaign, flight.name, pair)
+            planned_pair = next(one for one in design.opened.pairs if (one.flight, one.name) == (flight.name, pair))
+            numbers = [_numbers(planned), _numbers(flown)]
+            pulses = [float(len(one.time_s)) for one in (planned_pair, opened)]
+            speeds = [_speed_m_s(one.aperture.middle_m, one.time_s) for one in (planned_pair, opened)]
+            numbers[0] |= {"pulses": pulses[0], "speed, m/s": speeds[0]}
+            numbers[1] |= {"pulses": pulses[1], "speed, m/s": speeds[1]}
+            for name, value in numbers[0].items():
+                said = measured.get(name)
+                texts = [f"{one:.4g}" for one in (value, numbers[1].get(name, float("nan")))]
+                rows.append((f"{flight.name}/{pair}", name, *texts, "" if said is None else f"{said:.4g}"))
+    if not rows:
+        raise CampaignError(
+            f"images {', '.join(design.images)}",
+            "the plan",
+            f"some of those of {campaign.root.name}",
+            "Name flights and nodes as in the campaign.",
+        )
+    return rows
+
+
+def _speed_m_s(place_m: NDArray[np.float64], time_s: NDArray[np.float64]) -> float:
+    return float(np.median(np.linalg.norm(np.diff(place_m, axis=0), axis=1) / np.diff(time_s)))
+
+
+def _numbers(image: PlannedImage) -> dict[str, float]:
+    """Return what a comparison shows of an image: medians over what is seen."""
+    seen = image.layers["mask"] == 0
+    numbers = {"coverage, %": 100 * float(seen.mean())}
+    for name in ("resolution", "resolution_fine", "looks", "incidence", "bistatic_angle", "nesz", "point_snr"):
+        values = image.layers[name][seen] if name in image.layers else np.empty(0)
+        values = values[np.isfinite(values)]
+        if values.size:
+            numbers[f"{name}, {UNITS[name][0]}"] = float(np.median(values))
+    return numbers | {"loss, dB": -expected(image.budget).loss_db}
+
+
+def _measured(campaign: Campaign, flight: str, pair: str) -> Mapping[str, float]:
+    """Return what a finished image says of itself; nothing before."""
+    from apertura.common.raster import opened_raster
+
+    if not (campaign.result(flight, pair, "image.json")).is_file():
+        return {}
+    report = read_report(campaign, flight, pair)
+    found: dict[str, float] = {}
+    if report["focus"].get("loss_db") is not None:
+        found["loss, dB"] = -float(report["focus"]["loss_db"])
+    for name in ("looks", "incidence", "bistatic_angle", "nesz"):
+        with opened_raster(
+            campaign.result(flight, pair, f"{name}.tif"), expected="a layer", remedy="Run again."
+        ) as raster:
+            values = raster.read(1, masked=True).compressed()
+        values = values[np.isfinite(values)]
+        if values.size:
+            found[f"{name}, {UNITS[name][0]}"] = float(np.median(values))
+    with opened_raster(campaign.result(flight, pair, "mask.tif"), expected="a layer", remedy="Run again.") as raster:
+        found["coverage, %"] = 100 * float((raster.read(1) == 0).mean())
+    return found

@@ -1,0 +1,209 @@
+"""A flight plan: what it says of resolution, noise and loss against closed forms, and one message for each bad plan."""
+
+import copy
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import apertura as ap
+from apertura.common.constants import BOLTZMANN_J_K, SPEED_OF_LIGHT_M_S
+from apertura.common.errors import CampaignError
+from apertura.pipeline.config.flight_plan import FlightPlan
+from apertura.pipeline.design import designed
+from apertura.pipeline.design.judgement import helpful_changes, judge, search
+from apertura.pipeline.opening.planned import open_plan
+
+HERE = Path()
+CARRIER, SPACING, COUNT = 1.3e9, 4e5, 512
+RECEIVER = {"full_scale_counts": 8192, "full_scale_dbm": 0.0, "gain_db": 40.0, "noise_figure_db": 5.0}
+
+
+def plan_of(**changes):
+    """Return a small plan of one node on a line past level ground, in a local frame; keys of it replaced."""
+    plan = {
+        "campaign": "meadow",
+        "waveform": {
+            "kind": "ofdm",
+            "subcarriers": COUNT,
+            "subcarrier_spacing_hz": SPACING,
+            "symbol_s": 2.5e-6,
+            "cyclic_prefix_s": 1e-6,
+            "carrier_hz": CARRIER,
+            "carrier_is": "band_centre",
+            "sample_rate_hz": 2.56e8,
+            "prf_hz": 100.0,
+        },
+        "nodes": {
+            "uav1": {
+                "transmit_power_dbm": 20.0,
+                "antennas": {"radar_tx_gain_dbi": 6.0, "radar_rx_gain_dbi": 3.0},
+                "receiver": RECEIVER,
+                "attitude": "log",
+            }
+        },
+        "scene": {"crs": "local", "bounds_m": [-5.0, 25.0, 5.0, 35.0], "spacing_m": 0.5, "atmosphere": "vacuum"},
+        "processing": {"window": "none", "integration": "all"},
+        "flights": {
+            "f01": {
+                "transmitter": "uav1",
+                "receivers": ["uav1"],
+                "tracks": {"uav1": line()},
+            }
+        },
+    }
+    return plan | changes
+
+
+def line(**changes):
+    way = {"kind": "line", "start_m": [-20.0, 0.0], "end_m": [20.0, 0.0], "height_m": 30.0, "speed_m_s": 5.0}
+    return way | changes
+
+
+def flown(plan, **tracks):
+    """Return a plan with other tracks in its flight."""
+    changed = copy.deepcopy(plan)
+    changed["flights"]["f01"]["tracks"] = tracks
+    return changed
+
+
+def with_second(shape="column", spacing_m=4.0, **flight):
+    """Return a plan of two nodes in formation, the second receiving alone."""
+    plan = plan_of()
+    plan["nodes"]["uav2"] = {"antennas": {"radar_rx_gain_dbi": 3.0}, "receiver": RECEIVER, "attitude": "log"}
+    formation = {"shape": shape, "leader": "uav1", "spacing_m": spacing_m}
+    plan["flights"]["f01"] |= {"receivers": ["uav1", "uav2"], "formation": formation, **flight}
+    return plan
+
+
+def in_the_middle(found, name, image=0):
+    return float(found[name].isel(image=image, y=found.sizes["y"] // 2, x=found.sizes["x"] // 2))
+
+
+def test_a_line_resolves_half_a_wavelength_over_the_sine_of_its_angle():
+    """λ/4 sin(Θ/2) across and c/2B sin θ along, of flat spectra: 0.886 of both."""
+    found = ap.design(flown(plan_of(), uav1=line(start_m=[-5.0, 0.0], end_m=[5.0, 0.0])))
+    x, y = (float(found[axis][found.sizes[axis] // 2]) for axis in "xy")
+    ends = [np.array([end - x, y, 30.0]) for end in (-5, 5)]
+    wavelength = SPEED_OF_LIGHT_M_S / CARRIER
+    spread = 2 * sum(abs(one[0]) / np.linalg.norm(one) for one in ends) / wavelength
+    across = 0.886 / spread
+    bandwidth = SPACING * COUNT
+    along = 0.886 * SPEED_OF_LIGHT_M_S / (2 * bandwidth) / (y / np.hypot(y, 30.0))
+    assert in_the_middle(found, "resolution_fine") == pytest.approx(across, rel=0.03)
+    assert in_the_middle(found, "resolution") == pytest.approx(along, rel=0.05)
+    assert abs(in_the_middle(found, "orientation")) == pytest.approx(90, abs=3)
+
+
+def test_a_circle_resolves_alike_in_every_direction():
+    """|p|² = J₀²(4π r sin θ/λ): half of it at 1.126, a full width of 2.252."""
+    circle = {"kind": "circle", "centre_m": [0.0, 30.0], "radius_m": 30.0, "height_m": 30.0, "speed_m_s": 3.0}
+    found = ap.design(flown(plan_of(), uav1=circle))
+    width = 2.252 * SPEED_OF_LIGHT_M_S / CARRIER / (4 * np.pi * np.sin(np.pi / 4))
+    for name in ("resolution", "resolution_fine"):
+        assert in_the_middle(found, name) == pytest.approx(width, rel=0.04)
+
+
+def test_noise_and_a_point_s_snr_are_those_of_the_radar_equation():
+    """SNR of M pulses of duration T: P G² λ² σ T M / ((4π)³ R⁴ kT₀F), R all but the same along a short track."""
+    found = ap.design(flown(plan_of(), uav1=line(start_m=[-1.0, 0.0], end_m=[1.0, 0.0])))
+    pulses = in_the_middle(found, "looks")
+    distance = np.sqrt(30.25**2 + 30**2)
+    power, gains, wavelength = 0.1, 10 ** (9 / 10), SPEED_OF_LIGHT_M_S / CARRIER
+    received = power * gains * wavelength**2 / ((4 * np.pi) ** 3 * distance**4)
+    noise = BOLTZMANN_J_K * 290 * 10**0.5 / 2.5e-6
+    snr_db = 10 * np.log10(received * pulses / noise)
+    assert in_the_middle(found, "point_snr") == pytest.approx(snr_db, abs=0.1)
+    assert in_the_middle(found, "snr") == pytest.approx(-15 - in_the_middle(found, "nesz"), abs=1e-4)
+
+
+def test_the_sum_of_two_pairs_resolves_finer_and_its_noise_is_their_mean():
+    found = ap.design(flown(with_second(spacing_m=8.0), uav1=line(start_m=[-3.0, 0.0], end_m=[3.0, 0.0])))
+    assert list(found.image.values) == ["f01/uav1-uav1", "f01/uav1-uav2", "f01/sum"]
+    assert in_the_middle(found, "resolution_fine", 2) < 0.9 * in_the_middle(found, "resolution_fine", 0)
+    linear = [10 ** (in_the_middle(found, "nesz", image) / 10) for image in range(3)]
+    assert linear[2] == pytest.approx((linear[0] + linear[1]) / 2, rel=1e-3)
+
+
+def test_positions_known_worse_cost_more_and_the_cause_is_named():
+    plan = plan_of(require={"loss_db": 0.5})
+    plan["nodes"]["uav1"]["position_std_m"] = 0.02
+    (verdict,) = judge(designed(FlightPlan.model_validate(plan), HERE))
+    assert not verdict.met
+    assert verdict.cause.startswith("positions: 2 2 2 cm")
+
+
+@pytest.mark.slow
+def test_the_changes_that_help_most_come_first(tmp_path):
+    changes = helpful_changes(FlightPlan.model_validate(plan_of(require={"nesz_db": -60.0})), tmp_path)
+    assert changes[0].gain_db >= changes[-1].gain_db > 0
+    gains = {change.words: change.gain_db for change in changes}
+    assert gains["3 dB more power"] == pytest.approx(3, abs=0.01)
+    assert gains["twice the pulse rate"] == pytest.approx(3.01, abs=0.05)
+
+
+@pytest.mark.slow
+def test_a_search_finds_the_same_again_and_what_it_finds_is_better(tmp_path):
+    plan = FlightPlan.model_validate(plan_of(require={"resolution_m": 0.8}, bounds={"height_m": [-20, 20]}))
+    found, tried = search(plan, tmp_path, ["height"], most=5)
+    again, _ = search(plan, tmp_path, ["height"], most=5)
+    assert found == again
+    assert found.moved.height_m < 0  # a flatter look resolves the ground better
+    assert any(one.on_front for one in tried)
+
+
+def test_recordings_are_as_large_as_their_captures():
+    recording = ap.design(with_second()).attrs["recording"]
+    capture = round(3.5e-6 * 2.56e8) * 4
+    assert recording["node_bytes_s"]["f01"] == {"uav1": 100 * capture, "uav2": 200 * capture}
+    assert recording["recorded_bytes"] == recording["pulses"]["f01"] * 3 * capture
+
+
+def test_turns_between_legs_are_flown_and_not_imaged():
+    racetrack = line(kind="racetrack", legs=3, spacing_m=5.0)
+    opened = open_plan(FlightPlan.model_validate(flown(plan_of(), uav1=racetrack)), HERE)
+    course = opened.courses["f01"]["uav1"]
+    assert len(course.imaged_s) == 3
+    assert len(opened.pairs[0].time_s) == 3 * 801
+    assert course.length_s > 3 * 8.0 + 2.0
+    legs = np.unique(opened.pairs[0].aperture.tx_m[:, 1].round(2))
+    assert legs.tolist() == [-10.0, -5.0, 0.0]
+
+
+def test_tracks_are_moved_about_the_middle_of_the_scene():
+    moved = {"height_m": 5.0, "offset_m": 10.0, "heading_deg": 90.0}
+    opened = open_plan(FlightPlan.model_validate(plan_of(moved=moved)), HERE)
+    place = opened.pairs[0].aperture.tx_m
+    # Pushed 10 m south to 40 m from the middle (0, 30), then turned clockwise: west of it, flying north to south.
+    assert place[:, 0] == pytest.approx(-40.0)
+    assert place[[0, -1], 1] == pytest.approx([50.0, 10.0])
+    assert place[:, 2] == pytest.approx(35.0)
+
+
+BAD = {
+    "through the ground": (flown(plan_of(), uav1=line(height_m=-2.0)), "in or below the ground"),
+    "too few pulses": (
+        plan_of(
+            waveform=plan_of()["waveform"] | {"prf_hz": 8.0},
+            scene=plan_of()["scene"] | {"bounds_m": [-25.0, 5.0, 25.0, 55.0]},
+        ),
+        "spread of Doppler over the scene, instead of 8 Hz",
+    ),
+    "colliding formation": (with_second(spacing_m=1.0), "come within 1.00 m at"),
+    "nobody flies": (with_second(formation=None), "uav2 has no track, and there is no formation"),
+    "a hover": (flown(plan_of(), uav1=line(end_m=[-20.0, 0.0])), "a hover makes no image"),
+    "unknown key": (plan_of(requires={"nesz_db": -20}), "requires: unknown key (did you mean 'require'?)"),
+    "beyond the prefix": (
+        plan_of(waveform=plan_of()["waveform"] | {"cyclic_prefix_s": 1e-7}),
+        "zero pulses see the scene",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_a_bad_plan_is_refused_by_one_message(case):
+    plan, words = BAD[case]
+    with pytest.raises(CampaignError) as caught:
+        ap.design(plan)
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,147 @@
+"""From a ground station's mission to a decision: `apertura design`, `init --from` and `compare` as people type them."""
+
+import json
+import sys
+
+import numpy as np
+import pytest
+import rasterio
+import yaml
+from folders import run_steps
+
+from apertura.common.documents import read_json
+from apertura.core.quality.point_targets import cut_through, find_peak
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.config.flight_plan import FlightPlan
+from apertura.pipeline.design import designed
+from apertura.pipeline.design.rehearsal import rehearse
+from apertura.pipeline.opening.scene import open_scene
+from apertura.pipeline.store import open_stage
+from apertura.simulation.scene import PointTarget
+from apertura.views import cli
+
+EAST, NORTH = 570661.0, 5363707.0
+PLAN = {
+    "campaign": "dike",
+    "waveform": {
+        "kind": "ofdm",
+        "subcarriers": 256,
+        "subcarrier_spacing_hz": 4e5,
+        "symbol_s": 2.5e-6,
+        "cyclic_prefix_s": 6e-7,
+        "carrier_hz": 1.3e9,
+        "sample_rate_hz": 1.28e8,
+        "prf_hz": 16.0,
+    },
+    "nodes": {
+        "uav1": {
+            "transmit_power_dbm": 10.0,
+            "antennas": {"radar_tx_gain_dbi": 6.0, "radar_rx_gain_dbi": 6.0},
+            "receiver": {"full_scale_counts": 8192, "full_scale_dbm": 0.0, "gain_db": 30.0, "noise_figure_db": 6.0},
+            "attitude": "log",
+        }
+    },
+    "scene": {
+        "crs": "EPSG:32632",
+        "bounds_m": [EAST - 5, NORTH - 5, EAST + 5, NORTH + 5],
+        "spacing_m": 0.125,
+        "height_m": 500.0,
+    },
+    "processing": {"autofocus": "off"},
+    "flights": {
+        "f01": {
+            "transmitter": "uav1",
+            "receivers": ["uav1"],
+            "tracks": {"uav1": {"kind": "mission", "file": "dike.plan", "speed_m_s": 1.0}},
+        }
+    },
+    "require": {"coverage": 0.95},
+}
+LINE = {
+    "kind": "line",
+    "start_m": [EAST - 8, NORTH - 30],
+    "end_m": [EAST + 8, NORTH - 30],
+    "height_m": 30.0,
+    "speed_m_s": 1.0,
+}
+# 30 m south of the scene, from west to east.
+WAYPOINTS = ((48.42228, 9.95497), (48.42228, 9.95519))
+
+
+@pytest.fixture
+def folder(tmp_path):
+    items = [
+        {"type": "SimpleItem", "command": 16, "frame": 3, "params": [0, 0, 0, None, *place, 30]} for place in WAYPOINTS
+    ]
+    mission = {"vehicleType": 2, "hoverSpeed": 5, "plannedHomePosition": [*WAYPOINTS[0], 0], "items": items}
+    (tmp_path / "dike.plan").write_text(json.dumps({"fileType": "Plan", "mission": mission}))
+    (tmp_path / "plan.yaml").write_text(yaml.safe_dump(PLAN))
+    return tmp_path
+
+
+def typed(monkeypatch, capsys, *words):
+    monkeypatch.setattr(sys, "argv", ["apertura", *map(str, words)])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    said = capsys.readouterr()
+    return ended.value.code or 0, said.out, said.err
+
+
+@pytest.mark.slow
+def test_a_mission_becomes_a_report_layers_and_the_campaign_s_config(folder, monkeypatch, capsys):
+    status, out, err = typed(monkeypatch, capsys, "design", folder / "plan.yaml", folder / "out")
+    assert (status, err) == (0, "")
+    assert "coverage" in out
+    page = (folder / "out" / "design.html").read_text()
+    assert page.count("data:image/png") == 2
+    assert "All that is required is met." in page
+    with rasterio.open(folder / "out/f01/uav1-uav1/nesz.tif") as raster:
+        assert raster.shape == (80, 80)
+        assert raster.tags()["APERTURA_PLANNED"] == "true"
+        assert np.isfinite(raster.read(1)).all()
+    assert len(json.loads((folder / "out/tracks.geojson").read_text())["features"]) == 2
+    assert "LineString" in (folder / "out/tracks.kml").read_text()
+    status, _, err = typed(monkeypatch, capsys, "init", folder / "campaign", "--from", folder / "plan.yaml")
+    assert (status, err) == (0, "")
+    campaign = Campaign.load(folder / "campaign")
+    assert campaign.flights[0].pairs == ("uav1-uav1",)
+    assert campaign.settings.scene.spacing_m == 0.125
+
+
+def test_what_a_plan_lacks_is_one_message(folder, monkeypatch, capsys):
+    (folder / "dike.plan").unlink()
+    status, out, err = typed(monkeypatch, capsys, "design", folder / "plan.yaml")
+    assert (status, out) == (2, "")
+    assert err.count("\n") == 1
+    assert "dike.plan: no such file" in err
+
+
+def test_an_unknown_word_of_optimise_is_one_message(folder, monkeypatch, capsys):
+    status, _, err = typed(monkeypatch, capsys, "design", folder / "plan.yaml", "--optimise", "speed")
+    assert status == 2
+    assert "expected some of height,offset,spacing,heading" in err
+
+
+@pytest.mark.slow
+def test_what_was_predicted_is_measured_after_the_same_plan_was_sampled_and_processed(tmp_path, monkeypatch, capsys):
+    """Widths within 5 %, NESZ and SNR within 1 dB: 256 pulses measure their noise to 0.4 dB."""
+    document = PLAN | {"flights": {"f01": PLAN["flights"]["f01"] | {"tracks": {"uav1": LINE}}}}
+    design = designed(FlightPlan.model_validate(document), tmp_path)
+    campaign = run_steps(rehearse(design.opened, [PointTarget((0.0, 0.0, 0.0))], tmp_path / "flown"), exports=False)
+    planned, grid = design.images["f01/uav1-uav1"].layers, open_scene(campaign).grid
+    pixels = open_stage(campaign.stage("image", "f01", "uav1-uav1"), "image").image.values
+    peak = find_peak(pixels, 40, 40)
+    for direction, name in (((1, 0), "resolution_fine"), ((0, 1), "resolution")):
+        cut = cut_through(pixels, peak, direction=direction, spacing_m=grid.spacing_m, reach_m=3.8)
+        assert cut.width_m == pytest.approx(planned[name][40, 40], rel=0.05)
+    (tmp_path / "plan.yaml").write_text(yaml.safe_dump(document))
+    status, out, err = typed(monkeypatch, capsys, "compare", tmp_path / "plan.yaml", tmp_path / "flown")
+    assert (status, err) == (0, "")
+    assert "measured in the image" in out
+    from apertura.pipeline.steps.layers import layers
+
+    layers(campaign, "f01", "uav1-uav1")
+    with rasterio.open(campaign.result("f01", "uav1-uav1", "nesz.tif")) as raster:
+        assert raster.read(1)[40, 40] == pytest.approx(planned["nesz"][40, 40], abs=1.0)
+    (point,) = read_json(campaign.result("f01", "uav1-uav1", "radiometry.json"), expected="", remedy="")["points"][:1]
+    assert point["rcs_dbsm"] == pytest.approx(0.0, abs=1.0)
