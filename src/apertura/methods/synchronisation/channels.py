@@ -167,7 +167,7 @@ def measure_channel(name: str, blocks: Iterable[Samples], numerology: Numerology
     for block in blocks:
         if integers := block.dtype.kind == "i":
             ones |= int(np.bitwise_or.reduce(block, axis=None))
-            zeros |= int(np.bitwise_or.reduce(~block, axis=None))
+            zeros |= ~int(np.bitwise_and.reduce(block, axis=None))
         samples = np.ascontiguousarray(block[:, window], np.float32).view(np.complex64)[..., 0].astype(np.complex128)
         level = samples.mean(axis=1)
         captures += len(samples)

@@ -404,8 +404,8 @@ def _hypotheses(
 
 def _regained(focus: Mapping[str, Any], gain_db: float) -> bool:
     """Return whether a cause named for other images of the flight brings back what this one lost, beyond chance."""
-    lost_db = -focus.get("loss_db", 0.0)
-    beyond = max(UNEXPECTED_DB, _REGAINED_SIGMAS * focus.get("std_db", 0.0))
+    lost_db = -float(focus.get("loss_db", 0.0))
+    beyond = max(UNEXPECTED_DB, _REGAINED_SIGMAS * float(focus.get("std_db", 0.0)))
     return lost_db > beyond and gain_db > max(beyond, LEAST_SHARE * lost_db)
 
 
