@@ -1,6 +1,7 @@
 """Noise of a pulse: measured at Doppler frequencies that no echo of the scene has, and what a sidelink adds to it."""
 
 from dataclasses import replace
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -9,14 +10,14 @@ from numpy.typing import NDArray
 from apertura.core.antenna.beam import Beams
 from apertura.core.antenna.illumination import illumination_mask
 from apertura.core.echo.sidelink import METHODS
-from apertura.core.focus.contributions import band_limited_terms
+from apertura.core.focus.contributions import Echoes
 from apertura.core.focus.inputs import PhaseHistory, Profiles
 from apertura.core.focus.reach import PULSES
 from apertura.core.imaging.range_profiles import range_compress
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import Terrain
 
-_PLACES, _BLOCKS = 64, 32
+_PLACES, _BLOCKS = 64, 8
 """Random places, and blocks of 64 pulses at most, that the noise is measured at."""
 
 _MARGIN, _BAND = 2.0, (0.25, 0.4375)
@@ -25,8 +26,8 @@ _MARGIN, _BAND = 2.0, (0.25, 0.4375)
 _LEAK = 1e-5
 """Share of a taper's energy within that band, at most."""
 
-_DRAWN = 128  # pulses on which the noise of a sidelink is drawn, or up to twice as many
-_ALIKE, _BLOCKS_DRAWN = 8, 16  # of them that see a place alike; blocks drawn of each
+_GROUPS, _ALIKE = 16, 8  # of pulses on which the noise of a sidelink is drawn: those of a group see a place alike
+_BLOCKS_DRAWN = 16  # of each
 _FEWEST = 16  # pulses of a block at least
 _LEAST_WEIGHT = 0.1  # of the largest weight of a block at a place: places with less are left out
 
@@ -83,12 +84,12 @@ def noise_power(
     power, weight = list[NDArray[np.float64]](), list[NDArray[np.float64]]()
     for first in chosen.tolist():
         block = slice(first, min(first + PULSES, len(profiles)))
-        some, number = profiles[block], _numbers(block, time_s)
-        spread, _ = some.aperture.phase_rates(places_m, wavelength_m=profiles.wavelength_m)
-        tapers = _tapers(number, float(np.clip(_MARGIN * spread, *_BAND)))
-        terms = band_limited_terms(some, places_m, beams=beams and beams[block])
-        seen = np.ones(terms.shape) if beams is None else beams[block].weight(some.aperture, places_m)
-        power.extend(np.abs(tapers @ terms) ** 2)
+        aperture, number = profiles.aperture[block], _numbers(block, time_s)
+        spread, _ = aperture.phase_rates(places_m, wavelength_m=profiles.wavelength_m)
+        tapers = _tapers(tuple(number.tolist()), round(float(np.clip(_MARGIN * spread, *_BAND)), 2))
+        terms, _ = Echoes.read(profiles, [block]).at(places_m)
+        seen = np.ones(terms.shape) if beams is None else beams[block].weight(aperture, places_m)
+        power.extend(np.abs(tapers @ (seen * terms)) ** 2)
         weight.extend(tapers**2 @ seen**2)
     powers, weights = np.array(power), np.array(weight)
     enough = weights > _LEAST_WEIGHT * weights.max()
@@ -109,7 +110,8 @@ def _numbers(block: slice, time_s: NDArray[np.float64] | None) -> NDArray[np.flo
     return np.cumsum(np.concatenate([[0.0], np.maximum(1.0, np.rint(step_s / max(float(np.median(step_s)), 1e-9)))]))
 
 
-def _tapers(number: NDArray[np.float64], band: float) -> NDArray[np.float64]:
+@lru_cache(maxsize=8)
+def _tapers(number: tuple[float, ...], band: float) -> NDArray[np.float64]:
     """Return tapers over pulses, (taper, pulse) float64 of norm 1, that see next to nothing of |f| < band per pulse.
 
     At least one, the best.
@@ -148,8 +150,15 @@ def sidelink_noise(
     Source: docs/theory/radiometry.md, eq. 8a. Noise is drawn and goes through the correction itself, so that what each
     method keeps, and where, is its own.
     """
-    some_pulses, generator = history.aperture.sample(_DRAWN), np.random.default_rng(0)
-    some = history[some_pulses]
+    starts = np.unique(np.linspace(0, max(0, len(history) - _ALIKE), _GROUPS).astype(int)).tolist()
+    groups, generator = [slice(first, min(first + _ALIKE, len(history))) for first in starts], np.random.default_rng(0)
+    pulses = np.concatenate([np.arange(one.start, one.stop) for one in groups])
+    some = replace(
+        history,
+        transfer=np.concatenate([history.transfer[one] for one in groups]),
+        reference_delay_s=history.reference_delay_s[pulses],
+        aperture=history.aperture[pulses],
+    )
     draws = generator.standard_normal((*some.transfer.shape, 2)) @ np.array([1, 1j])
     noisy = 1 + draws * 10 ** (-snr_db / 20) / np.sqrt(2)
     left = METHODS[method](np.ones(noisy.shape, np.complex64), noisy.astype(np.complex64))
@@ -159,9 +168,8 @@ def sidelink_noise(
     profiles = range_compress(replace(some, transfer=some.transfer * left), grid, terrain)
     at = np.rint((some.aperture.path(places_m) - profiles.start_m[:, None]) / profiles.step_m).astype(np.int64)
     power = np.abs(np.take_along_axis(profiles.samples, np.clip(at, 0, profiles.samples.shape[1] - 1), axis=1)) ** 2
-    weight = np.ones(power.shape) if beams is None else beams[some_pulses].weight(some.aperture, places_m) ** 2
-    parts = max(1, len(power) // _ALIKE)
-    local, seen = (np.array([part.mean(axis=0) for part in np.array_split(of, parts)]) for of in (power, weight))
+    weight = np.ones(power.shape) if beams is None else beams[pulses].weight(some.aperture, places_m) ** 2
+    local, seen = (np.array([part.mean(axis=0) for part in np.array_split(of, len(groups))]) for of in (power, weight))
     if not seen.any():
         return 0.0
     local = local[seen > _LEAST_WEIGHT * seen.max()]

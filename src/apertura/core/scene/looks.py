@@ -16,7 +16,7 @@ from apertura.core.antenna.illumination import illumination_mask
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.swath import balls
-from apertura.core.scene.terrain import Terrain
+from apertura.core.scene.terrain import FlatGround, Terrain
 
 # ---- Lattice of nodes over a raster, and interpolation between them
 
@@ -338,9 +338,52 @@ class Looks:
 
     def centre(self, tile: Window) -> tuple[Floats, Floats]:
         """Return transmitter and receiver at each pixel's closest approach, (row, column, 3) float64 metres each."""
-        limit_m = _JUMP_PITCHES * self.lattice.pitch_px * self.grid.spacing_m
-        centre = self.lattice.between(self.centres, tile, farthest=limit_m)
+        centre = self.lattice.between(self.centres, tile, farthest=self._jump_m)
         return centre[..., 0, :], centre[..., 1, :]
+
+    @property
+    def _jump_m(self) -> float:
+        return _JUMP_PITCHES * self.lattice.pitch_px * self.grid.spacing_m
+
+    def incidence_deg(self, tile: Window) -> Floats:
+        """Return the angle from the ground's normal to the transmitter at closest approach, (row, column) degrees.
+
+        Over level ground bilinear between nodes (docs/theory/layers.md, section 4).
+        """
+        if self._smooth(tile):
+            return self.lattice.between(self._angles_deg[0], tile)
+        from apertura.core.scene.visibility import incidence_deg, surface  # slow to import: it brings a compiler
+
+        return incidence_deg(*surface(self.grid, self.terrain, tile), self.centre(tile)[0])
+
+    def bistatic_angle_deg(self, tile: Window) -> Floats:
+        """Return the angle between both antennas at closest approach, (row, column) degrees; as `incidence_deg`."""
+        if self._smooth(tile):
+            return self.lattice.between(self._angles_deg[1], tile)
+        from apertura.core.scene.visibility import bistatic_angle_deg
+
+        return bistatic_angle_deg(self.terrain.positions(self.grid[tile]), *self.centre(tile))
+
+    @cached_property
+    def _angles_deg(self) -> tuple[Floats, Floats]:
+        """(node row, node column), over level ground."""
+        from apertura.core.scene.visibility import bistatic_angle_deg, incidence_deg
+
+        row, column = np.meshgrid(*self.lattice.nodes, indexing="ij")
+        height_m = self.terrain.heights_at(self.grid, row, column)
+        place_m, above_m = (self.grid.positions_at(row, column, height_m + more) for more in (0.0, 1.0))
+        tx_m, rx_m = np.moveaxis(self.centres, 2, 0)
+        return incidence_deg(place_m, above_m - place_m, tx_m), bistatic_angle_deg(place_m, tx_m, rx_m)
+
+    def _smooth(self, tile: Window) -> bool:
+        """Return whether angles are those between nodes: level ground, nodes that its range is many of, no jump."""
+        if not isinstance(self.terrain, FlatGround) or self.lattice.pitch_px == PITCHES_PX[-1]:
+            return False
+        near = tuple(
+            slice(int(before[0]), int(after[-1]) + 1) for before, after, _ in map(_cells, self.lattice.nodes, tile)
+        )
+        steps = (np.linalg.norm(np.diff(self.centres[near], axis=axis), axis=-1) for axis in (0, 1))
+        return all((step <= self._jump_m).all() for step in steps)
 
 
 def pulses_of(reaching: NDArray[np.bool_], pulses: int) -> slice:

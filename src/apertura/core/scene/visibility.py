@@ -10,7 +10,7 @@ from apertura.common.arrays import Floats
 from apertura.common.contracts import Window
 from apertura.core.geometry.geodesy import LOCAL
 from apertura.core.scene.grid import SceneGrid
-from apertura.core.scene.terrain import Terrain
+from apertura.core.scene.terrain import FlatGround, Terrain
 
 # ---- Shadow and layover along lines of sight
 #
@@ -235,6 +235,9 @@ def surface(grid: SceneGrid, terrain: Terrain, window: Window) -> tuple[Floats, 
     tuple of ndarray
         (row, column, 3) float64 each: metres in the grid's processing frame; normals upward.
     """
+    if isinstance(terrain, FlatGround):
+        position = terrain.positions(grid[window])
+        return position, _unit(grid[window].positions(terrain.height_m + 1.0) - position)
     around = [
         np.arange(max(0, part.start - 1), max(2, min(size, part.stop + 1)))
         for part, size in zip(window, grid.shape, strict=True)
@@ -283,8 +286,12 @@ def bistatic_angle_deg(position: Floats, tx: Floats, rx: Floats) -> Floats:
 
 
 def _angle(one: Floats, other: Floats) -> Floats:
-    across = np.linalg.norm(np.cross(one, other), axis=-1)
-    return np.asarray(np.arctan2(across, (one * other).sum(-1)))
+    apart = _unit(one) - _unit(other)  # of small angles the arc is exact, where the cosine is not
+    return np.asarray(2 * np.arcsin(np.minimum(1.0, np.sqrt(np.einsum("...i,...i", apart, apart)) / 2)))
+
+
+def _unit(vector: Floats) -> Floats:
+    return np.asarray(vector / np.sqrt(np.einsum("...i,...i", vector, vector))[..., None])
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from apertura.core.imaging.range_profiles import profiles_of
 from apertura.core.imaging.speckle import Multilook
 from apertura.core.scene.looks import BLOCK_PX, Looks
 from apertura.core.scene.terrain import FlatGround
-from apertura.core.scene.visibility import Relief, bistatic_angle_deg, incidence_deg, surface, visibility
+from apertura.core.scene.visibility import Relief, surface, visibility
 from apertura.formats.export import product, remove_outdated, write_exports
 from apertura.formats.export.layers import OUTSIDE
 from apertura.formats.export.radiometry import CROSS_SECTIONS, ECHO, of_coefficient
@@ -215,12 +215,8 @@ def layer_rasters(
     grid, terrain = scene.grid, scene.terrain
     level = isinstance(terrain, FlatGround)
 
-    def incidence(window: Window) -> NDArray[np.float64]:
-        return _inside(looks, window, incidence_deg(*surface(grid, terrain, window), looks.centre(window)[0]))
-
-    def bistatic_angle(window: Window) -> NDArray[np.float64]:
-        angle_deg = bistatic_angle_deg(terrain.positions(grid[window]), *looks.centre(window))
-        return _inside(looks, window, angle_deg)
+    def angle(of: Callable[[Window], Floats], window: Window) -> Floats:
+        return _inside(looks, window, of(window))
 
     def nesz(window: Window) -> NDArray[np.float64]:
         if calibrated is not None:
@@ -231,8 +227,8 @@ def layer_rasters(
         return 10 * np.log10((noise or np.nan) / np.where(effective > 0, effective, np.nan))
 
     return {
-        "incidence": LazyLayer(grid, np.float32, incidence, threads),
-        "bistatic_angle": LazyLayer(grid, np.float32, bistatic_angle, threads),
+        "incidence": LazyLayer(grid, np.float32, partial(angle, looks.incidence_deg), threads),
+        "bistatic_angle": LazyLayer(grid, np.float32, partial(angle, looks.bistatic_angle_deg), threads),
         "mask": LazyLayer(grid, np.uint8, _mask(scene, looks), threads),
         "looks": LazyLayer(grid, np.float32, looks.effective, threads),
         "nesz": LazyLayer(grid, np.float32, nesz, threads),
