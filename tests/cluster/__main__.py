@@ -1,4 +1,4 @@
-"""A campaign of two flights on a real Slurm of two nodes: one job cancelled, one node drained, one killed.
+"""A campaign on a real Slurm of two nodes: one job cancelled, one node drained, one killed.
 
     python -m tests.cluster [FOLDER]
 
@@ -9,6 +9,7 @@ where the run fails, a marker fires or the bytes differ.
 """
 
 import importlib.util
+import os
 import shutil
 import signal
 import subprocess
@@ -37,7 +38,8 @@ def main() -> None:
         print(f"no cluster test: {reason}")
         return
     for number in (signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, lambda one, _: sys.exit(128 + one))  # daemons are ended on the way out
+        signal.signal(number, lambda one, _: sys.exit(128 + one))  # the scratch folder is removed on the way out
+    began = time.perf_counter()
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(sys.argv[1] if sys.argv[1:] else scratch)
         campaign = simulated(folder)
@@ -46,6 +48,10 @@ def main() -> None:
         with slurm.running(folder / "slurm"), planted.fires() as fired:
             made = products(disturbed(planted.root, folder))
         report(folder / "slurm" / "jobs.log")
+    took_s = time.perf_counter() - began
+    busy = 100 * sum(os.times()[:4]) / took_s / (os.cpu_count() or 1)
+    load = os.getloadavg()[2]
+    print(f"{took_s:.0f} s in all; {busy:.0f} % of the machine taken beside Slurm's jobs, load {load:.1f}")
     if fired:
         sys.exit(f"{len(fired)} markers in the campaign folder fired: {', '.join(fired[:5])}")
     print(f"{len(planted.watched)} markers in the campaign folder, none fired", flush=True)
@@ -56,12 +62,11 @@ def main() -> None:
 
 
 def simulated(folder: Path) -> Path:
-    """Two flights whose images take a while: by the double sum, in many tiles."""
+    """A flight whose images take a while: by the double sum, in many tiles."""
     from apertura.simulation import ImageGrid, preset, simulate
 
     plan = replace(preset("demo", pulses=60), scene=ImageGrid("EPSG:32632", half_width_m=6.0, spacing_m=0.03))
-    (flight,) = plan.flights
-    root = simulate(folder / "campaign", replace(plan, flights=(flight, replace(flight, name="f02"))), seed=3)
+    root = simulate(folder / "campaign", plan, seed=3)
     config = root / "config" / "config.yaml"
     choices = {"processing": {"tile_px": 32, "engine": "reference"}}
     config.write_text(config.read_text(encoding="utf-8") + yaml.safe_dump(choices), encoding="utf-8")

@@ -55,20 +55,45 @@ def running(root: Path) -> Iterator[None]:
         template = template.replace(f"@{name}@", value)
     CONF.parent.mkdir(exist_ok=True)
     CONF.write_text(template, encoding="utf-8")
-    try:
+
+    def end() -> None:
+        for node in NODES:
+            with suppress(subprocess.CalledProcessError):  # its controller may have ended
+                kill(root, node)
+        _end(root / "slurmctld.pid", signal.SIGTERM)
+        if munged:
+            _end(Path("/run/munge/munged.pid"), signal.SIGTERM)
+        CONF.unlink(missing_ok=True)
+
+    with _at_the_end(end):
         said("slurmctld", "-i")
         for node in NODES:
             start(node)
         wait_for("both nodes idle", lambda: all(state(node) == "idle" for node in NODES))
         yield
+
+
+@contextmanager
+def _at_the_end(end: Callable[[], None]) -> Iterator[None]:
+    """Have a process of its own `end` what was started, when the body or this process is gone, however that is."""
+    held, ours = os.pipe()  # which only this process writes to: programs that it starts inherit no pipe
+    keeper = os.fork()
+    if not keeper:
+        try:
+            os.setsid()  # out of reach of Ctrl-C and of `make`
+            for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+                signal.signal(number, signal.SIG_IGN)
+            os.close(ours)
+            os.read(held, 1)
+            end()
+        finally:
+            os._exit(0)
+    os.close(held)
+    try:
+        yield
     finally:
-        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
-            signal.signal(number, signal.SIG_IGN)  # a second one, as `make` sends it, leaves no daemon behind
-        for name in (*(f"slurmd.{node}" for node in NODES), "slurmctld"):
-            _end(root / f"{name}.pid", signal.SIGTERM)
-        if munged:
-            _end(Path("/run/munge/munged.pid"), signal.SIGTERM)
-        CONF.unlink(missing_ok=True)
+        os.close(ours)
+        os.waitpid(keeper, 0)
 
 
 def _munge() -> bool:

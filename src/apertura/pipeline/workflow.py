@@ -35,7 +35,7 @@ Show = Literal["errors", "steps", "snakemake"]
 _GRACE_S = 3.0
 _LOOK_S, _REST = 0.2, 20  # looking at 10^5 jobs takes time: at most a twentieth of one core
 _COUNTERS = Path("/proc/vmstat")
-_ELSEWHERE = ("memory",)
+_ELSEWHERE = ("memory", "plan")
 """Checks of this machine, of no use where steps run on others."""
 _HOLDS_CODE = ("--profile", "--workflow-profile", "--configfiles", "--snakefile", "--jobscript", "--js")
 """Options of snakemake that name files which it takes code from; it knows them by their beginnings, too."""

@@ -70,7 +70,8 @@ def cluster_tiles(
             yield numbers[future.key], tile
 
 
-def _connected(scheduler: str) -> Any:
+def check_named(scheduler: str) -> None:
+    """Raise CampaignError unless whoever runs this names the scheduler at an address, too."""
     named = os.environ.get(NAMED_BY)
     if named != scheduler:
         raise CampaignError(
@@ -79,6 +80,10 @@ def _connected(scheduler: str) -> Any:
             expected="the scheduler that whoever runs this names: it may send code",
             remedy=f"If it is yours, run `export {NAMED_BY}={scheduler}`; else set {KEY} to threads.",
         )
+
+
+def _connected(scheduler: str) -> Any:
+    check_named(scheduler)
     try:
         from distributed import Client
     except ImportError as error:

@@ -324,7 +324,8 @@ class Aperture:
         some = self.sample(64 if weigh is None else 1024)
         slope = self[some].path_gradient(point_m) @ axes.T
         if weigh is not None:
-            slope = slope[weigh(some, point_m[None])[:, 0] >= 0.5]
+            counted = weigh(some, point_m[None])[:, 0] >= 0.5
+            slope = slope[counted] if counted.any() else slope  # a place beside all sectors: as if every pulse saw it
         cycles = slope[:, None] * (frequency_hz / SPEED_OF_LIGHT_M_S)[None, :, None]
         return np.asarray(np.cov(cycles.reshape(-1, len(axes)), rowvar=False, bias=True))
 

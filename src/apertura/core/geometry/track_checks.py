@@ -409,7 +409,7 @@ def _holes(
     shortest_s = min(LONG_GAP * interval_s, longest_gap_s)
     for number in np.flatnonzero((lengths > shortest_s) | (np.diff(sound) > 1)):
         inside = set(cause[sound[number] + 1 : sound[number + 1]].tolist())
-        poor, missing = "fix_poor" in inside, round(float(lengths[number]) / interval_s) - 1
+        poor, missing = "fix_poor" in inside, max(1, round(float(lengths[number]) / interval_s) - 1)
         if not poor and lengths[number] <= shortest_s:
             continue
         error_m = _gap_error_m(time, place, missing)

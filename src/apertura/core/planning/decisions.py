@@ -161,6 +161,7 @@ MOST_ASPECT = 1.5
 """Aspect angle of a place over the integration angle above which `integration_turns` is raised: the track turns."""
 
 _PULSES = 256  # sampled for the geometry
+_FEWEST = 3  # pulses of the place that takes most: of two there is no focus to be judged
 _COUNTED = 16384  # pulses sampled to count those of a pixel
 
 
@@ -247,12 +248,13 @@ def _integration_of(
     """Return the integration by a sector, with its pulses per place, resolution and flags."""
     points = points_m.reshape(-1, 3)
     total, pulses = _pulses_per_place(sector, aperture, points)
-    if not pulses.any():
+    if pulses.max() < _FEWEST:
+        seen = "zero" if not pulses.any() else f"no more than {pulses.max():.0f}"
         raise CampaignError(
-            f"zero pulses see the scene inside the integration angle (s = {sector.centre:.3g} ± {sector.half:.3g})",
+            f"{seen} pulses see the scene inside the integration angle (s = {sector.centre:.3g} ± {sector.half:.3g})",
             where=f"{where}.integration",
-            expected="a scene that the flight passes, or antennas that look at it",
-            remedy="Set processing.integration to all, or correct scene.bounds_m.",
+            expected="a scene that the flight passes, or antennas that look at it, and an angle that spans an aperture",
+            remedy="Set processing.integration to all or to more, or correct scene.bounds_m.",
         )
     degrees = float(np.degrees(2 * np.arcsin(min(1.0, sector.half))))
     least, median, most = (round(float(np.quantile(pulses, part))) for part in (0, 0.5, 1))

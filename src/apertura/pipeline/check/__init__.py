@@ -42,7 +42,7 @@ CHECKS: Mapping[str, str] = {
     "codes": "apertura.pipeline.check.recordings:check_codes",
     "recordings": "apertura.pipeline.check.recordings:check_recordings",
     "histories": "apertura.pipeline.check.recordings:check_histories",
-    "channels": "apertura.pipeline.check.recordings:check_channels",
+    "channels": "apertura.pipeline.check.recordings:check_receivers",
     "intervals": "apertura.pipeline.check.recordings:check_intervals",
     "overlap": "apertura.pipeline.check.recordings:check_overlap",
     "segments": "apertura.pipeline.check.recordings:check_segments",
@@ -62,8 +62,14 @@ CHECKS: Mapping[str, str] = {
     "calibration": "apertura.pipeline.check.reach:check_calibration",
     "memory": "apertura.pipeline.check.resources:check_memory",
     "disk": "apertura.pipeline.check.resources:check_disk",
+    "scheduler": "apertura.pipeline.check.resources:check_scheduler",
+    "imaging": "apertura.pipeline.check.imaging:check_imaging",
+    "plan": "apertura.pipeline.check.imaging:check_plan",
 }
 """Name → ``module:function``; a function takes an `Examination` and yields problems, or raises one."""
+
+LAST = frozenset({"imaging", "plan"})
+"""Of these, what is asked where nothing else is wrong: it opens pairs as steps do, and would say the same again."""
 
 
 def problems(root: str | Path, *, without: Collection[str] = ()) -> list[CampaignError]:
@@ -93,7 +99,7 @@ def problems_of(examined: "Examination", *, without: Collection[str] = ()) -> li
     """Return what is wrong with a campaign that is opened already; `without` as of `problems`."""
     wrong: list[CampaignError] = []
     for name, function in CHECKS.items():
-        if name not in without:
+        if name not in without and not (name in LAST and wrong):
             wrong += _each(pkgutil.resolve_name(function), examined)
     return list({str(problem): problem for problem in wrong}.values())
 

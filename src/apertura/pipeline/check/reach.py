@@ -15,7 +15,7 @@ from apertura.core.scene.terrain import FlatGround, Terrain
 from apertura.pipeline.check.hints import likely_place
 from apertura.pipeline.config import CONFIG, FLIGHTS, Calibration, Flight, LeverArms, SampledWaveform
 from apertura.pipeline.examination.campaign import Examination, Key
-from apertura.pipeline.examination.times import common_pulses, recorded_span
+from apertura.pipeline.examination.times import expected_pulses, recorded_span
 
 _TAGS = 256  # of a pair at which distances are taken
 _POINTS = 9  # along each side of the scene
@@ -132,11 +132,7 @@ def pair_aperture(examined: Examination, flight: Flight, node: str, waveform: Sa
     key, other = (flight.name, flight.transmitter), (flight.name, node)
     if not {key, other} <= examined.tracks.keys() & examined.recordings.keys():
         return None
-    times = common_pulses(examined.recordings[key], examined.recordings[other], waveform.prf_hz)
-    if not times.size:
-        span = recorded_span(examined.recordings[key])
-        first, last = (time.astype("datetime64[ns]").astype(np.int64) for time in span)
-        times = np.linspace(first, last, _TAGS).astype(np.int64).astype("datetime64[ns]")
+    times = expected_pulses(examined.recordings[key], examined.recordings[other], waveform.prf_hz)
     times = times[np.unique(np.linspace(0, len(times) - 1, _TAGS).astype(int))]
     return Aperture(*(_positions(examined, one, times) for one in (key, other)))
 

@@ -1,32 +1,29 @@
 """Whether what was transmitted and recorded fits the waveform, the nodes of a flight and each other."""
 
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 
-from apertura.common import paths
 from apertura.common.arrays import Times
 from apertura.common.errors import CampaignError
 from apertura.formats.recordings.recording import Recording
 from apertura.pipeline.check.hints import likely_cause
-from apertura.pipeline.config import CONFIG, SEGMENTS, OfdmWaveform, SampledWaveform
+from apertura.pipeline.config import CONFIG
 from apertura.pipeline.examination.campaign import Examination
-from apertura.pipeline.examination.facts import RecordingFacts
 from apertura.pipeline.examination.times import (
     LAG,
     apart_s,
+    expected_pulses,
     frame_numbers,
-    inside,
     iso,
     recorded_span,
     shift_s,
     steps_s,
 )
+from apertura.pipeline.opening.acquisition import check_channels, check_length, check_rates
+from apertura.pipeline.opening.positions import inside_segments
+from apertura.pipeline.opening.recordings import framing_of
 from apertura.pipeline.opening.transmitted import check_mixing
-
-_SAME = 1e-9
-"""Carriers and rates that differ by less, relative to what the config states, are the same."""
 
 _OFF = 0.2
 """Spacings further from 1/prf_hz than this share of it are others: tags are good to a few ms, some are whole ms."""
@@ -40,40 +37,8 @@ def check_codes(examined: Examination) -> Iterator[CampaignError]:
     if waveform is None:
         return
     path = examined.campaign.sent_file
-    if not path.is_file() or path.stat().st_size == 0:
-        return
-    if not isinstance(waveform, OfdmWaveform):
+    if path.is_file() and path.stat().st_size:
         yield from examined.transmitted_problems
-        return
-    defect = _codes_defect(path, waveform.subcarriers)
-    if defect:
-        yield CampaignError(
-            defect,
-            where=path,
-            expected=f"a .npy file of ({waveform.subcarriers},) complex64, waveform.subcarriers, finite, without zeros",
-            remedy="Use the codes that were transmitted, or correct the waveform.",
-        )
-
-
-def _codes_defect(path: Path, subcarriers: int) -> str:
-    """Return what is wrong with a file of codes, shape and type before any of its content is read; '' if nothing is."""
-    try:
-        with path.open("rb") as stream:
-            version = np.lib.format.read_magic(stream)
-            header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-            shape, _, dtype = header(stream)
-            at = stream.tell()
-    except (OSError, ValueError) as error:
-        return f"not a .npy file ({str(error).splitlines()[0]})"
-    if shape != (subcarriers,) or dtype.kind != "c":
-        return f"{dtype} of shape {shape}"
-    if path.stat().st_size - at != subcarriers * dtype.itemsize:
-        return f"{path.stat().st_size - at} bytes for {subcarriers} symbols of {dtype.itemsize}"
-    codes = np.fromfile(path, dtype, offset=at)
-    lost, silent = int((~np.isfinite(codes)).sum()), int((codes == 0).sum())
-    if lost or silent:
-        return f"{lost} symbols that are no number, {silent} that are zero"
-    return ""
 
 
 def check_recordings(examined: Examination) -> Iterator[CampaignError]:
@@ -84,36 +49,18 @@ def check_recordings(examined: Examination) -> Iterator[CampaignError]:
         return
     transmitted = examined.transmitted
     for recording in examined.recordings.values():
-        keys = (("sample_rate_hz", "core:sample_rate"), ("carrier_hz", "core:frequency"))
-        recorded = recording.sample_rate_hz, recording.frequency_hz
-        for (key, name), value in zip(keys, recorded, strict=True):
-            stated = float(getattr(waveform, key))
-            if not abs(value - stated) <= _SAME * stated:
-                yield CampaignError(
-                    f"{name} {value:.6f}",
-                    where=recording.files[0],
-                    expected=f"{stated:.6f}, as {CONFIG}: waveform.{key}",
-                    remedy="Correct whichever is wrong; every node of a flight shares one waveform.",
-                )
+        recorded = {"sample_rate_hz": recording.sample_rate_hz, "carrier_hz": recording.frequency_hz}
         try:
+            check_rates(waveform, recorded, where=recording.files[0])
             if transmitted is not None:
                 check_mixing(recording.samples, transmitted.numerology, where=recording.files[0])
+            if recording.framing is not None:
+                framing_of(recording, examined.campaign)
         except CampaignError as problem:
             yield problem
-        preamble = recording.framing["preamble"] if recording.framing else None
-        if not preamble:
-            continue
-        path = paths.inside(examined.campaign.root, preamble, where=f"{recording.files[0]}: apertura:framing.preamble")
-        if not path.is_file():
-            yield CampaignError(
-                "no such file",
-                where=path,
-                expected=f"the preamble that {recording.files[0].name}: apertura:framing names",
-                remedy="Copy it there.",
-            )
 
 
-def check_channels(examined: Examination) -> Iterator[CampaignError]:
+def check_receivers(examined: Examination) -> Iterator[CampaignError]:
     """Yield receivers without the channels they need, or with captures shorter than prefix and DFT window."""
     waveform = examined.waveform
     if waveform is None:
@@ -123,45 +70,13 @@ def check_channels(examined: Examination) -> Iterator[CampaignError]:
             key = (flight.name, node)
             if key in examined.recorded:
                 facts, meta = examined.recorded[key], examined.recordings[key].files[0]
-                yield from _channels(facts, meta, node, secondary=node != flight.transmitter)
-                yield from _long_enough(facts, meta, waveform)
-
-
-def _channels(recording: RecordingFacts, meta: Path, node: str, *, secondary: bool) -> Iterator[CampaignError]:
-    names = list(recording.channels)
-    if secondary and "sidelink" not in names:
-        yield CampaignError(
-            f"apertura:channels {names}",
-            where=meta,
-            expected=f"a channel named 'sidelink': {node} receives what another node sends",
-            remedy="Name the channel, or take the node out of the flight.",
-        )
-    if len(set(names)) < len(names):
-        yield CampaignError(
-            f"apertura:channels {names}, a name twice",
-            where=meta,
-            expected="another name for each channel",
-            remedy="Correct the metadata.",
-        )
-
-
-def _long_enough(recording: RecordingFacts, meta: Path, waveform: SampledWaveform) -> Iterator[CampaignError]:
-    if recording.runs_through:
-        return
-    if isinstance(waveform, OfdmWaveform):
-        parts = (
-            f"cyclic prefix ({waveform.prefix_samples}) and one period of "
-            f"1/subcarrier_spacing_hz ({waveform.dft_samples})"
-        )
-    else:
-        parts = "lead_s, pulse_s and listen_s of the waveform"
-    if recording.capture_samples < waveform.needed_samples:
-        yield CampaignError(
-            f"captures of {recording.capture_samples} samples",
-            where=meta,
-            expected=f"at least {waveform.needed_samples}: {parts}",
-            remedy=f"Correct the waveform in {CONFIG}, or record longer captures.",
-        )
+                needed = ("radar", "sidelink") if node != flight.transmitter else ("radar",)
+                try:
+                    check_channels(facts.channels, needed, where=meta)
+                    if not facts.runs_through:
+                        check_length(facts.capture_samples, waveform.needed_samples, where=meta)
+                except CampaignError as problem:
+                    yield problem
 
 
 def check_histories(examined: Examination) -> Iterator[CampaignError]:
@@ -258,25 +173,12 @@ def _nothing_in_common(tx: Recording, rx: Recording, prf_hz: float) -> CampaignE
 
 def check_segments(examined: Examination) -> Iterator[CampaignError]:
     """Yield pairs of which no pulse lies inside their lines of segments.tsv."""
-    campaign = examined.campaign
+    campaign, waveform = examined.campaign, examined.waveform
     for flight in campaign.image_flights:
         tx = examined.recordings.get((flight.name, flight.transmitter))
         for pair in flight.pairs:
-            lines = campaign.segments_of(flight.name, pair)
-            if not lines or tx is None or any(_holds_pulse(tx, *line) for line in lines):
-                continue
-            first, last = map(iso, recorded_span(tx))
-            yield CampaignError(
-                f"no pulse of flight {flight.name}, pair {pair} inside {' or '.join('…'.join(line) for line in lines)}",
-                where=campaign.root / SEGMENTS,
-                expected=f"times between {first} and {last}, UTC",
-                remedy="Correct start and end, or take the lines out to image with the whole track.",
-            )
-
-
-def _holds_pulse(recording: Recording, begun: str, ended: str) -> bool:
-    start, end = np.datetime64(begun), np.datetime64(ended)
-    if recording.framing is not None:
-        first, last = recorded_span(recording)
-        return bool(start <= last and end >= first)
-    return bool(inside(recording.captures.time, (start, end)).any())
+            if tx is not None and waveform is not None:
+                try:
+                    inside_segments(campaign, flight.name, pair, expected_pulses(tx, tx, waveform.prf_hz))
+                except CampaignError as problem:
+                    yield problem

@@ -2,7 +2,7 @@
 
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from apertura.common.errors import CampaignError
@@ -102,3 +102,13 @@ def disk_bytes(examined: Examination) -> dict[str, int]:
 
 def _made(examined: Examination, stage: str, *where: str) -> bool:
     return (examined.campaign.root / examined.campaign.manifest(stage, *where)).is_file()
+
+
+def check_scheduler(examined: Examination) -> Iterable[CampaignError]:
+    """Raise for a scheduler that whoever runs this has not named."""
+    scheduler = examined.campaign.settings.processing.scheduler
+    if scheduler != "threads":
+        from apertura.core.focus.tiles import check_named
+
+        check_named(scheduler)
+    return ()

@@ -114,6 +114,14 @@ class Examination:
         """Why other logs cannot be read."""
         return self._tracks[1]
 
+    def opens(self, flight: str, pair: str) -> bool:
+        """Return whether a pair can be opened by logs and headers, or its phase history is small."""
+        if self.waveform is not None:
+            keys = {(flight, node) for node in pair.split("-")}
+            return keys <= self.tracks.keys() & self.recordings.keys()
+        files = self.campaign.history_files(flight, pair.split("-")[1])
+        return 0 < sum(path.stat().st_size for path in files) <= _SMALL_BYTES
+
     @cached_property
     def history_problems(self) -> list[CampaignError]:
         """What is wrong with phase history: of every pair whose files are small, and of one that states the frame."""

@@ -224,6 +224,16 @@ def common_pulses(tx: Recording, rx: Recording, prf_hz: float) -> Times:
     return times[inside(times, (first + interval, last - interval))]
 
 
+def expected_pulses(tx: Recording, rx: Recording, prf_hz: float) -> Times:
+    """Return tags as `common_pulses`; where they are not known a series over what the transmitter recorded."""
+    times = common_pulses(tx, rx, prf_hz)
+    if times.size:
+        return times
+    first, last = (time.astype("datetime64[ns]").astype(np.int64) for time in recorded_span(tx))
+    count = max(2, round((last - first) * 1e-9 * prf_hz))
+    return np.linspace(first, last, count).astype(np.int64).astype("datetime64[ns]")
+
+
 def inside(times: Times, span: Span) -> NDArray[np.bool_]:
     """Return (time,) bool: which times lie inside a span, both ends included.
 

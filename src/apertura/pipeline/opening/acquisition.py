@@ -1,6 +1,6 @@
 """Recording of one node in a flight: samples by channel, antennas by pulse, by the clocks of recorder and log."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
@@ -20,13 +20,56 @@ from apertura.formats.recordings.sample_file import SampleFile, SampleLayout
 from apertura.formats.times import FIRST
 from apertura.methods.autofocus.motion import Logged, Recorded
 from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.config import SampledWaveform
+from apertura.pipeline.config import CONFIG, SampledWaveform
 from apertura.pipeline.digests import digest_of
 from apertura.pipeline.opening.air import scene_air
 from apertura.pipeline.opening.node_log import NodeLog, raw_log, shortest_wave
 from apertura.pipeline.opening.reading import read_history
 from apertura.pipeline.opening.transmitted import Transmitted, check_mixing
 from apertura.pipeline.store import manifest_of, open_stage
+
+# ---- What a recording must be ---------------------------------------------------------------------------------------
+
+_SAME = 1e-9
+"""Carriers and rates that differ by less, relative to what the config states, are the same."""
+
+
+def check_rates(waveform: SampledWaveform, recorded: Mapping[str, float], *, where: Path | str) -> None:
+    """Raise CampaignError unless what was `recorded`, sample_rate_hz and carrier_hz, is that of the waveform."""
+    for key, value in recorded.items():
+        stated = float(getattr(waveform, key))
+        if not abs(value - stated) <= _SAME * stated:
+            raise CampaignError(
+                f"recorded with {key} {value:.6f}",
+                where=where,
+                expected=f"{stated:.6f}, as {CONFIG}: waveform.{key}",
+                remedy="Correct whichever is wrong; every node of a flight shares one waveform.",
+            )
+
+
+def check_channels(recorded: Sequence[str], needed: Sequence[str], *, where: Path | str) -> None:
+    """Raise CampaignError unless channels were recorded under the names `needed`."""
+    for channel in needed:
+        if channel not in recorded:
+            raise CampaignError(
+                f"apertura:channels {[*recorded]}",
+                where=where,
+                expected=f"a channel named {channel!r}",
+                remedy="A secondary node needs its sidelink; name the channel or take the node out of the flight.",
+            )
+
+
+def check_length(samples: int, needed: int, *, where: Path | str) -> None:
+    """Raise CampaignError unless captures hold as many samples as an echo takes."""
+    if samples < needed:
+        raise CampaignError(
+            f"captures of {samples} samples",
+            where=where,
+            expected=f"at least {needed}: cyclic prefix and one period of 1/subcarrier_spacing_hz, or lead_s, "
+            "pulse_s and listen_s",
+            remedy=f"Correct the waveform in {CONFIG}, or record longer captures.",
+        )
+
 
 # ---- Recording of one node: samples by channel, antennas by pulse ---------------------------------------------------
 
@@ -71,23 +114,8 @@ class Captured:
             If a channel was not recorded, or captures are shorter than prefix and DFT window.
         """
         recorded, length = list(self.raw.attrs["channels"]), int(self.raw.attrs["capture_samples"])
-        for channel in channels:
-            if channel not in recorded:
-                raise CampaignError(
-                    f"channels {recorded}",
-                    where=self.recording,
-                    expected=f"a channel named {channel!r}",
-                    remedy="A secondary node needs its sidelink; name the channel or take the node out of the flight.",
-                )
-        needed = self.numerology.prefix_samples + self.numerology.dft_samples
-        if length < needed:
-            raise CampaignError(
-                f"captures of {length} samples",
-                where=self.recording,
-                expected=f"at least {needed}: cyclic prefix and one period of 1/subcarrier_spacing_hz, or lead_s, "
-                "pulse_s and listen_s",
-                remedy="Correct the waveform in config/config.yaml or record longer captures.",
-            )
+        check_channels(recorded, channels, where=self.recording)
+        check_length(length, self.numerology.prefix_samples + self.numerology.dft_samples, where=self.recording)
         start, places = self.raw.start.values[pulses], {name: recorded.index(name) for name in channels}
 
         def read(captures: NDArray[np.int64]) -> dict[str, Samples]:
@@ -117,16 +145,8 @@ class Captured:
         sent
             What was transmitted.
         """
-        recorded = ("sample_rate_hz", raw.attrs["sample_rate_hz"]), ("carrier_hz", raw.attrs["frequency_hz"])
-        for key, value in recorded:
-            requested = getattr(sent.waveform, key)
-            if abs(value - requested) > 1e-9 * requested:
-                raise CampaignError(
-                    f"recorded with {key} {value:.6f}",
-                    where=recording,
-                    expected=f"{requested:.6f}, as config/config.yaml: waveform.{key}",
-                    remedy="Correct whichever is wrong; every node of a flight shares one waveform.",
-                )
+        recorded = {"sample_rate_hz": raw.attrs["sample_rate_hz"], "carrier_hz": raw.attrs["frequency_hz"]}
+        check_rates(sent.waveform, recorded, where=recording)
         opened = SampleFile(samples, len(raw.attrs["channels"]), SampleLayout.of(raw))
         check_mixing(opened, sent.numerology, where=recording)
         return cls(raw, opened, files, recording, sent.numerology)

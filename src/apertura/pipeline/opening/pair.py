@@ -9,6 +9,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from apertura.common.arrays import Times
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
 from apertura.common.flags import Flags
@@ -263,8 +264,8 @@ class OpenPair:
         Phase centres.
     frequency_hz, weight
         (subcarrier,) float64, RF frequency and window.
-    path_limit_m
-        Longest total path inside the cyclic prefix.
+    path_limits_m
+        (pulse,) float64, longest total path inside the cyclic prefix.
     time_s
         (pulse,) float64, seconds from the first.
     began
@@ -295,7 +296,7 @@ class OpenPair:
     aperture: Aperture
     frequency_hz: NDArray[np.float64]
     weight: NDArray[np.float64]
-    path_limit_m: float
+    path_limits_m: NDArray[np.float64]
     time_s: NDArray[np.float64]
     began: np.datetime64
     positions: tuple[NodePositions, ...]
@@ -315,22 +316,31 @@ class OpenPair:
         return tx == rx
 
     @property
+    def path_limit_m(self) -> float:
+        """Longest total path inside the cyclic prefix of every pulse."""
+        return float(self.path_limits_m.min())
+
+    @property
     def flown(self) -> Flown:
         """What `auto` settles the grid from."""
         return Flown(self.aperture, self.frequency_hz, self.path_limit_m)
 
 
-def open_pair(campaign: Campaign, flight: str, pair: str, *, echo: xr.Dataset | None = None) -> OpenPair:
-    """Return an open pair from `echo`, its stage as far as it is formed, or from the logs."""
+def open_pair(
+    campaign: Campaign, flight: str, pair: str, *, echo: xr.Dataset | None = None, recorded: Times | None = None
+) -> OpenPair:
+    """Return an open pair from `echo`, its stage as far as it is formed, or from the logs.
+
+    From the logs in any case where the tags of pulses that both nodes `recorded` are given.
+    """
     waveform = campaign.settings.waveform
-    if echo is None and manifest_of(campaign.stage("echo", flight, pair)).is_file():
+    if echo is None and recorded is None and manifest_of(campaign.stage("echo", flight, pair)).is_file():
         echo = open_stage(campaign.stage("echo", flight, pair), "echo")
     if echo is None:
         if isinstance(waveform, SampledWaveform):
-            return _expected(campaign, flight, pair, waveform)
+            return _expected(campaign, flight, pair, waveform, recorded)
         echo = keep_segments(campaign, flight, pair, recorded_echo(campaign, flight, pair))
     history = phase_history_of(echo, campaign.settings.processing.window, lazy=True)
-    limit_m = float(echo.path_limit.values.min())
     axes = body_axes(echo)
     stated = echo.attrs.get("positions", {})
     return OpenPair(
@@ -339,7 +349,7 @@ def open_pair(campaign: Campaign, flight: str, pair: str, *, echo: xr.Dataset | 
         history.aperture,
         history.frequency_hz,
         history.weight,
-        limit_m,
+        echo.path_limit.values,
         time_s=_seconds(echo.time.values),
         began=echo.time.values[0],
         positions=tuple(_positions(stated.get(leg, {})) for leg in _legs(pair)),
@@ -353,16 +363,20 @@ def open_pair(campaign: Campaign, flight: str, pair: str, *, echo: xr.Dataset | 
     )
 
 
-def _expected(campaign: Campaign, flight: str, pair: str, waveform: SampledWaveform) -> OpenPair:
-    """Return the pair expected from the logs: the transmitter's pulses within all logs."""
+def _expected(
+    campaign: Campaign, flight: str, pair: str, waveform: SampledWaveform, recorded: Times | None
+) -> OpenPair:
+    """Return the pair expected from the logs: the pulses that all logs place, but those of hovers."""
     frequency = transmitted(campaign, waveform).numerology.frequency_hz
     tx, rx = (raw_log(campaign, flight, node, shortest_wave(frequency)) for node in pair.split("-"))
     first = max(log.track.time.values[0] for log in (tx, rx))
     last = min(log.track.time.values[-1] for log in (tx, rx))
-    recorded = open_recording(campaign.recording_files(flight, tx.name)).captures.time
-    recorded = campaign.clock(flight, tx.name).utc(recorded)
+    if recorded is None:
+        recorded = open_recording(campaign.recording_files(flight, tx.name)).captures.time
+        recorded = campaign.clock(flight, tx.name).utc(recorded)
     times = _pulse_times(recorded, first, last, waveform.prf_hz)
     times = times[inside_segments(campaign, flight, pair, times)]
+    times = times[place(tx, rx, times, hovers=bool(campaign.segments_of(flight, pair))).good]
     return expected_pair(campaign, flight, (tx, rx), times, frequency_hz=frequency, delay_s=waveform.longest_delay_s)
 
 
@@ -394,14 +408,14 @@ def expected_pair(
     turning = {"radar_tx": tx.turns("radar_tx") and tx, "radar_rx": rx.turns("radar_rx") and rx}
     axes = {antenna: log.body_axes(times) for antenna, log in turning.items() if log}
     offset = rx.settings.path_offset_m
-    beyond_m = offset.radar
+    beyond_m = np.full(len(times), offset.radar)
     if tx.name != rx.name:
         length_m = np.linalg.norm(tx.antenna("sidelink", times) - rx.antenna("sidelink", times), axis=1)
-        beyond_m -= offset.sidelink + float(length_m.min())
+        beyond_m -= offset.sidelink + length_m
     weight = window_weights(campaign.settings.processing.window, len(frequency_hz))
     aperture = Aperture(tx.antenna("radar_tx", times), rx.antenna("radar_rx", times))
     flown = scene_air(campaign, aperture.tx_m).over(aperture)
-    limit_m = flown.wave_speed_m_s * delay_s - beyond_m
+    limits_m = flown.wave_speed_m_s * delay_s - beyond_m
     known = {log.name: _positions(position_error(log.track, log.settings, times)) for log in (tx, rx)}
     pair = f"{tx.name}-{rx.name}"
     return OpenPair(
@@ -410,7 +424,7 @@ def expected_pair(
         aperture,
         frequency_hz,
         weight,
-        limit_m,
+        limits_m,
         time_s=_seconds(times),
         began=times[0],
         positions=tuple(known.values()),

@@ -9,12 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.filesize import decimal
 
-from apertura.common.errors import CampaignError
+from apertura.common.errors import CampaignError, number_of
 from apertura.common.flags import Flags
 from apertura.core.antenna.beam import Beams
 from apertura.core.echo.compression import centre_frequency
 from apertura.core.focus.job import Integration, Job
 from apertura.core.imaging.job import decide_integration, imaging_job
+from apertura.core.imaging.range_profiles import GUARD_SAMPLES, RangeWindow
 from apertura.core.planning.decisions import decide_accuracy
 from apertura.core.planning.plan import Decision, Plan, memory_limit
 from apertura.core.planning.planner import make_plan
@@ -321,6 +322,60 @@ def weighing(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> Beams | No
     As in `job_of`, but without the echo: the ranges that profiles must cover follow from it.
     """
     return Beams.within(integration_of(campaign, pair, scene).sector, pair.beams)
+
+
+def ranges_of(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> RangeWindow:
+    """Return the ranges that the profiles of a pair cover.
+
+    Raises
+    ------
+    CampaignError
+        If an antenna is in the ground, or echoes of the scene were not recorded, or repeat themselves.
+    """
+    where = f"flight {pair.flight}, pair {pair.name}"
+    check_antennas(scene.grid, scene.terrain, pair.aperture, where=where)
+    window = RangeWindow.of(
+        pair.aperture,
+        scene.grid,
+        scene.terrain,
+        pair.frequency_hz,
+        beams=weighing(campaign, pair, scene),
+        wave_speed_m_s=pair.wave_speed_m_s,
+    )
+    _check_held(window.farthest_m, pair.path_limits_m, campaign, where=where)
+    _check_unambiguous(window)
+    return window
+
+
+def _check_held(farthest: NDArray[np.float64], limit: NDArray[np.float64], campaign: Campaign, *, where: str) -> None:
+    """Raise CampaignError where echoes of the scene arrive after the captures end."""
+    waveform = campaign.settings.waveform
+    key, limit_name = "path_limit", "the recorded delays"
+    if isinstance(waveform, SampledWaveform):
+        key, limit_name = waveform.delay_key, waveform.limit_name
+    beyond = np.flatnonzero(farthest > limit)
+    if beyond.size:
+        pulse = int((farthest - limit).argmax())
+        raise CampaignError(
+            f"at {number_of(beyond.size, 'pulse')} echoes of the scene arrive after {limit_name}, worst at pulse "
+            f"{pulse}: total path {farthest[pulse]:.1f} m",
+            where=where,
+            expected=f"at most {limit[pulse]:.1f} m (c·{key} less the path offsets)",
+            remedy=f"Make scene.bounds_m smaller, or check path_offset_m and {key}.",
+        )
+
+
+def _check_unambiguous(window: RangeWindow) -> None:
+    if window.samples > window.unambiguous:
+        spans_m, most_m = (
+            (count - 2 * GUARD_SAMPLES) * window.step_m for count in (window.samples, window.unambiguous)
+        )
+        raise CampaignError(
+            f"the scene spans {spans_m:.1f} m of total path",
+            where=f"{CONFIG}: scene.bounds_m",
+            expected=f"less than the unambiguous {most_m:.1f} m",
+            remedy="Make the scene smaller.",
+        )
 
 
 def integration_of(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> Integration:

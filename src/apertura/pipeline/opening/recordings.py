@@ -6,7 +6,7 @@ import xarray as xr
 
 from apertura.common.errors import CampaignError
 from apertura.common.paths import inside
-from apertura.core.echo.trigger import trigger_captures
+from apertura.core.echo.trigger import PulseFraming, trigger_captures
 from apertura.formats.reading import open_recording
 from apertura.formats.recordings.recording import Recording
 from apertura.pipeline.campaign import Campaign
@@ -47,11 +47,15 @@ def captures_of(recording: Recording, campaign: Campaign, *, node: str) -> xr.Da
     return dataset
 
 
-def _triggered(recording: Recording, campaign: Campaign, *, node: str) -> xr.Dataset:
-    """Return the `raw` stage of a continuous recording, as a triggered recorder would have written it."""
-    waveform, described = campaign.settings.waveform, recording.framing or {}
-    if not isinstance(waveform, SampledWaveform):
-        raise TypeError("a recording of samples needs a waveform that was recorded as samples")
+def framing_of(recording: Recording, campaign: Campaign) -> PulseFraming:
+    """Return what was sent before each symbol of a continuous recording.
+
+    Raises
+    ------
+    CampaignError
+        If the preamble is none, or the waveform begins before its captures can.
+    """
+    waveform = campaign.settings.waveform
     if isinstance(waveform, PulseWaveform) and waveform.lead_s:
         raise CampaignError(
             f"waveform.lead_s is {waveform.lead_s:g}, and {recording.files[0].name} never stopped",
@@ -59,12 +63,20 @@ def _triggered(recording: Recording, campaign: Campaign, *, node: str) -> xr.Dat
             expected="0: its captures are cut where the pulse begins",
             remedy="Set waveform.lead_s to 0.",
         )
-    framing = read_framing(
+    return read_framing(
         preamble_files(recording, campaign)[0],
-        described,
+        recording.framing or {},
         sample_rate_hz=recording.sample_rate_hz,
         where=recording.files[0],
     )
+
+
+def _triggered(recording: Recording, campaign: Campaign, *, node: str) -> xr.Dataset:
+    """Return the `raw` stage of a continuous recording, as a triggered recorder would have written it."""
+    waveform, described = campaign.settings.waveform, recording.framing or {}
+    if not isinstance(waveform, SampledWaveform):
+        raise TypeError("a recording of samples needs a waveform that was recorded as samples")
+    framing = framing_of(recording, campaign)
     rate = campaign.settings.processing.false_alarms_per_s
     channel = "sidelink" if "sidelink" in recording.channels else "radar"
     samples, length = recording.samples.channel(recording.channels.index(channel)), waveform.capture_samples

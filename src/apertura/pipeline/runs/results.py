@@ -127,9 +127,9 @@ def in_bytes(size: int) -> str:
     Examples
     --------
     >>> in_bytes(0), in_bytes(25_300_000), in_bytes(5 * 10**12)
-    ('0.0 MB', '25.3 MB', '5.0 TB')
+    ('0.0 kB', '25.3 MB', '5.0 TB')
     """
-    value, units = size / 1e6, iter(("MB", "GB"))
+    value, units = size / 1e3, iter(("kB", "MB", "GB"))
     for unit in units:
         if value < 1000:
             return f"{value:.1f} {unit}"

@@ -9,23 +9,13 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from apertura.common.errors import CampaignError, number_of
 from apertura.common.provenance import merged
 from apertura.core.echo.compression import centre_frequency
-from apertura.core.imaging.range_profiles import (
-    GUARD_SAMPLES,
-    RangeWindow,
-    aperture_of,
-    phase_history_of,
-    range_compress,
-    wave_speed_of,
-)
-from apertura.core.scene.clearance import check_antennas
+from apertura.core.imaging.range_profiles import RangeWindow, phase_history_of, range_compress
 from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.config import CONFIG, SampledWaveform
 from apertura.pipeline.lineage import result_of
 from apertura.pipeline.opening.pair import open_pair, pattern_digests
-from apertura.pipeline.opening.plan import weighing
+from apertura.pipeline.opening.plan import ranges_of
 from apertura.pipeline.opening.scene import OpenScene, open_scene
 from apertura.pipeline.steps.stamping import stamped
 from apertura.pipeline.store import blocks_of_rows, finish, open_stage, write_blocks, writing
@@ -35,15 +25,9 @@ def profile(campaign: Campaign, flight: str, pair: str) -> Path:
     """Write results/<flight>/<pair>/profile.zarr, block by block."""
     lineage = result_of(campaign, "profile", flight, pair).begin(campaign.root)
     source, scene = open_stage(campaign.stage("echo", flight, pair), "echo"), open_scene(campaign)
-    aperture, frequency, where = aperture_of(source), source.frequency.values, f"flight {flight}, pair {pair}"
-    check_antennas(scene.grid, scene.terrain, aperture, where=where)
-    beams = weighing(campaign, open_pair(campaign, flight, pair, echo=source), scene)
-    speed = wave_speed_of(source)
-    window = RangeWindow.of(aperture, scene.grid, scene.terrain, frequency, beams=beams, wave_speed_m_s=speed)
-    _check_held(window.farthest_m, source.path_limit.values, campaign, where=where)
-    _check_unambiguous(window)
-    requested = campaign.settings.processing.window
-    zeros = np.broadcast_to(np.complex64(0), (len(aperture), window.samples))
+    window = ranges_of(campaign, open_pair(campaign, flight, pair, echo=source), scene)
+    frequency, requested = source.frequency.values, campaign.settings.processing.window
+    zeros = np.broadcast_to(np.complex64(0), (source.sizes["pulse"], window.samples))
     dataset = source[["time", "tx_position", "rx_position"]].assign(
         profile=(("pulse", "range"), zeros), start=("pulse", window.start_m)
     )
@@ -52,7 +36,7 @@ def profile(campaign: Campaign, flight: str, pair: str) -> Path:
         "centre_frequency_hz": centre_frequency(frequency),
         "oversampling": window.unambiguous / len(frequency),
         "window": requested,
-        "wave_speed_m_s": speed,
+        "wave_speed_m_s": window.wave_speed_m_s,
     }
     settings, parents = {**lineage.result.settings, **scene.spec}, [source, *scene.parents]
     inputs = merged(scene.inputs, pattern_digests(campaign, pair))
@@ -75,34 +59,3 @@ def _compressed(
         history = phase_history_of(source.isel(pulse=part), requested)
         here = replace(window, start_m=window.start_m[part], farthest_m=window.farthest_m[part])
         yield range_compress(history, scene.grid, scene.terrain, window=here).samples
-
-
-def _check_held(farthest: NDArray[np.float64], limit: NDArray[np.float64], campaign: Campaign, *, where: str) -> None:
-    """Raise CampaignError where echoes of the scene arrive after the captures end."""
-    waveform = campaign.settings.waveform
-    key, limit_name = "path_limit", "the recorded delays"
-    if isinstance(waveform, SampledWaveform):
-        key, limit_name = waveform.delay_key, waveform.limit_name
-    beyond = np.flatnonzero(farthest > limit)
-    if beyond.size:
-        pulse = int((farthest - limit).argmax())
-        raise CampaignError(
-            f"at {number_of(beyond.size, 'pulse')} echoes of the scene arrive after {limit_name}, worst at pulse "
-            f"{pulse}: total path {farthest[pulse]:.1f} m",
-            where=where,
-            expected=f"at most {limit[pulse]:.1f} m (c·{key} less the path offsets)",
-            remedy=f"Make scene.bounds_m smaller, or check path_offset_m and {key}.",
-        )
-
-
-def _check_unambiguous(window: RangeWindow) -> None:
-    if window.samples > window.unambiguous:
-        spans_m, most_m = (
-            (count - 2 * GUARD_SAMPLES) * window.step_m for count in (window.samples, window.unambiguous)
-        )
-        raise CampaignError(
-            f"the scene spans {spans_m:.1f} m of total path",
-            where=f"{CONFIG}: scene.bounds_m",
-            expected=f"less than the unambiguous {most_m:.1f} m",
-            remedy="Make the scene smaller.",
-        )
