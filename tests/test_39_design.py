@@ -159,6 +159,16 @@ def test_recordings_are_as_large_as_their_captures():
     assert recording["recorded_bytes"] == recording["pulses"]["f01"] * 3 * capture
 
 
+def test_a_radar_of_sweeps_is_told_but_for_its_noise():
+    sweep = {"kind": "fmcw", "format": "beat_npy", "start_hz": 5.7e9, "bandwidth_hz": 2e8, "sweep_s": 1e-3}
+    plan = plan_of(waveform=sweep | {"sample_rate_hz": 4e5, "prf_hz": 200.0}, nodes={"uav1": {"attitude": "log"}})
+    found = ap.design(flown(plan, uav1=line(start_m=[-2.0, 0.0], end_m=[2.0, 0.0])))
+    across = 0.886 * SPEED_OF_LIGHT_M_S / (2 * 2e8) / np.sin(np.pi / 4)
+    assert in_the_middle(found, "resolution") == pytest.approx(across, rel=0.02)
+    assert np.isnan(found.nesz).all()
+    assert found.attrs["recording"]["node_bytes_s"]["f01"]["uav1"] == 200 * 400 * 2
+
+
 def test_turns_between_legs_are_flown_and_not_imaged():
     racetrack = line(kind="racetrack", legs=3, spacing_m=5.0)
     opened = open_plan(FlightPlan.model_validate(flown(plan_of(), uav1=racetrack)), HERE)
