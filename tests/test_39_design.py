@@ -98,10 +98,11 @@ def test_a_line_resolves_half_a_wavelength_over_the_sine_of_its_angle():
 def test_a_circle_resolves_alike_in_every_direction():
     """|p|² = J₀²(4π r sin θ/λ): half of it at 1.126, a full width of 2.252."""
     circle = {"kind": "circle", "centre_m": [0.0, 30.0], "radius_m": 30.0, "height_m": 30.0, "speed_m_s": 3.0}
-    found = ap.design(flown(plan_of(), uav1=circle))
+    scene = plan_of()["scene"] | {"bounds_m": [-0.5, 29.5, 0.5, 30.5]}
+    found = ap.design(flown(plan_of(scene=scene), uav1=circle))
     width = 2.252 * SPEED_OF_LIGHT_M_S / CARRIER / (4 * np.pi * np.sin(np.pi / 4))
     for name in ("resolution", "resolution_fine"):
-        assert in_the_middle(found, name) == pytest.approx(width, rel=0.04)
+        assert in_the_middle(found, name) == pytest.approx(width, rel=0.015)
 
 
 def test_noise_and_a_point_s_snr_are_those_of_the_radar_equation():
