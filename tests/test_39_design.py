@@ -9,6 +9,10 @@ import pytest
 import apertura as ap
 from apertura.common.constants import BOLTZMANN_J_K, SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
+from apertura.core.geometry.aperture import Aperture
+from apertura.core.imaging.resolution import Resolution
+from apertura.core.scene.grid import SceneGrid
+from apertura.core.scene.terrain import Plane
 from apertura.pipeline.config.flight_plan import FlightPlan
 from apertura.pipeline.design import designed
 from apertura.pipeline.design.judgement import helpful_changes, judge, search
@@ -103,6 +107,21 @@ def test_a_circle_resolves_alike_in_every_direction():
     width = 2.252 * SPEED_OF_LIGHT_M_S / CARRIER / (4 * np.pi * np.sin(np.pi / 4))
     for name in ("resolution", "resolution_fine"):
         assert in_the_middle(found, name) == pytest.approx(width, rel=0.015)
+
+
+@pytest.mark.parametrize("rise", [-0.3, 0.3])
+def test_ground_that_falls_away_from_the_radar_is_resolved_finer_on_the_map(rise):
+    """The path grows by 2(sin θ - r cos θ) per metre of the map, r the rise: 0.886 c/B over that."""
+    along = np.linspace(-2, 2, 401)
+    track = np.stack([along, np.full(401, -30.0), np.full(401, 30.0)], -1)
+    band = CARRIER + np.linspace(-1e8, 1e8, 64)
+    grid, ground = SceneGrid("local", -2.0, 2.0, 1.0, (4, 4)), Plane(0.0, 0.0, 0.0, east=0.0, north=rise)
+    aperture = Aperture(track, track)
+    found = Resolution.of(grid, ground, aperture, None, frequency_hz=band, weight=np.ones(64) / 64)
+    fine, coarse, azimuth = found.axes((slice(1, 2), slice(2, 3)))
+    width = 0.886 * SPEED_OF_LIGHT_M_S / 2e8 / (2 * np.sqrt(0.5) * (1 - rise))
+    widths = (fine, coarse) if abs(azimuth[0, 0]) < 45 else (coarse, fine)
+    assert widths[0][0, 0] == pytest.approx(width, rel=0.04)
 
 
 def test_noise_and_a_point_s_snr_are_those_of_the_radar_equation():
