@@ -16,11 +16,12 @@ from numpy.typing import NDArray
 from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
 from apertura.core.antenna.beam import Beam, Beams, antenna_axes, gaussian_cut
 from apertura.core.echo.compression import centre_frequency, window_weights
+from apertura.core.echo.sidelink import METHODS
 from apertura.core.focus.engines import reference
 from apertura.core.focus.inputs import PhaseHistory
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.imaging.backproject import backproject
-from apertura.core.imaging.noise import noise_power
+from apertura.core.imaging.noise import noise_places, noise_power, sidelink_noise
 from apertura.core.imaging.radiometry import Calibration, Link, cell_constant
 from apertura.core.imaging.range_profiles import range_compress
 from apertura.core.imaging.speckle import Multilook, Speckle
@@ -273,23 +274,44 @@ def looks() -> None:
             )
 
 
+SIDELINK_DB, MISSED = 30.0, 0.05
+
+
 def noise(draws: int = 8) -> None:
-    """Print the noise figure that profiles of echoes and thermal noise have, against that put."""
-    aperture = flown(apart=False, length_m=20.0, pulses=2048, height_m=10.0)
-    grid = SceneGrid("local", -8.0, 36.0, 0.1, (160, 160))
-    weighing = beams(aperture)
-    places = np.array([[2.0, 25.0, 0.0], [-5.0, 30.0, 0.0]])
-    told = []
-    for draw in range(draws):
-        gain = weighing.weight(aperture, places)
-        echo = counts(Scatterers(places, np.array([1.0, 3.0 + 0j])), aperture, gain, np.random.default_rng(draw))
-        profiles = range_compress(history(echo, aperture), grid, FlatGround(0.0))
-        rows, columns = np.random.default_rng(draw).integers(0, grid.shape, (64, 2)).T
-        measured = noise_power(profiles, grid.positions_at(rows, columns, 0.0), beams=weighing)
-        thermal = LINK.pulse_noise(0.0, spacing_hz=WAVE.subcarrier_spacing_hz, squares=float((weights() ** 2).sum()))
-        told.append(10 * float(np.log10(measured / thermal)))
-    spread = f"{min(told):.2f} to {max(told):.2f} dB, mean {np.mean(told):.2f} dB"
-    print(f"noise figure 6 dB, measured below echoes: {spread} in {draws} draws")
+    """Print the noise figure that profiles of echoes and thermal noise have, against that put.
+
+    Some pulses are missing; a bistatic pair is divided by a sidelink with noise of its own, which is taken off.
+    """
+    grid, ground = SceneGrid("local", -8.0, 36.0, 0.1, (160, 160)), FlatGround(0.0)
+    points = Scatterers(np.array([[2.0, 25.0, 0.0], [-5.0, 30.0, 0.0]]), np.array([30.0, 100.0 + 0j]))
+    thermal = LINK.pulse_noise(0.0, spacing_hz=WAVE.subcarrier_spacing_hz, squares=float((weights() ** 2).sum()))
+    for apart in (False, True):
+        told, stated, share = list[float](), list[float](), list[float]()
+        for draw in range(draws):
+            generator = np.random.default_rng(draw)
+            kept = np.flatnonzero(generator.random(2048) >= MISSED)
+            aperture = flown(apart=apart, length_m=20.0, pulses=2048, height_m=10.0)[kept]
+            weighing, where = beams(aperture), noise_places(grid, ground)
+            echo, added = counts(points, aperture, weighing.weight(aperture, points.position_m), generator), 0.0
+            if apart:
+                parts = generator.standard_normal((*echo.shape, 2)) @ [1, 1j] * np.sqrt(0.5) * 10 ** (-SIDELINK_DB / 20)
+                echo = METHODS["divide"](echo, np.asarray(1 + parts, np.complex64))
+            formed = history(echo, aperture)
+            if apart:
+                known = {"beams": weighing, "method": "divide", "snr_db": SIDELINK_DB}
+                added = sidelink_noise(formed, grid, ground, where, **known)
+            profiles = range_compress(formed, grid, ground)
+            measured = noise_power(profiles, where, time_s=kept / WAVE.prf_hz, beams=weighing)
+            own = measured.power - added
+            told.append(10 * float(np.log10(own / thermal)))
+            stated.append(measured.std_db * measured.power / own)
+            share.append(10 * float(np.log10(measured.power / own)))
+        print(
+            f"{'bistatic' if apart else 'monostatic'}: noise figure of 6 dB measured below echoes: {min(told):.2f} to "
+            f"{max(told):.2f} dB, mean {np.mean(told):.2f} dB in {draws} draws, {np.mean(stated):.2f} dB stated; the "
+            f"sidelink's noise was {np.mean(share):.1f} dB of it",
+            flush=True,
+        )
 
 
 PARTS = {"points": points, "clutter": lambda _: clutter(), "looks": lambda _: looks(), "noise": lambda _: noise()}

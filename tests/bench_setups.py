@@ -160,6 +160,11 @@ def _tone(x: Samples) -> Samples:
     return x + 0.3 * np.sqrt((np.abs(x) ** 2).mean()) * np.exp(1j * turns)
 
 
+def _stuck(x: Samples) -> Samples:
+    """Return samples whose bit 3 is always 1."""
+    return (x.real.astype(np.int64) | 8) + 1j * (x.imag.astype(np.int64) | 8)
+
+
 def _false(captures: list, iq: NDArray[np.int16]) -> tuple[list, NDArray[np.int16]]:
     """Put a capture of noise between two pulses, five times."""
     rng, listed, rows = np.random.default_rng(6), [], []
@@ -255,6 +260,7 @@ SPOILT = {
     "triggers missed": Setup(frozenset({"triggers_missed"}), spoil=_captures(RECEIVER, _lost)),
     "triggers false": Setup(frozenset({"triggers_false"}), spoil=_captures(TRANSMITTER, _false)),
     "DC": Setup(frozenset({"channel_dc"}), spoil=channel(TRANSMITTER, 0, lambda x: x + 900)),
+    "bit stuck": Setup(frozenset({"channel_bits_stuck"}), spoil=channel(RECEIVER, 0, _stuck)),
     "I and Q unequal": Setup(
         frozenset({"channel_image"}), spoil=channel(RECEIVER, 0, lambda x: x.real + 0.8j * x.imag)
     ),

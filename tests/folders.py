@@ -14,7 +14,7 @@ import yaml
 from apertura.common.errors import CampaignError
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.check.files import check_files
-from apertura.pipeline.config import SampledWaveform
+from apertura.pipeline.config import FUSED, SampledWaveform
 from apertura.pipeline.examination.campaign import Examination
 from apertura.pipeline.steps import (
     assess,
@@ -102,7 +102,8 @@ def export_flight(campaign: Campaign, flight: str) -> None:
     for pair in campaign.flight(flight).pairs:
         layers.layers(campaign, flight, pair, threads=2)
         export.export(campaign, flight, pair)
-    export.export_fused(campaign, flight)
+    if FUSED in campaign.flight(flight).images:
+        export.export_fused(campaign, flight)
     if isinstance(campaign.settings.waveform, SampledWaveform):
         tracks.tracks(campaign, flight)
 

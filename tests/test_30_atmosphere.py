@@ -230,7 +230,7 @@ VACUUM = {
     "methods/autofocus/refine.py": _SIZE,
     "methods/autofocus/speckle.py": _SIZE,
     "methods/autofocus/motion.py": _DEFAULT,
-    "methods/synchronisation/bench.py": _ELECTRICAL,
+    "methods/synchronisation/links.py": _ELECTRICAL,
     "methods/synchronisation/clock_alignment.py": _ELECTRICAL,
     "methods/interferometry/sensitivity.py": "radians per metre of height, to 0.03 %",
     "formats/phase_histories/afrl.py": _FORMAT,

@@ -74,7 +74,7 @@ CHANGES = [
     ("common/errors.py", "code", set()),
     ("pipeline/config/nodes.py", "docstring", set()),
     ("core/echo/dechirp.py", "docstring", set()),
-    ("formats/export/cog.py", "code", {"export", "fused", "layers", "mosaic", "page", "report"}),
+    ("formats/export/cog.py", "code", {"export", "fused", "layers", "mosaic", "pictures_fused"}),
     ("pipeline/rules.py", "code", set()),  # sources and settings are compared for themselves
     ("core/focus/engines/numba.py", "comment", set()),
     ("core/focus/engines/numba.py", "code", FOCUSED),

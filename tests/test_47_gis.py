@@ -31,7 +31,7 @@ from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.stale import damaged_results
 from apertura.pipeline.steps import mosaic
 
-FLOWN = {"f01": ("uav1-uav1", "uav1-uav2")}
+FLOWN = {"f01": ("uav1-uav1", "uav1-uav2", "fused")}
 RASTERS = [name for name in product_files(FLOWN) if name.endswith((".tif", ".vrt"))]
 STYLED = [name for name in product_files(FLOWN) if name.endswith(".qml")]
 needs_gdal = pytest.mark.skipif(not have_gdal(), reason="no programs of GDAL here: gdalinfo, gdallocationinfo")
@@ -124,7 +124,7 @@ def control(request, tmp_path_factory):
             transform=Affine(*grid.transform),
             crs=grid.crs_wkt,
         )
-    for name, files in mosaics({"f01": ["a-b"]}).items():
+    for name, files in mosaics({"f01": ["a-b", "fused"]}).items():
         write_mosaic(folder.parent / "mosaic" / name, [folder.parent / file for file in files])
     x, y = map(float, grid.map_at(ROW, COLUMN))
     return sorted([*folder.parent.rglob("*.tif"), *folder.parent.rglob("*.vrt")]), (x, y)
@@ -193,10 +193,10 @@ def test_every_image_and_sum_says_what_its_values_mean(finished_tiny):
         len({said[name]["quantity"] for name in [*sums, "uav1-uav1/slc.tif", "uav1-uav1/power.tif"]}) == len(sums) + 2
     )
     reports = {
-        pair: json.loads((finished_tiny.results / f"f01/{pair}/image.json").read_text()) for pair in FLOWN["f01"]
+        name: json.loads((finished_tiny.results / f"f01/{name}/image.json").read_text()) for name in FLOWN["f01"]
     }
+    fused = reports.pop("fused")
     peaks = {pair: report["brightest"]["amplitude"] for pair, report in reports.items()}
-    fused = json.loads((finished_tiny.results / "f01/fused/image.json").read_text())
     for source in ("coherent", "noncoherent", "magnitude"):
         assert fused["radiometry"][source]["divided_by"] == peaks
     for name in sums:

@@ -20,7 +20,7 @@ from apertura.pipeline.store import open_stage, read_manifest
 from apertura.simulation import ImageGrid, preset, simulate
 
 PAIRS = ("uav1-uav1", "uav1-uav2")
-PRODUCTS = list(product_files({"f01": PAIRS}))
+PRODUCTS = list(product_files({"f01": (*PAIRS, "fused")}))
 LAYERS = [
     f"f01/{pair}/{export.file}" for pair in PAIRS for export in exports_in("layers") if export.file.endswith(".tif")
 ]
@@ -94,7 +94,7 @@ def test_a_raster_of_one_flight_names_no_recording_of_another(tmp_path):
     campaign = run_steps(
         simulate(tmp_path / "two", replace(plan, flights=(flight, replace(flight, name="f02"))), seed=3)
     )
-    for name in product_files({one.name: one.pairs for one in campaign.image_flights}):
+    for name in product_files(campaign.images):
         if name.endswith(".tif"):
             inputs = json.loads(tags_of(campaign, name)["APERTURA_INPUTS"])
             assert {role.split("/")[1] for role in inputs} == {"codes.npy", name.split("/")[0]}

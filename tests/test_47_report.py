@@ -13,6 +13,7 @@ from apertura.views.report import PICTURES
 from apertura.views.report.image_drawings import steadiness
 from apertura.views.report.pictures import Shown, pictures
 from apertura.views.report.step import landing, page
+from apertura.views.report.sums import pictures_fused
 from apertura.views.verify.products import read_tags
 
 NAME = "`x`_ |y| .. raw:: html {{ 7*7 }} $\u00b5_\u03b1$ ../../etc 'a'"
@@ -26,6 +27,7 @@ def reported(finished_tiny, tmp_path_factory):
     campaign = Campaign.load(root)
     for pair in ("uav1-uav1", "uav1-uav2"):
         pictures(campaign, "f01", pair)
+    pictures_fused(campaign, "f01")
     page(campaign, "f01")
     return campaign
 
@@ -36,12 +38,14 @@ def test_every_picture_and_the_page_are_written_and_listed_with_what_they_are_ma
     assert set(listed["files"]) == {f"pictures/{name}.png" for name in PICTURES}
     assert "results/f01/uav1/raw.manifest.json" in listed["sources"]
     listed = read_manifest(reported.result("f01", "page.manifest.json"))
-    assert set(listed["files"]) == {"report.html", "fused/panels.png", "fused/cuts.png"}
-    assert "results/f01/uav1-uav1/pictures.manifest.json" in listed["sources"]
+    assert set(listed["files"]) == {"report.html"}
+    assert {f"results/f01/{name}/pictures.manifest.json" for name in ("uav1-uav1", "fused")} <= listed["sources"].keys()
+    listed = read_manifest(reported.result("f01", "fused", "pictures.manifest.json"))
+    assert set(listed["files"]) == {"panels.png", "sum_cuts.png"}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("manifest", ["uav1-uav2/pictures", "page"])
+@pytest.mark.parametrize("manifest", ["uav1-uav2/pictures", "fused/pictures"])
 def test_every_picture_says_what_it_was_made_from(reported, manifest):
     path = reported.result("f01", f"{manifest}.manifest.json")
     listed = read_manifest(path)

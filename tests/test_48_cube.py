@@ -160,9 +160,14 @@ def test_the_sum_says_how_far_it_lowers_clutter(opened):
     assert float(opened.clutter_reduction[0]) == pytest.approx(
         float(mean_db - opened.coherent_noise_floor[0]), abs=1e-9
     )
-    assert float(opened.clutter_reduction.sel(flight="f02")) == pytest.approx(
-        0, abs=0.011
-    )  # of one image, to its 0.01 dB
+
+
+def test_a_flight_of_one_pair_has_no_sum(opened):
+    alone = opened.sel(flight="f02")
+    for name in ("coherent", "noncoherent", "magnitude", "clutter_reduction", "coherent_noise_floor", "phase_removed"):
+        assert alone[name].isnull().all(), name
+    assert [*opened.attrs["fusion"]] == ["f01"]
+    assert not opened.coherent.sel(flight="f01").isnull().all()
 
 
 def test_metadata_are_consolidated_and_hashed_with_the_rest(campaign):

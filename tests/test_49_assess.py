@@ -167,6 +167,21 @@ def test_a_hypothesis_is_named_where_it_alone_explains_most_of_what_was_lost(tri
     assert [one["kind"] for one in found] == ([named] if named else [])
 
 
+@pytest.mark.parametrize(
+    ("loss_db", "std_db", "gain_db", "told"),
+    [
+        (-1.35, 0.3, 1.6, True),
+        (-1.35, 0.3, 0.0, False),  # the cause is another pair's
+        (-1.35, 0.6, 1.6, False),  # chance
+        (-3.0, 0.3, 1.6, False),  # something else does most of it
+        (-0.1, 0.01, 0.3, False),
+    ],
+)
+def test_a_cause_named_for_one_pair_is_told_of_another_that_it_brings_back(loss_db, std_db, gain_db, told):
+    assert assess._regained({"loss_db": loss_db, "std_db": std_db}, gain_db) is told
+    assert assess._regained({}, gain_db) is False
+
+
 @pytest.mark.slow
 def test_a_phase_between_pairs_is_taken_off_where_that_is_asked_for(finished_sample, tmp_path):
     def off_by_a_quarter(align):

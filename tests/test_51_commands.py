@@ -3,14 +3,13 @@
 import os
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 import yaml
 
 from apertura.common import processes
+from apertura.pipeline.config import FUSED
 from apertura.views import cli
-from apertura.views.image_report import FUSED, images_of
 
 
 @pytest.fixture
@@ -114,13 +113,6 @@ def test_a_summary_of_nothing_says_what_to_run(tiny, typed):
     status, _, err = typed("summary", tiny)
     assert status == 2
     assert "Run the workflow first" in err
-
-
-def test_a_pair_alone_is_not_fused_in_what_people_see(finished_tiny):
-    """One node alone: every view names the pair, none a sum of it."""
-    alone = SimpleNamespace(flight=lambda _: SimpleNamespace(pairs=["uav1-uav1"]))
-    assert images_of(alone, "f01") == ["uav1-uav1"]
-    assert images_of(finished_tiny, "f01")[-1] == FUSED
 
 
 def test_a_plan_says_what_it_was_made_from(tiny, finished_tiny, typed):

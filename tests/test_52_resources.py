@@ -108,7 +108,7 @@ def job_of(path):
     if not rule:
         return name, SimpleNamespace(**({"flight": folder[0]} if folder else {}))
     if where == "fused":
-        return "export_fused", SimpleNamespace(flight=folder[0])
+        return rule, SimpleNamespace(flight=folder[0])
     rule, _, share = rule.partition(".")
     if where == rule:  # a flight's own folder
         return rule, SimpleNamespace(flight=folder[0])

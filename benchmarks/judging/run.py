@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from apertura.common.errors import CampaignError
 from apertura.core.scene.grid import SceneGrid
 from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.config import Flight
+from apertura.pipeline.config import FUSED, Flight
 from apertura.pipeline.opening.scene import settled_scene
 from apertura.pipeline.steps import cube, echo, export, image, ingest, profile, scene
 from apertura.pipeline.store import open_stage
@@ -97,7 +97,8 @@ def _steps(campaign: Campaign, flight: Flight) -> None:
     cube.cube(campaign)
     for pair in flight.pairs:
         export.export(campaign, flight.name, pair)
-    export.export_fused(campaign, flight.name)
+    if FUSED in flight.images:
+        export.export_fused(campaign, flight.name)
 
 
 def _grid(campaign: Campaign) -> SceneGrid:
@@ -105,14 +106,15 @@ def _grid(campaign: Campaign) -> SceneGrid:
 
 
 def _reports(campaign: Campaign, flight: Flight) -> dict[str, dict[str, Any]]:
-    folders = {name: campaign.results / flight.name / name for name in (*flight.pairs, "fused")}
+    folders = {name: campaign.results / flight.name / name for name in flight.images}
     return {name: json.loads((folder / "image.json").read_text(encoding="utf-8")) for name, folder in folders.items()}
 
 
 def _images(campaign: Campaign, flight: Flight) -> Iterator[tuple[str, NDArray[np.complex64]]]:
     for pair in flight.pairs:
         yield pair, open_stage(campaign.stage("image", flight.name, pair), "image").image.values
-    yield "fused", open_stage(campaign.stage("cube"), "cube").coherent[0].values
+    if FUSED in flight.images:
+        yield FUSED, open_stage(campaign.stage("cube"), "cube").coherent[0].values
 
 
 def verdict_of(report: dict[str, Any]) -> str:

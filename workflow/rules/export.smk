@@ -119,10 +119,7 @@ rule mosaic:
     input:
         header["mosaic"].sources,
     output:
-        [
-            f"results/{file}"
-            for file in mosaic_files({one.name: one.pairs for one in campaign.image_flights}, campaign.coefficients)
-        ],
+        [f"results/{file}" for file in mosaic_files(campaign.images, campaign.coefficients)],
         header["mosaic"].output,
     log:
         header["mosaic"].log,

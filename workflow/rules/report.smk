@@ -32,6 +32,39 @@ rule pictures:
         "apertura step pictures {wildcards.flight} {wildcards.pair} > {log} 2>&1"
 
 
+rule pictures_fused:
+    input:
+        header["pictures_fused"].sources,
+    output:
+        [
+            report(
+                file,
+                caption=f"../report/{Path(file).stem}.rst",
+                category="{flight}",
+                labels={"image": "fused", "shows": Path(file).stem.replace("_", " ")},
+            )
+            for file in header["pictures_fused"].pictured
+        ],
+        header["pictures_fused"].output,
+    log:
+        header["pictures_fused"].log,
+    benchmark:
+        header["pictures_fused"].benchmark
+    conda:
+        "../../environment.yml"
+    threads: header["pictures_fused"].threads
+    resources:
+        mem_mb=header["pictures_fused"].mem_mb,
+        runtime=header["pictures_fused"].runtime,
+    params:
+        settings=header["pictures_fused"].settings,
+        code=header["pictures_fused"].code,
+    message:
+        "{wildcards.flight}: drawing what the pairs add up to for the report"
+    shell:
+        "apertura step pictures-fused {wildcards.flight} > {log} 2>&1"
+
+
 rule page:
     input:
         header["page"].sources,
@@ -41,18 +74,6 @@ rule page:
             caption="../report/page.rst",
             category="{flight}",
             labels={"image": "all", "shows": "results section, to be printed"},
-        ),
-        report(
-            f"results/{{flight}}/fused/{PANELS}",
-            caption="../report/panels.rst",
-            category="{flight}",
-            labels={"image": "all", "shows": "pairs and their sums"},
-        ),
-        report(
-            f"results/{{flight}}/fused/{SUM_CUTS}",
-            caption="../report/sum_cuts.rst",
-            category="{flight}",
-            labels={"image": "fused", "shows": "cuts of the coherent sum"},
         ),
         header["page"].output,
     log:

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 # ---- Variables of stage `cube`: name → dimensions, dtype, unit, meaning ---------------------------------------------
 
-_RASTERS, _SUMS, _IMAGES = ("flight", "pair", "y", "x"), ("flight", "y", "x"), ("flight", "pair")
+_RASTERS, _SUMS, _IMAGES, _FLIGHTS = ("flight", "pair", "y", "x"), ("flight", "y", "x"), ("flight", "pair"), ("flight",)
 
 CF_SIGMA0 = "surface_backwards_scattering_coefficient_of_radar_wave"
 """Standard name of σ⁰ in CF (Standard Name Table, https://cfconventions.org); γ⁰ and β⁰ have none."""
@@ -48,10 +48,13 @@ MEASURED: dict[str, Row] = {
         for kind in ("pair", "flight")
         for name, meaning in _OF_COHERENCE.items()
     },
-    "coherent_noise_floor": (("flight",), "float64", "dB", "median power of the coherent sum against its peak"),
-    "clutter_reduction": (("flight",), "float64", "dB", "clutter of the images over that of their coherent sum"),
+    "coherent_noise_floor": (_FLIGHTS, "float64", "dB", "median power of the coherent sum against its peak"),
+    "clutter_reduction": (_FLIGHTS, "float64", "dB", "clutter of the images over that of their coherent sum"),
 }
 """Known when the rasters are written."""
+
+SUMMED = frozenset(name for name, row in (*RASTERS.items(), *MEASURED.items()) if row[0] in {_SUMS, _FLIGHTS})
+"""Of these, what exists where a flight has two pairs to add up; NaN of flights of one pair."""
 
 QUOTED: dict[str, Row] = {
     "heading": (_IMAGES, "float64", "degree", "direction of flight, clockwise from grid north"),
@@ -118,6 +121,7 @@ _PULSE_GEOMETRY = {
     "tx_position": Variable(("pulse", "axis"), "float64", "m", "transmitting phase centre, in `frame`"),
     "rx_position": Variable(("pulse", "axis"), "float64", "m", "receiving phase centre, in `frame`"),
 }
+_CUBE = {name: Variable(*row) for part in (RASTERS, MEASURED, QUOTED, COORDINATES) for name, row in part.items()}
 _KNOTS = "node", "knot", "axis"
 _FRAME = {
     "frame": "'ecef' (EPSG:4978) or 'local' (the campaign's own Cartesian axes, no place on Earth)",
@@ -244,11 +248,12 @@ STAGES: Mapping[str, Stage] = {
         {**_FRAME, "quality": "engine, models, errors and measures, as in image.json"},
     ),
     "cube": Stage(
-        {name: Variable(*row) for part in (RASTERS, MEASURED, QUOTED, COORDINATES) for name, row in part.items()},
+        {name: row for name, row in _CUBE.items() if name not in SUMMED},
         {
             "fusion": "flight → pairs of the coherent sum with the phase taken off each, pairs left out and why",
             "coherence_window": "pixels along a side of the window that coherence is measured in",
         },
+        {name: row for name, row in _CUBE.items() if name in SUMMED},
     ),
 }
 

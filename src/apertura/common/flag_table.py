@@ -283,7 +283,8 @@ _OF_IMAGES = {
         "the hypothesis named behind it; positions, lever arms, heights, times", "core/imaging/focus_check.py"),
     "loss_unexpected": Flag(
         "dB lost at bright points, and dB that the budget expects, both with their deviation",
-        "bright points lost less than 1 dB or hardly more, yet more than the budget expects by three deviations",
+        "bright points lost less than 1 dB or hardly more, yet more than the budget expects by three deviations, or "
+        "what a cause named for another image of the flight brings back",
         "nodes.<n>.position_std_m, scene.height_std_m, time_tag_std_s: is what they state true?",
         "core/imaging/focus_check.py"),
     "echo_elsewhere": Flag(
@@ -373,67 +374,70 @@ _OF_IMAGES = {
 _OF_BENCHES = {
     "triggers_missed": Flag(
         "pulses not recorded, of all that were due", "more than 1 % of the pulses started no capture",
-        "trigger level and its cable; the recorder's disk", "methods/synchronisation/bench.py"),
+        "trigger level and its cable; the recorder's disk", "methods/synchronisation/channels.py"),
     "triggers_false": Flag(
         "captures between two pulses, of all", "the recorder was triggered by something else than the radar's pulses",
-        "trigger level; interference; waveform.prf_hz", "methods/synchronisation/bench.py"),
+        "trigger level; interference; waveform.prf_hz", "methods/synchronisation/channels.py"),
     "channel_weak": Flag(
         "counts rms of a channel", "the converter hardly sees a signal: quantisation adds to its noise",
-        "gain, attenuators, the cable of the channel", "methods/synchronisation/bench.py"),
+        "gain, attenuators, the cable of the channel", "methods/synchronisation/channels.py"),
     "channel_dc": Flag(
         "mean of I and Q, dB of the signal", "a constant in the samples: one subcarrier holds it, and all ranges",
-        "offset of the converter, leakage of the local oscillator", "methods/synchronisation/bench.py"),
+        "offset of the converter, leakage of the local oscillator", "methods/synchronisation/channels.py"),
     "channel_image": Flag(
         "dB of the mirror image", "I and Q are unequal, or not at 90°: subcarriers leak into their mirror images",
-        "balance of the mixer; clipping of one of both", "methods/synchronisation/bench.py"),
+        "balance of the mixer; clipping of one of both", "methods/synchronisation/channels.py"),
+    "channel_bits_stuck": Flag(
+        "bits of the samples that never change", "the converter or its bus holds a bit: its weight is added or lost",
+        "data lines of the converter; the recorder's format", "methods/synchronisation/channels.py"),
     "spectrum_inverted": Flag(
         "the node", "conjugates of the samples carry the code: I and Q are swapped, or a mixer is above the band",
         "order of I and Q in the recorder; the local oscillator's side", "pipeline/opening/bench.py"),
     "link_weak": Flag(
         "dB of a compressed pulse", "the path is hardly above the noise: no coherence to speak of",
-        "attenuators, cables, gain; which channel is which", "methods/synchronisation/bench.py"),
+        "attenuators, cables, gain; which channel is which", "methods/synchronisation/links.py"),
     "link_incoherent": Flag(
         "Γ, what noise allows, and phase noise beyond it",
         "the phase of the path scatters from pulse to pulse by more than noise does: images lose so much",
         "the clock that feeds both channels; the sidelink's connection; a loose connector",
-        "methods/synchronisation/bench.py"),
+        "methods/synchronisation/links.py"),
     "link_drifts": Flag(
         "phase and delay over the recording", "path or delay changes while nothing moves",
-        "warming up: cables, amplifiers, filters; wait, or calibrate again", "methods/synchronisation/bench.py"),
+        "warming up: cables, amplifiers, filters; wait, or calibrate again", "methods/synchronisation/links.py"),
     "delay_jumps": Flag(
         "pulses that arrive at another delay, and how far from the others",
         "pulses arrive at several delays while nothing moves: captures that begin elsewhere, or another path",
         "trigger of the transmitter; cables that were changed; two reflectors as strong as each other",
-        "methods/synchronisation/bench.py"),
+        "methods/synchronisation/links.py"),
     "interference": Flag(
         "dB by which one subcarrier changes more than the others, and its frequency",
         "a narrow signal lies in the band: it adds noise to every range",
-        "other transmitters; spurs of the node's own clocks", "methods/synchronisation/bench.py"),
+        "other transmitters; spurs of the node's own clocks", "methods/synchronisation/links.py"),
     "contact_loose": Flag(
         "amplitude beyond noise, from pulse to pulse and over the recording; pulses lost or 6 dB low",
         "amplitude is not steady while nothing moves",
-        "connectors of that channel; supply of the amplifiers", "methods/synchronisation/bench.py"),
+        "connectors of that channel; supply of the amplifiers", "methods/synchronisation/links.py"),
     "channel_leaks": Flag(
         "dB of what arrives with the sidelink against the strongest path",
         "the radar channel hears what the sidelink carries: an echo at short range that is none",
-        "shielding, cables side by side, isolation of the channels", "methods/synchronisation/bench.py"),
+        "shielding, cables side by side, isolation of the channels", "methods/synchronisation/links.py"),
     "channels_swapped": Flag(
         "m that the echo arrives before the sidelink", "the strongest echo comes before the direct path",
         "which channel is radar, which sidelink; bench.radar_m and bench.sidelink_m",
-        "methods/synchronisation/bench.py"),
+        "methods/synchronisation/links.py"),
     "clock_unlocked": Flag(
         "ppm against the transmitter's clock",
         "the two clocks are not of one reference: samples are corrected by what is measured, if it keeps",
-        "lock of the node's reference (GNSS, 10 MHz)", "methods/synchronisation/bench.py"),
+        "lock of the node's reference (GNSS, 10 MHz)", "methods/synchronisation/links.py"),
     "clock_drifts": Flag(
         "ppm over the recording", "the clock moves while it is recorded",
-        "warming up; lock of the node's reference", "methods/synchronisation/bench.py"),
+        "warming up; lock of the node's reference", "methods/synchronisation/links.py"),
     "path_disagrees": Flag(
         "path beyond the set-up, and the config's", "the config's path offset is not what the set-up says",
-        "nodes.<n>.path_offset_m; bench.radar_m, bench.sidelink_m", "methods/synchronisation/bench.py"),
+        "nodes.<n>.path_offset_m; bench.radar_m, bench.sidelink_m", "methods/synchronisation/links.py"),
     "split_disagrees": Flag(
         "gain, phase, and both over the band", "two channels that one signal feeds do not show the same",
-        "splitter and cables; filters of the two channels; path offsets", "methods/synchronisation/bench.py"),
+        "splitter and cables; filters of the two channels; path offsets", "methods/synchronisation/links.py"),
 }  # fmt: skip
 """Name → what it says; see `apertura.common.flags.FLAGS`."""
 

@@ -74,6 +74,11 @@ class Campaign(RawFolder):
         """Flights that become images."""
         return tuple(flight for flight in self.flights if flight.kind == "image")
 
+    @property
+    def images(self) -> dict[str, tuple[str, ...]]:
+        """Flight that becomes images → their names: its pairs, and their sums where there are two pairs to add."""
+        return {flight.name: flight.images for flight in self.image_flights}
+
     def check_images(self) -> None:
         """Raise CampaignError where no flight becomes an image: what shows images has nothing to show."""
         if not self.image_flights:

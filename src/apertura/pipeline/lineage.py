@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from apertura.common.code_imports import import_closure
+from apertura.common.errors import CampaignError
 from apertura.core.focus.engines import ENGINES
 from apertura.formats.export import EXPORTS, export_modules, exports_in
 from apertura.formats.names import FINDERS, PHASE_HISTORIES, RECORDERS, TRACKS, log_format
@@ -49,9 +50,21 @@ def result_of(campaign: Campaign, result: str, *where: str) -> Result:
         A key of `apertura.pipeline.rules.RESULTS`.
     *where
         What it is of: values of the wildcards of its row.
+
+    Raises
+    ------
+    CampaignError
+        If the campaign has none there, as sums of one pair.
     """
     rule = RESULTS[result]
     place = JobPlace(campaign, rule.of, where)
+    if not rule.needed(place):
+        raise CampaignError(
+            f"no {result} of {' '.join(where) or 'this campaign'}",
+            where=campaign.root,
+            expected="a result that its flights and its config have",
+            remedy="`apertura list` shows them.",
+        )
     sources = tuple(dict.fromkeys(source for one in rule.sources for source in _read(place, one)))
     settings = {name: value for one in rule.settings for name, value in _stated(place, one).items()}
     return Result(_manifest(rule, where), sources, settings, modules_of(campaign, result, *where))
@@ -100,8 +113,14 @@ def _jobs(campaign: Campaign) -> Iterator[tuple[Rule, tuple[str, ...]]]:
 
 def _places(campaign: Campaign, rule: Rule, kind: str) -> list[tuple[str, ...]]:
     """Return the places of a rule that belong to flights of a kind; those of the campaign belong to its images."""
-    if kind not in rule.kinds or not rule.needed(campaign):
-        return []
+    return _needed(rule, campaign, _candidates(campaign, rule, kind)) if kind in rule.kinds else []
+
+
+def _needed(rule: Rule, campaign: Campaign, places: Iterable[tuple[str, ...]]) -> list[tuple[str, ...]]:
+    return [where for where in places if rule.needed(JobPlace(campaign, rule.of, where))]
+
+
+def _candidates(campaign: Campaign, rule: Rule, kind: str) -> list[tuple[str, ...]]:
     flights = [flight for flight in campaign.flights if flight.kind == kind]
     if rule.of in {Scope.CAMPAIGN, Scope.CHARTED}:
         return [()] if flights else []
@@ -125,7 +144,7 @@ def _read(place: JobPlace, source: SourceSpec) -> Iterable[str]:
     if source == EVERY:
         return [_manifest(rule, where) for rule, where in _jobs(place.campaign) if not _describes_all(rule)]
     rule = RESULTS[source]
-    return [_manifest(rule, where) for where in place.below(rule.of)] if rule.needed(place.campaign) else []
+    return [_manifest(rule, where) for where in _needed(rule, place.campaign, place.below(rule.of))]
 
 
 def _describes_all(rule: Rule) -> bool:

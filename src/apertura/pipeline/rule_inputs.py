@@ -104,6 +104,18 @@ def is_sampled(campaign: "Campaign") -> bool:
     return isinstance(campaign.settings.waveform, SampledWaveform)
 
 
+def of_samples(place: JobPlace) -> bool:
+    """Return whether samples were recorded, as `is_sampled`."""
+    return is_sampled(place.campaign)
+
+
+def adds_up(place: JobPlace) -> bool:
+    """Return whether a flight has pairs to add up."""
+    from apertura.pipeline.config import FUSED
+
+    return FUSED in place.campaign.flight(place.where[0]).images
+
+
 def recording(place: JobPlace) -> Iterable[str]:
     """Return the files of what a node recorded."""
     return map(place.campaign.relative, place.campaign.recording_files(*place.where))

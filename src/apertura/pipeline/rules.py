@@ -6,13 +6,10 @@ They name modules as text, since the command line reads them, too: what a row ne
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from apertura.pipeline import rule_inputs as inputs
 from apertura.pipeline.rule_inputs import Scope
-
-if TYPE_CHECKING:
-    from apertura.pipeline.campaign import Campaign
 
 INTERFEROMETRY = "interferometry"
 """Folder of the results: pairs of images compared in phase."""
@@ -120,7 +117,7 @@ class Rule:
     kinds
         Kinds of flights that it is made of.
     needed
-        Whether a campaign has it at all.
+        Whether a place has it at all.
     on_demand
         Whether it is made when it is asked for, and not with the images.
     shares
@@ -150,7 +147,7 @@ class Rule:
     styles: bool = False
     manifest: str = ""
     kinds: tuple[str, ...] = ("image",)
-    needed: Callable[["Campaign"], bool] = lambda _: True
+    needed: Callable[[inputs.JobPlace], bool] = lambda _: True
     on_demand: bool = False
     shares: bool = False
     reads: tuple[str, ...] = ("recordings", "logs")
@@ -235,7 +232,7 @@ _INGEST = Rule(
     settings=("waveform", "processing.false_alarms_per_s"),
     reads=("recordings",),
     kinds=("calibration", "image"),
-    needed=inputs.is_sampled,
+    needed=inputs.of_samples,
     demand=Demand(250, pulse_bytes=100, recorded_s=60),
     cost=Cost(1.3, mb_s=0.01),
 )
@@ -321,7 +318,7 @@ _ROWS = (
         f"{_STEPS}.scene:terrain",
         sources=("scene", inputs.heights),
         settings=("scene.dem", "scene.dem_datum", "scene.geoid"),
-        needed=lambda campaign: bool(campaign.settings.scene.dem),
+        needed=lambda place: bool(place.campaign.settings.scene.dem),
         demand=Demand(500, pixel_bytes=50, pixel_s=10),
     ),
     Rule(
@@ -354,7 +351,7 @@ _ROWS = (
         settings=("campaign", inputs.stated_errors),
         products=("tracks.png",),
         manifest="{flight}/tracks/tracks",
-        needed=inputs.is_sampled,
+        needed=inputs.of_samples,
         demand=Demand(500, recorded_s=5),
         cost=Cost(2.0, last=True),
     ),
@@ -449,6 +446,7 @@ _ROWS = (
         documents=("image.json",),
         exports="fused",
         manifest="{flight}/fused/export",
+        needed=inputs.adds_up,
         command="export",
         last_words=("fused",),
         demand=Demand(500, pixel_bytes=50, pixel_s=30),
@@ -507,11 +505,25 @@ _ROWS = (
         cost=Cost(5.0, mb_s=0.01, last=True),
     ),
     Rule(
+        "pictures_fused",
+        Scope.FLIGHT,
+        "Draw what the report shows of the sums of a flight's pairs: beside the pairs, and cuts.",
+        "apertura.views.report.sums:pictures_fused",
+        sources=("export", "image", "cube", "fused", "scene"),
+        settings=("campaign",),
+        products=("panels.png", "sum_cuts.png"),
+        manifest="{flight}/fused/pictures",
+        needed=inputs.adds_up,
+        on_demand=True,
+        demand=Demand(500, pixel_s=5),
+        cost=Cost(2.0, mpx_s=0.5, last=True),
+    ),
+    Rule(
         "page",
         Scope.FLIGHT,
         "Write what the report says of a flight, report.html, which prints.",
         "apertura.views.report.step:page",
-        sources=("pictures", "export", "image", "cube", "fused", "scene"),
+        sources=("pictures", "pictures_fused", "export", "fused", "scene"),
         settings=(inputs.everything,),
         on_demand=True,
         demand=Demand(500, pixel_s=5),

@@ -161,20 +161,20 @@ def _stretch(channel: Channel, pulse: int, spectra: Complex, start: int, stop: i
     index = np.arange(start, stop)
     time_s = index / sampling_rate(channel) + channel.start_s[pulse] - waveform.duration_s / 2
     numbers = waveform.first_subcarrier + np.arange(spectra.shape[1])
-    total = np.zeros(stop - start, np.complex128)
-    for term, one in enumerate(spectra):
-        if stop - start <= _SHORT:
-            table = _rotations(turns, waveform.first_subcarrier, len(one))[: stop - start]
-            part = table @ (one * np.exp(2j * np.pi * turns * numbers * start))
-        elif channel.sfo_hz:
-            part = _zoom(len(one), count, turns)(one)[start:stop]
-            part = part * np.exp(2j * np.pi * turns * waveform.first_subcarrier * index)
-        else:
-            bins = np.zeros(waveform.dft_samples, np.complex128)
-            bins[numbers] = one
-            part = np.fft.ifft(bins, norm="forward")[index % waveform.dft_samples]
-        total += time_s**term * part
-    return total
+    if stop - start <= _SHORT:
+        table = _rotations(turns, waveform.first_subcarrier, len(numbers))[: stop - start]
+        parts = (spectra * np.exp(2j * np.pi * turns * start * numbers)) @ table.T
+    elif channel.sfo_hz:
+        parts = _zoom(len(numbers), count, turns)(spectra)[:, start:stop]
+        parts = parts * np.exp(2j * np.pi * turns * waveform.first_subcarrier * index)
+    else:
+        bins = np.zeros((len(spectra), waveform.dft_samples), np.complex128)
+        bins[:, numbers] = spectra
+        parts = fft.ifft(bins, norm="forward")[:, index % waveform.dft_samples]
+    total = parts[-1]  # Horner's rule in t
+    for part in parts[-2::-1]:
+        total = total * time_s + part
+    return np.asarray(total)
 
 
 @lru_cache(maxsize=4)

@@ -363,11 +363,14 @@ def bench(
     campaign: CampaignFolder = HERE,
     write: Annotated[bool, typer.Option("--write", help="write the measured paths into config/config.yaml")] = False,
 ) -> None:
-    """Measure a radar that stands still or is cabled: channels, clocks, coherence, paths; a verdict per line."""
+    """Measure a radar that stands still or is cabled: channels, clocks, coherence, paths; a verdict per line.
+
+    Exits with 2 where a line is beyond its limit.
+    """
     opened = _opened(campaign)
     from apertura.views.report.bench import print_bench
 
-    print_bench(opened, write=write)
+    raise SystemExit(2 if print_bench(opened, write=write) else 0)
 
 
 @app.command()

@@ -9,10 +9,8 @@ from apertura.common.errors import shown
 from apertura.common.flag_table import FLAGS
 from apertura.core.quality.budget import is_counted
 from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.config import FUSED
 from apertura.pipeline.store import open_listed
-
-FUSED = "fused"
-"""Name of the sums of a flight, among those of its pairs."""
 
 REPORT = "image.json"
 
@@ -107,12 +105,6 @@ def read_report(campaign: Campaign, flight: str, image: str) -> dict[str, Any]:
         report = {**report, "flags": printable(report["flags"])}
         ImageValues.of(report)
     return report
-
-
-def images_of(campaign: Campaign, flight: str) -> list[str]:
-    """Return the images of a flight: its pairs, and their sums where there are two pairs to add."""
-    pairs = campaign.flight(flight).pairs
-    return [*pairs, *([FUSED] if len(pairs) > 1 else [])]
 
 
 def printable(flags: Mapping[str, str]) -> dict[str, str]:

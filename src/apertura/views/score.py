@@ -18,12 +18,11 @@ from apertura.core.scene.grid import SceneGrid
 from apertura.formats.export import product, product_files
 from apertura.formats.export.radiometry import CROSS_SECTIONS
 from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.config import Flight
+from apertura.pipeline.config import FUSED, Flight
 from apertura.pipeline.opening.pair import open_pair
 from apertura.pipeline.opening.radiometry import calibrated_pair
 from apertura.pipeline.opening.scene import open_scene, settled_scene
 from apertura.pipeline.store import open_listed, open_stage
-from apertura.views.image_report import FUSED, images_of
 from apertura.views.summary import print_summary
 
 REACH_M = 1.0
@@ -71,7 +70,7 @@ def score(campaign: Campaign) -> list[Finding]:
 def _flight(campaign: Campaign, flight: Flight, targets: list[dict[str, float]]) -> Iterator[Finding]:
     grid = settled_scene(campaign).grid
     along = _along_track(campaign, flight, grid)
-    sources = {name: "coherent" if name == FUSED else "image" for name in images_of(campaign, flight.name)}
+    sources = {name: "coherent" if name == FUSED else "image" for name in flight.images}
     files = {name: campaign.result(flight.name, name, product(of, "write_slc").file) for name, of in sources.items()}
     for name, file in files.items():
         if not file.is_file():
@@ -154,7 +153,5 @@ def print_findings(campaign: Campaign, *, paths: bool) -> None:
     console.print(table)
     print_summary(campaign)
     if paths:
-        for file in product_files(
-            {flight.name: flight.pairs for flight in campaign.image_flights}, campaign.coefficients
-        ):
+        for file in product_files(campaign.images, campaign.coefficients):
             print(campaign.results / file)

@@ -8,15 +8,14 @@ from apertura.common.documents import undamaged
 from apertura.common.errors import shown
 from apertura.formats.export import MAP, exports_in
 from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.config import FUSED
 from apertura.pipeline.rules import INTERFEROMETRY
 from apertura.pipeline.store import open_listed
 from apertura.views.image_report import (
-    FUSED,
     REPORT,
     ImageValues,
     Report,
     decibels,
-    images_of,
     printable,
     raised_flags,
     read_report,
@@ -34,7 +33,7 @@ _MOST_FLIGHTS = 3
 
 def is_finished(campaign: Campaign) -> bool:
     """Return whether every image has its report."""
-    images = ((flight.name, name) for flight in campaign.image_flights for name in (*flight.pairs, FUSED))
+    images = ((flight.name, name) for flight in campaign.image_flights for name in flight.images)
     return all(campaign.result(*image, REPORT).is_file() for image in images)
 
 
@@ -49,7 +48,7 @@ def print_summary(campaign: Campaign) -> None:
     from rich.console import Console
 
     campaign.check_images()
-    names = [(flight.name, name) for flight in campaign.image_flights for name in images_of(campaign, flight.name)]
+    names = [(flight.name, name) for flight in campaign.image_flights for name in flight.images]
     there = [image for image in names if campaign.result(*image, REPORT).is_file()]
     reports = {" ".join(image): read_report(campaign, *image) for image in there or names[:1]}
     values = {name: ImageValues.of(report) for name, report in reports.items()}
@@ -86,10 +85,9 @@ def print_products(campaign: Campaign) -> None:
     """Print which files to open, of the first flights."""
     print(f"what to open, in {campaign.root}:")
     flights = campaign.image_flights
-    folders = []
-    for flight in flights[:_MOST_FLIGHTS]:
-        image = images_of(campaign, flight.name)[-1]
-        folders.append(("fused" if image == FUSED else "pair", flight.name, image))
+    folders = [
+        ("fused" if FUSED in one.images else "pair", one.name, one.images[-1]) for one in flights[:_MOST_FLIGHTS]
+    ]
     folders += [("interferogram", INTERFEROMETRY, name) for name in campaign.settings.interferometry.pairs]
     for kind, *folder in folders:
         for row in sorted(exports_in(kind), key=lambda row: row.pictured):  # rasters first

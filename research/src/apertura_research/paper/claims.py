@@ -1,6 +1,7 @@
 """One row of the claims table: what is printed, what this project computes, and what the verdict is about."""
 
 from dataclasses import dataclass, replace
+from math import isinf
 
 AGREES, DISAGREES, EXPLAINED, UNTESTABLE = "agrees", "disagrees", "explained", "not testable here"
 VERDICTS = (AGREES, DISAGREES, EXPLAINED, UNTESTABLE)
@@ -78,6 +79,8 @@ def compare(
     >>> row = compare("loss", -1.7, "dB", independent_model=-1.0, within=0.5, relative=False, note="few draws")
     >>> row.paper, row.independent_model, row.about, row.verdict, row.note
     ('', '-1', 'model', 'disagrees', 'differs by -0.7 dB; few draws')
+    >>> compare("width", 57.35, "cm", paper="58", within=0.05).note
+    'differs by -1.1 %, ±5 % allowed here'
     """
     if not paper and independent_model is None:
         raise ValueError(f"{claim}: neither a value of the paper nor of a model to compare with")
@@ -86,9 +89,11 @@ def compare(
     allowed = half_digit(paper) if within is None else within * (abs(expected) if relative else 1)
     modelled, shown = "" if independent_model is None else f"{independent_model:.4g}", f"{computed:{style}}"
     about = PAPER if paper else MODEL
-    if abs(difference) <= allowed * (1 + 1e-9):
-        return Claim(claim, paper, modelled, shown, unit, about, AGREES, note)
     by = f"{100 * difference / abs(expected):+.1f} %" if relative else f"{difference:+.3g} {unit}"
+    if abs(difference) <= allowed * (1 + 1e-9):
+        share = f"{100 * within:g} %" if within and relative else f"{allowed:.2g} {unit}"
+        chosen = "" if within is None or isinf(within) else f"differs by {by}, ±{share} allowed here"
+        return Claim(claim, paper, modelled, shown, unit, about, AGREES, _join(chosen, note))
     verdict = EXPLAINED if reason else DISAGREES
     return Claim(claim, paper, modelled, shown, unit, about, verdict, _join(f"differs by {by}", reason, note))
 

@@ -21,7 +21,16 @@ from apertura.pipeline.opening.results import OpenCampaign, open_campaign
 from apertura.pipeline.opening.transmitted import transmitted
 from apertura.simulation import CampaignSpecification, Line, PointTarget, preset
 from apertura.simulation.scene import Clutter, Target, Vector
-from apertura_research.paper.claims import AGREES, DISAGREES, PAPER, Claim, compare, fitted_to, half_digit, require
+from apertura_research.paper.claims import (
+    DISAGREES,
+    PAPER,
+    UNTESTABLE,
+    Claim,
+    compare,
+    fitted_to,
+    half_digit,
+    require,
+)
 from apertura_research.paper.parameters import coherence_of_snr, snr_of_coherence_factor
 
 FLIGHT, MONOSTATIC, BISTATIC = "f01", "uav1-uav1", "uav1-uav2"
@@ -156,10 +165,10 @@ def _uncorrected(experiments: Mapping[str, Experiment]) -> Claim:
     note = (
         f"of the cables; {factors['static']:.2g} of the first cylinder: it is not known here of which one is printed; "
         f"random phases: mean 1/M = {1 / pulses:g}, median {np.log(2) / pulses:.4f}; 95 % of recordings give "
-        f"{low:.4f} to {high:.4f}, so that any value there agrees"
+        f"{low:.4f} to {high:.4f}, so that any value there would agree"
     )
     chance = all(low <= value <= high for value in (*factors.values(), float(PRINTED_UNCORRECTED)))
-    shown, verdict = f"{factors['lab']:.2g}", AGREES if chance else DISAGREES
+    shown, verdict = f"{factors['lab']:.2g}", UNTESTABLE if chance else DISAGREES
     name = "coherence factor without correction"
     return Claim(name, PRINTED_UNCORRECTED, f"{1 / pulses:g}", shown, "1", PAPER, verdict, note)
 

@@ -280,7 +280,7 @@ def _undisturbed_peaks(error: UncorrectedError) -> Floats:
 def _row(error: UncorrectedError, size: float, expected_db: float, losses_db: Floats) -> Claim:
     mean_db, count = float(losses_db.mean()), losses_db.size
     destroyed = expected_db < DESTROYED_DB and mean_db < DESTROYED_DB
-    how = "destroyed: no peak is left to compare" if destroyed else f"to within {error.within_db:g} dB"
+    how = "destroyed: no peak is left to compare" if destroyed else ""
     over = f"mean of {count} draws, spread {losses_db.std():.2f} dB" if count > 1 else "nothing random"
     return compare(
         f"uncorrected loss: {error.sweep.title} {size:g} {error.sweep.unit}",

@@ -89,7 +89,7 @@ def uav_table(*, pulses: int = 200) -> list[Claim]:
     return [
         compare(f"{across}, Hann, mono", mono[0], "cm", paper="58", within=WITHIN, note=closed),
         compare(f"{along} of L = 3.4 m", mono[1], "cm", independent_model=100 * short_m, within=WITHIN),
-        compare(f"{along} as printed", mono[1], "cm", paper="25", within=WITHIN, note=other_length),
+        compare(f"{along} as printed", mono[1], "cm", paper="25", within=WITHIN, reason=other_length),
         fitted_to(compare(f"{along}, fused, fitted segments", fused[1], "cm", paper="11", within=WITHIN, note=fitted)),
         fitted_to(compare(f"{across}, fused, fitted segments", fused[0], "cm", paper="49", within=WITHIN, note=fitted)),
     ]  # fmt: skip

@@ -1,6 +1,7 @@
-"""Noise power of a pulse: measured at the Doppler farthest from the scene's, and what a sidelink adds to it."""
+"""Noise of a pulse: measured at Doppler frequencies that no echo of the scene has, and what a sidelink adds to it."""
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,15 +9,21 @@ from numpy.typing import NDArray
 from apertura.core.antenna.beam import Beams
 from apertura.core.antenna.illumination import illumination_mask
 from apertura.core.echo.sidelink import METHODS
-from apertura.core.focus.contributions import band_limited_image
+from apertura.core.focus.contributions import band_limited_terms
 from apertura.core.focus.inputs import PhaseHistory, Profiles
 from apertura.core.focus.reach import PULSES
 from apertura.core.imaging.range_profiles import range_compress
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import Terrain
 
-PLACES, BLOCKS = 64, 32
+_PLACES, _BLOCKS = 64, 32
 """Random places, and blocks of 64 pulses at most, that the noise is measured at."""
+
+_MARGIN, _BAND = 2.0, (0.25, 0.4375)
+"""Doppler frequencies left to echoes: twice those of the scene, for what lies beside it, and limits, cycles a pulse."""
+
+_LEAK = 1e-5
+"""Share of a taper's energy within that band, at most."""
 
 _DRAWN = 128  # pulses on which the noise of a sidelink is drawn, or up to twice as many
 _ALIKE, _BLOCKS_DRAWN = 8, 16  # of them that see a place alike; blocks drawn of each
@@ -26,12 +33,25 @@ _LEAST_WEIGHT = 0.1  # of the largest weight of a block at a place: places with 
 
 def noise_places(grid: SceneGrid, terrain: Terrain) -> NDArray[np.float64]:
     """Return the places at which the noise of a scene is measured, (place, 3) float64, metres: random ones."""
-    rows, columns = np.random.default_rng(0).integers(0, grid.shape, (PLACES, 2)).T
+    rows, columns = np.random.default_rng(0).integers(0, grid.shape, (_PLACES, 2)).T
     return terrain.positions_at(grid, rows, columns)
 
 
-def noise_power(profiles: Profiles, places_m: NDArray[np.float64], *, beams: Beams | None = None) -> float:
-    """Return σ², the power of the noise of one pulse at a place, in units of the profiles.
+class PulseNoise(NamedTuple):
+    """σ², the noise of one pulse at a place, in units of the profiles, and its standard deviation, dB; NaN: unknown."""
+
+    power: float
+    std_db: float
+
+
+def noise_power(
+    profiles: Profiles,
+    places_m: NDArray[np.float64],
+    *,
+    time_s: NDArray[np.float64] | None = None,
+    beams: Beams | None = None,
+) -> PulseNoise:
+    """Return the noise of one pulse at a place, measured where no echo of the scene is: at other Doppler frequencies.
 
     Parameters
     ----------
@@ -39,12 +59,14 @@ def noise_power(profiles: Profiles, places_m: NDArray[np.float64], *, beams: Bea
         Of every pulse; some are read.
     places_m
         (place, 3) float64, metres: spread over the scene.
+    time_s
+        (pulse,) float64, seconds, by which pulses that are missing are counted; by default none is.
     beams
         Weights of the pulses.
 
     Returns
     -------
-    float
+    PulseNoise
         NaN where no block illuminates a place. An upper bound where pulses are so sparse that echoes of every other
         pulse alias.
 
@@ -56,38 +78,44 @@ def noise_power(profiles: Profiles, places_m: NDArray[np.float64], *, beams: Bea
     illuminated = illumination_mask(beams, profiles.aperture, places_m, places, pulses=PULSES)
     illuminating = starts[illuminated.any(axis=1) & (np.minimum(starts + PULSES, len(profiles)) - starts >= _FEWEST)]
     if not illuminating.size:
-        return float("nan")
-    chosen = illuminating[np.unique(np.linspace(0, len(illuminating) - 1, BLOCKS).round().astype(int))]
-    power, weight = np.empty((2, len(chosen), len(places_m)))
-    for number, first in enumerate(chosen.tolist()):
+        return PulseNoise(float("nan"), float("nan"))
+    chosen = illuminating[np.unique(np.linspace(0, len(illuminating) - 1, _BLOCKS).round().astype(int))]
+    power, weight = list[NDArray[np.float64]](), list[NDArray[np.float64]]()
+    for first in chosen.tolist():
         block = slice(first, min(first + PULSES, len(profiles)))
-        power[number], weight[number] = _alternating_power(profiles[block], places_m, beams and beams[block])
-    enough = weight > _LEAST_WEIGHT * weight.max()
-    return float(np.median(power[enough] / weight[enough]) / np.log(2)) if enough.any() else float("nan")
+        some, number = profiles[block], _numbers(block, time_s)
+        spread, _ = some.aperture.phase_rates(places_m, wavelength_m=profiles.wavelength_m)
+        tapers = _tapers(number, float(np.clip(_MARGIN * spread, *_BAND)))
+        terms = band_limited_terms(some, places_m, beams=beams and beams[block])
+        seen = np.ones(terms.shape) if beams is None else beams[block].weight(some.aperture, places_m)
+        power.extend(np.abs(tapers @ terms) ** 2)
+        weight.extend(tapers**2 @ seen**2)
+    powers, weights = np.array(power), np.array(weight)
+    enough = weights > _LEAST_WEIGHT * weights.max()
+    if not enough.any():
+        return PulseNoise(float("nan"), float("nan"))
+    each = np.where(enough, powers / np.where(enough, weights, 1.0), np.nan)
+    # tapers are orthogonal and blocks apart, so their noise is independent; that of places in one cell is not
+    levels = np.array([np.nanmedian(one) for one in each if np.isfinite(one).any()])
+    apart = float(levels.std(ddof=1) / levels.mean() / np.sqrt(len(levels))) if len(levels) > 1 else 1.0
+    return PulseNoise(float(np.nanmedian(each) / np.log(2)), 10 / float(np.log(10)) * apart)
 
 
-def _alternating_power(
-    profiles: Profiles, places_m: NDArray[np.float64], beams: Beams | None
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the power at places of the sum of pulses with alternating signs, and Σ of their squared weights."""
-    count = len(profiles)
-    taper = np.hanning(count + 2)[1:-1] * np.where(np.arange(count) % 2, -1.0, 1.0)
-    alternating = replace(profiles, samples=np.asarray(profiles.samples * taper[:, None], np.complex64))
-    weight = np.ones((count, len(places_m))) if beams is None else beams.weight(profiles.aperture, places_m)
-    image = band_limited_image(alternating, places_m, beams=beams)
-    return np.abs(image) ** 2, taper**2 @ weight**2
+def _numbers(block: slice, time_s: NDArray[np.float64] | None) -> NDArray[np.float64]:
+    """Return which pulse each of a block was, counted from its first, missing ones too."""
+    if time_s is None:
+        return np.arange(float(block.stop - block.start))
+    step_s = np.diff(time_s[block])
+    return np.cumsum(np.concatenate([[0.0], np.maximum(1.0, np.rint(step_s / max(float(np.median(step_s)), 1e-9)))]))
 
 
-def noise_std_db(pulses: int) -> float:
-    """Return the standard deviation of `noise_power` of so many pulses, dB: that of the median of exponential powers.
+def _tapers(number: NDArray[np.float64], band: float) -> NDArray[np.float64]:
+    """Return tapers over pulses, (taper, pulse) float64 of norm 1, that see next to nothing of |f| < band per pulse.
 
-    Examples
-    --------
-    >>> round(noise_std_db(4096), 2), round(noise_std_db(100), 2)
-    (0.14, 0.78)
+    At least one, the best.
     """
-    values = PLACES * min(BLOCKS, max(1, pulses // PULSES))
-    return float(10 / np.log(10) / np.log(2) / np.sqrt(values))
+    leak, taper = np.linalg.eigh(2 * band * np.sinc(2 * band * np.subtract.outer(number, number)))
+    return np.asarray(taper[:, leak <= max(_LEAK, float(leak[0]))].T)
 
 
 def sidelink_noise(

@@ -7,7 +7,7 @@ as entry point of group ``apertura.exports``. Importing this module imports no f
 """
 
 import pkgutil
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -230,15 +230,15 @@ def export_modules(folder: str) -> list[str]:
     return sorted({export.module for export in exports_in(folder)})
 
 
-def mosaics(pairs: Mapping[str, Sequence[str]], coefficients: Sequence[str] = ()) -> dict[str, list[str]]:
+def mosaics(images: Mapping[str, Sequence[str]], coefficients: Sequence[str] = ()) -> dict[str, list[str]]:
     """Return the rasters of all flights, relative to `MOSAICS` → what they are made of, relative to the results.
 
     Images of one pair, or the sums of a flight: others are taken from other places, or mean something else.
 
     Parameters
     ----------
-    pairs
-        Flight → its pairs, the lowest first.
+    images
+        Flight → its images, as `product_files`; the lowest flight first.
     coefficients
         Sources of kinds ``radiometry`` and ``multilook`` that are written.
 
@@ -248,42 +248,37 @@ def mosaics(pairs: Mapping[str, Sequence[str]], coefficients: Sequence[str] = ()
     ['f01/a-b/db.tif', 'f02/a-b/db.tif']
     """
     found: dict[str, list[str]] = {}
-    for flight, names in pairs.items():
-        for folder, kinds in _folders(names):
-            for row in _written(kinds, coefficients):
+    for flight, folders in images.items():
+        for folder in folders:
+            for row in _written(folder, coefficients):
                 if row.mosaicked and row.file.endswith(".tif"):
                     name = f"{folder}/{row.file.removesuffix('.tif')}.vrt"
                     found.setdefault(name, []).append(f"{flight}/{folder}/{row.file}")
     return found
 
 
-def mosaic_files(pairs: Mapping[str, Sequence[str]], coefficients: Sequence[str] = ()) -> Iterator[str]:
+def mosaic_files(images: Mapping[str, Sequence[str]], coefficients: Sequence[str] = ()) -> Iterator[str]:
     """Yield the rasters of all flights and their styles, relative to the results; as `mosaics`."""
     styles = {row.file for row in EXPORTS if row.style}
-    for name in mosaics(pairs, coefficients):
+    for name in mosaics(images, coefficients):
         style = f"{name.removesuffix('.vrt')}.qml"
         yield from (f"{MOSAICS}/{file}" for file in (name, style) if file == name or Path(file).name in styles)
 
 
-def _folders(pairs: Sequence[str]) -> Iterator[tuple[str, tuple[str, ...]]]:
-    """Yield the folders of a flight, and the kinds of rows that lie in each."""
-    yield from ((pair, ("pair", "layers", "radiometry", "multilook")) for pair in pairs)
-    yield "fused", ("fused", "multilook_fused")
-
-
-def _written(kinds: Iterable[str], coefficients: Sequence[str]) -> Iterator[Export]:
-    """Yield the rows of some kinds, of optional ones those of the coefficients written."""
+def _written(image: str, coefficients: Sequence[str]) -> Iterator[Export]:
+    """Yield the rows of the files in the folder of an image, of optional ones those of the coefficients written."""
+    kinds = ("fused", "multilook_fused") if image == "fused" else ("pair", "layers", "radiometry", "multilook")
     rows = (row for kind in kinds for row in exports_in(kind))
     return (row for row in rows if SOURCES[row.source] not in _OPTIONAL or row.source in coefficients)
 
 
-def product_files(pairs: Mapping[str, Sequence[str]], coefficients: Sequence[str] = ()) -> Iterator[str]:
+def product_files(images: Mapping[str, Sequence[str]], coefficients: Sequence[str] = ()) -> Iterator[str]:
     """Yield every file that a finished campaign offers its user, relative to the results.
 
     Parameters
     ----------
-    pairs
-        Flight → its pairs.
+    images
+        Flight → its images: pairs, and 'fused' where there are sums of them.
     coefficients
         As of `mosaics`.
 
@@ -293,11 +288,11 @@ def product_files(pairs: Mapping[str, Sequence[str]], coefficients: Sequence[str
     ['f01/a-b/slc.tif', 'f01/a-b/power.tif', 'f01/a-b/power.qml']
     """
     yield from COVERAGE
-    for flight, names in pairs.items():
-        for folder, kinds in _folders(names):
-            files = [row.file for row in _written(kinds, coefficients)]
+    for flight, folders in images.items():
+        for folder in folders:
+            files = [row.file for row in _written(folder, coefficients)]
             yield from (f"{flight}/{folder}/{file}" for file in (*files, "image.json"))
-    yield from mosaic_files(pairs, coefficients)
+    yield from mosaic_files(images, coefficients)
     yield MAP
 
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from apertura.common.arrays import Floats
 from apertura.common.atomic import replacement
 from apertura.core.geometry.geodesy import LOCAL, LOCAL_NED, geodetic_from_ecef, ned_axes
+from apertura.core.geometry.track_checks import stretches
 from apertura.formats.campaign_files import write_csv_log
 from apertura.formats.export.map_layout import DPI
 from apertura.formats.times import coarsened
@@ -236,18 +237,11 @@ def _draw(column: Sequence[Axes], log: RefinedLog) -> None:
         for side in (-1, 1):
             label = "± standard deviation stated of the log" if side > 0 else None
             axes.plot(at_s, side * stated[:, number], ":", color=_STATED, linewidth=1.0, label=label)
-        for begin_s, end_s in _spans(at_s, ~refined[some]) if refined.any() else ():
-            axes.axvspan(begin_s, end_s, color="0.92", lw=0, zorder=0)
+        for begin, end in stretches(~refined[some]) if refined.any() else ():
+            axes.axvspan(at_s[begin], at_s[min(end, len(at_s) - 1)], color="0.92", lw=0, zorder=0)
         axes.grid(visible=True, color="0.9", linewidth=0.6)
         axes.margins(x=0)
     column[0].set_title(log.node, fontsize=9)
     began = np.datetime_as_string(log.track.time.values[0], "ms")
     beyond = "\n(grey: beyond the pulses)" if refined.any() else ""
     column[-1].set_xlabel(f"time after {began}Z, s{beyond}")
-
-
-def _spans(at_s: Floats, out: NDArray[np.bool_]) -> list[tuple[float, float]]:
-    """Return where runs of epochs begin and end that were left out."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], out, [False]]).astype(int)))
-    last = len(at_s) - 1
-    return [(float(at_s[begin]), float(at_s[min(end, last)])) for begin, end in edges.reshape(-1, 2)]

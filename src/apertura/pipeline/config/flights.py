@@ -26,6 +26,9 @@ KINDS = ("bench", "calibration", "image")
 """Of flights: a radar that stands still; a flight past a reflector, which corrects the echoes of others; images."""
 _NAME: TypeAdapter[str] = TypeAdapter(Name)
 
+FUSED = "fused"
+"""Name of the sums of a flight's pairs, among its images and as a folder."""
+
 
 @dataclass(frozen=True)
 class Flight:
@@ -62,6 +65,17 @@ class Flight:
     def pairs(self) -> tuple[str, ...]:
         """Transmitter-receiver names, as folders are named."""
         return tuple(f"{self.transmitter}-{node}" for node in self.nodes)
+
+    @property
+    def images(self) -> tuple[str, ...]:
+        """Names of its images: its pairs, and their sums where there are two pairs to add.
+
+        Examples
+        --------
+        >>> Flight("f01", "image", "a", ("a", "b")).images, Flight("f02", "image", "a", ("b",)).images
+        (('a-a', 'a-b', 'fused'), ('a-b',))
+        """
+        return (*self.pairs, FUSED) if len(self.pairs) > 1 else self.pairs
 
 
 def read_flights(path: Path, *, nodes: Collection[str]) -> Iterator[Flight]:

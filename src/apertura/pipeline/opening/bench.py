@@ -15,21 +15,37 @@ from apertura.core.echo.clock import GROUPS, ClockOffset, clock_of
 from apertura.core.echo.demodulate import demodulate
 from apertura.core.echo.transfer import Transfer, as_complex, transfer_by_code, transfer_by_sidelink
 from apertura.core.quality.budget import strictest_accuracy_db
-from apertura.methods.synchronisation import bench as limits
-from apertura.methods.synchronisation.bench import (
+from apertura.methods.synchronisation.channels import (
+    DC_DB,
+    FEWEST_COUNTS,
+    IMAGE_DB,
+    MISSED_SHARE,
     Channel,
+    Triggers,
+    measure_channel,
+    triggers,
+)
+from apertura.methods.synchronisation.links import (
+    AMPLITUDE_DB,
+    DRIFT_PPM,
+    DROPOUT_SHARE,
+    LEAKAGE_DB,
+    PATH_CELLS,
+    PHASE_RAD,
+    SPLIT_DB,
+    SPLIT_RAD,
+    TONE_DB,
+    UNLOCKED_PPM,
+    WEAK_DB,
     Contact,
     Link,
     PathOffset,
     SplitAgreement,
-    Triggers,
     clock_flags,
-    measure_channel,
     measure_contact,
     measure_link,
     reversed_flags,
     split_agreement,
-    triggers,
 )
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import CONFIG, SampledWaveform
@@ -153,7 +169,7 @@ class Bench:
             node.name,
             "pulses",
             f"{count.recorded} recorded, {lost} of {due} missed, {count.false} false",
-            f"missed {100 * limits.MISSED_SHARE:g} %, false 0",
+            f"missed {100 * MISSED_SHARE:g} %, false 0",
             "triggers_missed",
             "triggers_false",
         )
@@ -161,7 +177,7 @@ class Bench:
             of, mine = f"{node.name} {channel.name}", channel.flags
             level = f"{channel.counts:.0f} counts rms" if channel.integers else f"{channel.counts:.3g} rms"
             share = node.saturated.get(channel.name, 0.0)
-            yield line(of, "level", level, f"at least {limits.FEWEST_COUNTS:g}", *({"channel_weak"} & {*mine}))
+            yield line(of, "level", level, f"at least {FEWEST_COUNTS:g}", *({"channel_weak"} & {*mine}))
             yield line(
                 of,
                 "samples at the end stops",
@@ -169,8 +185,11 @@ class Bench:
                 f"{100 * SATURATED_SHARE:g} %",
                 *([f"saturated_{channel.name}"] if share > SATURATED_SHARE else []),
             )
-            yield line(of, "DC", f"{channel.dc_db:.1f} dB", f"{limits.DC_DB:g} dB", *({"channel_dc"} & {*mine}))
-            worst = max(limits.IMAGE_DB, channel.image_floor_db)
+            if channel.stuck:
+                bits = ", ".join(map(str, channel.stuck))
+                yield line(of, "bits that never change", bits, "none", *({"channel_bits_stuck"} & {*mine}))
+            yield line(of, "DC", f"{channel.dc_db:.1f} dB", f"{DC_DB:g} dB", *({"channel_dc"} & {*mine}))
+            worst = max(IMAGE_DB, channel.image_floor_db)
             yield line(
                 of, "mirror image", f"{channel.image_db:.1f} dB", f"{worst:.0f} dB", *({"channel_image"} & {*mine})
             )
@@ -187,11 +206,11 @@ class Bench:
         if node.clock is not None:
             ppm, std = node.clock.cfo_hz / self.carrier_hz * 1e6, node.clock.cfo_std_hz / self.carrier_hz * 1e6
             sampling = f"{node.clock.sfo_ppm:+.4f} ± {node.clock.sfo_std_ppm:.4f} ppm of the sampling rate"
-            yield line(node.name, "clock, carrier", f"{ppm:+.4f} ± {std:.4f} ppm", f"{limits.UNLOCKED_PPM:g} ppm",
+            yield line(node.name, "clock, carrier", f"{ppm:+.4f} ± {std:.4f} ppm", f"{UNLOCKED_PPM:g} ppm",
                        "clock_unlocked", "clock_ambiguous")  # fmt: skip
             yield line(node.name, "clock, sampling", sampling, "as the carrier")
             moved = node.clock.cfo_slope_hz * node.triggers.recorded / self.carrier_hz * 1e6
-            yield line(node.name, "clock, change over the recording", f"{moved:+.4f} ppm", f"{limits.DRIFT_PPM:g} ppm",
+            yield line(node.name, "clock, change over the recording", f"{moved:+.4f} ppm", f"{DRIFT_PPM:g} ppm",
                        "clock_drifts")  # fmt: skip
         of = f"{node.name} sidelink"
         if node.sidelink is not None:
@@ -208,7 +227,7 @@ class Bench:
 
     def _steady(self, contact: Contact, of: str) -> Line:
         return Line(of, "amplitude", contact.line.removeprefix("amplitude "),
-                    f"{limits.AMPLITUDE_DB:g} dB, {100 * limits.DROPOUT_SHARE:g} %",
+                    f"{AMPLITUDE_DB:g} dB, {100 * DROPOUT_SHARE:g} %",
                     tuple(contact.flags))  # fmt: skip
 
     def _link(self, node: BenchNode, link: Link, line: Any) -> Iterator[Line]:
@@ -223,38 +242,38 @@ class Bench:
             "link_incoherent",
             "phase_unstable",
         )
-        yield line(pair, "SNR of a compressed pulse", f"{10 * np.log10(link.snr):.1f} dB", f"{limits.WEAK_DB:g} dB",
+        yield line(pair, "SNR of a compressed pulse", f"{10 * np.log10(link.snr):.1f} dB", f"{WEAK_DB:g} dB",
                    "link_weak", "code_unconfirmed", "wrong_code", "spectrum_inverted")  # fmt: skip
         yield line(
             pair,
             "phase",
             f"{link.phase_excess_rad:.4f} rad rms beyond noise of {link.noise_rad:.4f}",
-            f"{limits.PHASE_RAD:g} rad",
+            f"{PHASE_RAD:g} rad",
             "link_incoherent",
         )
         yield line(
             pair,
             "drift over the recording",
             f"{drift[0]:+.4f} ± {drift[1]:.4f} rad, {moved[0]:+.2f} ± {moved[1]:.2f} ps",
-            f"{limits.PHASE_RAD:g} rad",
+            f"{PHASE_RAD:g} rad",
             "link_drifts",
         )
         yield self._steady(link.contact, pair)
         path = f"{link.path_m:+.4f} ± {link.path_std_m:.4f} m"
         yield line(pair, "path", path, "one of all pulses", "channels_swapped", "delay_jumps")
         yield line(pair, "strongest tone", f"{link.tone_db:.1f} dB at {link.tone_hz / 1e6:.2f} MHz",
-                   f"{limits.TONE_DB:g} dB of the noise", "interference")  # fmt: skip
+                   f"{TONE_DB:g} dB of the noise", "interference")  # fmt: skip
         if (offset := self.offsets.get(node.name)) is not None:
             yield line(
                 pair,
                 "path beyond the set-up",
                 f"{offset.offset_m:+.4f} ± {offset.std_m:.4f} m, config {offset.stated_m:+.4f} m",
-                f"{limits.PATH_CELLS * offset.cell_m:.3f} m",
+                f"{PATH_CELLS * offset.cell_m:.3f} m",
                 "path_disagrees",
             )
         if link.direct_db is not None:
             yield line(pair, "sidelink in the radar channel", f"{link.direct_db:.1f} dB of the path",
-                       f"{limits.LEAKAGE_DB:g} dB", "channel_leaks")  # fmt: skip
+                       f"{LEAKAGE_DB:g} dB", "channel_leaks")  # fmt: skip
         if link.arrivals:
             others = ", ".join(f"{one.level_db:.1f} dB {one.later_m:+.2f} m" for one in link.arrivals)
             yield line(pair, "other arrivals", others, "")
@@ -265,7 +284,7 @@ class Bench:
                 f"{split.gain_db:+.2f} dB, {split.phase_rad:+.3f} ± {split.phase_std_rad:.3f} rad, paths "
                 f"{split.path_m:+.3f} m apart, the receiver's beyond its "
                 f"sidelink; over the band {split.band_db:.2f} dB, {split.band_rad:.3f} rad rms",
-                f"{limits.SPLIT_DB:g} dB, {limits.SPLIT_RAD:g} rad",
+                f"{SPLIT_DB:g} dB, {SPLIT_RAD:g} rad",
                 "split_disagrees",
             )
 

@@ -11,7 +11,7 @@ from apertura.common.contracts import Window
 from apertura.common.flags import Flags
 from apertura.core.antenna.beam import Beams
 from apertura.core.echo.compression import centre_frequency
-from apertura.core.imaging.noise import noise_places, noise_std_db, sidelink_noise
+from apertura.core.imaging.noise import PulseNoise, noise_places, sidelink_noise
 from apertura.core.imaging.radiometry import Calibration, Link, Turn, cell_constant, pointing_std_db
 from apertura.core.imaging.reflectors import DRIFT_SIGMAS
 from apertura.core.quality.bright_points import BrightPoint
@@ -154,7 +154,7 @@ class CalibratedPair:
             for one, one_db, std, scatter, doubt in zip(sigma, sigma_db, std_db, scatter_db, inverse, strict=True)
         ]
 
-    def noise_report(self, pulse_noise: float, *, bound: bool) -> tuple[dict[str, Any], Flags]:
+    def noise_report(self, pulse_noise: PulseNoise, *, bound: bool) -> tuple[dict[str, Any], Flags]:
         """Return the noise measured against what the receiver alone would have, and the flag where they disagree.
 
         Parameters
@@ -168,14 +168,13 @@ class CalibratedPair:
         -----
         Source: docs/theory/radiometry.md, eqs. 8, 8a and 8b.
         """
-        own, pulses = pulse_noise - self.sidelink_noise, len(self.calibration.aperture)
+        own = pulse_noise.power - self.sidelink_noise
         said = {"noise_figure_db": self.noise_figure_db, "noise_figure_measured_db": None, "std_db": None}
         said |= {"sidelink": self.sidelink_noise or None}
-        # Jitter of tags and positions spreads bright echoes, too: of a bistatic pair the noise is an upper bound.
-        bound, apart = bound or self.sidelink_noise > 0, list[tuple[str, float, float]]()
+        apart = list[tuple[str, float, float]]()
         if self.thermal_noise and own > 0:  # NaN is not
             figure_db = 10 * float(np.log10(own / self.thermal_noise))
-            of_own_db = np.hypot(noise_std_db(pulses) * pulse_noise, _SIDELINK_STD_DB * self.sidelink_noise) / own
+            of_own_db = np.hypot(pulse_noise.std_db * pulse_noise.power, _SIDELINK_STD_DB * self.sidelink_noise) / own
             said |= {"noise_figure_measured_db": round(figure_db, 2), "std_db": round(float(of_own_db), 2)}
             radio_db = _UNSTATED_STD_DB if self.radio_std_db is None else self.radio_std_db
             std_db = float(np.hypot(of_own_db, np.hypot(radio_db, _FIGURE_STD_DB)))
@@ -183,9 +182,9 @@ class CalibratedPair:
                 apart.append(("the noise figure stated", figure_db - self.noise_figure_db, std_db))
             elif figure_db < 0:  # nobody who states no figure has a receiver below 0 dB
                 apart.append(("a receiver of 0 dB", figure_db, std_db))
-        if self.noise_before and pulse_noise > 0 and not self.sidelink_noise:
-            std_db = float(np.hypot(2**0.5 * noise_std_db(pulses), _FIGURE_STD_DB))
-            since_db = 10 * float(np.log10(pulse_noise / self.noise_before))
+        if self.noise_before and pulse_noise.power > 0 and not self.sidelink_noise:
+            std_db = float(np.hypot(2**0.5 * pulse_noise.std_db, _FIGURE_STD_DB))
+            since_db = 10 * float(np.log10(pulse_noise.power / self.noise_before))
             apart.append(("that over the reflectors, of another gain?", since_db, std_db))
         lines = [
             f"the noise measured is {by_db:+.1f} dB of {than}, ± {std_db:.1f} dB"

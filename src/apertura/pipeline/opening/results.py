@@ -81,8 +81,7 @@ class OpenCampaign:
 
     def report(self, flight: str, pair: str) -> dict[str, Any]:
         """Return image.json of a pair or of 'fused': engine, models and reasons, errors, measures, flags."""
-        known = (*self.campaign.flight(flight).pairs, "fused")
-        _check_name(pair, "pair", known, where=f"campaign.report({flight!r})")
+        _check_name(pair, "pair", self.campaign.flight(flight).images, where=f"campaign.report({flight!r})")
         path = self.campaign.result(flight, pair, "image.json")
         return open_listed(path, path.with_name("export.manifest.json"))
 

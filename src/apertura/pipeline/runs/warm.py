@@ -5,7 +5,6 @@ each step that snakemake's shell asks for; it has no thread of its own. Log, ben
 status of a step are those of the command in its rule, which plain snakemake and other machines start as it stands.
 """
 
-import ctypes
 import gc
 import importlib
 import json
@@ -27,7 +26,7 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import IO, Any
 
-from apertura.common.processes import ENDING, SIGNALLED, die_with_parent
+from apertura.common.processes import ALGEBRA_THREADS, ENDING, SIGNALLED, die_with_parent
 from apertura.pipeline.rules import RULES
 
 NAME = "apertura.pipeline.runs.warm"
@@ -58,8 +57,6 @@ _LIBRARIES = (
 _COMMAND = re.compile(r"(?:set -euo pipefail; +)?apertura (step(?: [\w.-]+)+) > ([\w./-]+) 2>&1")
 """What snakemake hands to a shell for a step; any other command goes to a shell."""
 
-_THREADS = "OPENBLAS_NUM_THREADS"
-_SET_THREADS = ("scipy_openblas_set_num_threads64_", "scipy_openblas_set_num_threads", "openblas_set_num_threads")
 _LONGEST = 1 << 17  # bytes of a request; the environment is most of it
 _GRACE_S = 2.0
 _fork = multiprocessing.get_context("fork").Process
@@ -91,7 +88,7 @@ class Order:
 
 def main() -> int:
     """Run snakemake as ordered, and its steps; return its exit status."""
-    os.environ[_THREADS] = "1"  # else numpy starts threads when it is imported
+    os.environ[ALGEBRA_THREADS] = "1"  # else numpy starts threads when it is imported, and no fork is safe
     for number in ENDING:  # the whole group gets them: this process ends when the others have
         signal.signal(number, signal.SIG_IGN)
     here, there = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -299,19 +296,8 @@ def _step(asked: Mapping[str, Any], answer: socket.socket) -> None:
     tempfile.tempdir = None  # the environment says where
     os.chdir(asked["folder"])
     _redirect(asked["log"])
-    _use_threads(int(os.environ.get(_THREADS, "1")))
     sys.argv = ["apertura", *asked["words"]]
     pkgutil.resolve_name("apertura.__main__:main")()
-
-
-def _use_threads(count: int) -> None:
-    """Have linear algebra use so many threads, as the environment of a new process would."""
-    for name in ("numpy.linalg._umath_linalg", "scipy.linalg._fblas") if count > 1 else ():
-        library = ctypes.CDLL(str(importlib.import_module(name).__file__))
-        for function in _SET_THREADS:
-            if hasattr(library, function):
-                getattr(library, function)(count)
-                break
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ from apertura.common.provenance import chained_sha256
 from apertura.core.combination import CoherentSum, agreement_between, choose_fusion
 from apertura.core.echo.compression import centre_frequency
 from apertura.core.focus.inputs import PhaseHistory
-from apertura.core.imaging.focus_check import joint_peak_power, strongest_echo
+from apertura.core.imaging.focus_check import UNEXPECTED_DB, joint_peak_power, strongest_echo
 from apertura.core.quality.agreement import Agreement
 from apertura.core.scene.grid import SceneGrid
 from apertura.pipeline.campaign import Campaign
@@ -27,6 +27,7 @@ from apertura.pipeline.opening.acquisition import Acquisition, open_acquisition
 from apertura.pipeline.opening.air import scene_air
 from apertura.pipeline.opening.autofocus import open_refined
 from apertura.pipeline.opening.diagnosis import (
+    LEAST_SHARE,
     Hypothesis,
     PairGeometry,
     Trial,
@@ -83,7 +84,8 @@ def hypotheses(
     Returns
     -------
     list
-        what, kind, gain_db and lost_db: gain of the peak power at the bright place, and what there is to gain.
+        what, kind, gain_db and lost_db: gain of the peak power at the bright place, and what there is to gain; and
+        gain_of_pairs_db, of each pair's own peak.
 
     Notes
     -----
@@ -107,19 +109,34 @@ def hypotheses(
     now = joint_peak_power([one.history for one in found], here, height_m)
     lost_db = _db(_possible(found, here, height_m, focused) / now)
 
+    def peak(hypothesis: Hypothesis, pairs: slice = slice(None)) -> float:
+        grid = _around(scene, moved(hypothesis), cell_m)
+        return joint_peak_power(hypothesis.histories[pairs], grid, height_m + hypothesis.height_m)
+
+    def moved(hypothesis: Hypothesis) -> tuple[float, float]:
+        return _moved(scene.grid, brightest, found, hypothesis.histories)
+
     def tried(hypothesis: Hypothesis) -> Trial | None:
-        place = _moved(scene.grid, brightest, found, hypothesis.histories)
         try:
-            then = joint_peak_power(hypothesis.histories, _around(scene, place, cell_m), height_m + hypothesis.height_m)
+            gain_db = _db(peak(hypothesis) / now)
         except ValueError:  # the places are too far apart for one pulse: rejected
             return None
-        return Trial(_db(then / now), hypothesis, offset=_is_offset(scene, (brightest, place), found, hypothesis))
+        constant = _is_offset(scene, (brightest, moved(hypothesis)), found, hypothesis)
+        return Trial(gain_db, hypothesis, offset=constant)
 
     possible = chain(hypotheses_of(nodes, found), _other_echoes(campaign, flight, nodes, found, sent=sent))
     trials = [one for one in map(tried, possible) if one is not None]
     by_chance = hypotheses_by_chance(nodes, found, np.random.default_rng(0))
     drawn = [one for one in map(tried, by_chance) if one is not None]
-    return explanation(trials, drawn, lost_db)
+    named = explanation(trials, drawn, lost_db)
+    if named:
+        best = max(trials, key=lambda one: one.gain_db).hypothesis
+        gains = {
+            pair: round(_db(peak(best, slice(at, at + 1)) / joint_peak_power([one.history], here, height_m)), 2)
+            for at, (pair, one) in enumerate(zip(campaign.flight(flight).pairs, found, strict=True))
+        }
+        named[0]["gain_of_pairs_db"] = gains
+    return named
 
 
 def _db(ratio: float) -> float:
@@ -252,6 +269,9 @@ _TIED = "as many pairs say the opposite, and their images do not show which is w
 _EXPLAINED_SIGMAS = 3.0
 """Standard deviations of the phase that errors of the logs make between pairs, beyond which it has another cause."""
 
+_REGAINED_SIGMAS = 3.0
+"""Standard deviations of a loss from none, beyond which a cause named for another image is told of this one too."""
+
 _VISIBLE_SNR_DB = 20.0
 """A bright point this far above the noise should show in every image of the scene."""
 
@@ -376,7 +396,17 @@ def _hypotheses(
         for name in names:
             line = flags[pair].get(name) or images[pair].attrs["flags"][name]
             flags[pair][name] = line + hypothesis_line(named)
+        focus = images[pair].attrs["quality"]["focus"]
+        if named and not names and _regained(focus, named[0]["gain_of_pairs_db"][pair]):
+            flags[pair]["loss_unexpected"] = f"{focus['why']}{hypothesis_line(named)}"
     return named
+
+
+def _regained(focus: Mapping[str, Any], gain_db: float) -> bool:
+    """Return whether a cause named for other images of the flight brings back what this one lost, beyond chance."""
+    lost_db = -float(focus.get("loss_db", 0.0))
+    beyond = max(UNEXPECTED_DB, _REGAINED_SIGMAS * float(focus.get("std_db", 0.0)))
+    return lost_db > beyond and gain_db > max(beyond, LEAST_SHARE * lost_db)
 
 
 def _rank(focus: Mapping[str, Any]) -> tuple[int, float]:

@@ -2,14 +2,13 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import compress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
-from apertura.common.contracts import MEASURED, QUOTED, RASTERS, STAGES, Window
+from apertura.common.contracts import MEASURED, QUOTED, RASTERS, SUMMED, Window
 from apertura.common.documents import undamaged
 from apertura.common.flags import Flags
 from apertura.core.combination import clutter_reduction_db, coherent_sum, magnitude_sum, noncoherent_sum
@@ -17,6 +16,7 @@ from apertura.core.quality.measures import image_statistics
 from apertura.core.scene.grid import SceneGrid
 from apertura.methods.interferometry.coherence import chance, coherence, common_band, window_px
 from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.config import FUSED
 from apertura.pipeline.lineage import result_of
 from apertura.pipeline.opening.images import ComparedImage, agreement_of, agreement_report
 from apertura.pipeline.opening.results import assessment_of
@@ -32,7 +32,11 @@ Images = Mapping[tuple[str, str], xr.Dataset]
 _TEXTS = np.dtypes.StringDType()
 
 
-def labels(images: Images, assessed: Mapping[str, Mapping[str, Any]], pairs: Sequence[str]) -> xr.Dataset:
+Sums = Mapping[str, Mapping[str, Any]]
+"""Flight that has pairs to add up → its coherent sum, as step `assess` chose it."""
+
+
+def labels(images: Images, assessed: Mapping[str, Mapping[str, Any]], sums: Sums, pairs: Sequence[str]) -> xr.Dataset:
     """Return coordinates flight, pair, time and what pairs and flights are compared with; values of every image.
 
     Parameters
@@ -41,6 +45,8 @@ def labels(images: Images, assessed: Mapping[str, Mapping[str, Any]], pairs: Seq
         Those that were formed.
     assessed
         Flight → what step `assess` wrote of it.
+    sums
+        Of the flights that have any.
     pairs
         Every pair of the campaign.
     """
@@ -48,7 +54,8 @@ def labels(images: Images, assessed: Mapping[str, Mapping[str, Any]], pairs: Seq
     for place, (flight, one) in enumerate(assessed.items()):
         for pair in pairs:
             if (flight, pair) in images:
-                measures = _quoted(images[flight, pair], one, pair)
+                measures = _quoted(images[flight, pair], one["pairs"][pair])
+                measures["phase_removed"] = sums[flight]["phases_rad"].get(pair) if flight in sums else None
                 for name, value in measures.items():
                     if value is not None:
                         values[name][place, pairs.index(pair)] = value
@@ -80,7 +87,7 @@ def _middle(images: Images, flight: str) -> Any:
     return ends.min() + (ends.max() - ends.min()) // 2
 
 
-def _quoted(image: xr.Dataset, assessed: Mapping[str, Any], pair: str) -> dict[str, float | str | None]:
+def _quoted(image: xr.Dataset, assessed: Mapping[str, Any]) -> dict[str, float | str | None]:
     """Return the quality of an image and its assessment: name of a row of `QUOTED` → value or None."""
     quality = image.attrs["quality"]
     view, focus, pulses = quality["view"], quality["focus"], quality.get("pulses", {})  # a phase history has none
@@ -101,9 +108,8 @@ def _quoted(image: xr.Dataset, assessed: Mapping[str, Any], pair: str) -> dict[s
         "pulses_used": pulses.get("used"),
         "pulses_dropped": pulses.get("dropped"),
         "peak": quality["brightest"]["amplitude"],
-        "phase_removed": assessed["fusion"]["phases_rad"].get(pair),
         "verdict": focus["verdict"],
-        "flags": ",".join(sorted({*image.attrs["flags"], *assessed["pairs"][pair]["flags"]})),
+        "flags": ",".join(sorted({*image.attrs["flags"], *assessed["flags"]})),
     }
 
 
@@ -217,6 +223,7 @@ _PHASE = "coherence", "phase"
 def cube(campaign: Campaign) -> Path:
     """Write results/cube.zarr: images (flight, pair, y, x), sums of each flight, coherence and phase between images.
 
+    Sums are there where a flight has two pairs, and NaN of flights of one.
     Tile by tile; a tile that no pulse of a pair illuminates is not stored and reads as NaN, as in its image.
     """
     flights, lineage = campaign.image_flights, result_of(campaign, "cube").begin(campaign.root)
@@ -226,29 +233,31 @@ def cube(campaign: Campaign) -> Path:
         for pair in flight.pairs
     }
     assessed = {flight.name: assessment_of(campaign, flight.name) for flight in flights}
+    sums = {flight.name: assessed[flight.name]["fusion"] for flight in flights if FUSED in flight.images}
     grid, side = settled_scene(campaign).grid, campaign.settings.processing.tile_px
     folder, windows = campaign.stage("cube"), list(grid.tiles(side))
     with undamaged(folder, expected="images as this version forms them", remedy="Run the workflow again."):
-        described = _empty(campaign.settings.campaign, images, assessed, grid, windows)
+        described = _empty(campaign.settings.campaign, images, assessed, sums, grid, windows)
     with writing(folder) as wip:
         empty = stamped(
             described,
             "cube",
             modules=lineage.modules,
             parents={"/".join(name): image for name, image in images.items()},
-            settings={"fusion": {name: one["fusion"] for name, one in assessed.items()}},
+            settings={"fusion": sums},
         )
         tile = {"y": side, "x": side, "flight": 1, "pair": 1}
-        chunks = {name: tuple(tile[dim] for dim in STAGES["cube"].variables[name].dims) for name in RASTERS}
-        create(wip, empty, chunks | {name: empty[name].shape for name in MEASURED}, consolidated=True)
+        chunks = {name: tuple(tile[dim] for dim in dims) for name, (dims, *_) in RASTERS.items() if name in empty}
+        whole = {name: empty[name].shape for name in MEASURED if name in empty}
+        create(wip, empty, chunks | whole, consolidated=True)
         arrays = _CubeArrays(
-            {name: open_array(wip, name) for name in (*RASTERS, *MEASURED)}, [*assessed], empty.attrs["pairs"]
+            {name: open_array(wip, name) for name in (*chunks, *whole)}, [*assessed], empty.attrs["pairs"]
         )
-        for flight, one in assessed.items():
-            _add_up(images, one["fusion"]["phases_rad"], arrays, flight, windows)
-            single_db = [
-                images[flight, pair].attrs["quality"]["noise_floor_db"] for pair in one["fusion"]["phases_rad"]
-            ]
+        for (flight, pair), image in images.items():
+            _copy(image, arrays.plane("image", flight, pair), windows)
+        for flight, fusion in sums.items():
+            _add_up(images, fusion["phases_rad"], arrays, flight, windows)
+            single_db = [images[flight, pair].attrs["quality"]["noise_floor_db"] for pair in fusion["phases_rad"]]
             sum_db = image_statistics(arrays.plane("coherent", flight), windows).noise_floor_db
             arrays.plane("coherent_noise_floor", flight)[()] = sum_db
             arrays.plane("clutter_reduction", flight)[()] = clutter_reduction_db(single_db, sum_db)
@@ -291,21 +300,26 @@ class _CubeArrays:
         return _Plane(self.arrays[name], place)
 
 
+def _copy(image: xr.Dataset, copy: _Plane, windows: list[Window]) -> None:
+    """Write an image tile by tile, but those in which it is empty."""
+    for window in windows:
+        block = image.image[window].values
+        if not np.isnan(block).all():
+            copy[window] = block
+
+
 def _add_up(
     images: Images, phases_rad: Mapping[str, float], arrays: _CubeArrays, flight: str, windows: list[Window]
 ) -> None:
-    """Copy the images of a flight and write their sums, tile by tile; `phases_rad` of those added coherently."""
+    """Write the sums of a flight's images tile by tile; `phases_rad` of those added coherently."""
     present = {pair: image for (name, pair), image in images.items() if name == flight}
     peaks = np.array([image.attrs["quality"]["brightest"]["amplitude"] for image in present.values()])
     added = np.array([pair in phases_rad for pair in present])
     turned = np.array([phases_rad[pair] for pair in present if pair in phases_rad])
-    copies = [arrays.plane("image", flight, pair) for pair in present]
     sums = {name: arrays.plane(name, flight) for name in ("coherent", "noncoherent", "magnitude")}
     for window in windows:
         stack = np.stack([image.image[window].values for image in present.values()])
         there = ~np.isnan(stack).all(axis=(1, 2))
-        for copy, block in zip(compress(copies, there), stack[there], strict=True):
-            copy[window] = block
         if there[added].any():
             sums["coherent"][window] = coherent_sum(stack[added], peaks[added], turned)
         if there.any():
@@ -349,14 +363,17 @@ def _empty(
     campaign: str,
     images: Images,
     assessed: Mapping[str, Mapping[str, Any]],
+    sums: Sums,
     grid: SceneGrid,
     windows: Sequence[Window],
 ) -> xr.Dataset:
     """Return the cube of a campaign of this name without the values of its rasters and of measures on them."""
     pairs = sorted({pair for _, pair in images})
-    named = labels(images, assessed, pairs)
+    named = labels(images, assessed, sums, pairs)
     sizes = {**named.sizes, "y": grid.shape[0], "x": grid.shape[1]}
     for name, (dims, dtype, _, _) in {**RASTERS, **MEASURED}.items():
+        if name in SUMMED and not sums:
+            continue
         nothing = np.full((), complex(np.nan, np.nan) if dtype == "complex64" else np.nan, dtype)
         named[name] = dims, np.broadcast_to(nothing, tuple(sizes[dim] for dim in dims))
     references = {flight: images[flight, one["reference"]] for flight, one in assessed.items()}
@@ -366,7 +383,7 @@ def _empty(
         history="rule cube of apertura: runspec, inputs and code_sha256 say of what and how",
         flights=[*assessed],
         pairs=pairs,
-        fusion={flight: one["fusion"] for flight, one in assessed.items()},
+        fusion=sums,
         coherence_window=window_of(images, grid.spacing_m),
         **_between_flights(references, grid, windows),
     )

@@ -25,6 +25,7 @@ from apertura.core.scene.grid import SceneGrid
 from apertura.formats.export import product, remove_outdated, write_exports
 from apertura.formats.export.radiometry import CROSS_SECTIONS, ECHO, Radiometry, of_sums
 from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.config import FUSED
 from apertura.pipeline.config.processing import Multilooking
 from apertura.pipeline.digests import Lineage
 from apertura.pipeline.lineage import result_of
@@ -38,7 +39,7 @@ from apertura.pipeline.store import open_listed, open_stage, record_files
 
 def export(campaign: Campaign, flight: str, pair: str) -> list[Path]:
     """Write the products of one pair, or of 'fused', and image.json; return their paths."""
-    if pair == "fused":
+    if pair == FUSED:
         return export_fused(campaign, flight)
     lineage = result_of(campaign, "export", flight, pair).begin(campaign.root)
     image = open_stage(campaign.stage("image", flight, pair), "image")
@@ -89,7 +90,7 @@ def export_fused(campaign: Campaign, flight: str) -> list[Path]:
     sums: dict[str, BlockRaster] = {"coherent": cube.coherent[index], "noncoherent": Amplitude(cube.noncoherent[index])}
     pairs, assessed = campaign.flight(flight).pairs, assessment_of(campaign, flight)
     images = {pair: open_stage(campaign.stage("image", flight, pair), "image") for pair in pairs}
-    folder, grid = campaign.result(flight, "fused"), settled_scene(campaign).grid
+    folder, grid = campaign.result(flight, FUSED), settled_scene(campaign).grid
     windows = list(grid.tiles(campaign.settings.processing.tile_px))
     measured, isolated = _in_phase(images, assessed, sums["noncoherent"], grid, windows)
     at_points = measured if isolated else None

@@ -18,7 +18,7 @@ from apertura.common.contracts import Window
 from apertura.common.flags import Flags
 from apertura.common.provenance import Provenance
 from apertura.common.raster import opened_raster
-from apertura.core.imaging.noise import noise_places, noise_power
+from apertura.core.imaging.noise import PulseNoise, noise_places, noise_power
 from apertura.core.imaging.radiometry import Quantity
 from apertura.core.imaging.range_profiles import profiles_of
 from apertura.core.imaging.speckle import Multilook
@@ -52,7 +52,9 @@ def layers(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> l
     opened = open_pair(campaign, flight, pair, echo=echo)
     beams, calibrated = weighing(campaign, opened, scene), calibrated_pair(campaign, opened, scene, threads=threads)
     looks = Looks.of(scene.grid, scene.terrain, profiles.aperture, beams, threads=threads)
-    noise = noise_power(profiles, noise_places(scene.grid, scene.terrain), beams=beams)
+    places_m = noise_places(scene.grid, scene.terrain)
+    measured_noise = noise_power(profiles, places_m, time_s=opened.time_s, beams=beams)
+    noise = measured_noise.power
     asked, multilook = campaign.settings.processing.radiometry, campaign.settings.processing.multilook
     measured = calibrated is not None or multilook is not None
     image = open_stage(campaign.stage("image", flight, pair), "image") if measured else None
@@ -92,7 +94,7 @@ def layers(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> l
             images = ((name, one.amplitude) for name, one in powers.items())
             write("radiometry", {name: LazyLayer(scene.grid, np.complex64, of, threads) for name, of in images}, means)
             written.append(folder / CROSS_SECTIONS)
-            write_json(written[-1], _report(scene, image, calibrated, noise) | {"polarisation": label})
+            write_json(written[-1], _report(scene, image, calibrated, measured_noise) | {"polarisation": label})
         if multilook is not None:
             per_weight = noise / integration_of(campaign, opened, scene).count ** 2
             averaged = {f"multilook_{name}": (power, means[name]) for name, power in powers.items()}
@@ -177,7 +179,7 @@ def _noise_of_echoes(
     return {"multilook_noise": raster}, {"multilook_noise": ECHO.report | means}
 
 
-def _report(scene: OpenScene, image: xr.Dataset, calibrated: CalibratedPair, noise: float) -> dict[str, Any]:
+def _report(scene: OpenScene, image: xr.Dataset, calibrated: CalibratedPair, noise: PulseNoise) -> dict[str, Any]:
     """Return what the radio says of an image, for radiometry.json."""
     found = points_of(image.image, image.attrs["quality"], scene, list(scene.grid.tiles(BLOCK_PX)))
     constant = calibrated.calibration.constant
@@ -189,8 +191,8 @@ def _report(scene: OpenScene, image: xr.Dataset, calibrated: CalibratedPair, noi
         "pointing_std_db": round(calibrated.pointing_std_db, 3),
         "flags": Flags.merged(calibrated.flags, noise_flags),
         "link": calibrated.link and asdict(calibrated.link),
-        "noise": {"pulse": noise if np.isfinite(noise) else None, **noise_said},
-        "points": calibrated.points(found, scene, noise),
+        "noise": {"pulse": noise.power if np.isfinite(noise.power) else None, **noise_said},
+        "points": calibrated.points(found, scene, noise.power),
     }
 
 

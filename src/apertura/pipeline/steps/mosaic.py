@@ -21,8 +21,7 @@ def mosaic(campaign: Campaign) -> list[Path]:
     made = _made(campaign.root, lineage.result.sources)
     styles = {row.file: row for row in EXPORTS if row.style}
     written = []
-    pairs = {flight.name: flight.pairs for flight in campaign.image_flights}
-    for name, files in mosaics(pairs, campaign.coefficients).items():
+    for name, files in mosaics(campaign.images, campaign.coefficients).items():
         path, sources = campaign.result(MOSAICS, name), [campaign.result(file) for file in files]
         for source in sources:
             _check(source, made)

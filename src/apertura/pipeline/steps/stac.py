@@ -27,7 +27,7 @@ from apertura.formats.catalog.stac import (
 )
 from apertura.formats.export.coverage import Covered, feature_collection
 from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.config import polarisation_of
+from apertura.pipeline.config import FUSED, polarisation_of
 from apertura.pipeline.lineage import result_of
 from apertura.pipeline.opening.scene import OpenScene, settled_scene
 from apertura.pipeline.steps.coverage import few_looks, place_of, transform_of
@@ -64,7 +64,8 @@ class _Described:
             looks = {pair: few_looks(self.campaign, flight.name, pair) for pair in flight.pairs}
             pairs = [self._pair(flight.name, pair, looks[pair]) for pair in flight.pairs]
             together = np.sum(list(looks.values()), axis=0)
-            images += pairs + [self._sum(flight.name, name, pairs, together) for name in _SUMS]
+            sums = _SUMS if FUSED in flight.images else ()
+            images += pairs + [self._sum(flight.name, name, pairs, together) for name in sums]
         return images
 
     def _pair(self, flight: str, pair: str, looks: NDArray[np.float32]) -> Image:
@@ -90,18 +91,15 @@ class _Described:
 
     def _sum(self, flight: str, name: str, pairs: Sequence[Image], looks: NDArray[np.float32]) -> Image:
         others = tuple(f"{other}_" for other in _SUMS if other != name)
-        listed = self._listed(flight, "fused", "export")
-        facts = {
-            "sar:instrument_mode": "multistatic" if len(pairs) > 1 else _mode(pairs[0].name),
-            "sar:product_type": _SUMS[name],
-        }
+        listed = self._listed(flight, FUSED, "export")
+        facts = {"sar:instrument_mode": "multistatic", "sar:product_type": _SUMS[name]}
         return Image(
             flight,
             name,
             f"{self.campaign.settings.campaign} · flight {flight} · {name} sum of {len(pairs)} pairs",
             self._footprint(looks),
             AcquisitionTime.together([pair.acquisition for pair in pairs]),
-            {**facts, **self._properties(flight, "fused")},
+            {**facts, **self._properties(flight, FUSED)},
             *self._assets({path: digest for path, digest in listed.items() if not path.name.startswith(others)}),
             [pair.name for pair in pairs],
         )

@@ -6,8 +6,5 @@ PICTURES = ("geometry", "pulses", "phase", "cuts", "range_profiles", "budget")
 PAGE = "report.html"
 """The report of a flight, and of all of them."""
 
-PANELS = "panels.png"
-"""Images of a flight and their sums side by side."""
-
-SUM_CUTS = "cuts.png"
-"""Cuts through the brightest target of the coherent sum, beside the panels."""
+SUM_PICTURES = ("panels", "sum_cuts")
+"""What is drawn of the sums of a flight: beside its pairs, and cuts through the brightest target."""

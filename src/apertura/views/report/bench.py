@@ -11,7 +11,7 @@ from apertura.common.atomic import write_json, write_text
 from apertura.common.errors import CampaignError
 from apertura.common.flag_table import FLAGS
 from apertura.common.provenance import Provenance
-from apertura.methods.synchronisation.bench import SIGMAS
+from apertura.methods.synchronisation.channels import SIGMAS
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import CONFIG, FLIGHTS, validated
 from apertura.pipeline.lineage import result_of

@@ -7,58 +7,42 @@ from typing import Any
 
 from apertura.common.atomic import replacement, write_text
 from apertura.common.paths import shipped
-from apertura.common.provenance import Provenance
-from apertura.common.raster import opened_raster
-from apertura.formats.export import exports_in, product
+from apertura.formats.export import exports_in
 from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.digests import Lineage
+from apertura.pipeline.config import FUSED
 from apertura.pipeline.lineage import result_of
-from apertura.pipeline.opening.images import averaged
 from apertura.pipeline.opening.scene import OpenScene, settled_scene
-from apertura.pipeline.steps.stamping import tags_of
-from apertura.pipeline.store import check_listed, open_stage, record_files
+from apertura.pipeline.store import check_listed, record_files
 from apertura.views.image_report import (
     BUDGET,
     DECISIONS,
     FLAGGED,
-    FUSED,
     VERDICTS,
     budget_rows,
     decision_rows,
     flag_rows,
-    images_of,
     read_report,
     sentences,
     shared_rows,
     verdict_row,
 )
-from apertura.views.report import PAGE, PANELS, PICTURES, SUM_CUTS
-from apertura.views.report.image_drawings import draw_cuts, drawn_cuts
+from apertura.views.report import PAGE, PICTURES, SUM_PICTURES
 from apertura.views.report.page import Block, Heading, Paragraph, Picture, Table, rst_table, rst_text
 from apertura.views.report.page import page as page_of
-from apertura.views.report.panels import draw_panels
 
 ASKED = ("key", "value")
 """Headings of what was asked."""
 
-_DOTS = 480  # of the longer side of a panel
-_MOST_PANELS = 2  # pairs beside their sums
-
 
 def page(campaign: Campaign, flight: str) -> list[Path]:
-    """Write results/<flight>/report.html, the panels of its images and the cuts of their sum; return their paths."""
+    """Write results/<flight>/report.html; return its path."""
     lineage = result_of(campaign, "page", flight).begin(campaign.root)
-    fused = read_report(campaign, flight, FUSED)
-    reports = {name: read_report(campaign, flight, name) for name in images_of(campaign, flight)}
-    panels, cuts = (campaign.result(flight, FUSED, name) for name in (PANELS, SUM_CUTS))
+    reports = {name: read_report(campaign, flight, name) for name in campaign.flight(flight).images}
     text = campaign.result(flight, PAGE)
-    _write_panels(panels, campaign, flight, fused, lineage)
-    _write_cuts(cuts, campaign, flight, fused, lineage)
     title = f"{campaign.settings.campaign}, flight {flight}"
     write_text(text, page_of(title, [Heading(1, title), *_blocks(campaign, flight, reports)]))
-    written = [text, panels, cuts]
-    record_files(campaign.root / lineage.result.manifest, written, lineage)
-    return written
+    record_files(campaign.root / lineage.result.manifest, [text], lineage)
+    return [text]
 
 
 def _blocks(campaign: Campaign, flight: str, reports: Mapping[str, Mapping[str, Any]]) -> Iterator[Block]:
@@ -69,8 +53,7 @@ def _blocks(campaign: Campaign, flight: str, reports: Mapping[str, Mapping[str, 
     if FUSED in reports:
         yield Heading(2, "Pairs and their sums")
         yield Paragraph(" ".join(sentences("Sum of the pairs", reports[FUSED])))
-        yield Picture(campaign.result(flight, FUSED, PANELS).read_bytes(), _caption("panels"))
-        yield Picture(campaign.result(flight, FUSED, SUM_CUTS).read_bytes(), _caption("sum_cuts"))
+        yield from _pictures(campaign.result(flight, FUSED), {f"{name}.png": "pictures" for name in SUM_PICTURES})
     for pair in campaign.flight(flight).pairs:
         yield from _pair_blocks(campaign, flight, pair, reports[pair])
     raised = flag_rows(reports)
@@ -87,9 +70,7 @@ def _pair_blocks(campaign: Campaign, flight: str, pair: str, report: Mapping[str
     shown |= {f"pictures/{name}.png": "pictures" for name in PICTURES}
     yield Heading(2, f"Pair {pair}")
     yield Paragraph(" ".join(sentences(f"Image {pair}", report)))
-    for name, of in shown.items():
-        check_listed(folder / name, folder / f"{of}.manifest.json")
-        yield Picture((folder / name).read_bytes(), _caption(Path(name).stem))
+    yield from _pictures(folder, shown)
     yield Table(
         "Error budget; in brackets what a size assumed would do where nobody stated one.",
         BUDGET,
@@ -98,35 +79,16 @@ def _pair_blocks(campaign: Campaign, flight: str, pair: str, report: Mapping[str
     yield Table("What the planner decided, and why.", DECISIONS, decision_rows(report))
 
 
+def _pictures(folder: Path, shown: Mapping[str, str]) -> Iterator[Block]:
+    """Yield the pictures of a folder, file → the result that lists it, with what the workflow's report says of them."""
+    for name, of in shown.items():
+        check_listed(folder / name, folder / f"{of}.manifest.json")
+        yield Picture((folder / name).read_bytes(), _caption(Path(name).stem))
+
+
 def _caption(name: str) -> str:
     """Return what the workflow's report says below a picture."""
     return " ".join((shipped() / "workflow" / "report" / f"{name}.rst").read_text(encoding="utf-8").split())
-
-
-def _write_panels(path: Path, campaign: Campaign, flight: str, fused: Mapping[str, Any], lineage: Lineage) -> None:
-    scene, pairs = settled_scene(campaign), campaign.flight(flight).pairs[:_MOST_PANELS]
-    files = {pair: campaign.result(flight, pair, product("image", "write_power").file) for pair in pairs}
-    for kind in ("coherent", "noncoherent"):
-        files[f"{kind} sum"] = campaign.result(flight, FUSED, product(kind, "write_power").file)
-    powers = {}
-    for name, file in files.items():
-        with opened_raster(file, expected="what step export writes", remedy="Run the workflow again.") as raster:
-            powers[name] = averaged(raster, _DOTS).astype("f8")
-    west, south, east, north = scene.grid.bounds_m
-    brightest = fused["brightest"]["x_m"] - west, fused["brightest"]["y_m"] - south
-    images = {pair: open_stage(campaign.stage("image", flight, pair), "image") for pair in pairs}
-    tags = tags_of(Provenance.of(lineage.modules, images), lineage)
-    draw_panels(
-        path, powers, size_m=(east - west, north - south), target_m=brightest, title=f"flight {flight}", tags=tags
-    )
-
-
-def _write_cuts(path: Path, campaign: Campaign, flight: str, fused: Mapping[str, Any], lineage: Lineage) -> None:
-    cube = open_stage(campaign.stage("cube"), "cube")
-    coherent = cube.coherent[cube.attrs["flights"].index(flight)]
-    tags = tags_of(Provenance.of(lineage.modules, [cube]), lineage)
-    title = f"flight {flight}, coherent sum of {' + '.join(fused['fusion']['phases_rad'])}"
-    draw_cuts(path, drawn_cuts(coherent, fused["brightest"], settled_scene(campaign).grid), title=title, tags=tags)
 
 
 def asked_rows(campaign: Campaign) -> list[tuple[str, str]]:
@@ -175,7 +137,7 @@ def landing(campaign: Campaign) -> dict[str, Any]:
     """Return what the workflow's report opens with, as reStructuredText in which nothing is markup but the tables."""
     flights = {one.name: one.pairs for one in campaign.image_flights}
     reports = {
-        f"{one} {name}": read_report(campaign, one, name) for one in flights for name in images_of(campaign, one)
+        f"{one} {name}": read_report(campaign, one, name) for one, names in campaign.images.items() for name in names
     }
     first, pairs = next(iter(flights.items()))
     decided, raised = {pair: reports[f"{first} {pair}"] for pair in pairs}, flag_rows(reports)

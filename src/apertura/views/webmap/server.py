@@ -409,9 +409,7 @@ def _listing(campaign: Campaign) -> Callable[[], Mapping[str, str]]:
 
     Both are read again when the manifest is another: the workflow ran meanwhile.
     """
-    products = frozenset(
-        product_files({flight.name: flight.pairs for flight in campaign.image_flights}, campaign.coefficients)
-    )
+    products = frozenset(product_files(campaign.images, campaign.coefficients))
 
     @lru_cache(maxsize=1)
     def listed(*_: int) -> Mapping[str, str]:

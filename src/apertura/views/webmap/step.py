@@ -1,7 +1,7 @@
 """Rule `map`: what a browser shows of every image of the campaign."""
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +15,12 @@ from apertura.common.raster import opened_raster
 from apertura.core.geometry.geodesy import LOCAL, frame_from_map, geodetic_from_ecef
 from apertura.formats.export import COVERAGE, MAP, Export, exports_in
 from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.config import FUSED
 from apertura.pipeline.digests import digest_of
 from apertura.pipeline.lineage import result_of
 from apertura.pipeline.opening.scene import OpenScene, settled_scene
 from apertura.pipeline.store import check_listed, read_manifest, record_files
-from apertura.views.image_report import FUSED, images_of, read_report
+from apertura.views.image_report import read_report
 from apertura.views.webmap.document import Layer, Place, found_places, image_entry, map_document, url_of
 
 _FEW = 512  # places along a raster's longer side that its range of values is taken from
@@ -33,7 +34,8 @@ def webmap(campaign: Campaign) -> list[Path]:
     images, places = [], [*_stated(campaign)]
     notes: list[str] = []
     places += _true(campaign, scene, notes)
-    for flight, image in _images(campaign):
+    # Sums, the last of a flight, are what a map opens on.
+    for flight, image in ((name, one) for name, (*pairs, last) in campaign.images.items() for one in (last, *pairs)):
         report = read_report(campaign, flight, image)
         with undamaged(campaign.result(flight, image, "image.json"), expected="a report", remedy="Run export again."):
             images.append(image_entry(flight, image, report, _layers(campaign, flight, image, report)))
@@ -53,16 +55,10 @@ def webmap(campaign: Campaign) -> list[Path]:
     return [path]
 
 
-def _images(campaign: Campaign) -> Iterator[tuple[str, str]]:
-    for flight in campaign.image_flights:
-        images = images_of(campaign, flight.name)  # sums, the last, are what a map opens on
-        yield from ((flight.name, image) for image in (images[-1], *images[:-1]))
-
-
 def _layers(campaign: Campaign, flight: str, image: str, report: Mapping[str, Any]) -> list[Layer]:
     """Return what a page can show of an image: real rasters, the linear ones only where no dB show the same."""
-    kinds = [("export", "fused")] if image == FUSED else [("export", "pair"), ("layers", "layers")]
-    kinds += [("layers", "radiometry")] if image != FUSED else []
+    of_pairs = [("export", "pair"), ("layers", "layers"), ("layers", "radiometry")]
+    kinds = [("export", "fused")] if image == FUSED else of_pairs
     return [
         layer
         for result, kind in kinds
