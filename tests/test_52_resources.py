@@ -98,7 +98,15 @@ def test_every_job_of_a_run_stays_within_what_it_asked_for_and_asked_for_no_more
         assert math.isnan(used) or used * 1.048576 + BESIDE_MB <= predicted, (rule, used, predicted)
         assert predicted <= 4 * max(used, 1000), (rule, used, predicted)
         seen.add(rule)
-    assert seen == set(RULES) - {"bench", "calibrate", "terrain", "cphd", "interferogram", "speed_accuracy", "whole_chart"}
+    assert seen == set(RULES) - {
+        "bench",
+        "calibrate",
+        "terrain",
+        "cphd",
+        "interferogram",
+        "speed_accuracy",
+        "whole_chart",
+    }
 
 
 def job_of(path):
