@@ -85,10 +85,11 @@ def beamed(document, azimuth, elevation, widths):
 
 
 def hill(folder: Path) -> Path:
-    """Write a DEM with a hill of 6 m, steeper than the radar looks down at its far side."""
+    """Write a DEM of a gentle hill of 6 m, where the points stand, and a mound beside it that throws a shadow."""
     path = folder / "dem.tif"
     x, y = np.meshgrid(np.arange(-60.5, 60.5, 1.0), np.arange(60.5, -60.5, -1.0))
-    heights = 500.0 + 6.0 * np.exp(-(x**2 + (y - 2.0) ** 2) / (2 * 4.0**2))
+    heights = 500.0 + 6.0 * np.exp(-(x**2 + (y - 2.0) ** 2) / (2 * 15.0**2))
+    heights += 5.0 * np.exp(-((x - 9.5) ** 2 + (y + 8.0) ** 2) / (2 * 1.3**2))
     transform = rasterio.Affine(1, 0, EAST - 61.0, 0, -1, NORTH + 61.0)
     form = {"driver": "GTiff", "count": 1, "dtype": "float64", "crs": CRS, "transform": transform}
     with rasterio.open(path, "w", height=heights.shape[0], width=heights.shape[1], **form) as raster:

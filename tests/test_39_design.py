@@ -9,6 +9,10 @@ import pytest
 import apertura as ap
 from apertura.common.constants import BOLTZMANN_J_K, SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
+from apertura.core.geometry.aperture import Aperture
+from apertura.core.imaging.resolution import Resolution
+from apertura.core.scene.grid import SceneGrid
+from apertura.core.scene.terrain import Plane
 from apertura.pipeline.config.flight_plan import FlightPlan
 from apertura.pipeline.design import designed
 from apertura.pipeline.design.judgement import helpful_changes, judge, search
@@ -98,10 +102,26 @@ def test_a_line_resolves_half_a_wavelength_over_the_sine_of_its_angle():
 def test_a_circle_resolves_alike_in_every_direction():
     """|p|² = J₀²(4π r sin θ/λ): half of it at 1.126, a full width of 2.252."""
     circle = {"kind": "circle", "centre_m": [0.0, 30.0], "radius_m": 30.0, "height_m": 30.0, "speed_m_s": 3.0}
-    found = ap.design(flown(plan_of(), uav1=circle))
+    scene = plan_of()["scene"] | {"bounds_m": [-0.5, 29.5, 0.5, 30.5]}
+    found = ap.design(flown(plan_of(scene=scene), uav1=circle))
     width = 2.252 * SPEED_OF_LIGHT_M_S / CARRIER / (4 * np.pi * np.sin(np.pi / 4))
     for name in ("resolution", "resolution_fine"):
-        assert in_the_middle(found, name) == pytest.approx(width, rel=0.04)
+        assert in_the_middle(found, name) == pytest.approx(width, rel=0.015)
+
+
+@pytest.mark.parametrize("rise", [-0.3, 0.3])
+def test_ground_that_falls_away_from_the_radar_is_resolved_finer_on_the_map(rise):
+    """The path grows by 2(sin θ - r cos θ) per metre of the map, r the rise: 0.886 c/B over that."""
+    along = np.linspace(-2, 2, 401)
+    track = np.stack([along, np.full(401, -30.0), np.full(401, 30.0)], -1)
+    band = CARRIER + np.linspace(-1e8, 1e8, 64)
+    grid, ground = SceneGrid("local", -2.0, 2.0, 1.0, (4, 4)), Plane(0.0, 0.0, 0.0, east=0.0, north=rise)
+    aperture = Aperture(track, track)
+    found = Resolution.of(grid, ground, aperture, None, frequency_hz=band, weight=np.ones(64) / 64)
+    fine, coarse, azimuth = found.axes((slice(1, 2), slice(2, 3)))
+    width = 0.886 * SPEED_OF_LIGHT_M_S / 2e8 / (2 * np.sqrt(0.5) * (1 - rise))
+    widths = (fine, coarse) if abs(azimuth[0, 0]) < 45 else (coarse, fine)
+    assert widths[0][0, 0] == pytest.approx(width, rel=0.04)
 
 
 def test_noise_and_a_point_s_snr_are_those_of_the_radar_equation():
@@ -157,6 +177,16 @@ def test_recordings_are_as_large_as_their_captures():
     capture = round(3.5e-6 * 2.56e8) * 4
     assert recording["node_bytes_s"]["f01"] == {"uav1": 100 * capture, "uav2": 200 * capture}
     assert recording["recorded_bytes"] == recording["pulses"]["f01"] * 3 * capture
+
+
+def test_a_radar_of_sweeps_is_told_but_for_its_noise():
+    sweep = {"kind": "fmcw", "format": "beat_npy", "start_hz": 5.7e9, "bandwidth_hz": 2e8, "sweep_s": 1e-3}
+    plan = plan_of(waveform=sweep | {"sample_rate_hz": 4e5, "prf_hz": 200.0}, nodes={"uav1": {"attitude": "log"}})
+    found = ap.design(flown(plan, uav1=line(start_m=[-2.0, 0.0], end_m=[2.0, 0.0])))
+    across = 0.886 * SPEED_OF_LIGHT_M_S / (2 * 2e8) / np.sin(np.pi / 4)
+    assert in_the_middle(found, "resolution") == pytest.approx(across, rel=0.02)
+    assert np.isnan(found.nesz).all()
+    assert found.attrs["recording"]["node_bytes_s"]["f01"]["uav1"] == 200 * 400 * 2
 
 
 def test_turns_between_legs_are_flown_and_not_imaged():

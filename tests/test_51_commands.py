@@ -52,7 +52,8 @@ WRONG = [
     "simulate new --preset none",     "simulate --print-spec none", "run --cores 0", "run --cores many",
     "run --until", "map --port 99999", "plan --threads 0",     "run export", "align . f01 uav1 --point 1 2",
     "align . f01 uav1 --search-s -1", "check --product", "step", "step nothing",     "step image f01",
-    "step image f01 uav1-uav9", "check-crate .",
+    "step image f01 uav1-uav9", "check-crate .", "design nowhere",
+    "design", "compare nowhere", "init new --from nowhere",
 ]  # fmt: skip
 
 

@@ -122,6 +122,18 @@ def test_an_unknown_word_of_optimise_is_one_message(folder, monkeypatch, capsys)
     assert "expected some of height,offset,spacing,heading" in err
 
 
+def test_a_scene_beyond_the_dem_is_one_message(folder, monkeypatch, capsys):
+    place = {"transform": rasterio.Affine(1, 0, EAST, 0, -1, NORTH), "crs": "EPSG:32632", "height": 9, "width": 9}
+    with rasterio.open(folder / "dem.tif", "w", driver="GTiff", count=1, dtype="float32", **place) as raster:
+        raster.write(np.full((9, 9), 500.0, np.float32), 1)
+    scene = PLAN["scene"] | {"dem": "dem.tif", "dem_datum": "ellipsoid"}
+    (folder / "plan.yaml").write_text(yaml.safe_dump(PLAN | {"scene": scene}))
+    status, out, err = typed(monkeypatch, capsys, "design", folder / "plan.yaml")
+    assert (status, out) == (2, "")
+    assert err.count("\n") == 1
+    assert "dem.tif" in err
+
+
 @pytest.mark.slow
 def test_what_was_predicted_is_measured_after_the_same_plan_was_sampled_and_processed(tmp_path, monkeypatch, capsys):
     """Widths within 5 %, NESZ and SNR within 1 dB: 256 pulses measure their noise to 0.4 dB."""

@@ -1,7 +1,8 @@
 """Resolution of an image at each place, from the spatial spectrum that its pulses and its band sample there."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from math import comb
 
 import numpy as np
@@ -14,14 +15,14 @@ from apertura.core.antenna.beam import Beams
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.imaging.radiometry import point_weights
 from apertura.core.scene.grid import SceneGrid
-from apertura.core.scene.looks import Lattice, fill, pitch_px, pulses_of
-from apertura.core.scene.terrain import Terrain
+from apertura.core.scene.looks import Lattice, fill, pulses_of
+from apertura.core.scene.terrain import FlatGround, Terrain
 
 _ORDER = 4  # of moments: width by the second, the shape of the spectrum by the fourth
 _ORDERS = [(east, total - east) for total in range(_ORDER + 1) for east in range(total + 1)]
-_RANGE_SHARE = 24  # as of the calibration: the same weights change from node to node
 _PULSES = 128  # summed for a block of the lattice, or up to twice as many
 _HALF_POWER = np.log(2) / 2  # of -ln|p| where |p|² is one half
+_UPRIGHT = 4  # moments with the vertical, of which slopes take their part
 _LEAST_SPREAD = 1e-12  # of a spectrum's second moment, cycles² per m²: no aperture at all
 
 
@@ -31,17 +32,22 @@ class Resolution:
 
     Attributes
     ----------
+    grid, terrain
+        The scene.
     lattice
         Nodes at which the moments are computed.
     moments
-        (node row, node column, moment) float64, cycles per metre to their power, of the spectrum's density along
-        eastward columns and northward rows on the ground; the first is 1, or 0 where no pulse sees the node.
+        (node row, node column, moment) float64, cycles per metre to their power, of the spectrum's density: those of
+        `_ORDERS` over level ground, eastward and northward, the first 1, or 0 where no pulse sees the node; then, with
+        the vertical, of u, east·u, north·u and u².
 
     Notes
     -----
     Source: docs/theory/design.md, eq. 1 and 2.
     """
 
+    grid: SceneGrid
+    terrain: Terrain
     lattice: Lattice
     moments: Floats
 
@@ -84,29 +90,34 @@ class Resolution:
         >>> fine.round(2), coarse.round(2), abs(azimuth).round(0)
         (array([[0.24]]), array([[0.47]]), array([[90.]]))
         """
-        lattice = Lattice.of(grid.shape, pitch_px(grid, terrain, aperture, share=_RANGE_SHARE))
-        moments = np.zeros((*lattice.shape, len(_ORDERS)))
+        lattice = Lattice.of(grid.shape)  # one pitch for all pairs, so that their moments add node by node
+        moments = np.zeros((*lattice.shape, len(_ORDERS) + _UPRIGHT))
         share = weight / weight.sum()
         of_band = [float((share * (frequency_hz / SPEED_OF_LIGHT_M_S) ** order).sum()) for order in range(_ORDER + 1)]
 
         def compute(block: Window, reaching: NDArray[np.bool_]) -> None:
             rows, columns = (at[part] for at, part in zip(lattice.nodes, block, strict=True))
             row, column = (one.ravel() for one in np.meshgrid(rows, columns, indexing="ij"))
-            points = terrain.positions_at(grid, row, column)
+            height_m = np.asarray(terrain.heights_at(grid, row, column), np.float64)
+            points = grid.positions_at(row, column, height_m)
+            beside = [grid.positions_at(row, column + 1, height_m), grid.positions_at(row - 1, column, height_m)]
+            sides = [(one - points) / grid.spacing_m for one in beside]
+            sides.append(grid.positions_at(row, column, height_m + 1.0) - points)
             reached = pulses_of(reaching, len(aperture))
             some = slice(reached.start, reached.stop, max(1, (reached.stop - reached.start) // _PULSES))
             taken = aperture[some]
             parts, _ = point_weights(taken, beams and beams[some], points)
             density = np.abs(parts)
-            total = density.sum(axis=0)
-            density = density / np.maximum(total, 1e-300)
+            density = density / np.maximum(density.sum(axis=0), 1e-300)
             gradient = taken.path_gradient(points)
-            east, north = ((gradient * side).sum(axis=-1) for side in _sides(grid, terrain, row, column))
+            east, north, up = ((gradient * side).sum(axis=-1) for side in sides)
             found = [(density * east**a * north**b).sum(axis=0) * of_band[a + b] for a, b in _ORDERS]
+            found += [(density * up).sum(axis=0) * of_band[1]]
+            found += [(density * up * other).sum(axis=0) * of_band[2] for other in (east, north, up)]
             moments[block] = np.stack(found, axis=-1).reshape(len(rows), len(columns), -1)
 
         fill(lattice, compute, grid, terrain, aperture, beams, threads=threads)
-        return cls(lattice, moments)
+        return cls(grid, terrain, lattice, moments)
 
     @classmethod
     def summed(cls, images: Sequence["Resolution"]) -> "Resolution":
@@ -114,14 +125,8 @@ class Resolution:
 
         The spectra of pairs at different places lie side by side (docs/theory.md, eq. 7): their densities add.
         """
-        nodes = max((image.lattice for image in images), key=lambda one: one.shape[0] * one.shape[1])
-        total = np.zeros((*nodes.shape, len(_ORDERS)))
-        for image in images:
-            rows, columns = (slice(0, int(at[-1]) + 1) for at in nodes.nodes)
-            same = image.lattice.shape == nodes.shape
-            whole = image.moments if same else image.lattice.between(image.moments, (rows, columns))
-            total += whole if same else whole[np.ix_(*nodes.nodes)]
-        return cls(nodes, total / np.maximum(total[..., :1], 1e-300))
+        total = np.sum([image.moments for image in images], axis=0)
+        return replace(images[0], moments=total / np.maximum(total[..., :1], 1e-300))
 
     def axes(self, window: Window) -> tuple[Floats, Floats, Floats]:
         """Return −3 dB widths of a point along the finest and the coarsest direction, and the azimuth of the finest.
@@ -137,79 +142,122 @@ class Resolution:
             (row, column) float64: metres, metres, and degrees clockwise from the grid's north, −90 to 90; NaN where no
             pulse sees the place, infinite along a direction that nothing resolves.
         """
-        first, second = self._order(1), self._order(2)
-        seen = self.moments[..., 0] > 0
-        middle = first / np.where(seen, 1.0, np.nan)[..., None]
-        north_north, north_east, east_east = np.moveaxis(second, -1, 0)
-        spread = np.stack(
-            [
-                np.stack([east_east - middle[..., 1] ** 2, north_east - middle[..., 0] * middle[..., 1]], -1),
-                np.stack([north_east - middle[..., 0] * middle[..., 1], north_north - middle[..., 0] ** 2], -1),
-            ],
-            -2,
+        if isinstance(self.terrain, FlatGround):
+            fine, coarse, azimuth = self._axes_at_nodes
+            doubled = [self._between(part, window) for part in (np.cos(2 * azimuth), np.sin(2 * azimuth))]
+            with np.errstate(divide="ignore"):
+                widths = [1 / self._between(1 / width, window) for width in (fine, coarse)]
+            return widths[0], widths[1], np.degrees(np.arctan2(doubled[1], doubled[0])) / 2
+        spread = [self._between(part, window) for part in self._spread_at_nodes]
+        _, _, azimuth, *values = _principal(*_on_slopes(spread, _slopes(self.grid, self.terrain, window)))
+        fine, coarse = (
+            _width(self._between(shape, window), value)
+            for shape, value in zip(self._shapes_at_nodes, values, strict=True)
         )
-        known = np.isfinite(spread).all(axis=(-1, -2))
-        _, vectors = np.linalg.eigh(np.where(known[..., None, None], spread, np.eye(2)))
-        coarse_axis, fine_axis = vectors[..., 0], vectors[..., 1]
-        widths = [self._width(axis) for axis in (fine_axis, coarse_axis)]
-        # Azimuths jump from -90° to 90°: between nodes their double angle is what is smooth.
-        doubled = np.stack(
-            [fine_axis[..., 1] ** 2 - fine_axis[..., 0] ** 2, 2 * fine_axis[..., 0] * fine_axis[..., 1]], -1
-        )
-        with np.errstate(invalid="ignore", divide="ignore"):
-            smooth = [1 / self.lattice.between(1 / width, window) for width in widths]
-        cosine, sine = np.moveaxis(self.lattice.between(doubled, window), -1, 0)
-        return smooth[0], smooth[1], np.where(np.isfinite(smooth[0]), np.degrees(np.arctan2(sine, cosine)) / 2, np.nan)
-
-    def along(self, direction: tuple[float, float], window: Window) -> Floats:
-        """Return the −3 dB width of a point along (east, north), metres, (row, column); as `axes`."""
-        axis = np.broadcast_to(np.array(direction) / np.hypot(*direction), (*self.lattice.shape, 2))
-        with np.errstate(invalid="ignore", divide="ignore"):
-            return np.asarray(1 / self.lattice.between(1 / self._width(axis), window))
+        return fine, coarse, np.degrees(azimuth)
 
     def look_azimuth_deg(self, window: Window) -> Floats:
         """Return the azimuth in which paths grow fastest on the ground, degrees clockwise from grid north."""
-        north, east = np.moveaxis(self.lattice.between(self._order(1), window), -1, 0)
+        east, north = (self._between(self._raw(one), window) for one in ((1, 0), (0, 1)))
         return np.asarray(np.degrees(np.arctan2(east, north)))
 
-    def _order(self, total: int) -> Floats:
-        return self.moments[..., [number for number, (a, b) in enumerate(_ORDERS) if a + b == total]]
+    def _raw(self, order: tuple[int, int]) -> Floats:
+        """Return a moment at the nodes; NaN where no pulse sees them."""
+        seen = self.moments[..., 0] > 0
+        return np.where(seen, self.moments[..., _ORDERS.index(order)], np.nan)
 
-    def _width(self, axis: Floats) -> Floats:
-        """Return −3 dB widths at the nodes along unit vectors (node row, node column, 2), metres."""
-        east, north = axis[..., 0], axis[..., 1]
-        raw = [
-            sum(comb(total, a) * east**a * north ** (total - a) * self._order(total)[..., a] for a in range(total + 1))
-            for total in range(_ORDER + 1)
-        ]
-        seen, mean = np.asarray(raw[0]) > 0, np.asarray(raw[1])
-        variance = np.asarray(raw[2] - mean**2)
-        fourth = np.asarray(raw[4] - 4 * mean * raw[3] + 6 * mean**2 * raw[2] - 3 * mean**4)
-        excess = fourth / np.maximum(variance, _LEAST_SPREAD) ** 2 - 3
-        # ln|p(x)| = −κ₂t²/2 + κ₄t⁴/24, t = 2πx: where that is −ln √2, in units of the spectrum's deviation
-        root = 0.25 - np.minimum(excess, 1.0) * _HALF_POWER / 6
-        square = 4 * _HALF_POWER / (1 + 2 * np.sqrt(np.maximum(root, 0.0)))
-        width = np.sqrt(square) / (np.pi * np.sqrt(np.maximum(variance, 0.0)) + 1e-300)
-        return np.where(seen, np.where(variance > _LEAST_SPREAD, width, np.inf), np.nan)
+    def _central(self, order: tuple[int, int]) -> Floats:
+        """Return a moment about the mean at the nodes: means move from node to node, these are smooth."""
+        means = self._raw((1, 0)), self._raw((0, 1))
+        return np.asarray(
+            sum(
+                comb(order[0], a) * comb(order[1], b) * self._raw((a, b))
+                * (-means[0]) ** (order[0] - a) * (-means[1]) ** (order[1] - b)
+                for a in range(order[0] + 1)
+                for b in range(order[1] + 1)
+            )
+        )  # fmt: skip
+
+    def _between(self, values: Floats, window: Window) -> Floats:
+        """Return values at the pixels of a window, between those nodes that have any; NaN where none has."""
+        known = np.isfinite(values)
+        share = self.lattice.between(known.astype(np.float64), window)
+        mean = self.lattice.between(np.where(known, values, 0.0), window)
+        return np.where(share > 0, mean / np.where(share > 0, share, 1.0), np.nan)
+
+    @cached_property
+    def _spread_at_nodes(self) -> list[Floats]:
+        """Covariances east-east, east-north, north-north, east-up, north-up and up-up of the spectrum at the nodes."""
+        mean, *products = np.moveaxis(self.moments[..., len(_ORDERS) :], -1, 0)
+        means = self._raw((1, 0)), self._raw((0, 1)), mean
+        upright = [one - mean * other for one, other in zip(products, means, strict=True)]
+        return [*(self._central(one) for one in ((2, 0), (1, 1), (0, 2))), *upright]
+
+    @cached_property
+    def _shapes_at_nodes(self) -> list[Floats]:
+        """Values of s of docs/theory/design.md, eq. 2, along the finest and the coarsest direction of level ground."""
+        level, shapes = self._spread_at_nodes[:3], []
+        east, north, *_ = _principal(*level)
+        for axis in ((east, north), (-north, east)):
+            second, fourth = (
+                sum(
+                    comb(order, a) * axis[0] ** a * axis[1] ** (order - a) * self._central((a, order - a))
+                    for a in range(order + 1)
+                )
+                for order in (2, 4)
+            )
+            excess = fourth / np.maximum(second, _LEAST_SPREAD) ** 2 - 3
+            # ln|p(x)| = −κ₂t²/2 + κ₄t⁴/24, t = 2πx: where that is −ln √2, in units of the spectrum's deviation
+            root = 0.25 - np.minimum(excess, 1.0) * _HALF_POWER / 6
+            shapes.append(4 * _HALF_POWER / (1 + 2 * np.sqrt(np.maximum(root, 0.0))))
+        return shapes
+
+    @cached_property
+    def _axes_at_nodes(self) -> tuple[Floats, Floats, Floats]:
+        """Widths along both axes, and the azimuth of the finest, radians, on level ground."""
+        _, _, azimuth, *values = _principal(*self._spread_at_nodes[:3])
+        fine, coarse = (_width(shape, value) for shape, value in zip(self._shapes_at_nodes, values, strict=True))
+        return fine, coarse, azimuth
 
 
-def _sides(
-    grid: SceneGrid, terrain: Terrain, row: NDArray[np.int64], column: NDArray[np.int64]
-) -> tuple[Floats, Floats]:
-    """Return how the ground moves per metre of the map eastward and northward, (point, 3) each."""
-    sides = []
-    for step, sign in (((0, 1), 1.0), ((1, 0), -1.0)):
-        ends = [
-            (np.clip(row + far * step[0], 0, grid.shape[0] - 1), np.clip(column + far * step[1], 0, grid.shape[1] - 1))
-            for far in (-1, 1)
-        ]
-        apart = (ends[1][0] - ends[0][0]) + (ends[1][1] - ends[0][1])
-        if grid.shape[step.index(1)] < 2:  # one row or column is continued level
-            heights = terrain.heights_at(grid, row, column)
-            ends = [(row + far * step[0], column + far * step[1]) for far in (-1, 1)]
-            places = [grid.positions_at(*end, heights) for end in ends]
-            apart = np.full(len(row), 2)
-        else:
-            places = [terrain.positions_at(grid, *end) for end in ends]
-        sides.append(sign * (places[1] - places[0]) / (grid.spacing_m * apart)[:, None])
-    return sides[0], sides[1]
+def _principal(east: Floats, both: Floats, north: Floats) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+    """Return east and north of the axis of the largest variance, its azimuth (rad), and both variances."""
+    mean, half = (east + north) / 2, np.hypot((east - north) / 2, both)
+    turn = np.arctan2(2 * both, east - north) / 2  # anticlockwise from east
+    azimuth = np.pi / 2 - turn
+    azimuth = (azimuth + np.pi / 2) % np.pi - np.pi / 2
+    return np.cos(turn), np.sin(turn), azimuth, mean + half, mean - half
+
+
+def _width(shape: Floats, variance: Floats) -> Floats:
+    width = np.sqrt(shape) / (np.pi * np.sqrt(np.maximum(variance, _LEAST_SPREAD)))
+    return np.asarray(np.where(variance <= _LEAST_SPREAD, np.inf, width))
+
+
+def _on_slopes(spread: list[Floats], slopes: tuple[Floats, Floats]) -> tuple[Floats, Floats, Floats]:
+    """Return covariances east-east, east-north and north-north per metre of the map along the ground."""
+    east, both, north, east_up, north_up, up_up = spread
+    to_east, to_north = slopes
+    return (
+        east + 2 * to_east * east_up + to_east**2 * up_up,
+        both + to_north * east_up + to_east * north_up + to_east * to_north * up_up,
+        north + 2 * to_north * north_up + to_north**2 * up_up,
+    )
+
+
+def _slopes(grid: SceneGrid, terrain: Terrain, window: Window) -> tuple[Floats, Floats]:
+    """Return the rise of the ground per metre of the map eastward and northward, (row, column) each."""
+    around = [
+        slice(max(0, part.start - 1), min(size, part.stop + 1)) for part, size in zip(window, grid.shape, strict=True)
+    ]
+    heights = np.asarray(terrain.heights(grid[around[0], around[1]]), np.float64)
+    inner = tuple(
+        slice(part.start - whole.start, part.stop - whole.start) for part, whole in zip(window, around, strict=True)
+    )
+    rises = [
+        np.gradient(heights, axis=axis)[inner] / grid.spacing_m
+        if heights.shape[axis] > 1
+        else np.zeros(heights.shape)[inner]
+        for axis in (1, 0)
+    ]
+    return rises[0], -rises[1]
