@@ -82,7 +82,12 @@ def compress_into(history: PhaseHistory, window: RangeWindow, grid: SceneGrid, i
     for first in range(0, len(history), AT_ONCE):
         block = slice(first, min(first + AT_ONCE, len(history)))
         part = RangeWindow(
-            window.start_m[block], window.samples, window.step_m, window.unambiguous, window.farthest_m[block]
+            window.start_m[block],
+            window.samples,
+            window.step_m,
+            window.unambiguous,
+            window.farthest_m[block],
+            window.wave_speed_m_s,
         )
         into[block] = range_compress(history[block], grid, FLAT, window=part).samples
 
@@ -99,7 +104,9 @@ def formed(flight: Flight, grid: SceneGrid, *, integration: Any = "auto") -> dic
     began = time.process_time()
     job = imaging_job(flight.aperture, flight.frequency_hz, history.weight, grid, ground, integration=integration)
     plan = make_plan(job, accuracy_db=-60.0)
-    window = RangeWindow.of(flight.aperture, grid, FLAT, flight.frequency_hz, beams=job.beams)
+    window = RangeWindow.of(
+        flight.aperture, grid, FLAT, flight.frequency_hz, beams=job.beams, wave_speed_m_s=history.wave_speed_m_s
+    )
     planned = time.process_time()
     samples = np.empty((len(flight), window.samples), np.complex64)
     compress_into(history, window, grid, samples)
@@ -147,7 +154,9 @@ def long_flight(pulses: int, pixels: int, folder: Path) -> None:
     history = flight.history
     known = flight.aperture, flight.frequency_hz, history.weight
     job = imaging_job(*known, grid, GroundModels.of(FLAT, None, grid), beams=beams)
-    window = RangeWindow.of(flight.aperture, grid, FLAT, flight.frequency_hz, beams=job.beams)
+    window = RangeWindow.of(
+        flight.aperture, grid, FLAT, flight.frequency_hz, beams=job.beams, wave_speed_m_s=history.wave_speed_m_s
+    )
     import zarr
 
     group = zarr.open_group(folder / "flight.zarr", mode="w")

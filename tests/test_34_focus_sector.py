@@ -189,7 +189,9 @@ def test_tiles_beyond_the_swath_are_not_formed():
     aperture, grid = strip()
     history = strip_history(aperture, np.array([[x, 36.0, 0.0] for x in (-60.0, -20.0, 0.0, 40.0)]))
     beams = Beams(sector=Sector.of(aperture, chord_m=4.0, centre=0.0, half=0.1))
-    window = RangeWindow.of(aperture, grid, FLAT, history.frequency_hz, beams=beams)
+    window = RangeWindow.of(
+        aperture, grid, FLAT, history.frequency_hz, beams=beams, wave_speed_m_s=history.wave_speed_m_s
+    )
     profiles, read = range_compress(history, grid, FLAT, window=window), []
 
     class Read:

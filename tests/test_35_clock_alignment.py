@@ -42,7 +42,9 @@ def given(move, *, amplitudes=(1.0, 0.4, 0.5), seed=3):
     )
     transfer = transfer + 5 * np.exp(-2j * np.pi * FREQUENCY * 0.5 / SPEED_OF_LIGHT_M_S)
     transfer = transfer + rng.normal(0, 0.3, (2, *transfer.shape)).T.swapaxes(0, 1) @ [1, 1j]
-    echo = Recorded(transfer.astype(np.complex64), FREQUENCY, np.zeros(len(pulse_s)), pulse_s - BEHIND_S)
+    echo = Recorded(
+        transfer.astype(np.complex64), FREQUENCY, np.zeros(len(pulse_s)), pulse_s - BEHIND_S, SPEED_OF_LIGHT_M_S
+    )
     log = Logged(lambda at_s: Aperture(flown(move(at_s)), flown(move(at_s))), 0.0, 18.0)
     return echo, log
 
@@ -69,7 +71,9 @@ def test_offset_and_path_are_found_on_a_known_point():
 
 def test_a_path_that_is_known_is_kept():
     echo, log = given(start_and_stop)
-    known = Recorded(echo.transfer, FREQUENCY, echo.reference_delay_s - PATH_M / SPEED_OF_LIGHT_M_S, echo.time_s)
+    known = Recorded(
+        echo.transfer, FREQUENCY, echo.reference_delay_s - PATH_M / SPEED_OF_LIGHT_M_S, echo.time_s, SPEED_OF_LIGHT_M_S
+    )
     found = align_on_point(known, log, POINTS[0], within_s=(-10.0, 15.0), search_m=0.0)
     assert found.path_m == 0.0
     assert found.offset_s == pytest.approx(BEHIND_S, abs=0.003)
@@ -85,7 +89,7 @@ def test_a_clock_that_runs_slow_is_told_on_a_long_recording():
     path = 2 * np.linalg.norm(flown(to_and_fro(pulse_s)) - POINTS[0], axis=1) + PATH_M
     transfer = np.exp(-2j * np.pi * FREQUENCY * path[:, None] / SPEED_OF_LIGHT_M_S).astype(np.complex64)
     clock_s = (pulse_s - pulse_s[0]) / (1 + slow_ppm * 1e-6) + pulse_s[0] - BEHIND_S
-    echo = Recorded(transfer, FREQUENCY, np.zeros(len(pulse_s)), clock_s)
+    echo = Recorded(transfer, FREQUENCY, np.zeros(len(pulse_s)), clock_s, SPEED_OF_LIGHT_M_S)
     log = Logged(lambda at_s: Aperture(flown(to_and_fro(at_s)), flown(to_and_fro(at_s))), 0.0, 610.0)
     without = align_on_point(echo, log, POINTS[0], within_s=(2.9, 3.5), search_m=2.0)
     found = estimate_drift(without, echo, log, POINTS[0])

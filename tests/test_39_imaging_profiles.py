@@ -24,7 +24,7 @@ def test_an_echo_peaks_at_its_path_with_its_amplitude_and_the_phase_of_the_band_
     path = history.aperture.path(TARGET)[:, 0]
     sample = (path - profiles.start_m) / profiles.step_m
     np.testing.assert_array_equal(np.abs(profiles.samples).argmax(axis=1), np.rint(sample))
-    window = RangeWindow.of(history.aperture, TARGET_GRID, FLAT, history.frequency_hz)
+    window = RangeWindow.of(history.aperture, TARGET_GRID, FLAT, history.frequency_hz, wave_speed_m_s=C)
     on_the_echo = range_compress(
         history, TARGET_GRID, FLAT, window=replace(window, start_m=path - 40 * window.step_m)
     ).samples[:, 40]
@@ -54,7 +54,7 @@ def test_the_window_covers_every_pixel_with_all_its_guard_samples(shape, relief_
     heights = relief_m * generator.uniform(-1, 1, shape)
     track = np.stack([np.linspace(-4, 4, 9), np.zeros(9), np.full(9, 10.0)], -1)
     flown = Aperture(track, track + [2.0, 1.0, 0.5])
-    window = RangeWindow.of(flown, grid, GridHeights(grid, heights), 1.2e9 + 2e6 * np.arange(200))
+    window = RangeWindow.of(flown, grid, GridHeights(grid, heights), 1.2e9 + 2e6 * np.arange(200), wave_speed_m_s=C)
     path = flown.path(grid.positions(heights)).reshape(9, -1)
     guard = GUARD_SAMPLES * window.step_m
     assert (path.min(axis=1) >= window.start_m + guard - 1e-9).all()

@@ -7,7 +7,6 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
 from apertura.core.antenna.beam import Beams
 from apertura.core.echo.compression import centre_frequency, compress, range_step, window_weights
@@ -51,7 +50,7 @@ class RangeWindow:
     step_m: float
     unambiguous: int
     farthest_m: NDArray[np.float64]
-    wave_speed_m_s: float = SPEED_OF_LIGHT_M_S
+    wave_speed_m_s: float
 
     @property
     def contributing(self) -> NDArray[np.bool_]:
@@ -67,7 +66,7 @@ class RangeWindow:
         frequency_hz: NDArray[np.float64],
         *,
         beams: Beams | None = None,
-        wave_speed_m_s: float = SPEED_OF_LIGHT_M_S,
+        wave_speed_m_s: float,
     ) -> "RangeWindow":
         """Return the window that a scene needs.
 

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.common.arrays import Complexes, Floats
-from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.geometry.aperture import Aperture
 
 PhaseCentres = Callable[[Floats], Aperture]
@@ -43,7 +42,7 @@ class Recorded:
     frequency_hz: Floats
     reference_delay_s: Floats
     time_s: Floats
-    wave_speed_m_s: float = SPEED_OF_LIGHT_M_S
+    wave_speed_m_s: float
 
     def __len__(self) -> int:
         return len(self.time_s)
