@@ -174,7 +174,7 @@ def coherence_layers(
         ]
         second = replace(second, pulses=second.pulses[np.ix_(*nearest)], lattice=first.lattice)
     band = float(pairs[0].frequency_hz[0]), float(pairs[0].frequency_hz[-1])
-    sensed = sensed_heights(scene, first, [legs_of(first), legs_of(second)], band)
+    sensed = sensed_heights(scene, first, [legs_of(first), legs_of(second)], band, pairs[0].weight)
     coherence = sensed.overlap
     for image in images:
         if "snr" in image.layers and np.isfinite(image.layers["snr"]).any():
