@@ -173,7 +173,7 @@ def _overlap(
     in_range = [np.sort(np.multiply.outer((one * along).sum(-1), np.array(band_hz)), axis=-1) for one in middle]
     turned = [np.einsum("pmi,pi->pm", one, across) for one in ground]
     in_angle = [np.stack([one.min(axis=1), one.max(axis=1)], axis=-1) for one in turned]
-    along_range = _shared(*in_range) if window is None else _correlated(*in_range, window)
+    along_range = _shared(in_range[0], in_range[1]) if window is None else _correlated(in_range[0], in_range[1], window)
     return np.asarray(along_range * _shared(*in_angle))
 
 
@@ -190,7 +190,7 @@ def _correlated(one: Floats, other: Floats, window: Floats) -> Floats:
     correlation = np.correlate(window, window, mode="full")[count - 1 :] / (window**2).sum()
     width = np.sqrt((one[:, 1] - one[:, 0]) * (other[:, 1] - other[:, 0]))
     apart = np.abs(one.mean(axis=1) - other.mean(axis=1)) / np.maximum(width, 1e-12)
-    return np.interp(apart * (count - 1), np.arange(count), correlation, right=0.0)
+    return np.asarray(np.interp(apart * (count - 1), np.arange(count), correlation, right=0.0))
 
 
 # ---- Errors of the tracks -------------------------------------------------------------------------------------------
