@@ -145,6 +145,23 @@ def test_the_sum_of_two_pairs_resolves_finer_and_its_noise_is_their_mean():
     assert linear[2] == pytest.approx((linear[0] + linear[1]) / 2, rel=1e-3)
 
 
+def test_coherence_of_two_heights_is_the_common_share_of_windowed_spectra():
+    """Spectra of flat windows shift by δ of their width and share 1 - δ; under Hann 1 - (2π²/3) δ² for a small δ."""
+    shares, low = [], line(start_m=[-2.0, 0.0], end_m=[2.0, 0.0])
+    for window in ("none", "hann"):
+        plan = plan_of(processing={"window": window, "integration": "all"}, expect={"sigma0_db": None})
+        plan["flights"] = {
+            name: {"transmitter": "uav1", "receivers": ["uav1"], "tracks": {"uav1": low | {"height_m": height}}}
+            for name, height in (("f01", 30.0), ("f02", 31.0))
+        }
+        found = ap.design(plan | {"interferometry": {"pairs": {"two": ["f01/uav1-uav1", "f02/uav1-uav1"]}}})
+        shares.append(float(found.coherence[0, 10, 10]))
+    sines = [29.75 / np.hypot(29.75, height) for height in (30.0, 31.0)]
+    shift = (sines[0] - sines[1]) * CARRIER / (SPACING * COUNT) / np.mean(sines)
+    assert shares[0] == pytest.approx(1 - shift, abs=0.02)
+    assert shares[1] == pytest.approx(1 - 2 * np.pi**2 / 3 * shift**2, abs=0.02)
+
+
 def test_positions_known_worse_cost_more_and_the_cause_is_named():
     plan = plan_of(require={"loss_db": 0.5})
     plan["nodes"]["uav1"]["position_std_m"] = 0.02

@@ -65,7 +65,13 @@ class Sensitivity:
 
 
 def sensitivity(
-    places_m: Floats, axes: Floats, first: Legs, second: Legs, *, band_hz: tuple[float, float]
+    places_m: Floats,
+    axes: Floats,
+    first: Legs,
+    second: Legs,
+    *,
+    band_hz: tuple[float, float],
+    window: Floats | None = None,
 ) -> Sensitivity:
     """Return the sensitivity of the phase between two images to height at some places.
 
@@ -79,6 +85,8 @@ def sensitivity(
         Phase centres of pulses spread over each image's aperture, place by place, in the frame of `places_m`.
     band_hz
         Lowest and highest frequency.
+    window
+        (subcarrier,) float64, weights over the band, which the overlap counts with; flat by default.
 
     Examples
     --------
@@ -105,7 +113,7 @@ def sensitivity(
         slope=(phases[0] - phases[1]) / (2 * probe),
         bend=(phases[0] + phases[1]) / (2 * probe**2),
         shift=(shifts[0] - shifts[1]) / (2 * probe[:, None]),
-        overlap=_overlap(places_m, axes, first, second, band_hz),
+        overlap=_overlap(places_m, axes, (first, second), band_hz, window),
         range_m=range_m,
     )
 
@@ -153,9 +161,11 @@ def _gradient(places_m: Floats, legs: Legs) -> Floats:
     return total
 
 
-def _overlap(places_m: Floats, axes: Floats, first: Legs, second: Legs, band_hz: tuple[float, float]) -> Floats:
+def _overlap(
+    places_m: Floats, axes: Floats, images: tuple[Legs, Legs], band_hz: tuple[float, float], window: Floats | None
+) -> Floats:
     """Return the share of the spectrum that both images sample: along range, times across it."""
-    ground = [_gradient(places_m, legs) @ axes[:2].T for legs in (first, second)]
+    ground = [_gradient(places_m, legs) @ axes[:2].T for legs in images]
     middle = [one.mean(axis=1) for one in ground]
     along = middle[0] + middle[1]
     along = along / np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), 1e-12)
@@ -163,7 +173,8 @@ def _overlap(places_m: Floats, axes: Floats, first: Legs, second: Legs, band_hz:
     in_range = [np.sort(np.multiply.outer((one * along).sum(-1), np.array(band_hz)), axis=-1) for one in middle]
     turned = [np.einsum("pmi,pi->pm", one, across) for one in ground]
     in_angle = [np.stack([one.min(axis=1), one.max(axis=1)], axis=-1) for one in turned]
-    return np.asarray(_shared(*in_range) * _shared(*in_angle))
+    along_range = _shared(in_range[0], in_range[1]) if window is None else _correlated(in_range[0], in_range[1], window)
+    return np.asarray(along_range * _shared(*in_angle))
 
 
 def _shared(one: Floats, other: Floats) -> Floats:
@@ -171,6 +182,15 @@ def _shared(one: Floats, other: Floats) -> Floats:
     both = np.minimum(one[:, 1], other[:, 1]) - np.maximum(one[:, 0], other[:, 0])
     mean = np.sqrt((one[:, 1] - one[:, 0]) * (other[:, 1] - other[:, 0]))
     return np.asarray(np.clip(both / np.maximum(mean, 1e-12), 0, 1))
+
+
+def _correlated(one: Floats, other: Floats, window: Floats) -> Floats:
+    """Return ∫W₁W₂ over √(∫W₁² ∫W₂²) of two intervals (place, 2) over which a window lies."""
+    count = len(window)
+    correlation = np.correlate(window, window, mode="full")[count - 1 :] / (window**2).sum()
+    width = np.sqrt((one[:, 1] - one[:, 0]) * (other[:, 1] - other[:, 0]))
+    apart = np.abs(one.mean(axis=1) - other.mean(axis=1)) / np.maximum(width, 1e-12)
+    return np.asarray(np.interp(apart * (count - 1), np.arange(count), correlation, right=0.0))
 
 
 # ---- Errors of the tracks -------------------------------------------------------------------------------------------

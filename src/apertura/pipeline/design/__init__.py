@@ -81,9 +81,11 @@ def dataset_of(design: Design) -> xr.Dataset:
     names = [name for name in UNITS if any(name in image.layers for image in design.images.values())]
 
     def stacked(layers: list[Mapping[str, Any]], name: str) -> np.ndarray:
-        found = [one.get(name) for one in layers]
         dtype = np.uint8 if name == "mask" else np.float32
-        return np.stack([np.full(shape, np.nan, dtype) if one is None else one.astype(dtype) for one in found])
+        values = np.empty((len(layers), *shape), dtype)
+        for at, one in enumerate(layers):
+            values[at] = one.get(name, np.nan)
+        return values
 
     each = [image.layers for image in design.images.values()]
     variables: dict[str, Any] = {name: (("image", "y", "x"), stacked(each, name)) for name in names}

@@ -144,7 +144,7 @@ def summed_image(flight: str, images: list[PlannedImage]) -> PlannedImage:
         for name, coherent, sign in (("nesz", False, 1), ("snr", False, -1), ("point_snr", True, -1)):
             if name in images[0].layers:
                 values = np.stack([image.layers[name] for image in images])
-                inverse = np.where(seen, 10 ** (sign * values / 10), 0.0)
+                inverse = np.where(seen, np.exp(sign * np.float32(np.log(10) / 10) * values), np.float32(0))
                 mean = inverse.sum(axis=0) / count
                 mean = np.where(mean > 0, mean / (count if coherent else 1), np.nan)
                 layers[name] = (sign * 10 * np.log10(mean)).astype(np.float32)
@@ -174,7 +174,7 @@ def coherence_layers(
         ]
         second = replace(second, pulses=second.pulses[np.ix_(*nearest)], lattice=first.lattice)
     band = float(pairs[0].frequency_hz[0]), float(pairs[0].frequency_hz[-1])
-    sensed = sensed_heights(scene, first, [legs_of(first), legs_of(second)], band)
+    sensed = sensed_heights(scene, first, [legs_of(first), legs_of(second)], band, pairs[0].weight)
     coherence = sensed.overlap
     for image in images:
         if "snr" in image.layers and np.isfinite(image.layers["snr"]).any():

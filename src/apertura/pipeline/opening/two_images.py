@@ -142,7 +142,13 @@ def legs_of(looks: Looks) -> Legs:
     return tx, rx
 
 
-def sensed_heights(scene: OpenScene, looks: Looks, legs: Sequence[Legs], band_hz: tuple[float, float]) -> Sensitivity:
+def sensed_heights(
+    scene: OpenScene,
+    looks: Looks,
+    legs: Sequence[Legs],
+    band_hz: tuple[float, float],
+    window: NDArray[np.float64] | None = None,
+) -> Sensitivity:
     """Return the sensitivity to height at every pixel: computed at nodes of the lattice, bilinear between them.
 
     Parameters
@@ -151,11 +157,11 @@ def sensed_heights(scene: OpenScene, looks: Looks, legs: Sequence[Legs], band_hz
         Grid and ground; whose lattice.
     legs
         Of both images at the nodes of that lattice, as `legs_of`.
-    band_hz
-        Lowest and highest frequency.
+    band_hz, window
+        Lowest and highest frequency; weights between them, by which the overlap counts, flat by default.
     """
     lattice, grid, places = looks.lattice, scene.grid, _nodes(scene, looks)
-    at_nodes = sensitivity(places, scene.axes, legs[0], legs[1], band_hz=band_hz)
+    at_nodes = sensitivity(places, scene.axes, legs[0], legs[1], band_hz=band_hz, window=window)
     whole: Window = (slice(0, grid.shape[0]), slice(0, grid.shape[1]))
 
     def between(name: str) -> NDArray[np.float64]:
