@@ -298,8 +298,7 @@ def noise(draws: int = 8) -> None:
                 echo = METHODS["divide"](echo, np.asarray(1 + parts, np.complex64))
             formed = history(echo, aperture)
             if apart:
-                known = {"beams": weighing, "method": "divide", "snr_db": SIDELINK_DB}
-                added = sidelink_noise(formed, grid, ground, where, **known)
+                added = sidelink_noise(formed, grid, ground, where, beams=weighing, method="divide", snr_db=SIDELINK_DB)
             profiles = range_compress(formed, grid, ground)
             measured = noise_power(profiles, where, time_s=kept / WAVE.prf_hz, beams=weighing)
             own = measured.power - added
