@@ -43,7 +43,7 @@ _NEAR_M = 2.4  # of its place a target is looked for; others are farther
 
 
 def flown(height_m: float, *, weather: bool = False) -> CampaignSpecification:
-    """Return a tandem flight past targets at a slant range of 1.4 heights, of an aperture of a third of it."""
+    """Return a flight of four pairs past targets at a slant range of 1.4 heights, of an aperture of a third of it."""
     base, ground_m, side_m = preset("demo"), height_m, 12.0
     range_m = float(np.hypot(height_m, ground_m))
     prefix_s = 1e-6 * np.ceil(2e6 * range_m / 299_792_458 + 0.3)
@@ -53,7 +53,7 @@ def flown(height_m: float, *, weather: bool = False) -> CampaignSpecification:
     ahead = 0.02 * range_m + 3.0
     tracks = {
         name: Straight((-long_m / 2 + further, -ground_m, height_m), (speed, 0.0, 0.0))
-        for name, further in (("uav1", 0.0), ("uav2", ahead))
+        for name, further in (("uav1", 0.0), ("uav2", ahead), ("uav3", -ahead), ("uav4", 2 * ahead))
     }
     perfect = {name: SimulatedNode(impairments=Impairments(radar_snr_db=25.0, doppler=False)) for name in tracks}
     origin = base.origin
@@ -82,7 +82,8 @@ def formed(root: Path, air: object) -> dict[str, Any]:
     grid = settled_scene(Campaign.load(root)).grid
     truth = json.loads((root / "truth.json").read_text(encoding="utf-8"))["targets"]
     off, reports = {}, {}
-    for name, file in (("uav1-uav1", "slc.tif"), ("uav1-uav2", "slc.tif"), ("fused", "coherent_slc.tif")):
+    pairs = Campaign.load(root).image_flights[0].pairs
+    for name, file in (*((pair, "slc.tif") for pair in pairs), ("fused", "coherent_slc.tif")):
         reports[name] = json.loads((root / f"results/f01/{name}/image.json").read_text(encoding="utf-8"))
         with rasterio.open(root / f"results/f01/{name}/{file}") as raster:
             image = raster.read(1)
