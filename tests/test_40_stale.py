@@ -52,7 +52,7 @@ def names(stale):
 
 def test_every_result_records_what_it_was_made_from_and_none_is_stale(finished_tiny):
     results = list(results_of(finished_tiny))
-    assert len(results) == 23 + 4 + 6
+    assert len(results) == 23 + 4 + 7
     for name, result in results:
         if RESULTS[name].on_demand:
             continue

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
 PAGE, PLAN, PANELS, PARETO = "design.html", "plan.yaml", "layers.png", "pareto.png"
 _SHOWN = ("resolution", "nesz", "point_snr", "incidence", "loss", "mask")
+_TITLES = {"resolution": "coarsest resolution", "nesz": "NESZ", "point_snr": "SNR of a point", "loss": "loss of focus"}
 _DOTS = 400  # of the longer side of a panel
 _MOST_CHANGES = 5
 _JUDGED = ("requirement", "asked", "given", "met", "image", "first cause")
@@ -224,13 +225,14 @@ def _draw_layers(path: Path, design: Design) -> None:
                 seen = np.ma.masked_where(image.layers["mask"][::step, ::step] == OUTSIDE, shown)
                 picture = axes.imshow(seen, extent=extent, cmap="viridis", interpolation="nearest")
                 figure.colorbar(picture, ax=axes, shrink=0.8).set_label(UNITS[name][0])
-            axes.set_title(name.replace("_", " "))
+            axes.set_title(_TITLES.get(name, name))
         for axes in list(drawn.flat)[len(found) :]:
             axes.set_axis_off()
         for axes in drawn[-1]:
             axes.set_xlabel("east, m")
         for axes in drawn[:, 0]:
             axes.set_ylabel("north, m")
+        figure.suptitle(f"{image.name}, from {west:.0f} m east, {south:.0f} m north")
 
 
 def draw_pareto(path: Path, tried: Sequence[Tried], design: Design) -> None:

@@ -58,7 +58,7 @@ def design(
     ...     "scene": {"crs": "local", "bounds_m": [-10, 20, 10, 40], "spacing_m": 1.0},
     ...     "flights": {"f01": {"transmitter": "uav1", "receivers": ["uav1"], "tracks": {"uav1": {
     ...         "kind": "line", "start_m": [-20, 0], "end_m": [20, 0], "height_m": 30.0, "speed_m_s": 5.0}}}},
-    ...     "require": {"resolution_m": 1.5, "coverage": 0.95}})
+    ...     "require": {"resolution_m": 2.0, "coverage": 0.95}})
     >>> found.sizes["image"], [line["met"] for line in found.attrs["judgement"]]
     (1, [True, True])
     """

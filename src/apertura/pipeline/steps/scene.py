@@ -57,7 +57,6 @@ def terrain(campaign: Campaign) -> Path:
     CampaignError
         If the config names no DEM, or the DEM does not reach over the scene or has voids in it.
     """
-    lineage = result_of(campaign, "terrain").begin(campaign.root)
     scene, folder = settled_scene(campaign), campaign.stage("terrain")
     grid, ground = scene.grid, ConfiguredGround.of(campaign.settings.scene, campaign.height_files(), crs=scene.grid.crs)
     if ground.dem is None:
@@ -67,6 +66,7 @@ def terrain(campaign: Campaign) -> Path:
             expected="a GeoTIFF of heights",
             remedy="Flat ground needs no terrain; name a DEM and its dem_datum, or leave this step out.",
         )
+    lineage = result_of(campaign, "terrain").begin(campaign.root)
     ground.dem.check_cover(grid)
     windows = list(grid.tiles(campaign.settings.processing.tile_px))
     with writing(folder) as wip:
