@@ -180,6 +180,15 @@ def test_the_changes_that_help_most_come_first(tmp_path):
 
 
 @pytest.mark.slow
+def test_changes_that_break_what_is_met_come_last_and_say_so(tmp_path):
+    required = {"point_snr_db": 60.0, "flight_s": 15.9}
+    changes = helpful_changes(FlightPlan.model_validate(plan_of(require=required)), tmp_path)
+    broken = {change.words: change.breaks for change in changes}
+    assert broken["fly at 0.5 of the speed"] == ("flight_s",)
+    assert broken["3 dB more power"] == ()
+    assert [*map(bool, broken.values())] == sorted(map(bool, broken.values()))
+
+
 def test_a_search_finds_the_same_again_and_what_it_finds_is_better(tmp_path):
     plan = FlightPlan.model_validate(plan_of(require={"resolution_m": 0.8}, bounds={"height_m": [-20, 20]}))
     found, tried = search(plan, tmp_path, ["height"], most=5)
@@ -242,8 +251,18 @@ BAD = {
     "unknown key": (plan_of(requires={"nesz_db": -20}), "requires: unknown key (did you mean 'require'?)"),
     "beyond the prefix": (
         plan_of(waveform=plan_of()["waveform"] | {"cyclic_prefix_s": 1e-7}),
-        "zero pulses see the scene",
+        "from the tracks at least",
     ),
+    "tracks elsewhere": (
+        flown(plan_of(), uav1=line(start_m=[4840.0, 990.0], end_m=[4880.0, 990.0])),
+        "km from the tracks",
+    ),
+    "a racetrack of one place": (
+        flown(plan_of(), uav1=line(kind="racetrack", end_m=[-20.0, 0.0])),
+        "a hover makes no image",
+    ),
+    "GHz": (plan_of(waveform=plan_of()["waveform"] | {"carrier_hz": 1.3, "carrier_is": "band_start"}), "in Hz"),
+    "a receiver twice": (with_second(receivers=["uav1", "uav1", "uav2"]), "each once"),
 }
 
 
@@ -253,4 +272,5 @@ def test_a_bad_plan_is_refused_by_one_message(case):
     with pytest.raises(CampaignError) as caught:
         ap.design(plan)
     assert words in str(caught.value)
+    assert "config.yaml" not in str(caught.value)
     assert "\n" not in str(caught.value)

@@ -326,7 +326,8 @@ def _complaint(item: dict[str, Any], schema: dict[str, Any]) -> tuple[str, str]:
     location = [str(part) for part in item["loc"] if not (re.match(_TYPE, str(part)) or part in tags)]
     key = ".".join(location) or "the whole file"
     if item["type"] in {"extra_forbidden", "unexpected_keyword_argument"}:
-        near = difflib.get_close_matches(location[-1], sorted(_collected(schema, _properties)), n=1, cutoff=0.5)
+        known = sorted(_collected(schema, _properties) - {location[-1]})  # it may be a key of another section
+        near = difflib.get_close_matches(location[-1], known, n=1, cutoff=0.5)
         return key, "unknown key" + (f" (did you mean '{near[0]}'?)" if near else "")
     if item["type"] == "missing":
         return key, "missing"

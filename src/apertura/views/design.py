@@ -8,16 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.common.atomic import write_text
+from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
 from apertura.core.quality.budget import expected
 from apertura.formats.export.layers import OUTSIDE
 from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.config.flight_plan import FlightPlan, read_flight_plan
+from apertura.pipeline.config.flight_plan import FlightPlan, MissionTrack, read_flight_plan
 from apertura.pipeline.design import as_plan
 from apertura.pipeline.design.computed import Design, designed
 from apertura.pipeline.design.judgement import AXES, Change, Tried, Verdict, helpful_changes, judge, search
 from apertura.pipeline.design.layers import PlannedImage, planned_image
-from apertura.pipeline.design.writing import UNITS, plan_text, tags_of, write_design
+from apertura.pipeline.design.writing import UNITS, copy_named, plan_text, tags_of, write_design
 from apertura.pipeline.opening.pair import open_pair
 from apertura.pipeline.opening.scene import expected_scene
 from apertura.views.image_report import read_report
@@ -74,6 +75,7 @@ def print_design(path: Path, out: Path | None, *, optimise: str | None = None, t
     if out is not None:
         write_design(design, out)
         write_text(out / PLAN, plan_text(plan))
+        copy_named(plan, path.absolute().parent, out)
         _draw_layers(out / PANELS, design)
         if tried:
             draw_pareto(out / PARETO, tried, design)
@@ -122,15 +124,36 @@ def verdict_row(verdict: Verdict) -> tuple[str, ...]:
 
 
 def recording_lines(design: Design) -> Iterator[str]:
-    """Yield what recording and processing take."""
-    recording = design.recording
+    """Yield what is sent, what of the tracks makes the image, and what recording and processing take."""
+    recording, opened = design.recording, design.opened
+    low, high = (float(edge(opened.pairs[0].frequency_hz)) for edge in (np.min, np.max))
+    wave_cm = 200 * SPEED_OF_LIGHT_M_S / (low + high)
+    yield f"band {low / 1e9:.4f} to {high / 1e9:.4f} GHz, {(high - low) / 1e6:.1f} MHz; {wave_cm:.2f} cm in its middle"
     for flight, lasting_s in recording.flight_s.items():
         rates = recording.node_bytes_s[flight]
         each = ", ".join(f"{node} {rate / 1e6:.3g} MB/s" for node, rate in rates.items())
-        yield f"{flight}: {lasting_s:.0f} s in the air, {recording.pulses[flight]} pulses; {each}"
-    dopplers = [f"{one.name} {one.doppler_hz:.0f}" for one in design.images.values() if one.looks is not None]
-    prf = getattr(design.opened.plan.waveform, "prf_hz", None)
-    yield f"Doppler over the scene, Hz: {', '.join(dopplers)}; {prf:g} pulses per second"
+        flown = opened.courses[flight][opened.campaign.flight(flight).transmitter]
+        imaged_s = sum(end - begin for begin, end in flown.imaged_s)
+        track = opened.plan.flights[flight].tracks.get(opened.campaign.flight(flight).transmitter)
+        image = track.image if isinstance(track, MissionTrack) else None
+        waypoints = f", waypoints {image[0]} to {image[1]}" if image else ""
+        yield (
+            f"{flight}: imaged along {flown.imaged_m:.1f} m in {imaged_s:.1f} s{waypoints}; {lasting_s:.0f} s in the "
+            f"air, {recording.pulses[flight]} pulses; {each}"
+        )
+    dopplers = {one.name: one.doppler_hz for one in design.images.values() if one.looks is not None}
+    prf = float(getattr(opened.plan.waveform, "prf_hz", None) or 0.0)
+    folds = "; more than the pulses: echoes fold by their angle, ambiguity.tif says where and how much" * (
+        max(dopplers.values()) > prf
+    )
+    told = ", ".join(f"{name} {hz:.0f}" for name, hz in dopplers.items())
+    yield f"Doppler over the scene, Hz: {told}; {prf:g} pulses per second{folds}"
+    looks = [one for one in design.judged if "looks" in one.layers]
+    share = float(np.median([np.nanmedian(one.layers["looks"]) for one in looks])) if looks else 0.0
+    yield (
+        f"a pixel of {opened.scene.grid.spacing_m:g} m is made of {share:.0f} pulses: scene.spacing_m says what angle "
+        "of the aperture it carries, and finer pixels resolve finer where more is flown"
+    )
     yield (
         f"recorded {recording.recorded_bytes / 1e9:.3g} GB; processing about {recording.processing_s / 3600:.2g} h, "
         f"{recording.memory_bytes / 1e9:.2g} GB of memory"
@@ -141,7 +164,10 @@ def change_lines(changes: Sequence[Change]) -> Iterator[str]:
     """Yield the single changes that help most."""
     for number, change in enumerate(changes[:_MOST_CHANGES], 1):
         found = ", ".join(f"{name} {value:.3g}" for name, value in change.found.items())
-        yield f"{number}. {change.words}: {change.gain_db:.1f} dB nearer{', all met' if change.meets else ''} ({found})"
+        then = (
+            ", all met" if change.meets else f", but then not met: {', '.join(change.breaks)}" if change.breaks else ""
+        )
+        yield f"{number}. {change.words}: {change.gain_db:.1f} dB nearer{then} ({found})"
 
 
 def _blocks(design: Design, verdicts: Sequence[Verdict], changes: Sequence[Change], out: Path) -> Iterator[Block]:
@@ -160,7 +186,7 @@ def _blocks(design: Design, verdicts: Sequence[Verdict], changes: Sequence[Chang
                 (
                     change.words,
                     f"{change.gain_db:.1f} dB",
-                    "yes" if change.meets else "no",
+                    "yes" if change.meets else f"no, nor {', '.join(change.breaks)}" if change.breaks else "no",
                     ", ".join(f"{name} {value:.3g}" for name, value in change.found.items()),
                 )
                 for change in changes[:_MOST_CHANGES]

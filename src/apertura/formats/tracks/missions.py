@@ -91,7 +91,10 @@ def _items(mission: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
         if item.get("type") == "SimpleItem":
             yield item
         else:
-            yield from _items({"items": item.get("TransectStyleComplexItem", item).get("Items", [])})
+            inside = item.get("TransectStyleComplexItem", item).get("Items", [])
+            if not inside:
+                raise ValueError(f"a {item.get('complexItemType', 'complex item')} without its transects")
+            yield from _items({"items": inside})
 
 
 def _of_commands(rows: list[tuple[int, int, list[float]]], speed: float, home: tuple[float, float] | None) -> Mission:

@@ -30,12 +30,11 @@ class _Track(Section):
     )
 
 
-class LineTrack(_Track):
-    """Straight from one place to another."""
+class _Leg(_Track):
+    """From one place to another."""
 
-    kind: Literal["line"]
-    start_m: Place = Field(description="easting, northing in scene.crs, m")
-    end_m: Place = Field(description="easting, northing in scene.crs, m")
+    start_m: Place = Field(description="where the first leg begins: easting, northing in scene.crs, m")
+    end_m: Place = Field(description="where it ends, m")
 
     @model_validator(mode="after")
     def _goes_somewhere(self) -> Self:
@@ -44,12 +43,16 @@ class LineTrack(_Track):
         return self
 
 
-class RacetrackTrack(_Track):
+class LineTrack(_Leg):
+    """Straight from one place to another."""
+
+    kind: Literal["line"]
+
+
+class RacetrackTrack(_Leg):
     """There and back on parallel legs; turns between them are flown and not imaged."""
 
     kind: Literal["racetrack"]
-    start_m: Place = Field(description="where the first leg begins: easting, northing in scene.crs, m")
-    end_m: Place = Field(description="where it ends, m")
     legs: int = Field(2, ge=1, le=_MOST_LEGS, description="number of legs, every other one flown back")
     spacing_m: float = Field(0.0, description="of a leg to the right of the one before, seen along the first, m")
     climb_m: float = Field(0.0, description="of a leg above the one before, m")
@@ -237,6 +240,8 @@ class FlightPlan(Settings):
             unknown = [node for node in (*flight.participants, *flight.tracks) if node not in self.nodes]
             if unknown:
                 raise ValueError(f"flights.{name}: node {unknown[0]!r} is not in nodes: {', '.join(self.nodes)}")
+            if len(set(flight.receivers)) < len(flight.receivers):
+                raise ValueError(f"flights.{name}: receivers {', '.join(flight.receivers)}: each once")
             without = [node for node in flight.participants if node not in flight.tracks]
             if without and flight.formation is None:
                 raise ValueError(f"flights.{name}: {without[0]} has no track, and there is no formation")

@@ -31,6 +31,9 @@ _LAYERS = {
 }
 """Requirement → layer, and whether the requirement is the most or the least of it."""
 
+LEAST_GAIN_DB = 0.05
+"""Of a change that is told: less is printed as nothing."""
+
 _LEAST = {"snr_db", "point_snr_db", "coverage", "coherence"}
 _IN_DB = {"nesz_db", "snr_db", "point_snr_db", "loss_db"}
 
@@ -185,12 +188,15 @@ class Change:
         Whether all are then met.
     found
         Requirement → what the plan then gives.
+    breaks
+        Requirements that are met before it, and not with it.
     """
 
     words: str
     gain_db: float
     meets: bool
     found: Mapping[str, float]
+    breaks: tuple[str, ...] = ()
 
 
 def shortfall_db(verdicts: Sequence[Verdict]) -> float:
@@ -199,7 +205,7 @@ def shortfall_db(verdicts: Sequence[Verdict]) -> float:
 
 
 def helpful_changes(plan: FlightPlan, root: Path, *, threads: int = 1) -> list[Change]:
-    """Return single changes that bring a plan nearer to what is required, the one that helps most first."""
+    """Return single changes that bring a plan nearer to what is required: first those that break nothing, by gain."""
     before = judge(designed(plan, root, threads=threads, coarse=COARSE_PX))
     missed_db, found = shortfall_db(before), []
     if not missed_db:
@@ -210,10 +216,12 @@ def helpful_changes(plan: FlightPlan, root: Path, *, threads: int = 1) -> list[C
         except (CampaignError, ValueError):  # a change that makes another plan impossible helps nobody
             continue
         gain = missed_db - shortfall_db(after)
-        if gain > 0.01:
+        if gain > LEAST_GAIN_DB:
             values = {one.requirement: one.found for one in after}
-            found.append(Change(words, gain, all(one.met for one in after), values))
-    return sorted(found, key=lambda change: -change.gain_db)
+            was = {one.requirement for one in before if one.met}
+            breaks = tuple(one.requirement for one in after if one.requirement in was and not one.met)
+            found.append(Change(words, gain, all(one.met for one in after), values, breaks))
+    return sorted(found, key=lambda change: (len(change.breaks), -change.gain_db))
 
 
 _Changing = Callable[[FlightPlan], FlightPlan]

@@ -1,5 +1,6 @@
 """A design as files: layers as GeoTIFFs on the later campaign's grid, tracks and footprints, the campaign's config."""
 
+import shutil
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -171,3 +172,20 @@ def write_campaign_config(plan: FlightPlan, directory: Path) -> list[Path]:
 def plan_text(plan: FlightPlan) -> str:
     """Return a plan as YAML, without what is at its default; `read_flight_plan` reads it back."""
     return yaml.safe_dump(plan.model_dump(mode="json", exclude_unset=True), sort_keys=False, width=110)
+
+
+def copy_named(plan: FlightPlan, root: Path, folder: Path) -> None:
+    """Copy the files that a plan names, missions and heights, to the same places of another folder: it runs there."""
+
+    def named(value: Any) -> Iterator[str]:
+        if isinstance(value, str):
+            yield value
+        for part in value.values() if isinstance(value, dict) else value if isinstance(value, list | tuple) else ():
+            yield from named(part)
+
+    names = {Path(name) for name in named(plan.model_dump(mode="json", exclude_unset=True)) if name}
+    for name in sorted(name for name in names if not name.is_absolute() and ".." not in name.parts):
+        source, copy = root / name, folder / name
+        if source.is_file() and not source.is_symlink() and copy.resolve() != source.resolve():
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(source, copy)

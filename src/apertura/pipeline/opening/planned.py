@@ -30,7 +30,7 @@ from apertura.formats.phase_histories.fmcw import sweep_of
 from apertura.formats.tracks.missions import read_mission
 from apertura.formats.tracks.track import FIXES, make_track
 from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.config import FmcwWaveform, SampledWaveform, check_interferometry
+from apertura.pipeline.config import CONFIG, FmcwWaveform, SampledWaveform, check_interferometry
 from apertura.pipeline.config.flight_plan import (
     BesideTrack,
     CircleTrack,
@@ -86,6 +86,13 @@ class Course:
         """Return places evenly spread over what makes the image, (point, 3) float64 metres."""
         time_s = np.concatenate([np.linspace(*span, _IMAGED_POINTS) for span in self.imaged_s])
         return np.stack([np.interp(time_s, self.time_s, axis) for axis in self.place_m.T], -1)
+
+    @property
+    def imaged_m(self) -> float:
+        """How far it flies in what makes the image, metres."""
+        place = [np.stack([np.interp(np.linspace(*one, 65), self.time_s, axis) for axis in self.place_m.T], -1)
+                 for one in self.imaged_s]  # fmt: skip
+        return float(sum(np.linalg.norm(np.diff(one, axis=0), axis=1).sum() for one in place))
 
     @property
     def length_s(self) -> float:
@@ -149,7 +156,16 @@ def open_plan(plan: FlightPlan, root: Path) -> OpenPlan:
     CampaignError
         If a track leads into the ground or beyond the DEM, nodes come too close, or there is nothing to be imaged.
     """
-    campaign = Campaign(root, plan.settings, plan.image_flights, planned=True)
+    try:
+        return _opened(plan, Campaign(root, plan.settings, plan.image_flights, planned=True))
+    except CampaignError as error:  # its checks are those of a campaign, whose keys are the plan's
+        where, expected, remedy = (
+            part.replace(str(CONFIG), "the plan") for part in (error.where, error.expected, error.remedy)
+        )
+        raise CampaignError(error.found, where, expected, remedy) from error
+
+
+def _opened(plan: FlightPlan, campaign: Campaign) -> OpenPlan:
     campaign.check_radio()
     images = [f"{flight.name}/{pair}" for flight in campaign.flights for pair in flight.pairs]
     check_interferometry(campaign.settings.interferometry, images, where=Path("the plan"))
@@ -183,14 +199,36 @@ def open_plan(plan: FlightPlan, root: Path) -> OpenPlan:
     scene = OpenScene(grid, level, terrain, (), configured.inputs, chosen)
     for pair in pairs:
         check_antennas(grid, terrain, pair.aperture, where=f"flight {pair.flight}, pair {pair.name}")
+        _check_near(pair, level.positions(grid.coarse(3)).reshape(-1, 3), delay_s)
     return OpenPlan(plan, campaign, scene, tuple(pairs), courses)
+
+
+def _check_near(pair: OpenPair, points: Floats, delay_s: float) -> None:
+    """Raise CampaignError where no echo of a few points of the scene, (point, 3) float64, is recorded."""
+    path_m = float(pair.aperture.path(points).min())
+    if path_m > delay_s * SPEED_OF_LIGHT_M_S:
+        raise CampaignError(
+            f"the scene is {path_m / 2000:.3g} km from the tracks at least, half the path to it and back",
+            f"flight {pair.flight}, pair {pair.name}",
+            f"at most {delay_s * SPEED_OF_LIGHT_M_S / 2:.4g} m, whose echoes the cyclic prefix or the recording holds",
+            "Correct places and heights of the tracks (easting, northing in scene.crs), scene.bounds_m, or make the "
+            "prefix longer.",
+        )
 
 
 def _radar(campaign: Campaign) -> tuple[NDArray[np.float64], float, float]:
     """Return the frequencies of the band, the longest delay recorded whole, and pulses per second."""
     waveform = campaign.settings.waveform
     if isinstance(waveform, SampledWaveform):
-        return transmitted(campaign, waveform).numerology.frequency_hz, waveform.longest_delay_s, waveform.prf_hz
+        frequency_hz = transmitted(campaign, waveform).numerology.frequency_hz
+        if np.ptp(frequency_hz) > frequency_hz.mean():  # wider than the widest UWB radars by 3 dB
+            raise CampaignError(
+                f"carrier_hz {waveform.carrier_hz:g}, below the {np.ptp(frequency_hz):.4g} Hz that the band is wide",
+                "the plan: waveform",
+                "a band narrower than its middle frequency; frequencies in Hz",
+                "State carrier_hz in Hz, 1.3e+9 for 1.3 GHz.",
+            )
+        return frequency_hz, waveform.longest_delay_s, waveform.prf_hz
     if isinstance(waveform, FmcwWaveform) and waveform.prf_hz is not None:
         sweep = sweep_of(waveform.model_dump())
         return sweep.frequency_hz, sweep.path_limit_m / SPEED_OF_LIGHT_M_S, waveform.prf_hz
