@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import rasterio
+from judging.run import image_steps
 from rich.console import Console
 from rich.table import Table
 
@@ -27,7 +28,7 @@ from apertura.pipeline.design.rehearsal import rehearse
 from apertura.pipeline.opening.pair import open_pair
 from apertura.pipeline.opening.radiometry import calibrated_pair
 from apertura.pipeline.opening.scene import open_scene
-from apertura.pipeline.steps import assess, echo, image, ingest, interferogram, layers, profile, refine, scene
+from apertura.pipeline.steps import interferogram, layers
 from apertura.pipeline.store import open_stage
 from apertura.simulation.scene import Clutter, Origin, PointTarget
 
@@ -163,20 +164,7 @@ def processed(root: Path) -> Campaign:
     campaign = Campaign.load(root)
     with contextlib.redirect_stdout(io.StringIO()):
         for flight in campaign.image_flights:
-            for name in flight.participants:
-                ingest.ingest(campaign, flight.name, name)
-            for pair in flight.pairs:
-                echo.echo(campaign, flight.name, pair)
-        scene.scene(campaign)
-        if campaign.settings.scene.dem:
-            scene.terrain(campaign)
-        for flight in campaign.image_flights:
-            for pair in flight.pairs:
-                profile.profile(campaign, flight.name, pair)
-            refine.refine(campaign, flight.name)
-            for pair in flight.pairs:
-                image.image(campaign, flight.name, pair)
-            assess.assess(campaign, flight.name)
+            image_steps(campaign, flight)
             for pair in flight.pairs:
                 layers.layers(campaign, flight.name, pair)
         for name in campaign.settings.interferometry.pairs:

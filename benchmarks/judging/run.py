@@ -8,7 +8,6 @@ import time
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from importlib import import_module, util
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,7 @@ from apertura.core.scene.grid import SceneGrid
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import FUSED, Flight
 from apertura.pipeline.opening.scene import settled_scene
-from apertura.pipeline.steps import cube, echo, export, image, ingest, profile, scene
+from apertura.pipeline.steps import assess, cube, echo, export, image, ingest, profile, refine, scene
 from apertura.pipeline.store import open_stage
 
 
@@ -77,9 +76,9 @@ def run_campaign(root: Path) -> Outcome:
     return Outcome("", seconds, _reports(campaign, flight), dict(_images(campaign, flight)), _grid(campaign))
 
 
-def _steps(campaign: Campaign, flight: Flight) -> None:
-    """Run what the rules of the workflow run, in their order."""
-    for node in flight.nodes:
+def image_steps(campaign: Campaign, flight: Flight) -> None:
+    """Run what the rules of the workflow run of a flight, in their order, from its recordings to what to add up."""
+    for node in flight.participants:
         ingest.ingest(campaign, flight.name, node)
     for pair in flight.pairs:
         echo.echo(campaign, flight.name, pair)
@@ -88,12 +87,14 @@ def _steps(campaign: Campaign, flight: Flight) -> None:
         scene.terrain(campaign)
     for pair in flight.pairs:
         profile.profile(campaign, flight.name, pair)
-    if util.find_spec("apertura.pipeline.steps.refine"):
-        import_module("apertura.pipeline.steps.refine").refine(campaign, flight.name)
+    refine.refine(campaign, flight.name)
     for pair in flight.pairs:
         image.image(campaign, flight.name, pair, threads=1)
-    if util.find_spec("apertura.pipeline.steps.assess"):
-        import_module("apertura.pipeline.steps.assess").assess(campaign, flight.name)
+    assess.assess(campaign, flight.name)
+
+
+def _steps(campaign: Campaign, flight: Flight) -> None:
+    image_steps(campaign, flight)
     cube.cube(campaign)
     for pair in flight.pairs:
         export.export(campaign, flight.name, pair)

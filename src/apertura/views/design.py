@@ -18,7 +18,7 @@ from apertura.pipeline.design import as_plan
 from apertura.pipeline.design.computed import Design, designed
 from apertura.pipeline.design.judgement import AXES, Change, Tried, Verdict, helpful_changes, judge, search
 from apertura.pipeline.design.layers import PlannedImage, planned_image
-from apertura.pipeline.design.writing import UNITS, copy_named, plan_text, tags_of, write_design
+from apertura.pipeline.design.writing import PICTURE_TAGS, UNITS, copy_named, plan_text, write_design
 from apertura.pipeline.opening.pair import open_pair
 from apertura.pipeline.opening.scene import expected_scene
 from apertura.views.image_report import read_report
@@ -78,7 +78,7 @@ def print_design(path: Path, out: Path | None, *, optimise: str | None = None, t
         copy_named(plan, path.absolute().parent, out)
         _draw_layers(out / PANELS, design)
         if tried:
-            draw_pareto(out / PARETO, tried, design)
+            draw_pareto(out / PARETO, tried)
         write_text(out / PAGE, page(f"{plan.campaign}, planned", _blocks(design, verdicts, changes, out)))
         console.print(*(out / name for name in (PAGE, "coverage.png", PLAN)), sep="\n", highlight=False)
     return all(verdict.met for verdict in verdicts)
@@ -132,9 +132,9 @@ def recording_lines(design: Design) -> Iterator[str]:
     for flight, lasting_s in recording.flight_s.items():
         rates = recording.node_bytes_s[flight]
         each = ", ".join(f"{node} {rate / 1e6:.3g} MB/s" for node, rate in rates.items())
-        flown = opened.courses[flight][opened.campaign.flight(flight).transmitter]
+        planned = opened.plan.flights[flight]
+        flown, track = opened.courses[flight][planned.transmitter], planned.tracks.get(planned.transmitter)
         imaged_s = sum(end - begin for begin, end in flown.imaged_s)
-        track = opened.plan.flights[flight].tracks.get(opened.campaign.flight(flight).transmitter)
         image = track.image if isinstance(track, MissionTrack) else None
         waypoints = f", waypoints {image[0]} to {image[1]}" if image else ""
         yield (
@@ -148,10 +148,9 @@ def recording_lines(design: Design) -> Iterator[str]:
     )
     told = ", ".join(f"{name} {hz:.0f}" for name, hz in dopplers.items())
     yield f"Doppler over the scene, Hz: {told}; {prf:g} pulses per second{folds}"
-    looks = [one for one in design.judged if "looks" in one.layers]
-    share = float(np.median([np.nanmedian(one.layers["looks"]) for one in looks])) if looks else 0.0
+    pulses = float(np.median([np.nanmedian(one.layers["looks"]) for one in design.judged]))
     yield (
-        f"a pixel of {opened.scene.grid.spacing_m:g} m is made of {share:.0f} pulses: scene.spacing_m says what angle "
+        f"a pixel of {opened.scene.grid.spacing_m:g} m is made of {pulses:.0f} pulses: scene.spacing_m says what angle "
         "of the aperture it carries, and finer pixels resolve finer where more is flown"
     )
     yield (
@@ -164,9 +163,8 @@ def change_lines(changes: Sequence[Change]) -> Iterator[str]:
     """Yield the single changes that help most."""
     for number, change in enumerate(changes[:_MOST_CHANGES], 1):
         found = ", ".join(f"{name} {value:.3g}" for name, value in change.found.items())
-        then = (
-            ", all met" if change.meets else f", but then not met: {', '.join(change.breaks)}" if change.breaks else ""
-        )
+        then = ", all met" if change.meets else ""
+        then += f", but then not met: {', '.join(change.breaks)}" if change.breaks else ""
         yield f"{number}. {change.words}: {change.gain_db:.1f} dB nearer{then} ({found})"
 
 
@@ -186,7 +184,7 @@ def _blocks(design: Design, verdicts: Sequence[Verdict], changes: Sequence[Chang
                 (
                     change.words,
                     f"{change.gain_db:.1f} dB",
-                    "yes" if change.meets else f"no, nor {', '.join(change.breaks)}" if change.breaks else "no",
+                    "yes" if change.meets else ", nor ".join(("no", *change.breaks)),
                     ", ".join(f"{name} {value:.3g}" for name, value in change.found.items()),
                 )
                 for change in changes[:_MOST_CHANGES]
@@ -233,8 +231,7 @@ def _draw_layers(path: Path, design: Design) -> None:
     rows = -(-len(found) // 2)
     high = 2.1 * min(1.6, max(0.45, size[1] / size[0]))
     step = max(1, max(grid.shape) // _DOTS)
-    tags = {key: value for key, value in tags_of(design).items() if key != "APERTURA_PLAN"}
-    with sheet(path, 0.5 + rows * (high + 0.55), title=f"layers of {image.name}", tags=tags) as figure:
+    with sheet(path, 0.5 + rows * (high + 0.55), title=f"layers of {image.name}", tags=PICTURE_TAGS) as figure:
         drawn = figure.subplots(rows, 2, squeeze=False)
         for axes, (name, values) in zip(drawn.flat, found.items(), strict=False):
             axes.grid(visible=False)
@@ -261,7 +258,7 @@ def _draw_layers(path: Path, design: Design) -> None:
         figure.suptitle(f"{image.name}, from {west:.0f} m east, {south:.0f} m north")
 
 
-def draw_pareto(path: Path, tried: Sequence[Tried], design: Design) -> None:
+def draw_pareto(path: Path, tried: Sequence[Tried]) -> None:
     """Draw the plans that a search tried over two requirements, those that no other beats, and the one taken."""
     asked = [one.requirement for one in tried[0].verdicts if one.asked is not None]
     names = [*asked, *(one.requirement for one in tried[0].verdicts if one.requirement not in asked)]
@@ -269,8 +266,7 @@ def draw_pareto(path: Path, tried: Sequence[Tried], design: Design) -> None:
     names = [name for name in names if np.isfinite(spread[name]) and spread[name] > 0] or names
     across, up = (*names, *names)[:2]
     limits = {one.requirement: one.asked for one in tried[0].verdicts}
-    tags = {key: value for key, value in tags_of(design).items() if key != "APERTURA_PLAN"}
-    with sheet(path, 4.2, title="plans tried", tags=tags) as figure:
+    with sheet(path, 4.2, title="plans tried", tags=PICTURE_TAGS) as figure:
         axes = figure.add_subplot()
         for front, colour, label in ((False, GREY, "tried"), (True, BLUE, "none is better in all that is required")):
             some = [one for one in tried if one.on_front == front]

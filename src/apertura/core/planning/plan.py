@@ -170,11 +170,12 @@ def _share_beyond(aperture: Aperture, points_m: NDArray[np.float64], path_limit_
     beyond = shortest > path_limit_m
     if beyond.all():
         raise CampaignError(
-            f"zero pulses see the scene: the shortest total path is {shortest.min():.1f} m",
+            f"zero pulses see the scene: the shortest total path is {shortest.min():.1f} m, the scene "
+            f"{shortest.min() / 2000:.3g} km from the tracks at least",
             where="scene.bounds_m",
             expected=f"at most {path_limit_m:.1f} m, the cyclic prefix",
-            remedy="Correct scene.bounds_m (easting before northing), scene.crs, or the height of the ground: "
-            "scene.height_m, or unit and datum of scene.dem.",
+            remedy="Correct scene.bounds_m (easting before northing), scene.crs, the tracks' places, or the height of "
+            "the ground: scene.height_m, or unit and datum of scene.dem; or make the prefix longer.",
         )
     return float(beyond.mean())
 

@@ -207,7 +207,7 @@ def shortfall_db(verdicts: Sequence[Verdict]) -> float:
 def helpful_changes(plan: FlightPlan, root: Path, *, threads: int = 1) -> list[Change]:
     """Return single changes that bring a plan nearer to what is required: first those that break nothing, by gain."""
     before = judge(designed(plan, root, threads=threads, coarse=COARSE_PX))
-    missed_db, found = shortfall_db(before), []
+    missed_db, kept, found = shortfall_db(before), {one.requirement for one in before if one.met}, []
     if not missed_db:
         return []
     for words, change in _candidates(plan):
@@ -218,8 +218,7 @@ def helpful_changes(plan: FlightPlan, root: Path, *, threads: int = 1) -> list[C
         gain = missed_db - shortfall_db(after)
         if gain > LEAST_GAIN_DB:
             values = {one.requirement: one.found for one in after}
-            was = {one.requirement for one in before if one.met}
-            breaks = tuple(one.requirement for one in after if one.requirement in was and not one.met)
+            breaks = tuple(one.requirement for one in after if one.requirement in kept and not one.met)
             found.append(Change(words, gain, all(one.met for one in after), values, breaks))
     return sorted(found, key=lambda change: (len(change.breaks), -change.gain_db))
 

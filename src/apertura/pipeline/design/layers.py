@@ -92,6 +92,8 @@ def planned_image(
     grid = scene.grid
     integration = integration_of(campaign, pair, scene)
     beams = Beams.within(integration.sector, pair.beams)
+    job = _job(campaign, pair, scene, beams, integration)
+    flags = Flags.merged(check_geometry(job), decide_antennas(job.beams, job.illumination)[1], integration.flags)
     calibrated = calibrated_pair(campaign, pair, scene, weights=(beams, integration.count), threads=threads)
     noise = _noise(calibrated)
     looks = Looks.of(grid, scene.terrain, pair.aperture, beams, threads=threads)
@@ -109,9 +111,6 @@ def planned_image(
     layers |= _coarse_layers(campaign, pair, scene, beams)
     outside = layers["mask"] == OUTSIDE
     layers["mask"] = np.where((layers["path_margin"] < 0) | outside, OUTSIDE, layers["mask"]).astype(np.uint8)
-    job = _job(campaign, pair, scene, beams, integration)
-    misses = decide_antennas(job.beams, job.illumination)[1]
-    flags = Flags.merged(check_geometry(job), misses, integration.flags)
     spread, _ = pair.aperture.phase_rates(job.points_m, wavelength_m=pair.wave_speed_m_s / job.band_hz[1])
     rate_hz = 1 / float(np.median(np.diff(pair.time_s)))
     budget = tuple(budget_of(campaign, _seen_from(pair, beams, scene.middle_m), scene))

@@ -80,13 +80,17 @@ def write_design(design: Design, folder: Path) -> list[Path]:
             style = path.with_suffix(".qml")
             (write_mask_style if layer == "mask" else write_layer_style)(style)
             written += [path, style]
-    return [*written, *_write_tracks(design, folder, tags), _write_report(design, folder)]
+    return [*written, *_write_tracks(design, folder), _write_report(design, folder)]
+
+
+PICTURE_TAGS = {"APERTURA_VERSION": __version__, "APERTURA_PLANNED": "true"}
+"""What pictures of a design say of where they come from; rasters name their plan, too."""
 
 
 def tags_of(design: Design) -> dict[str, str]:
-    """Return what files of a design say of where they come from."""
+    """Return what rasters of a design say of where they come from."""
     plan = design.opened.plan.model_dump(mode="json", exclude_unset=True)
-    return {"APERTURA_VERSION": __version__, "APERTURA_PLAN": canonical_json(plan), "APERTURA_PLANNED": "true"}
+    return PICTURE_TAGS | {"APERTURA_PLAN": canonical_json(plan)}
 
 
 def report_of(design: Design) -> dict[str, Any]:
@@ -105,15 +109,14 @@ def _write_report(design: Design, folder: Path) -> Path:
     return folder / "design.json"
 
 
-def _write_tracks(design: Design, folder: Path, tags: Mapping[str, str]) -> list[Path]:
+def _write_tracks(design: Design, folder: Path) -> list[Path]:
     """Write coverage.png, tracks.geojson and, of a scene on Earth, tracks.kml."""
     scene, covered = design.opened.scene, list(_covered(design))
     transform = transform_of(scene.grid, covered[0].looks)
     title = f"{design.opened.campaign.settings.campaign} · planned"
     picture, features = folder / "coverage.png", folder / "tracks.geojson"
     name, local = crs_name(scene.grid), scene.grid.crs == LOCAL
-    shown = {key: value for key, value in tags.items() if key != "APERTURA_PLAN"}
-    write_coverage(picture, covered, transform, crs_name=name, title=title, tags=shown, local=local)
+    write_coverage(picture, covered, transform, crs_name=name, title=title, tags=PICTURE_TAGS, local=local)
     on_earth = place_of(scene)
     found = feature_collection(covered, transform, on_earth, height_m=scene.level.height_m)
     write_text(features, canonical_json(found) + "\n")

@@ -90,9 +90,8 @@ class Course:
     @property
     def imaged_m(self) -> float:
         """How far it flies in what makes the image, metres."""
-        place = [np.stack([np.interp(np.linspace(*one, 65), self.time_s, axis) for axis in self.place_m.T], -1)
-                 for one in self.imaged_s]  # fmt: skip
-        return float(sum(np.linalg.norm(np.diff(one, axis=0), axis=1).sum() for one in place))
+        legs = np.split(self.imaged_from(), len(self.imaged_s))
+        return float(sum(np.linalg.norm(np.diff(leg, axis=0), axis=1).sum() for leg in legs))
 
     @property
     def length_s(self) -> float:
@@ -199,21 +198,7 @@ def _opened(plan: FlightPlan, campaign: Campaign) -> OpenPlan:
     scene = OpenScene(grid, level, terrain, (), configured.inputs, chosen)
     for pair in pairs:
         check_antennas(grid, terrain, pair.aperture, where=f"flight {pair.flight}, pair {pair.name}")
-        _check_near(pair, level.positions(grid.coarse(3)).reshape(-1, 3), delay_s)
     return OpenPlan(plan, campaign, scene, tuple(pairs), courses)
-
-
-def _check_near(pair: OpenPair, points: Floats, delay_s: float) -> None:
-    """Raise CampaignError where no echo of a few points of the scene, (point, 3) float64, is recorded."""
-    path_m = float(pair.aperture.path(points).min())
-    if path_m > delay_s * SPEED_OF_LIGHT_M_S:
-        raise CampaignError(
-            f"the scene is {path_m / 2000:.3g} km from the tracks at least, half the path to it and back",
-            f"flight {pair.flight}, pair {pair.name}",
-            f"at most {delay_s * SPEED_OF_LIGHT_M_S / 2:.4g} m, whose echoes the cyclic prefix or the recording holds",
-            "Correct places and heights of the tracks (easting, northing in scene.crs), scene.bounds_m, or make the "
-            "prefix longer.",
-        )
 
 
 def _radar(campaign: Campaign) -> tuple[NDArray[np.float64], float, float]:

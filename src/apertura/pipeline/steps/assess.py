@@ -109,20 +109,20 @@ def hypotheses(
     now = joint_peak_power([one.history for one in found], here, height_m)
     lost_db = _db(_possible(found, here, height_m, focused) / now)
 
-    def peak(hypothesis: Hypothesis, pairs: slice = slice(None)) -> float:
-        grid = _around(scene, moved(hypothesis), cell_m)
-        return joint_peak_power(hypothesis.histories[pairs], grid, height_m + hypothesis.height_m)
-
     def moved(hypothesis: Hypothesis) -> tuple[float, float]:
         return _moved(scene.grid, brightest, found, hypothesis.histories)
 
+    def peak(hypothesis: Hypothesis, place: tuple[float, float], pairs: slice = slice(None)) -> float:
+        grid = _around(scene, place, cell_m)
+        return joint_peak_power(hypothesis.histories[pairs], grid, height_m + hypothesis.height_m)
+
     def tried(hypothesis: Hypothesis) -> Trial | None:
+        place = moved(hypothesis)
         try:
-            gain_db = _db(peak(hypothesis) / now)
+            gain_db = _db(peak(hypothesis, place) / now)
         except ValueError:  # the places are too far apart for one pulse: rejected
             return None
-        constant = _is_offset(scene, (brightest, moved(hypothesis)), found, hypothesis)
-        return Trial(gain_db, hypothesis, offset=constant)
+        return Trial(gain_db, hypothesis, offset=_is_offset(scene, (brightest, place), found, hypothesis))
 
     possible = chain(hypotheses_of(nodes, found), _other_echoes(campaign, flight, nodes, found, sent=sent))
     trials = [one for one in map(tried, possible) if one is not None]
@@ -131,8 +131,9 @@ def hypotheses(
     named = explanation(trials, drawn, lost_db)
     if named:
         best = max(trials, key=lambda one: one.gain_db).hypothesis
+        place = moved(best)
         gains = {
-            pair: round(_db(peak(best, slice(at, at + 1)) / joint_peak_power([one.history], here, height_m)), 2)
+            pair: round(_db(peak(best, place, slice(at, at + 1)) / joint_peak_power([one.history], here, height_m)), 2)
             for at, (pair, one) in enumerate(zip(campaign.flight(flight).pairs, found, strict=True))
         }
         named[0]["gain_of_pairs_db"] = gains

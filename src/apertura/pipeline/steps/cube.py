@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import compress
 from pathlib import Path
 from typing import Any
 
@@ -253,10 +254,9 @@ def cube(campaign: Campaign) -> Path:
         arrays = _CubeArrays(
             {name: open_array(wip, name) for name in (*chunks, *whole)}, [*assessed], empty.attrs["pairs"]
         )
-        for (flight, pair), image in images.items():
-            _copy(image, arrays.plane("image", flight, pair), windows)
+        for flight in assessed:
+            _write_images(images, sums.get(flight), arrays, flight, windows)
         for flight, fusion in sums.items():
-            _add_up(images, fusion["phases_rad"], arrays, flight, windows)
             single_db = [images[flight, pair].attrs["quality"]["noise_floor_db"] for pair in fusion["phases_rad"]]
             sum_db = image_statistics(arrays.plane("coherent", flight), windows).noise_floor_db
             arrays.plane("coherent_noise_floor", flight)[()] = sum_db
@@ -300,29 +300,26 @@ class _CubeArrays:
         return _Plane(self.arrays[name], place)
 
 
-def _copy(image: xr.Dataset, copy: _Plane, windows: list[Window]) -> None:
-    """Write an image tile by tile, but those in which it is empty."""
-    for window in windows:
-        block = image.image[window].values
-        if not np.isnan(block).all():
-            copy[window] = block
-
-
-def _add_up(
-    images: Images, phases_rad: Mapping[str, float], arrays: _CubeArrays, flight: str, windows: list[Window]
+def _write_images(
+    images: Images, fusion: Mapping[str, Any] | None, arrays: _CubeArrays, flight: str, windows: list[Window]
 ) -> None:
-    """Write the sums of a flight's images tile by tile; `phases_rad` of those added coherently."""
+    """Copy the images of a flight and write their sums, tile by tile, each read once; `fusion`: None without sums."""
     present = {pair: image for (name, pair), image in images.items() if name == flight}
+    copies = [arrays.plane("image", flight, pair) for pair in present]
+    phases_rad = {} if fusion is None else fusion["phases_rad"]
     peaks = np.array([image.attrs["quality"]["brightest"]["amplitude"] for image in present.values()])
     added = np.array([pair in phases_rad for pair in present])
     turned = np.array([phases_rad[pair] for pair in present if pair in phases_rad])
-    sums = {name: arrays.plane(name, flight) for name in ("coherent", "noncoherent", "magnitude")}
+    named = () if fusion is None else ("coherent", "noncoherent", "magnitude")
+    sums = {name: arrays.plane(name, flight) for name in named}
     for window in windows:
         stack = np.stack([image.image[window].values for image in present.values()])
         there = ~np.isnan(stack).all(axis=(1, 2))
-        if there[added].any():
+        for copy, block in zip(compress(copies, there), stack[there], strict=True):
+            copy[window] = block
+        if sums and there[added].any():
             sums["coherent"][window] = coherent_sum(stack[added], peaks[added], turned)
-        if there.any():
+        if sums and there.any():
             sums["noncoherent"][window] = noncoherent_sum(stack, peaks)
             sums["magnitude"][window] = magnitude_sum(stack, peaks)
 
