@@ -37,6 +37,8 @@ TYPED = {
     "chart": "chart . -n",
     "check": "check .",
     "clean": "clean . --yes",
+    "compare": "compare plan.yaml .",
+    "design": "design plan.yaml design",
     "diff": "diff results/f01/uav1-uav1/db.tif results/f01/uav1-uav2/db.tif",
     "init": "init new",
     "inspect": "inspect .",
@@ -64,6 +66,7 @@ TYPED = {
     "step layers": "step layers f01 uav1-uav2",
     "step page": "step page f01",
     "step pictures": "step pictures f01 uav1-uav2",
+    "step pictures-fused": "step pictures-fused f01",
     "step profile": "step profile f01 uav1-uav2",
     "step refine": "step refine f01",
     "step tiles": "step tiles f01 uav1-uav2 1-of-2",
@@ -165,7 +168,21 @@ def _on_a_plane(_tiny, tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def _finished(_on_a_plane, tmp_path_factory):
-    return run_steps(copy_writable(_on_a_plane, tmp_path_factory.mktemp("finished_plane") / "campaign")).root
+    root = run_steps(copy_writable(_on_a_plane, tmp_path_factory.mktemp("finished_plane") / "campaign")).root
+    (root / "plan.yaml").write_text(yaml.safe_dump(plan_of(root)))
+    return root
+
+
+def plan_of(root):
+    """Return a plan with the radar and the scene of a campaign, and a straight line beside it."""
+    config = yaml.safe_load((root / "config/config.yaml").read_text())
+    west, south, east, _ = config["scene"]["bounds_m"]
+    line = {"kind": "line", "start_m": [west, south - 30], "end_m": [east, south - 30], "height_m": 30, "speed_m_s": 1}
+    flight = {"transmitter": "uav1", "receivers": ["uav1"], "tracks": {"uav1": line}}
+    waveform = {name: value for name, value in config["waveform"].items() if name != "codes"}
+    scene = {name: value for name, value in config["scene"].items() if not name.startswith("dem")}
+    nodes = {"uav1": {"attitude": "log"}}
+    return {"campaign": "plane", "waveform": waveform, "nodes": nodes, "scene": scene, "flights": {"f01": flight}}
 
 
 @pytest.fixture

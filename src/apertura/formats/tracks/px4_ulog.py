@@ -141,7 +141,7 @@ def _epochs(fields: Fields, source: str, options: LogOptions, node: str, where: 
     if not source.startswith(FUSED):
         boot_s, utc = _arrived(fields, source), _utc(fields, source)
     unknown = np.full(latitude.size, np.nan)
-    across, up = (unknown if one is None else one.astype(np.float64) for one in (of["eph"], of["epv"]))
+    across, up = (unknown if one is None else _numbers(one) for one in (of["eph"], of["epv"]))
     height = _height(fields, source, fixed, options.height_offset_m)
     if height is None:
         raise CampaignError(
@@ -188,8 +188,13 @@ def _first(fields: Fields, source: str, names: tuple[str, ...]) -> NDArray[np.fl
     for name in names:
         values = fields.get(f"{source}/{name}")
         if values is not None:
-            return np.asarray(values * _SCALES[name] if values.dtype.kind in "iu" else values, np.float64)
+            return _numbers(values * _SCALES[name] if values.dtype.kind in "iu" else values)
     return None
+
+
+def _numbers(values: NDArray[Any]) -> NDArray[np.float64]:
+    with np.errstate(invalid="ignore"):  # a NaN that signals stays one, and is refused as such
+        return np.asarray(values, np.float64)
 
 
 def _arrived(fields: Fields, source: str) -> NDArray[np.float64]:
