@@ -12,14 +12,13 @@ import numpy as np
 from apertura.core.geometry.geodesy import geodetic_from_ecef, ned_axes
 from apertura.formats.reading import read_track
 from apertura.simulation import simulate
-from apertura.simulation.scene import Origin, PointTarget
+from apertura.simulation.scene import Origin, PointTarget, Waypoints
 from apertura.simulation.specification import (
     CampaignSpecification,
     ImageGrid,
     SimulatedFlight,
     SimulatedNode,
 )
-from apertura.simulation.scene import Waypoints
 from apertura.simulation.waveform import WaveformSpecification
 
 FIRST_S, LAST_S = 5.6, 11.6
