@@ -171,6 +171,19 @@ def test_positions_known_worse_cost_more_and_the_cause_is_named():
 
 
 @pytest.mark.slow
+def test_echoes_that_fold_are_told_for_what_is_required_and_more_pulses_help(tmp_path):
+    """At 5 m/s the Doppler over 60 m of scene spreads more than 50 Hz and less than 100."""
+    plan = plan_of(require={"ambiguity": 0.02})
+    plan["waveform"]["prf_hz"] = 50.0
+    plan["scene"] |= {"bounds_m": [-30.0, 20.0, 30.0, 80.0], "spacing_m": 1.0}
+    design = designed(FlightPlan.model_validate(plan), tmp_path)
+    (verdict,) = judge(design)
+    assert not verdict.met
+    assert "Doppler spreads" in verdict.cause
+    assert "twice the pulse rate" in {one.words for one in helpful_changes(design.opened.plan, tmp_path) if one.meets}
+
+
+@pytest.mark.slow
 def test_the_changes_that_help_most_come_first(tmp_path):
     changes = helpful_changes(FlightPlan.model_validate(plan_of(require={"nesz_db": -60.0})), tmp_path)
     assert changes[0].gain_db >= changes[-1].gain_db > 0

@@ -91,7 +91,9 @@ def typed(monkeypatch, capsys, *words):
 def test_a_mission_becomes_a_report_layers_and_the_campaign_s_config(folder, monkeypatch, capsys):
     status, out, err = typed(monkeypatch, capsys, "design", folder / "plan.yaml", folder / "out")
     assert (status, err) == (0, "")
-    assert "coverage" in out
+    table = [line.split() for line in out.splitlines()]
+    assert ["coverage", "0.95", "1", "yes"] in [words[:4] for words in table]
+    assert any("uav1" in line and "100.0" in line for line in out.splitlines())  # seen, %
     page = (folder / "out" / "design.html").read_text()
     assert page.count("data:image/png") == 2
     assert "All that is required is met." in page

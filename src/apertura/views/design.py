@@ -17,8 +17,8 @@ from apertura.pipeline.config.flight_plan import FlightPlan, MissionTrack, read_
 from apertura.pipeline.design import as_plan
 from apertura.pipeline.design.computed import Design, designed
 from apertura.pipeline.design.judgement import AXES, Change, Tried, Verdict, helpful_changes, judge, search
-from apertura.pipeline.design.layers import PlannedImage, planned_image
-from apertura.pipeline.design.writing import PICTURE_TAGS, UNITS, copy_named, plan_text, write_design
+from apertura.pipeline.design.layers import UNITS, PlannedImage, planned_image
+from apertura.pipeline.design.writing import PICTURE_TAGS, copy_named, plan_text, write_design
 from apertura.pipeline.opening.pair import open_pair
 from apertura.pipeline.opening.scene import expected_scene
 from apertura.views.image_report import read_report
@@ -35,7 +35,22 @@ _TITLES = {"resolution": "coarsest resolution", "nesz": "NESZ", "point_snr": "SN
 _DOTS = 400  # of the longer side of a panel
 _MOST_CHANGES = 5
 _JUDGED = ("requirement", "asked", "given", "met", "image", "first cause")
-_VALUES = ("image", "middle of what is seen", "95 % have", "unit")
+_LISTED = {
+    "resolution": "coarsest, m",
+    "resolution_fine": "finest, m",
+    "looks": "pulses",
+    "incidence": "incidence, °",
+    "bistatic_angle": "bistatic, °",
+    "nesz": "NESZ, dB",
+    "snr": "SNR, dB",
+    "point_snr": "point's SNR, dB",
+    "ambiguity": "folded",
+    "loss": "loss, dB",
+}
+"""Layer → head of its column; those that no image has are left out."""
+
+_LEAST = {"looks", "snr", "point_snr"}
+_CAPTION = "what images will be: the middle of what is seen, and what 95 % have"
 
 
 def print_design(path: Path, out: Path | None, *, optimise: str | None = None, threads: int = 1) -> bool:
@@ -64,10 +79,10 @@ def print_design(path: Path, out: Path | None, *, optimise: str | None = None, t
     design = designed(plan, root, threads=threads)
     verdicts = judge(design)
     changes = helpful_changes(plan, root, threads=threads)
-    console.print(_table("what images will be", _VALUES, value_rows(design)))
+    console.print(_table(_CAPTION, *value_table(design, "\n")))
     if verdicts:
         console.print(_table("what is required", _JUDGED, [verdict_row(one) for one in verdicts]))
-    for line in (*recording_lines(design), *change_lines(changes)):
+    for line in (*interferogram_lines(design), *recording_lines(design), *change_lines(changes)):
         console.print(line, highlight=False)
     for name, image in design.images.items():
         for flag, line in image.flags.items() if image.looks is not None else ():
@@ -85,9 +100,10 @@ def print_design(path: Path, out: Path | None, *, optimise: str | None = None, t
 
 
 def _table(title: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> "PrintedTable":
+    from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
-    table = Table(title=title, title_justify="left")
+    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
     for heading in head:
         table.add_column(heading, overflow="fold")
     for row in rows:
@@ -98,23 +114,32 @@ def _table(title: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> "P
 # ---- Words ----------------------------------------------------------------------------------------------------------
 
 
-def value_rows(design: Design) -> list[tuple[str, ...]]:
-    """Return each layer of the images that requirements are of: median of what is seen, what 95 % have, unit."""
+def value_table(design: Design, between: str = " / ") -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    """Return head and rows of images, pairs and sums: median of what is seen, what 95 % have, share that is seen."""
+    images = design.images.values()
+    listed = [name for name in _LISTED if any(np.isfinite(one.layers.get(name, np.nan)).any() for one in images)]
     rows = list[tuple[str, ...]]()
-    for image in design.judged:
+    for image in images:
         seen = image.layers["mask"] == 0
-        for name in ("resolution", "resolution_fine", "looks", "incidence", "nesz", "snr", "point_snr", "loss"):
-            values = image.layers.get(name, np.empty(0))
-            values = values[seen] if values.size else values
+        cells = []
+        for name in listed:
+            values = image.layers[name][seen] if name in image.layers else np.empty(0)
             values = values[np.isfinite(values)]
-            if values.size:
-                worst = np.percentile(values, 5 if name in {"looks", "snr", "point_snr"} else 95)
-                rows.append((f"{image.name} {name}", f"{np.median(values):.4g}", f"{worst:.4g}", UNITS[name][0]))
-        rows.append((f"{image.name} coverage", f"{100 * seen.mean():.1f}", "", "%"))
+            worst = np.percentile(values, 5 if name in _LEAST else 95) if values.size else np.nan
+            cells.append(between.join(map(_digits, (np.median(values), worst))) if values.size else "")
+        rows.append((image.name, *cells, f"{100 * seen.mean():.1f}"))
+    return ("image", *(_LISTED[name] for name in listed), "seen, %"), rows
+
+
+def _digits(value: float) -> str:
+    return f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"
+
+
+def interferogram_lines(design: Design) -> Iterator[str]:
+    """Yield coherence and height of ambiguity in the middle of each interferogram."""
     for name, layers in design.interferograms.items():
-        for layer, values in layers.items():
-            rows.append((f"{name} {layer}", f"{np.nanmedian(values):.4g}", "", UNITS[layer][0]))
-    return rows
+        told = [f"{layer} {np.nanmedian(values):.3g} {UNITS[layer][0]}" for layer, values in layers.items()]
+        yield f"{name}: {', '.join(told)}".replace(" 1,", ",")
 
 
 def verdict_row(verdict: Verdict) -> tuple[str, ...]:
@@ -194,8 +219,8 @@ def _blocks(design: Design, verdicts: Sequence[Verdict], changes: Sequence[Chang
     yield Picture((out / PANELS).read_bytes(), f"Layers of {design.judged[0].name}; white: not seen.")
     if (out / PARETO).is_file():
         yield Picture((out / PARETO).read_bytes(), "Plans that the search tried, and those that no other beats.")
-    yield Table("What images will be.", _VALUES, value_rows(design))
-    yield Paragraph(" ".join(f"{line}." for line in recording_lines(design)))
+    yield Table(f"{_CAPTION.capitalize()}.", *value_table(design))
+    yield Paragraph(" ".join(f"{line}." for line in (*interferogram_lines(design), *recording_lines(design))))
     for image in design.images.values():
         if image.budget:
             counted = [one for one in image.budget if one.counts]

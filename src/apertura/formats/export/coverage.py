@@ -1,7 +1,7 @@
 """Coverage of a campaign: looks, pairs, footprints and tracks as a picture and for a GIS."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -41,12 +41,15 @@ class Covered:
         Antenna (transmitter, receiver) → (vertex, 3) float64, easting, northing and height on the map, metres.
     looks
         (row, column) float32, pulses that make each place of the scene, 0 where none does.
+    imaged_m
+        Antenna → what of its track makes the image, a list of (vertex, 2 or 3), metres; where that is not all of it.
     """
 
     flight: str
     pair: str
     tracks_m: Mapping[str, NDArray[np.float64]]
     looks: NDArray[np.float32]
+    imaged_m: Mapping[str, Sequence[NDArray[np.float64]]] = field(default_factory=dict)
 
 
 def footprint(looks: NDArray[np.float32], transform: Affine) -> list[list[Ring]]:
@@ -189,7 +192,10 @@ def write_coverage(
         if len(flights) > 1:
             maps[0].draw_legend(*_legend(flights))
         share = f"{100 * float((pairs > 0).mean()):.1f} % of the scene is seen by {number_of(len(covered), 'pair')}"
-        subtitle = f"{share} of {number_of(len(flights), 'flight')}; lines: tracks (dashed: receiver) and footprints"
+        thick = ", thick: makes the image" if any(one.imaged_m for one in covered) else ""
+        subtitle = (
+            f"{share} of {number_of(len(flights), 'flight')}; lines: tracks (dashed: receiver{thick}) and footprints"
+        )
         maps[0].write_words(title, subtitle, f"apertura {tags['APERTURA_VERSION']}")
         with replacement(path) as temporary:
             maps[0].figure.savefig(temporary, dpi=DPI, metadata={"Title": title, **dict(sorted(tags.items()))})
@@ -228,11 +234,25 @@ def _draw_lines(layout: MapLayout, covered: Sequence[Covered], transform: Affine
     """Draw tracks and footprints in the colours of their flights."""
     for one in covered:
         colour = _COLOURS[flights[one.flight] % len(_COLOURS)]
-        for style, track_m in zip(("-", "--"), one.tracks_m.values(), strict=False):
-            layout.axes.plot(*track_m.T[:2], style, color=colour, linewidth=1.4)
+        for style, (antenna, track_m) in zip(("-", "--"), one.tracks_m.items(), strict=False):
+            imaged = one.imaged_m.get(antenna)
+            layout.axes.plot(*track_m.T[:2], style, color=colour, linewidth=0.7 if imaged else 1.4)
+            for leg_m in imaged or [track_m]:
+                if imaged:
+                    layout.axes.plot(*leg_m.T[:2], style, color=colour, linewidth=2.2)
+                _draw_way(layout, leg_m, colour)
         for rings in footprint(one.looks, transform):
             for ring in rings:
                 layout.axes.plot(*ring.T, color=colour, alpha=0.8, linewidth=1.2)
+
+
+def _draw_way(layout: MapLayout, leg_m: NDArray[np.float64], colour: Any) -> None:
+    """Point an arrow the way that a leg is flown, in its middle."""
+    middle = max(1, len(leg_m) // 2)
+    if len(leg_m) > 1 and (leg_m[middle, :2] != leg_m[middle - 1, :2]).any():
+        arrow = {"arrowstyle": "-|>", "color": colour, "mutation_scale": 12}
+        ends = [(float(x), float(y)) for x, y in leg_m[middle - 1 : middle + 1, :2]]
+        layout.axes.annotate("", ends[1], ends[0], arrowprops=arrow)
 
 
 def _legend(flights: Mapping[str, int]) -> tuple[list[Any], list[str]]:

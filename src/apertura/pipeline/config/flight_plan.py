@@ -170,6 +170,9 @@ class Requirements(Section):
     loss_db: Annotated[float, Field(ge=0)] | None = Field(
         None, description="of a point's peak by all expected errors, at most, dB"
     )
+    ambiguity: Positive | None = Field(
+        None, description="echo of the rest of the scene that folds onto a place, as share of its own, at most"
+    )
     coherence: Annotated[float, Field(gt=0, lt=1)] | None = Field(
         None, description="of the images that interferometry.pairs names, at least"
     )

@@ -15,7 +15,8 @@ import xarray as xr
 from apertura.common.documents import validated
 from apertura.pipeline.config.flight_plan import FlightPlan, read_flight_plan
 from apertura.pipeline.design.computed import Design, designed
-from apertura.pipeline.design.writing import UNITS, report_of
+from apertura.pipeline.design.judgement import report_of
+from apertura.pipeline.design.layers import UNITS
 
 
 def design(

@@ -1,7 +1,7 @@
 """Whether a plan gives what is required: the first cause where it does not, and which change helps most."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -28,6 +28,7 @@ _LAYERS = {
     "snr_db": ("snr", "least"),
     "point_snr_db": ("point_snr", "least"),
     "loss_db": ("loss", "most"),
+    "ambiguity": ("ambiguity", "most"),
 }
 """Requirement → layer, and whether the requirement is the most or the least of it."""
 
@@ -100,6 +101,17 @@ def judge(design: Design, *, every: bool = False) -> list[Verdict]:
     return verdicts
 
 
+def report_of(design: Design) -> dict[str, Any]:
+    """Return what a design says in numbers, as JSON values."""
+    return {
+        "judgement": [verdict.report for verdict in judge(design)],
+        "recording": asdict(design.recording),
+        "budget": {name: [line.report for line in image.budget] for name, image in design.images.items()},
+        "flags": {name: dict(image.flags) for name, image in design.images.items()},
+        "doppler_hz": {name: image.doppler_hz for name, image in design.images.items() if image.looks is not None},
+    }
+
+
 _Found = tuple[str, float, str, str]
 
 
@@ -142,6 +154,9 @@ def _cause(name: str, design: Design, image: PlannedImage, seen: np.ndarray, val
         lines = [line for one in pairs for line in one.budget if line.counts]
         worst = min(lines, key=lambda line: line.effect.loss_db)
         return f"{worst.cause}: {worst.stated or worst.assumed}"
+    if name == "ambiguity":
+        spread_hz = max(one.doppler_hz for one in design.images.values() if one.looks is not None)
+        return f"Doppler spreads {spread_hz:.0f} Hz over the scene, by speed, range and beams"
     looks = float(np.median(image.layers["looks"][seen]))
     return f"noise of {looks:.0f} pulses at the far side, by power, gains and range"
 

@@ -37,6 +37,25 @@ AMBIGUITY_NODES = 9
 
 Layer = NDArray[Any]
 
+UNITS: Mapping[str, tuple[str, str]] = {
+    "resolution": ("m", "−3 dB width of a point in its coarsest direction"),
+    "resolution_fine": ("m", "−3 dB width of a point in its finest direction"),
+    "orientation": ("deg", "azimuth of the finest direction, clockwise from grid north"),
+    "looks": ("pulses", "effective number of pulses that make the pixel"),
+    "incidence": ("deg", "incidence at closest approach, from the terrain's normal"),
+    "bistatic_angle": ("deg", "angle between transmitter and receiver at closest approach"),
+    "mask": ("bits", "0 seen, 1 shadow, 2 layover, 3 both, 255 outside"),
+    "nesz": ("dB", "noise-equivalent sigma0"),
+    "snr": ("dB", "ground of expect.sigma0_db over noise"),
+    "point_snr": ("dB", "point of expect.rcs_dbsm over noise"),
+    "ambiguity": ("1", "share of the scene's echo that folds onto the place"),
+    "path_margin": ("m", "total path left before the prefix or the recording ends"),
+    "loss": ("dB", "expected loss of a point's peak by all causes of the error budget"),
+    "coherence": ("1", "of still ground between two images: common spectrum and noise"),
+    "height_ambiguity": ("m", "height that turns the phase between two images once"),
+}
+"""Layer → unit and meaning."""
+
 
 @dataclass(frozen=True, eq=False)
 class PlannedImage:

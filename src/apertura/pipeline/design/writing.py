@@ -1,8 +1,7 @@
 """A design as files: layers as GeoTIFFs on the later campaign's grid, tracks and footprints, the campaign's config."""
 
 import shutil
-from collections.abc import Iterator, Mapping
-from dataclasses import asdict
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -25,27 +24,9 @@ from apertura.formats.tracks.missions import write_kml
 from apertura.pipeline.config import FLIGHTS
 from apertura.pipeline.config.flight_plan import FlightPlan
 from apertura.pipeline.design.computed import Design
-from apertura.pipeline.design.judgement import judge
+from apertura.pipeline.design.judgement import report_of
+from apertura.pipeline.design.layers import UNITS
 from apertura.pipeline.steps.coverage import crs_name, place_of, transform_of
-
-UNITS: Mapping[str, tuple[str, str]] = {
-    "resolution": ("m", "−3 dB width of a point in its coarsest direction"),
-    "resolution_fine": ("m", "−3 dB width of a point in its finest direction"),
-    "orientation": ("deg", "azimuth of the finest direction, clockwise from grid north"),
-    "looks": ("pulses", "effective number of pulses that make the pixel"),
-    "incidence": ("deg", "incidence at closest approach, from the terrain's normal"),
-    "bistatic_angle": ("deg", "angle between transmitter and receiver at closest approach"),
-    "mask": ("bits", "0 seen, 1 shadow, 2 layover, 3 both, 255 outside"),
-    "nesz": ("dB", "noise-equivalent sigma0"),
-    "snr": ("dB", "ground of expect.sigma0_db over noise"),
-    "point_snr": ("dB", "point of expect.rcs_dbsm over noise"),
-    "ambiguity": ("1", "share of the scene's echo that folds onto the place"),
-    "path_margin": ("m", "total path left before the prefix or the recording ends"),
-    "loss": ("dB", "expected loss of a point's peak by all causes of the error budget"),
-    "coherence": ("1", "of still ground between two images: common spectrum and noise"),
-    "height_ambiguity": ("m", "height that turns the phase between two images once"),
-}
-"""Layer → unit and meaning."""
 
 _BANDS = {"incidence": INCIDENCE, "bistatic_angle": BISTATIC_ANGLE, "mask": MASK, "looks": LOOKS}
 _DOTS = 480  # of the longer side of the scene, in footprints
@@ -93,17 +74,6 @@ def tags_of(design: Design) -> dict[str, str]:
     return PICTURE_TAGS | {"APERTURA_PLAN": canonical_json(plan)}
 
 
-def report_of(design: Design) -> dict[str, Any]:
-    """Return what a design says in numbers, as JSON values."""
-    return {
-        "judgement": [verdict.report for verdict in judge(design)],
-        "recording": asdict(design.recording),
-        "budget": {name: [line.report for line in image.budget] for name, image in design.images.items()},
-        "flags": {name: dict(image.flags) for name, image in design.images.items()},
-        "doppler_hz": {name: image.doppler_hz for name, image in design.images.items() if image.looks is not None},
-    }
-
-
 def _write_report(design: Design, folder: Path) -> Path:
     write_json(folder / "design.json", report_of(design))
     return folder / "design.json"
@@ -149,7 +119,8 @@ def _covered(design: Design) -> Iterator[Covered]:
         tracks = {
             leg: courses[node].place_m[:: max(1, len(courses[node].place_m) // _VERTICES)] for leg, node in legs.items()
         }
-        yield Covered(pair.flight, pair.name, tracks, looks)
+        imaged = {leg: courses[node].imaged_legs_m() for leg, node in legs.items()}
+        yield Covered(pair.flight, pair.name, tracks, looks, imaged)
 
 
 def write_campaign_config(plan: FlightPlan, directory: Path) -> list[Path]:

@@ -82,16 +82,15 @@ class Course:
     place_m: Floats
     imaged_s: tuple[tuple[float, float], ...]
 
-    def imaged_from(self) -> Floats:
-        """Return places evenly spread over what makes the image, (point, 3) float64 metres."""
-        time_s = np.concatenate([np.linspace(*span, _IMAGED_POINTS) for span in self.imaged_s])
-        return np.stack([np.interp(time_s, self.time_s, axis) for axis in self.place_m.T], -1)
+    def imaged_legs_m(self) -> list[Floats]:
+        """Return places evenly spread over each leg that makes the image, (point, 3) float64 metres."""
+        times = [np.linspace(*span, _IMAGED_POINTS) for span in self.imaged_s]
+        return [np.stack([np.interp(time_s, self.time_s, axis) for axis in self.place_m.T], -1) for time_s in times]
 
     @property
     def imaged_m(self) -> float:
         """How far it flies in what makes the image, metres."""
-        legs = np.split(self.imaged_from(), len(self.imaged_s))
-        return float(sum(np.linalg.norm(np.diff(leg, axis=0), axis=1).sum() for leg in legs))
+        return float(sum(np.linalg.norm(np.diff(leg, axis=0), axis=1).sum() for leg in self.imaged_legs_m()))
 
     @property
     def length_s(self) -> float:
@@ -422,7 +421,7 @@ def _moved(courses: dict[str, dict[str, Course]], plan: FlightPlan) -> dict[str,
     moved = plan.moved
     if moved.model_copy(update={"spacing": 1.0}) == Moved():
         return courses
-    every = [course.imaged_from()[:, :2] for nodes in courses.values() for course in nodes.values()]
+    every = [leg[:, :2] for nodes in courses.values() for course in nodes.values() for leg in course.imaged_legs_m()]
     if plan.scene.bounds_m == "auto":
         middle = np.concatenate(every).mean(axis=0)
     else:
@@ -432,7 +431,7 @@ def _moved(courses: dict[str, dict[str, Course]], plan: FlightPlan) -> dict[str,
     turn = np.array([[cosine, -sine], [sine, cosine]])  # of row vectors, clockwise
     result = {}
     for name, nodes in courses.items():
-        away = np.concatenate([course.imaged_from() for course in nodes.values()])[:, :2] - middle
+        away = np.concatenate([leg for course in nodes.values() for leg in course.imaged_legs_m()])[:, :2] - middle
         mean, far_m = away.mean(axis=0), float(np.linalg.norm(away, axis=1).mean())
         round_it = float(np.linalg.norm(mean)) < _RADIAL * far_m
         push = np.zeros(2) if round_it else moved.offset_m * mean / np.linalg.norm(mean)
