@@ -169,10 +169,13 @@ def sentences(name: str, report: Report) -> Iterator[str]:
     if coherence.get("mean") is not None:
         yield f"The pairs add up with {coherence['mean']:.3f} of full coherence ({coherence['chance']:.2f} by chance)."
     if gain := report.get("gain"):
-        over_db = gain["over_best_pair_db"]
+        over_db, noise_db = gain["over_best_pair_db"], gain["allowed_db"]
+        beyond = " More is gained where the pairs' sidelobes, seen from different places, cancel." * (
+            over_db > noise_db
+        )
         yield (
             f"Between the targets it is {abs(over_db):.1f} dB {'lower' if over_db >= 0 else 'higher'} against the peak "
-            f"than {gain['best_pair']}, its best pair; the number of pairs allows {gain['allowed_db']:.1f} dB."
+            f"than {gain['best_pair']}, its best pair; noise that pairs do not share allows {noise_db:.1f} dB.{beyond}"
         )
         yield _cut_sentence(report["brightest"])
 
