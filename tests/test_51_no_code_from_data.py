@@ -24,6 +24,7 @@ from apertura.common.errors import CampaignError
 from apertura.common.processes import SAFE_PATH
 from apertura.pipeline.config.template import config_schema
 from apertura.pipeline.store.chunks import array_of
+from apertura.pipeline.workflow import code_from_outside
 from apertura.views.cli import app
 
 ROOT = Path(__file__).parents[1]
@@ -99,14 +100,6 @@ ROADS = {
         None,
     ),
     "Slurm, in the campaign": ("{bin}/apertura run . --profile profiles/slurm --cores 2 {soon}", "{campaign}"),
-    "Slurm, from elsewhere": (
-        "{bin}/apertura run {campaign} --profile {root}/profiles/slurm --cores 2 {soon} {part}",
-        None,
-    ),
-    "Slurm, plain snakemake": (
-        "{bin}/snakemake --directory {campaign} --profile profiles/slurm --cores 2 {soon} {part}",
-        "{root}",
-    ),
     "a batch system that hands on no environment": (
         "{bin}/apertura run . --executor cluster-generic --cluster-generic-submit-cmd "
         "'env -i PATH={bin}:/usr/bin:/bin sh' --jobs 1 --cores 2 {part}",
@@ -292,38 +285,43 @@ def test_modules_where_snakemake_installs_its_own_are_told_before_a_job_could_im
     "words",
     [
         "--profile profiles/own",
-        *slow(
-            "--profile {linked}",
-            "--profile=./profiles/slurm",
-            "--profile {campaign}/profiles/slurm",
-            "--prof {campaign}/profiles/slurm",
-            "--profile {campaign}/../campaign/profiles/slurm/config.yaml",
-            "--workflow-profile {campaign}/profiles/default",
-            "--workflow-profile=profiles/none",
-            "--configfile {campaign}/config.yaml",
-            "--snakefile Snakefile",
-            "-s {campaign}/Snakefile",
-            "-s{campaign}/Snakefile",
-            "-ns{campaign}/Snakefile",
-            "-ns {campaign}/Snakefile",
-            "--sn {campaign}/Snakefile",
-            "--pro {campaign}/profiles/slurm",
-            "--wo={campaign}/profiles/slurm",
-            "--jobscript {campaign}/bash",
-            "--jobsc {campaign}/bash",
-            "--profile leads_out/slurm",
-            "--profile {campaign}/none/../leads_out/slurm",
-        ),
+        "--profile {linked}",
+        "--profile=./profiles/slurm",
+        "--profile {campaign}/profiles/slurm",
+        "--prof {campaign}/profiles/slurm",
+        "--profile {campaign}/../campaign/profiles/slurm/config.yaml",
+        "--workflow-profile {campaign}/profiles/default",
+        "--workflow-profile=profiles/none",
+        "--configfile {campaign}/config.yaml",
+        "--snakefile Snakefile",
+        "-s {campaign}/Snakefile",
+        "-s{campaign}/Snakefile",
+        "-ns{campaign}/Snakefile",
+        "-ns {campaign}/Snakefile",
+        "--sn {campaign}/Snakefile",
+        "--pro {campaign}/profiles/slurm",
+        "--wo={campaign}/profiles/slurm",
+        "--jobscript {campaign}/bash",
+        "--jobsc {campaign}/bash",
+        "--profile leads_out/slurm",
+        "--profile {campaign}/none/../leads_out/slurm",
     ],
 )
-def test_a_profile_of_the_campaigns_own_is_refused(unfinished, tmp_path, words):
-    planted, linked = plant(unfinished), tmp_path / "linked"
+def test_a_profile_of_the_campaigns_own_is_refused(unfinished, tmp_path, monkeypatch, words):
+    plant(unfinished)
+    linked = tmp_path / "linked"
     linked.symlink_to(unfinished / "profiles" / "slurm")
     shutil.copytree(unfinished / "profiles", tmp_path / "profiles")
     (unfinished / "leads_out").symlink_to(tmp_path / "profiles")
-    words = shlex.split(words.format(campaign=unfinished, linked=linked))
+    monkeypatch.chdir(unfinished)
+    with pytest.raises(CampaignError, match="lies in the campaign folder"):
+        code_from_outside(unfinished, shlex.split(words.format(campaign=unfinished, linked=linked)))
+
+
+def test_nothing_of_a_profile_that_is_refused_runs(unfinished):
+    planted = plant(unfinished)
     with planted.fires() as fired:
-        said = one_message(*run([BIN / "apertura", "run", ".", "-n", *words], unfinished))
+        said = one_message(*run([BIN / "apertura", "run", ".", "-n", "--profile", "profiles/own"], unfinished))
     assert fired == []
     assert "lies in the campaign folder" in said
 
@@ -655,9 +653,19 @@ ENVIRONMENT = {
 }
 
 
+READ_BY = {
+    "step pictures f01 uav1-uav2": set(ENVIRONMENT),
+    "run . -n": {"APERTURA_ISA", "COLUMNS", "HOME", "PATH", "SNAKEMAKE_PROFILE", "TMPDIR"},
+    "plan .": {"APERTURA_KERNEL", "COLUMNS", "PYTHONIOENCODING"},
+}
+"""Command → settings that it meets before, or besides, a step."""
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "value"), [(name, value) for name, values in ENVIRONMENT.items() for value in values])
-@pytest.mark.parametrize("words", ["plan .", "run . -n", "step pictures f01 uav1-uav2"])
+@pytest.mark.parametrize(
+    ("words", "name", "value"),
+    [(words, name, value) for words, names in READ_BY.items() for name in sorted(names) for value in ENVIRONMENT[name]],
+)
 def test_a_setting_of_the_environment_changes_nothing_or_is_one_message(finished, name, value, words):
     status, said = run([BIN / "apertura", *words.split()], finished, **{name: value})
     assert "Traceback" not in said
