@@ -19,6 +19,6 @@ def test_a_random_geometry_is_certified_as_asked(seed):
 
 @pytest.mark.slow
 def test_every_random_geometry_is_certified_as_asked():
-    outcomes = [measure(draw(seed), nodes_db=-74) for seed in range(60)]
+    outcomes = [measure(draw(seed), nodes_db=-74) for seed in range(30)]
     assert [found for found in outcomes if found.failure] == []
-    assert sum(found.by_tree > 0.99 for found in outcomes) >= 50
+    assert sum(found.by_tree > 0.99 for found in outcomes) >= 25

@@ -115,7 +115,7 @@ def unbroken(_tiny, tmp_path_factory):
     """The products of a run that nobody disturbed."""
     root = copy_writable(_tiny, tmp_path_factory.mktemp("unbroken") / "campaign")
     larger(root)
-    code, output = finished(snakemake(root))
+    code, output = finished(apertura("run", root))
     assert code == 0, output
     return contents(root)
 
@@ -132,7 +132,7 @@ def test_a_killed_run_goes_on_from_its_tiles_to_the_same_bytes(tiny, unbroken, w
         process.kill()
     process.wait()
     process.stdout.close()
-    code, output = finished(snakemake(tiny))
+    code, output = finished(apertura("run", tiny))
     assert code == 0, output
     log = lines_of(tiny / "results" / "logs" / "f01", "*.image.log")
     formed_again = sum(int(line.split()[0]) for line in log if "tiles to form" in line)
@@ -149,7 +149,7 @@ def test_tiles_scattered_over_jobs_and_killed_give_the_same_bytes(tiny, unbroken
     os.killpg(process.pid, signal.SIGKILL)
     process.wait()
     process.stdout.close()
-    code, output = finished(snakemake(tiny, "--set-scatter", "tiles=4"))
+    code, output = finished(apertura("run", tiny, "--set-scatter", "tiles=4"))
     assert code == 0, output
     logs = tiny / "results" / "logs" / "f01"
     by_shares, by_image = (

@@ -89,7 +89,6 @@ QUICK = ("check", "init", "plan", "step scene")
 
 ROADS = {
     "apertura, in the campaign": ("{bin}/apertura run . --cores 2", "{campaign}"),
-    "apertura, from elsewhere": ("{bin}/apertura run {campaign} --cores 2 --groups echo=g {part}", None),
     "apertura, tiles by several jobs": (
         "{bin}/apertura run . --cores 2 --set-scatter tiles=2 --until image",
         "{campaign}",

@@ -24,5 +24,5 @@ def disturbed(*options: str) -> list[int]:
 @pytest.mark.slow
 @pytest.mark.skipif(compiler() is None, reason="no C compiler to build what makes calls fail")
 def test_a_step_killed_or_failing_or_on_a_full_disk_leaves_nothing_half_and_resumes_to_the_same_bytes():
-    kills, errors, full = disturbed("--kills", "39", "--errors", "26", "--full", "13")
-    assert (kills, errors, full >= 10) == (39, 26, may_mount())
+    kills, errors, full = disturbed("--kills", "26", "--errors", "26", "--full", "13")
+    assert (kills, errors, full >= 10) == (26, 26, may_mount())
