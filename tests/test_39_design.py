@@ -15,7 +15,7 @@ from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import Plane
 from apertura.pipeline.config.flight_plan import FlightPlan
 from apertura.pipeline.design import designed
-from apertura.pipeline.design.judgement import helpful_changes, judge, search
+from apertura.pipeline.design.judgement import helpful_changes, judge, search, tried_report
 from apertura.pipeline.opening.planned import open_plan
 
 HERE = Path()
@@ -176,29 +176,44 @@ def test_echoes_that_fold_are_told_for_what_is_required_and_more_pulses_help(tmp
     plan = plan_of(require={"ambiguity": 0.02})
     plan["waveform"]["prf_hz"] = 50.0
     plan["scene"] |= {"bounds_m": [-30.0, 20.0, 30.0, 80.0], "spacing_m": 1.0}
-    design = designed(FlightPlan.model_validate(plan), tmp_path)
-    (verdict,) = judge(design)
+    (verdict,) = judge(designed(FlightPlan.model_validate(plan), tmp_path))
     assert not verdict.met
     assert "Doppler spreads" in verdict.cause
-    assert "twice the pulse rate" in {one.words for one in helpful_changes(design.opened.plan, tmp_path) if one.meets}
+    assert "twice the pulse rate (waveform.prf_hz)" in {one.words for one in changes_of(plan, tmp_path) if one.meets}
+
+
+def changes_of(plan, root):
+    plan = FlightPlan.model_validate(plan)
+    return helpful_changes(plan, root, judge(designed(plan, root)))
+
+
+@pytest.mark.slow
+def test_what_is_missed_by_a_hair_on_the_fine_grid_alone_gets_its_change_too(tmp_path):
+    """A coarser grid tells 0.1 to 1 % less of the far side: what it says of the plan as it is, is taken off."""
+    plan = plan_of(scene=plan_of()["scene"] | {"spacing_m": 0.05})
+    (verdict,) = judge(designed(FlightPlan.model_validate(plan | {"require": {"nesz_db": 0.0}}), tmp_path))
+    missed = plan | {"require": {"nesz_db": verdict.found - 0.002}}
+    changes = changes_of(missed, tmp_path)
+    assert any(change.meets for change in changes)
+    assert all(change.gain_db == pytest.approx(0.002, abs=1e-4) for change in changes if change.meets)
 
 
 @pytest.mark.slow
 def test_the_changes_that_help_most_come_first(tmp_path):
-    changes = helpful_changes(FlightPlan.model_validate(plan_of(require={"nesz_db": -60.0})), tmp_path)
+    changes = changes_of(plan_of(require={"nesz_db": -60.0}), tmp_path)
     assert changes[0].gain_db >= changes[-1].gain_db > 0
     gains = {change.words: change.gain_db for change in changes}
-    assert gains["3 dB more power"] == pytest.approx(3, abs=0.01)
-    assert gains["twice the pulse rate"] == pytest.approx(3.01, abs=0.05)
+    assert gains["3 dB more power (transmit_power_dbm)"] == pytest.approx(3, abs=0.01)
+    assert gains["twice the pulse rate (waveform.prf_hz)"] == pytest.approx(3.01, abs=0.05)
 
 
 @pytest.mark.slow
 def test_changes_that_break_what_is_met_come_last_and_say_so(tmp_path):
     required = {"point_snr_db": 60.0, "flight_s": 15.9}
-    changes = helpful_changes(FlightPlan.model_validate(plan_of(require=required)), tmp_path)
+    changes = changes_of(plan_of(require=required), tmp_path)
     broken = {change.words: change.breaks for change in changes}
-    assert broken["fly at 0.5 of the speed"] == ("flight_s",)
-    assert broken["3 dB more power"] == ()
+    assert broken["fly at 0.5 times the speed (speed_m_s)"] == ("flight_s",)
+    assert broken["3 dB more power (transmit_power_dbm)"] == ()
     assert [*map(bool, broken.values())] == sorted(map(bool, broken.values()))
 
 
@@ -208,7 +223,10 @@ def test_a_search_finds_the_same_again_and_what_it_finds_is_better(tmp_path):
     again, _ = search(plan, tmp_path, ["height"], most=5)
     assert found == again
     assert found.moved.height_m < 0  # a flatter look resolves the ground better
-    assert any(one.on_front for one in tried)
+    assert min(tried, key=lambda one: one.objective).on_front
+    first = tried_report(tried)[0]
+    assert first["moved"] == {"height_m": found.moved.height_m}
+    assert first["found"]["resolution_m"] < 0.8
 
 
 def test_recordings_are_as_large_as_their_captures():

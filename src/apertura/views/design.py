@@ -16,7 +16,16 @@ from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config.flight_plan import FlightPlan, MissionTrack, read_flight_plan
 from apertura.pipeline.design import as_plan
 from apertura.pipeline.design.computed import Design, designed
-from apertura.pipeline.design.judgement import AXES, Change, Tried, Verdict, helpful_changes, judge, search
+from apertura.pipeline.design.judgement import (
+    AXES,
+    Change,
+    Tried,
+    Verdict,
+    helpful_changes,
+    judge,
+    search,
+    tried_report,
+)
 from apertura.pipeline.design.layers import UNITS, PlannedImage, planned_image
 from apertura.pipeline.design.writing import PICTURE_TAGS, copy_named, plan_text, write_design
 from apertura.pipeline.opening.pair import open_pair
@@ -33,7 +42,7 @@ PAGE, PLAN, PANELS, PARETO = "design.html", "plan.yaml", "layers.png", "pareto.p
 _SHOWN = ("resolution", "nesz", "point_snr", "incidence", "loss", "mask")
 _TITLES = {"resolution": "coarsest resolution", "nesz": "NESZ", "point_snr": "SNR of a point", "loss": "loss of focus"}
 _DOTS = 400  # of the longer side of a panel
-_MOST_CHANGES = 5
+_MOST_CHANGES, _MOST_PLANS = 5, 12
 _JUDGED = ("requirement", "asked", "given", "met", "image", "first cause")
 _LISTED = {
     "resolution": "coarsest, m",
@@ -78,7 +87,7 @@ def print_design(path: Path, out: Path | None, *, optimise: str | None = None, t
         console.print(f"best of {len(tried)} plans tried: moved: {{{moved}}}", highlight=False)
     design = designed(plan, root, threads=threads)
     verdicts = judge(design)
-    changes = helpful_changes(plan, root, threads=threads)
+    changes = helpful_changes(plan, root, verdicts, threads=threads)
     console.print(_table(_CAPTION, *value_table(design, "\n")))
     if verdicts:
         console.print(_table("what is required", _JUDGED, [verdict_row(one) for one in verdicts]))
@@ -88,13 +97,13 @@ def print_design(path: Path, out: Path | None, *, optimise: str | None = None, t
         for flag, line in image.flags.items() if image.looks is not None else ():
             console.print(f"[yellow]{flag}[/yellow]: {name}: {line}", highlight=False)
     if out is not None:
-        write_design(design, out)
+        write_design(design, out, tried)
         write_text(out / PLAN, plan_text(plan))
         copy_named(plan, path.absolute().parent, out)
         _draw_layers(out / PANELS, design)
         if tried:
             draw_pareto(out / PARETO, tried)
-        write_text(out / PAGE, page(f"{plan.campaign}, planned", _blocks(design, verdicts, changes, out)))
+        write_text(out / PAGE, page(f"{plan.campaign}, planned", _blocks(design, verdicts, changes, tried, out)))
         console.print(*(out / name for name in (PAGE, "coverage.png", PLAN)), sep="\n", highlight=False)
     return all(verdict.met for verdict in verdicts)
 
@@ -131,6 +140,10 @@ def value_table(design: Design, between: str = " / ") -> tuple[tuple[str, ...], 
     return ("image", *(_LISTED[name] for name in listed), "seen, %"), rows
 
 
+def _value(value: float | None) -> str:
+    return "" if value is None else f"{value:.4g}"
+
+
 def _digits(value: float) -> str:
     return f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"
 
@@ -144,7 +157,7 @@ def interferogram_lines(design: Design) -> Iterator[str]:
 
 def verdict_row(verdict: Verdict) -> tuple[str, ...]:
     """Return a verdict as text."""
-    met = "yes" if verdict.met else f"no, {verdict.short_db:.1f} dB short"
+    met = "yes" if verdict.met else f"no, {verdict.short_db:.2g} dB short"
     return verdict.requirement, f"{verdict.asked:g}", f"{verdict.found:.4g}", met, verdict.image, verdict.cause
 
 
@@ -187,13 +200,15 @@ def recording_lines(design: Design) -> Iterator[str]:
 def change_lines(changes: Sequence[Change]) -> Iterator[str]:
     """Yield the single changes that help most."""
     for number, change in enumerate(changes[:_MOST_CHANGES], 1):
-        found = ", ".join(f"{name} {value:.3g}" for name, value in change.found.items())
+        found = ", ".join(f"{name} {value:.4g}" for name, value in change.found.items())
         then = ", all met" if change.meets else ""
         then += f", but then not met: {', '.join(change.breaks)}" if change.breaks else ""
-        yield f"{number}. {change.words}: {change.gain_db:.1f} dB nearer{then} ({found})"
+        yield f"{number}. {change.words}: {change.gain_db:.2g} dB nearer{then} ({found})"
 
 
-def _blocks(design: Design, verdicts: Sequence[Verdict], changes: Sequence[Change], out: Path) -> Iterator[Block]:
+def _blocks(
+    design: Design, verdicts: Sequence[Verdict], changes: Sequence[Change], tried: Sequence[Tried], out: Path
+) -> Iterator[Block]:
     plan = design.opened.plan
     yield Heading(1, f"{plan.campaign}: what the flight will give")
     if verdicts:
@@ -208,24 +223,28 @@ def _blocks(design: Design, verdicts: Sequence[Verdict], changes: Sequence[Chang
             [
                 (
                     change.words,
-                    f"{change.gain_db:.1f} dB",
+                    f"{change.gain_db:.2g} dB",
                     "yes" if change.meets else ", nor ".join(("no", *change.breaks)),
-                    ", ".join(f"{name} {value:.3g}" for name, value in change.found.items()),
+                    ", ".join(f"{name} {value:.4g}" for name, value in change.found.items()),
                 )
                 for change in changes[:_MOST_CHANGES]
             ],
         )
     yield Picture((out / "coverage.png").read_bytes(), "Tracks and what they see.")
     yield Picture((out / PANELS).read_bytes(), f"Layers of {design.judged[0].name}; white: not seen.")
-    if (out / PARETO).is_file():
+    if tried:
         yield Picture((out / PARETO).read_bytes(), "Plans that the search tried, and those that no other beats.")
+        plans = tried_report(tried)[:_MOST_PLANS]
+        head = (*(f"moved.{key}" for key in plans[0]["moved"]), *plans[0]["found"])
+        rows = [[_value(value) for value in (*one["moved"].values(), *one["found"].values())] for one in plans]
+        yield Table("Plans that no other beats, the one taken first; design.json holds all.", head, rows)
     yield Table(f"{_CAPTION.capitalize()}.", *value_table(design))
     yield Paragraph(" ".join(f"{line}." for line in (*interferogram_lines(design), *recording_lines(design))))
     for image in design.images.values():
         if image.budget:
             counted = [one for one in image.budget if one.counts]
             sizes = [one.stated or one.assumed or "" for one in counted]
-            effects = [(f"{one.effect.loss_db:.2f}", f"{100 * one.effect.shift_m:.2g}") for one in counted]
+            effects = [(f"{one.effect.loss_db:.2f}", _digits(100 * one.effect.shift_m)) for one in counted]
             lines = [(one.cause, size, *effect) for one, size, effect in zip(counted, sizes, effects, strict=True)]
             caption = (
                 f"Error budget of {image.name}, in the middle of the scene: {expected(image.budget).loss_db:.2f} dB."
@@ -270,7 +289,7 @@ def _draw_layers(path: Path, design: Design) -> None:
                 bar = figure.colorbar(picture, ax=axes, ticks=range(5), shrink=0.8)
                 bar.ax.set_yticklabels(["seen", "shadow", "layover", "both", "outside"])
             else:
-                seen = np.ma.masked_where(image.layers["mask"][::step, ::step] == OUTSIDE, shown)
+                seen = np.ma.masked_where(image.layers["mask"][::step, ::step] != 0, shown)
                 picture = axes.imshow(seen, extent=extent, cmap="viridis", interpolation="nearest")
                 figure.colorbar(picture, ax=axes, shrink=0.8).set_label(UNITS[name][0])
             axes.set_title(_TITLES.get(name, name))
@@ -368,7 +387,7 @@ def comparison_rows(plan: FlightPlan, root: Path, campaign: Campaign, *, threads
             numbers[1] |= {"pulses": pulses[1], "speed, m/s": speeds[1]}
             for name, value in numbers[0].items():
                 said = measured.get(name)
-                texts = [f"{one:.4g}" for one in (value, numbers[1].get(name, float("nan")))]
+                texts = ["" if np.isnan(one) else f"{one:.4g}" for one in (value, numbers[1].get(name, np.nan))]
                 rows.append((f"{flight.name}/{pair}", name, *texts, "" if said is None else f"{said:.4g}"))
     if not rows:
         raise CampaignError(

@@ -12,7 +12,7 @@ from apertura.pipeline.config import FmcwWaveform, SampledWaveform
 from apertura.pipeline.config.flight_plan import FlightPlan
 from apertura.pipeline.design.layers import Layer, PlannedImage, coherence_layers, planned_image, summed_image
 from apertura.pipeline.lineage import places
-from apertura.pipeline.opening.planned import OpenPlan, open_plan
+from apertura.pipeline.opening.planned import OpenPlan, errors_of_the_plan, open_plan
 from apertura.pipeline.resources import Resources
 from apertura.pipeline.rules import RULES
 
@@ -139,7 +139,12 @@ def designed(plan: FlightPlan, root: Path, *, threads: int = 1, coarse: int | No
         As `open_plan`, and where pulses are too few for the scene.
     """
     opened = open_plan(plan, root)
-    recording = Recording.of(opened)
+    with errors_of_the_plan():
+        return _computed(opened, threads=threads, coarse=coarse)
+
+
+def _computed(opened: OpenPlan, *, threads: int, coarse: int | None) -> Design:
+    plan, recording = opened.plan, Recording.of(opened)
     if coarse is not None:
         opened = opened.coarse(coarse)
     images: dict[str, PlannedImage] = {}

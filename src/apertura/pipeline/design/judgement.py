@@ -33,7 +33,7 @@ _LAYERS = {
 """Requirement → layer, and whether the requirement is the most or the least of it."""
 
 LEAST_GAIN_DB = 0.05
-"""Of a change that is told: less is printed as nothing."""
+"""Of a change that is told, where not all that is missed is less: a smaller one is printed as nothing."""
 
 _LEAST = {"snr_db", "point_snr_db", "coverage", "coherence"}
 _IN_DB = {"nesz_db", "snr_db", "point_snr_db", "loss_db"}
@@ -219,19 +219,32 @@ def shortfall_db(verdicts: Sequence[Verdict]) -> float:
     return sum(max(0.0, one.short_db) for one in verdicts)
 
 
-def helpful_changes(plan: FlightPlan, root: Path, *, threads: int = 1) -> list[Change]:
-    """Return single changes that bring a plan nearer to what is required: first those that break nothing, by gain."""
-    before = judge(designed(plan, root, threads=threads, coarse=COARSE_PX))
+def helpful_changes(plan: FlightPlan, root: Path, before: Sequence[Verdict], *, threads: int = 1) -> list[Change]:
+    """Return single changes that bring a plan nearer to what is required: first those that break nothing, by gain.
+
+    Parameters
+    ----------
+    plan, root
+        As `designed`.
+    before
+        Verdicts on the grid itself. Changes are compared on a coarser one, and what that says of the plan as it is in
+        another way than these is taken off.
+    threads
+        Tiles computed at once.
+    """
     missed_db, kept, found = shortfall_db(before), {one.requirement for one in before if one.met}, []
     if not missed_db:
         return []
+    coarse = {one.requirement: one.found for one in judge(designed(plan, root, threads=threads, coarse=COARSE_PX))}
+    off = {one.requirement: one.found - coarse.get(one.requirement, np.nan) for one in before}
     for words, change in _candidates(plan):
         try:
             after = judge(designed(change(plan), root, threads=threads, coarse=COARSE_PX))
         except (CampaignError, ValueError):  # a change that makes another plan impossible helps nobody
             continue
+        after = [replace(one, found=one.found + np.nan_to_num(off.get(one.requirement, 0.0))) for one in after]
         gain = missed_db - shortfall_db(after)
-        if gain > LEAST_GAIN_DB:
+        if gain >= min(LEAST_GAIN_DB, missed_db):
             values = {one.requirement: one.found for one in after}
             breaks = tuple(one.requirement for one in after if one.requirement in kept and not one.met)
             found.append(Change(words, gain, all(one.met for one in after), values, breaks))
@@ -245,24 +258,26 @@ def _candidates(plan: FlightPlan) -> Iterator[tuple[str, _Changing]]:
     several = any(len(flight.participants) > 1 for flight in plan.flights.values())
     lines = any(isinstance(track, LineTrack) for flight in plan.flights.values() for track in flight.tracks.values())
     for factor in (0.5, 0.75, 1.5):
-        yield f"fly at {factor:g} of the speed", partial(_faster, factor=factor)
+        yield f"fly at {factor:g} times the speed (speed_m_s)", partial(_faster, factor=factor)
     for height_m in (-10.0, 10.0, 20.0):
         way = "higher" if height_m > 0 else "lower"
-        yield f"fly {abs(height_m):g} m {way}", partial(moved, height_m=height_m)
+        now_m = plan.moved.height_m + height_m
+        yield f"fly {abs(height_m):g} m {way} (moved.height_m: {now_m:g})", partial(moved, height_m=height_m)
     for offset_m in (-10.0, 10.0, 20.0):
         way = "farther from" if offset_m > 0 else "nearer to"
-        yield f"fly {abs(offset_m):g} m {way} the scene", partial(moved, offset_m=offset_m)
+        now_m = plan.moved.offset_m + offset_m
+        yield f"fly {abs(offset_m):g} m {way} the scene (moved.offset_m: {now_m:g})", partial(moved, offset_m=offset_m)
     for factor in (0.5, 2.0) if several else ():
-        yield f"separations times {factor:g}", partial(moved, spacing=plan.moved.spacing * factor)
+        yield f"separations times {factor:g} (moved.spacing)", partial(moved, spacing=plan.moved.spacing * factor)
     if lines:
-        yield "lines longer by half", partial(_longer, factor=1.5)
+        yield "lines longer by half (start_m, end_m)", partial(_longer, factor=1.5)
     prf_hz = getattr(plan.waveform, "prf_hz", None)
     if prf_hz:
-        yield "twice the pulse rate", partial(_radar, prf_hz=2 * prf_hz)
+        yield "twice the pulse rate (waveform.prf_hz)", partial(_radar, prf_hz=2 * prf_hz)
     if isinstance(plan.waveform, OfdmWaveform):
-        yield "twice the bandwidth", partial(_radar, subcarriers=2 * plan.waveform.subcarriers)
-    yield "3 dB more power", _louder
-    yield "positions known twice as well (RTK quality)", _surer
+        yield "twice the bandwidth (waveform.subcarriers)", partial(_radar, subcarriers=2 * plan.waveform.subcarriers)
+    yield "3 dB more power (transmit_power_dbm)", _louder
+    yield "positions known twice as well (position_std_m)", _surer
 
 
 def moved(plan: FlightPlan, **changes: float) -> FlightPlan:
@@ -343,7 +358,8 @@ class Tried:
     verdicts
         On every requirement there is.
     objective
-        What is minimised, dB: what is missed, tenfold, and the scarcest margin.
+        What is minimised, dB: what is missed, tenfold, the scarcest margin, and a hundredth of the mean of margins: of
+        plans alike in the others none is taken that another beats.
     on_front
         Whether none that was tried is better in one requirement and as good in the others.
     """
@@ -396,14 +412,15 @@ def search(
     keys, tried = [AXES[word] for word in words], list[Tried]()
 
     def objective(place: np.ndarray) -> float:
-        values = dict(zip(keys, map(float, place), strict=True))
+        values = {key: round(float(value), 3) for key, value in zip(keys, place, strict=True)}
         one = plan.model_copy(update={"moved": plan.moved.model_copy(update=values)})
         try:
             verdicts = judge(designed(one, root, threads=threads, coarse=COARSE_PX), every=True)
         except CampaignError:
             return IMPOSSIBLE_DB
         asked = [verdict for verdict in verdicts if verdict.asked is not None]
-        missed = 10 * shortfall_db(asked) + max(verdict.short_db for verdict in asked)
+        short = [verdict.short_db for verdict in asked]
+        missed = 10 * shortfall_db(asked) + max(short) + 0.01 * float(np.mean(short))
         tried.append(Tried(values, tuple(verdicts), missed))
         return missed
 
@@ -416,6 +433,14 @@ def search(
     best = min(tried, key=lambda one: one.objective)
     found = plan.model_copy(update={"moved": plan.moved.model_copy(update=dict(best.moved))})
     return found, with_front(tried)
+
+
+def tried_report(tried: Sequence[Tried]) -> list[dict[str, Any]]:
+    """Return the plans that no other beats, the one taken first, as JSON values: moves, and what it gives."""
+    front = sorted((one for one in tried if one.on_front), key=lambda one: one.objective)
+    return [
+        {"moved": dict(one.moved), "found": {v.requirement: v.report["found"] for v in one.verdicts}} for one in front
+    ]
 
 
 def with_front(tried: Sequence[Tried]) -> list[Tried]:

@@ -1,7 +1,7 @@
 """A design as files: layers as GeoTIFFs on the later campaign's grid, tracks and footprints, the campaign's config."""
 
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ from apertura.formats.tracks.missions import write_kml
 from apertura.pipeline.config import FLIGHTS
 from apertura.pipeline.config.flight_plan import FlightPlan
 from apertura.pipeline.design.computed import Design
-from apertura.pipeline.design.judgement import report_of
+from apertura.pipeline.design.judgement import Tried, report_of, tried_report
 from apertura.pipeline.design.layers import UNITS
 from apertura.pipeline.steps.coverage import crs_name, place_of, transform_of
 
@@ -33,7 +33,7 @@ _DOTS = 480  # of the longer side of the scene, in footprints
 _VERTICES = 400  # of a track
 
 
-def write_design(design: Design, folder: Path) -> list[Path]:
+def write_design(design: Design, folder: Path, tried: Sequence[Tried] = ()) -> list[Path]:
     """Write layers, tracks, footprints, a map and design.json into a folder; return their paths.
 
     Parameters
@@ -42,6 +42,8 @@ def write_design(design: Design, folder: Path) -> list[Path]:
         As computed on the grid itself.
     folder
         Made where it is not there; files of the same names are replaced.
+    tried
+        Plans that a search tried: those that no other beats are in design.json.
     """
     grid, written = design.opened.scene.grid, list[Path]()
     place = {"transform": Affine(*grid.transform), "crs": grid.crs_wkt}
@@ -61,7 +63,7 @@ def write_design(design: Design, folder: Path) -> list[Path]:
             style = path.with_suffix(".qml")
             (write_mask_style if layer == "mask" else write_layer_style)(style)
             written += [path, style]
-    return [*written, *_write_tracks(design, folder), _write_report(design, folder)]
+    return [*written, *_write_tracks(design, folder), _write_report(design, folder, tried)]
 
 
 PICTURE_TAGS = {"APERTURA_VERSION": __version__, "APERTURA_PLANNED": "true"}
@@ -74,8 +76,8 @@ def tags_of(design: Design) -> dict[str, str]:
     return PICTURE_TAGS | {"APERTURA_PLAN": canonical_json(plan)}
 
 
-def _write_report(design: Design, folder: Path) -> Path:
-    write_json(folder / "design.json", report_of(design))
+def _write_report(design: Design, folder: Path, tried: Sequence[Tried]) -> Path:
+    write_json(folder / "design.json", report_of(design) | ({"plans": tried_report(tried)} if tried else {}))
     return folder / "design.json"
 
 

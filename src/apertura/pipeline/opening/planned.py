@@ -1,6 +1,7 @@
 """A flight plan, opened: where nodes will be at each pulse, the pairs they make, the grid and the ground."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import combinations, pairwise
 from pathlib import Path
@@ -154,11 +155,19 @@ def open_plan(plan: FlightPlan, root: Path) -> OpenPlan:
     CampaignError
         If a track leads into the ground or beyond the DEM, nodes come too close, or there is nothing to be imaged.
     """
-    try:
+    with errors_of_the_plan():
         return _opened(plan, Campaign(root, plan.settings, plan.image_flights, planned=True))
-    except CampaignError as error:  # its checks are those of a campaign, whose keys are the plan's
+
+
+@contextmanager
+def errors_of_the_plan() -> Iterator[None]:
+    """Raise what a check of campaigns finds as an error of the plan, whose keys are those of the config."""
+    try:
+        yield
+    except CampaignError as error:
         where, expected, remedy = (
-            part.replace(str(CONFIG), "the plan") for part in (error.where, error.expected, error.remedy)
+            part.replace(str(CONFIG), "the plan").replace("the flight log", "the planned track")
+            for part in (error.where, error.expected, error.remedy)
         )
         raise CampaignError(error.found, where, expected, remedy) from error
 
