@@ -150,7 +150,6 @@ reached 26, at 4 cm and with three points; wrong arms of 20 cm reach 250 to 1300
 CHANCES = 6
 """Wrong tracks drawn at random, each of three unknowns, as a lever arm has."""
 
-_LEFT = 1e-9  # power over power of a place from which a point moved away
 _STAGES = 2  # of caching contributions and sharpening
 
 
