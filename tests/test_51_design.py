@@ -1,5 +1,6 @@
 """From a ground station's mission to a decision: `apertura design`, `init --from` and `compare` as people type them."""
 
+import copy
 import json
 import sys
 
@@ -139,7 +140,7 @@ def test_a_scene_beyond_the_dem_is_one_message(folder, monkeypatch, capsys):
 @pytest.mark.slow
 def test_what_was_predicted_is_measured_after_the_same_plan_was_sampled_and_processed(tmp_path, monkeypatch, capsys):
     """Widths within 5 %, NESZ and SNR within 1 dB: 256 pulses measure their noise to 0.4 dB."""
-    document = PLAN | {"flights": {"f01": PLAN["flights"]["f01"] | {"tracks": {"uav1": LINE}}}}
+    document = copy.deepcopy(PLAN) | {"flights": {"f01": PLAN["flights"]["f01"] | {"tracks": {"uav1": LINE}}}}
     design = designed(FlightPlan.model_validate(document), tmp_path)
     campaign = run_steps(rehearse(design.opened, [PointTarget((0.0, 0.0, 0.0))], tmp_path / "flown"), exports=False)
     planned, grid = design.images["f01/uav1-uav1"].layers, open_scene(campaign).grid
@@ -152,6 +153,12 @@ def test_what_was_predicted_is_measured_after_the_same_plan_was_sampled_and_proc
     status, out, err = typed(monkeypatch, capsys, "compare", tmp_path / "plan.yaml", tmp_path / "flown")
     assert (status, err) == (0, "")
     assert "measured in the image" in out
+    assert "another radar" not in out
+    document["waveform"]["carrier_hz"] = 1.2e9
+    (tmp_path / "plan.yaml").write_text(yaml.safe_dump(document))
+    _, out, _ = typed(monkeypatch, capsys, "compare", tmp_path / "plan.yaml", tmp_path / "flown")
+    assert "another radar: waveform.carrier_hz: 1.2e+09 planned, 1.3e+09 in the campaign" in out
+    document["waveform"]["carrier_hz"] = PLAN["waveform"]["carrier_hz"]
     from apertura.pipeline.steps.layers import layers
 
     layers(campaign, "f01", "uav1-uav1")

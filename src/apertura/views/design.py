@@ -347,7 +347,18 @@ def print_comparison(path: Path, folder: Path, *, threads: int = 1) -> None:
     campaign.check_images()
     rows = comparison_rows(plan, path.absolute().parent, campaign, threads=threads)
     head = ("image", "quantity", "planned", "flown, by the logs", "measured in the image")
-    Console(width=max(120, Console().width)).print(_table("planned and flown", head, rows))
+    console = Console(width=max(120, Console().width))
+    console.print(_table("planned and flown", head, rows))
+    for line in _other_radar(plan, campaign):
+        console.print(f"[yellow]another radar[/yellow]: {line}", highlight=False)
+
+
+def _other_radar(plan: FlightPlan, campaign: Campaign) -> Iterator[str]:
+    """Yield numbers of the waveform in which a campaign is not what was planned."""
+    planned, flown = (one.model_dump() for one in (plan.waveform, campaign.settings.waveform))
+    for key, value in planned.items():
+        if isinstance(value, int | float) and flown.get(key) != value:
+            yield f"waveform.{key}: {_value(value)} planned, {_value(flown.get(key)) or 'none'} in the campaign"
 
 
 def comparison_rows(plan: FlightPlan, root: Path, campaign: Campaign, *, threads: int = 1) -> list[tuple[str, ...]]:
