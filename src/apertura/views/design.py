@@ -151,8 +151,9 @@ def _digits(value: float) -> str:
 def interferogram_lines(design: Design) -> Iterator[str]:
     """Yield coherence and height of ambiguity in the middle of each interferogram."""
     for name, layers in design.interferograms.items():
-        told = [f"{layer} {np.nanmedian(values):.3g} {UNITS[layer][0]}" for layer, values in layers.items()]
-        yield f"{name}: {', '.join(told)}".replace(" 1,", ",")
+        units = {layer: "" if UNITS[layer][0] == "1" else f" {UNITS[layer][0]}" for layer in layers}
+        told = [f"{layer} {np.nanmedian(values):.3g}{units[layer]}" for layer, values in layers.items()]
+        yield f"{name}: {', '.join(told)}"
 
 
 def verdict_row(verdict: Verdict) -> tuple[str, ...]:
@@ -197,13 +198,16 @@ def recording_lines(design: Design) -> Iterator[str]:
     )
 
 
+def _given(change: Change) -> str:
+    return ", ".join(f"{name} {value:.4g}" for name, value in change.found.items())
+
+
 def change_lines(changes: Sequence[Change]) -> Iterator[str]:
     """Yield the single changes that help most."""
     for number, change in enumerate(changes[:_MOST_CHANGES], 1):
-        found = ", ".join(f"{name} {value:.4g}" for name, value in change.found.items())
         then = ", all met" if change.meets else ""
         then += f", but then not met: {', '.join(change.breaks)}" if change.breaks else ""
-        yield f"{number}. {change.words}: {change.gain_db:.2g} dB nearer{then} ({found})"
+        yield f"{number}. {change.words}: {change.gain_db:.2g} dB nearer{then} ({_given(change)})"
 
 
 def _blocks(
@@ -225,7 +229,7 @@ def _blocks(
                     change.words,
                     f"{change.gain_db:.2g} dB",
                     "yes" if change.meets else ", nor ".join(("no", *change.breaks)),
-                    ", ".join(f"{name} {value:.4g}" for name, value in change.found.items()),
+                    _given(change),
                 )
                 for change in changes[:_MOST_CHANGES]
             ],
