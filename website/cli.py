@@ -12,10 +12,11 @@ from apertura.views.cli import app
 _HEAD = """# Command line
 
 `apertura COMMAND --help` says the same. Exit codes: 0, done; 2, something for you to fix, in one message;
-130, ended by a signal; 1, what `verify`, `diff` or `reproduce` compared is
-not the same, or a defect of apertura. A campaign folder that is not named is the one in hand.
-Written by `make pages` from the commands.
+130, ended by a signal; 1, what `verify`, `diff` or `reproduce` compared is not the same, or a defect of apertura.
+`[campaign]` is a campaign folder; without it, the one in hand. Written by `make pages` from the commands.
 """
+_SAID_ABOVE = {"campaign folder, else the one in hand"}
+"""What the head says once for all commands."""
 
 
 def cli_page() -> str:
@@ -36,7 +37,8 @@ def _sections(command: Any, context: typer.Context, level: int) -> Iterator[str]
     commands = {name: command.get_command(context, name) for name in names}
     if level == 2 and commands:
         yield "\nOptions: `--help` of each.\n\n| command | what it does |\n|---|---|\n"
-    rows = [] if commands else [_row(one, context) for one in command.params if not getattr(one, "hidden", False)]
+    shown = [] if commands else [one for one in command.params if not getattr(one, "hidden", False)]
+    rows = [_row(one, context) for one in shown if getattr(one, "help", None) not in _SAID_ABOVE]
     if rows:
         yield "\n| argument or option | what it is |\n|---|---|\n" + "".join(rows)
     for name, one in sorted(commands.items(), key=lambda item: hasattr(item[1], "commands")):
