@@ -7,11 +7,11 @@ from apertura.common.flag_table import FLAGS
 _HEAD = """# Flags
 
 A flag says that a limit of a method was crossed, and what was measured; it never stops a run. It stands in `image.json`
-under `flags`, in the attributes of stages and of `ap.backproject`, in the tag `APERTURA_FLAGS`, below quicklooks, and
-in `apertura summary`. Written by `make pages` from `FLAGS` of `apertura.common.flag_table`; limits: [theory](theory.md).
+under `flags`, in the attributes of stages and of `ap.backproject`, in the tag `APERTURA_FLAGS`, below quicklooks and in
+`apertura summary`. Here: *what was measured*; what it means → what to look at first. In the order in which a recording
+becomes an image, those of a bench first. Limits: [theory](theory.md). Written by `make pages` from
+`apertura.common.flag_table`.
 
-| flag | what was measured | what it means | what to look at first |
-|---|---|---|---|
 """
 
 _PAGE = re.compile(r"\bdocs/([\w/]*?(\w+)\.md)")
@@ -20,11 +20,10 @@ _NAME = re.compile(r"(?<![\w/(.-])((?:[\w]+[./])+[\w<>]+(?:\.[\w<>]+)*|\w+_\w+|-
 
 def flags_page() -> str:
     """Return docs/flags.md."""
-    rows = [
-        f"| `{name}` | {_marked(flag.measured)} | {_marked(flag.means)} | {_marked(flag.look)} |\n"
+    return _HEAD + "".join(
+        f"- **`{name}`** *{_marked(flag.measured)}*; {_marked(flag.means)} → {_marked(flag.look)}\n"
         for name, flag in FLAGS.items()
-    ]
-    return _HEAD + "".join(rows)
+    )
 
 
 def _marked(text: str) -> str:
