@@ -28,11 +28,10 @@ def cli_page() -> str:
 
 
 def _section(command: Any, context: typer.Context) -> str:
-    usage = " ".join(command.get_usage(context).split()).removeprefix("Usage: ")
+    usage = " ".join(command.get_usage(context).split()).removeprefix("Usage: ").replace(" [OPTIONS]", "")
     params = [one for one in command.params if not getattr(one, "hidden", False)]
     lines = [_line(one, context) for one in params if getattr(one, "help", None) not in _SAID_ABOVE]
-    told = f"\n## {context.command_path}\n\n{_told(command.help)}\n\n    {usage}\n"
-    return told + ("\n" + "".join(lines) if lines else "")
+    return f"\n## `{usage}`\n\n{_told(command.help)}\n" + ("\n" + "".join(lines) if lines else "")
 
 
 def _line(one: Any, context: typer.Context) -> str:

@@ -44,8 +44,7 @@ _OF_RECORDINGS = {
         "pulses paired, of the shorter recording", "less than half of the shorter recording found a partner",
         "flights and nodes in flights.tsv; missed triggers", "core/echo/association.py"),
     "frame_counter_conflict": Flag(
-        "pulses dropped", "frame counter and time tags disagree there", "the counter's bits",
-        "core/echo/association.py"),
+        "pulses dropped", "frame counter and time tags disagree", "the counter's bits", "core/echo/association.py"),
     "time_tags_apart": Flag(
         "distance of the nodes' tags, s and m flown", "tags are more than 20 ms apart: positions are of another moment",
         "the time system of a node", "core/echo/association.py"),
@@ -57,8 +56,8 @@ _OF_RECORDINGS = {
         "more than 5 % of the transmitter's pulses lie outside the other recording",
         "start and end of recordings; tags late by whole intervals", "core/echo/association.py"),
     "fix_poor": Flag(
-        "pulses dropped, of all, per node", "the log's solution is poorer than asked there",
-        "the log; nodes.<n>.worst_fix", "pipeline/opening/positions.py"),
+        "pulses dropped, of all, per node", "the log's solution is poorer than asked", "the log; nodes.<n>.worst_fix",
+        "pipeline/opening/positions.py"),
     "alignment_ambiguous": Flag(
         "the other offset, and how many dB it is worse", "another clock offset focuses nearly as well, or all do",
         "a reflector (apertura align --point); changes of speed", "methods/synchronisation/clock_alignment.py"),
@@ -147,8 +146,9 @@ _OF_RECORDINGS = {
         "dB of ripple over the band that stay", "ripple of the transmitter stays after the correction",
         "processing.sidelink", "core/echo/sidelink.py"),
     "sidelink_ripple_or_echo": Flag(
-        "dB and m of the arrival beside the direct path", "it may be an echo: paths and phases may err by so much",
-        "reflections at the sidelink antenna", "core/echo/sidelink_state.py"),
+        "dB and m of the arrival beside the direct path",
+        "the arrival may be an echo: paths and phases may err by so much", "reflections at the sidelink antenna",
+        "core/echo/sidelink_state.py"),
     "sidelink_code": Flag(
         "the correction asked for", "the sidelink lacks the code that the correction needs", "waveform.codes",
         "core/echo/sidelink.py"),
@@ -192,7 +192,8 @@ _OF_IMAGES = {
         "m below the lowest ground of the scene", "an antenna is lower than all of the DEM beside it",
         "unit and datum of scene.dem", "core/scene/clearance.py"),
     "outside_swath": Flag(
-        "share of the scene, and the integration angle", "no pulse passes it inside the integration angle: no data",
+        "share of the scene, and the integration angle",
+        "no pulse passes part of the scene inside the integration angle: no data",
         "scene.bounds_m; processing.integration", "core/planning/decisions.py"),
     "integration_turns": Flag(
         "angle that places are seen under, integration angle",
@@ -210,17 +211,18 @@ _OF_IMAGES = {
         "core/planning/plan.py"),
     "pulses_missing": Flag(
         "missing pulses, of all in the aperture, and dB of their sidelobes",
-        "their sidelobes along the track exceed −20 dB", "pulses of the echo: what was dropped and why",
+        "sidelobes of missing pulses along the track exceed −20 dB", "pulses of the echo: what was dropped and why",
         "core/echo/association.py"),
     "beyond_cyclic_prefix": Flag(
         "share of the scene that arrives too late",
-        "its echoes come after the prefix, or the listening time, of every pulse", "scene.bounds_m",
+        "echoes of part of the scene come after the prefix, or the listening time, of every pulse", "scene.bounds_m",
         "core/planning/plan.py"),
     "scene_beyond_samples": Flag(
         "share of the scene's total paths", "from Python: profiles do not cover the scene",
         "how the profiles were cropped", "core/imaging/job.py"),
     "beam_misses": Flag(
-        "share of the scene", "no antenna beam sees it", "boresights; scene.bounds_m", "core/antenna/illumination.py"),
+        "share of the scene", "no antenna beam sees part of the scene", "boresights; scene.bounds_m",
+        "core/antenna/illumination.py"),
     "antenna_phase": Flag(
         "dB that a point loses, cm that it is off", "the phase of antenna patterns changes over the aperture",
         "lever_arms_m, to the phase centre; phase_deg of the pattern", "core/quality/budget.py"),
@@ -294,7 +296,7 @@ _OF_IMAGES = {
         "constant or phase changed by over three standard deviations",
         "cables, gains, temperature; what the antennas point at", "pipeline/opening/reflectors.py"),
     "reflectors_disagree": Flag(
-        "reflectors, sum of squares, its chance", "they disagree: the constant's standard deviation was widened",
+        "reflectors, sum of squares, its chance", "reflectors disagree: the constant's standard deviation was widened",
         "places, sizes, orientation of reflectors; other echoes; antenna patterns", "pipeline/opening/reflectors.py"),
     "constant_disagrees": Flag(
         "dB between the radio stated and the constant measured, in standard deviations",
