@@ -38,6 +38,7 @@ def _line(one: Any, context: typer.Context) -> str:
     names, told = one.get_help_record(context) or ("", "")
     if one.name == "cores":  # as many as the machine has, which is no property of the command
         told = re.sub(r"\[default: \d+", "[default: all of the machine", told)
+    names = re.sub(r" <(?:path|str|int|(?:int|float) range)>", "", names)  # the text says what it is
     return f"- `{_one_line(names)}`: {_plain(told)}\n"
 
 

@@ -6,11 +6,9 @@ from apertura.common.flag_table import FLAGS
 
 _HEAD = """# Flags
 
-A flag says that a limit of a method was crossed, and what was measured; it never stops a run. It stands in `image.json`
-under `flags`, in the attributes of stages and of `ap.backproject`, in the tag `APERTURA_FLAGS`, below quicklooks and in
-`apertura summary`. Here: *what was measured*; what it means → what to look at first. In the order in which a recording
-becomes an image, those of a bench first. Limits: [theory](theory.md). Written by `make pages` from
-`apertura.common.flag_table`.
+A flag says that a limit of a method was crossed, and what was measured; it stops no run. It stands in `image.json`,
+`image.attrs["flags"]`, the tag `APERTURA_FLAGS`, below quicklooks and in `apertura summary`. Here: *what was measured*;
+what it means → what to look at first. Limits: [theory](theory.md). Written by `make pages`.
 
 """
 

@@ -49,26 +49,25 @@ _OF_RECORDINGS = {
         "distance of the nodes' tags, s and m flown", "tags are more than 20 ms apart: positions are of another moment",
         "the time system of a node", "core/echo/association.py"),
     "time_tag_outlier": Flag(
-        "pulses dropped, of all, and how far their tags are off", "single tags leave the line through all",
-        "triggers of both nodes", "core/echo/association.py"),
+        "pulses dropped, how far tags are off", "single tags leave the line through all", "triggers of both nodes",
+        "core/echo/association.py"),
     "pulses_unpaired": Flag(
-        "the transmitter's pulses before and after the other recording",
-        "more than 5 % of the transmitter's pulses lie outside the other recording",
+        "such pulses, before and after", "more than 5 % of the transmitter's pulses lie outside the other recording",
         "start and end of recordings; tags late by whole intervals", "core/echo/association.py"),
     "fix_poor": Flag(
-        "pulses dropped, of all, per node", "the log's solution is poorer than asked", "the log; nodes.<n>.worst_fix",
+        "pulses dropped, per node", "the log's solution is poorer than asked", "the log; nodes.<n>.worst_fix",
         "pipeline/opening/positions.py"),
     "alignment_ambiguous": Flag(
-        "the other offset, and how many dB it is worse", "another clock offset focuses nearly as well, or all do",
+        "the other offset, dB that it is worse", "another clock offset focuses nearly as well, or all do",
         "a reflector (apertura align --point); changes of speed", "methods/synchronisation/clock_alignment.py"),
     "alignment_at_edge": Flag(
-        "the offset, and the range of those tried", "the best clock offset lies at an end of those tried", "--search-s",
+        "the offset, the range tried", "the best clock offset lies at an end of those tried", "--search-s",
         "methods/synchronisation/clock_alignment.py"),
     "alignment_uncertain": Flag(
         "dB of the best offset above the others", "the best clock offset hardly stands out",
         "place of the point; path; which log belongs to the recording", "methods/synchronisation/clock_alignment.py"),
     "scans_incomplete": Flag(
-        "scans left out, of all", "messages of scans are missing, damaged or cut off", "the recorder, or the copy",
+        "scans left out", "messages of scans are missing, damaged or cut off", "the recorder, or the copy",
         "formats/phase_histories/pulson.py"),
     "sweep_motion": Flag(
         "wavelengths of path per sweep, m that echoes are off",
@@ -78,17 +77,17 @@ _OF_RECORDINGS = {
         "epochs left out, by reason", "epochs without a fix, damaged or doubled",
         "the log, if track_gap comes with it; else nothing", "pipeline/opening/positions.py"),
     "track_gap": Flag(
-        "pulses dropped, of all, and the longest gap", "the spline does not bridge the log's gap",
-        "the log's rate and losses", "pipeline/opening/positions.py"),
+        "pulses dropped, longest gap", "the spline does not bridge the log's gap", "the log's rate and losses",
+        "pipeline/opening/positions.py"),
     "track_outlier": Flag(
-        "pulses dropped, outliers found, and the worst of them", "epochs of the log stand out, or it has a step",
+        "pulses dropped, outliers, the worst", "epochs of the log stand out, or it has a step",
         "multipath, cycle slips, the log's export", "pipeline/opening/positions.py"),
     "hover": Flag(
-        "pulses dropped, of all, how long the antennas stood, and from when",
+        "pulses dropped, how long the antennas stood",
         "antennas stood still: these pulses would all weigh on one direction",
         "config/segments.tsv, which decides alone where it names the pair", "pipeline/opening/positions.py"),
     "track_frozen": Flag(
-        "pulses dropped, epochs found, and the worst of them", "epochs repeat the position before them",
+        "pulses dropped, epochs, the worst", "epochs repeat the position before them",
         "rate of the receiver against that of the log", "pipeline/opening/positions.py"),
     "track_times": Flag(
         "m along the flight that positions err by", "rounded times of the log displace positions along the flight",
@@ -101,7 +100,7 @@ _OF_RECORDINGS = {
         "scatter of the tags, s rms, and the repetition interval", "single pulses may pair with a neighbour",
         "frame counters", "core/echo/association.py"),
     "association_suspect": Flag(
-        "m by which the sidelink leaves its geometry, and where",
+        "m by which the sidelink leaves its geometry",
         "the sidelink contradicts the geometry: pairs or positions are wrong", "tags, logs, lever arms",
         "core/echo/transfer.py"),
     "reference_point": Flag(
@@ -109,11 +108,9 @@ _OF_RECORDINGS = {
         "CPHD: positions and times of pulses contradict each other", "the file's writer; whether the image is sharp",
         "formats/phase_histories/cphd.py"),
     "saturated_radar": Flag(
-        "share of the samples at the end stops", "samples at the end stops of the converter", "gain",
-        "core/echo/captures.py"),
+        "share of the samples", "samples at the end stops of the converter", "gain", "core/echo/captures.py"),
     "saturated_sidelink": Flag(
-        "share of the samples at the end stops", "samples at the end stops of the converter", "gain",
-        "core/echo/captures.py"),
+        "share of the samples", "samples at the end stops of the converter", "gain", "core/echo/captures.py"),
     "code_unconfirmed": Flag(
         "dB of the strongest echo above what lies beyond the prefix",
         "own echoes repeat, yet do not gather inside the prefix or listening time",
@@ -127,17 +124,15 @@ _OF_RECORDINGS = {
         "the sidelink carries another code: the transmitter's if all its pairs say so, else another transmitter's",
         "waveform.codes; the recording", "core/echo/sidelink_state.py"),
     "sidelink_lost": Flag(
-        "pulses dropped, of all", "pulses without a sidelink were dropped", "blockage, antenna",
-        "core/echo/sidelink_state.py"),
+        "pulses dropped", "pulses without a sidelink were dropped", "blockage, antenna", "core/echo/sidelink_state.py"),
     "second_arrival": Flag(
-        "dB of the second path beside the direct one, and its delay",
-        "a second path is nearly as strong as the direct one", "two transmitters; reflections",
-        "core/echo/sidelink_state.py"),
+        "dB of the second path, its delay", "a second path is nearly as strong as the direct one",
+        "two transmitters; reflections", "core/echo/sidelink_state.py"),
     "sidelink_nulls": Flag(
         "share of subcarriers far below the mean", "parts of the band are attenuated instead of corrected",
         "reflections at the sidelink antenna", "core/echo/sidelink_state.py"),
     "sidelink_noisy": Flag(
-        "SNR of the sidelink, and the SNR needed", "the SNR is below what the correction needs",
+        "SNR of the sidelink, SNR needed", "the SNR is below what the correction needs",
         "processing.sidelink, auto chooses another", "core/echo/sidelink.py"),
     "sidelink_echo": Flag(
         "dB of the echo beside the direct path", "an echo in the sidelink makes ghosts", "processing.sidelink",
@@ -156,7 +151,7 @@ _OF_RECORDINGS = {
         "dB of sidelobes in range beside every point", "the pulse's filter leaves the band uneven: sidelobes in range",
         "waveform.filter, waveform.band_hz", "core/echo/pulse_filter.py"),
     "waveform_noise": Flag(
-        "dB of SNR lost, and the share of the band that lies low",
+        "dB of SNR lost, share of the band that lies low",
         "dividing by the pulse amplifies noise where it has little energy", "waveform.band_hz; waveform.filter",
         "core/echo/pulse_filter.py"),
     "pulse_cut": Flag(
@@ -164,16 +159,16 @@ _OF_RECORDINGS = {
         "captures cut the direct pulse: divide leaves sidelobes and loses energy",
         "waveform.lead_s; the receiver's trigger", "core/echo/pulse_filter.py"),
     "clock_ambiguous": Flag(
-        "carrier offset in Hz, and half a subcarrier", "the carrier offset is close to half a subcarrier",
+        "carrier offset, half a subcarrier, Hz", "the carrier offset is close to half a subcarrier",
         "the receiver's oscillator", "core/echo/clock.py"),
     "clock_uncertain": Flag(
-        "uncertainty of the carrier offset in Hz, and its floor", "the clock is too uncertain for the accuracy asked",
+        "uncertainty of the carrier offset, Hz", "the clock is too uncertain for the accuracy asked",
         "SNR of the sidelink", "core/echo/clock.py"),
     "clock_unmeasured": Flag(
         "why it was not measured", "captures are too short, or the pulse neither repeats nor is divided out",
         "length of captures; processing.sidelink", "core/echo/transfer.py"),
     "calibration_uncertain": Flag(
-        "path offset and its scatter, and what is needed", "the path offset scatters more than an image allows",
+        "path offset, its scatter, what is needed", "the path offset scatters more than an image allows",
         "the reflector; the track", "core/echo/calibration.py"),
     "calibration_ambiguous": Flag(
         "dB and path offset of the second reflector", "a second reflector is nearly as strong", "calibration.search_m",
@@ -186,13 +181,13 @@ _OF_RECORDINGS = {
 
 _OF_IMAGES = {
     "platform_inside_scene": Flag(
-        "pulses above the scene, of all", "the flight passes over the scene: echoes of both sides mix",
-        "scene.bounds_m", "core/planning/plan.py"),
+        "pulses above the scene", "the flight passes over the scene: echoes of both sides mix", "scene.bounds_m",
+        "core/planning/plan.py"),
     "platform_below_scene": Flag(
         "m below the lowest ground of the scene", "an antenna is lower than all of the DEM beside it",
         "unit and datum of scene.dem", "core/scene/clearance.py"),
     "outside_swath": Flag(
-        "share of the scene, and the integration angle",
+        "share of the scene, integration angle",
         "no pulse passes part of the scene inside the integration angle: no data",
         "scene.bounds_m; processing.integration", "core/planning/decisions.py"),
     "integration_turns": Flag(
@@ -200,19 +195,18 @@ _OF_IMAGES = {
         "the track turns or returns: places are sharper in some direction",
         "config/segments.tsv, to image passes apart", "core/planning/decisions.py"),
     "no_aperture": Flag(
-        "m that the antennas moved, and what that resolves", "the antennas hardly moved as the scene sees it: no image",
+        "m that the antennas moved", "the antennas hardly moved as the scene sees it: no image",
         "kind bench in flights.tsv; the flight log; config/segments.tsv", "core/planning/plan.py"),
     "spacing_coarse": Flag(
-        "spacing of pixels, and the finest resolution cell", "pixels are wider than the finest resolution cell",
-        "scene.spacing_m", "core/planning/plan.py"),
+        "spacing, finest resolution cell", "pixels are wider than the finest resolution cell", "scene.spacing_m",
+        "core/planning/plan.py"),
     "pulses_sparse": Flag(
         "spread of phase rates, cycles per pulse; share that folds, its dB",
         "the aperture is undersampled: azimuth ambiguities show", "scene.bounds_m; speed and waveform.prf_hz",
         "core/planning/plan.py"),
     "pulses_missing": Flag(
-        "missing pulses, of all in the aperture, and dB of their sidelobes",
-        "sidelobes of missing pulses along the track exceed −20 dB", "pulses of the echo: what was dropped and why",
-        "core/echo/association.py"),
+        "missing pulses, dB of their sidelobes", "sidelobes of missing pulses along the track exceed −20 dB",
+        "pulses of the echo: what was dropped and why", "core/echo/association.py"),
     "beyond_cyclic_prefix": Flag(
         "share of the scene that arrives too late",
         "echoes of part of the scene come after the prefix, or the listening time, of every pulse", "scene.bounds_m",
@@ -230,15 +224,14 @@ _OF_IMAGES = {
         "error predicted and accuracy asked, dB", "the plan is expected to miss the accuracy asked",
         "engine and options asked for", "core/planning/planner.py"),
     "refinement_rejected": Flag(
-        "dB of contrast gained on places not fitted, its uncertainty, what is required",
+        "dB of contrast gained on places not fitted; what is required",
         "places not fitted did not get sharper beyond doubt, or a track is a wavelength off: the logs are used",
         "position_std_m of the nodes; SNR; docs/howto/refine_tracks.md", "methods/autofocus/evidence.py"),
     "refinement_no_bright_place": Flag(
-        "how far places would have to stand out, and what speckle shows",
-        "no bright place to refine tracks by: the logs are used", "reflectors in the scene; processing.autofocus off",
-        "methods/autofocus/patches.py"),
+        "how far places would have to stand out", "no bright place to refine tracks by: the logs are used",
+        "reflectors in the scene; processing.autofocus off", "methods/autofocus/patches.py"),
     "cause_found": Flag(
-        "what is wrong, by how much, and dB that it explains",
+        "what is wrong, by how much, dB explained",
         "a wrong constant explains the loss better than errors of the logs: images are formed with it corrected",
         "the constant named: lever_arms_m or attitude, config/clocks.tsv, scene.height_m",
         "methods/autofocus/causes.py"),
@@ -246,10 +239,10 @@ _OF_IMAGES = {
         "cm of path, and standard deviation", "after refinement pairs show points a constant path apart",
         "nodes.<n>.path_offset_m of the pair's receiver, lever arms", "methods/autofocus/refine.py"),
     "prior_inconsistent": Flag(
-        "how large the motions are against the errors stated", "motions found are much larger or smaller than stated",
+        "motions against the errors stated", "motions found are much larger or smaller than stated",
         "position_std_m, position_correlation_s; lever arms, heights, times", "methods/autofocus/evidence.py"),
     "cycle_slip_suspected": Flag(
-        "parts of the track, and how far off", "parts of the refined track may be a wavelength off",
+        "parts of the track, how far off", "parts of the refined track may be a wavelength off",
         "position_std_m; more bright points", "methods/autofocus/evidence.py"),
     "defocused": Flag(
         "dB lost at bright points, dB that the budget expects",
@@ -266,28 +259,27 @@ _OF_IMAGES = {
         "heights and datum of log and scene; scene.bounds_m; path offsets; waveform.iq: I and Q swapped",
         "core/imaging/focus_check.py"),
     "pairs_apart": Flag(
-        "cm between the points, with uncertainty, east and north",
+        "cm between the points, east and north",
         "a pair shows the same points at other places than most, or as many say one place as the other",
         "the hypothesis named; path offsets, lever arms, scene.height_m", "pipeline/steps/assess.py"),
     "pairs_out_of_phase": Flag(
-        "phase against the pairs that agree, with uncertainty",
+        "phase against the pairs that agree",
         "a pair shows points in another phase than most, or opinions are even: the sum leaves it out",
         "path offsets; processing.fusion.align_phase", "pipeline/steps/assess.py"),
     "pair_left_out": Flag(
-        "the pair, why, and the phase that would align it", "the coherent sum is without that pair",
+        "the pair, why, the phase that would align it", "the coherent sum is without that pair",
         "the flags of that pair; processing.fusion.align_phase", "pipeline/steps/export.py"),
     "phase_unmeasured": Flag(
         "the pair, why, dB that a wrong phase costs",
         "no image tells the phase of a pair in the coherent sum: if wrong, targets split",
-        "a reflector in the scene; a calibration flight for the path offsets", "pipeline/steps/export.py"),
+        "a reflector in the scene; a calibration flight", "pipeline/steps/export.py"),
     "sum_incoherent": Flag(
         "share of power in phase at bright points, dB lost",
         "pairs of the coherent sum are not in phase: its peaks are weaker than theirs",
         "pairs_out_of_phase, phase_unmeasured; positions; processing.fusion.align_phase", "pipeline/steps/export.py"),
     "flights_apart": Flag(
-        "cm between the points, with uncertainty, east and north",
-        "two flights show the same points at different places", "base station, datum, time system of one flight",
-        "pipeline/steps/cube.py"),
+        "cm between the points, east and north", "two flights show the same points at different places",
+        "base station, datum, time system of one flight", "pipeline/steps/cube.py"),
     "pair_unconfirmed": Flag(
         "bright points in common", "a pair shows none of the bright points of another",
         "SNR of its echo; names of its channels", "pipeline/steps/assess.py"),
@@ -309,7 +301,7 @@ _OF_IMAGES = {
         "nodes.<n>.receiver: gain_db, full_scale_dbm or full_scale_v, full_scale_counts, noise_figure_db",
         "pipeline/opening/radiometry.py"),
     "accuracy_missed": Flag(
-        "bound of the error, and the accuracy asked, dB", "at 95 %, the error may exceed the accuracy asked",
+        "bound of the error, accuracy asked, dB", "at 95 %, the error may exceed the accuracy asked",
         "processing.accuracy_db, processing.engine", "core/imaging/certify.py, core/imaging/backproject.py"),
     "interferogram_decorrelated": Flag(
         "pixels more coherent than chance; coherence, chance, what geometry leaves",
@@ -342,7 +334,7 @@ _OF_BENCHES = {
         "pulses not recorded, of those due", "more than 1 % of the pulses started no capture",
         "trigger level and cable; the recorder's disk", "methods/synchronisation/channels.py"),
     "triggers_false": Flag(
-        "captures between two pulses, of all", "something other than the radar's pulses triggered the recorder",
+        "captures between two pulses", "something other than the radar's pulses triggered the recorder",
         "trigger level; interference; waveform.prf_hz", "methods/synchronisation/channels.py"),
     "channel_weak": Flag(
         "counts rms of a channel", "the converter hardly sees a signal: quantisation adds noise",
@@ -363,14 +355,14 @@ _OF_BENCHES = {
         "dB of a compressed pulse", "the path hardly stands out of the noise",
         "attenuators, cables, gain; which channel is which", "methods/synchronisation/links.py"),
     "link_incoherent": Flag(
-        "Γ, what noise allows, and phase noise beyond it",
+        "Γ, what noise allows, phase noise beyond",
         "the phase of the path scatters by more than noise: images lose as much",
         "clock of both channels; sidelink; connectors", "methods/synchronisation/links.py"),
     "link_drifts": Flag(
         "phase and delay over the recording", "path or delay changes while nothing moves",
         "warm-up of cables, amplifiers, filters: wait, or calibrate again", "methods/synchronisation/links.py"),
     "delay_jumps": Flag(
-        "pulses at another delay, and how far off",
+        "pulses at another delay, how far off",
         "delays jump while nothing moves: captures begin elsewhere, or another path",
         "trigger of the transmitter; cables; two equal reflectors", "methods/synchronisation/links.py"),
     "interference": Flag(
@@ -395,10 +387,10 @@ _OF_BENCHES = {
         "ppm over the recording", "the clock moves during the recording", "warm-up; lock of the node's reference",
         "methods/synchronisation/links.py"),
     "path_disagrees": Flag(
-        "path beyond the set-up, and the config's", "the config's path offset is not what was measured",
+        "path beyond the set-up, the config's", "the config's path offset is not what was measured",
         "nodes.<n>.path_offset_m; bench.radar_m, bench.sidelink_m", "methods/synchronisation/links.py"),
     "split_disagrees": Flag(
-        "gain, phase, and both over the band", "two channels fed by one signal differ",
+        "gain and phase over the band", "two channels fed by one signal differ",
         "splitter and cables; filters of both channels; path offsets", "methods/synchronisation/links.py"),
 }  # fmt: skip
 """Name → what it says; see `apertura.common.flags.FLAGS`."""
