@@ -1,7 +1,7 @@
 """A whole flight, step by step: wall and CPU seconds, peak memory, and rates beside a plain read and a plain FFT.
 
 ``python benchmarks/flight.py WORK --minutes 1 3 10`` simulates `--preset flight` of each length into WORK where it is
-not there yet (13 GB for ten minutes), runs every step alone, and prints a table; docs/long_flights.md has one.
+not there yet (13 GB for ten minutes), runs every step alone, and prints a table (docs/howto/long_flights.md).
 """
 
 import argparse

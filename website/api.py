@@ -4,8 +4,8 @@ import apertura
 
 _HEAD = """# Python
 
-Every public name of the package, which is `ap` throughout these pages, with shape, unit and frame of what it takes and
-gives. The examples run as tests. Written by `make pages` from the names that `src/apertura/__init__.py` gives.
+Every public name, with shape, unit and frame of what it takes and gives. The examples run as tests. Written by
+`make pages`.
 """
 
 _GROUPS = {

@@ -6,18 +6,10 @@ from apertura.common.flag_table import FLAGS
 
 _HEAD = """# Flags
 
-A flag says that a limit of a method was crossed and what was measured, in one line: in `image.json` under `flags`,
-in the attributes of stages and of `ap.backproject`, in the tag `APERTURA_FLAGS` of its files, below its quicklook, in
-the table that closes a run. It never stops a run. Without one, no known limit was crossed.
+A flag says that a limit of a method was crossed, and what was measured; it stops no run. It stands in `image.json`,
+`image.attrs["flags"]`, the tag `APERTURA_FLAGS`, below quicklooks and in `apertura summary`. Here: *what was measured*;
+what it means → what to look at first. Limits: [theory](theory.md). Written by `make pages`.
 
-| flag | what was measured | what it means | what to look at first |
-|---|---|---|---|
-"""
-
-_FOOT = """
-Limits and how they follow: [echo methods](theory/echo_methods.md), [tracks](theory/tracks.md),
-[planner](theory/planner.md), [terrain](theory/terrain.md), [waveforms](theory/waveforms.md),
-[FMCW](theory/fmcw.md), [focus](theory/focus.md). Written by `make pages` from `FLAGS` of `apertura.common.flag_table`.
 """
 
 _PAGE = re.compile(r"\bdocs/([\w/]*?(\w+)\.md)")
@@ -26,11 +18,10 @@ _NAME = re.compile(r"(?<![\w/(.-])((?:[\w]+[./])+[\w<>]+(?:\.[\w<>]+)*|\w+_\w+|-
 
 def flags_page() -> str:
     """Return docs/flags.md."""
-    rows = [
-        f"| `{name}` | {_marked(flag.measured)} | {_marked(flag.means)} | {_marked(flag.look)} |\n"
+    return _HEAD + "".join(
+        f"- **`{name}`** *{_marked(flag.measured)}*; {_marked(flag.means)} → {_marked(flag.look)}\n"
         for name, flag in FLAGS.items()
-    ]
-    return _HEAD + "".join(rows) + _FOOT
+    )
 
 
 def _marked(text: str) -> str:

@@ -37,120 +37,102 @@ class Flag:
 
 _OF_RECORDINGS = {
     "association_ambiguous": Flag(
-        "how far the tags of the two nodes are apart, in s and in repetition intervals",
-        "time tags are nearly half a repetition interval apart: every pair may be off by one pulse",
-        "frame counters; the nodes' clocks", "core/echo/association.py"),
+        "distance of the nodes' tags, s and intervals",
+        "tags are nearly half an interval apart: pairs may be off by one pulse", "frame counters; the nodes' clocks",
+        "core/echo/association.py"),
     "association_sparse": Flag(
-        "pulses paired, of those of the shorter recording", "less than half of the shorter recording found a partner",
+        "pulses paired, of the shorter recording", "less than half of the shorter recording found a partner",
         "flights and nodes in flights.tsv; missed triggers", "core/echo/association.py"),
     "frame_counter_conflict": Flag(
-        "pulses dropped", "frame counter and time tags disagree at some pulses, which were dropped",
-        "the counter's bits", "core/echo/association.py"),
+        "pulses dropped", "frame counter and time tags disagree", "the counter's bits", "core/echo/association.py"),
     "time_tags_apart": Flag(
-        "how far the tags of the two nodes are apart, in s and in m flown",
-        "tags of the two nodes are more than 20 ms apart: positions are those of another moment",
+        "distance of the nodes' tags, s and m flown", "tags are more than 20 ms apart: positions are of another moment",
         "the time system of a node", "core/echo/association.py"),
     "time_tag_outlier": Flag(
-        "pulses left out, of all, and how far their tags are off",
-        "single tags leave the line through all; their pulses were dropped", "triggers of both nodes",
+        "pulses dropped, how far tags are off", "single tags leave the line through all", "triggers of both nodes",
         "core/echo/association.py"),
     "pulses_unpaired": Flag(
-        "pulses of the transmitter before and after the other recording",
-        "more than 5 % of the transmitter's pulses lie before or after the other recording",
+        "such pulses, before and after", "more than 5 % of the transmitter's pulses lie outside the other recording",
         "start and end of recordings; tags late by whole intervals", "core/echo/association.py"),
     "fix_poor": Flag(
-        "pulses left out, of all, per node", "pulses were dropped where the log's solution is poorer than asked",
-        "the log; nodes.<n>.worst_fix", "pipeline/opening/positions.py"),
+        "pulses dropped, per node", "the log's solution is poorer than asked", "the log; nodes.<n>.worst_fix",
+        "pipeline/opening/positions.py"),
     "alignment_ambiguous": Flag(
-        "the other offset, and how many dB it is worse", "another clock offset focuses nearly as well, or all do",
-        "a reflector (apertura align --point), a flight with changes of speed",
-        "methods/synchronisation/clock_alignment.py"),
+        "the other offset, dB that it is worse", "another clock offset focuses nearly as well, or all do",
+        "a reflector (apertura align --point); changes of speed", "methods/synchronisation/clock_alignment.py"),
     "alignment_at_edge": Flag(
-        "the offset, and the range of those tried", "the best clock offset lies at an end of those tried",
-        "--search-s", "methods/synchronisation/clock_alignment.py"),
-    "alignment_uncertain": Flag(
-        "how many dB the best offset stands above the others", "the best clock offset hardly stands out",
-        "the place of the point, the path, or which log belongs to the recording",
+        "the offset, the range tried", "the best clock offset lies at an end of those tried", "--search-s",
         "methods/synchronisation/clock_alignment.py"),
+    "alignment_uncertain": Flag(
+        "dB of the best offset above the others", "the best clock offset hardly stands out",
+        "place of the point; path; which log belongs to the recording", "methods/synchronisation/clock_alignment.py"),
     "scans_incomplete": Flag(
-        "scans left out, of all",
-        "scans of the radar of which a message is missing or damaged, or in which the file ends, were left out",
-        "the recorder, or the copy", "formats/phase_histories/pulson.py"),
+        "scans left out", "messages of scans are missing, damaged or cut off", "the recorder, or the copy",
+        "formats/phase_histories/pulson.py"),
     "sweep_motion": Flag(
-        "wavelengths of path within a sweep, and m that echoes are off",
-        "antennas move so far while frequency is swept that envelopes of echoes are elsewhere than their phases say",
-        "waveform.sweep_s; fly slower or stand still while sweeping", "core/echo/dechirp.py"),
+        "wavelengths of path per sweep, m that echoes are off",
+        "antennas move within a sweep: envelopes and phases of echoes disagree",
+        "waveform.sweep_s; fly slower, or stand while sweeping", "core/echo/dechirp.py"),
     "track_epochs_dropped": Flag(
-        "epochs left out, by reason", "epochs of the log were left out: without a fix, damaged, doubled",
-        "nothing where track_gap does not come with it; else the log", "pipeline/opening/positions.py"),
+        "epochs left out, by reason", "epochs without a fix, damaged or doubled",
+        "the log, if track_gap comes with it; else nothing", "pipeline/opening/positions.py"),
     "track_gap": Flag(
-        "pulses left out, of all, and the longest gap",
-        "pulses were dropped in a gap of the log that a spline does not bridge", "the log's rate and losses",
+        "pulses dropped, longest gap", "the spline does not bridge the log's gap", "the log's rate and losses",
         "pipeline/opening/positions.py"),
     "track_outlier": Flag(
-        "pulses left out, outliers found, and the worst of them",
-        "epochs of the log were not used, or pulses dropped at a step of it",
+        "pulses dropped, outliers, the worst", "epochs of the log stand out, or it has a step",
         "multipath, cycle slips, the log's export", "pipeline/opening/positions.py"),
     "hover": Flag(
-        "pulses left out, of all, how long the antennas stood, and from when",
-        "antennas stood still while pulses were sent: all of these would weigh on one direction",
-        "config/segments.tsv, which decides alone where a pair is named there", "pipeline/opening/positions.py"),
+        "pulses dropped, how long the antennas stood",
+        "antennas stood still: these pulses would all weigh on one direction",
+        "config/segments.tsv, which decides alone where it names the pair", "pipeline/opening/positions.py"),
     "track_frozen": Flag(
-        "pulses left out, epochs found, and the worst of them",
-        "epochs of the log repeat the position before them and were not used",
+        "pulses dropped, epochs, the worst", "epochs repeat the position before them",
         "rate of the receiver against that of the log", "pipeline/opening/positions.py"),
     "track_times": Flag(
-        "m along the flight that positions err by",
-        "times of the log are rounded so that positions err along the flight", "decimals of the log's times",
-        "pipeline/opening/positions.py"),
+        "m along the flight that positions err by", "rounded times of the log displace positions along the flight",
+        "decimals of the log's times", "pipeline/opening/positions.py"),
     "attitude_suspect": Flag(
-        "degrees that yaw is off the course over ground, as logged and by another convention",
-        "angles of the log's attitude look like radians, or are counted anticlockwise: lever arms and beams are turned "
-        "wrongly",
+        "degrees of yaw off the course, as logged and by another convention",
+        "attitude looks like radians, or anticlockwise: lever arms and beams turn wrongly",
         "the log's export; nodes.<n>.attitude course, or none", "pipeline/opening/positions.py"),
     "time_tag_jitter": Flag(
-        "scatter of the tags in s rms, and the repetition interval",
-        "tags scatter so much that single pulses may be paired with a neighbour", "frame counters",
-        "core/echo/association.py"),
+        "scatter of the tags, s rms, and the repetition interval", "single pulses may pair with a neighbour",
+        "frame counters", "core/echo/association.py"),
     "association_suspect": Flag(
-        "m by which the sidelink leaves its geometry, and at which pulse",
-        "the sidelink's path does not move as geometry says: pairs or positions are wrong", "tags, logs, lever arms",
+        "m by which the sidelink leaves its geometry",
+        "the sidelink contradicts the geometry: pairs or positions are wrong", "tags, logs, lever arms",
         "core/echo/transfer.py"),
     "reference_point": Flag(
-        "s and m of path between reception and reference point, of the worst pulse",
-        "CPHD: positions and times of pulses contradict each other, by more than any atmosphere",
-        "who wrote the file; whether the image is sharp", "formats/phase_histories/cphd.py"),
+        "s and m of path between reception and reference point, at worst",
+        "CPHD: positions and times of pulses contradict each other", "the file's writer; whether the image is sharp",
+        "formats/phase_histories/cphd.py"),
     "saturated_radar": Flag(
-        "share of the channel's samples at the end stops", "samples at the end stops of the converter", "gain",
-        "core/echo/captures.py"),
+        "share of the samples", "samples at the end stops of the converter", "gain", "core/echo/captures.py"),
     "saturated_sidelink": Flag(
-        "share of the channel's samples at the end stops", "samples at the end stops of the converter", "gain",
-        "core/echo/captures.py"),
+        "share of the samples", "samples at the end stops of the converter", "gain", "core/echo/captures.py"),
     "code_unconfirmed": Flag(
         "dB of the strongest echo above what lies beyond the prefix",
-        "own echoes repeat from pulse to pulse and do not gather inside the prefix, or the listening time",
+        "own echoes repeat, yet do not gather inside the prefix or listening time",
         "waveform.codes, waveform.pulse; another transmitter", "core/echo/own_pulses.py"),
     "phase_unstable": Flag(
-        "second differences of phase, rad rms, and steadiness of magnitude",
-        "own echoes keep their magnitude from pulse to pulse and not their phase: speckle",
-        "the node's oscillator; which node transmits", "core/echo/own_pulses.py"),
+        "rad rms of second differences of phase; steadiness of magnitude",
+        "own echoes keep their magnitude and not their phase: speckle", "the node's oscillator; which node transmits",
+        "core/echo/own_pulses.py"),
     "wrong_code": Flag(
         "SNR of the sidelink",
-        "the sidelink is there but carries another code: in all pairs of a transmitter if it sent another one, in some "
-        "if their receivers recorded another transmitter",
+        "the sidelink carries another code: the transmitter's if all its pairs say so, else another transmitter's",
         "waveform.codes; the recording", "core/echo/sidelink_state.py"),
     "sidelink_lost": Flag(
-        "pulses dropped, of all", "pulses without a sidelink were dropped", "blockage, antenna",
-        "core/echo/sidelink_state.py"),
+        "pulses dropped", "pulses without a sidelink were dropped", "blockage, antenna", "core/echo/sidelink_state.py"),
     "second_arrival": Flag(
-        "dB of the second path beside the direct one, and its delay",
-        "a second path nearly as strong as the direct one", "two transmitters; reflections",
-        "core/echo/sidelink_state.py"),
+        "dB of the second path, its delay", "a second path is nearly as strong as the direct one",
+        "two transmitters; reflections", "core/echo/sidelink_state.py"),
     "sidelink_nulls": Flag(
         "share of subcarriers far below the mean", "parts of the band are attenuated instead of corrected",
         "reflections at the sidelink antenna", "core/echo/sidelink_state.py"),
     "sidelink_noisy": Flag(
-        "SNR of the sidelink, and the SNR needed", "the SNR is below what the correction needs",
+        "SNR of the sidelink, SNR needed", "the SNR is below what the correction needs",
         "processing.sidelink, auto chooses another", "core/echo/sidelink.py"),
     "sidelink_echo": Flag(
         "dB of the echo beside the direct path", "an echo in the sidelink makes ghosts", "processing.sidelink",
@@ -160,36 +142,33 @@ _OF_RECORDINGS = {
         "processing.sidelink", "core/echo/sidelink.py"),
     "sidelink_ripple_or_echo": Flag(
         "dB and m of the arrival beside the direct path",
-        "what arrives beside the direct path is an echo, or may be one and not the transmitter's ripple: paths "
-        "and phases may be wrong by what is said",
-        "reflections at the sidelink antenna", "core/echo/sidelink_state.py"),
+        "the arrival may be an echo: paths and phases may err by so much", "reflections at the sidelink antenna",
+        "core/echo/sidelink_state.py"),
     "sidelink_code": Flag(
-        "the correction that was asked for", "the correction needs the code, which the sidelink does not carry",
-        "waveform.codes", "core/echo/sidelink.py"),
+        "the correction asked for", "the sidelink lacks the code that the correction needs", "waveform.codes",
+        "core/echo/sidelink.py"),
     "waveform_sidelobes": Flag(
-        "dB of sidelobes in range beside every point",
-        "the pulse's filter leaves the band uneven: energy of every point is scattered in range",
+        "dB of sidelobes in range beside every point", "the pulse's filter leaves the band uneven: sidelobes in range",
         "waveform.filter, waveform.band_hz", "core/echo/pulse_filter.py"),
     "waveform_noise": Flag(
-        "dB of signal to noise ratio lost, and the share of the band that lies low",
-        "dividing by the pulse amplifies noise: parts of the band hold little of its energy",
-        "waveform.band_hz; waveform.filter", "core/echo/pulse_filter.py"),
+        "dB of SNR lost, share of the band that lies low",
+        "dividing by the pulse amplifies noise where it has little energy", "waveform.band_hz; waveform.filter",
+        "core/echo/pulse_filter.py"),
     "pulse_cut": Flag(
-        "pulses whose captures cut the direct one, of all",
-        "captures of a receiver begin in the direct pulse, or end in it: divide leaves sidelobes and loses energy",
+        "pulses whose captures cut the direct one",
+        "captures cut the direct pulse: divide leaves sidelobes and loses energy",
         "waveform.lead_s; the receiver's trigger", "core/echo/pulse_filter.py"),
     "clock_ambiguous": Flag(
-        "carrier offset in Hz, and half a subcarrier", "the carrier offset is close to half a subcarrier",
+        "carrier offset, half a subcarrier, Hz", "the carrier offset is close to half a subcarrier",
         "the receiver's oscillator", "core/echo/clock.py"),
     "clock_uncertain": Flag(
-        "uncertainty of the carrier offset in Hz, and the floor it makes",
-        "the clock is not known well enough for the accuracy asked", "SNR of the sidelink", "core/echo/clock.py"),
+        "uncertainty of the carrier offset, Hz", "the clock is too uncertain for the accuracy asked",
+        "SNR of the sidelink", "core/echo/clock.py"),
     "clock_unmeasured": Flag(
-        "why it was not measured",
-        "captures are too short to measure the clock, or the pulse does not repeat itself and is not divided out",
+        "why it was not measured", "captures are too short, or the pulse neither repeats nor is divided out",
         "length of captures; processing.sidelink", "core/echo/transfer.py"),
     "calibration_uncertain": Flag(
-        "path offset and its scatter, and what is needed", "the path offset scatters more than an image allows",
+        "path offset, its scatter, what is needed", "the path offset scatters more than an image allows",
         "the reflector; the track", "core/echo/calibration.py"),
     "calibration_ambiguous": Flag(
         "dB and path offset of the second reflector", "a second reflector is nearly as strong", "calibration.search_m",
@@ -202,170 +181,149 @@ _OF_RECORDINGS = {
 
 _OF_IMAGES = {
     "platform_inside_scene": Flag(
-        "pulses above the scene, of all", "pulses above the scene: echoes of both sides mix", "scene.bounds_m",
+        "pulses above the scene", "the flight passes over the scene: echoes of both sides mix", "scene.bounds_m",
         "core/planning/plan.py"),
     "platform_below_scene": Flag(
-        "m below the lowest ground of the scene", "an antenna is lower than all of a DEM beside it",
+        "m below the lowest ground of the scene", "an antenna is lower than all of the DEM beside it",
         "unit and datum of scene.dem", "core/scene/clearance.py"),
     "outside_swath": Flag(
-        "share of the scene, and the integration angle",
-        "a part of the scene is passed by no pulse inside the integration angle: it is zero",
+        "share of the scene, integration angle",
+        "no pulse passes part of the scene inside the integration angle: no data",
         "scene.bounds_m; processing.integration", "core/planning/decisions.py"),
     "integration_turns": Flag(
-        "the angle that places are seen under, and the integration angle",
-        "the track turns, or passes places more than once: they are seen under more than the integration angle, "
-        "and are sharper along some direction",
+        "angle that places are seen under, integration angle",
+        "the track turns or returns: places are sharper in some direction",
         "config/segments.tsv, to image passes apart", "core/planning/decisions.py"),
     "no_aperture": Flag(
-        "m that the antennas moved, and what that resolves across the line of sight",
-        "the antennas hardly moved as the scene sees it: there is an echo per range, and no image",
+        "m that the antennas moved", "the antennas hardly moved as the scene sees it: no image",
         "kind bench in flights.tsv; the flight log; config/segments.tsv", "core/planning/plan.py"),
     "spacing_coarse": Flag(
-        "spacing of pixels, and the finest resolution cell", "pixels are wider than the finest resolution cell",
-        "scene.spacing_m", "core/planning/plan.py"),
+        "spacing, finest resolution cell", "pixels are wider than the finest resolution cell", "scene.spacing_m",
+        "core/planning/plan.py"),
     "pulses_sparse": Flag(
-        "spread of phase rates over the scene, cycles per pulse; share of it that folds, and dB of what does",
-        "azimuth ambiguities show: the aperture is undersampled", "scene.bounds_m; speed and waveform.prf_hz",
+        "spread of phase rates, cycles per pulse; share that folds, its dB",
+        "the aperture is undersampled: azimuth ambiguities show", "scene.bounds_m; speed and waveform.prf_hz",
         "core/planning/plan.py"),
     "pulses_missing": Flag(
-        "missing pulses, of all in the aperture, and dB of the sidelobes they raise",
-        "pulses missing inside the aperture, dropped or never recorded, raise sidelobes above −20 dB along the track",
+        "missing pulses, dB of their sidelobes", "sidelobes of missing pulses along the track exceed −20 dB",
         "pulses of the echo: what was dropped and why", "core/echo/association.py"),
     "beyond_cyclic_prefix": Flag(
         "share of the scene that arrives too late",
-        "part of the scene lies beyond the prefix, or the listening time, of every pulse", "scene.bounds_m",
+        "echoes of part of the scene come after the prefix, or the listening time, of every pulse", "scene.bounds_m",
         "core/planning/plan.py"),
     "scene_beyond_samples": Flag(
-        "share of the scene's total paths",
-        "from Python: part of the scene's total paths lies beyond the profiles given", "how the profiles were cropped",
-        "core/imaging/job.py"),
+        "share of the scene's total paths", "from Python: profiles do not cover the scene",
+        "how the profiles were cropped", "core/imaging/job.py"),
     "beam_misses": Flag(
-        "share of the scene", "part of the scene is seen by no antenna beam", "boresights; scene.bounds_m",
+        "share of the scene", "no antenna beam sees part of the scene", "boresights; scene.bounds_m",
         "core/antenna/illumination.py"),
     "antenna_phase": Flag(
-        "dB that a point in the middle of the scene loses by it, and cm that it is off",
-        "the phase of the antennas' patterns changes over the aperture, and is not taken out",
-        "lever_arms_m: to the phase centre, about which a pattern has least phase; phase_deg of the pattern",
-        "core/quality/budget.py"),
+        "dB that a point loses, cm that it is off", "the phase of antenna patterns changes over the aperture",
+        "lever_arms_m, to the phase centre; phase_deg of the pattern", "core/quality/budget.py"),
     "prediction_misses": Flag(
         "error predicted and accuracy asked, dB", "the plan is expected to miss the accuracy asked",
         "engine and options asked for", "core/planning/planner.py"),
     "refinement_rejected": Flag(
-        "dB of contrast gained on places that were not fitted and its uncertainty, and what is required",
-        "tracks, or phases of pulses, refined by the images are not believed: places that were not fitted did "
-        "not get sharper beyond doubt, or parts of the tracks are a wavelength off; images are formed from the logs",
+        "dB of contrast gained on places not fitted; what is required",
+        "places not fitted did not get sharper beyond doubt, or a track is a wavelength off: the logs are used",
         "position_std_m of the nodes; SNR; docs/howto/refine_tracks.md", "methods/autofocus/evidence.py"),
     "refinement_no_bright_place": Flag(
-        "how far places would have to stand out, and what speckle shows",
-        "no bright place to refine tracks by; images are formed from the logs",
+        "how far places would have to stand out", "no bright place to refine tracks by: the logs are used",
         "reflectors in the scene; processing.autofocus off", "methods/autofocus/patches.py"),
     "cause_found": Flag(
-        "what is wrong, by how much, and dB that it explains",
-        "one wrong constant of the config explains what points lost better than errors of the logs do: images are "
-        "formed with it corrected",
+        "what is wrong, by how much, dB explained",
+        "a wrong constant explains the loss better than errors of the logs: images are formed with it corrected",
         "the constant named: lever_arms_m or attitude, config/clocks.tsv, scene.height_m",
         "methods/autofocus/causes.py"),
     "paths_differ": Flag(
-        "cm of path, and standard deviation",
-        "from the refined tracks, pairs show the same points a constant path apart, more than errors of the logs leave",
+        "cm of path, and standard deviation", "after refinement pairs show points a constant path apart",
         "nodes.<n>.path_offset_m of the pair's receiver, lever arms", "methods/autofocus/refine.py"),
     "prior_inconsistent": Flag(
-        "how large the motions are against the errors stated",
-        "motions that the images settle are much larger or smaller than the errors that logs or config state",
+        "motions against the errors stated", "motions found are much larger or smaller than stated",
         "position_std_m, position_correlation_s; lever arms, heights, times", "methods/autofocus/evidence.py"),
     "cycle_slip_suspected": Flag(
-        "parts of the track, and how far off",
-        "parts of the refined track may be a wavelength off: they see points at another range than the whole",
+        "parts of the track, how far off", "parts of the refined track may be a wavelength off",
         "position_std_m; more bright points", "methods/autofocus/evidence.py"),
     "defocused": Flag(
-        "dB lost at bright points, and dB that the budget expects",
+        "dB lost at bright points, dB that the budget expects",
         "bright points lost more than 1 dB of their peak to phase errors",
-        "the hypothesis named behind it; positions, lever arms, heights, times", "core/imaging/focus_check.py"),
+        "the hypothesis named; positions, lever arms, heights, times", "core/imaging/focus_check.py"),
     "loss_unexpected": Flag(
-        "dB lost at bright points, and dB that the budget expects, both with their deviation",
-        "bright points lost less than 1 dB or hardly more, yet more than the budget expects by three deviations, or "
-        "what a cause named for another image of the flight brings back",
-        "nodes.<n>.position_std_m, scene.height_std_m, time_tag_std_s: is what they state true?",
+        "dB lost at bright points, dB expected, with deviations",
+        "the loss is about 1 dB at most, yet three deviations above the budget, or what a cause of another image "
+        "brings back", "are nodes.<n>.position_std_m, scene.height_std_m, time_tag_std_s true?",
         "core/imaging/focus_check.py"),
     "echo_elsewhere": Flag(
         "where the pulses hold the strong echo",
-        "nothing bright in the image, and pulses hold a strong echo: at ranges that the scene does not have, or "
-        "that no place gathers",
+        "pulses hold a strong echo outside the scene's ranges, or that no place gathers",
         "heights and datum of log and scene; scene.bounds_m; path offsets; waveform.iq: I and Q swapped",
         "core/imaging/focus_check.py"),
     "pairs_apart": Flag(
-        "cm between the places of the points, with its uncertainty, east and north",
+        "cm between the points, east and north",
         "a pair shows the same points at other places than most, or as many say one place as the other",
-        "the hypothesis named behind it; path offsets, lever arms, scene.height_m", "pipeline/steps/assess.py"),
+        "the hypothesis named; path offsets, lever arms, scene.height_m", "pipeline/steps/assess.py"),
     "pairs_out_of_phase": Flag(
-        "phase against the pairs that agree, with its uncertainty",
-        "a pair shows the same points in another phase than most, or as many say one phase as the other: it is left "
-        "out of the coherent sum",
+        "phase against the pairs that agree",
+        "a pair shows points in another phase than most, or opinions are even: the sum leaves it out",
         "path offsets; processing.fusion.align_phase", "pipeline/steps/assess.py"),
     "pair_left_out": Flag(
-        "the pair, why, and the phase that would align it",
-        "the coherent sum is without a pair that shows other places, or another phase",
+        "the pair, why, the phase that would align it", "the coherent sum is without that pair",
         "the flags of that pair; processing.fusion.align_phase", "pipeline/steps/export.py"),
     "phase_unmeasured": Flag(
-        "the pair, why nothing tells its phase, and dB that a wrong one costs",
-        "the coherent sum holds a pair whose phase nothing in the images tells: where it is wrong, targets are split",
-        "a reflector in the scene; a calibration flight for the path offsets", "pipeline/steps/export.py"),
+        "the pair, why, dB that a wrong phase costs",
+        "no image tells the phase of a pair in the coherent sum: if wrong, targets split",
+        "a reflector in the scene; a calibration flight", "pipeline/steps/export.py"),
     "sum_incoherent": Flag(
-        "share of their power that the pairs keep in phase at bright points, and dB lost",
-        "the pairs of the coherent sum are not in phase where it shows points: its peaks are weaker than theirs",
+        "share of power in phase at bright points, dB lost",
+        "pairs of the coherent sum are not in phase: its peaks are weaker than theirs",
         "pairs_out_of_phase, phase_unmeasured; positions; processing.fusion.align_phase", "pipeline/steps/export.py"),
     "flights_apart": Flag(
-        "cm between the places of the points, with its uncertainty, east and north",
-        "two flights show the same points at different places", "base station, datum, time system of one flight",
-        "pipeline/steps/cube.py"),
+        "cm between the points, east and north", "two flights show the same points at different places",
+        "base station, datum, time system of one flight", "pipeline/steps/cube.py"),
     "pair_unconfirmed": Flag(
         "bright points in common", "a pair shows none of the bright points of another",
         "SNR of its echo; names of its channels", "pipeline/steps/assess.py"),
     "constant_drifts": Flag(
-        "dB or rad from one flight to another, or since an earlier calibration, and its standard deviation",
-        "the constant or the phase of a pair is not what it was, by more than three standard deviations",
+        "dB or rad between flights or calibrations, standard deviation",
+        "constant or phase changed by over three standard deviations",
         "cables, gains, temperature; what the antennas point at", "pipeline/opening/reflectors.py"),
     "reflectors_disagree": Flag(
-        "reflectors, the sum of squares that they differ by, and how often chance does as much",
-        "reflectors of one calibration say different things: the standard deviation of the constant was widened",
-        "places, sizes and orientation of the reflectors; what else lies in their cells; patterns of the antennas",
-        "pipeline/opening/reflectors.py"),
+        "reflectors, sum of squares, its chance", "reflectors disagree: the constant's standard deviation was widened",
+        "places, sizes, orientation of reflectors; other echoes; antenna patterns", "pipeline/opening/reflectors.py"),
     "constant_disagrees": Flag(
-        "dB between the radio as stated and the constant measured, in standard deviations of both",
-        "what the config states of power, gains and receiver is not what reflectors said; theirs was used",
-        "transmit_power_dbm, gains of antennas, receiver of the nodes", "pipeline/opening/radiometry.py"),
+        "dB between the radio stated and the constant measured, in standard deviations",
+        "the config contradicts the reflectors, whose constant was used", "transmit_power_dbm, antenna gains, receiver",
+        "pipeline/opening/radiometry.py"),
     "noise_disagrees": Flag(
-        "dB of the noise measured against the figure stated (0 dB where none is), or that over the reflectors, ± std",
-        "above: interference, too little gain before the converter, or a gain or full scale stated wrong; below: only "
-        "the latter, and then every cross-section and coefficient is wrong alike",
-        "gain_db, full_scale_dbm or full_scale_v, full_scale_counts and noise_figure_db of nodes.<n>.receiver",
+        "dB of the noise measured against the figure stated, or over the reflectors",
+        "above: interference, too little gain, a wrong gain or full scale; below: the latter, and every cross-section "
+        "is wrong alike",
+        "nodes.<n>.receiver: gain_db, full_scale_dbm or full_scale_v, full_scale_counts, noise_figure_db",
         "pipeline/opening/radiometry.py"),
     "accuracy_missed": Flag(
-        "bound of the error, and the accuracy asked, dB",
-        "the error is not known to be below the accuracy asked, 95 % sure",
+        "bound of the error, accuracy asked, dB", "at 95 %, the error may exceed the accuracy asked",
         "processing.accuracy_db, processing.engine", "core/imaging/certify.py, core/imaging/backproject.py"),
     "interferogram_decorrelated": Flag(
-        "pixels more coherent than chance, of all that both images see; coherence, chance, and what geometry leaves",
-        "most pixels of two images have nothing in common: no phase, no height",
-        "distance of the tracks; what changed between the flights; focus of both images",
+        "pixels more coherent than chance; coherence, chance, what geometry leaves",
+        "two images have little in common: no phase, no height",
+        "distance of the tracks; changes between the flights; focus of both images",
         "methods/interferometry/comparison.py"),
     "height_insensitive": Flag(
-        "pixels where one turn of the phase is more height than the range, of all that both images see",
-        "tracks lie too close together for a height: there is none", "tracks further apart",
-        "methods/interferometry/comparison.py"),
+        "pixels where one turn is more height than the range", "tracks lie too close together to give heights",
+        "tracks further apart", "methods/interferometry/comparison.py"),
     "height_ambiguous": Flag(
-        "pixels in parts apart, or jumps of the phase where nobody unwraps; height of one turn",
-        "heights are known up to multiples of the height of one turn, or left out where parts do not hang together",
+        "pixels in parts apart, or jumps where nobody unwraps; height of one turn",
+        "heights are known up to turns, or left out where parts do not connect",
         "extra unwrap; tracks closer together; a wider interferometry.window_px",
         "methods/interferometry/comparison.py"),
     "unwrapping_inconsistent": Flag(
-        "loops of four pixels around which the phase contradicts itself, of all; places that several pixels show",
-        "the phase changes by more than half a turn per pixel, or is noise: heights may err by whole turns",
+        "loops of four pixels whose phase contradicts itself; places shown twice",
+        "over half a turn per pixel, or noise: heights may err by turns",
         "tracks closer together; a DEM; interferometry.window_px", "methods/interferometry/comparison.py"),
     "height_relative": Flag(
         "that no point of known height shows",
-        "a constant of the phase is not observable: heights count from the terrain, and an error of it changes over "
-        "the scene", "scene.reference_points", "methods/interferometry/comparison.py"),
+        "heights count from the terrain; the error of that varies over the scene", "scene.reference_points",
+        "methods/interferometry/comparison.py"),
 }  # fmt: skip
 """Name → what it says; see `apertura.common.flags.FLAGS`."""
 
@@ -373,71 +331,67 @@ _OF_IMAGES = {
 
 _OF_BENCHES = {
     "triggers_missed": Flag(
-        "pulses not recorded, of all that were due", "more than 1 % of the pulses started no capture",
-        "trigger level and its cable; the recorder's disk", "methods/synchronisation/channels.py"),
+        "pulses not recorded, of those due", "more than 1 % of the pulses started no capture",
+        "trigger level and cable; the recorder's disk", "methods/synchronisation/channels.py"),
     "triggers_false": Flag(
-        "captures between two pulses, of all", "the recorder was triggered by something else than the radar's pulses",
+        "captures between two pulses", "something other than the radar's pulses triggered the recorder",
         "trigger level; interference; waveform.prf_hz", "methods/synchronisation/channels.py"),
     "channel_weak": Flag(
-        "counts rms of a channel", "the converter hardly sees a signal: quantisation adds to its noise",
-        "gain, attenuators, the cable of the channel", "methods/synchronisation/channels.py"),
+        "counts rms of a channel", "the converter hardly sees a signal: quantisation adds noise",
+        "gain, attenuators, the channel's cable", "methods/synchronisation/channels.py"),
     "channel_dc": Flag(
-        "mean of I and Q, dB of the signal", "a constant in the samples: one subcarrier holds it, and all ranges",
+        "mean of I and Q, dB of the signal", "a constant in the samples spoils one subcarrier, and so all ranges",
         "offset of the converter, leakage of the local oscillator", "methods/synchronisation/channels.py"),
     "channel_image": Flag(
         "dB of the mirror image", "I and Q are unequal, or not at 90°: subcarriers leak into their mirror images",
-        "balance of the mixer; clipping of one of both", "methods/synchronisation/channels.py"),
+        "balance of the mixer; clipping of I or Q", "methods/synchronisation/channels.py"),
     "channel_bits_stuck": Flag(
-        "bits of the samples that never change", "the converter or its bus holds a bit: its weight is added or lost",
+        "bits that never change", "the converter or its bus holds a bit",
         "data lines of the converter; the recorder's format", "methods/synchronisation/channels.py"),
     "spectrum_inverted": Flag(
-        "the node", "conjugates of the samples carry the code: I and Q are swapped, or a mixer is above the band",
+        "the node", "I and Q are swapped, or the mixer's oscillator is above the band",
         "order of I and Q in the recorder; the local oscillator's side", "pipeline/opening/bench.py"),
     "link_weak": Flag(
-        "dB of a compressed pulse", "the path is hardly above the noise: no coherence to speak of",
+        "dB of a compressed pulse", "the path hardly stands out of the noise",
         "attenuators, cables, gain; which channel is which", "methods/synchronisation/links.py"),
     "link_incoherent": Flag(
-        "Γ, what noise allows, and phase noise beyond it",
-        "the phase of the path scatters from pulse to pulse by more than noise does: images lose so much",
-        "the clock that feeds both channels; the sidelink's connection; a loose connector",
-        "methods/synchronisation/links.py"),
+        "Γ, what noise allows, phase noise beyond",
+        "the phase of the path scatters by more than noise: images lose as much",
+        "clock of both channels; sidelink; connectors", "methods/synchronisation/links.py"),
     "link_drifts": Flag(
         "phase and delay over the recording", "path or delay changes while nothing moves",
-        "warming up: cables, amplifiers, filters; wait, or calibrate again", "methods/synchronisation/links.py"),
+        "warm-up of cables, amplifiers, filters: wait, or calibrate again", "methods/synchronisation/links.py"),
     "delay_jumps": Flag(
-        "pulses that arrive at another delay, and how far from the others",
-        "pulses arrive at several delays while nothing moves: captures that begin elsewhere, or another path",
-        "trigger of the transmitter; cables that were changed; two reflectors as strong as each other",
-        "methods/synchronisation/links.py"),
+        "pulses at another delay, how far off",
+        "delays jump while nothing moves: captures begin elsewhere, or another path",
+        "trigger of the transmitter; cables; two equal reflectors", "methods/synchronisation/links.py"),
     "interference": Flag(
-        "dB by which one subcarrier changes more than the others, and its frequency",
-        "a narrow signal lies in the band: it adds noise to every range",
-        "other transmitters; spurs of the node's own clocks", "methods/synchronisation/links.py"),
+        "dB of a subcarrier's change above the others', its frequency",
+        "a narrow signal in the band adds noise to every range", "other transmitters; spurs of the node's clocks",
+        "methods/synchronisation/links.py"),
     "contact_loose": Flag(
-        "amplitude beyond noise, from pulse to pulse and over the recording; pulses lost or 6 dB low",
-        "amplitude is not steady while nothing moves",
+        "change of amplitude beyond noise; pulses lost or 6 dB low", "amplitude is not steady while nothing moves",
         "connectors of that channel; supply of the amplifiers", "methods/synchronisation/links.py"),
     "channel_leaks": Flag(
-        "dB of what arrives with the sidelink against the strongest path",
-        "the radar channel hears what the sidelink carries: an echo at short range that is none",
-        "shielding, cables side by side, isolation of the channels", "methods/synchronisation/links.py"),
+        "dB of the sidelink against the strongest path",
+        "the radar channel hears the sidelink: a false echo at short range",
+        "shielding, parallel cables, isolation of the channels", "methods/synchronisation/links.py"),
     "channels_swapped": Flag(
-        "m that the echo arrives before the sidelink", "the strongest echo comes before the direct path",
-        "which channel is radar, which sidelink; bench.radar_m and bench.sidelink_m",
-        "methods/synchronisation/links.py"),
+        "m that the echo precedes the sidelink", "the strongest echo comes before the direct path",
+        "order of the channels; bench.radar_m, bench.sidelink_m", "methods/synchronisation/links.py"),
     "clock_unlocked": Flag(
         "ppm against the transmitter's clock",
-        "the two clocks are not of one reference: samples are corrected by what is measured, if it keeps",
+        "the clocks share no reference: samples are corrected by the offset measured",
         "lock of the node's reference (GNSS, 10 MHz)", "methods/synchronisation/links.py"),
     "clock_drifts": Flag(
-        "ppm over the recording", "the clock moves while it is recorded",
-        "warming up; lock of the node's reference", "methods/synchronisation/links.py"),
+        "ppm over the recording", "the clock moves during the recording", "warm-up; lock of the node's reference",
+        "methods/synchronisation/links.py"),
     "path_disagrees": Flag(
-        "path beyond the set-up, and the config's", "the config's path offset is not what the set-up says",
+        "path beyond the set-up, the config's", "the config's path offset is not what was measured",
         "nodes.<n>.path_offset_m; bench.radar_m, bench.sidelink_m", "methods/synchronisation/links.py"),
     "split_disagrees": Flag(
-        "gain, phase, and both over the band", "two channels that one signal feeds do not show the same",
-        "splitter and cables; filters of the two channels; path offsets", "methods/synchronisation/links.py"),
+        "gain and phase over the band", "two channels fed by one signal differ",
+        "splitter and cables; filters of both channels; path offsets", "methods/synchronisation/links.py"),
 }  # fmt: skip
 """Name → what it says; see `apertura.common.flags.FLAGS`."""
 

@@ -523,7 +523,8 @@ def simulate(
     preset: Annotated[
         str | None,
         typer.Option(
-            help="demo (the default), first-flight, paper, swarm, continuous, paper-lab, paper-static, paper-uav"
+            help="demo (the default), first-flight, paper, swarm, continuous, flight (13.5 GB), "
+            "paper-lab, paper-static, paper-uav"
         ),
     ] = None,
     seed: Annotated[int, typer.Option(help="of the random generator")] = 1,
