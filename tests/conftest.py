@@ -104,6 +104,19 @@ def finished_tiny(_tiny, all_steps):
 
 
 @pytest.fixture(scope="session")
+def run_by_snakemake(_tiny, made_once):
+    """The tiny campaign as `snakemake` itself runs it, each step a process, images in two jobs each; read only."""
+    from folders import copy_writable
+    from test_50_workflow import finished, snakemake
+
+    def run(root):
+        code, output = finished(snakemake(copy_writable(_tiny, root), "all", "pages", "--set-scatter", "tiles=2"))
+        assert code == 0, output
+
+    return made_once("by_snakemake", run)
+
+
+@pytest.fixture(scope="session")
 def finished_sample(shared, all_steps, tmp_path_factory):
     """The independently made campaign-sample with all its results; read only."""
     from folders import copy_writable, state

@@ -5,7 +5,7 @@ import shutil
 from pathlib import Path
 
 import pytest
-from test_50_workflow import finished, snakemake
+from test_50_workflow import apertura, finished
 
 CAMPAIGN = Path(__file__).parents[1] / ".test"
 
@@ -14,7 +14,7 @@ CAMPAIGN = Path(__file__).parents[1] / ".test"
 def test_the_campaign_of_the_catalogue_gives_a_focused_image_without_a_flag(tmp_path):
     ignored = shutil.ignore_patterns("results", ".snakemake")
     root = Path(shutil.copytree(CAMPAIGN, tmp_path / "campaign", ignore=ignored))
-    code, output = finished(snakemake(root))
+    code, output = finished(apertura("run", root))
     assert code == 0, output
     report = json.loads((root / "results/f01/fused/image.json").read_text())
     assert report["flags"] == {}

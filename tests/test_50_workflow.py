@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -43,6 +44,10 @@ def contents(root):
     }
 
 
+TO_IMAGES = ("--until", "image")
+"""What is killed, and goes on: later products follow from the images."""
+
+
 def larger(root):
     """Enough tiles that imaging takes a few seconds."""
     path = root / "config" / "config.yaml"
@@ -62,15 +67,14 @@ def test_a_name_that_looks_like_a_wildcard_is_text(tiny):
 
 
 @pytest.mark.slow
-def test_a_finished_campaign_has_nothing_to_do_and_a_new_setting_redoes_what_it_touches(tiny):
-    code, output = finished(snakemake(tiny))
-    assert code == 0, output
-    code, output = finished(snakemake(tiny, "-n"))
+def test_a_finished_campaign_has_nothing_to_do_and_a_new_setting_redoes_what_it_touches(run_by_snakemake, tmp_path):
+    root = Path(shutil.copytree(run_by_snakemake, tmp_path / "campaign"))  # with the times of its files
+    code, output = finished(snakemake(root, "-n", "--set-scatter", "tiles=2"))
     assert code == 0
     assert "Nothing to be done" in output
-    path = tiny / "config" / "config.yaml"
+    path = root / "config" / "config.yaml"
     path.write_text(path.read_text() + "processing:\n  window: none\n")
-    code, output = finished(snakemake(tiny, "-n"))
+    code, output = finished(snakemake(root, "-n", "--set-scatter", "tiles=2"))
     assert code == 0
     planned = {line.split()[0] for line in output.split("Job stats:")[1].split("total")[0].splitlines()[3:] if line}
     assert planned == {
@@ -88,6 +92,7 @@ def test_a_finished_campaign_has_nothing_to_do_and_a_new_setting_redoes_what_it_
         "refine",
         "ro_crate",
         "stac",
+        "tiles",
         "tracks",
     }
 
@@ -110,21 +115,23 @@ def wait_for_tiles(root, process, count=5, timeout=120):
     return len(tiles(root))
 
 
-@pytest.fixture(scope="module")
-def unbroken(_tiny, tmp_path_factory):
-    """The products of a run that nobody disturbed."""
-    root = copy_writable(_tiny, tmp_path_factory.mktemp("unbroken") / "campaign")
-    larger(root)
-    code, output = finished(apertura("run", root))
-    assert code == 0, output
-    return contents(root)
+@pytest.fixture(scope="session")
+def unbroken(_tiny, made_once):
+    """What a run makes to its images that nobody disturbed."""
+
+    def run(root):
+        larger(copy_writable(_tiny, root))
+        code, output = finished(apertura("run", root, *TO_IMAGES))
+        assert code == 0, output
+
+    return contents(made_once("unbroken", run))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("whole_group", [True, False], ids=["process group", "snakemake alone"])
 def test_a_killed_run_goes_on_from_its_tiles_to_the_same_bytes(tiny, unbroken, whole_group):
     larger(tiny)
-    process = snakemake(tiny, start_new_session=True)
+    process = snakemake(tiny, *TO_IMAGES, start_new_session=True)
     made = wait_for_tiles(tiny, process)
     if whole_group:
         os.killpg(process.pid, signal.SIGKILL)
@@ -132,7 +139,7 @@ def test_a_killed_run_goes_on_from_its_tiles_to_the_same_bytes(tiny, unbroken, w
         process.kill()
     process.wait()
     process.stdout.close()
-    code, output = finished(apertura("run", tiny))
+    code, output = finished(apertura("run", tiny, *TO_IMAGES))
     assert code == 0, output
     log = lines_of(tiny / "results" / "logs" / "f01", "*.image.log")
     formed_again = sum(int(line.split()[0]) for line in log if "tiles to form" in line)
@@ -144,12 +151,12 @@ def test_a_killed_run_goes_on_from_its_tiles_to_the_same_bytes(tiny, unbroken, w
 @pytest.mark.slow
 def test_tiles_scattered_over_jobs_and_killed_give_the_same_bytes(tiny, unbroken):
     larger(tiny)
-    process = snakemake(tiny, "--set-scatter", "tiles=3", start_new_session=True)
+    process = snakemake(tiny, *TO_IMAGES, "--set-scatter", "tiles=3", start_new_session=True)
     made = wait_for_tiles(tiny, process)
     os.killpg(process.pid, signal.SIGKILL)
     process.wait()
     process.stdout.close()
-    code, output = finished(apertura("run", tiny, "--set-scatter", "tiles=4"))
+    code, output = finished(apertura("run", tiny, *TO_IMAGES, "--set-scatter", "tiles=4"))
     assert code == 0, output
     logs = tiny / "results" / "logs" / "f01"
     by_shares, by_image = (
@@ -195,16 +202,6 @@ def test_what_headers_tell_ends_a_run_before_any_step(tiny):
         assert "Traceback" not in output
     assert code == 2
     assert not (tiny / "results").exists()
-
-
-@pytest.mark.slow
-def test_an_installed_apertura_runs_a_campaign_from_any_folder_and_any_path(tiny, tmp_path):
-    """As the README says it: by the path of the command alone, without an active environment."""
-    command = [str(Path(sys.executable).parent / "apertura"), "run", str(tiny)]
-    plain = {**os.environ, "PATH": "/usr/bin:/bin"}
-    done = subprocess.run(command, cwd=tmp_path, env=plain, text=True, capture_output=True, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert (tiny / "results" / "f01" / "fused" / "coherent_db.tif").is_file()
 
 
 def apertura(*words, **popen):
@@ -314,20 +311,22 @@ def test_steps_are_forks_that_end_with_the_run_whatever_is_killed_outright(tiny,
         assert time.monotonic() < until, "a step lives on"
         time.sleep(0.05)
     hold(tiny).close()
-    code, output = finished(apertura("run", tiny))
+    code, output = finished(apertura("run", tiny, *TO_IMAGES))
     assert code == 0, output
     assert contents(tiny) == unbroken
 
 
 @pytest.mark.slow
-def test_a_run_tells_each_step_and_ends_with_what_its_images_say(tiny):
+def test_a_run_from_any_folder_tells_each_step_and_ends_with_what_its_images_say(tiny, tmp_path):
     code, output = finished(apertura("run", tiny, "-n"))
     assert code == 0
     assert output.startswith("23 steps to do: ")
     assert output.count("\n") == 1
     assert not (tiny / "results/.run").exists()
-    code, output = finished(apertura("run", tiny))
+    elsewhere = {"cwd": tmp_path, "env": {**os.environ, "PATH": "/usr/bin:/bin"}}  # without an active environment
+    code, output = finished(apertura("run", tiny, **elsewhere))
     assert code == 0, output
+    assert (tiny / "results" / "f01" / "fused" / "coherent_db.tif").is_file()
     told = [line.split("  ") for line in output.splitlines()]
     for word, count in (("begun", 23), ("done", 23), ("failed", 0)):
         assert sum(len(cells) > 2 and cells[1].strip() == word for cells in told) == count
