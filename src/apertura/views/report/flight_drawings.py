@@ -151,6 +151,7 @@ def _draw_side(axes: Axes, flown: FlownGeometry) -> None:
     axes.plot(0, flown.target_m[2] - flown.ground_m, "*", color=RED, markersize=9, label="brightest target")
     axes.set(title="from the side", xlabel="distance towards the target, m", ylabel="height above the scene, m")
     axes.set_aspect("equal", adjustable="datalim")
+    axes.xaxis.set_major_locator(MaxNLocator(5))
 
 
 def _draw_heights(axes: Axes, flown: FlownGeometry) -> None:
@@ -245,6 +246,7 @@ def _draw_counts(axes: Axes, record: PulseRecord) -> None:
         label=f"left out: {int((~record.kept).sum())}{_why(record.reasons)}",
     )
     axes.set(title="pulses", ylabel=f"pulses in {width:.2g} s", ylim=(0, 1.45 * max(1, (kept + left).max())))
+    axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))
     axes.legend(loc="upper right", ncols=2)
 
 
@@ -369,9 +371,9 @@ def draw_waterfall(
             waterfall.times(time_s), edges, cells, cmap="viridis", vmin=-_RANGE_DB, vmax=0, rasterized=True
         )
         some = np.linspace(0, len(time_s) - 1, min(len(time_s), 60)).round().astype(int)
-        axes.plot(time_s[some], target_path_m[some], ":", color="white", linewidth=0.9, label="to the brightest target")
-        axes.legend(loc="upper right", labelcolor="white", facecolor="0.25", framealpha=0.7)
-        axes.set(title="range profiles", xlabel="time from the first pulse, s", ylabel="total path, m")
+        axes.plot(time_s[some], target_path_m[some], ":", color="white", linewidth=0.9)
+        title = "range profiles; dotted: path to the brightest target"
+        axes.set(title=title, xlabel="time from the first pulse, s", ylabel="total path, m")
         axes.yaxis.set_major_locator(MaxNLocator(7))
         axes.grid(visible=False)
         figure.colorbar(drawn, ax=axes, extend="min", pad=0.02).set_label("power re strongest cell, dB")
