@@ -100,7 +100,8 @@ export class Section {
 
   save() {
     const geographic = this.places.toGeographic;
-    const names = ['distance_m', 'easting_m', 'northing_m', ...(geographic ? ['longitude_deg', 'latitude_deg'] : [])];
+    const onEarth = ['easting_m', 'northing_m', 'longitude_deg', 'latitude_deg'];
+    const names = ['distance_m', ...(geographic ? onEarth : ['x_m', 'y_m'])];
     const rows = this.samples.map(({ distance, place, value }) => {
       const degrees = geographic ? geographic([...place]).map((one) => one.toFixed(9)) : [];
       const metres = [distance, ...place].map((one) => one.toFixed(4));
