@@ -9,7 +9,7 @@ from matplotlib.ticker import ScalarFormatter
 from numpy.typing import NDArray
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
-from apertura.common.errors import shown
+from apertura.common.errors import number_of, shown
 from apertura.core.geometry.geodesy import geodetic_from_ecef, ned_axes
 from apertura.core.geometry.track_checks import LONG_GAP
 from apertura.formats.tracks.track import FIXES
@@ -46,7 +46,7 @@ def draw_log(track: "xr.Dataset", name: str) -> Figure:
     position, times, frame = track.position.values, track.time.values, track.attrs["frame"]
     place, at_s = east_north_up(position, frame, np.median(position, axis=0)), seconds(times)
     for label, own in _by_fix(track).items():
-        words, colour = f"{label}, {int(own.sum())} epochs", _COLOURS[label]
+        words, colour = f"{label}, {number_of(int(own.sum()), 'epoch')}", _COLOURS[label]
         plan.plot(place[own, 0], place[own, 1], ".", color=colour, label=words, markersize=2.5)
         height.plot(at_s[own], place[own, 2], ".", color=colour, markersize=2.5)
     for number, epoch in enumerate(gaps(times, LONG_GAP)):

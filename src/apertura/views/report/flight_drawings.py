@@ -14,6 +14,7 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator
 from numpy.typing import NDArray
 
 from apertura.common.arrays import Floats
+from apertura.common.errors import number_of
 from apertura.formats.export.map_layout import from_origin, number, round_length, round_origin
 from apertura.views.report.sheet import BLUE, GREEN, GREY, ORANGE, RED, column_of, sheet, thinned
 
@@ -107,8 +108,8 @@ def _draw_plan(axes: Axes, flown: FlownGeometry) -> None:
     axes.set(xlim=(x - half, x + half), ylim=(y - half, y + half), aspect="equal", title="plan")
     scene = Rectangle((west, south), east - west, north - south, facecolor="0.93", edgecolor=GREY, label="scene")
     axes.add_patch(scene)
-    for number_of, ring in enumerate(flown.footprint):
-        axes.plot(*ring.T, color=GREEN, linewidth=1.0, linestyle=":", label="" if number_of else "footprint")
+    for place, ring in enumerate(flown.footprint):
+        axes.plot(*ring.T, color=GREEN, linewidth=1.0, linestyle=":", label="" if place else "footprint")
     for name, track in flown.tracks_m.items():
         axes.plot(*track[:, :2].T, label=name, **_STYLES[name])
         axes.plot(*track[0, :2], "o", color=_STYLES[name]["color"], markersize=4)
@@ -269,7 +270,7 @@ def _draw_series(axes: Axes, time_s: Floats, values: Floats, label: str, heading
     axes.axhline(median, color=GREY, linewidth=0.8, linestyle="--")
     spread = 1.4826 * float(np.nanmedian(np.abs(values - median)))
     unlocked = int(np.isnan(values).sum())
-    lost = f"; {unlocked} pulses without lock" if unlocked else ""
+    lost = f"; {number_of(unlocked, 'pulse')} without lock" if unlocked else ""
     unit = label.rpartition(", ")[2]
     axes.set(title=f"{heading}: median {median:.3g} {unit}, spread {spread:.2g} {unit}{lost}", ylabel=label)
 
