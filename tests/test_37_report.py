@@ -137,6 +137,21 @@ def test_the_legend_of_a_budget_shows_what_a_bar_of_each_kind_looks_like(monkeyp
     assert counted.get_facecolor() != left_out.get_facecolor()
 
 
+@pytest.mark.parametrize(
+    ("counted", "labels"),
+    [
+        (True, ["of 2 pulses", "pulses from the first pulse sent; no times"]),
+        (False, ["pulses in 2 s", "time from the first pulse sent, s"]),
+    ],
+)
+def test_pulses_that_came_without_times_are_counted_and_not_drawn_over_seconds(counted, labels, monkeypatch, tmp_path):
+    at = np.arange(100.0)
+    record = PulseRecord(at, at != 5, {"unpaired": 1}, at[at != 5], counted=counted)
+    axes = figure_of(lambda path: draw_pulses(path, record, **SHARED), tmp_path / "one.png", monkeypatch).axes[0]
+    assert axes.get_ylabel() == labels[0]
+    assert axes.get_xlabel().startswith(labels[1])
+
+
 def test_panels_of_a_local_frame_have_x_and_y_and_no_north(monkeypatch, tmp_path):
     power = {"a-a": np.eye(60)}
 

@@ -17,7 +17,7 @@ from apertura.core.quality.budget import is_counted, is_stated
 from apertura.core.quality.measures import BlockRaster
 from apertura.core.quality.point_targets import CUT_REACH_M, cut_through, find_peak, line_through
 from apertura.core.scene.grid import SceneGrid
-from apertura.views.report.sheet import BLUE, GREEN, GREY, ORANGE, RED, column_of, sheet, thinned
+from apertura.views.report.sheet import BLUE, GREEN, GREY, ORANGE, RED, column_of, over, sheet, thinned
 
 _COLOURS = (ORANGE, BLUE, GREEN)
 
@@ -81,6 +81,7 @@ def draw_phase(
     *,
     title: str,
     tags: Mapping[str, str],
+    counted: bool = False,
 ) -> None:
     """Draw the phase of a target in each pulse, one drawing below the other for each stage of correction, as a PNG.
 
@@ -96,6 +97,8 @@ def draw_phase(
         Flight and pair.
     tags
         Provenance; lies in the file.
+    counted
+        Whether `time_s` counts pulses, since the recording has no times.
     """
     some = thinned(len(time_s))
     with sheet(path, 0.6 + 1.55 * len(phasors), title=title, tags=tags) as figure:
@@ -113,7 +116,7 @@ def draw_phase(
                 yticklabels=["−π", "0", "π"],
             )
             axes.margins(x=0)
-        drawn[-1].set_xlabel("time from the first pulse, s")
+        drawn[-1].set_xlabel(over(counted=counted))
 
 
 _DEEPEST_DB = -40.0
