@@ -95,6 +95,17 @@ def test_one_pair_has_one_panel_and_a_distant_scene_is_drawn_once_more(monkeypat
         assert room.y0 <= box.y0 < box.y1 <= room.y1
 
 
+def test_no_words_of_a_narrow_map_are_cut(monkeypatch, tmp_path):
+    north = np.stack([np.full(9, 110.0), np.linspace(20, 85, 9), np.full(9, 30.0)], -1)
+    one = Covered("f01", "a-a", {"transmitter": north}, 7 * RING, {"transmitter": [north[3:6]]})
+    _, words, figure = drawn(monkeypatch, tmp_path, [one])
+    assert any(line.endswith("thick: makes the image) and footprints") for line in words)
+    figure.canvas.draw()
+    boxes = [text.get_window_extent() for text in figure.texts if text.get_text()]
+    assert all(box.x1 <= figure.bbox.x1 for box in boxes)
+    assert not any(one.overlaps(other) for number, one in enumerate(boxes) for other in boxes[:number])
+
+
 def test_many_flights_have_a_legend_off_the_data_and_whole_numbers_of_pairs(monkeypatch, tmp_path):
     several = [covered(f"f{number // 2:02d}") for number in range(40)]
     _, words, figure = drawn(monkeypatch, tmp_path, several)

@@ -155,11 +155,13 @@ class MapLayout:
             )
 
     def write_words(self, title: str, subtitle: str, footer: str) -> None:
-        """Write title and subtitle above the picture, and its provenance below."""
+        """Write title and subtitle above the picture, on two lines where one is too short, and its provenance below."""
         width, height = self.figure.get_size_inches()
         room = (width - LEFT - 0.1) * 72 / 0.68  # points, over the width of a bold letter in units of its size
         self._write(LEFT, height - 0.4, title, size=min(13, room / max(1, len(title))), weight="bold")
-        self._write(LEFT, height - 0.65, subtitle, size=9)
+        lines = wrap(subtitle, floor((width - LEFT - 0.1) * 72 / (0.6 * 9)))
+        for line, down in zip(lines, (0.65, 0.8) if len(lines) < 2 else (0.6, 0.76), strict=False):
+            self._write(LEFT, height - down, line, size=9)
         self._write(LEFT, 0.16, footer, size=7, color="0.3")
 
     def write_flags(self, flags: Sequence[str]) -> None:
