@@ -7,7 +7,7 @@ TESTS ?= tests src research
 export UV_PYTHON_DOWNLOADS := never
 export PATH := $(CURDIR)/$(BIN):$(PATH)
 
-.PHONY: setup webmap demo run bench paper stability pages docs wheel test test-slow attack cluster-test crate-check lint format lock clean
+.PHONY: setup webmap demo run bench paper stability pages gallery docs wheel test test-slow attack cluster-test crate-check lint format lock clean
 
 setup: $(SETUP)
 
@@ -53,6 +53,10 @@ bench: $(SETUP)
 # The pages of docs/ that are written from the code.
 pages: $(SETUP)
 	$(BIN)/python -m website.pages
+
+# The pictures of docs/gallery.md, or some: make gallery PICTURES="bench dem". 10 minutes; the map's needs chromium.
+gallery: $(SETUP)
+	PYTHONPATH=.:tests:benchmarks $(BIN)/python -m gallery $(PICTURES)
 
 # The site, into build/site: a link that leads nowhere ends it, so does a page that another host would be asked for.
 # Look at it: python3 -m http.server --bind 127.0.0.1 --directory build/site

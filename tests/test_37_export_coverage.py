@@ -80,11 +80,30 @@ def test_one_pair_has_one_panel_and_a_distant_scene_is_drawn_once_more(monkeypat
     assert labels == ["Easting, m", "Northing, m", "pulses that make a pixel"]
     assert words[-2].startswith("80.0 % of the scene is seen by 1 pair of 1 flight;")
     assert not figure.legends
-    far = np.stack([np.linspace(-400, 900, 9), np.full(9, -600.0), np.full(9, 30.0)], -1)
+    far = np.stack([np.linspace(-400, 900, 9), np.full(9, -60.0), np.full(9, 30.0)], -1)
     one = Covered("f01", "a-a", {"transmitter": far}, 7 * RING)
     labels, _, figure = drawn(monkeypatch, tmp_path, [one])
-    assert labels[-1] == "pulses that make a pixel, the scene alone"
+    assert labels[-1].replace("\n", " ") == "pulses that make a pixel, the scene alone"
     assert figure.axes[2].get_xlim() == (100, 120)
+    figure.canvas.draw()
+    wide, high = (figure.axes[2].bbox.size / figure.dpi).tolist()
+    assert max(wide, high) > 3  # inch: it is drawn to be looked at
+    room = figure.bbox
+    for axes in figure.axes:  # nothing is cut at the edge of the picture
+        box = axes.get_tightbbox()
+        assert room.x0 <= box.x0 < box.x1 <= room.x1
+        assert room.y0 <= box.y0 < box.y1 <= room.y1
+
+
+def test_no_words_of_a_narrow_map_are_cut(monkeypatch, tmp_path):
+    north = np.stack([np.full(9, 110.0), np.linspace(20, 85, 9), np.full(9, 30.0)], -1)
+    one = Covered("f01", "a-a", {"transmitter": north}, 7 * RING, {"transmitter": [north[3:6]]})
+    _, words, figure = drawn(monkeypatch, tmp_path, [one])
+    assert any(line.endswith("thick: makes the image) and footprints") for line in words)
+    figure.canvas.draw()
+    boxes = [text.get_window_extent() for text in figure.texts if text.get_text()]
+    assert all(box.x1 <= figure.bbox.x1 for box in boxes)
+    assert not any(one.overlaps(other) for number, one in enumerate(boxes) for other in boxes[:number])
 
 
 def test_many_flights_have_a_legend_off_the_data_and_whole_numbers_of_pairs(monkeypatch, tmp_path):

@@ -1,10 +1,12 @@
 """Pictures and words of the report say what was measured, whatever the names, and the same to the byte."""
 
 import io
+from pathlib import Path
 
 import numpy as np
 import pytest
 from docutils.core import publish_parts
+from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
@@ -114,6 +116,53 @@ def test_a_picture_is_as_wide_as_a_page_clips_nothing_and_is_the_same_every_time
     edge = np.concatenate([drawn[0], drawn[-1], drawn[:, 0], drawn[:, -1]])
     assert (edge == 1).all()  # what leaves the sheet would colour its edge
     assert (drawn < 0.5).any()
+
+
+def figure_of(draw, path, monkeypatch):
+    """The figure that is drawn, before it becomes a file."""
+    figures = []
+    monkeypatch.setattr(Figure, "savefig", lambda self, path, **_: figures.append(self) or Path(path).write_bytes(b""))
+    draw(path)
+    return figures[0]
+
+
+def test_the_legend_of_a_budget_shows_what_a_bar_of_each_kind_looks_like(monkeypatch, tmp_path):
+    """Also of a kind that no line of the image is, as in the first of its three drawings."""
+    stated = [{"cause": "positions", "stated": "1 cm", "loss_db": -0.2, "shift_m": 0.01, "phase_rad": 0.1}]
+    (legend,) = figure_of(
+        lambda path: draw_budget(path, stated, Measured(), **SHARED), tmp_path / "one.png", monkeypatch
+    ).legends
+    counted, left_out = legend.legend_handles
+    assert (counted.get_hatch(), left_out.get_hatch()) == (None, "/////")
+    assert counted.get_facecolor() != left_out.get_facecolor()
+
+
+@pytest.mark.parametrize(
+    ("counted", "labels"),
+    [
+        (True, ["of 2 pulses", "pulses from the first pulse sent; no times"]),
+        (False, ["pulses in 2 s", "time from the first pulse sent, s"]),
+    ],
+)
+def test_pulses_that_came_without_times_are_counted_and_not_drawn_over_seconds(counted, labels, monkeypatch, tmp_path):
+    at = np.arange(100.0)
+    record = PulseRecord(at, at != 5, {"unpaired": 1}, at[at != 5], counted=counted)
+    axes = figure_of(lambda path: draw_pulses(path, record, **SHARED), tmp_path / "one.png", monkeypatch).axes[0]
+    assert axes.get_ylabel() == labels[0]
+    assert axes.get_xlabel().startswith(labels[1])
+
+
+def test_panels_of_a_local_frame_have_x_and_y_and_no_north(monkeypatch, tmp_path):
+    power = {"a-a": np.eye(60)}
+
+    def texts(local):
+        scene = {"size_m": (9.0, 9.0), "target_m": (4.5, 3.0), "local": local, **SHARED}
+        figure = figure_of(lambda path: draw_panels(path, power, **scene), tmp_path / f"{local}.png", monkeypatch)
+        axes = figure.axes[0]
+        return [axes.get_xlabel(), axes.get_ylabel(), *(text.get_text() for text in axes.texts)]
+
+    assert texts(True) == ["x of the corner, m", "y of the corner, m", "2 m"]
+    assert texts(False) == ["east of the corner, m", "north of the corner, m", "2 m", "", "N"]
 
 
 def test_the_sidelink_takes_out_what_clocks_and_triggers_put_in():

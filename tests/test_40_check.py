@@ -157,7 +157,7 @@ def test_a_transmitter_that_does_not_receive_must_have_recorded_as_well(tiny):
 
 def test_a_campaign_without_a_flight_to_image_is_reported(tiny):
     (tiny / "config/flights.tsv").write_text("flight\tkind\ttransmitter\tnodes\nf01\tcalibration\tuav1\tuav1\n")
-    assert "config/flights.tsv: 1 flights, none of kind image" in reported(tiny)[0]
+    assert "config/flights.tsv: 1 flight, none of kind image" in reported(tiny)[0]
 
 
 def test_results_that_are_no_folder_are_reported(tiny):

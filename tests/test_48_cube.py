@@ -21,8 +21,7 @@ from apertura.simulation import ImageGrid, preset, simulate
 LIFTED_M = 0.1
 
 
-@pytest.fixture(scope="session")
-def campaign(made_once):
+def two_days(root):
     """Two flights, the second of one node, a little higher and a day later; tiles of 16 of 60 pixels."""
     plan = preset("demo", pulses=120)
     first, grid = plan.flights[0], ImageGrid("EPSG:32632", half_width_m=3.0, spacing_m=0.1)
@@ -30,13 +29,15 @@ def campaign(made_once):
     east, north, up = track.start_m
     lifted = {"uav1": replace(track, start_m=(east, north, up + LIFTED_M))}
     second = replace(first, name="f02", tracks=lifted, start_utc="2025-05-15T09:30:00")
+    simulate(root, replace(plan, scene=grid, flights=(first, second)), seed=7)
+    edit_config(root, lambda document: document.setdefault("processing", {}).update(tile_px=16))
+    run_steps(root, exports=False)
 
-    def make(root):
-        simulate(root, replace(plan, scene=grid, flights=(first, second)), seed=7)
-        edit_config(root, lambda document: document.setdefault("processing", {}).update(tile_px=16))
-        run_steps(root, exports=False)
 
-    return Campaign.load(made_once("cube", make))
+@pytest.fixture(scope="session")
+def campaign(made_once):
+    """That, made once."""
+    return Campaign.load(made_once("cube", two_days))
 
 
 @pytest.fixture(scope="module")

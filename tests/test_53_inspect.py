@@ -19,11 +19,12 @@ from folders import SHARED, copy_writable
 from matplotlib import image
 
 from apertura.core.echo.dechirp import FrequencySweep
+from apertura.formats.reading import read_track
 from apertura.formats.tracks.track import make_track
 from apertura.pipeline.examination.facts import log_facts
 from apertura.simulation.fmcw import FmcwFlight, write_fmcw_campaign
 from apertura.views.inspect.look import inspect_path, look
-from apertura.views.inspect.pictures import draw_history
+from apertura.views.inspect.pictures import draw_history, draw_log
 
 APERTURA = Path(sys.executable).parent / "apertura"
 F01 = SHARED / "campaign-sample/raw/f01"
@@ -70,6 +71,17 @@ def test_a_log_in_radians_lacks_degrees_before_any_campaign_is_made(tmp_path):
         said = [line for line in look(path).missing if line.startswith("an attitude in degrees")]
         assert bool(said) is lacking
         assert not lacking or "look in radians: yaw is 0° off the course so" in said[0]
+
+
+def test_the_preview_of_a_log_names_the_axes_that_it_has(shared, tmp_path):
+    """East and north of a place on Earth; in a frame of its own x, y and z."""
+    path = tmp_path / "uav1.track.csv"
+    rows = [f"2026-05-14T09:30:0{second}Z,{second},0,20" for second in range(9)]
+    path.write_text("\n".join(["time_utc,east_m,north_m,up_m", *rows, ""]))
+    plan, height, _ = draw_log(read_track(path, node="uav1"), "log").axes
+    assert (plan.get_xlabel(), plan.get_ylabel(), height.get_ylabel()) == ("x, m", "y, m", "z, m")
+    plan, height, _ = draw_log(read_track(F01 / "uav1.track.csv", node="uav1"), "log").axes
+    assert (plan.get_xlabel(), plan.get_ylabel()) == ("east of the median, m", "north of the median, m")
 
 
 def test_lines_taken_out_of_a_log_are_a_gap_of_their_length_at_their_time(shared, tmp_path):

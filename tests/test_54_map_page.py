@@ -2,6 +2,7 @@
 
 import io
 import json
+import shutil
 import signal
 import socket
 import subprocess
@@ -14,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from folders import copy_writable, run_steps
+from folders import ROOT, copy_writable, run_steps
 from matplotlib.image import imread
 from pyproj import Transformer
 
@@ -440,6 +441,21 @@ def test_the_map_leads_nowhere_in_a_browser_that_knows_no_connection_allowlist(o
         window.wait_for_timeout(500)
         assert other.requests == []
         assert (window.url, context.pages) == (before, [window])
+
+
+def test_a_frame_without_a_place_on_earth_has_x_and_y_and_no_north(browser, shared, tmp_path):
+    root = Path(shutil.copytree(ROOT / "examples/gotcha", tmp_path / "gotcha"))
+    (root / "raw/pass1").mkdir(parents=True)
+    for path in (shared / "gotcha_afrl").glob("*.mat"):
+        shutil.copyfile(path, root / f"raw/pass1/aircraft.{path.name}")
+    run_steps(root)
+    with serving(root) as address, shown(browser, address) as (frame, wrong):
+        frame.locator("#targets button").first.click()
+        until(frame, lambda: "cm along x" in frame.inner_text("#targets"))
+        words = frame.inner_text("body").split()
+        assert wrong == []
+    assert not {"E", "N", "east,", "north"} & set(words)
+    assert words.count("from") >= 3  # colours from; from x, from y
 
 
 def test_the_map_does_not_see_the_window_around_it(browser, address):

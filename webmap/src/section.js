@@ -3,14 +3,14 @@ import Draw from 'ol/interaction/Draw.js';
 import { byId, element, number } from './dom.js';
 import { plot, width3dB } from './plot.js';
 
-const NAMES = ['from E', 'from N', 'to E', 'to N'];
+const NAMES = { earth: ['from E', 'from N', 'to E', 'to N'], local: ['from x', 'from y', 'to x', 'to y'] };
 const HEIGHT = 190;
 
 export class Section {
   /** `raster` gives what is cut now; `changed` hears of a new line. */
   constructor(chart, places, raster, changed) {
     Object.assign(this, { chart, places, raster, changed, ends: null, asked: 0 });
-    this.inputs = NAMES.map((name) => {
+    this.inputs = NAMES[places.toGeographic ? 'earth' : 'local'].map((name) => {
       const input = element('input', { type: 'number', step: 'any' });
       input.addEventListener('change', () => this.typed());
       byId('ends').append(element('label', {}, `${name} `, input));
@@ -100,7 +100,8 @@ export class Section {
 
   save() {
     const geographic = this.places.toGeographic;
-    const names = ['distance_m', 'easting_m', 'northing_m', ...(geographic ? ['longitude_deg', 'latitude_deg'] : [])];
+    const onEarth = ['easting_m', 'northing_m', 'longitude_deg', 'latitude_deg'];
+    const names = ['distance_m', ...(geographic ? onEarth : ['x_m', 'y_m'])];
     const rows = this.samples.map(({ distance, place, value }) => {
       const degrees = geographic ? geographic([...place]).map((one) => one.toFixed(9)) : [];
       const metres = [distance, ...place].map((one) => one.toFixed(4));

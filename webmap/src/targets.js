@@ -50,7 +50,8 @@ export class Targets {
         return;
       }
       const [east, north] = peak.place.map((value, axis) => value - at[axis]);
-      const off = `${number(100 * east, 1)} cm east, ${number(100 * north, 1)} cm north of it`;
+      const [right, up] = this.places.toGeographic ? ['east', 'north'] : ['along x', 'along y'];
+      const off = `${number(100 * east, 1)} cm ${right}, ${number(100 * north, 1)} cm ${up} of it`;
       output.textContent = `peak ${number(peak.value, 2)} dB at ${this.places.words(peak.place)}: ${off}`;
       output.dataset.east = peak.place[0].toFixed(6);
       output.dataset.north = peak.place[1].toFixed(6);

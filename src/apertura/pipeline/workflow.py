@@ -16,7 +16,7 @@ from typing import IO, Literal
 
 from apertura.common.atomic import remove
 from apertura.common.code_imports import PACKAGE
-from apertura.common.errors import CampaignError
+from apertura.common.errors import CampaignError, number_of
 from apertura.common.paths import check_shell_name, shipped
 from apertura.common.processes import INTERRUPTED, STATUS_FILE, die_with_parent, given, hold, isolate
 from apertura.common.progress import RUN
@@ -207,7 +207,7 @@ def _looked_at(root: Path, words: Sequence[str], files: "_Files", *, told: bool)
     if status:
         _say(*failures(root, run, files.log))
     elif told:
-        print(f"{run.total} steps to do: {listed(run.planned)}" if run.planned else NOTHING)
+        print(f"{number_of(run.total, 'step')} to do: {listed(run.planned)}" if run.planned else NOTHING)
     return status
 
 

@@ -10,8 +10,10 @@ from numpy.typing import NDArray
 from apertura.common.atomic import write_text
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
+from apertura.core.geometry.geodesy import LOCAL
 from apertura.core.quality.budget import expected
 from apertura.formats.export.layers import OUTSIDE
+from apertura.formats.export.map_layout import number
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config.flight_plan import FlightPlan, MissionTrack, read_flight_plan
 from apertura.pipeline.design import as_plan
@@ -204,10 +206,10 @@ def _given(change: Change) -> str:
 
 def change_lines(changes: Sequence[Change]) -> Iterator[str]:
     """Yield the single changes that help most."""
-    for number, change in enumerate(changes[:_MOST_CHANGES], 1):
+    for place, change in enumerate(changes[:_MOST_CHANGES], 1):
         then = ", all met" if change.meets else ""
         then += f", but then not met: {', '.join(change.breaks)}" if change.breaks else ""
-        yield f"{number}. {change.words}: {change.gain_db:.2g} dB nearer{then} ({_given(change)})"
+        yield f"{place}. {change.words}: {change.gain_db:.2g} dB nearer{then} ({_given(change)})"
 
 
 def _blocks(
@@ -279,6 +281,7 @@ def _draw_layers(path: Path, design: Design) -> None:
     rows = -(-len(found) // 2)
     high = 2.1 * min(1.6, max(0.45, size[1] / size[0]))
     step = max(1, max(grid.shape) // _DOTS)
+    across, up = ("x", "y") if grid.crs == LOCAL else ("east", "north")
     with sheet(path, 0.5 + rows * (high + 0.55), title=f"layers of {image.name}", tags=PICTURE_TAGS) as figure:
         drawn = figure.subplots(rows, 2, squeeze=False)
         for axes, (name, values) in zip(drawn.flat, found.items(), strict=False):
@@ -294,16 +297,31 @@ def _draw_layers(path: Path, design: Design) -> None:
                 bar.ax.set_yticklabels(["seen", "shadow", "layover", "both", "outside"])
             else:
                 seen = np.ma.masked_where(image.layers["mask"][::step, ::step] != 0, shown)
-                picture = axes.imshow(seen, extent=extent, cmap="viridis", interpolation="nearest")
+                ends = dict(zip(("vmin", "vmax"), _ends(seen), strict=True))
+                picture = axes.imshow(seen, extent=extent, cmap="viridis", interpolation="nearest", **ends)
                 figure.colorbar(picture, ax=axes, shrink=0.8).set_label(UNITS[name][0])
             axes.set_title(_TITLES.get(name, name))
         for axes in list(drawn.flat)[len(found) :]:
             axes.set_axis_off()
         for axes in drawn[-1]:
-            axes.set_xlabel("east, m")
+            axes.set_xlabel(f"{across}, m")
         for axes in drawn[:, 0]:
-            axes.set_ylabel("north, m")
-        figure.suptitle(f"{image.name}, from {west:.0f} m east, {south:.0f} m north")
+            axes.set_ylabel(f"{up}, m")
+        figure.suptitle(f"{image.name}, {across} and {up} from {number(round(west))} m, {number(round(south))} m")
+
+
+def _ends(values: NDArray[np.float64]) -> tuple[float, float]:
+    """Return where the colours of a layer end: no nearer than a hundredth of its size, so that labels stay short.
+
+    Examples
+    --------
+    >>> _ends(np.array([1.0, 3.0])), _ends(np.array([2.0, 2.0]))
+    ((1.0, 3.0), (1.99, 2.01))
+    """
+    known = np.ma.compressed(values)
+    low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
+    more = max(0.0, 0.01 * max(abs(low), abs(high)) - (high - low)) / 2
+    return low - more, high + more
 
 
 def draw_pareto(path: Path, tried: Sequence[Tried]) -> None:

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from apertura.common.documents import undamaged
-from apertura.common.errors import shown
+from apertura.common.errors import number_of, shown
 from apertura.formats.export import MAP, exports_in
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import FUSED
@@ -95,7 +95,7 @@ def print_products(campaign: Campaign) -> None:
             if row.opened and path.is_file():
                 print(f"  {campaign.relative(path)}  {row.opened}")
     if len(flights) > _MOST_FLIGHTS:
-        print(f"  and the same of {len(flights) - _MOST_FLIGHTS} flights more")
+        print(f"  and the same of {number_of(len(flights) - _MOST_FLIGHTS, 'flight')} more")
     if campaign.result(MAP).is_file():
         print(f"  all of them on a map: apertura map {shlex.quote(str(campaign.root))}")
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.common.arrays import Floats
-from apertura.common.errors import CampaignError
+from apertura.common.errors import CampaignError, number_of
 from apertura.core.echo.trigger import ABSENT
 
 # ---- Offset and drift between the time tags of two nodes
@@ -368,7 +368,9 @@ def association_flags(
     if abs(association.offset_s) > LARGEST_OFFSET_S:
         flags["time_tags_apart"] = _offset_line(association, speed_m_s)
     if conflicts:
-        flags["frame_counter_conflict"] = f"{conflicts} pulses dropped: frame counter and time tags disagree"
+        flags["frame_counter_conflict"] = (
+            f"{number_of(conflicts, 'pulse')} dropped: frame counter and time tags disagree"
+        )
     if by_tags and association.residual_s > interval_s * LARGEST_JITTER:
         flags["time_tag_jitter"] = (
             f"time tags scatter by {association.residual_s:.4f} s rms at a repetition interval of {interval_s:.4g} s: "

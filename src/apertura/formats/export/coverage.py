@@ -177,10 +177,11 @@ def write_coverage(
     small = max(scene[2] - scene[0], scene[3] - scene[1]) < _SMALL * max(bounds[2] - bounds[0], bounds[3] - bounds[1])
     looks_label = f"pulses that make a pixel{', all pairs' if len(covered) > 1 else ''}"
     with matplotlib.style.context("default"):
-        maps = [MapLayout.for_bounds(bounds, maps=2 if small or len(covered) > 1 else 1, local=local)]
+        several, part = small or len(covered) > 1, scene if small else None
+        maps = [MapLayout.for_bounds(bounds, maps=2 if several else 1, part=part, local=local)]
         _draw(maps[0], total, transform, "viridis", looks_label)
-        if small or len(covered) > 1:
-            maps.append(maps[0].beside(scene if small else None))
+        if several:
+            maps.append(maps[0].beside(part))
         if len(covered) > 1:
             _draw(maps[1], pairs, transform, "YlGnBu", f"pairs that see a pixel, of {len(covered)}", counts=True)
         elif small:

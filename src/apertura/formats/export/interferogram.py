@@ -118,7 +118,7 @@ def write_panels(
                 vmax=high,
                 interpolation="nearest",
             )
-            layout.draw_frame(crs_name(crs))
+            layout.draw_frame("" if at else crs_name(crs))
             layout.draw_colour_bar(picture, words, beyond="neither" if ends else "both")
             if not np.isfinite(thin).any():
                 layout.axes.text(0.5, 0.5, "no valid pixel", transform=layout.axes.transAxes, ha="center")

@@ -21,6 +21,8 @@ LONGER_SIDE = 6.4  # of the picture, inch
 PICTURE_DOTS = floor(LONGER_SIDE * DPI)
 LEFT, RIGHT, TOP, BOTTOM = 1.0, 1.4, 0.85, 1.6  # margins around the picture, inch
 LEAST_WIDTH, LEAST_HEIGHT = 4.2, 1.6  # room kept for words and colour bar beside a narrow or flat picture, inch
+PART_HEIGHT = 3.2  # and for a part of it that is drawn once more, inch
+LETTER = 0.073  # of a colour bar's label, inch
 LONGEST_FLAG = 24  # letters with the comma: so many the first of two lines may leave empty
 
 Marker = tuple[float, float, str]
@@ -53,14 +55,24 @@ class MapLayout:
 
     @classmethod
     def for_bounds(
-        cls, bounds: tuple[float, float, float, float], *, maps: int = 1, local: bool = False
+        cls,
+        bounds: tuple[float, float, float, float],
+        *,
+        maps: int = 1,
+        part: tuple[float, float, float, float] | None = None,
+        local: bool = False,
     ) -> "MapLayout":
-        """Return an empty layout on which the longer side of `bounds` is `LONGER_SIDE`, with room for `maps`."""
+        """Return an empty layout on which the longer side of `bounds` is `LONGER_SIDE`, with room for `maps`.
+
+        The last of them is of the bounds `part`, if these are given.
+        """
         west, south, east, north = bounds
         scale = LONGER_SIDE / max(east - west, north - south)
         wide, high = (east - west) * scale, (north - south) * scale
-        width = maps * (LEFT + max(wide, LEAST_WIDTH) + RIGHT)
-        height = BOTTOM + max(high, LEAST_HEIGHT) + TOP
+        room = max(wide, LEAST_WIDTH), max(high, LEAST_HEIGHT if part is None else PART_HEIGHT)
+        last = room[0] if part is None else (part[2] - part[0]) * _scale_in(room, part)
+        width = maps * (LEFT + RIGHT) + (maps - 1) * room[0] + last
+        height = BOTTOM + room[1] + TOP
         figure = Figure(figsize=(width, height))
         FigureCanvasAgg(figure)
         bottom = height - TOP - high
@@ -70,12 +82,9 @@ class MapLayout:
     def beside(self, bounds: tuple[float, float, float, float] | None = None) -> "MapLayout":
         """Return the layout of the next map, right of this one: of the same place, or of a part as large as fits."""
         width, height = self.figure.get_size_inches()
-        room = [(self.bounds[2 + side] - self.bounds[side]) * self.inch_per_m for side in (0, 1)]
-        left = self.left + max(room[0], LEAST_WIDTH) + RIGHT + LEFT
-        shown, scale = bounds or self.bounds, self.inch_per_m
-        if bounds is not None:
-            room = [max(room[0], LEAST_WIDTH), max(room[1], LEAST_HEIGHT)]
-            scale = min(one / (shown[2 + side] - shown[side]) for side, one in enumerate(room))
+        room = max((self.bounds[2] - self.bounds[0]) * self.inch_per_m, LEAST_WIDTH), height - TOP - BOTTOM
+        left = self.left + room[0] + RIGHT + LEFT
+        shown, scale = bounds or self.bounds, self.inch_per_m if bounds is None else _scale_in(room, bounds)
         wide, high = ((shown[2 + side] - shown[side]) * scale for side in (0, 1))
         place = (left / width, (height - TOP - high) / height, wide / width, high / height)
         return replace(self, axes=self.figure.add_axes(place), left=left, bounds=shown, inch_per_m=scale)
@@ -103,7 +112,7 @@ class MapLayout:
         high = max(high, LEAST_HEIGHT)
         place = ((self.left + wide + 0.15) / width, (height - TOP - high) / height, 0.16 / width, high / height)
         bar = self.figure.colorbar(picture, cax=self.figure.add_axes(place), extend=beyond)
-        bar.set_label(label)
+        bar.set_label("\n".join(part for line in label.split("\n") for part in wrap(line, floor(high / LETTER))))
         return bar
 
     def draw_scale_and_north(self) -> None:
@@ -146,11 +155,13 @@ class MapLayout:
             )
 
     def write_words(self, title: str, subtitle: str, footer: str) -> None:
-        """Write title and subtitle above the picture, and its provenance below."""
+        """Write title and subtitle above the picture, on two lines where one is too short, and its provenance below."""
         width, height = self.figure.get_size_inches()
         room = (width - LEFT - 0.1) * 72 / 0.68  # points, over the width of a bold letter in units of its size
         self._write(LEFT, height - 0.4, title, size=min(13, room / max(1, len(title))), weight="bold")
-        self._write(LEFT, height - 0.65, subtitle, size=9)
+        lines = wrap(subtitle, floor((width - LEFT - 0.1) * 72 / (0.6 * 9)))
+        for line, down in zip(lines, (0.65, 0.8) if len(lines) < 2 else (0.6, 0.76), strict=False):
+            self._write(LEFT, height - down, line, size=9)
         self._write(LEFT, 0.16, footer, size=7, color="0.3")
 
     def write_flags(self, flags: Sequence[str]) -> None:
@@ -163,6 +174,11 @@ class MapLayout:
 
     def _write(self, x: float, y: float, words: str, **style: Any) -> None:
         self.figure.text(x, y, words, transform=self.figure.dpi_scale_trans, parse_math=False, **style)
+
+
+def _scale_in(room: tuple[float, float], bounds: tuple[float, float, float, float]) -> float:
+    """Return inches per metre at which bounds fill a room, inches wide and high."""
+    return min(one / (bounds[2 + side] - bounds[side]) for side, one in enumerate(room))
 
 
 def flag_words(flags: Sequence[str], most: int) -> str:

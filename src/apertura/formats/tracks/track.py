@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from apertura.common.errors import CampaignError, quoted, shown
+from apertura.common.errors import CampaignError, number_of, quoted, shown
 from apertura.core.geometry.geodesy import ecef_from_geodetic
 from apertura.formats.times import outside, utc_times
 from apertura.formats.tracks.log_options import LogOptions
@@ -136,8 +136,9 @@ def _check_positions(position: NDArray[np.float64], frame: str, where: Path) -> 
         expected = f"finite local coordinates within {FARTHEST_M:g} m"
     if not good.all():
         first = int(np.flatnonzero(~good)[0])
+        lacking = number_of(int((~good).sum()), "epoch")
         raise CampaignError(
-            f"{int((~good).sum())} epochs without a position, first epoch {first}: {position[first].tolist()}",
+            f"{lacking} without a position, first epoch {first}: {position[first].tolist()}",
             where,
             expected,
             "Drop those lines or export again.",

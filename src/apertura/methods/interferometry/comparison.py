@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from apertura.common.arrays import Floats
 from apertura.common.contracts import Window
+from apertura.common.errors import number_of
 from apertura.common.flags import Flags
 from apertura.methods.interferometry.coherence import chance, map_coherence, unbiased
 from apertura.methods.interferometry.heights import (
@@ -109,8 +110,8 @@ def interferogram_flags(measured: InterferogramCounts) -> Flags:
         ambiguous.append(f"{one.apart} of {one.told} pixels lie in parts apart, whole turns from the others: left out")
     if one.jumps and not one.by:
         ambiguous.append(
-            f"snaphu is not installed and the phase jumps by a turn at {one.jumps} places: heights are known up to "
-            f"multiples of {one.ambiguity_m:.3g} m"
+            f"snaphu is not installed and the phase jumps by a turn at {number_of(one.jumps, 'place')}: heights are "
+            f"known up to multiples of {one.ambiguity_m:.3g} m"
         )
     if ambiguous:
         flags["height_ambiguous"] = "; ".join(ambiguous)

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from apertura.common.errors import CampaignError
+from apertura.common.errors import CampaignError, number_of
 from apertura.common.paths import inside
 from apertura.formats.names import recording_files
 from apertura.pipeline.campaign import Campaign
@@ -29,7 +29,7 @@ def check_flights(examined: "Examination") -> Iterator[CampaignError]:
     """Yield a problem where no flight becomes an image, and none is measured on a bench."""
     if {flight.kind for flight in examined.campaign.flights} <= {"calibration"}:
         yield CampaignError(
-            f"{len(examined.campaign.flights)} flights, none of kind image",
+            f"{number_of(len(examined.campaign.flights), 'flight')}, none of kind image",
             where=examined.campaign.root / FLIGHTS,
             expected="at least one flight of kind image, or bench",
             remedy="Add one, or correct its kind.",

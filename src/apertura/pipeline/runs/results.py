@@ -10,7 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from apertura.common.atomic import remove
-from apertura.common.errors import CampaignError, shown
+from apertura.common.errors import CampaignError, number_of, shown
 from apertura.common.paths import inside
 from apertura.common.processes import hold
 from apertura.common.progress import RUN
@@ -103,7 +103,7 @@ def clean(campaign: Campaign, *, unfinished_only: bool, agreed: bool) -> None:
         _refuse_writers(campaign.results)
         files = sorted(set(_unfinished(campaign.results) if unfinished_only else _made(campaign.results)))
         size = sum(path.lstat().st_size for path in files)
-        told = f"{len(files)} files, {in_bytes(size)}, that the workflow has made in {campaign.results}"
+        told = f"{number_of(len(files), 'file')}, {in_bytes(size)}, that the workflow has made in {campaign.results}"
         if not files or not (agreed or _is_wanted(f"remove {told}?", campaign.root)):
             print("nothing removed")
             return

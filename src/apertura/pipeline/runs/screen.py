@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TextIO
 
-from apertura.common.errors import shown
+from apertura.common.errors import number_of, shown
 from apertura.common.processes import INTERRUPTED, holder
 from apertura.common.progress import RUN
 from apertura.pipeline.campaign import Campaign
@@ -165,7 +165,7 @@ class Screen:
 
     def ended(self, run: RunRecord) -> None:
         """Say that all is done."""
-        done = f"{run.total} steps done in {span((run.ended_s or time.time()) - run.begun_s)}"
+        done = f"{number_of(run.total, 'step')} done in {span((run.ended_s or time.time()) - run.begun_s)}"
         self._line(done if run.planned else NOTHING)
 
     def _ended(self, job: JobRecord, whole: Bar | None) -> None:

@@ -13,6 +13,7 @@ from rasterio import Affine
 from apertura.common.arrays import Floats
 from apertura.common.atomic import write_json
 from apertura.common.contracts import Window
+from apertura.common.errors import number_of
 from apertura.common.flags import Flags
 from apertura.common.provenance import Provenance, canonical_json, chained_sha256
 from apertura.common.raster import opened_raster
@@ -321,8 +322,8 @@ def _focus(images: Mapping[str, xr.Dataset], measured: InPhase | None, added: Se
         "loss_db": round(loss_db, 3),
         "std_db": round(std_db, 3),
         "why": (
-            f"{measured.places} bright points of the sum lost {abs(loss_db):.2f} ± {std_db:.2f} dB of their peak, "
-            f"{abs(measured.loss_db):.2f} dB of it because the pairs differ in phase"
+            f"{number_of(measured.places, 'bright point')} of the sum lost {abs(loss_db):.2f} ± {std_db:.2f} dB of "
+            f"their peak, {abs(measured.loss_db):.2f} dB of it because the pairs differ in phase"
         ),
     }
 
@@ -343,8 +344,9 @@ def _incoherent(measured: InPhase | None) -> dict[str, str]:
     if measured is None or measured.loss_db >= DEFOCUSED_DB - 2 * measured.loss_std_db:
         return {}
     line = (
-        f"at {measured.places} bright points the pairs keep {measured.coherence:.2f} ± {measured.std:.2f} of their "
-        f"power in phase, {measured.chance:.2f} by chance: the peaks of the sum lost {abs(measured.loss_db):.1f} dB"
+        f"at {number_of(measured.places, 'bright point')} the pairs keep {measured.coherence:.2f} ± "
+        f"{measured.std:.2f} of their power in phase, {measured.chance:.2f} by chance: the peaks of the sum lost "
+        f"{abs(measured.loss_db):.1f} dB"
     )
     return {"sum_incoherent": line}
 

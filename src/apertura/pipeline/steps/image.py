@@ -10,6 +10,7 @@ import xarray as xr
 
 from apertura.common.atomic import write_json
 from apertura.common.contracts import Window
+from apertura.common.errors import number_of
 from apertura.common.flags import Flags
 from apertura.core.focus.engines import instruction_set
 from apertura.core.focus.tiles import compute_tiles
@@ -137,7 +138,7 @@ class _Work:
     def compute(self, windows: list[Window], target: Any) -> None:
         """Compute some tiles as planned."""
         line = self.formation.plan.setting.line
-        print(f"{len(windows)} of {len(self.formation.windows)} tiles to form with {line}", flush=True)
+        print(f"{len(windows)} of {number_of(len(self.formation.windows), 'tile')} to form with {line}", flush=True)
         if windows:
             image = self.formation.image
             compute_tiles(image, windows, target, threads=self.threads, scheduler=self.scheduler)

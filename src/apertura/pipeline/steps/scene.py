@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
-from apertura.common.errors import CampaignError
+from apertura.common.errors import CampaignError, number_of
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.scene.dem import height_range
 from apertura.core.scene.terrain import GridHeights
@@ -71,7 +71,7 @@ def terrain(campaign: Campaign) -> Path:
     windows = list(grid.tiles(campaign.settings.processing.tile_px))
     with writing(folder) as wip:
         missing = resume(wip, _empty(scene, ground, lineage), "height", windows)
-        print(f"{len(missing)} of {len(windows)} tiles to read from {ground.dem.path.name}", flush=True)
+        print(f"{len(missing)} of {number_of(len(windows), 'tile')} to read from {ground.dem.path.name}", flush=True)
         heights = open_array(wip, "height")
         for window in missing:
             heights[window] = ground.dem.heights(grid[window])

@@ -9,7 +9,7 @@ from matplotlib.ticker import ScalarFormatter
 from numpy.typing import NDArray
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
-from apertura.common.errors import shown
+from apertura.common.errors import number_of, shown
 from apertura.core.geometry.geodesy import geodetic_from_ecef, ned_axes
 from apertura.core.geometry.track_checks import LONG_GAP
 from apertura.formats.tracks.track import FIXES
@@ -46,7 +46,7 @@ def draw_log(track: "xr.Dataset", name: str) -> Figure:
     position, times, frame = track.position.values, track.time.values, track.attrs["frame"]
     place, at_s = east_north_up(position, frame, np.median(position, axis=0)), seconds(times)
     for label, own in _by_fix(track).items():
-        words, colour = f"{label}, {int(own.sum())} epochs", _COLOURS[label]
+        words, colour = f"{label}, {number_of(int(own.sum()), 'epoch')}", _COLOURS[label]
         plan.plot(place[own, 0], place[own, 1], ".", color=colour, label=words, markersize=2.5)
         height.plot(at_s[own], place[own, 2], ".", color=colour, markersize=2.5)
     for number, epoch in enumerate(gaps(times, LONG_GAP)):
@@ -55,10 +55,10 @@ def draw_log(track: "xr.Dataset", name: str) -> Figure:
         height.axvspan(*at_s[ends], color="red", alpha=0.2)
     plan.plot(*place[0, :2], "k^", label="first epoch")
     earth = frame == "ecef"
-    _named(plan, "east of the median, m" if earth else "east, m", "north of the median, m" if earth else "north, m")
+    _named(plan, "east of the median, m" if earth else "x, m", "north of the median, m" if earth else "y, m")
     plan.set_aspect("equal", adjustable="datalim")
     plan.legend(loc="best", fontsize="small")
-    _named(height, "", "height above the ellipsoid, m" if earth else "up, m")
+    _named(height, "", "height above the ellipsoid, m" if earth else "z, m")
     _intervals(steps, at_s[1:], times)
     _named(steps, f"seconds since {utc(times[0])}", "since the epoch before, s")
     return figure
@@ -154,8 +154,7 @@ def _antennas(plan: "Axes", echo: "xr.Dataset") -> None:
     for leg, style, size in (("tx", "k.", 5), ("rx", "r.", 2)):
         place = east_north_up(echo[f"{leg}_position"].values, frame, middle)
         plan.plot(place[:, 0], place[:, 1], style, markersize=size, label=leg)
-    about = " of the middle" if frame == "ecef" else ""
-    _named(plan, f"east{about}, m", f"north{about}, m")
+    _named(plan, *(("east of the middle, m", "north of the middle, m") if frame == "ecef" else ("x, m", "y, m")))
     plan.set_aspect("equal", adjustable="datalim")
     plan.legend(loc="best", fontsize="small")
 

@@ -8,7 +8,7 @@ import numpy as np
 import yaml
 
 from apertura.common.atomic import write_json, write_text
-from apertura.common.errors import CampaignError
+from apertura.common.errors import CampaignError, number_of
 from apertura.common.flag_table import FLAGS
 from apertura.common.provenance import Provenance
 from apertura.methods.synchronisation.channels import SIGMAS
@@ -59,7 +59,7 @@ def print_bench(campaign: Campaign, *, write: bool = False) -> int:
     flights = [flight.name for flight in campaign.flights if flight.kind == "bench"]
     if not flights:
         raise CampaignError(
-            f"{len(campaign.flights)} flights, none of kind bench",
+            f"{number_of(len(campaign.flights), 'flight')}, none of kind bench",
             where=campaign.root / FLIGHTS,
             expected="a line of a recording that stood still: flight, bench, transmitter, nodes",
             remedy="Add it; no flight log is needed.",

@@ -14,8 +14,9 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator
 from numpy.typing import NDArray
 
 from apertura.common.arrays import Floats
+from apertura.common.errors import number_of
 from apertura.formats.export.map_layout import from_origin, number, round_length, round_origin
-from apertura.views.report.sheet import BLUE, GREEN, GREY, ORANGE, RED, column_of, sheet, thinned
+from apertura.views.report.sheet import BLUE, GREEN, GREY, ORANGE, RED, column_of, over, sheet, thinned
 
 _STYLES: Mapping[str, Any] = {
     "transmitter": {"color": BLUE, "linestyle": "-", "linewidth": 1.6},
@@ -47,6 +48,8 @@ class FlownGeometry:
         Of the map.
     local
         Whether it has no place on Earth.
+    counted
+        Whether `time_s` counts pulses, since the recording has no times.
     """
 
     time_s: NDArray[np.float64]
@@ -57,6 +60,7 @@ class FlownGeometry:
     footprint: Sequence[NDArray[np.float64]]
     crs_name: str
     local: bool = False
+    counted: bool = False
 
     @property
     def middle_m(self) -> NDArray[np.float64]:
@@ -107,8 +111,8 @@ def _draw_plan(axes: Axes, flown: FlownGeometry) -> None:
     axes.set(xlim=(x - half, x + half), ylim=(y - half, y + half), aspect="equal", title="plan")
     scene = Rectangle((west, south), east - west, north - south, facecolor="0.93", edgecolor=GREY, label="scene")
     axes.add_patch(scene)
-    for number_of, ring in enumerate(flown.footprint):
-        axes.plot(*ring.T, color=GREEN, linewidth=1.0, linestyle=":", label="" if number_of else "footprint")
+    for place, ring in enumerate(flown.footprint):
+        axes.plot(*ring.T, color=GREEN, linewidth=1.0, linestyle=":", label="" if place else "footprint")
     for name, track in flown.tracks_m.items():
         axes.plot(*track[:, :2].T, label=name, **_STYLES[name])
         axes.plot(*track[0, :2], "o", color=_STYLES[name]["color"], markersize=4)
@@ -151,6 +155,7 @@ def _draw_side(axes: Axes, flown: FlownGeometry) -> None:
     axes.plot(0, flown.target_m[2] - flown.ground_m, "*", color=RED, markersize=9, label="brightest target")
     axes.set(title="from the side", xlabel="distance towards the target, m", ylabel="height above the scene, m")
     axes.set_aspect("equal", adjustable="datalim")
+    axes.xaxis.set_major_locator(MaxNLocator(5))
 
 
 def _draw_heights(axes: Axes, flown: FlownGeometry) -> None:
@@ -158,7 +163,7 @@ def _draw_heights(axes: Axes, flown: FlownGeometry) -> None:
         axes.plot(flown.time_s, track[:, 2] - flown.ground_m, label=name, **_STYLES[name])
     axes.set(
         title=f"height above the scene, whose ground lies at {number(round(flown.ground_m, 2))} m",
-        xlabel="time from the first pulse, s",
+        xlabel=over(counted=flown.counted),
         ylabel="height, m",
     )
     axes.margins(x=0)
@@ -185,6 +190,8 @@ class PulseRecord:
         (pulse,) float64, of the sidelink per subcarrier; None without one.
     delay_m
         (pulse,) float64, by how much the sidelink came later than its length says, metres; None without one.
+    counted
+        Whether times count pulses, since the recording has none.
     """
 
     sent_s: Floats
@@ -193,6 +200,7 @@ class PulseRecord:
     time_s: Floats = field(default_factory=lambda: np.empty(0))
     snr_db: Floats | None = None
     delay_m: Floats | None = None
+    counted: bool = False
 
 
 def draw_pulses(path: Path, record: PulseRecord, *, title: str, tags: Mapping[str, str]) -> None:
@@ -222,7 +230,7 @@ def draw_pulses(path: Path, record: PulseRecord, *, title: str, tags: Mapping[st
         _draw_counts(first, record)
         for axes, (values, label, heading) in zip(others, series, strict=True):
             _draw_series(axes, record.time_s, values, label, heading)
-        [first, *others][-1].set_xlabel("time from the first pulse sent, s")
+        [first, *others][-1].set_xlabel(over(counted=record.counted, first="first pulse sent"))
         first.set_xlim(0.0, max(float(record.sent_s.max(initial=0.0)), 1e-3))
 
 
@@ -244,7 +252,9 @@ def _draw_counts(axes: Axes, record: PulseRecord) -> None:
         linewidth=0,
         label=f"left out: {int((~record.kept).sum())}{_why(record.reasons)}",
     )
-    axes.set(title="pulses", ylabel=f"pulses in {width:.2g} s", ylim=(0, 1.45 * max(1, (kept + left).max())))
+    label = f"of {width:.0f} pulses" if record.counted else f"pulses in {width:.2g} s"
+    axes.set(title="pulses", ylabel=label, ylim=(0, 1.45 * max(1, (kept + left).max())))
+    axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))
     axes.legend(loc="upper right", ncols=2)
 
 
@@ -267,7 +277,7 @@ def _draw_series(axes: Axes, time_s: Floats, values: Floats, label: str, heading
     axes.axhline(median, color=GREY, linewidth=0.8, linestyle="--")
     spread = 1.4826 * float(np.nanmedian(np.abs(values - median)))
     unlocked = int(np.isnan(values).sum())
-    lost = f"; {unlocked} pulses without lock" if unlocked else ""
+    lost = f"; {number_of(unlocked, 'pulse')} without lock" if unlocked else ""
     unit = label.rpartition(", ")[2]
     axes.set(title=f"{heading}: median {median:.3g} {unit}, spread {spread:.2g} {unit}{lost}", ylabel=label)
 
@@ -342,6 +352,7 @@ def draw_waterfall(
     *,
     title: str,
     tags: Mapping[str, str],
+    counted: bool = False,
 ) -> None:
     """Draw a waterfall with the total path to the brightest target, as a PNG.
 
@@ -357,6 +368,8 @@ def draw_waterfall(
         Flight and pair.
     tags
         Provenance; lies in the file.
+    counted
+        Whether `time_s` counts pulses, since the recording has no times.
     """
     mean = waterfall.mean
     top = float(np.nanmax(mean)) if np.isfinite(mean).any() else 1.0
@@ -369,9 +382,9 @@ def draw_waterfall(
             waterfall.times(time_s), edges, cells, cmap="viridis", vmin=-_RANGE_DB, vmax=0, rasterized=True
         )
         some = np.linspace(0, len(time_s) - 1, min(len(time_s), 60)).round().astype(int)
-        axes.plot(time_s[some], target_path_m[some], ":", color="white", linewidth=0.9, label="to the brightest target")
-        axes.legend(loc="upper right", labelcolor="white", facecolor="0.25", framealpha=0.7)
-        axes.set(title="range profiles", xlabel="time from the first pulse, s", ylabel="total path, m")
+        axes.plot(time_s[some], target_path_m[some], ":", color="white", linewidth=0.9)
+        title = "range profiles; dotted: path to the brightest target"
+        axes.set(title=title, xlabel=over(counted=counted), ylabel="total path, m")
         axes.yaxis.set_major_locator(MaxNLocator(7))
         axes.grid(visible=False)
         figure.colorbar(drawn, ax=axes, extend="min", pad=0.02).set_label("power re strongest cell, dB")

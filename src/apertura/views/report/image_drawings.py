@@ -7,15 +7,17 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.container import Container
 from matplotlib.gridspec import GridSpec
+from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from numpy.typing import NDArray
 
-from apertura.core.quality.budget import is_counted
+from apertura.core.quality.budget import is_counted, is_stated
 from apertura.core.quality.measures import BlockRaster
 from apertura.core.quality.point_targets import CUT_REACH_M, cut_through, find_peak, line_through
 from apertura.core.scene.grid import SceneGrid
-from apertura.views.report.sheet import BLUE, GREEN, GREY, ORANGE, RED, column_of, sheet, thinned
+from apertura.views.report.sheet import BLUE, GREEN, GREY, ORANGE, RED, column_of, over, sheet, thinned
 
 _COLOURS = (ORANGE, BLUE, GREEN)
 
@@ -79,6 +81,7 @@ def draw_phase(
     *,
     title: str,
     tags: Mapping[str, str],
+    counted: bool = False,
 ) -> None:
     """Draw the phase of a target in each pulse, one drawing below the other for each stage of correction, as a PNG.
 
@@ -94,6 +97,8 @@ def draw_phase(
         Flight and pair.
     tags
         Provenance; lies in the file.
+    counted
+        Whether `time_s` counts pulses, since the recording has no times.
     """
     some = thinned(len(time_s))
     with sheet(path, 0.6 + 1.55 * len(phasors), title=title, tags=tags) as figure:
@@ -111,7 +116,7 @@ def draw_phase(
                 yticklabels=["−π", "0", "π"],
             )
             axes.margins(x=0)
-        drawn[-1].set_xlabel("time from the first pulse, s")
+        drawn[-1].set_xlabel(over(counted=counted))
 
 
 _DEEPEST_DB = -40.0
@@ -213,7 +218,7 @@ def _crossings(cut: DrawnCut) -> tuple[float, float]:
 _LEAST = {"loss_db": 1e-4, "shift_m": 1e-4, "phase_rad": 1e-4}
 _LABELS = {"loss_db": "peak lost, dB", "shift_m": "targets shifted, m", "phase_rad": "phase of the image, rad"}
 _STYLES: Mapping[bool, Any] = {
-    True: {"color": BLUE, "label": "stated or measured"},
+    True: {"color": BLUE, "label": "counted: stated, measured or assumed"},
     False: {"facecolor": "white", "edgecolor": GREY, "hatch": "/////", "label": "not stated: of the size in the table"},
 }
 
@@ -261,11 +266,14 @@ def draw_budget(
             axes.tick_params(labelleft=place == 0)
             if measure == "loss_db":
                 _draw_measured(axes, measured)
-        handles, labels = figure.axes[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower center", ncols=2, frameon=False)
+        lines_of, _ = figure.axes[0].get_legend_handles_labels()
+        bars = [Patch(**style) for style in _STYLES.values()]  # also of a kind that this image has none of
+        handles = [*(one for one in lines_of if not isinstance(one, Container)), *bars]
+        figure.legend(handles=handles, loc="outside lower center", ncols=2, frameon=False)
 
 
-_SHORT = 0.01  # below which a number is written with its exponent: three labels find room below an axis
+_SHORT = 0.1  # below which a number is written as a power of ten: three labels find room below an axis
+_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def _draw_causes(axes: Axes, lines: Sequence[Mapping[str, Any]], measure: str) -> None:
@@ -279,14 +287,36 @@ def _draw_causes(axes: Axes, lines: Sequence[Mapping[str, Any]], measure: str) -
         if size <= least:
             words = "does not apply" if line[measure] is None else f"below {least:g}"
             axes.text(1.2 * least, place, words, va="center", fontsize=6, color=GREY)
-    axes.set_yticks(places, [line["cause"] for line in lines])
+    axes.set_yticks(places, _names(lines))
     axes.set(xscale="log", xlim=(least, 2 * highest), ylim=(len(lines) - 0.4, -0.6), xlabel=_LABELS[measure])
-    axes.xaxis.set_major_formatter(
-        FuncFormatter(lambda value, _position: f"{value:.0e}" if value < _SHORT else f"{value:g}")
-    )
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _position: _power_of_ten(value)))
     axes.xaxis.set_minor_formatter(NullFormatter())
     axes.xaxis.set_major_locator(LogLocator(numticks=4))
     axes.grid(visible=False, axis="y")
+
+
+def _names(lines: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return the cause of each line, with what tells those apart that come twice.
+
+    Examples
+    --------
+    >>> _names([{"cause": "positions", "stated": "1 cm"}, {"cause": "positions", "stated": "not stated; assumed 2 cm"}])
+    ['positions, stated', 'positions, not stated']
+    """
+    causes = [str(line["cause"]) for line in lines]
+    known = ["stated" if is_stated(line) else "not stated" for line in lines]
+    return [f"{cause}, {how}" if causes.count(cause) > 1 else cause for cause, how in zip(causes, known, strict=True)]
+
+
+def _power_of_ten(value: float) -> str:
+    """Return the label of a decade.
+
+    Examples
+    --------
+    >>> [_power_of_ten(value) for value in (1e-4, 0.01, 0.1, 10.0)]
+    ['10⁻⁴', '10⁻²', '0.1', '10']
+    """
+    return f"{value:g}" if value >= _SHORT else f"10{str(round(np.log10(value))).translate(_RAISED)}"
 
 
 def _draw_measured(axes: Axes, measured: Measured) -> None:

@@ -19,6 +19,7 @@ from apertura.core.imaging.range_profiles import aperture_of, profiles_of
 from apertura.formats.export.coverage import footprint
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import SampledWaveform
+from apertura.pipeline.examination.times import counted
 from apertura.pipeline.lineage import result_of
 from apertura.pipeline.opening.autofocus import open_refined
 from apertura.pipeline.opening.pair import open_pair
@@ -58,9 +59,10 @@ def pictures(campaign: Campaign, flight: str, pair: str) -> list[Path]:
     quality = shown.image.attrs["quality"]
     draw_geometry(geometry, shown.geometry(), **drawn)
     draw_pulses(pulses, shown.record(), **drawn)
-    draw_phase(phase, shown.time_s, shown.phasors(), **drawn)
+    draw_phase(phase, shown.time_s, shown.phasors(), counted=shown.counted, **drawn)
     draw_cuts(cuts, shown.cuts(), **drawn)
-    draw_waterfall(profiles, shown.waterfall(), shown.time_s, shown.target_path_m, **drawn)
+    path_m = shown.target_path_m
+    draw_waterfall(profiles, shown.waterfall(), shown.time_s, path_m, counted=shown.counted, **drawn)
     measured = Measured(*(quality["focus"].get(name) for name in ("loss_db", "std_db", "expected_db")))
     draw_budget(budget, quality["budget"], measured, **drawn)
     record_files(campaign.root / lineage.result.manifest, written, lineage)
@@ -110,6 +112,11 @@ class Shown:
         return _seconds(self.echo.time.values, self.echo.time.values[0])
 
     @cached_property
+    def counted(self) -> bool:
+        """Whether these count pulses, since the recording has no times."""
+        return counted(self.echo.time.values)
+
+    @cached_property
     def _target(self) -> tuple[float, float]:
         """Row and column of the brightest target."""
         brightest = self.image.attrs["quality"]["brightest"]
@@ -147,12 +154,13 @@ class Shown:
             [ring for polygon in rings for ring in polygon],
             crs_name(grid),
             grid.crs == LOCAL,
+            self.counted,
         )
 
     def record(self) -> PulseRecord:
         """Return which pulses make the image, and what the sidelink measured of them."""
         echo, sent = self.echo, self._sent()
-        counted = echo.attrs.get("pulses") or {}
+        told = echo.attrs.get("pulses") or {}
         snr_db = echo.sidelink_snr.values if "sidelink_snr" in echo else None
         beyond_m = None
         if "sidelink_delay" in echo and "sidelink_vector" in echo:
@@ -161,10 +169,11 @@ class Shown:
         return PulseRecord(
             _seconds(sent, sent[0]),
             np.isin(sent, echo.time.values),
-            counted.get("reasons") or {},
+            told.get("reasons") or {},
             _seconds(echo.time.values, sent[0]),
             snr_db,
             beyond_m,
+            self.counted,
         )
 
     def _sent(self) -> NDArray[np.datetime64]:

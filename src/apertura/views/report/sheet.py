@@ -40,6 +40,17 @@ _STYLE: Any = {
 }
 
 
+def over(*, counted: bool, first: str = "first pulse") -> str:
+    """Return the label of an axis along a flight: seconds, or pulses where a recording has no times.
+
+    Examples
+    --------
+    >>> over(counted=False), over(counted=True)
+    ('time from the first pulse, s', 'pulses from the first pulse; no times were recorded')
+    """
+    return f"pulses from the {first}; no times were recorded" if counted else f"time from the {first}, s"
+
+
 @contextmanager
 def sheet(path: Path, height: float, *, title: str, tags: Mapping[str, str]) -> Iterator[Figure]:
     """Yield an empty figure that becomes a PNG when the body ends.

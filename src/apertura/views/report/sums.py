@@ -1,9 +1,11 @@
 """Rule `pictures_fused`: what the report shows of the sums of a flight's pairs."""
 
 from pathlib import Path
+from typing import Any
 
 from apertura.common.provenance import Provenance
 from apertura.common.raster import opened_raster
+from apertura.core.geometry.geodesy import LOCAL
 from apertura.formats.export import product
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import FUSED
@@ -43,9 +45,8 @@ def pictures_fused(campaign: Campaign, flight: str) -> list[Path]:
     west, south, east, north = grid.bounds_m
     brightest = report["brightest"]
     target_m = brightest["x_m"] - west, brightest["y_m"] - south
-    draw_panels(
-        panels, powers, size_m=(east - west, north - south), target_m=target_m, title=f"flight {flight}", tags=tags
-    )
+    where: dict[str, Any] = {"size_m": (east - west, north - south), "target_m": target_m, "local": grid.crs == LOCAL}
+    draw_panels(panels, powers, title=f"flight {flight}", tags=tags, **where)
     coherent = cube.coherent[cube.attrs["flights"].index(flight)]
     title = f"flight {flight}, coherent sum of {' + '.join(report['fusion']['phases_rad'])}"
     draw_cuts(cuts, drawn_cuts(coherent, brightest, grid), title=title, tags=tags)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from apertura import __version__
-from apertura.common.errors import CampaignError, shown
+from apertura.common.errors import CampaignError, number_of, shown
 from apertura.common.paths import inside
 from apertura.common.provenance import lock_sha256, sha256_file, software
 from apertura.pipeline.campaign import Campaign
@@ -453,7 +453,7 @@ def print_verified(path: Path, campaign: Path | None = None, *, quiet: bool = Fa
         print(shown(note, _LONGEST))
     counts = [(state, sum(link.state == state for link in links)) for state in reversed(_ORDER)]
     if not quiet:
-        print(f"{len(links)} links: {', '.join(f'{count} {state}' for state, count in counts if count)}")
+        print(f"{number_of(len(links), 'link')}: {', '.join(f'{count} {state}' for state, count in counts if count)}")
     return 0 if all(link.state == "same" for link in links) else 1
 
 

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from apertura.common.errors import CampaignError, shown
+from apertura.common.errors import CampaignError, number_of, shown
 from apertura.common.paths import inside
 from apertura.common.processes import holder
 from apertura.pipeline.campaign import Campaign
@@ -71,7 +71,7 @@ def _found(root: Path, again: Path, wanted: Sequence[str], known: Sequence[str])
     if not lines:
         count, more = sum(len(_files(root, one)) for one in wanted), len(wanted) - 1
         others = f" and {more} more results" if more else ""
-        return [f"same     {count} files, byte for byte, of {wanted[0]}{others}"]
+        return [f"same     {number_of(count, 'file')}, byte for byte, of {wanted[0]}{others}"]
     begins = next((one for one in known if _differs(root, again, one)), None)
     if begins is None:
         return [*lines, "its manifest is the same: a file was changed after it was made, see `apertura verify`"]
