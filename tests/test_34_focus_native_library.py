@@ -109,7 +109,7 @@ def test_the_kernel_is_clean_under_sanitizers(tmp_path):
         "not slow",
         *(
             f"tests/test_34_focus_{name}.py"
-            for name in ("native", "beams", "envelope", "contributions", "gradient", "tree")
+            for name in ("native", "beams", "sector", "envelope", "contributions", "gradient", "tree")
         ),
     ]
     done = subprocess.run(command, env=environment, cwd=root, capture_output=True, text=True, check=False)
