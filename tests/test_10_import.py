@@ -39,7 +39,8 @@ def test_every_public_name_is_documented_and_listed():
     for name in apertura.__all__:
         assert getattr(apertura, name).__doc__, name
         assert getattr(apertura, name) is vars(apertura)[name]
-        assert name in dir(apertura)
+    assert {name for name in dir(apertura) if not name.startswith("_")} <= set(apertura.__all__)
+    assert set(apertura.__all__) <= set(dir(apertura))
 
 
 def test_a_name_that_is_not_public_is_an_attribute_error():

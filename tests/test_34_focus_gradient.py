@@ -19,6 +19,7 @@ from scenes import (
 
 import apertura as ap
 from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
+from apertura.common.errors import CampaignError
 from apertura.core.antenna.beam import Beams
 from apertura.core.focus.contributions import Echoes, block_contributions
 from apertura.core.focus.gradient import path_gradient
@@ -196,10 +197,10 @@ def test_a_stage_of_profiles_does_as_well_as_arrays_and_other_stages_are_refused
     one, other = (ap.gradient(given, patch, slope) for given in (profiles, stage))
     assert np.array_equal(one.rx_m, other.rx_m)
     for given in (point_history(), stage.drop_vars("profile")):
-        with pytest.raises(TypeError, match="must be profiles or a stage profile"):
+        with pytest.raises(CampaignError, match="expected Profiles, or a stage profile"):
             ap.gradient(given, patch, slope)
 
 
 def test_the_front_door_wants_a_slope_for_each_pixel():
-    with pytest.raises(ValueError, match="must be that of the grid"):
+    with pytest.raises(CampaignError, match="of the grid's shape"):
         ap.gradient(PROFILES, TARGET_GRID, np.ones((4, 4)))

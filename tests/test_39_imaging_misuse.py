@@ -252,3 +252,26 @@ def test_errors_of_positions_that_are_stated_are_expected():
         ap.judge(image, position_std_m=0.01)
     with pytest.raises(CampaignError, match="seconds of each of 96 pulses"):
         ap.judge(image, position_std_m=0.01, time_s=np.arange(3.0))
+
+
+@pytest.mark.parametrize(
+    ("call", "told"),
+    [
+        (lambda: ap.range_compress("x", TARGET_GRID, 0.0), "type str; expected a PhaseHistory"),
+        (lambda: ap.range_compress(PROFILES, TARGET_GRID, 0.0), "range profiles; expected a PhaseHistory"),
+        (lambda: ap.range_compress(HISTORY, (1, 2), 0.0), "expected a SceneGrid"),
+        (lambda: ap.range_compress(HISTORY, TARGET_GRID, "flat"), "expected a height in metres"),
+        (lambda: ap.gradient(PROFILES, (1, 2), np.ones((1, 2))), "expected a SceneGrid"),
+        (lambda: ap.gradient(HISTORY, TARGET_GRID, np.ones(TARGET_GRID.shape)), "expected Profiles"),
+        (lambda: ap.gradient(PROFILES, TARGET_GRID, "x"), "of the grid's shape"),
+        (lambda: ap.open_campaign(3), "expected the path of a campaign folder"),
+    ],
+)
+def test_other_doors_refuse_what_is_of_another_kind(call, told):
+    with pytest.raises(CampaignError) as refused:
+        call()
+    assert told in str(refused.value)
+
+
+def test_one_height_is_flat_ground_for_every_door():
+    assert np.array_equal(ap.range_compress(HISTORY, TARGET_GRID, 0.0).samples, PROFILES.samples)

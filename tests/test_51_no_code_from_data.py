@@ -85,8 +85,6 @@ TYPED = {
 MAY_REFUSE = {"align", "bench", "step bench", "reflectors", "step calibrate", "step interferogram", "step page"}
 """Commands that ask for what such a campaign does not have."""
 
-QUICK = ("check", "init", "plan", "step scene")
-
 ROADS = {
     "apertura, in the campaign": ("{bin}/apertura run . --cores 2", "{campaign}"),
     "apertura, tiles by several jobs": (
@@ -203,16 +201,12 @@ def test_a_marker_that_is_run_or_opened_is_seen(unfinished, monkeypatch):
     assert "ran numpy.py" not in fired
 
 
-def every_command():
-    return [*QUICK, *slow(*(name for name in leaves() if name not in QUICK))]
-
-
 def test_every_command_is_tried():
     assert set(TYPED) | MAY_REFUSE <= set(leaves())
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("command", every_command())
+@pytest.mark.parametrize("command", leaves())
 def test_nothing_fires_when_a_command_is_typed_in_a_finished_campaign(finished, command):
     planted = plant(finished)
     words = [str(BIN / "apertura"), *shlex.split(TYPED.get(command, command))]
@@ -540,7 +534,7 @@ def test_a_crs_is_authority_and_code_and_any_other_text_is_one_message(unfinishe
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("what", ["chunk", *slow("config", "raw", "log", "results", "records")])
+@pytest.mark.parametrize("what", ["chunk", "config", "raw", "log", "results", "records"])
 def test_a_link_out_of_the_folder_is_refused_and_nothing_behind_it_is_opened(finished, tmp_path, what):
     planted = plant(finished)
     behind = {

@@ -167,8 +167,8 @@ def backproject(  # noqa: PLR0913 - each choice is a keyword, so that an editor 
         expected="choices of ImagingChoices",
     )
     inputs = inputs_of(profiles, choices.window)
-    _check_kinds(inputs, grid, beams, certified_pixels)
     ground = ground_of(terrain, grid)
+    _check_kinds(inputs, beams, certified_pixels)
     if atmosphere is not None:
         inputs = inputs.at_speed(_wave_speed(atmosphere, grid, ground, inputs.aperture))
     _check_calibration(calibration, inputs)
@@ -213,12 +213,8 @@ def backproject(  # noqa: PLR0913 - each choice is a keyword, so that an editor 
     return image.assign_coords(_calibrated(image.data, formation, history, ground, calibration))
 
 
-def _check_kinds(inputs: PhaseHistory | Profiles, grid: Any, beams: Any, certified_pixels: Any) -> None:
-    """Raise CampaignError unless grid, beams and number of pixels are such."""
-    if not isinstance(grid, SceneGrid):
-        raise CampaignError(
-            quoted(grid), "backproject: grid", "a SceneGrid", "Make one by SceneGrid.from_bounds(crs, bounds_m)."
-        )
+def _check_kinds(inputs: PhaseHistory | Profiles, beams: Any, certified_pixels: Any) -> None:
+    """Raise CampaignError unless beams and number of pixels are such."""
     if not isinstance(certified_pixels, int) or certified_pixels < 0:
         raise CampaignError(
             quoted(certified_pixels), "backproject: certified_pixels", "a number of pixels", "Give 0 for none."

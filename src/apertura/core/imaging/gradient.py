@@ -1,10 +1,11 @@
 """Gradient of a caller's objective of an image with respect to phase centres and paths."""
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.common.errors import CampaignError
 from apertura.core.antenna.beam import Beams
 from apertura.core.focus.gradient import Gradient, path_gradient
 from apertura.core.focus.inputs import Profiles
@@ -49,12 +50,11 @@ def gradient(
 
     Raises
     ------
-    TypeError
-        If other than profiles are given: `range_compress` makes them from a phase history.
-    ValueError
-        If `dj_dimage` is not of the grid's shape, or it or a position on the ground is not finite.
     CampaignError
-        If a grid on Earth has no terrain.
+        If other than profiles are given: `range_compress` makes them from a phase history. If `dj_dimage` is not of the
+        grid's shape, or a grid on Earth has no terrain.
+    ValueError
+        If `dj_dimage` or a position on the ground is not finite.
 
     Notes
     -----
@@ -79,12 +79,19 @@ def gradient(
     >>> int(np.abs(derivatives.rx_m[:, 2]).argmax()), bool(derivatives.rx_m[64, 2] < 0), derivatives.path_m.shape
     (64, True, (128,))
     """
+    ground = ground_of(terrain, grid)
+    if "profile" in getattr(profiles, "data_vars", ()):
+        profiles = profiles_of(cast("xr.Dataset", profiles), lazy=True)
     if not isinstance(profiles, Profiles):
-        if "profile" not in getattr(profiles, "variables", ()):
-            raise TypeError(f"{type(profiles).__name__}: must be profiles or a stage profile, as of range_compress")
-        profiles = profiles_of(profiles, lazy=True)
-    slope = np.asarray(dj_dimage, np.complex128)
+        found = f"an object of type {type(profiles).__name__}"
+        raise CampaignError(found, "profiles", "Profiles, or a stage profile", "range_compress makes them of an echo.")
+    try:
+        slope = np.asarray(dj_dimage, np.complex128)
+    except (TypeError, ValueError):
+        slope = np.empty(0, np.complex128)
     if slope.shape != grid.shape:
-        raise ValueError(f"{slope.shape=}: must be that of the grid, {grid.shape}")
-    places_m = ground_of(terrain, grid).positions(grid).reshape(-1, 3)
+        found = f"shape {slope.shape}" if slope.size else f"an object of type {type(dj_dimage).__name__}"
+        expected = f"a complex array of the grid's shape, {grid.shape}"
+        raise CampaignError(found, "dj_dimage", expected, "Derive the objective by every pixel of that grid.")
+    places_m = ground.positions(grid).reshape(-1, 3)
     return path_gradient(profiles, places_m, slope.ravel() / len(profiles), beams=beams)

@@ -14,7 +14,7 @@ from apertura.core.focus.inputs import PhaseHistory, Profiles
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.swath import swath
-from apertura.core.scene.terrain import Terrain
+from apertura.core.scene.terrain import Terrain, ground_of
 
 # ---- Range windows and compression
 
@@ -97,16 +97,16 @@ class RangeWindow:
 
 
 def range_compress(
-    history: PhaseHistory, grid: SceneGrid, terrain: Terrain, *, window: RangeWindow | None = None
+    history: PhaseHistory, grid: SceneGrid, terrain: Terrain | float | None, *, window: RangeWindow | None = None
 ) -> Profiles:
     """Return range profiles of calibrated transfer functions, cropped to a scene.
 
     Parameters
     ----------
     history
-        Transfer functions with their window over the subcarriers.
+        Transfer functions with their window over the subcarriers; or a stage `echo` of a campaign.
     grid, terrain
-        The scene.
+        The scene; as of `backproject`.
     window
         Total paths to cover; those of the scene by default.
 
@@ -118,7 +118,7 @@ def range_compress(
     Raises
     ------
     CampaignError
-        If the scene is deeper than the unambiguous range.
+        If the scene is deeper than the unambiguous range, or an argument is something else.
     ValueError
         If the window is of another wave's speed.
 
@@ -138,8 +138,11 @@ def range_compress(
     >>> len(profiles), round(float(np.abs(profiles.samples).max()), 1)
     (8, 1.0)
     """
-    frequency, speed = history.frequency_hz, history.wave_speed_m_s
-    window = window or RangeWindow.of(history.aperture, grid, terrain, frequency, wave_speed_m_s=speed)
+    ground, given = ground_of(terrain, grid), history if isinstance(history, PhaseHistory) else inputs_of(history)
+    if not isinstance(given, PhaseHistory):
+        raise CampaignError("range profiles", "history", "a PhaseHistory", "They are compressed already: use them.")
+    history, frequency, speed = given, given.frequency_hz, given.wave_speed_m_s
+    window = window or RangeWindow.of(history.aperture, grid, ground, frequency, wave_speed_m_s=speed)
     if window.wave_speed_m_s != speed:
         raise ValueError(f"{window.wave_speed_m_s=}: must be {speed}, that of the history")
     if window.samples > window.unambiguous:

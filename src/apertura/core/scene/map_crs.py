@@ -42,10 +42,11 @@ def axis_attributes(side: str, *, projected: bool) -> dict[str, str]:
     Examples
     --------
     >>> axis_attributes("x", projected=False)
-    {'units': 'm', 'axis': 'X', 'long_name': 'easting'}
+    {'units': 'm', 'axis': 'X', 'long_name': 'x'}
     """
     standard = {"standard_name": f"projection_{side}_coordinate"} if projected else {}
-    return {"units": "m", "axis": side.upper(), "long_name": {"x": "easting", "y": "northing"}[side], **standard}
+    name = {"x": "easting", "y": "northing"}[side] if projected else side
+    return {"units": "m", "axis": side.upper(), "long_name": name, **standard}
 
 
 def horizontal_crs(crs: str) -> CRS:

@@ -165,13 +165,15 @@ def ground_of(terrain: Terrain | float | None, grid: SceneGrid) -> Terrain:
     Raises
     ------
     CampaignError
-        If it was left out of a grid on Earth, or is none.
+        If it was left out of a grid on Earth, or is none, or the grid is none.
 
     Examples
     --------
     >>> ground_of(2.5, SceneGrid("local", 0.0, 0.0, 1.0, (4, 4)))
     FlatGround(height_m=2.5)
     """
+    if not isinstance(grid, SceneGrid):
+        raise CampaignError(quoted(grid), "grid", "a SceneGrid", "Make one by SceneGrid.from_bounds(crs, bounds_m).")
     if terrain is None and grid.frame == "ecef":
         raise CampaignError(
             "no terrain for a grid on Earth",

@@ -119,7 +119,7 @@ def interferogram_flags(measured: InterferogramCounts) -> Flags:
     if one.residues > MOST_RESIDUES * one.loops:
         inconsistent.append(f"around {one.residues} of {one.loops} loops of four pixels the phase does not come back")
     if one.folded > MOST_FOLDED * one.told:
-        inconsistent.append(f"{one.folded} places are shown by several pixels and left out")
+        inconsistent.append(f"places shown by several pixels are left out: {one.folded}")
     if inconsistent:
         flags["unwrapping_inconsistent"] = (
             f"{'; '.join(inconsistent)}: heights may err by multiples of {one.ambiguity_m:.3g} m"

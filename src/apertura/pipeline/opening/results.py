@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from apertura.common.contracts import STAGES
 from apertura.common.documents import undamaged
-from apertura.common.errors import CampaignError
+from apertura.common.errors import CampaignError, quoted
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.opening.scene import OpenScene, open_scene
 from apertura.pipeline.store import open_document, open_listed, open_stage, remake
@@ -119,7 +119,7 @@ def open_campaign(path: str | Path) -> OpenCampaign:
     Raises
     ------
     CampaignError
-        If the config is wrong.
+        If that is no path, or the config is wrong.
 
     Examples
     --------
@@ -128,6 +128,9 @@ def open_campaign(path: str | Path) -> OpenCampaign:
     ...
     apertura.common.errors.CampaignError: nowhere/config/config.yaml: no such file; ...
     """
+    if not isinstance(path, str | Path):
+        expected = "the path of a campaign folder, which holds config/config.yaml"
+        raise CampaignError(quoted(path), "open_campaign: path", expected, "Give it as text or a pathlib.Path.")
     return OpenCampaign(Campaign.load(path))
 
 
