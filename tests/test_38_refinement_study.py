@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from apertura_research import commands, sweep
 from apertura_research.autofocus import charts, outcomes
-from apertura_research.autofocus.cases import SCENES
+from apertura_research.autofocus.cases import CELL_M2, SCENES, case
 from apertura_research.autofocus.outcomes import (
     ACCEPTED,
     FLAGGED,
@@ -19,7 +19,9 @@ from apertura_research.autofocus.outcomes import (
     VERDICTS,
     AutofocusRow,
     case_of,
+    judge,
     outcome_of,
+    refine_case,
     run_case,
     verdict_of,
 )
@@ -30,6 +32,8 @@ from apertura.common.errors import CampaignError
 from apertura.common.tables import read_table, write_table
 from apertura.core.geometry.phase_centres import TrackCorrection
 from apertura.methods.autofocus.inputs import Refinement
+
+QUARTER_OF_A_CELL_CM = 100 * np.sqrt(CELL_M2) / 4
 
 
 def row(sigma_cm, said, *, scene="five", seed=1, product_db=0.2):
@@ -98,6 +102,18 @@ def test_where_there_are_points_little_is_left_of_two_centimetres(scene):
     rows = [run_case(scene, (2.0, seed))[0] for seed in (1, 2)]
     assert all(one.loss_db > 3 for one in rows)
     assert np.mean([one.product_loss_db for one in rows]) < 0.5
+
+
+@compiled
+@pytest.mark.slow
+@pytest.mark.parametrize("sigma_m", [0.02, 0.04])
+def test_among_thirty_points_in_clutter_no_place_is_made_worse(sigma_m):
+    for seed in (1, 2):
+        one = case("thirty", "short", "joint", sigma_m, 10.0, seed)
+        result = refine_case(one)
+        before, after = judge(one), judge(one, result.correction)
+        assert not result.accepted or after.target_shift_cm <= before.target_shift_cm + QUARTER_OF_A_CELL_CM
+        assert not result.accepted or after.target_loss_db >= before.target_loss_db
 
 
 def marks(axes, said):
