@@ -32,8 +32,8 @@ def main() -> None:
         subprocess.run([apertura, "clean", campaign, "--yes"], check=True, stdout=subprocess.DEVNULL)
     began = time.perf_counter()
     rows, unknown = [], 0.0
-    with subprocess.Popen([apertura, "run", campaign, "--cores", "2"], text=True, stdout=subprocess.PIPE) as run:
-        for line in run.stdout or ():
+    with subprocess.Popen([apertura, "run", campaign, "--cores", "2"], text=True, stderr=subprocess.PIPE) as run:
+        for line in run.stderr or ():
             now = time.perf_counter() - began
             told = _LEFT.search(line.rstrip())
             if told:
