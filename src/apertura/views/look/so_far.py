@@ -1,0 +1,631 @@
+"""What has come of a campaign so far: captures and logs that grow, pairs of pulses, and images that they are added into.
+
+An image is a sum over pulses (docs/theory/engine.md, eq. 9): blocks of them are added as they are recorded, and none is
+read twice.
+"""
+
+import pkgutil
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, cast
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from apertura.common.errors import CampaignError
+from apertura.common.flags import Flags
+from apertura.core.antenna.beam import Beams
+from apertura.core.echo.association import associate
+from apertura.core.echo.compression import centre_frequency, window_weights
+from apertura.core.focus.contributions import band_limited_image
+from apertura.core.focus.inputs import PhaseHistory, Profiles
+from apertura.core.focus.tiles import Weighing, image_array
+from apertura.core.geometry.aperture import Aperture
+from apertura.core.geometry.sector import TAPER, Sector
+from apertura.core.imaging.formation import Formation
+from apertura.core.imaging.job import profiles_job
+from apertura.core.imaging.judgement import budget_by_hand, judgement
+from apertura.core.imaging.range_profiles import RangeWindow, phase_history_of, range_compress
+from apertura.core.planning.decisions import CHORD
+from apertura.core.planning.plan import Plan
+from apertura.core.planning.planner import make_plan
+from apertura.core.quality.budget import MOST_ACCURACY_DB
+from apertura.core.quality.error_check import error_bound
+from apertura.core.scene.dem import UncheckedDem
+from apertura.core.scene.grid import SceneGrid
+from apertura.core.scene.terrain import GroundModels, Terrain
+from apertura.formats.names import GROWING, TRACKS, log_format
+from apertura.formats.reading import open_recording, read_track
+from apertura.formats.recordings.recording import Captures, Recording
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.config import CONFIG
+from apertura.pipeline.opening.acquisition import Acquisition, Captured
+from apertura.pipeline.opening.air import scene_air
+from apertura.pipeline.opening.echo import PairEcho, pair_echo
+from apertura.pipeline.opening.node_log import shortest_wave
+from apertura.pipeline.opening.pair import beams_of, body_axes
+from apertura.pipeline.opening.positions import inside_segments, place
+from apertura.pipeline.opening.recordings import captures_of
+from apertura.pipeline.opening.scene import ConfiguredGround, Flown, settled
+from apertura.pipeline.opening.transmitted import Transmitted
+from apertura.pipeline.steps.calibration import calibrated
+
+Times = NDArray[np.datetime64]
+Axes = dict[str, NDArray[np.float64]]
+"""As of `apertura.pipeline.opening.pair.beams_of`."""
+
+# ---- What a node has recorded and logged so far ---------------------------------------------------------------------
+
+_ABOUT_S = 60.0  # of the log about the pulses of a block: farther epochs do not move a spline
+_EPOCHS = 4  # that a log must be ahead of a pulse: those to come would move it by 0.27⁴ of its error at the end
+
+
+class NodeSoFar:
+    """What a node has recorded and logged so far; whole captures and whole lines alone.
+
+    Parameters
+    ----------
+    campaign, flight, node
+        Which.
+    sent
+        What was transmitted.
+    follow
+        Whether its files still grow: a kind that cannot be read meanwhile is refused.
+    """
+
+    def __init__(self, campaign: Campaign, flight: str, node: str, sent: Transmitted, *, follow: bool) -> None:
+        self.name, self.waits, self.ended = node, "", False
+        self.time: Times = np.zeros(0, "datetime64[ns]")
+        self.frame: NDArray[np.int64] = np.zeros(0, np.int64)
+        self.track: xr.Dataset | None = None
+        self._campaign, self._flight, self._sent, self._follow = campaign, flight, sent, follow
+        self._recording: Recording | None = None
+        self._found: xr.Dataset | None = None  # captures found in samples that never stopped
+        self._growing: Any = None
+        self._log_bytes = -1
+
+    def read(self) -> bool:
+        """Read what has come since; return whether anything has."""
+        before = len(self.time), self._log_bytes
+        self.waits = ""
+        for read in (self._read_recording, self._read_log):
+            try:
+                read()
+            except _Refused as error:
+                raise error.why from error
+            except CampaignError as error:
+                if not self._follow:
+                    raise
+                self.waits = str(error)  # a file that is not there yet, or has only begun
+        return (len(self.time), self._log_bytes) != before
+
+    def _read_recording(self) -> None:
+        if self._found is not None:
+            return
+        files = self._campaign.recording_files(self._flight, self.name)
+        if self._growing is None:
+            row = next(row for row in GROWING if files[0].name.endswith(row[0]))
+            self._growing = pkgutil.resolve_name(GROWING[row])(*files)
+        growing = self._growing.read()
+        if self._growing.runs_through and not self._follow:
+            whole = open_recording(files)
+            self._recording, self._found = whole, captures_of(whole, self._campaign, node=self.name)
+            recorded, self.frame = self._found.time.values, self._found.frame.values
+        elif self._growing.runs_through:
+            raise _Refused(
+                CampaignError(
+                    "apertura:framing: its recorder never stops",
+                    files[0],
+                    "one capture segment per trigger, in a recording that is followed",
+                    "Its pulses are found in all of its samples: look at it without --follow, or when it has ended.",
+                )
+            )
+        else:
+            self._recording = growing if growing or self._follow else open_recording(files)
+            if self._recording is None:
+                return
+            recorded, self.frame = self._recording.captures.time, self._recording.captures.frame
+        self.time = self._campaign.clock(self._flight, self.name).utc(recorded)
+        self.ended = self._growing.ended
+
+    def _read_log(self) -> None:
+        path = self._campaign.track_file(self._flight, self.name)
+        options = self._campaign.settings.nodes[self.name].log.options
+        size = path.stat().st_size
+        if size == self._log_bytes:
+            return
+        kind = log_format(path, options)
+        if not TRACKS[kind].by_lines:
+            if self._follow:
+                by_lines = ", ".join(name for name, row in TRACKS.items() if row.by_lines)
+                raise _Refused(
+                    CampaignError(
+                        f"a log of format {kind}, which cannot be read while it is written",
+                        path,
+                        f"a log of lines of text ({by_lines}), where it is followed",
+                        "Look without --follow when it has ended, or let the log be streamed as text.",
+                    )
+                )
+            self.track = read_track(path, node=self.name, options=options)
+        else:
+            lines = path.read_bytes()
+            with TemporaryDirectory() as folder:
+                whole = Path(folder) / path.name
+                whole.write_bytes(lines[: lines.rfind(b"\n") + 1])
+                self.track = read_track(whole, node=self.name, options=options)
+        self._log_bytes = size
+
+    def known_until(self, *, ended: bool) -> np.datetime64:
+        """Return up to when positions are known: by some epochs less than the log, unless that has ended."""
+        if self.track is None:
+            return np.datetime64(0, "ns")
+        epochs = self.track.time.values
+        return cast("np.datetime64", epochs[-1 if ended else max(0, len(epochs) - 1 - _EPOCHS)])
+
+    def acquisition(self, captures: NDArray[np.int64]) -> Acquisition:
+        """Return some captures with the log about them; frames count them, as they are paired already."""
+        if self._recording is None or self.track is None:
+            raise TypeError("nothing is recorded or logged yet")
+        if self._found is not None:
+            raw = self._found.isel(pulse=captures)
+        else:
+            own = self._recording.captures
+            some = Captures(own.start[captures], own.length, own.time[captures], own.frame[captures])
+            raw = self._recording.cut(some, node=self.name)
+        raw = raw.assign(time=("pulse", self.time[captures]), frame=("pulse", np.arange(len(captures))))
+        about = np.timedelta64(round(_ABOUT_S * 1e9), "ns")
+        epochs = self.track.time.values
+        near = (epochs >= raw.time.values[0] - about) & (epochs <= raw.time.values[-1] + about)
+        files = Path("raw") / self._flight / self.name
+        captured = Captured.of(raw, self._recording.samples.path, files, str(files), self._sent)
+        settings = self._campaign.node(self._flight, self.name)
+        wave_m = shortest_wave(self._sent.numerology.frequency_hz)
+        log = str(self._campaign.track_file(self._flight, self.name))
+        return Acquisition(self.name, settings, self.track.isel(epoch=near), log, wave_m, **vars(captured))
+
+
+class _Refused(Exception):
+    """What no waiting helps: `why` is the error."""
+
+    def __init__(self, why: CampaignError) -> None:
+        super().__init__(str(why))
+        self.why = why
+
+
+# ---- An image that pulses are added into ----------------------------------------------------------------------------
+
+_CERTIFIED = 16  # pixels that are also summed exactly
+_TOGETHER = 16  # pulses that are bounded in range by one of them
+_JUDGED = 1024  # pulses kept for the judgement, evenly spread
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """Some pulses of a pair: transfer functions, body axes and times.
+
+    Attributes
+    ----------
+    history
+        Their phase history.
+    axes
+        As of `apertura.pipeline.opening.pair.beams_of`.
+    time
+        (pulse,) datetime64[ns], UTC.
+    """
+
+    history: PhaseHistory
+    axes: Axes
+    time: Times
+
+
+class ImageSoFar:
+    """The sum of the pulses so far over a grid: eq. 8 of docs/theory/engine.md, block by block.
+
+    Parameters
+    ----------
+    campaign, pair
+        Settings, and which pair.
+    grid, terrain
+        Its pixels, and the ground under them.
+    share
+        Of the band and of the resolution along the flight: 2 takes the middle half of the subcarriers and half the
+        angle, whose cells twice as wide need every second pixel.
+    accuracy_db
+        Numerical error asked.
+    threads
+        Tiles formed at once.
+    plans
+        Share → how it is formed: what one pair has planned serves the others, as long as the error measured allows.
+    """
+
+    def __init__(
+        self,
+        campaign: Campaign,
+        pair: str,
+        grid: SceneGrid,
+        terrain: Terrain,
+        *,
+        share: int,
+        accuracy_db: float,
+        threads: int,
+        plans: dict[int, Plan],
+    ) -> None:
+        self.grid, self.share, self.pulses, self.error_db = grid, share, 0, np.inf
+        self.sums = np.zeros(grid.shape, np.complex64)
+        self._campaign, self._pair, self._terrain = campaign, pair, terrain
+        self._accuracy_db, self._threads = accuracy_db, threads
+        self._pixels = np.random.default_rng(0).integers(0, grid.shape, (_CERTIFIED, 2))
+        self._exact = np.zeros(_CERTIFIED, np.complex128)
+        self._plans = plans
+        self._speed_m_s = 0.0
+        self._every, self._kept = 1, list[tuple[Profiles, Axes, Times]]()
+
+    def compressed(self, block: Block) -> Profiles:
+        """Return the range profiles of a block, over this image's share of the band."""
+        history, count = block.history, len(block.history.frequency_hz)
+        self._speed_m_s = self._speed_m_s or history.wave_speed_m_s  # of all blocks: air changes it by less than 1e-8
+        kept = -(-count // self.share)
+        part = slice((count - kept) // 2, (count - kept) // 2 + kept)
+        weight = window_weights(self._campaign.settings.processing.window, kept)
+        some = replace(
+            history, transfer=history.transfer[:, part], frequency_hz=history.frequency_hz[part], weight=weight
+        ).at_speed(self._speed_m_s)
+        window = RangeWindow.of(
+            some.aperture,
+            self.grid,
+            self._terrain,
+            some.frequency_hz,
+            beams=self._beams(some.aperture, block.axes, centre_frequency(some.frequency_hz)),
+            wave_speed_m_s=self._speed_m_s,
+            together=_TOGETHER,
+        )
+        return range_compress(some, self.grid, self._terrain, window=window)
+
+    def add(self, profiles: Profiles, axes: Axes, at: Times) -> None:
+        """Add a block of pulses; the setting is planned for the first, and again where the error measured is above it.
+
+        Parameters
+        ----------
+        profiles
+            From `compressed`.
+        axes, at
+            As of the block.
+        """
+        beams = self._beams(profiles.aperture, axes, profiles.centre_frequency_hz)
+        if self._plan is None or (self.pulses and self.error_db > self._accuracy_db):
+            self._plans[self.share] = self._planned(profiles, beams)
+        plan = self._plans[self.share]
+        side = self._campaign.settings.processing.tile_px
+        image = image_array(
+            profiles,
+            plan.setting,
+            self.grid,
+            plan.terrain,
+            side_px=side,
+            weighing=Weighing(beams, None, count=1),
+        )
+        self.sums += image.compute(scheduler="threads", num_workers=self._threads)
+        places = plan.terrain.positions_at(self.grid, *self._pixels.T)
+        self._exact += band_limited_image(profiles, places, beams=beams)
+        self.pulses += len(profiles)
+        power = np.full(_CERTIFIED, float(np.mean(np.abs(self.sums) ** 2)))
+        computed = self.sums[tuple(self._pixels.T)]
+        self.error_db = error_bound(computed, self._exact, np.ones(_CERTIFIED), power=power).bound_db
+        self._keep(profiles, axes, at)
+
+    @property
+    def _plan(self) -> Plan | None:
+        return self._plans.get(self.share)
+
+    def _planned(self, profiles: Profiles, beams: Beams | None) -> Plan:
+        ground = GroundModels.of(self._terrain, None, self.grid)
+        job = profiles_job(profiles, self.grid, ground, integration="all")
+        overrides = {**self._campaign.settings.processing.planned, "presum": 1, "pulse_blocks": 1}
+        return make_plan(replace(job, beams=beams), accuracy_db=self._accuracy_db, overrides=overrides, where=CONFIG)
+
+    def _beams(
+        self, aperture: Aperture, axes: Axes, centre_hz: float
+    ) -> Beams | None:
+        """Return the weights of pulses: antennas, and a sector that no later pulse changes; None: all count alike."""
+        asked = self._campaign.settings.processing.integrated
+        antennas = beams_of(self._campaign, self._pair, axes)
+        if asked == "all" or len(aperture) < 2:
+            return antennas
+        wavelength_m = self._speed_m_s / centre_hz
+        if asked == "auto":
+            half = wavelength_m / (4 * self.grid.spacing_m) / (1 + TAPER)
+        elif "degrees" in asked:
+            half = float(np.sin(np.radians(asked["degrees"]) / 2)) / self.share
+        else:
+            half = wavelength_m / (4 * asked["resolution_m"] * self.share)
+        if half * (1 - TAPER) >= 1:  # all directions
+            return antennas
+        middle_m = self._terrain.positions_at(self.grid, *((size - 1) / 2 for size in self.grid.shape))
+        range_m = float(np.linalg.norm(aperture.middle_m - middle_m, axis=-1).min())
+        return Beams.within(Sector.of(aperture, chord_m=CHORD * range_m, centre=0.0, half=half), antennas)
+
+    def _keep(self, profiles: Profiles, axes: Axes, at: Times) -> None:
+        """Keep evenly spread pulses for the judgement."""
+        self._kept.append(_every(profiles, axes, at, self._every))
+        if sum(len(one[0]) for one in self._kept) > _JUDGED:
+            self._every *= 2
+            self._kept = [_every(*one, 2) for one in self._kept]
+
+    @property
+    def image(self) -> NDArray[np.complex64]:
+        """(y, x) complex64, the mean over the pulses so far."""
+        return np.asarray(self.sums / np.float32(max(1, self.pulses)), np.complex64)
+
+    @property
+    def setting(self) -> str:
+        """Engine and options."""
+        return self._plan.setting.line if self._plan else ""
+
+    @property
+    def peak(self) -> dict[str, float]:
+        """Place of the brightest pixel, metres of the scene's CRS, and dB above the median pixel."""
+        power = np.abs(self.sums) ** 2
+        row, column = np.unravel_index(int(power.argmax()), power.shape)
+        x_m, y_m = map(float, self.grid.map_at(row, column))
+        lit = power[power > 0]
+        above_db = 10 * float(np.log10(power.max() / np.median(lit))) if lit.size else 0.0
+        return {"x_m": round(x_m, 3), "y_m": round(y_m, 3), "above_median_db": round(above_db, 1)}
+
+    def judged(self) -> dict[str, Any]:
+        """Return verdict, why, loss_db where it was measured, and flags, by the pulses kept."""
+        pulses = sum(len(one[0]) for one in self._kept)
+        if self._plan is None or pulses < 64:
+            return {"verdict": "cannot tell", "why": f"{pulses} pulses so far", "flags": {}}
+        profiles, axes, at = _joined(self._kept)
+        beams = self._beams(profiles.aperture, axes, profiles.centre_frequency_hz)
+        plan = replace(self._plan, beams=beams, integration=None)
+        side = self._campaign.settings.processing.tile_px
+        formation = Formation(None, profiles, self.grid, plan, side)
+        stated = [self._campaign.settings.nodes[node].position_std_m for node in self._pair.split("-")]
+        std_m = None if None in stated else max(float(np.max(cast("Any", one))) for one in stated)
+        seconds = (at - at[0]) / np.timedelta64(1, "s")
+        error_db = float(self.error_db) if np.isfinite(self.error_db) else None
+        lines = budget_by_hand(formation, error_db=error_db, position_std_m=std_m, time_s=seconds)
+        told = judgement(formation, self.image, lines)
+        loss = {"loss_db": told.focus["loss_db"]} if "loss_db" in told.focus else {}
+        return {"verdict": told.verdict, "why": told.why, **loss, "flags": dict(told.flags)}
+
+
+_Kept = tuple[Profiles, Axes, Times]
+
+
+def _every(profiles: Profiles, axes: Axes, at: Times, step: int) -> _Kept:
+    some = slice(None, None, step)
+    thinned = profiles[some]
+    return replace(thinned, samples=np.array(thinned.samples)), {name: one[some] for name, one in axes.items()}, at[some]
+
+
+def _joined(kept: Sequence[_Kept]) -> _Kept:
+    """Return several blocks as one; shorter profiles end in zeros."""
+    longest = max(one.samples.shape[1] for one, _, _ in kept)
+    samples = [np.pad(one.samples, ((0, 0), (0, longest - one.samples.shape[1]))) for one, _, _ in kept]
+    tx_m, rx_m = (np.concatenate([one.aperture.legs[leg] for one, _, _ in kept]) for leg in (0, 1))
+    start_m = np.concatenate([one.start_m for one, _, _ in kept])
+    whole = replace(kept[0][0], samples=np.concatenate(samples), start_m=start_m, aperture=Aperture(tx_m, rx_m))
+    axes = {name: np.concatenate([axes[name] for _, axes, _ in kept]) for name in kept[0][1]}
+    return whole, axes, np.concatenate([at for _, _, at in kept])
+
+
+# ---- A pair: which pulses have come, and where they are added -------------------------------------------------------
+
+AT_ONCE = 2048
+"""Pulses of a block at most: each costs a tenth of a second, however few they are."""
+
+_LEAST = 64  # pulses of a block while more will come: the state of a sidelink is measured on each
+_OVERLAP = 256  # pulses that are paired again, so that tags of the next follow from theirs
+_QUEUE_BYTES = 512_000_000  # of profiles that wait for the fine image
+
+
+@dataclass(eq=False)
+class PairSoFar:
+    """A pair while it flies: pulses are paired and held back until both logs know where they were sent and received.
+
+    Attributes
+    ----------
+    campaign, flight, name
+        Which.
+    echo
+        Of a recorder that stores transfer functions; then there are no
+    tx, rx, sent
+        Its nodes, and what was transmitted.
+    threads
+        Tiles formed at once.
+    plans
+        As of `ImageSoFar`.
+    images
+        Coarse, then fine; the fine one's pulses wait in a queue.
+    dropped
+        Pulses read that have no position or no sidelink, or are left out as every other.
+    """
+
+    campaign: Campaign
+    flight: str
+    name: str
+    echo: PairEcho | None
+    tx: NodeSoFar | None = None
+    rx: NodeSoFar | None = None
+    sent: Transmitted | None = None
+    threads: int = 1
+    plans: dict[int, Plan] = field(default_factory=dict)
+    images: list[ImageSoFar] = field(default_factory=list)
+    flags: Flags = field(default_factory=Flags)
+    taken: int = 0
+    dropped: int = 0
+    until: np.datetime64 | None = None
+    why_dropped: str = ""
+    _shift_ns: int = 0
+    _queue: list[_Kept] = field(default_factory=list)
+    _fine: bool = True
+
+    def ready(self, *, ended: bool) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return captures of transmitter and receiver that belong together and were not taken yet.
+
+        Those are held back that a log does not reach yet, or whose partner may still come.
+        """
+        nothing = np.zeros(0, np.int64)
+        if self.tx is None or self.rx is None or self.sent is None:
+            here = np.arange(self.taken, len(self.time))
+            return here, here
+        until = min(node.known_until(ended=ended) for node in (self.tx, self.rx))
+        last = int(np.searchsorted(self.tx.time, until, "right"))
+        if self.tx is self.rx:
+            here = np.arange(self.taken, last)
+            return here, here
+        tags = [node.time.astype("datetime64[ns]").astype(np.int64) for node in (self.tx, self.rx)]
+        if last <= self.taken or not tags[1].size:
+            return nothing, nothing
+        interval_ns = round(1e9 / self.sent.waveform.prf_hz)
+        tags[1] = tags[1] - self._shift_ns
+        if not ended:
+            last = min(last, int(np.searchsorted(tags[0], tags[1][-1] - interval_ns)))
+        if last <= self.taken:
+            return nothing, nothing
+        begun = max(0, self.taken - _OVERLAP)
+        ends = np.searchsorted(tags[1], [tags[0][begun] - interval_ns, tags[0][last - 1] + interval_ns])
+        some = slice(begun, last), slice(*map(int, ends))
+        if some[1].start == some[1].stop:
+            return nothing, nothing
+        found = associate(
+            tags[0][some[0]],
+            tags[1][some[1]],
+            repetition_interval_s=interval_ns * 1e-9,
+            tx_frame=self.tx.frame[some[0]],
+            rx_frame=self.rx.frame[some[1]],
+            where=f"flight {self.flight}, pair {self.name}",
+        )
+        tx_index, rx_index = found.tx_index + some[0].start, found.rx_index + some[1].start
+        self._shift_ns += round(float(np.median(tags[1][rx_index] - tags[0][tx_index])))
+        new = ~found.outlier & (tx_index >= self.taken)
+        return tx_index[new], rx_index[new]
+
+    def add_next(self, *, ended: bool, every: int = 1) -> bool:
+        """Read a block of the pulses that have come and add it to the coarse image; return whether there was one.
+
+        Of every `every` pulses one is taken.
+        """
+        try:
+            tx_index, rx_index = self.ready(ended=ended)
+        except CampaignError as error:  # tags that do not pair yet
+            if ended:
+                self.why_dropped = str(error)
+            return False
+        if len(tx_index) < (1 if ended else _LEAST * every):
+            return False
+        some = slice(0, AT_ONCE * every)
+        tx_index, rx_index = tx_index[some], rx_index[some]
+        read = self.taken
+        self.taken = int(tx_index[-1]) + 1
+        kept = tx_index % every == 0
+        added = self._add(tx_index[kept], rx_index[kept]) if kept.any() else 0
+        self.dropped += self.taken - read - added
+        self.until = self.time[self.taken - 1]
+        return True
+
+    def _add(self, tx_index: NDArray[np.int64], rx_index: NDArray[np.int64]) -> int:
+        """Add the pulses of some captures; return how many have a position and a transfer function."""
+        try:
+            block = self._block(tx_index, rx_index)
+        except CampaignError as error:
+            self.why_dropped = str(error)
+            return 0
+        if block is None:
+            return 0
+        if not self.images:
+            self.images = self._begin(block)
+        coarse, *fine = self.images
+        profiles = coarse.compressed(block)
+        coarse.add(profiles, block.axes, block.time)
+        if fine and self._fine:
+            self._queue.append((fine[0].compressed(block), block.axes, block.time))
+            self._fine = sum(one.samples.nbytes for one, _, _ in self._queue) <= _QUEUE_BYTES
+            self._queue = self._queue if self._fine else []  # it would never be as far as the coarse one
+        return len(block.time)
+
+    def _block(self, tx_index: NDArray[np.int64], rx_index: NDArray[np.int64]) -> Block | None:
+        """Return the echo of some captures, as step `echo` forms it of all; None where no pulse is left."""
+        campaign, processing = self.campaign, self.campaign.settings.processing
+        if self.tx is None or self.rx is None or self.sent is None:
+            return self._read(cast("PairEcho", self.echo), tx_index)
+        try:
+            inside = inside_segments(campaign, self.flight, self.name, self.tx.time[tx_index])
+        except CampaignError:  # none is
+            return None
+        tx = self.tx.acquisition(tx_index[inside])
+        rx = tx if self.rx is self.tx else self.rx.acquisition(rx_index[inside])
+        hovers = bool(campaign.segments_of(self.flight, self.name))
+        if not place(tx, rx, tx.raw.time.values, hovers=hovers).good.any():
+            self.why_dropped = "hover: the antennas stood"
+            return None
+        air = scene_air(campaign, tx.track.position.values)
+        offset = calibrated(campaign, self.flight, self.name)
+        echo = pair_echo(tx, rx, self.sent, processing, offset, air, hovers=hovers)
+        return self._read(echo, np.arange(echo.dataset.sizes["pulse"]))
+
+    def _read(self, echo: PairEcho, pulses: NDArray[np.int64]) -> Block:
+        formed = replace(echo, dataset=echo.dataset.isel(pulse=pulses)).at(slice(None))
+        self.flags = Flags({**self.flags, **formed.attrs["flags"], **echo.saturation.flags})
+        history = phase_history_of(formed, self.campaign.settings.processing.window)
+        return Block(history, body_axes(formed), formed.time.values)
+
+    def _begin(self, block: Block) -> list[ImageSoFar]:
+        """Return the images, on the grid of the config: what is `auto` there is settled by what has come."""
+        campaign, history = self.campaign, block.history
+        flown = Flown(history.aperture, history.frequency_hz, np.inf)
+        grid, ground, _ = settled(campaign, lambda: flown)
+        asked = campaign.settings.processing.accuracy_db
+        accuracy_db = MOST_ACCURACY_DB if asked == "auto" else float(asked)
+        images = []
+        for share in (2, 1):
+            own = grid.coarse(max(grid.shape) // share)
+            terrain = UncheckedDem(ground.dem, own) if ground.dem else ground.level(own)
+            how: dict[str, Any] = {"share": share, "accuracy_db": accuracy_db / share, "threads": self.threads, "plans": self.plans}
+            images.append(ImageSoFar(campaign, self.name, own, terrain, **how))
+        return images
+
+    def refine_next(self) -> bool:
+        """Add the next block of the queue to the fine image; return whether there was one."""
+        if not self._queue:
+            return False
+        self.images[1].add(*self._queue.pop(0))
+        return True
+
+    @property
+    def time(self) -> Times:
+        """(pulse,) datetime64[ns], UTC: when the pulses so far were sent."""
+        if self.tx is None:
+            return cast("Times", cast("PairEcho", self.echo).dataset.time.values)
+        return self.tx.time
+
+    @property
+    def delay_s(self) -> float | None:
+        """Seconds by which the last pulse added is behind the last one recorded; None before both."""
+        if self.until is None or not len(self.time):
+            return None
+        return round(float((self.time[-1] - self.until) / np.timedelta64(1, "s")), 2)
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Pulses recorded, added to what is shown, and left out."""
+        return {"recorded": len(self.time), "added": self.shown.pulses if self.shown else 0, "left_out": self.dropped}
+
+    @property
+    def waits(self) -> str:
+        """What is missing for more; empty: nothing."""
+        nodes = [node.waits for node in (self.tx, self.rx) if node is not None]
+        return next((why for why in (*nodes, self.why_dropped) if why), "")
+
+    @property
+    def shown(self) -> ImageSoFar | None:
+        """The fine image where it has all pulses that the coarse one has; else that one."""
+        if not self.images:
+            return None
+        coarse, fine = self.images
+        return fine if fine.pulses == coarse.pulses else coarse
