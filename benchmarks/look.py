@@ -1,9 +1,10 @@
 """A look at a campaign while it flies: its delay behind the recording, its share of a core, and what it leaves.
 
 ``python benchmarks/look.py WORK --seconds 60`` simulates a flight at 500 Hz into WORK/flown where it is not there yet
-(one transmitter, one receiver, 5 m/s; 27 kB per pulse), runs the workflow on it, then copies its recordings and logs at
-their own rate into WORK/replayed, cut wherever a write may end, while ``apertura look --follow`` runs there; and
-compares what the two runs leave, file by file. ``--campaign DIR`` replays another campaign, ``--rate`` times as fast.
+(one transmitter, one receiver, 5 m/s; 27 kB per pulse), then copies its recordings and logs at their own rate into
+WORK/replayed, cut wherever a write may end, while ``apertura look --follow`` runs there; then runs the workflow on a
+copy of these, without look, and compares what the two runs leave, file by file. ``--campaign DIR`` replays another
+campaign, ``--rate`` times as fast.
 """
 
 import argparse
@@ -38,7 +39,7 @@ def main() -> None:
     asked.add_argument("work", type=Path)
     asked.add_argument("--seconds", type=float, default=60)
     asked.add_argument("--half-width", type=float, default=25.6, help="of the scene, m; pixels are 10 cm")
-    asked.add_argument("--campaign", type=Path, help="a finished campaign to replay instead")
+    asked.add_argument("--campaign", type=Path, help="a campaign to replay instead")
     asked.add_argument("--rate", type=float, default=1.0, help="times as fast as it was recorded")
     asked.add_argument("--every", type=float, default=5.0, help="s between pictures")
     asked.add_argument("--cores", type=int, default=1)
@@ -49,8 +50,6 @@ def main() -> None:
         simulate(flown, flight(given.seconds, given.half_width))
     replayed = given.work / "replayed"
     shutil.rmtree(replayed, ignore_errors=True)
-    if not given.no_run and not (flown / "results/ro-crate-metadata.json").is_file():
-        subprocess.run([*APERTURA, "run", str(flown), "-q", "--cores", str(given.cores)], check=True)
     begin(flown, replayed)
     words = ["look", str(replayed), "--follow", "--every", str(given.every), "--cores", str(given.cores)]
     looking = subprocess.Popen(
@@ -67,7 +66,17 @@ def main() -> None:
     reader.join()
     report(said, spent / lasted, lasted)
     if not given.no_run:
-        compare(flown / "results", replayed / "results")
+        other = run_without_look(replayed, given.work / "without_look", cores=given.cores)
+        compare(other / "results", replayed / "results")
+
+
+def run_without_look(root: Path, other: Path, *, cores: int) -> Path:
+    """Run the workflow on a copy of a campaign's own files, of the same dates; return that."""
+    shutil.rmtree(other, ignore_errors=True)
+    for name in ("config", "raw"):
+        shutil.copytree(root / name, other / name)
+    subprocess.run([*APERTURA, "run", str(other), "-q", "--cores", str(cores)], check=True)
+    return other
 
 
 APERTURA = [sys.executable, "-P", "-m", "apertura"]

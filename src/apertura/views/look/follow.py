@@ -110,7 +110,7 @@ class Look:
             if ended or time.monotonic() >= shown_at + self.every_s:
                 while ended and fine and any(one.refine_next() for one in self.pairs):
                     pass
-                self._show(ended=ended, elapsed_s=time.monotonic() - shown_at)
+                self.show(ended=ended, elapsed_s=time.monotonic() - shown_at)
                 shown_at = time.monotonic()
             elif not ended:
                 self.finish.wait(max(0.0, polled + poll_s - time.monotonic()))
@@ -121,14 +121,14 @@ class Look:
         while more and (ended or time.monotonic() < until):
             more = any([one.add_next(ended=ended, every=self.decimated) for one in self.pairs])
 
-    def _show(self, *, ended: bool, elapsed_s: float) -> None:
+    def show(self, *, ended: bool, elapsed_s: float) -> None:
         """Write pictures, status and page, and say each in a line; take fewer pulses where it has fallen behind."""
         began = time.monotonic()
         pairs = {}
         for pair in self.pairs:
             for node in self.nodes.values():
                 node.read()  # so that the delay is that of the picture
-            told = self._show_pair(pair)
+            told = self.show_pair(pair)
             pairs[f"{pair.flight}/{pair.name}"] = told
             print(f"{datetime.now(UTC):%H:%M:%S}  {_line(pair, told)}", flush=True)
         delays = [one["delay_s"] for one in pairs.values() if one["delay_s"] is not None]
@@ -153,7 +153,7 @@ class Look:
         elif busy < _AT_EASE and self.decimated > 1:
             self.decimated //= 2
 
-    def _show_pair(self, pair: PairSoFar) -> dict[str, Any]:
+    def show_pair(self, pair: PairSoFar) -> dict[str, Any]:
         """Write the picture of a pair; return what is known of it, for the status."""
         shown = pair.shown
         told: dict[str, Any] = {"pulses": pair.counts, "waits": pair.waits, "delay_s": None, "image": None}

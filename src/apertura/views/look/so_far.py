@@ -16,7 +16,6 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from apertura.common.errors import CampaignError
-from apertura.common.flags import Flags
 from apertura.core.antenna.beam import Beams
 from apertura.core.echo.association import associate
 from apertura.core.echo.compression import centre_frequency, window_weights
@@ -419,7 +418,7 @@ def _joined(kept: Sequence[_Kept]) -> _Kept:
 AT_ONCE = 2048
 """Pulses of a block at most: each costs a tenth of a second, however few they are."""
 
-_LEAST = 64  # pulses of a block while more will come: the state of a sidelink is measured on each
+_LEAST = 32  # pulses of a block while more will come: the state of a sidelink is measured on each
 _OVERLAP = 256  # pulses that are paired again, so that tags of the next follow from theirs
 _QUEUE_BYTES = 512_000_000  # of profiles that wait for the fine image
 
@@ -456,12 +455,13 @@ class PairSoFar:
     threads: int = 1
     plans: dict[int, Plan] = field(default_factory=dict)
     images: list[ImageSoFar] = field(default_factory=list)
-    flags: Flags = field(default_factory=Flags)
     taken: int = 0
     dropped: int = 0
     until: np.datetime64 | None = None
     why_dropped: str = ""
     _shift_ns: int = 0
+    _blocks: int = 0
+    _raised: dict[str, tuple[int, str]] = field(default_factory=dict)  # blocks that raised a flag, and its last line
     _queue: list[_Kept] = field(default_factory=list)
     _fine: bool = True
 
@@ -571,7 +571,9 @@ class PairSoFar:
 
     def _read(self, echo: PairEcho, pulses: NDArray[np.int64]) -> Block:
         formed = replace(echo, dataset=echo.dataset.isel(pulse=pulses)).at(slice(None))
-        self.flags = Flags({**self.flags, **formed.attrs["flags"], **echo.saturation.flags})
+        self._blocks += 1
+        for name, line in {**formed.attrs["flags"], **echo.saturation.flags}.items():
+            self._raised[name] = self._raised.get(name, (0, ""))[0] + 1, line
         history = phase_history_of(formed, self.campaign.settings.processing.window)
         return Block(history, body_axes(formed), formed.time.values)
 
@@ -615,6 +617,11 @@ class PairSoFar:
     def counts(self) -> dict[str, int]:
         """Pulses recorded, added to what is shown, and left out."""
         return {"recorded": len(self.time), "added": self.shown.pulses if self.shown else 0, "left_out": self.dropped}
+
+    @property
+    def flags(self) -> dict[str, str]:
+        """Flags that most blocks raised, by the last line: what is told by the statistics of one may be chance."""
+        return {name: line for name, (times, line) in self._raised.items() if 2 * times > self._blocks}
 
     @property
     def waits(self) -> str:
