@@ -210,7 +210,9 @@ def _read(looking: subprocess.Popen, said: list[str]) -> None:
 def report(said: list[str], share: float, lasted_s: float) -> None:
     """Print delay, share of a core and images shown while it was recorded."""
     delays = [float(found[1]) for line in said if (found := re.search(r"([\d.]+) s behind", line))]
-    print(f"recorded for {lasted_s:.0f} s; {share:.2f} of one core; {len(delays)} images; load {os.getloadavg()[0]:.1f}")
+    print(
+        f"recorded for {lasted_s:.0f} s; {share:.2f} of one core; {len(delays)} images; load {os.getloadavg()[0]:.1f}"
+    )
     if delays:
         print(f"behind the recording: median {statistics.median(delays):.1f} s, most {max(delays):.1f} s")
 
@@ -221,7 +223,7 @@ def compare(first: Path, second: Path) -> None:
     names = sorted(set(hashes[0]) | set(hashes[1]))
     other = [name for name in names if hashes[0].get(name) != hashes[1].get(name)]
     print(f"{len(names) - len(other)} of {len(names)} files of the runs are the same, byte for byte")
-    print(*other, sep="\n")
+    print(*other[:10], *(["…"] if len(other) > 10 else []), sep="\n")
 
 
 def hashes_of(results: Path) -> dict[str, str]:

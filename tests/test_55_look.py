@@ -1,4 +1,4 @@
-"""`apertura look`: images of the pulses so far, of files cut wherever a write may end, with nothing written elsewhere."""
+"""`apertura look`: images of the pulses so far, of files cut wherever a write may end; nothing is written elsewhere."""
 
 import hashlib
 import json
@@ -26,7 +26,7 @@ from apertura.views.look.follow import Look
 from apertura.views.look.so_far import NodeSoFar
 
 sys.path.insert(0, str(ROOT / "benchmarks"))
-import look as replayed  # noqa: E402 - the writers of benchmarks/look.py, which end files wherever a write may
+import look as replayed  # the writers of benchmarks/look.py, which end files wherever a write may
 
 APERTURA = Path(sys.executable).parent / "apertura"
 
@@ -172,6 +172,31 @@ def test_files_that_are_not_there_yet_are_waited_for(tiny):
     assert told["image"] is None
 
 
+def test_an_image_of_hardly_any_aperture_is_shown_but_not_judged(tiny, monkeypatch):
+    monkeypatch.setattr(so_far, "AT_ONCE", 16)
+    monkeypatch.setattr(so_far, "LEAST_PULSES", 8)
+    look = Look(Campaign.load(tiny), follow=False)
+    for node in look.nodes.values():
+        node.read()
+    assert look.pairs[0].add_next(ended=True)
+    told = look.pairs[0].shown.judged()
+    assert told["verdict"] == "cannot tell"
+    assert told["why"].startswith("no aperture yet")
+
+
+def test_a_recording_has_ended_only_where_its_log_has(tiny):
+    (log,) = (tiny / "raw/f01").glob("uav1.track.*")
+    whole = log.read_bytes()
+    log.write_bytes(whole[: len(whole) // 2])
+    node = node_of(tiny, "uav1")
+    node.read()
+    assert node.ended
+    assert not node.complete
+    log.write_bytes(whole)
+    node.read()
+    assert node.complete
+
+
 def test_a_pair_that_falls_behind_takes_every_other_pulse_and_says_so(tiny):
     look = Look(Campaign.load(tiny), follow=False)
     look.decimated = 2
@@ -187,7 +212,9 @@ def test_a_pair_that_falls_behind_takes_every_other_pulse_and_says_so(tiny):
 def test_a_delay_doubles_the_decimation_and_ease_halves_it(tiny, monkeypatch):
     look = Look(Campaign.load(tiny), follow=True, every_s=1.0)
     delay = [20.0]
-    monkeypatch.setattr(look, "show_pair", lambda pair: {"delay_s": delay[0], "image": None, "pulses": {"recorded": 0}, "waits": ""})
+    monkeypatch.setattr(
+        look, "show_pair", lambda _: {"delay_s": delay[0], "image": None, "pulses": {"recorded": 0}, "waits": ""}
+    )
     told = []
     for delay[0] in (20.0, 20.0, 0.5, 0.5):
         look.show(ended=False, elapsed_s=1e3)
@@ -221,13 +248,35 @@ def test_what_cannot_be_followed_is_refused_in_one_message(tiny, spoil, named):
 
 
 @pytest.mark.slow
+def test_a_picture_that_takes_longer_than_files_may_rest_does_not_end_them(tiny, tmp_path, monkeypatch):
+    root = tmp_path / "replayed"
+    replayed.begin(tiny, root)
+    look = Look(Campaign.load(root), follow=True, every_s=1.0, end_after_s=2.0)
+
+    def slowly(_):
+        time.sleep(2.5)
+        for node in look.nodes.values():
+            node.read()
+        return {"delay_s": None, "image": None, "pulses": {"recorded": 0}, "waits": ""}
+
+    monkeypatch.setattr(look, "show_pair", slowly)
+    writing = threading.Thread(target=replayed.replay, args=(tiny, root, 0.2))
+    writing.start()
+    look.run()
+    writing.join()
+    assert all(node.complete for node in look.nodes.values())
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("ends", ["by its hash", "by Ctrl-C"])
 def test_a_replay_that_was_looked_at_ends_as_an_ordinary_run(tiny, tmp_path, ends):
     root = tmp_path / "replayed"
     replayed.begin(tiny, root)
     words = [APERTURA, "look", root, "--follow", "--every", "1", "--end-after", "600", "--cores", "2"]
     environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
-    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment) as process:
+    with subprocess.Popen(
+        words, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment
+    ) as process:
         assert "shown in" in process.stdout.readline()
         replayed.replay(tiny, root, rate=0.25)
         if ends == "by Ctrl-C":

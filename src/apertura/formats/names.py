@@ -44,7 +44,9 @@ class LogFormat(NamedTuple):
 
 
 TRACKS: Mapping[str, LogFormat] = {
-    "airdata": LogFormat((".csv",), "apertura.formats.tracks.airdata:read_airdata", "time(millisecond),datetime(utc)", True),
+    "airdata": LogFormat(
+        (".csv",), "apertura.formats.tracks.airdata:read_airdata", "time(millisecond),datetime(utc)", True
+    ),
     "optitrack": LogFormat((".csv",), "apertura.formats.tracks.optitrack:read_optitrack", "Format Version,1.", True),
     "csv": LogFormat((".csv",), "apertura.formats.tracks.csv_track:read_csv_track", by_lines=True),
     "nmea": LogFormat((".nmea", ".txt"), "apertura.formats.tracks.nmea:read_nmea", "$", True),

@@ -100,6 +100,14 @@ class StatedCaptures(NamedTuple):
     header_bytes: NDArray[np.int64]
     frame: NDArray[np.int64]
 
+    def first(self, count: int) -> "StatedCaptures":
+        """Return the first ones."""
+        return StatedCaptures._make(column[:count] for column in self)
+
+    def followed_by(self, later: "StatedCaptures") -> "StatedCaptures":
+        """Return these and later ones."""
+        return StatedCaptures._make(np.concatenate(both) for both in zip(self, later, strict=True))
+
 
 def read_meta(path: Path) -> tuple[Global, StatedCaptures]:
     """Return the metadata of a recording.
@@ -435,7 +443,8 @@ class GrowingSigmf:
     Examples
     --------
     >>> from tempfile import TemporaryDirectory
-    >>> meta = ('{"global": {"core:datatype": "ci16_le", "core:version": "1.2.5", "core:sample_rate": 1e6}, "captures": ['
+    >>> meta = ('{"global": {"core:datatype": "ci16_le", "core:version": "1.2.5", "core:sample_rate": 1e6}, '
+    ...         '"captures": ['
     ...         '{"core:sample_start": 0, "core:datetime": "2025-05-14T09:30:00Z"}, '
     ...         '{"core:sample_start": 4, "core:datetime": "2025-05-14T09:30:01Z"}, {"core:sample_st')
     >>> with TemporaryDirectory() as folder:
@@ -480,7 +489,7 @@ class GrowingSigmf:
         self.ended = self._closed and header.sha512 is not None and bool(whole.all())
         if not whole.any():
             return None
-        captures = StatedCaptures(*(column[whole] for column in captures))
+        captures = captures.first(int(whole.sum()))
         layout = _layout(header, captures, meta)
         _length(captures, int(captures.start[-1]) + length, meta)
         return Recording(
@@ -488,9 +497,7 @@ class GrowingSigmf:
             channels,
             header.sample_rate_hz,
             _frequency_hz(captures, meta),
-            Captures(
-                captures.start, _usable(length, layout, meta), _checked(captures.time, meta), captures.frame
-            ),
+            Captures(captures.start, _usable(length, layout, meta), _checked(captures.time, meta), captures.frame),
             None,
             self.files,
             header.sha512 and header.sha512.lower(),
@@ -521,7 +528,7 @@ class GrowingSigmf:
             return
         read = _read_captures(iter(documents), path)
         if self._captures is not None:
-            read = StatedCaptures(*map(np.concatenate, zip(self._captures, read, strict=True)))
+            read = self._captures.followed_by(read)
         self._captures = read
         behind = text[:at].encode()
         self._read_to, self._known = self._read_to + len(behind), (self._known + behind)[-_KNOWN_BYTES:]
@@ -542,7 +549,10 @@ class GrowingSigmf:
             return len(text)
         if header is None:
             raise CampaignError(
-                "captures before global", path, "global first, in a recording that grows", "Look at it when it has ended."
+                "captures before global",
+                path,
+                "global first, in a recording that grows",
+                "Look at it when it has ended.",
             )
         self._header = of_sigmf(TypeAdapter(Global), header, path, "global")
         return at + 1  # behind the bracket

@@ -12,12 +12,14 @@ from types import FrameType
 from typing import Any
 
 import numpy as np
+from rasterio import Affine
 
 from apertura import __version__
 from apertura.common.atomic import write_json, write_text
 from apertura.common.errors import CampaignError
 from apertura.common.processes import as_typed
 from apertura.core.planning.plan import Plan
+from apertura.formats.export.quicklook import write_quicklook
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import CONFIG, SampledWaveform
 from apertura.pipeline.opening.echo import PairEcho
@@ -93,15 +95,13 @@ class Look:
 
     def run(self, *, fine: bool = True) -> None:
         """Read, add and show until the recordings end; `fine`: then also what the fine images still lack."""
-        poll_s, grown_at, shown_at = self.every_s / _POLLS, time.monotonic(), time.monotonic()
-        begun, ended = False, False
+        poll_s, shown_at, ended = self.every_s / _POLLS, time.monotonic(), False
         while not ended:
             polled = time.monotonic()
             grown = [node.read() for node in self.nodes.values()]
-            if any(grown):
-                grown_at, begun = time.monotonic(), True
-            idle = begun and time.monotonic() - grown_at > self.end_after_s
-            complete = all(node.ended and not one for node, one in zip(self.nodes.values(), grown, strict=True))
+            grown_at = [node.grown_at for node in self.nodes.values() if node.grown_at is not None]
+            idle = bool(grown_at) and time.monotonic() - max(grown_at) > self.end_after_s
+            complete = not any(grown) and all(node.complete for node in self.nodes.values())
             ended = not self.follow or self.finish.is_set() or idle or complete
             self._add(ended=ended, until=shown_at + self.every_s)
             while not ended and time.monotonic() < polled + poll_s and any(one.refine_next() for one in self.pairs):
@@ -119,15 +119,14 @@ class Look:
         """Add what has come, pair by pair in turn, until it is time to show it."""
         more = True
         while more and (ended or time.monotonic() < until):
-            more = any([one.add_next(ended=ended, every=self.decimated) for one in self.pairs])
+            added = [one.add_next(ended=ended, every=self.decimated) for one in self.pairs]
+            more = any(added)
 
     def show(self, *, ended: bool, elapsed_s: float) -> None:
         """Write pictures, status and page, and say each in a line; take fewer pulses where it has fallen behind."""
         began = time.monotonic()
         pairs = {}
         for pair in self.pairs:
-            for node in self.nodes.values():
-                node.read()  # so that the delay is that of the picture
             told = self.show_pair(pair)
             pairs[f"{pair.flight}/{pair.name}"] = told
             print(f"{datetime.now(UTC):%H:%M:%S}  {_line(pair, told)}", flush=True)
@@ -159,9 +158,10 @@ class Look:
         told: dict[str, Any] = {"pulses": pair.counts, "waits": pair.waits, "delay_s": None, "image": None}
         if shown is None or not shown.pulses:
             return told
-        judged = shown.judged()
+        judged, bound_db = shown.judged(), float(shown.error_db)
+        error_db = round(bound_db, 1) if np.isfinite(bound_db) else None
         told |= {"peak": shown.peak, **judged, "flags": {**pair.flags, **judged["flags"]}}
-        told |= {"share": shown.share, "error_db": round(float(shown.error_db), 1)}
+        told |= {"share": shown.share, "error_db": error_db}
         told |= {"spacing_m": shown.grid.spacing_m, "setting": shown.setting}
         told["delay_s"] = pair.delay_s
         path = self.campaign.result(FOLDER, pair.flight, f"{pair.name}.png")
@@ -174,10 +174,6 @@ class Look:
         return told
 
     def _draw(self, path: Any, pair: PairSoFar, told: Mapping[str, Any]) -> None:
-        from rasterio import Affine
-
-        from apertura.formats.export.quicklook import write_quicklook
-
         shown = pair.shown
         if shown is None:
             raise TypeError("a pair without an image is not drawn")
@@ -187,7 +183,7 @@ class Look:
         tags = {
             "APERTURA_VERSION": __version__,
             "APERTURA_FOCUS": json.dumps(focus),
-            "APERTURA_ERROR_DB": f"{told['error_db']:g}",
+            **({} if told["error_db"] is None else {"APERTURA_ERROR_DB": f"{told['error_db']:g}"}),
             **({"APERTURA_FLAGS": json.dumps(told["flags"])} if told["flags"] else {}),
         }
         crs = grid.crs_wkt if grid.crs == "local" else grid.crs
@@ -259,7 +255,12 @@ def _extent(told: Mapping[str, Any]) -> str:
 
 def _subtitle(pair: PairSoFar, told: Mapping[str, Any], every: int) -> str:
     until = "" if pair.until is None else f"{str(pair.until)[11:21]}Z"
-    words = (f"{told['pulses']['added']} pulses to {until}", _behind(told["delay_s"]), _decimation(every), _extent(told))
+    words = (
+        f"{told['pulses']['added']} pulses to {until}",
+        _behind(told["delay_s"]),
+        _decimation(every),
+        _extent(told),
+    )
     return " · ".join(word for word in words if word)
 
 

@@ -1,10 +1,11 @@
-"""What has come of a campaign so far: captures and logs that grow, pairs of pulses, and images that they are added into.
+"""What has come of a campaign so far: captures and logs that grow, paired pulses, and images that they are added into.
 
 An image is a sum over pulses (docs/theory/engine.md, eq. 9): blocks of them are added as they are recorded, and none is
 read twice.
 """
 
 import pkgutil
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -24,6 +25,7 @@ from apertura.core.focus.inputs import PhaseHistory, Profiles
 from apertura.core.focus.tiles import Weighing, image_array
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.sector import TAPER, Sector
+from apertura.core.imaging.focus_check import LEAST_PULSES, resolution_cell_m
 from apertura.core.imaging.formation import Formation
 from apertura.core.imaging.job import profiles_job
 from apertura.core.imaging.judgement import budget_by_hand, judgement
@@ -48,7 +50,7 @@ from apertura.pipeline.opening.node_log import shortest_wave
 from apertura.pipeline.opening.pair import beams_of, body_axes
 from apertura.pipeline.opening.positions import inside_segments, place
 from apertura.pipeline.opening.recordings import captures_of
-from apertura.pipeline.opening.scene import ConfiguredGround, Flown, settled
+from apertura.pipeline.opening.scene import Flown, settled
 from apertura.pipeline.opening.transmitted import Transmitted
 from apertura.pipeline.steps.calibration import calibrated
 
@@ -77,6 +79,8 @@ class NodeSoFar:
 
     def __init__(self, campaign: Campaign, flight: str, node: str, sent: Transmitted, *, follow: bool) -> None:
         self.name, self.waits, self.ended = node, "", False
+        self.grown_at: float | None = None
+        """When something was last found to have come, by the clock `time.monotonic`."""
         self.time: Times = np.zeros(0, "datetime64[ns]")
         self.frame: NDArray[np.int64] = np.zeros(0, np.int64)
         self.track: xr.Dataset | None = None
@@ -93,13 +97,15 @@ class NodeSoFar:
         for read in (self._read_recording, self._read_log):
             try:
                 read()
-            except _Refused as error:
+            except _RefusedError as error:
                 raise error.why from error
             except CampaignError as error:
                 if not self._follow:
                     raise
                 self.waits = str(error)  # a file that is not there yet, or has only begun
-        return (len(self.time), self._log_bytes) != before
+        grown = (len(self.time), self._log_bytes) != before
+        self.grown_at = time.monotonic() if grown else self.grown_at
+        return grown
 
     def _read_recording(self) -> None:
         if self._found is not None:
@@ -114,7 +120,7 @@ class NodeSoFar:
             self._recording, self._found = whole, captures_of(whole, self._campaign, node=self.name)
             recorded, self.frame = self._found.time.values, self._found.frame.values
         elif self._growing.runs_through:
-            raise _Refused(
+            raise _RefusedError(
                 CampaignError(
                     "apertura:framing: its recorder never stops",
                     files[0],
@@ -140,7 +146,7 @@ class NodeSoFar:
         if not TRACKS[kind].by_lines:
             if self._follow:
                 by_lines = ", ".join(name for name, row in TRACKS.items() if row.by_lines)
-                raise _Refused(
+                raise _RefusedError(
                     CampaignError(
                         f"a log of format {kind}, which cannot be read while it is written",
                         path,
@@ -164,6 +170,11 @@ class NodeSoFar:
         epochs = self.track.time.values
         return cast("np.datetime64", epochs[-1 if ended else max(0, len(epochs) - 1 - _EPOCHS)])
 
+    @property
+    def complete(self) -> bool:
+        """Whether the recording says that it has ended, and the log reaches as far."""
+        return bool(self.ended and len(self.time) and self.known_until(ended=True) >= self.time[-1])
+
     def acquisition(self, captures: NDArray[np.int64]) -> Acquisition:
         """Return some captures with the log about them; frames count them, as they are paired already."""
         if self._recording is None or self.track is None:
@@ -186,7 +197,7 @@ class NodeSoFar:
         return Acquisition(self.name, settings, self.track.isel(epoch=near), log, wave_m, **vars(captured))
 
 
-class _Refused(Exception):
+class _RefusedError(Exception):
     """What no waiting helps: `why` is the error."""
 
     def __init__(self, why: CampaignError) -> None:
@@ -198,6 +209,7 @@ class _Refused(Exception):
 
 _CERTIFIED = 16  # pixels that are also summed exactly
 _TOGETHER = 16  # pulses that are bounded in range by one of them
+_CELLS = 8  # of resolution that the shorter side of a scene must have before its image is judged
 _JUDGED = 1024  # pulses kept for the judgement, evenly spread
 
 
@@ -218,6 +230,37 @@ class Block:
     history: PhaseHistory
     axes: Axes
     time: Times
+
+
+@dataclass(frozen=True, eq=False)
+class Compressed:
+    """Pulses of a block that may add to an image, with axes and times as of the block, and how many it had."""
+
+    profiles: Profiles
+    axes: Axes
+    time: Times
+    pulses: int
+
+    def every(self, step: int) -> "Compressed":
+        """Return every `step`-th pulse, apart from the others' memory."""
+        some = self.profiles[::step]
+        axes = {name: one[::step] for name, one in self.axes.items()}
+        return Compressed(replace(some, samples=np.array(some.samples)), axes, self.time[::step], self.pulses)
+
+    @classmethod
+    def joined(cls, several: Sequence["Compressed"]) -> "Compressed":
+        """Return several blocks as one; shorter profiles end in zeros."""
+        parts = [one.profiles for one in several]
+        longest = max(one.samples.shape[1] for one in parts)
+        samples = [np.pad(one.samples, ((0, 0), (0, longest - one.samples.shape[1]))) for one in parts]
+        whole = replace(
+            parts[0],
+            samples=np.concatenate(samples),
+            start_m=np.concatenate([one.start_m for one in parts]),
+            aperture=Aperture(*(np.concatenate([one.aperture.legs[leg] for one in parts]) for leg in (0, 1))),
+        )
+        axes = {name: np.concatenate([one.axes[name] for one in several]) for name in several[0].axes}
+        return cls(whole, axes, np.concatenate([one.time for one in several]), sum(one.pulses for one in several))
 
 
 class ImageSoFar:
@@ -260,10 +303,10 @@ class ImageSoFar:
         self._exact = np.zeros(_CERTIFIED, np.complex128)
         self._plans = plans
         self._speed_m_s = 0.0
-        self._every, self._kept = 1, list[tuple[Profiles, Axes, Times]]()
+        self._summed, self._every, self._kept = 0, 1, list[Compressed]()
 
-    def compressed(self, block: Block) -> Profiles:
-        """Return the range profiles of a block, over this image's share of the band."""
+    def compressed(self, block: Block) -> "Compressed":
+        """Return the range profiles of a block, over this image's share of the band, of pulses that may add to it."""
         history, count = block.history, len(block.history.frequency_hz)
         self._speed_m_s = self._speed_m_s or history.wave_speed_m_s  # of all blocks: air changes it by less than 1e-8
         kept = -(-count // self.share)
@@ -281,39 +324,51 @@ class ImageSoFar:
             wave_speed_m_s=self._speed_m_s,
             together=_TOGETHER,
         )
-        return range_compress(some, self.grid, self._terrain, window=window)
+        here = window.contributing
+        some = replace(
+            some,
+            transfer=some.transfer[here],
+            reference_delay_s=some.reference_delay_s[here],
+            aperture=some.aperture[here],
+        )
+        window = replace(window, start_m=window.start_m[here], farthest_m=window.farthest_m[here])
+        profiles = range_compress(some, self.grid, self._terrain, window=window)
+        return Compressed(
+            profiles, {name: one[here] for name, one in block.axes.items()}, block.time[here], len(block.time)
+        )
 
-    def add(self, profiles: Profiles, axes: Axes, at: Times) -> None:
-        """Add a block of pulses; the setting is planned for the first, and again where the error measured is above it.
+    def add(self, block: "Compressed") -> None:
+        """Add a block of `compressed` pulses.
 
-        Parameters
-        ----------
-        profiles
-            From `compressed`.
-        axes, at
-            As of the block.
+        The setting is planned for the first, and again where the error measured is above the one asked.
         """
-        beams = self._beams(profiles.aperture, axes, profiles.centre_frequency_hz)
-        if self._plan is None or (self.pulses and self.error_db > self._accuracy_db):
+        self.pulses += block.pulses
+        profiles = block.profiles
+        if not len(profiles):
+            return
+        beams = self._beams(profiles.aperture, block.axes, profiles.centre_frequency_hz)
+        if self._plan is None or self._accuracy_db < self.error_db < np.inf:
             self._plans[self.share] = self._planned(profiles, beams)
         plan = self._plans[self.share]
-        side = self._campaign.settings.processing.tile_px
         image = image_array(
             profiles,
             plan.setting,
             self.grid,
             plan.terrain,
-            side_px=side,
+            side_px=self._campaign.settings.processing.tile_px,
             weighing=Weighing(beams, None, count=1),
         )
         self.sums += image.compute(scheduler="threads", num_workers=self._threads)
         places = plan.terrain.positions_at(self.grid, *self._pixels.T)
         self._exact += band_limited_image(profiles, places, beams=beams)
-        self.pulses += len(profiles)
+        self._summed += len(profiles)
         power = np.full(_CERTIFIED, float(np.mean(np.abs(self.sums) ** 2)))
         computed = self.sums[tuple(self._pixels.T)]
         self.error_db = error_bound(computed, self._exact, np.ones(_CERTIFIED), power=power).bound_db
-        self._keep(profiles, axes, at)
+        self._kept.append(block.every(self._every))
+        if sum(len(one.profiles) for one in self._kept) > _JUDGED:
+            self._every *= 2
+            self._kept = [one.every(2) for one in self._kept]
 
     @property
     def _plan(self) -> Plan | None:
@@ -323,11 +378,11 @@ class ImageSoFar:
         ground = GroundModels.of(self._terrain, None, self.grid)
         job = profiles_job(profiles, self.grid, ground, integration="all")
         overrides = {**self._campaign.settings.processing.planned, "presum": 1, "pulse_blocks": 1}
-        return make_plan(replace(job, beams=beams), accuracy_db=self._accuracy_db, overrides=overrides, where=CONFIG)
+        return make_plan(
+            replace(job, beams=beams), accuracy_db=self._accuracy_db, overrides=overrides, where=str(CONFIG)
+        )
 
-    def _beams(
-        self, aperture: Aperture, axes: Axes, centre_hz: float
-    ) -> Beams | None:
+    def _beams(self, aperture: Aperture, axes: Axes, centre_hz: float) -> Beams | None:
         """Return the weights of pulses: antennas, and a sector that no later pulse changes; None: all count alike."""
         asked = self._campaign.settings.processing.integrated
         antennas = beams_of(self._campaign, self._pair, axes)
@@ -346,17 +401,10 @@ class ImageSoFar:
         range_m = float(np.linalg.norm(aperture.middle_m - middle_m, axis=-1).min())
         return Beams.within(Sector.of(aperture, chord_m=CHORD * range_m, centre=0.0, half=half), antennas)
 
-    def _keep(self, profiles: Profiles, axes: Axes, at: Times) -> None:
-        """Keep evenly spread pulses for the judgement."""
-        self._kept.append(_every(profiles, axes, at, self._every))
-        if sum(len(one[0]) for one in self._kept) > _JUDGED:
-            self._every *= 2
-            self._kept = [_every(*one, 2) for one in self._kept]
-
     @property
     def image(self) -> NDArray[np.complex64]:
-        """(y, x) complex64, the mean over the pulses so far."""
-        return np.asarray(self.sums / np.float32(max(1, self.pulses)), np.complex64)
+        """(y, x) complex64, the mean over the pulses so far that may add to it."""
+        return np.asarray(self.sums / np.float32(max(1, self._summed)), np.complex64)
 
     @property
     def setting(self) -> str:
@@ -375,14 +423,18 @@ class ImageSoFar:
 
     def judged(self) -> dict[str, Any]:
         """Return verdict, why, loss_db where it was measured, and flags, by the pulses kept."""
-        pulses = sum(len(one[0]) for one in self._kept)
-        if self._plan is None or pulses < 64:
+        pulses = sum(len(one.profiles) for one in self._kept)
+        if self._plan is None or pulses < LEAST_PULSES or not self.sums.any():
             return {"verdict": "cannot tell", "why": f"{pulses} pulses so far", "flags": {}}
-        profiles, axes, at = _joined(self._kept)
-        beams = self._beams(profiles.aperture, axes, profiles.centre_frequency_hz)
+        joined = Compressed.joined(self._kept)
+        profiles, at = joined.profiles, joined.time
+        beams = self._beams(profiles.aperture, joined.axes, profiles.centre_frequency_hz)
         plan = replace(self._plan, beams=beams, integration=None)
         side = self._campaign.settings.processing.tile_px
         formation = Formation(None, profiles, self.grid, plan, side)
+        cell_m = resolution_cell_m(formation)
+        if not cell_m * _CELLS < min(self.grid.shape) * self.grid.spacing_m:
+            return {"verdict": "cannot tell", "why": f"no aperture yet: cells of {cell_m:.2g} m", "flags": {}}
         stated = [self._campaign.settings.nodes[node].position_std_m for node in self._pair.split("-")]
         std_m = None if None in stated else max(float(np.max(cast("Any", one))) for one in stated)
         seconds = (at - at[0]) / np.timedelta64(1, "s")
@@ -391,26 +443,6 @@ class ImageSoFar:
         told = judgement(formation, self.image, lines)
         loss = {"loss_db": told.focus["loss_db"]} if "loss_db" in told.focus else {}
         return {"verdict": told.verdict, "why": told.why, **loss, "flags": dict(told.flags)}
-
-
-_Kept = tuple[Profiles, Axes, Times]
-
-
-def _every(profiles: Profiles, axes: Axes, at: Times, step: int) -> _Kept:
-    some = slice(None, None, step)
-    thinned = profiles[some]
-    return replace(thinned, samples=np.array(thinned.samples)), {name: one[some] for name, one in axes.items()}, at[some]
-
-
-def _joined(kept: Sequence[_Kept]) -> _Kept:
-    """Return several blocks as one; shorter profiles end in zeros."""
-    longest = max(one.samples.shape[1] for one, _, _ in kept)
-    samples = [np.pad(one.samples, ((0, 0), (0, longest - one.samples.shape[1]))) for one, _, _ in kept]
-    tx_m, rx_m = (np.concatenate([one.aperture.legs[leg] for one, _, _ in kept]) for leg in (0, 1))
-    start_m = np.concatenate([one.start_m for one, _, _ in kept])
-    whole = replace(kept[0][0], samples=np.concatenate(samples), start_m=start_m, aperture=Aperture(tx_m, rx_m))
-    axes = {name: np.concatenate([axes[name] for _, axes, _ in kept]) for name in kept[0][1]}
-    return whole, axes, np.concatenate([at for _, _, at in kept])
 
 
 # ---- A pair: which pulses have come, and where they are added -------------------------------------------------------
@@ -462,7 +494,7 @@ class PairSoFar:
     _shift_ns: int = 0
     _blocks: int = 0
     _raised: dict[str, tuple[int, str]] = field(default_factory=dict)  # blocks that raised a flag, and its last line
-    _queue: list[_Kept] = field(default_factory=list)
+    _queue: list[Compressed] = field(default_factory=list)
     _fine: bool = True
 
     def ready(self, *, ended: bool) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -540,12 +572,11 @@ class PairSoFar:
             return 0
         if not self.images:
             self.images = self._begin(block)
-        coarse, *fine = self.images
-        profiles = coarse.compressed(block)
-        coarse.add(profiles, block.axes, block.time)
-        if fine and self._fine:
-            self._queue.append((fine[0].compressed(block), block.axes, block.time))
-            self._fine = sum(one.samples.nbytes for one, _, _ in self._queue) <= _QUEUE_BYTES
+        coarse, fine = self.images
+        coarse.add(coarse.compressed(block))
+        if self._fine:
+            self._queue.append(fine.compressed(block))
+            self._fine = sum(one.profiles.samples.nbytes for one in self._queue) <= _QUEUE_BYTES
             self._queue = self._queue if self._fine else []  # it would never be as far as the coarse one
         return len(block.time)
 
@@ -588,7 +619,12 @@ class PairSoFar:
         for share in (2, 1):
             own = grid.coarse(max(grid.shape) // share)
             terrain = UncheckedDem(ground.dem, own) if ground.dem else ground.level(own)
-            how: dict[str, Any] = {"share": share, "accuracy_db": accuracy_db / share, "threads": self.threads, "plans": self.plans}
+            how: dict[str, Any] = {
+                "share": share,
+                "accuracy_db": accuracy_db / share,
+                "threads": self.threads,
+                "plans": self.plans,
+            }
             images.append(ImageSoFar(campaign, self.name, own, terrain, **how))
         return images
 
@@ -596,7 +632,7 @@ class PairSoFar:
         """Add the next block of the queue to the fine image; return whether there was one."""
         if not self._queue:
             return False
-        self.images[1].add(*self._queue.pop(0))
+        self.images[1].add(self._queue.pop(0))
         return True
 
     @property
