@@ -158,7 +158,7 @@ class Look:
         told: dict[str, Any] = {"pulses": pair.counts, "waits": pair.waits, "delay_s": None, "image": None}
         if shown is None or not shown.pulses:
             return told
-        judged, bound_db = shown.judged(), float(shown.error_db)
+        judged, bound_db = pair.judged(), float(shown.error_db)
         error_db = round(bound_db, 1) if np.isfinite(bound_db) else None
         told |= {"peak": shown.peak, **judged, "flags": {**pair.flags, **judged["flags"]}}
         told |= {"share": shown.share, "error_db": error_db}
@@ -169,7 +169,7 @@ class Look:
         self._draw(path, pair, told)
         for node in self.nodes.values():
             node.read()
-        told["delay_s"] = pair.delay_s  # when the picture is there
+        told |= {"delay_s": pair.delay_s, "pulses": pair.counts}  # when the picture is there
         told["image"] = f"{pair.flight}/{pair.name}.png"
         return told
 

@@ -635,6 +635,15 @@ class PairSoFar:
         self.images[1].add(self._queue.pop(0))
         return True
 
+    def judged(self) -> dict[str, Any]:
+        """Return the judgement of the fine image, or of the coarse one where that has more than twice its pulses.
+
+        The coarse one sees the scene under half the angle, and points in one range cell less apart.
+        """
+        coarse, fine = self.images
+        by = fine if 2 * fine.pulses >= coarse.pulses else coarse
+        return by.judged() | {"judged_by": f"{by.pulses} pulses, {'fine' if by is fine else 'coarse'}"}
+
     @property
     def time(self) -> Times:
         """(pulse,) datetime64[ns], UTC: when the pulses so far were sent."""
