@@ -21,9 +21,10 @@ from apertura.formats.recordings.sigmf import GrowingSigmf, open_sigmf
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.opening.transmitted import transmitted
 from apertura.pipeline.store import open_stage
-from apertura.views.look import so_far
+from apertura.views.look import image as look_image
+from apertura.views.look import pair as look_pair
 from apertura.views.look.follow import Look
-from apertura.views.look.so_far import NodeSoFar
+from apertura.views.look.node import NodeSoFar
 
 sys.path.insert(0, str(ROOT / "benchmarks"))
 import look as replayed  # the writers of benchmarks/look.py, which end files wherever a write may
@@ -48,7 +49,7 @@ def node_of(root, node, *, follow=True):
 
 def in_blocks(root, pulses, monkeypatch):
     """Return the pairs of a campaign whose pulses were added so many at a time."""
-    monkeypatch.setattr(so_far, "AT_ONCE", pulses)
+    monkeypatch.setattr(look_pair, "AT_ONCE", pulses)
     look = Look(Campaign.load(root), follow=False)
     for node in look.nodes.values():
         node.read()
@@ -173,8 +174,8 @@ def test_files_that_are_not_there_yet_are_waited_for(tiny):
 
 
 def test_an_image_of_hardly_any_aperture_is_shown_but_not_judged(tiny, monkeypatch):
-    monkeypatch.setattr(so_far, "AT_ONCE", 16)
-    monkeypatch.setattr(so_far, "LEAST_PULSES", 8)
+    monkeypatch.setattr(look_pair, "AT_ONCE", 16)
+    monkeypatch.setattr(look_image, "LEAST_PULSES", 8)
     look = Look(Campaign.load(tiny), follow=False)
     for node in look.nodes.values():
         node.read()

@@ -25,7 +25,8 @@ from apertura.pipeline.config import CONFIG, SampledWaveform
 from apertura.pipeline.opening.echo import PairEcho
 from apertura.pipeline.opening.pair import recorded_echo
 from apertura.pipeline.opening.transmitted import transmitted
-from apertura.views.look.so_far import NodeSoFar, PairSoFar
+from apertura.views.look.node import NodeSoFar
+from apertura.views.look.pair import PairSoFar
 
 FOLDER = "look"
 """Of the results, where it is shown."""
@@ -156,7 +157,7 @@ class Look:
         """Write the picture of a pair; return what is known of it, for the status."""
         shown = pair.shown
         told: dict[str, Any] = {"pulses": pair.counts, "waits": pair.waits, "delay_s": None, "image": None}
-        if shown is None or not shown.pulses:
+        if shown is None or not shown.sums.any():
             return told
         judged, bound_db = pair.judged(), float(shown.error_db)
         error_db = round(bound_db, 1) if np.isfinite(bound_db) else None
@@ -167,8 +168,8 @@ class Look:
         path = self.campaign.result(FOLDER, pair.flight, f"{pair.name}.png")
         path.parent.mkdir(parents=True, exist_ok=True)
         self._draw(path, pair, told)
-        for node in self.nodes.values():
-            node.read()
+        if pair.tx is not None:
+            pair.tx.read()
         told |= {"delay_s": pair.delay_s, "pulses": pair.counts}  # when the picture is there
         told["image"] = f"{pair.flight}/{pair.name}.png"
         return told
