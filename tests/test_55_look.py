@@ -99,24 +99,41 @@ def test_a_secondary_in_blocks_shows_the_same_points_in_focus(finished_tiny, tmp
     assert apart_db(pair.images[1].image, image) < -20  # what the state of a sidelink is by 16 pulses, or by all
 
 
-@pytest.mark.parametrize("share", [0.3, 0.5001, 0.77, 0.99])
-def test_a_recording_cut_anywhere_is_read_to_its_last_whole_pulse_and_on_from_there(tiny, tmp_path, share):
-    meta, data = (tiny / f"raw/f01/uav2.sigmf-{kind}" for kind in ("meta", "data"))
-    whole, texts = open_sigmf(meta, data), (meta.read_bytes(), data.read_bytes())
+@pytest.mark.parametrize("shares", [(0.9, 0.3), (0.4, 0.9), (0.97, 0.5001), (1.0, 0.99)])
+def test_a_recording_cut_anywhere_is_read_to_its_last_whole_pulse_and_on_from_there(tiny, tmp_path, shares):
+    files = [tiny / f"raw/f01/uav2.sigmf-{kind}" for kind in ("meta", "data")]
+    whole, texts = open_sigmf(*files), [path.read_bytes() for path in files]
     growing = GrowingSigmf(tmp_path / "a.sigmf-meta", tmp_path / "a.sigmf-data")
     assert growing.read() is None
-    for part in (share, 1.0):
-        for path, text in zip(growing.files, texts, strict=True):
-            path.write_bytes(text[: int(part * len(text))])
+    for path, text, share in zip(growing.files, texts, shares, strict=True):
+        path.write_bytes(text[: int(share * len(text))])
+    read = growing.read()
+    count = len(read.captures.start)
+    stated = growing.files[0].read_bytes().partition(b'"captures"')[2].count(b"}") - 2 * (shares[0] == 1)
+    pulse_bytes = whole.samples.sample_bytes * whole.captures.length
+    assert count == min(stated, growing.files[1].stat().st_size // pulse_bytes) > 1
+    assert not growing.ended
+    for name in ("start", "time", "frame"):
+        np.testing.assert_array_equal(getattr(read.captures, name), getattr(whole.captures, name)[:count])
+    for path, text in zip(growing.files, texts, strict=True):
+        path.write_bytes(text)
+    assert len(growing.read().captures.start) == len(whole.captures.start)
+    assert growing.ended
+
+
+def test_a_recording_that_grows_byte_by_byte_is_that_which_was_recorded(tiny, tmp_path):
+    meta, data = (tiny / f"raw/f01/uav2.sigmf-{kind}" for kind in ("meta", "data"))
+    whole, text = open_sigmf(meta, data), meta.read_bytes()
+    (tmp_path / "a.sigmf-data").write_bytes(data.read_bytes())
+    growing, counts = GrowingSigmf(tmp_path / "a.sigmf-meta", tmp_path / "a.sigmf-data"), []
+    for size in range(0, len(text) + 37, 37):
+        growing.files[0].write_bytes(text[:size])
         read = growing.read()
-        length, count = whole.captures.length, len(read.captures.start)
-        samples = growing.files[1].stat().st_size // read.samples.sample_bytes
-        stated = growing.files[0].read_bytes().count(b"}", texts[0].index(b'"captures"'))
-        assert 0 < count == min(stated - 2 * (part == 1.0), samples // length) or part == 1.0
-        np.testing.assert_array_equal(read.captures.start, whole.captures.start[:count])
-        np.testing.assert_array_equal(read.captures.time, whole.captures.time[:count])
-        assert growing.ended is (part == 1.0)
-    assert count == len(whole.captures.start)
+        counts.append(0 if read is None else len(read.captures.start))
+    assert counts == sorted(counts)
+    assert len(set(counts)) > len(whole.captures.start) / 2
+    for name in ("start", "time", "frame"):
+        np.testing.assert_array_equal(getattr(read.captures, name), getattr(whole.captures, name))
 
 
 def test_metadata_that_are_written_anew_are_read_anew(tiny, tmp_path):
