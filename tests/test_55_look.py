@@ -20,6 +20,7 @@ from apertura.core.echo.compression import window_weights
 from apertura.formats.recordings.sigmf import GrowingSigmf, open_sigmf
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.opening.transmitted import transmitted
+from apertura.pipeline.runs.results import clean
 from apertura.pipeline.store import open_stage
 from apertura.views.look import image as look_image
 from apertura.views.look import pair as look_pair
@@ -123,7 +124,7 @@ def test_a_recording_cut_anywhere_is_read_to_its_last_whole_pulse_and_on_from_th
 
 def test_a_recording_that_grows_byte_by_byte_is_that_which_was_recorded(tiny, tmp_path):
     meta, data = (tiny / f"raw/f01/uav2.sigmf-{kind}" for kind in ("meta", "data"))
-    whole, text = open_sigmf(meta, data), meta.read_bytes()
+    whole, text = open_sigmf(meta, data), b"\xef\xbb\xbf" + meta.read_bytes()
     (tmp_path / "a.sigmf-data").write_bytes(data.read_bytes())
     growing, counts = GrowingSigmf(tmp_path / "a.sigmf-meta", tmp_path / "a.sigmf-data"), []
     for size in range(0, len(text) + 37, 37):
@@ -250,6 +251,14 @@ def test_a_look_writes_beside_the_results_and_nowhere_else(finished_tiny, tmp_pa
     told = json.loads((root / "results/look/status.json").read_text())["pairs"]["f01/uav1-uav1"]
     assert told["verdict"] in {"focused", "cannot tell"}
     assert told["share"] == 1
+
+
+def test_what_a_look_wrote_goes_with_what_a_run_wrote(tiny):
+    campaign = Campaign.load(tiny)
+    Look(campaign, follow=False).run()
+    (tiny / "results/look/notes.txt").write_text("mine")
+    clean(campaign, unfinished_only=False, agreed=True)
+    assert [path.name for path in (tiny / "results").rglob("*") if path.is_file()] == ["notes.txt"]
 
 
 @pytest.mark.parametrize(

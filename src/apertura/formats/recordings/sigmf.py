@@ -516,21 +516,21 @@ class GrowingSigmf:
                 self._forget()
                 self._read_meta()
             return
-        text = appended.decode("utf-8", errors="ignore")  # a letter that is cut is no part of what is whole
-        at = 0 if self._header else self._begin(text.removeprefix("\ufeff"))
+        mark = len(BOM_UTF8) if not self._read_to and appended.startswith(BOM_UTF8) else 0
+        text = appended[mark:].decode("utf-8", errors="ignore")  # a letter that is cut is no part of what is whole
+        at = 0 if self._header else self._begin(text)
         documents: list[object] = []
         for document, end in _whole_objects(text, at):
             documents.append(document)
             at = end
         rest = text[at:].lstrip()
         self._closed = rest.startswith("]") and rest.rstrip().endswith("}")
-        if self._header is None or not documents:
+        if self._header is None:
             return
-        read = _read_captures(iter(documents), path)
-        if self._captures is not None:
-            read = self._captures.followed_by(read)
-        self._captures = read
-        behind = text[:at].encode()
+        if documents:
+            read = _read_captures(iter(documents), path)
+            self._captures = read if self._captures is None else self._captures.followed_by(read)
+        behind = appended[: mark + len(text[:at].encode())]
         self._read_to, self._known = self._read_to + len(behind), (self._known + behind)[-_KNOWN_BYTES:]
 
     def _begin(self, text: str) -> int:
