@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,7 @@ from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.opening.transmitted import transmitted
 from apertura.pipeline.runs.results import clean
 from apertura.pipeline.store import open_stage
+from apertura.simulation import ImageGrid, preset
 from apertura.views.look import image as look_image
 from apertura.views.look import pair as look_pair
 from apertura.views.look.follow import Look
@@ -203,6 +205,20 @@ def test_an_image_of_hardly_any_aperture_is_shown_but_not_judged(tiny, monkeypat
     assert told["why"].startswith("no aperture yet")
 
 
+def test_what_the_first_pulses_could_not_tell_later_ones_do(tmp_path, monkeypatch):
+    plan = replace(preset("demo", pulses=100), scene=ImageGrid("EPSG:32632", half_width_m=3.0, spacing_m=0.1))
+    look = Look(Campaign.load(ap.simulate(tmp_path / "campaign", plan, seed=7)), follow=False)
+    look.nodes["f01", "uav1"].read()
+    monkeypatch.setattr(look_pair, "AT_ONCE", 2)  # which span no aperture: what is planned for them says so
+    assert look.pairs[0].add_next(ended=True)
+    monkeypatch.setattr(look_pair, "AT_ONCE", 2048)
+    while look.pairs[0].add_next(ended=True) or look.pairs[0].refine_next():
+        pass
+    told = look.pairs[0].judged()
+    assert told["verdict"] == "focused", told
+    assert told["judged_by"].endswith("fine")
+
+
 def test_a_recording_has_ended_only_where_its_log_has(tiny):
     (log,) = (tiny / "raw/f01").glob("uav1.track.*")
     whole = log.read_bytes()
@@ -258,7 +274,7 @@ def test_what_a_look_wrote_goes_with_what_a_run_wrote(tiny):
     Look(campaign, follow=False).run()
     (tiny / "results/look/notes.txt").write_text("mine")
     clean(campaign, unfinished_only=False, agreed=True)
-    assert [path.name for path in (tiny / "results").rglob("*") if path.is_file()] == ["notes.txt"]
+    assert [path.name for path in (tiny / "results/look").rglob("*")] == ["notes.txt"]
 
 
 @pytest.mark.parametrize(

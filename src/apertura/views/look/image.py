@@ -259,7 +259,7 @@ class ImageSoFar:
         joined = Compressed.joined(self._kept)
         profiles, at = joined.profiles, joined.time
         beams = self._beams(profiles.aperture, joined.axes, profiles.centre_frequency_hz)
-        plan = replace(self._plan, beams=beams, integration=None)
+        plan = replace(self._plan, beams=beams, integration=None, flags={})  # they are of the block it was planned for
         side = self._campaign.settings.processing.tile_px
         formation = Formation(None, profiles, self.grid, plan, side)
         cell_m = resolution_cell_m(formation)

@@ -214,11 +214,15 @@ class PairSoFar:
     def judged(self) -> dict[str, Any]:
         """Return the judgement of the fine image, or of the coarse one where that has more than twice its pulses.
 
-        The coarse one sees the scene under half the angle, and points in one range cell less apart.
+        The coarse one may only say that it is focused: in its range cells, twice as deep, points spoil each other while
+        they are being passed.
         """
         coarse, fine = self.images
         by = fine if 2 * fine.pulses >= coarse.pulses else coarse
-        return by.judged() | {"judged_by": f"{by.pulses} pulses, {'fine' if by is fine else 'coarse'}"}
+        told = by.judged() | {"judged_by": f"{by.pulses} pulses, {'fine' if by is fine else 'coarse'}"}
+        if by is coarse and told["flags"]:
+            told |= {"verdict": "cannot tell", "why": f"the coarse image alone: {told['why']}", "flags": {}}
+        return told
 
     @property
     def time(self) -> Times:
