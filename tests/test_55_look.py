@@ -13,15 +13,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from folders import ROOT, copy_writable, state
+from folders import ROOT, copy_writable, ingest_all, settle_ground, state
 
 import apertura as ap
 from apertura.common.errors import CampaignError
 from apertura.core.echo.compression import window_weights
 from apertura.formats.recordings.sigmf import GrowingSigmf, open_sigmf
 from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.opening.scene import settled_scene
 from apertura.pipeline.opening.transmitted import transmitted
 from apertura.pipeline.runs.results import clean
+from apertura.pipeline.steps import echo
 from apertura.pipeline.store import open_stage
 from apertura.simulation import ImageGrid, preset
 from apertura.views.look import image as look_image
@@ -217,6 +219,19 @@ def test_what_the_first_pulses_could_not_tell_later_ones_do(tmp_path, monkeypatc
     told = look.pairs[0].judged()
     assert told["verdict"] == "focused", told
     assert told["judged_by"].endswith("fine")
+
+
+def test_a_scene_left_to_auto_is_that_of_the_run(tiny, tmp_path):
+    state(tiny, "scene", bounds_m="auto", spacing_m=0.5)
+    other = Campaign.load(copy_writable(tiny, tmp_path / "other"))
+    ingest_all(other)
+    for pair in other.flight("f01").pairs:
+        echo.echo(other, "f01", pair)
+    settle_ground(other)
+    look = Look(Campaign.load(tiny), follow=False)
+    look.run(fine=False)
+    grids = {pair.images[1].grid for pair in look.pairs}
+    assert grids == {settled_scene(other).grid}
 
 
 def test_a_recording_has_ended_only_where_its_log_has(tiny):

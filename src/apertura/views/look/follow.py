@@ -8,6 +8,7 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from datetime import UTC, datetime
+from functools import cache
 from types import FrameType
 from typing import Any
 
@@ -19,12 +20,15 @@ from apertura.common.atomic import write_json, write_text
 from apertura.common.errors import CampaignError
 from apertura.common.processes import as_typed
 from apertura.core.planning.plan import Plan
+from apertura.core.scene.grid import SceneGrid
 from apertura.formats.export.quicklook import write_quicklook
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import CONFIG, SampledWaveform
 from apertura.pipeline.opening.echo import PairEcho
-from apertura.pipeline.opening.pair import recorded_echo
+from apertura.pipeline.opening.pair import open_pair, recorded_echo
+from apertura.pipeline.opening.scene import ConfiguredGround, Flown, settled
 from apertura.pipeline.opening.transmitted import transmitted
+from apertura.views.look.image import Block
 from apertura.views.look.node import NodeSoFar
 from apertura.views.look.pair import PairSoFar
 
@@ -72,6 +76,7 @@ class Look:
         waveform = campaign.settings.waveform
         self.nodes: dict[tuple[str, str], NodeSoFar] = {}
         self.pairs: list[PairSoFar] = []
+        self._settled: tuple[SceneGrid, ConfiguredGround] | None = None
         if not isinstance(waveform, SampledWaveform):
             if follow:
                 raise CampaignError(
@@ -83,7 +88,8 @@ class Look:
             for flight in campaign.image_flights:
                 for pair in flight.pairs:
                     echo = PairEcho.recorded(recorded_echo(campaign, flight.name, pair))
-                    self.pairs.append(PairSoFar(campaign, flight.name, pair, echo.within(campaign, flight.name, pair)))
+                    echo = echo.within(campaign, flight.name, pair)
+                    self.pairs.append(PairSoFar(campaign, flight.name, pair, self._scene, echo))
             return
         check_bounds(campaign, follow=follow)
         sent, plans = transmitted(campaign, waveform), dict[int, Plan]()
@@ -92,7 +98,29 @@ class Look:
                 self.nodes[flight.name, node] = NodeSoFar(campaign, flight.name, node, sent, follow=follow)
             for pair in flight.pairs:
                 tx, rx = (self.nodes[flight.name, node] for node in pair.split("-"))
-                self.pairs.append(PairSoFar(campaign, flight.name, pair, None, tx, rx, sent, threads, plans))
+                self.pairs.append(
+                    PairSoFar(campaign, flight.name, pair, self._scene, None, tx, rx, sent, threads, plans)
+                )
+
+    def _scene(self, block: Block) -> tuple[SceneGrid, ConfiguredGround]:
+        """Return the grid of all pairs and its ground; what is `auto` is settled by all that has come, once.
+
+        Of a flight that is followed, whose bounds are stated, by its first block.
+        """
+        if self._settled is None:
+            campaign, history = self.campaign, block.history
+            here = Flown(history.aperture, history.frequency_hz, np.inf)
+            self._settled = settled(campaign, cache(lambda: here if self.follow else self._flown()))[:2]
+        return self._settled
+
+    def _flown(self) -> Flown:
+        """Return what all pairs of the first flight flew, by its logs."""
+        pairs = [pair for pair in self.pairs if pair.flight == self.pairs[0].flight]
+        tags = [None if pair.tx is None else pair.tx.time for pair in pairs]
+        opened = (
+            open_pair(self.campaign, one.flight, one.name, recorded=at) for one, at in zip(pairs, tags, strict=True)
+        )
+        return Flown.together([pair.flown for pair in opened])
 
     def run(self, *, fine: bool = True) -> None:
         """Read, add and show until the recordings end; `fine`: then also what the fine images still lack."""

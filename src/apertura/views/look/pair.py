@@ -1,5 +1,6 @@
 """A pair while it flies: which pulses have come, and the images that they are added to."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any, cast
 
@@ -12,12 +13,13 @@ from apertura.core.imaging.range_profiles import phase_history_of
 from apertura.core.planning.plan import Plan
 from apertura.core.quality.budget import MOST_ACCURACY_DB
 from apertura.core.scene.dem import UncheckedDem
+from apertura.core.scene.grid import SceneGrid
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.opening.air import scene_air
 from apertura.pipeline.opening.echo import PairEcho, pair_echo
 from apertura.pipeline.opening.pair import body_axes
 from apertura.pipeline.opening.positions import inside_segments, place
-from apertura.pipeline.opening.scene import Flown, settled
+from apertura.pipeline.opening.scene import ConfiguredGround
 from apertura.pipeline.opening.transmitted import Transmitted
 from apertura.pipeline.steps.calibration import calibrated
 from apertura.views.look.image import Block, Compressed, ImageSoFar, Times
@@ -39,6 +41,8 @@ class PairSoFar:
     ----------
     campaign, flight, name
         Which.
+    scene
+        First block → grid, and its ground.
     echo
         Of a recorder that stores transfer functions; then there are no
     tx, rx, sent
@@ -56,7 +60,8 @@ class PairSoFar:
     campaign: Campaign
     flight: str
     name: str
-    echo: PairEcho | None
+    scene: Callable[[Block], tuple[SceneGrid, ConfiguredGround]]
+    echo: PairEcho | None = None
     tx: NodeSoFar | None = None
     rx: NodeSoFar | None = None
     sent: Transmitted | None = None
@@ -185,10 +190,8 @@ class PairSoFar:
         return Block(history, body_axes(formed), formed.time.values)
 
     def _begin(self, block: Block) -> list[ImageSoFar]:
-        """Return the images, on the grid of the config: what is `auto` there is settled by what has come."""
-        campaign, history = self.campaign, block.history
-        flown = Flown(history.aperture, history.frequency_hz, np.inf)
-        grid, ground, _ = settled(campaign, lambda: flown)
+        """Return the images, coarse and fine."""
+        campaign, (grid, ground) = self.campaign, self.scene(block)
         asked = campaign.settings.processing.accuracy_db
         accuracy_db = MOST_ACCURACY_DB if asked == "auto" else float(asked)
         images = []
