@@ -259,6 +259,19 @@ def test_a_pair_that_falls_behind_takes_every_other_pulse_and_says_so(tiny):
     assert "1 pulse in 2 taken" in (tiny / "results/look/index.html").read_text()
 
 
+def test_pulses_stand_for_those_left_out_beside_them(finished_tiny, tmp_path, monkeypatch):
+    root = copy_writable(finished_tiny.root, tmp_path / "campaign")
+    (whole, _), look = in_blocks(root, 20, monkeypatch), Look(Campaign.load(root), follow=False)
+    node, pair = look.nodes["f01", "uav1"], look.pairs[0]
+    node.read()
+    assert pair.add_next(ended=True, every=1)
+    assert pair.add_next(ended=True, every=2)
+    thinned, every = pair.images[0], whole.images[0]
+    assert thinned.pulses == 20 + (every.pulses - 20) // 2
+    gain = np.vdot(every.sums, thinned.sums) / np.vdot(every.sums, every.sums)
+    assert abs(gain - 1) < 0.05  # a half that counts half would make it 0.75
+
+
 def test_a_delay_doubles_the_decimation_and_ease_halves_it(tiny, monkeypatch):
     look = Look(Campaign.load(tiny), follow=True, every_s=1.0)
     delay = [20.0]
@@ -266,10 +279,11 @@ def test_a_delay_doubles_the_decimation_and_ease_halves_it(tiny, monkeypatch):
         look, "show_pair", lambda _: {"delay_s": delay[0], "image": None, "pulses": {"recorded": 0}, "waits": ""}
     )
     told = []
-    for delay[0] in (20.0, 20.0, 0.5, 0.5):
+    for delay[0] in (20.0, 21.0, 20.5, 22.0, 0.5, 0.5):
+        look.busy_s = 900.0 * (delay[0] > 1)
         look.show(ended=False, elapsed_s=1e3)
         told.append(look.decimated)
-    assert told == [2, 4, 2, 1]
+    assert told == [1, 2, 2, 4, 2, 1]  # not at first, when it still plans, nor while it catches up
 
 
 def test_a_look_writes_beside_the_results_and_nowhere_else(finished_tiny, tmp_path):

@@ -71,8 +71,8 @@ class Look:
         self.campaign, self.follow, self.every_s, self.end_after_s = campaign, follow, every_s, end_after_s
         self.finish = threading.Event()
         """Set: the recordings have ended."""
-        self.decimated, self.shown, self.busy_s = 1, 0, 0.0
-        self.delays_s: list[float] = []
+        self.decimated, self.busy_s = 1, 0.0
+        self._delay_s = np.inf  # of the picture before
         waveform = campaign.settings.waveform
         self.nodes: dict[tuple[str, str], NodeSoFar] = {}
         self.pairs: list[PairSoFar] = []
@@ -133,9 +133,9 @@ class Look:
             complete = not any(grown) and all(node.complete for node in self.nodes.values())
             ended = not self.follow or self.finish.is_set() or idle or complete
             self._add(ended=ended, until=shown_at + self.every_s)
+            self.busy_s += time.monotonic() - polled
             while not ended and time.monotonic() < polled + poll_s and any(one.refine_next() for one in self.pairs):
                 pass
-            self.busy_s += time.monotonic() - polled
             if ended or time.monotonic() >= shown_at + self.every_s:
                 while ended and fine and any(one.refine_next() for one in self.pairs):
                     pass
@@ -158,11 +158,8 @@ class Look:
         for pair in self.pairs:
             told = self.show_pair(pair)
             pairs[f"{pair.flight}/{pair.name}"] = told
-            print(f"{datetime.now(UTC):%H:%M:%S}  {_line(pair, told)}", flush=True)
+            print(f"{datetime.now(UTC):%H:%M:%S}  {_line(pair, told, self.decimated)}", flush=True)
         delays = [one["delay_s"] for one in pairs.values() if one["delay_s"] is not None]
-        if self.follow and not ended and delays:
-            self.delays_s.append(max(delays))
-        self.shown += 1
         status = {
             "campaign": self.campaign.settings.campaign,
             "shown": f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ}",
@@ -176,7 +173,9 @@ class Look:
         self.busy_s += time.monotonic() - began
         busy = self.busy_s / max(elapsed_s, 1e-3)
         self.busy_s = 0.0
-        if not ended and delays and max(delays) > _BEHIND * self.every_s:
+        delay_s, before_s = max(delays, default=0.0), self._delay_s
+        self._delay_s = delay_s if delays else before_s
+        if not ended and delay_s > max(before_s, _BEHIND * self.every_s):  # and it does not catch up
             self.decimated = min(_MOST_DECIMATED, 2 * self.decimated)
         elif busy < _AT_EASE and self.decimated > 1:
             self.decimated //= 2
@@ -293,13 +292,14 @@ def _subtitle(pair: PairSoFar, told: Mapping[str, Any], every: int) -> str:
     return " · ".join(word for word in words if word)
 
 
-def _line(pair: PairSoFar, told: Mapping[str, Any]) -> str:
+def _line(pair: PairSoFar, told: Mapping[str, Any], every: int) -> str:
     name, counts = f"{pair.flight} {pair.name}", told["pulses"]
     if told["image"] is None:
         return f"{name}: no image yet, {counts['recorded']} pulses recorded{told['waits'] and '; '}{told['waits']}"
     words = (
         f"{counts['added']} of {counts['recorded']} pulses",
         _behind(told["delay_s"]),
+        _decimation(every),
         _extent(told),
         told["verdict"],
         f"peak at {told['peak']['x_m']:.2f}, {told['peak']['y_m']:.2f}",

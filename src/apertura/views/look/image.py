@@ -55,27 +55,32 @@ class Block:
         As of `apertura.pipeline.opening.pair.beams_of`.
     time
         (pulse,) datetime64[ns], UTC.
+    weight
+        Pulses that each stands for: those left out beside it, and itself.
     """
 
     history: PhaseHistory
     axes: Axes
     time: Times
+    weight: int = 1
 
 
 @dataclass(frozen=True, eq=False)
 class Compressed:
-    """Pulses of a block that may add to an image, with axes and times as of the block, and how many it had."""
+    """Pulses of a block that may add to an image, with axes, times and weight as of the block, and how many it had."""
 
     profiles: Profiles
     axes: Axes
     time: Times
     pulses: int
+    weight: int = 1
 
     def every(self, step: int) -> "Compressed":
         """Return every `step`-th pulse, apart from the others' memory."""
         some = self.profiles[::step]
         axes = {name: one[::step] for name, one in self.axes.items()}
-        return Compressed(replace(some, samples=np.array(some.samples)), axes, self.time[::step], self.pulses)
+        own = replace(some, samples=np.array(some.samples))
+        return replace(self, profiles=own, axes=axes, time=self.time[::step])
 
     @classmethod
     def joined(cls, several: Sequence["Compressed"]) -> "Compressed":
@@ -163,9 +168,8 @@ class ImageSoFar:
         )
         window = replace(window, start_m=window.start_m[here], farthest_m=window.farthest_m[here])
         profiles = range_compress(some, self.grid, self._terrain, window=window)
-        return Compressed(
-            profiles, {name: one[here] for name, one in block.axes.items()}, block.time[here], len(block.time)
-        )
+        axes = {name: one[here] for name, one in block.axes.items()}
+        return Compressed(profiles, axes, block.time[here], len(block.time), block.weight)
 
     def add(self, block: "Compressed") -> None:
         """Add a block of `compressed` pulses.
@@ -188,14 +192,14 @@ class ImageSoFar:
             side_px=self._campaign.settings.processing.tile_px,
             weighing=Weighing(beams, None, count=1),
         )
-        self.sums += image.compute(scheduler="threads", num_workers=self._threads)
+        self.sums += block.weight * image.compute(scheduler="threads", num_workers=self._threads)
         places = plan.terrain.positions_at(self.grid, *self._pixels.T)
-        self._exact += band_limited_image(profiles, places, beams=beams)
-        self._summed += len(profiles)
+        self._exact += block.weight * band_limited_image(profiles, places, beams=beams)
+        self._summed += block.weight * len(profiles)
         power = np.full(_CERTIFIED, float(np.mean(np.abs(self.sums) ** 2)))
         computed = self.sums[tuple(self._pixels.T)]
         self.error_db = error_bound(computed, self._exact, np.ones(_CERTIFIED), power=power).bound_db
-        self._kept.append(block.every(self._every))
+        self._kept.append(block.every(max(1, self._every // block.weight)))
         if sum(len(one.profiles) for one in self._kept) > _JUDGED:
             self._every *= 2
             self._kept = [one.every(2) for one in self._kept]

@@ -137,12 +137,12 @@ class PairSoFar:
         read = self.taken
         self.taken = int(tx_index[-1]) + 1
         kept = tx_index % every == 0
-        added = self._add(tx_index[kept], rx_index[kept]) if kept.any() else 0
+        added = self._add(tx_index[kept], rx_index[kept], every) if kept.any() else 0
         self.dropped += self.taken - read - added
         self.until = self.time[self.taken - 1]
         return True
 
-    def _add(self, tx_index: NDArray[np.int64], rx_index: NDArray[np.int64]) -> int:
+    def _add(self, tx_index: NDArray[np.int64], rx_index: NDArray[np.int64], every: int) -> int:
         """Add the pulses of some captures; return how many have a position and a transfer function."""
         try:
             block = self._block(tx_index, rx_index)
@@ -151,6 +151,7 @@ class PairSoFar:
             return 0
         if block is None:
             return 0
+        block = replace(block, weight=every)
         if not self.images:
             self.images = self._begin(block)
         coarse, fine = self.images
