@@ -1,5 +1,7 @@
 """Phase history whose positions lie in a flight log, and whose clock is not the log's."""
 
+import json
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -12,6 +14,7 @@ from apertura.formats.names import PHASE_HISTORIES, HistoryFormat
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.check import problems
 from apertura.pipeline.store import open_stage
+from apertura.views.look.follow import Look
 
 CRS = "EPSG:32632"
 EAST, NORTH = 570_000.0, 5_363_000.0
@@ -160,3 +163,12 @@ def test_samples_without_any_positions_are_refused(campaign):
     (campaign / "raw/f01/uav1.track.csv").unlink()
     message = complaint(lambda: run_steps(campaign, exports=False))
     assert "samples without positions" in message
+
+
+def test_it_is_looked_at_as_it_is_but_not_followed(campaign):
+    keep_time(campaign)
+    Look(Campaign.load(campaign), follow=False).run()
+    told = json.loads((campaign / "results/look/status.json").read_text())["pairs"]["f01/uav1-uav1"]
+    assert (told["peak"]["x_m"] - EAST, told["peak"]["y_m"] - NORTH) == (1.0, 20.0)
+    assert (told["verdict"], told["pulses"]["added"]) == ("focused", 600)
+    assert "waveform.kind phase_history" in complaint(lambda: Look(Campaign.load(campaign), follow=True))

@@ -44,6 +44,7 @@ TYPED = {
     "init": "init new",
     "inspect": "inspect .",
     "list": "list",
+    "look": "look .",
     "map": "map .",
     "plan": "plan .",
     "reflectors": "reflectors .",

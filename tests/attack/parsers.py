@@ -24,7 +24,7 @@ from apertura.formats.phase_histories.afrl import joined
 from apertura.formats.phase_histories.mat_fields import read_fields
 from apertura.formats.phase_histories.pulson import read_pulson
 from apertura.formats.reading import open_recording, read_track
-from apertura.formats.recordings.sigmf import check_listed
+from apertura.formats.recordings.sigmf import GrowingSigmf, check_listed
 from apertura.formats.tracks import ardupilot, dataflash_fields, px4_ulog, ulog_fields
 from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions
 from apertura.formats.tracks.missions import read_mission
@@ -86,6 +86,11 @@ def _written(path: Path, data: bytes) -> Path:
 
 def _metadata(path: Path) -> Any:
     return open_recording((path, _written(path.with_name("uav1.sigmf-data"), seeds.sigmf_data()[0])))
+
+
+def _growing(path: Path) -> object:
+    growing = GrowingSigmf(path, _written(path.with_name("uav1.sigmf-data"), seeds.sigmf_data()[0]))
+    return growing.read() and growing.read()
 
 
 def _samples(path: Path) -> Any:
@@ -238,6 +243,7 @@ PARSERS: dict[str, Parser] = {
     ),
     "scans.out": Parser("uav1.out", seeds.scans, lambda path: read_pulson([path], pair="uav1-uav1"), (), "\xf2\x01"),
     "sigmf-meta": Parser("uav1.sigmf-meta", seeds.sigmf_meta, _metadata, _JSON_TREE, _SIGMF),
+    "sigmf-growing": Parser("uav1.sigmf-meta", seeds.sigmf_meta, _growing, _JSON_TREE, _SIGMF),
     "sigmf-data": Parser("uav1.sigmf-data", seeds.sigmf_data, _samples),
     "sigmf-floats": Parser("uav1.sigmf-data", seeds.sigmf_floats, _floats),
     "sigmf-collection": Parser(

@@ -24,6 +24,11 @@ FINDERS: Mapping[tuple[str, ...], str] = {
 }
 """Row of `RECORDERS` → finder(folder, node) → files, where metadata may give them other names than <node><suffix>."""
 
+GROWING: Mapping[tuple[str, ...], str] = {
+    (".sigmf-meta", ".sigmf-data"): "apertura.formats.recordings.sigmf:GrowingSigmf",
+}
+"""Row of `RECORDERS` that can be read while it is written → class(*files) whose read() returns what is whole."""
+
 
 class LogFormat(NamedTuple):
     """How a flight log is recognised, and read."""
@@ -34,16 +39,20 @@ class LogFormat(NamedTuple):
     """reader(path, node=, options=) → `track`."""
     heading: str = ""
     """What its first 8 KiB hold, where others have the same suffix; none: any."""
+    by_lines: bool = False
+    """Whether epochs are lines of text, so that a log is whole up to its last line while it is written."""
 
 
 TRACKS: Mapping[str, LogFormat] = {
-    "airdata": LogFormat((".csv",), "apertura.formats.tracks.airdata:read_airdata", "time(millisecond),datetime(utc)"),
-    "optitrack": LogFormat((".csv",), "apertura.formats.tracks.optitrack:read_optitrack", "Format Version,1."),
-    "csv": LogFormat((".csv",), "apertura.formats.tracks.csv_track:read_csv_track"),
-    "nmea": LogFormat((".nmea", ".txt"), "apertura.formats.tracks.nmea:read_nmea", "$"),
+    "airdata": LogFormat(
+        (".csv",), "apertura.formats.tracks.airdata:read_airdata", "time(millisecond),datetime(utc)", True
+    ),
+    "optitrack": LogFormat((".csv",), "apertura.formats.tracks.optitrack:read_optitrack", "Format Version,1.", True),
+    "csv": LogFormat((".csv",), "apertura.formats.tracks.csv_track:read_csv_track", by_lines=True),
+    "nmea": LogFormat((".nmea", ".txt"), "apertura.formats.tracks.nmea:read_nmea", "$", True),
     "px4": LogFormat((".ulg",), "apertura.formats.tracks.px4_ulog:read_px4_ulog"),
     "ardupilot": LogFormat((".bin", ".log"), "apertura.formats.tracks.ardupilot:read_ardupilot", heading="FMT"),
-    "rtklib": LogFormat((".pos",), "apertura.formats.tracks.rtklib:read_rtklib_pos"),
+    "rtklib": LogFormat((".pos",), "apertura.formats.tracks.rtklib:read_rtklib_pos", by_lines=True),
 }
 """Name of a format → how it is recognised and read; of those that fit a file the first is taken."""
 

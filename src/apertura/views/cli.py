@@ -21,6 +21,7 @@ from apertura.views.step_commands import app as step
 
 if TYPE_CHECKING:
     from apertura.pipeline.campaign import Campaign
+    from apertura.pipeline.workflow import Show
 
 PASS_ON = {"allow_extra_args": True, "ignore_unknown_options": True}
 """Options that are not known go to snakemake."""
@@ -222,12 +223,16 @@ def run(
     ] = None,
 ) -> None:
     """Run the workflow on a campaign folder; further options and targets go to snakemake."""
-    from apertura.pipeline.stale import forms_results
-    from apertura.pipeline.workflow import Show, run_workflow
-
     show: Show = "snakemake" if verbose else "errors" if quiet else "steps"
     asked = [*context.args, *(["-n"] if dry_run else []), *(["--until", *until] if until else [])]
     asked += [*(["--profile", profile] if profile else []), *(["--set-scatter", *set_scatter] if set_scatter else [])]
+    _run(campaign, cores, *asked, paranoid=paranoid, show=show)
+
+
+def _run(campaign: Path, cores: int, *asked: str, paranoid: bool = False, show: "Show" = "steps") -> None:
+    from apertura.pipeline.stale import forms_results
+    from apertura.pipeline.workflow import run_workflow
+
     status = run_workflow(given(campaign), cores, *asked, paranoid=paranoid, show=show)
     if status == 0 and forms_results(["", *asked]):
         opened = _opened(campaign)
@@ -235,8 +240,29 @@ def run(
 
         print_benches(opened)
         if opened.image_flights and is_finished(opened):  # not after `--until`
-            print_products(opened) if quiet else print_summary(opened)
+            print_products(opened) if show == "errors" else print_summary(opened)
     raise SystemExit(status)
+
+
+@app.command()
+def look(
+    campaign: CampaignFolder = HERE,
+    cores: Cores = ALL_CORES,
+    *,
+    follow: Annotated[
+        bool, typer.Option("--follow", help="its recordings still grow: show it as they do, then run the workflow")
+    ] = False,
+    every: Annotated[float, typer.Option(min=1, help="s between pictures")] = 5.0,
+    end_after: Annotated[float, typer.Option(min=1, help="s without growth that end the recordings")] = 10.0,
+    run_after: Annotated[bool, typer.Option("--run/--no-run", help="run the workflow when they have ended")] = True,
+) -> None:
+    """Show images of the pulses so far, beside the results; Ctrl-C ends a campaign that is followed, and runs it."""
+    opened = _opened(campaign)
+    from apertura.views.look.follow import look_at
+
+    look_at(opened, follow=follow, every_s=every, end_after_s=end_after, threads=cores, fine=not (follow and run_after))
+    if follow and run_after:
+        _run(campaign, cores)
 
 
 @app.command()

@@ -67,6 +67,7 @@ class RangeWindow:
         *,
         beams: Beams | None = None,
         wave_speed_m_s: float,
+        together: int = 1,
     ) -> "RangeWindow":
         """Return the window that a scene needs.
 
@@ -83,12 +84,14 @@ class RangeWindow:
             scene.
         wave_speed_m_s
             Speed of the wave along the paths.
+        together
+            Pulses whose window is bounded by one of them: wider by what the antennas move meanwhile, and sooner known.
 
         Notes
         -----
         Source: docs/theory.md, eq. 4.
         """
-        nearest, farthest = swath(grid, terrain, aperture, beams=beams)
+        nearest, farthest = swath(grid, terrain, aperture, beams=beams, together=together)
         step, length = range_step(frequency_hz, oversampling=OVERSAMPLING, wave_speed_m_s=wave_speed_m_s)
         spans = farthest - nearest
         samples = int(np.ceil(spans.max(initial=0.0, where=np.isfinite(spans)) / step)) + 2 * GUARD_SAMPLES + 1

@@ -18,7 +18,7 @@ _MOST_PULSES = 4096  # whose paths are computed; others are bounded
 
 
 def swath(
-    grid: SceneGrid, terrain: Terrain, aperture: Aperture, *, beams: Beams | None = None
+    grid: SceneGrid, terrain: Terrain, aperture: Aperture, *, beams: Beams | None = None, together: int = 1
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the shortest and longest total path from each pulse to the scene.
 
@@ -34,6 +34,8 @@ def swath(
         In the grid's processing frame.
     beams
         Weights of pulses: blocks of pixels that a pulse cannot illuminate do not count.
+    together
+        Pulses that are bounded by one of them, at least.
 
     Returns
     -------
@@ -53,7 +55,7 @@ def swath(
         -(-max(grid.shape) // _BLOCKS) if beams is None else math.isqrt(grid.shape[0] * grid.shape[1] // _BLOCKS**2) + 1
     )
     middle_m, radius_m = balls(grid, terrain, list(grid.tiles(side)))
-    every = 1 + (len(aperture) - 1) // _MOST_PULSES
+    every = max(together, 1 + (len(aperture) - 1) // _MOST_PULSES)
     nearest, farthest = np.empty((2, len(aperture)))
     for first in range(0, len(aperture), every * _PULSES_AT_ONCE):
         pulses = slice(first, first + every * _PULSES_AT_ONCE)

@@ -1,12 +1,14 @@
 """SigMF recordings: metadata, collections, one capture segment per trigger, channels interleaved per sample."""
 
+import json
+import re
 from codecs import BOM_UTF8
 from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
-from typing import Annotated, BinaryIO, NamedTuple, TypeVar
+from typing import Annotated, Any, BinaryIO, NamedTuple, TypeVar
 
 import ijson
 import numpy as np
@@ -97,6 +99,14 @@ class StatedCaptures(NamedTuple):
     frequency_hz: NDArray[np.float64]  # NaN where not stated
     header_bytes: NDArray[np.int64]
     frame: NDArray[np.int64]
+
+    def first(self, count: int) -> "StatedCaptures":
+        """Return the first ones."""
+        return StatedCaptures._make(column[:count] for column in self)
+
+    def followed_by(self, later: "StatedCaptures") -> "StatedCaptures":
+        """Return these and later ones."""
+        return StatedCaptures._make(np.concatenate(both) for both in zip(self, later, strict=True))
 
 
 def read_meta(path: Path) -> tuple[Global, StatedCaptures]:
@@ -410,3 +420,155 @@ def _checked(tags: NDArray[np.datetime64], path: Path) -> NDArray[np.datetime64]
             "Sort the captures or correct the tags.",
         )
     return tags
+
+
+# ---- Recordings that still grow: captures as far as they are whole --------------------------------------------------
+
+_DECODER = json.JSONDecoder()
+_BETWEEN = re.compile(r"[\s,:]*")
+_KNOWN_BYTES = 256  # before the place read to, by which metadata are known to have only been appended to
+
+
+class GrowingSigmf:
+    """A SigMF recording while its recorder writes it: metadata and samples are read from where the last read ended.
+
+    Metadata may be written as a stream, whose captures are not closed yet, or anew each time; what is not whole, a
+    capture's object or its samples, is left for the next read.
+
+    Parameters
+    ----------
+    meta_path, data_path
+        As of `open_sigmf`.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> meta = ('{"global": {"core:datatype": "ci16_le", "core:version": "1.2.5", "core:sample_rate": 1e6}, '
+    ...         '"captures": ['
+    ...         '{"core:sample_start": 0, "core:datetime": "2025-05-14T09:30:00Z"}, '
+    ...         '{"core:sample_start": 4, "core:datetime": "2025-05-14T09:30:01Z"}, {"core:sample_st')
+    >>> with TemporaryDirectory() as folder:
+    ...     files = Path(folder) / "a.sigmf-meta", Path(folder) / "a.sigmf-data"
+    ...     _ = files[0].write_text(meta)
+    ...     np.ones(2 * 7, "<i2").tofile(files[1])  # the second capture lacks a sample
+    ...     GrowingSigmf(*files).read().captures.start
+    array([0])
+    """
+
+    def __init__(self, meta_path: Path, data_path: Path) -> None:
+        self.files = meta_path, data_path
+        self.ended = False
+        """Whether the metadata are closed, state the hash of the samples, and all of these are there."""
+        self._forget()
+
+    @property
+    def runs_through(self) -> bool:
+        """Whether its recorder never stops: pulses are then found in all samples at once, and `read` returns none."""
+        return self._header is not None and self._header.framing is not None
+
+    def _forget(self) -> None:
+        self._header: Global | None = None
+        self._captures: StatedCaptures | None = None
+        self._read_to, self._known, self._closed = 0, b"", False
+
+    def read(self) -> Recording | None:
+        """Return the recording as far as it is whole; None before its second capture has begun.
+
+        Raises
+        ------
+        CampaignError
+            If what is there is not SigMF.
+        """
+        self._read_meta()
+        header, captures, (meta, data) = self._header, self._captures, self.files
+        if header is None or self.runs_through or captures is None or len(captures.start) < 2 or not data.is_file():
+            return None
+        channels, layout = _channels(header, meta), _layout(header, captures, meta)
+        length = int(np.median(np.diff(captures.start)))
+        whole = captures.start + length <= len(SampleFile(data, len(channels), layout))
+        self.ended = self._closed and header.sha512 is not None and bool(whole.all())
+        if not whole.any():
+            return None
+        captures = captures.first(int(whole.sum()))
+        layout = _layout(header, captures, meta)
+        _length(captures, int(captures.start[-1]) + length, meta)
+        return Recording(
+            SampleFile(data, len(channels), layout),
+            channels,
+            header.sample_rate_hz,
+            _frequency_hz(captures, meta),
+            Captures(captures.start, _usable(length, layout, meta), _checked(captures.time, meta), captures.frame),
+            None,
+            self.files,
+            header.sha512 and header.sha512.lower(),
+        )
+
+    def _read_meta(self) -> None:
+        """Read the captures that were appended; all of them where what was read before is no longer there."""
+        path = self.files[0]
+        if not path.is_file() or path.stat().st_size > LARGEST_META:
+            return
+        with naming(path), path.open("rb") as stream:
+            stream.seek(self._read_to - len(self._known))
+            known, appended = stream.read(len(self._known)), stream.read(LARGEST_META)
+        if known != self._known:
+            if len(known) == len(self._known):  # else it is being written anew
+                self._forget()
+                self._read_meta()
+            return
+        mark = len(BOM_UTF8) if not self._read_to and appended.startswith(BOM_UTF8) else 0
+        text = appended[mark:].decode("utf-8", errors="ignore")  # a letter that is cut is no part of what is whole
+        at = 0 if self._header else self._begin(text)
+        documents: list[object] = []
+        for document, end in _whole_objects(text, at):
+            documents.append(document)
+            at = end
+        rest = text[at:].lstrip()
+        self._closed = rest.startswith("]") and rest.rstrip().endswith("}")
+        if self._header is None:
+            return
+        if documents:
+            read = _read_captures(iter(documents), path)
+            self._captures = read if self._captures is None else self._captures.followed_by(read)
+        behind = appended[: mark + len(text[:at].encode())]
+        self._read_to, self._known = self._read_to + len(behind), (self._known + behind)[-_KNOWN_BYTES:]
+
+    def _begin(self, text: str) -> int:
+        """Read the global object; return where the captures begin, or the text's end where they have not yet."""
+        path, header = self.files[0], None
+        try:
+            at = _at_next(text, text.index("{") + 1)
+            while True:
+                key, at = _DECODER.raw_decode(text, at)
+                at = _at_next(text, at)
+                if key == "captures":
+                    break
+                value, at = _DECODER.raw_decode(text, at)
+                at, header = _at_next(text, at), value if key == "global" else header
+        except (ValueError, RecursionError):  # not whole yet
+            return len(text)
+        if header is None:
+            raise CampaignError(
+                "captures before global",
+                path,
+                "global first, in a recording that grows",
+                "Look at it when it has ended.",
+            )
+        self._header = of_sigmf(TypeAdapter(Global), header, path, "global")
+        return at + 1  # behind the bracket
+
+
+def _at_next(text: str, at: int) -> int:
+    """Return where the next value begins."""
+    found: Any = _BETWEEN.match(text, at)
+    return int(found.end())
+
+
+def _whole_objects(text: str, at: int) -> Iterator[tuple[object, int]]:
+    """Yield the objects of an array as far as they are whole, each with where it ends."""
+    while text.startswith("{", at := _at_next(text, at)):
+        try:
+            document, at = _DECODER.raw_decode(text, at)
+        except (ValueError, RecursionError):
+            return
+        yield document, at

@@ -17,7 +17,7 @@ from apertura.common.errors import CampaignError, quoted
 RESERVED_NAMES = frozenset(
     {
         *("fused", "layers", "stac", "map", "mosaic", "interferometry", "study", "logs", "benchmarks", "tiles"),
-        *("tracks", "workflow"),
+        *("tracks", "workflow", "look"),
     }
 )
 """Names of the results folder that no flight or node may take."""

@@ -5,7 +5,7 @@ import json
 import os
 import sys
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 
@@ -23,8 +23,14 @@ _HEADINGS = ("flight", "of", "finished", "stale", "missing", "size")
 _COLOURS = {"finished": "green", "stale": "yellow", "missing": ""}
 
 _LOCK = ".zarr.lock"
-_OWN = {"logs": ".log", "benchmarks": ".tsv", ".hashes": ".json", RUN: ""}
-"""Folder of the results → how the names of the files end that a run leaves there."""
+_OWN: Mapping[str, str | tuple[str, ...]] = {
+    "logs": ".log",
+    "benchmarks": ".tsv",
+    ".hashes": ".json",
+    RUN: "",
+    "look": (".png", ".json", ".html"),
+}
+"""Folder of the results → how the names of the files end that a run, or a look, leaves there."""
 
 
 def print_list(campaign: Campaign) -> None:

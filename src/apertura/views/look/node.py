@@ -1,0 +1,159 @@
+"""What a node has recorded and logged so far: captures and lines that are whole, read once."""
+
+import pkgutil
+import time
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, cast
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from apertura.common.errors import CampaignError
+from apertura.formats.names import GROWING, TRACKS, log_format
+from apertura.formats.reading import open_recording, read_track
+from apertura.formats.recordings.recording import Captures, Recording
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.opening.acquisition import Acquisition, Captured
+from apertura.pipeline.opening.node_log import shortest_wave
+from apertura.pipeline.opening.recordings import captures_of
+from apertura.pipeline.opening.transmitted import Transmitted
+
+Times = NDArray[np.datetime64]
+
+_ABOUT_S = 60.0  # of the log about the pulses of a block: farther epochs do not move a spline
+_EPOCHS = 4  # that a log must be ahead of a pulse: those to come would move it by 0.27⁴ of its error at the end
+
+
+class NotFollowedError(CampaignError):
+    """What is there cannot be read while it is written: no waiting helps."""
+
+
+class NodeSoFar:
+    """What a node has recorded and logged so far; whole captures and whole lines alone.
+
+    Parameters
+    ----------
+    campaign, flight, node
+        Which.
+    sent
+        What was transmitted.
+    follow
+        Whether its files still grow: a kind that cannot be read meanwhile is refused.
+    """
+
+    def __init__(self, campaign: Campaign, flight: str, node: str, sent: Transmitted, *, follow: bool) -> None:
+        self.name, self.waits, self.ended = node, "", False
+        self.grown_at: float | None = None
+        """When something was last found to have come, by the clock `time.monotonic`."""
+        self.time: Times = np.zeros(0, "datetime64[ns]")
+        self.frame: NDArray[np.int64] = np.zeros(0, np.int64)
+        self.track: xr.Dataset | None = None
+        self._campaign, self._flight, self._sent, self._follow = campaign, flight, sent, follow
+        self._recording: Recording | None = None
+        self._found: xr.Dataset | None = None  # captures found in samples that never stopped
+        self._growing: Any = None
+        self._log_bytes = -1
+
+    def read(self) -> bool:
+        """Read what has come since; return whether anything has."""
+        before = len(self.time), self._log_bytes
+        self.waits = ""
+        for read in (self._read_recording, self._read_log):
+            try:
+                read()
+            except NotFollowedError:
+                raise
+            except CampaignError as error:
+                if not self._follow:
+                    raise
+                self.waits = str(error)  # a file that is not there yet, or has only begun
+        grown = (len(self.time), self._log_bytes) != before
+        self.grown_at = time.monotonic() if grown else self.grown_at
+        return grown
+
+    def _read_recording(self) -> None:
+        if self._found is not None:
+            return
+        files = self._campaign.recording_files(self._flight, self.name)
+        if self._growing is None:
+            row = next(row for row in GROWING if files[0].name.endswith(row[0]))
+            self._growing = pkgutil.resolve_name(GROWING[row])(*files)
+        growing = self._growing.read()
+        if self._growing.runs_through and not self._follow:
+            whole = open_recording(files)
+            self._recording, self._found = whole, captures_of(whole, self._campaign, node=self.name)
+            recorded, self.frame = self._found.time.values, self._found.frame.values
+        elif self._growing.runs_through:
+            raise NotFollowedError(
+                "apertura:framing: its recorder never stops",
+                files[0],
+                "one capture segment per trigger, in a recording that is followed",
+                "Its pulses are found in all of its samples: look at it without --follow, or when it has ended.",
+            )
+        else:
+            self._recording = growing if growing or self._follow else open_recording(files)
+            if self._recording is None:
+                return
+            recorded, self.frame = self._recording.captures.time, self._recording.captures.frame
+        self.time = self._campaign.clock(self._flight, self.name).utc(recorded)
+        self.ended = self._growing.ended
+
+    def _read_log(self) -> None:
+        path = self._campaign.track_file(self._flight, self.name)
+        options = self._campaign.settings.nodes[self.name].log.options
+        size = path.stat().st_size
+        if size == self._log_bytes:
+            return
+        kind = log_format(path, options)
+        if not TRACKS[kind].by_lines:
+            if self._follow:
+                by_lines = ", ".join(name for name, row in TRACKS.items() if row.by_lines)
+                raise NotFollowedError(
+                    f"a log of format {kind}, which cannot be read while it is written",
+                    path,
+                    f"a log of lines of text ({by_lines}), where it is followed",
+                    "Look without --follow when it has ended, or let the log be streamed as text.",
+                )
+            self.track = read_track(path, node=self.name, options=options)
+        else:
+            lines = path.read_bytes()
+            with TemporaryDirectory() as folder:
+                whole = Path(folder) / path.name
+                whole.write_bytes(lines[: lines.rfind(b"\n") + 1])
+                self.track = read_track(whole, node=self.name, options=options)
+        self._log_bytes = size
+
+    def known_until(self, *, ended: bool) -> np.datetime64:
+        """Return up to when positions are known: by some epochs less than the log, unless that has ended."""
+        if self.track is None:
+            return np.datetime64(0, "ns")
+        epochs = self.track.time.values
+        return cast("np.datetime64", epochs[-1 if ended else max(0, len(epochs) - 1 - _EPOCHS)])
+
+    @property
+    def complete(self) -> bool:
+        """Whether the recording says that it has ended, and the log reaches as far."""
+        return bool(self.ended and len(self.time) and self.known_until(ended=True) >= self.time[-1])
+
+    def acquisition(self, captures: NDArray[np.int64]) -> Acquisition:
+        """Return some captures with the log about them; frames count them, as they are paired already."""
+        if self._recording is None or self.track is None:
+            raise TypeError("nothing is recorded or logged yet")
+        if self._found is not None:
+            raw = self._found.isel(pulse=captures)
+        else:
+            own = self._recording.captures
+            some = Captures(own.start[captures], own.length, own.time[captures], own.frame[captures])
+            raw = self._recording.cut(some, node=self.name)
+        raw = raw.assign(time=("pulse", self.time[captures]), frame=("pulse", np.arange(len(captures))))
+        about = np.timedelta64(round(_ABOUT_S * 1e9), "ns")
+        epochs = self.track.time.values
+        near = (epochs >= raw.time.values[0] - about) & (epochs <= raw.time.values[-1] + about)
+        files = Path("raw") / self._flight / self.name
+        captured = Captured.of(raw, self._recording.samples.path, files, str(files), self._sent)
+        settings = self._campaign.node(self._flight, self.name)
+        wave_m = shortest_wave(self._sent.numerology.frequency_hz)
+        log = str(self._campaign.track_file(self._flight, self.name))
+        return Acquisition(self.name, settings, self.track.isel(epoch=near), log, wave_m, **vars(captured))

@@ -1,0 +1,363 @@
+"""`apertura look`: images of the pulses so far, of files cut wherever a write may end; nothing is written elsewhere."""
+
+import hashlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from folders import ROOT, copy_writable, ingest_all, settle_ground, state
+
+import apertura as ap
+from apertura.common.errors import CampaignError
+from apertura.core.echo.compression import window_weights
+from apertura.formats.recordings.sigmf import GrowingSigmf, open_sigmf
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.opening.scene import settled_scene
+from apertura.pipeline.opening.transmitted import transmitted
+from apertura.pipeline.runs.results import clean
+from apertura.pipeline.steps import echo
+from apertura.pipeline.store import open_stage
+from apertura.simulation import ImageGrid, preset
+from apertura.views.look import image as look_image
+from apertura.views.look import pair as look_pair
+from apertura.views.look.follow import Look
+from apertura.views.look.node import NodeSoFar
+
+sys.path.insert(0, str(ROOT / "benchmarks"))
+import look as replayed  # the writers of benchmarks/look.py, which end files wherever a write may
+
+APERTURA = Path(sys.executable).parent / "apertura"
+
+
+def files_of(root):
+    """Return the files of the results but those of the look → sha256."""
+    found = (path for path in (root / "results").rglob("*") if path.is_file())
+    return {
+        path.relative_to(root).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in found
+        if path.relative_to(root).parts[1] != "look"
+    }
+
+
+def node_of(root, node, *, follow=True):
+    campaign = Campaign.load(root)
+    return NodeSoFar(campaign, "f01", node, transmitted(campaign, campaign.settings.waveform), follow=follow)
+
+
+def in_blocks(root, pulses, monkeypatch):
+    """Return the pairs of a campaign whose pulses were added so many at a time."""
+    monkeypatch.setattr(look_pair, "AT_ONCE", pulses)
+    look = Look(Campaign.load(root), follow=False)
+    for node in look.nodes.values():
+        node.read()
+    for pair in look.pairs:
+        while pair.add_next(ended=True) or pair.refine_next():
+            pass
+    return look.pairs
+
+
+def apart_db(image, exact):
+    """Return the RMS difference of two images relative to that of the second, dB."""
+    return 10 * np.log10(np.mean(np.abs(image - exact) ** 2) / np.mean(np.abs(exact) ** 2))
+
+
+@pytest.mark.parametrize("pulses", [7, 16, 2048])
+def test_an_image_added_in_blocks_is_that_of_all_pulses_at_once(finished_tiny, tmp_path, monkeypatch, pulses):
+    root = copy_writable(finished_tiny.root, tmp_path / "campaign")
+    state(root, "processing", integration="all")
+    for pair in in_blocks(root, pulses, monkeypatch)[:1]:
+        coarse, fine = pair.images
+        echo = open_stage(finished_tiny.stage("echo", "f01", pair.name), "echo").load()
+        assert fine.pulses == coarse.pulses == len(echo.pulse)
+        height_m = finished_tiny.settings.scene.height_m
+        exact = ap.backproject(echo, fine.grid, terrain=height_m, engine="reference", certified_pixels=0, judge=False)
+        assert apart_db(fine.image, exact.values) < -60
+        assert fine.error_db < -60
+        few = slice(len(echo.subcarrier) // 4, 3 * len(echo.subcarrier) // 4)
+        half = ap.PhaseHistory(
+            echo.transfer.values[:, few],
+            echo.frequency.values[few],
+            window_weights("hann", few.stop - few.start),
+            echo.reference_delay.values,
+            ap.Aperture(echo.tx_position.values, echo.rx_position.values),
+            echo.attrs["wave_speed_m_s"],
+        )
+        exact = ap.backproject(half, coarse.grid, terrain=height_m, engine="reference", certified_pixels=0, judge=False)
+        assert apart_db(coarse.image, exact.values) < -30  # half of what is asked
+        assert coarse.error_db < -30
+        assert coarse.grid.spacing_m == 2 * fine.grid.spacing_m
+
+
+def test_a_secondary_in_blocks_shows_the_same_points_in_focus(finished_tiny, tmp_path, monkeypatch):
+    pair = in_blocks(copy_writable(finished_tiny.root, tmp_path / "campaign"), 16, monkeypatch)[1]
+    image = open_stage(finished_tiny.stage("image", "f01", pair.name), "image").image.values
+    ours, theirs = np.abs(pair.images[1].image), np.abs(image)
+    assert np.unravel_index(ours.argmax(), ours.shape) == np.unravel_index(theirs.argmax(), theirs.shape)
+    assert apart_db(pair.images[1].image, image) < -20  # what the state of a sidelink is by 16 pulses, or by all
+
+
+@pytest.mark.parametrize("shares", [(0.9, 0.3), (0.4, 0.9), (0.97, 0.5001), (1.0, 0.99)])
+def test_a_recording_cut_anywhere_is_read_to_its_last_whole_pulse_and_on_from_there(tiny, tmp_path, shares):
+    files = [tiny / f"raw/f01/uav2.sigmf-{kind}" for kind in ("meta", "data")]
+    whole, texts = open_sigmf(*files), [path.read_bytes() for path in files]
+    growing = GrowingSigmf(tmp_path / "a.sigmf-meta", tmp_path / "a.sigmf-data")
+    assert growing.read() is None
+    for path, text, share in zip(growing.files, texts, shares, strict=True):
+        path.write_bytes(text[: int(share * len(text))])
+    read = growing.read()
+    count = len(read.captures.start)
+    stated = growing.files[0].read_bytes().partition(b'"captures"')[2].count(b"}") - 2 * (shares[0] == 1)
+    pulse_bytes = whole.samples.sample_bytes * whole.captures.length
+    assert count == min(stated, growing.files[1].stat().st_size // pulse_bytes) > 1
+    assert not growing.ended
+    for name in ("start", "time", "frame"):
+        np.testing.assert_array_equal(getattr(read.captures, name), getattr(whole.captures, name)[:count])
+    for path, text in zip(growing.files, texts, strict=True):
+        path.write_bytes(text)
+    assert len(growing.read().captures.start) == len(whole.captures.start)
+    assert growing.ended
+
+
+def test_a_recording_that_grows_byte_by_byte_is_that_which_was_recorded(tiny, tmp_path):
+    meta, data = (tiny / f"raw/f01/uav2.sigmf-{kind}" for kind in ("meta", "data"))
+    whole, text = open_sigmf(meta, data), b"\xef\xbb\xbf" + meta.read_bytes()
+    (tmp_path / "a.sigmf-data").write_bytes(data.read_bytes())
+    growing, counts = GrowingSigmf(tmp_path / "a.sigmf-meta", tmp_path / "a.sigmf-data"), []
+    for size in range(0, len(text) + 37, 37):
+        growing.files[0].write_bytes(text[:size])
+        read = growing.read()
+        counts.append(0 if read is None else len(read.captures.start))
+    assert counts == sorted(counts)
+    assert len(set(counts)) > len(whole.captures.start) / 2
+    for name in ("start", "time", "frame"):
+        np.testing.assert_array_equal(getattr(read.captures, name), getattr(whole.captures, name))
+
+
+def test_metadata_that_are_written_anew_are_read_anew(tiny, tmp_path):
+    meta, data = (tiny / f"raw/f01/uav1.sigmf-{kind}" for kind in ("meta", "data"))
+    document, captures = json.loads(meta.read_text()), len(open_sigmf(meta, data).captures.start)
+    (tmp_path / "a.sigmf-data").write_bytes(data.read_bytes())
+    growing = GrowingSigmf(tmp_path / "a.sigmf-meta", tmp_path / "a.sigmf-data")
+    for count in (10, 25, captures):
+        some = {"global": {"core:extra": "x" * count, **document["global"]}, "captures": document["captures"][:count]}
+        growing.files[0].write_text(json.dumps(some))
+        assert len(growing.read().captures.start) == count
+    growing.files[0].write_text("")  # its recorder has just truncated it
+    assert len(growing.read().captures.start) == captures
+
+
+@pytest.mark.parametrize("node", ["uav1", "uav2"])  # a CSV, and an RTKLIB solution
+@pytest.mark.parametrize("cut", [1, 9, 40])
+def test_a_log_cut_within_a_line_is_read_to_its_last_whole_line(tiny, node, cut):
+    whole = node_of(tiny, node)
+    whole.read()
+    (log,) = (tiny / "raw/f01").glob(f"{node}.track.*")
+    log.write_bytes(log.read_bytes()[:-cut])
+    read = node_of(tiny, node)
+    read.read()
+    assert read.waits == ""
+    assert len(read.track.time) == len(whole.track.time) - 1
+    assert read.known_until(ended=False) < read.known_until(ended=True) < whole.known_until(ended=True)
+
+
+def test_pulses_are_held_back_that_a_log_does_not_reach(tiny):
+    (log,) = (tiny / "raw/f01").glob("uav2.track.*")
+    lines = log.read_text().splitlines(keepends=True)
+    log.write_text("".join(lines[: len(lines) // 2]))
+    look = Look(Campaign.load(tiny), follow=True)
+    for one in look.nodes.values():
+        one.read()
+    mono, other = look.pairs
+    reach = other.rx.known_until(ended=False)
+    tx_index, rx_index = other.ready(ended=False)
+    assert 0 < len(tx_index) < len(mono.ready(ended=False)[0])
+    assert other.tx.time[tx_index].max() <= reach
+    apart_s = (other.rx.time[rx_index] - other.tx.time[tx_index]) / np.timedelta64(1, "s")
+    assert np.ptp(apart_s) < 5e-3  # the same pulses, by tags of two clocks
+
+
+def test_files_that_are_not_there_yet_are_waited_for(tiny):
+    for path in (tiny / "raw/f01").iterdir():
+        path.unlink()
+    look = Look(Campaign.load(tiny), follow=True, every_s=1.0)
+    threading.Timer(2.0, look.finish.set).start()
+    look.run()
+    told = json.loads((tiny / "results/look/status.json").read_text())["pairs"]["f01/uav1-uav1"]
+    assert "no such file" in told["waits"] or "track" in told["waits"]
+    assert told["image"] is None
+
+
+def test_an_image_of_hardly_any_aperture_is_shown_but_not_judged(tiny, monkeypatch):
+    monkeypatch.setattr(look_pair, "AT_ONCE", 16)
+    monkeypatch.setattr(look_image, "LEAST_PULSES", 8)
+    look = Look(Campaign.load(tiny), follow=False)
+    for node in look.nodes.values():
+        node.read()
+    assert look.pairs[0].add_next(ended=True)
+    told = look.pairs[0].shown.judged()
+    assert told["verdict"] == "cannot tell"
+    assert told["why"].startswith("no aperture yet")
+
+
+def test_what_the_first_pulses_could_not_tell_later_ones_do(tmp_path, monkeypatch):
+    plan = replace(preset("demo", pulses=100), scene=ImageGrid("EPSG:32632", half_width_m=3.0, spacing_m=0.1))
+    look = Look(Campaign.load(ap.simulate(tmp_path / "campaign", plan, seed=7)), follow=False)
+    look.nodes["f01", "uav1"].read()
+    monkeypatch.setattr(look_pair, "AT_ONCE", 2)  # which span no aperture: what is planned for them says so
+    assert look.pairs[0].add_next(ended=True)
+    monkeypatch.setattr(look_pair, "AT_ONCE", 2048)
+    while look.pairs[0].add_next(ended=True) or look.pairs[0].refine_next():
+        pass
+    told = look.pairs[0].judged()
+    assert told["verdict"] == "focused", told
+    assert told["judged_by"].endswith("fine")
+
+
+def test_a_scene_left_to_auto_is_that_of_the_run(tiny, tmp_path):
+    state(tiny, "scene", bounds_m="auto", spacing_m=0.5)
+    other = Campaign.load(copy_writable(tiny, tmp_path / "other"))
+    ingest_all(other)
+    for pair in other.flight("f01").pairs:
+        echo.echo(other, "f01", pair)
+    settle_ground(other)
+    look = Look(Campaign.load(tiny), follow=False)
+    look.run(fine=False)
+    grids = {pair.images[1].grid for pair in look.pairs}
+    assert grids == {settled_scene(other).grid}
+
+
+def test_a_recording_has_ended_only_where_its_log_has(tiny):
+    (log,) = (tiny / "raw/f01").glob("uav1.track.*")
+    whole = log.read_bytes()
+    log.write_bytes(whole[: len(whole) // 2])
+    node = node_of(tiny, "uav1")
+    node.read()
+    assert node.ended
+    assert not node.complete
+    log.write_bytes(whole)
+    node.read()
+    assert node.complete
+
+
+def test_a_pair_that_falls_behind_takes_every_other_pulse_and_says_so(tiny):
+    look = Look(Campaign.load(tiny), follow=False)
+    look.decimated = 2
+    look.run()
+    told = json.loads((tiny / "results/look/status.json").read_text())
+    assert told["one_pulse_in"] == 2
+    counts = told["pairs"]["f01/uav1-uav1"]["pulses"]
+    assert counts["added"] + counts["left_out"] == counts["recorded"]
+    assert counts["added"] == counts["recorded"] // 2
+    assert "1 pulse in 2 taken" in (tiny / "results/look/index.html").read_text()
+
+
+def test_pulses_stand_for_those_left_out_beside_them(finished_tiny, tmp_path, monkeypatch):
+    root = copy_writable(finished_tiny.root, tmp_path / "campaign")
+    (whole, _), look = in_blocks(root, 20, monkeypatch), Look(Campaign.load(root), follow=False)
+    node, pair = look.nodes["f01", "uav1"], look.pairs[0]
+    node.read()
+    assert pair.add_next(ended=True, every=1)
+    assert pair.add_next(ended=True, every=2)
+    thinned, every = pair.images[0], whole.images[0]
+    assert thinned.pulses == 20 + (every.pulses - 20) // 2
+    gain = np.vdot(every.sums, thinned.sums) / np.vdot(every.sums, every.sums)
+    assert abs(gain - 1) < 0.05  # a half that counts half would make it 0.75
+
+
+def test_a_delay_doubles_the_decimation_and_ease_halves_it(tiny, monkeypatch):
+    look = Look(Campaign.load(tiny), follow=True, every_s=1.0)
+    delay = [20.0]
+    monkeypatch.setattr(
+        look, "show_pair", lambda _: {"delay_s": delay[0], "image": None, "pulses": {"recorded": 0}, "waits": ""}
+    )
+    told = []
+    for delay[0] in (20.0, 21.0, 20.5, 22.0, 0.5, 0.5):
+        look.busy_s = 900.0 * (delay[0] > 1)
+        look.show(ended=False, elapsed_s=1e3)
+        told.append(look.decimated)
+    assert told == [1, 2, 2, 4, 2, 1]  # not at first, when it still plans, nor while it catches up
+
+
+def test_a_look_writes_beside_the_results_and_nowhere_else(finished_tiny, tmp_path):
+    root = copy_writable(finished_tiny.root, tmp_path / "campaign")
+    before = files_of(root)
+    Look(Campaign.load(root), follow=False).run()
+    assert files_of(root) == before
+    shown = {path.relative_to(root / "results/look").as_posix() for path in (root / "results/look").rglob("*.*")}
+    assert shown == {"index.html", "status.json", "f01/uav1-uav1.png", "f01/uav1-uav2.png"}
+    told = json.loads((root / "results/look/status.json").read_text())["pairs"]["f01/uav1-uav1"]
+    assert told["verdict"] in {"focused", "cannot tell"}
+    assert told["share"] == 1
+
+
+def test_what_a_look_wrote_goes_with_what_a_run_wrote(tiny):
+    campaign = Campaign.load(tiny)
+    Look(campaign, follow=False).run()
+    (tiny / "results/look/notes.txt").write_text("mine")
+    clean(campaign, unfinished_only=False, agreed=True)
+    assert [path.name for path in (tiny / "results/look").rglob("*")] == ["notes.txt"]
+
+
+@pytest.mark.parametrize(
+    ("spoil", "named"),
+    [
+        (lambda root: state(root, "scene", bounds_m="auto"), "scene.bounds_m"),
+        (lambda root: next((root / "raw/f01").glob("uav1.track.*")).rename(root / "raw/f01/uav1.track.ulg"), "px4"),
+    ],
+)
+def test_what_cannot_be_followed_is_refused_in_one_message(tiny, spoil, named):
+    spoil(tiny)
+    with pytest.raises(CampaignError, match=named):
+        Look(Campaign.load(tiny), follow=True, every_s=1.0).run()
+
+
+@pytest.mark.slow
+def test_a_picture_that_takes_longer_than_files_may_rest_does_not_end_them(tiny, tmp_path, monkeypatch):
+    root = tmp_path / "replayed"
+    replayed.begin(tiny, root)
+    look = Look(Campaign.load(root), follow=True, every_s=1.0, end_after_s=2.0)
+
+    def slowly(_):
+        time.sleep(2.5)
+        for node in look.nodes.values():
+            node.read()
+        return {"delay_s": None, "image": None, "pulses": {"recorded": 0}, "waits": ""}
+
+    monkeypatch.setattr(look, "show_pair", slowly)
+    writing = threading.Thread(target=replayed.replay, args=(tiny, root, 0.2))
+    writing.start()
+    look.run()
+    writing.join()
+    assert all(node.complete for node in look.nodes.values())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ends", ["by its hash", "by Ctrl-C"])
+def test_a_replay_that_was_looked_at_ends_as_an_ordinary_run(tiny, tmp_path, ends):
+    root = tmp_path / "replayed"
+    replayed.begin(tiny, root)
+    words = [APERTURA, "look", root, "--follow", "--every", "1", "--end-after", "600", "--cores", "2"]
+    environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
+    with subprocess.Popen(
+        words, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment
+    ) as process:
+        assert "shown in" in process.stdout.readline()
+        replayed.replay(tiny, root, rate=0.25)
+        if ends == "by Ctrl-C":
+            time.sleep(0.1)
+            process.send_signal(signal.SIGINT)
+        said = process.communicate(timeout=400)[0]
+    assert process.returncode == 0, said
+    assert "s behind" in said
+    other = replayed.run_without_look(root, tmp_path / "other", cores=2)
+    first, second = (replayed.hashes_of(one / "results") for one in (other, root))
+    assert "f01/fused/coherent_db.tif" in first
+    assert first == second
