@@ -18,6 +18,7 @@ from rasterio import Affine
 from apertura import __version__
 from apertura.common.atomic import write_json, write_text
 from apertura.common.errors import CampaignError
+from apertura.common.flags import Flags
 from apertura.common.processes import as_typed
 from apertura.core.planning.plan import Plan
 from apertura.core.scene.grid import SceneGrid
@@ -188,7 +189,7 @@ class Look:
             return told
         judged, bound_db = pair.judged(), float(shown.error_db)
         error_db = round(bound_db, 1) if np.isfinite(bound_db) else None
-        told |= {"peak": shown.peak, **judged, "flags": {**pair.flags, **judged["flags"]}}
+        told |= {"peak": shown.peak, **judged, "flags": Flags.merged(pair.flags, judged["flags"])}
         told |= {"share": shown.share, "error_db": error_db}
         told |= {"spacing_m": shown.grid.spacing_m, "setting": shown.setting}
         told["delay_s"] = pair.delay_s

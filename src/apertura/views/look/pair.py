@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.common.errors import CampaignError
+from apertura.common.flags import Flags
 from apertura.core.echo.association import associate
 from apertura.core.imaging.range_profiles import phase_history_of
 from apertura.core.planning.plan import Plan
@@ -185,7 +186,7 @@ class PairSoFar:
     def _read(self, echo: PairEcho, pulses: NDArray[np.int64]) -> Block:
         formed = replace(echo, dataset=echo.dataset.isel(pulse=pulses)).at(slice(None))
         self._blocks += 1
-        for name, line in {**formed.attrs["flags"], **echo.saturation.flags}.items():
+        for name, line in Flags.merged(formed.attrs["flags"], echo.saturation.flags).items():
             self._raised[name] = self._raised.get(name, (0, ""))[0] + 1, line
         history = phase_history_of(formed, self.campaign.settings.processing.window)
         return Block(history, body_axes(formed), formed.time.values)
