@@ -3,7 +3,7 @@
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
@@ -169,7 +169,7 @@ class SampleLayout:
     skipped_bytes: NDArray[np.int64] = field(default_factory=_none)
     mixing: Mixing | None = None
 
-    @property
+    @cached_property
     def stored(self) -> np.dtype[Any]:
         """Of one number in the file; ValueError if the datatype is none of those that are read."""
         match = _DATATYPE.fullmatch(self.datatype)
@@ -251,9 +251,9 @@ class SampleFile:
     channels: int
     layout: SampleLayout = field(default_factory=SampleLayout, compare=False)
 
-    @property
+    @cached_property
     def sample_bytes(self) -> int:
-        """Bytes of one sample of all channels."""
+        """Bytes of one sample of all channels; asked for with every capture."""
         return self.channels * self.layout.components * self.layout.stored.itemsize
 
     @property
