@@ -19,8 +19,8 @@ GOOD = "2025-05-14T09:30:00Z,48,9,600,1"
     ("line", "expected"),
     [
         ("2025-05-14T09:30:01Z,48,9,1e308,1", "the height between -1000 and 100000 m"),
-        ("2025-05-14T09:30:01Z,48,9,inf,1", "epochs without a position"),
-        ("2025-05-14T09:30:01Z,48,1e9,600,1", "epochs without a position"),
+        ("2025-05-14T09:30:01Z,48,9,inf,1", "1 epoch without a position"),
+        ("2025-05-14T09:30:01Z,48,1e9,600,1", "1 epoch without a position"),
         ("99999-05-14T09:30:01Z,48,9,600,1", "a.track.csv: "),
         ("2500-05-14T09:30:01Z,48,9,600,1", "a.track.csv: "),
         ("0001-05-14T09:30:01Z,48,9,600,1", "a.track.csv: "),
