@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
+from apertura.core.backprojection.inputs import PhaseHistory, Profiles
+from apertura.core.backprojection.job import Job
 from apertura.core.echo.compression import window_weights
-from apertura.core.focus.inputs import PhaseHistory, Profiles
-from apertura.core.focus.job import Job
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.imaging.job import imaging_job
 from apertura.core.imaging.range_profiles import GUARD_SAMPLES, OVERSAMPLING, range_compress

@@ -12,8 +12,8 @@ import numpy as np
 from campaigns import Drawn, draw
 from numpy.typing import NDArray
 
-from apertura.core.focus.engines import load_engine, reference
-from apertura.core.focus.engines.engine import Setting
+from apertura.core.backprojection.engines import load_engine, reference
+from apertura.core.backprojection.engines.engine import Setting
 from apertura.core.imaging.certify import certified
 from apertura.core.imaging.formation import Formation
 from apertura.core.planning.plan import Plan

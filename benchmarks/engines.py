@@ -25,8 +25,8 @@ from job import CENTRE_HZ, SPACING_HZ, SUBCARRIERS, Job, build, error_db, spectr
 from latest import replace_rows
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.core.backprojection.engines import native, native_binding, numba
 from apertura.core.echo.compression import compress, window_weights
-from apertura.core.focus.engines import native, native_binding, numba
 
 
 @dataclass

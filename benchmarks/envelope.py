@@ -11,8 +11,8 @@ import numpy as np
 from job import GUARD, Job, exact, response, total_path
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
-from apertura.core.focus.engines import native
-from apertura.core.focus.inputs import Profiles
+from apertura.core.backprojection.engines import native
+from apertura.core.backprojection.inputs import Profiles
 from apertura.core.geometry.aperture import Aperture
 
 RANGES_M = (30.0, 100.0, 300.0, 1000.0, 3000.0, 10000.0)

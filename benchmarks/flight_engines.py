@@ -20,8 +20,8 @@ from pathlib import Path
 import numpy as np
 
 from apertura.common.contracts import Window
-from apertura.core.focus.engines import ENGINES, load_engine
-from apertura.core.focus.tiles import compute_tiles
+from apertura.core.backprojection.engines import ENGINES, load_engine
+from apertura.core.backprojection.tiles import compute_tiles
 from apertura.core.imaging.formation import Formation
 from apertura.core.imaging.range_profiles import profiles_of
 from apertura.core.planning.planner import make_plan

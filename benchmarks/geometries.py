@@ -18,10 +18,10 @@ from drawn import Geometry, draw
 from numpy.typing import NDArray
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
-from apertura.core.focus.engines import tree
-from apertura.core.focus.engines.engine import Setting
-from apertura.core.focus.inputs import Profiles
-from apertura.core.focus.job import Job, Signal
+from apertura.core.backprojection.engines import tree
+from apertura.core.backprojection.engines.engine import Setting
+from apertura.core.backprojection.inputs import Profiles
+from apertura.core.backprojection.job import Job, Signal
 from apertura.core.planning.planner import make_plan
 from apertura.core.quality.error_check import error_bound
 

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from job import Job, build, error_db
 
-from apertura.core.focus.engines import cuda
+from apertura.core.backprojection.engines import cuda
 
 PUBLISHED = (
     (

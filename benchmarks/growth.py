@@ -31,7 +31,7 @@ from growing.scene import Geometry, Scene, Surface, build
 from growing.table import exponents, markdown
 from latest import Row, read_rows, replace_rows
 
-from apertura.core.focus.engines import instruction_set
+from apertura.core.backprojection.engines import instruction_set
 
 CHART = Path(__file__).parents[1] / "docs" / "assets" / "growth.png"
 AIMS_DB = (-40.0, -60.0, -80.0)

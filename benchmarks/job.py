@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
-from apertura.core.focus.inputs import Profiles
+from apertura.core.backprojection.inputs import Profiles
 from apertura.core.geometry.aperture import Aperture
 from apertura.simulation.echoes import transfer
 from apertura.simulation.scene import Scatterers

@@ -21,9 +21,9 @@ import zarr
 from rich.console import Console
 from rich.table import Table
 
+from apertura.core.backprojection.inputs import PhaseHistory
+from apertura.core.backprojection.tiles import compute_tiles
 from apertura.core.echo.compression import window_weights
-from apertura.core.focus.inputs import PhaseHistory
-from apertura.core.focus.tiles import compute_tiles
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.imaging.certify import certified, measures
 from apertura.core.imaging.focus_check import focus_report

@@ -13,8 +13,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from campaigns import Drawn, draw
 
-from apertura.core.focus.engines import load_engine, numba, reference
-from apertura.core.focus.engines.engine import Setting
+from apertura.core.backprojection.engines import load_engine, numba, reference
+from apertura.core.backprojection.engines.engine import Setting
 from apertura.core.planning.plan import Plan
 from apertura.core.planning.planner import SettingSearch, make_plan
 from apertura.core.quality.measures import numerical_error

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
 from apertura.core.antenna.beam import Beam, Beams, antenna_axes, gaussian_cut
+from apertura.core.backprojection.engines import reference
+from apertura.core.backprojection.inputs import PhaseHistory
 from apertura.core.echo.compression import centre_frequency, window_weights
 from apertura.core.echo.sidelink import METHODS
-from apertura.core.focus.engines import reference
-from apertura.core.focus.inputs import PhaseHistory
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.imaging.backproject import backproject
 from apertura.core.imaging.noise import noise_places, noise_power, sidelink_noise

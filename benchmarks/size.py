@@ -21,11 +21,11 @@ import numpy as np
 import zarr
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
-from apertura.core.focus.engines import PATCH_PX, native
-from apertura.core.focus.engines.engine import Setting
-from apertura.core.focus.engines.native_tables import Tables
-from apertura.core.focus.inputs import Profiles
-from apertura.core.focus.tiles import compute_tiles, image_array
+from apertura.core.backprojection.engines import PATCH_PX, native
+from apertura.core.backprojection.engines.engine import Setting
+from apertura.core.backprojection.engines.native_tables import Tables
+from apertura.core.backprojection.inputs import Profiles
+from apertura.core.backprojection.tiles import compute_tiles, image_array
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.geodesy import ecef_from_projected
 from apertura.core.scene.grid import SceneGrid

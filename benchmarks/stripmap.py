@@ -27,9 +27,9 @@ from numpy.typing import NDArray
 
 from apertura.core.antenna.beam import Beam, Beams, gaussian_cut
 from apertura.core.antenna.illumination import illuminate
+from apertura.core.backprojection.inputs import PhaseHistory, Profiles
+from apertura.core.backprojection.tiles import compute_tiles
 from apertura.core.echo.compression import centre_frequency
-from apertura.core.focus.inputs import PhaseHistory, Profiles
-from apertura.core.focus.tiles import compute_tiles
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.imaging.certify import certified, measures
 from apertura.core.imaging.focus_check import focus_report

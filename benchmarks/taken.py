@@ -20,10 +20,10 @@ from job import Job, build
 from numpy.typing import NDArray
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
-from apertura.core.focus.engines import native, tree
-from apertura.core.focus.engines.engine import Setting
-from apertura.core.focus.job import Job as PlannedJob
-from apertura.core.focus.job import Signal
+from apertura.core.backprojection.engines import native, tree
+from apertura.core.backprojection.engines.engine import Setting
+from apertura.core.backprojection.job import Job as PlannedJob
+from apertura.core.backprojection.job import Signal
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.planning.planner import MARGIN_DB
 

@@ -1,4 +1,4 @@
-// What Python hands over. `core/focus/engines/native_binding.py` mirrors these structs field by field and compares the
+// What Python hands over. `core/backprojection/engines/native_binding.py` mirrors these structs field by field and compares the
 // two layouts when it loads the library (contract.cpp lists them).
 #pragma once
 #include <cstdint>

@@ -129,7 +129,7 @@ def finished_sample(shared, all_steps, tmp_path_factory):
 def pytest_generate_tests(metafunc):
     """Tests with `isa` run on every instruction set of the compiled engine; the one that is taken here is quick."""
     if "isa" in metafunc.fixturenames:
-        from apertura.core.focus.engines import native, native_binding
+        from apertura.core.backprojection.engines import native, native_binding
 
         taken = next(filter(native_binding.supports, native.INSTRUCTION_SETS), None)
         others = [pytest.param(isa, marks=pytest.mark.slow) for isa in native.INSTRUCTION_SETS if isa != taken]
@@ -139,7 +139,7 @@ def pytest_generate_tests(metafunc):
 @pytest.fixture
 def isa(request, monkeypatch):
     """An instruction set that the compiled engine runs on."""
-    from apertura.core.focus.engines import native_binding
+    from apertura.core.backprojection.engines import native_binding
 
     if not native_binding.supports(request.param):
         pytest.skip(f"this machine has no {request.param}")
@@ -150,7 +150,7 @@ def isa(request, monkeypatch):
 @pytest.fixture
 def toy(monkeypatch):
     """The engine of `toy_engine.py`, known by its one row."""
-    from apertura.core.focus.engines import ENGINES
+    from apertura.core.backprojection.engines import ENGINES
 
     monkeypatch.setitem(ENGINES, "toy", "toy_engine")
 

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
 from apertura.core.antenna.beam import Beam, antenna_axes, gaussian_cut
-from apertura.core.focus.engines import native, native_binding
-from apertura.core.focus.inputs import PhaseHistory, Profiles
-from apertura.core.focus.job import Job, Signal
+from apertura.core.backprojection.engines import native, native_binding
+from apertura.core.backprojection.inputs import PhaseHistory, Profiles
+from apertura.core.backprojection.job import Job, Signal
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.planning.plan import Plan
 from apertura.core.planning.planner import make_plan

@@ -1,4 +1,4 @@
-"""The GPU engine in numba's simulator against the double sum: run by test_34_focus_cuda.py in a process of its own.
+"""The GPU engine in numba's simulator against the double sum: run by a test in a process of its own.
 
 The simulator must be asked for before numba is imported, and would be in the way of other tests. By hand:
 NUMBA_ENABLE_CUDASIM=1 python -m pytest -n0 tests/simulated_device.py
@@ -14,10 +14,10 @@ from scenes import BANDWIDTH_HZ, SUBCARRIERS, C, decibels, ecef, error_db, fly, 
 
 import apertura as ap
 from apertura.common.errors import CampaignError
-from apertura.core.focus.engines import cuda
-from apertura.core.focus.engines.cuda_prediction import candidates
-from apertura.core.focus.inputs import PhaseHistory
-from apertura.core.focus.job import Job, Signal
+from apertura.core.backprojection.engines import cuda
+from apertura.core.backprojection.engines.cuda_prediction import candidates
+from apertura.core.backprojection.inputs import PhaseHistory
+from apertura.core.backprojection.job import Job, Signal
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.scene.grid import SceneGrid
 

@@ -62,7 +62,7 @@ def test_tiles_under_way_tell_how_many_of_their_parts_are_done(tmp_path, monkeyp
     """A tile of a long flight is done with the last block of pulses: parts are counted, not tiles."""
     from dask.array import ones
 
-    from apertura.core.focus.tiles import compute_tiles
+    from apertura.core.backprojection.tiles import compute_tiles
 
     monkeypatch.setattr("apertura.common.progress._BETWEEN_S", 0.0)
     seen, path, target = [], tmp_path / "image.json", np.zeros((4, 6))

@@ -11,7 +11,7 @@ import pytest
 
 from apertura.common.code_imports import PACKAGE, import_closure, without_description
 from apertura.common.provenance import Provenance, code_sha256, merged
-from apertura.core.focus.engines import ENGINES
+from apertura.core.backprojection.engines import ENGINES
 from apertura.formats.export import export_modules
 
 RUN = {"image": ENGINES.values(), "export": export_modules("pair")}
@@ -36,8 +36,8 @@ def changes(copied, file, *modules):
 @pytest.mark.parametrize(
     ("edited", "step", "reruns"),
     [
-        ("core/focus/engines/numba.py", "image", True),
-        ("core/focus/engines/numba.py", "echo", False),
+        ("core/backprojection/engines/numba.py", "image", True),
+        ("core/backprojection/engines/numba.py", "echo", False),
         ("core/combination.py", "cube", True),
         ("core/combination.py", "image", False),
         ("core/echo/sidelink.py", "echo", True),
@@ -63,7 +63,7 @@ def test_editing_a_module_changes_what_depends_on_it_and_nothing_else(copied, ed
 
 @pytest.mark.parametrize(("step", "reruns"), [("image", True), ("echo", False)])
 def test_compiling_other_sources_changes_what_runs_them(copied, step, reruns):
-    digests = copied / "core/focus/engines/_backprojection.sha256"
+    digests = copied / "core/backprojection/engines/_backprojection.sha256"
     digests.write_text("of other sources")
     assert changes(copied, digests, f"apertura.pipeline.steps.{step}", *RUN.get(step, ())) is reruns
 
@@ -84,7 +84,11 @@ print(json.dumps([name for name, module in ours.items() if name not in before an
 def test_every_module_that_an_import_loads_is_in_the_closure():
     shown = subprocess.run([sys.executable, "-c", LOADED], check=True, capture_output=True, text=True)
     loaded = set(json.loads(shown.stdout))
-    assert {"apertura.pipeline.store.stages", "apertura.core.focus.tiles", "apertura.core.geometry.aperture"} <= loaded
+    assert {
+        "apertura.pipeline.store.stages",
+        "apertura.core.backprojection.tiles",
+        "apertura.core.geometry.aperture",
+    } <= loaded
     assert loaded <= set(import_closure(["apertura.pipeline.steps.image"]))
 
 

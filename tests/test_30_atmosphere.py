@@ -9,7 +9,7 @@ import pytest
 import apertura as ap
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
-from apertura.core.focus.engines import ENGINES, load_engine
+from apertura.core.backprojection.engines import ENGINES, load_engine
 from apertura.core.geometry.atmosphere import (
     SCALE_HEIGHT_M,
     Atmosphere,
@@ -213,9 +213,9 @@ VACUUM = {
     "core/scene/auto_grid.py": _SIZE,
     "core/planning/plan.py": _SIZE,
     "core/planning/planner.py": _SIZE,
-    "core/focus/presum.py": _SIZE,
-    "core/focus/inputs.py": _DEFAULT,
-    "core/focus/job.py": _DEFAULT,
+    "core/backprojection/presum.py": _SIZE,
+    "core/backprojection/inputs.py": _DEFAULT,
+    "core/backprojection/job.py": _DEFAULT,
     "core/imaging/radiometry.py": _POWER,
     "core/imaging/resolution.py": _SIZE,
     "core/imaging/reflectors.py": "wavelength of a cross-section: 0.003 dB",
@@ -269,5 +269,5 @@ def test_who_takes_the_speed_of_light_in_vacuum_is_listed_with_the_reason():
         if "SPEED_OF_LIGHT_M_S" in path.read_text(encoding="utf-8")
     }
     assert users == set(VACUUM), "read docs/theory/atmosphere.md, One place"
-    for path in (source / "core/focus/engines").rglob("*.py"):
+    for path in (source / "core/backprojection/engines").rglob("*.py"):
         assert "SPEED_OF_LIGHT_M_S" not in path.read_text(encoding="utf-8"), path

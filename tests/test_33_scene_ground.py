@@ -6,8 +6,8 @@ from scenes import UTM_GRID
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
-from apertura.core.focus.engines import reference
-from apertura.core.focus.inputs import PhaseHistory
+from apertura.core.backprojection.engines import reference
+from apertura.core.backprojection.inputs import PhaseHistory
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.quality.point_targets import find_peak
 from apertura.core.scene.clearance import check_antennas, clearance

@@ -6,8 +6,8 @@ from functools import cache
 import numpy as np
 import pytest
 
+from apertura.core.backprojection.inputs import PhaseHistory
 from apertura.core.echo.compression import window_weights
-from apertura.core.focus.inputs import PhaseHistory
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.phase_centres import TrackCorrection
 from apertura.core.imaging.range_profiles import range_compress

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
-from apertura.core.focus.contributions import block_contributions
-from apertura.core.focus.inputs import PhaseHistory
+from apertura.core.backprojection.contributions import block_contributions
+from apertura.core.backprojection.inputs import PhaseHistory
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.imaging.range_profiles import range_compress
 from apertura.core.quality.path_errors import PointPaths

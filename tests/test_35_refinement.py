@@ -10,9 +10,9 @@ from apertura_research.autofocus.outcomes import judge
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.antenna.beam import Beams
-from apertura.core.focus.contributions import block_contributions
-from apertura.core.focus.engines import reference
-from apertura.core.focus.inputs import PhaseHistory, Profiles
+from apertura.core.backprojection.contributions import block_contributions
+from apertura.core.backprojection.engines import reference
+from apertura.core.backprojection.inputs import PhaseHistory, Profiles
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.phase_centres import TrackCorrection
 from apertura.core.geometry.sector import Sector

@@ -11,7 +11,7 @@ from scenes import TARGET_GRID, point_history
 
 import apertura as ap
 from apertura.common.errors import CampaignError
-from apertura.core.focus.engines import reference
+from apertura.core.backprojection.engines import reference
 from apertura.core.quality.measures import numerical_error
 from apertura.core.scene.grid import SceneGrid
 

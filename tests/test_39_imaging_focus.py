@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
-from apertura.core.focus.engines import reference
-from apertura.core.focus.inputs import PhaseHistory
+from apertura.core.backprojection.engines import reference
+from apertura.core.backprojection.inputs import PhaseHistory
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.imaging.focus_check import (
     PART_PX,

@@ -8,9 +8,9 @@ from scenes import monostatic, straight_track
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
 from apertura.core.antenna.beam import Beams
+from apertura.core.backprojection.contributions import band_limited_image
+from apertura.core.backprojection.inputs import PhaseHistory, Profiles
 from apertura.core.echo.sidelink import DIVIDING, METHODS
-from apertura.core.focus.contributions import band_limited_image
-from apertura.core.focus.inputs import PhaseHistory, Profiles
 from apertura.core.geometry.sector import Sector
 from apertura.core.imaging.noise import noise_power, sidelink_noise
 from apertura.core.imaging.range_profiles import range_compress

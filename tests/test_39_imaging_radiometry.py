@@ -9,9 +9,9 @@ from scenes import side_beam, straight_track
 import apertura as ap
 from apertura.common.errors import CampaignError
 from apertura.core.antenna.beam import Beam, Beams
+from apertura.core.backprojection.engines import reference
+from apertura.core.backprojection.inputs import PhaseHistory
 from apertura.core.echo.compression import window_weights
-from apertura.core.focus.engines import reference
-from apertura.core.focus.inputs import PhaseHistory
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.sector import Sector
 from apertura.core.imaging.radiometry import Calibration, Link, cell_constant, pointing_std_db

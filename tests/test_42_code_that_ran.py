@@ -76,8 +76,8 @@ CHANGES = [
     ("core/echo/dechirp.py", "docstring", set()),
     ("formats/export/cog.py", "code", {"export", "fused", "layers", "mosaic", "pictures_fused"}),
     ("pipeline/rules.py", "code", set()),  # sources and settings are compared for themselves
-    ("core/focus/engines/numba.py", "comment", set()),
-    ("core/focus/engines/numba.py", "code", FOCUSED),
+    ("core/backprojection/engines/numba.py", "comment", set()),
+    ("core/backprojection/engines/numba.py", "code", FOCUSED),
     ("common/constants.py", "code", EVERY),
 ]
 EDITS = {"code": "EDITED = 1\n", "comment": "# Edited.\n", "docstring": '"""Edited."""\n'}

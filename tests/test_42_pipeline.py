@@ -7,10 +7,10 @@ import pytest
 import rasterio
 from folders import copy_writable, run_steps
 
+from apertura.core.backprojection.engines import load_engine, reference
+from apertura.core.backprojection.inputs import PhaseHistory, Profiles
 from apertura.core.echo.compression import compress, range_step, window_weights
 from apertura.core.echo.sidelink import METHODS
-from apertura.core.focus.engines import load_engine, reference
-from apertura.core.focus.inputs import PhaseHistory, Profiles
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.quality.measures import numerical_error
 from apertura.core.quality.point_targets import BandLimitedPatch, find_peak

@@ -13,9 +13,9 @@ from scenes import TARGET_GRID, plan, point_history
 
 from apertura.common.errors import CampaignError
 from apertura.common.tables import write_table
-from apertura.core.focus.engines import reference
-from apertura.core.focus.engines.engine import Setting
-from apertura.core.focus.inputs import PhaseHistory
+from apertura.core.backprojection.engines import reference
+from apertura.core.backprojection.engines.engine import Setting
+from apertura.core.backprojection.inputs import PhaseHistory
 from apertura.core.imaging.range_profiles import range_compress
 from apertura.core.scene.terrain import FlatGround
 from apertura.pipeline.campaign import Campaign

@@ -13,7 +13,7 @@ import yaml
 from folders import complaint, copy_writable, require_files, run_steps, settle_ground
 from rasterio.transform import from_origin
 
-from apertura.core.focus.engines import load_engine
+from apertura.core.backprojection.engines import load_engine
 from apertura.core.geometry.geodesy import projected_from_ecef
 from apertura.core.imaging.range_profiles import profiles_of
 from apertura.core.scene.grid import SceneGrid

@@ -5,7 +5,7 @@ import time
 import pytest
 from folders import complaint, contents, copy_writable, edit_config
 
-from apertura.core.focus.tiles import NAMED_BY
+from apertura.core.backprojection.tiles import NAMED_BY
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.lineage import result_of
 from apertura.pipeline.stale import stale_results

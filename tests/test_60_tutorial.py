@@ -10,7 +10,7 @@ import pytest
 import rasterio
 from walked import walk
 
-from apertura.core.focus.engines import native
+from apertura.core.backprojection.engines import native
 
 TUTORIAL = Path(__file__).parents[1] / "docs/tutorial.md"
 PROJECT = Path(__file__).parents[1] / "examples/qgis_project.py"

@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from apertura.core.focus.engines.engine import EngineOptions, Setting
-from apertura.core.focus.inputs import Profiles
-from apertura.core.focus.job import Job
+from apertura.core.backprojection.engines.engine import EngineOptions, Setting
+from apertura.core.backprojection.inputs import Profiles
+from apertura.core.backprojection.job import Job
 
 READS = "profiles"
 CALLS: list[str] = []

@@ -7,11 +7,11 @@ import numpy as np
 from scenes import BANDWIDTH_HZ, SUBCARRIERS, ecef, fly, scatter
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
-from apertura.core.focus.engines import tree
-from apertura.core.focus.engines.engine import Setting
-from apertura.core.focus.engines.tree_nodes import surfaces_of
-from apertura.core.focus.engines.tree_view import counts_of, subaperture_sizes, view_of_tile
-from apertura.core.focus.job import Job, Signal
+from apertura.core.backprojection.engines import tree
+from apertura.core.backprojection.engines.engine import Setting
+from apertura.core.backprojection.engines.tree_nodes import surfaces_of
+from apertura.core.backprojection.engines.tree_view import counts_of, subaperture_sizes, view_of_tile
+from apertura.core.backprojection.job import Job, Signal
 from apertura.core.geometry.aperture import Aperture
 
 STEP_M = C / BANDWIDTH_HZ / 2

@@ -8,10 +8,10 @@ from statistics import median
 import numpy as np
 from numpy.typing import NDArray
 
-from apertura.core.focus.engines import ENGINES, load_engine
-from apertura.core.focus.inputs import Profiles
-from apertura.core.focus.job import Job
-from apertura.core.focus.reach import pulse_blocks_of
+from apertura.core.backprojection.engines import ENGINES, load_engine
+from apertura.core.backprojection.inputs import Profiles
+from apertura.core.backprojection.job import Job
+from apertura.core.backprojection.reach import pulse_blocks_of
 from apertura.core.imaging.job import imaging_job
 from apertura.core.imaging.range_profiles import range_compress
 from apertura.core.planning.planner import make_plan

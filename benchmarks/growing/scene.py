@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
-from apertura.core.focus.engines import reference
-from apertura.core.focus.inputs import PhaseHistory
+from apertura.core.backprojection.engines import reference
+from apertura.core.backprojection.inputs import PhaseHistory
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import FlatGround, GridHeights, Terrain

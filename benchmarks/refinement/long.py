@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from apertura.common.arrays import Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.antenna.beam import Beams
-from apertura.core.focus.inputs import Profiles
+from apertura.core.backprojection.inputs import Profiles
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.imaging.job import decide_integration
 from apertura.core.scene.grid import SceneGrid

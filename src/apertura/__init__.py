@@ -12,7 +12,7 @@ Examples
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from apertura.core.focus.inputs import Profiles as Profiles
+    from apertura.core.backprojection.inputs import Profiles as Profiles
     from apertura.core.scene.grid import SceneGrid as SceneGrid
 
 __version__ = "0.1.0"
@@ -23,9 +23,9 @@ _PUBLIC = {
     "Dem": "apertura.core.scene.dem",
     "FlatGround": "apertura.core.scene.terrain",
     "Link": "apertura.core.imaging.radiometry",
-    "PhaseHistory": "apertura.core.focus.inputs",
+    "PhaseHistory": "apertura.core.backprojection.inputs",
     "Plane": "apertura.core.scene.terrain",
-    "Profiles": "apertura.core.focus.inputs",
+    "Profiles": "apertura.core.backprojection.inputs",
     "RecordedFlight": "apertura.pipeline.opening.writing",
     "RecordedNode": "apertura.pipeline.opening.writing",
     "SceneGrid": "apertura.core.scene.grid",

@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 
 from apertura.common.arrays import Complexes, Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.core.backprojection.engines import numba, reference
+from apertura.core.backprojection.inputs import PhaseHistory, Profiles
 from apertura.core.echo.compression import centre_frequency, compress, range_step, window_weights
 from apertura.core.echo.demodulate import remove_path
-from apertura.core.focus.engines import numba, reference
-from apertura.core.focus.inputs import PhaseHistory, Profiles
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.quality.measures import coherence_factor
 from apertura.core.quality.point_targets import half_power_width, locate_maximum

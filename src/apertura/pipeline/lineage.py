@@ -14,7 +14,7 @@ from typing import Any
 
 from apertura.common.code_imports import import_closure
 from apertura.common.errors import CampaignError
-from apertura.core.focus.engines import ENGINES
+from apertura.core.backprojection.engines import ENGINES
 from apertura.formats.export import EXPORTS, export_modules, exports_in
 from apertura.formats.names import FINDERS, PHASE_HISTORIES, RECORDERS, TRACKS, log_format
 from apertura.pipeline.campaign import Campaign
@@ -28,7 +28,7 @@ _READS = "apertura.formats.reading"
 
 _FOCUSES = frozenset(
     {
-        "apertura.core.focus.tiles",
+        "apertura.core.backprojection.tiles",
         "apertura.methods.autofocus.patches",
         "apertura.methods.synchronisation.scene_alignment",
     }

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from apertura.common.arrays import Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.core.backprojection.inputs import PhaseHistory
 from apertura.core.echo.compression import window_weights
-from apertura.core.focus.inputs import PhaseHistory
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.phase_centres import TrackCorrection
 from apertura.core.imaging.range_profiles import range_compress

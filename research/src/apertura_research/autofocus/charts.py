@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 
 from apertura.common.arrays import Floats
-from apertura.core.focus.engines import native
+from apertura.core.backprojection.engines import native
 from apertura.core.geometry.phase_centres import TrackCorrection
 from apertura.core.scene.grid import SceneGrid
 from apertura.methods.autofocus.inputs import PairRecord, Refinement

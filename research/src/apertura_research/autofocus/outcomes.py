@@ -7,8 +7,8 @@ from time import process_time
 import numpy as np
 
 from apertura.common.arrays import Floats
-from apertura.core.focus.engines import native
-from apertura.core.focus.engines.native_tables import Tables
+from apertura.core.backprojection.engines import native
+from apertura.core.backprojection.engines.native_tables import Tables
 from apertura.core.geometry.phase_centres import TrackCorrection
 from apertura.core.scene.terrain import FlatGround
 from apertura.methods.autofocus.inputs import PairRecord, Refinement, TrackErrors

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from apertura.common.arrays import Floats
 from apertura.common.errors import CampaignError
 from apertura.core.antenna.illumination import illuminate
-from apertura.core.focus.engines import load_engine
+from apertura.core.backprojection.engines import load_engine
 from apertura.core.imaging.certify import certified
 from apertura.core.imaging.focus_check import focus_flags, focus_report
 from apertura.core.imaging.formation import Formation

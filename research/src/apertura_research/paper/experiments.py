@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from apertura.common.arrays import Complexes, Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.core.backprojection.engines import reference
+from apertura.core.backprojection.inputs import PhaseHistory
 from apertura.core.echo.demodulate import remove_path
 from apertura.core.echo.transfer import transfer_by_code
-from apertura.core.focus.engines import reference
-from apertura.core.focus.inputs import PhaseHistory
 from apertura.core.imaging.range_profiles import phase_history_of
 from apertura.core.quality.measures import coherence_factor
 from apertura.pipeline.config import SampledWaveform

@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 
 from apertura.common.arrays import Complexes, Floats
-from apertura.core.focus.engines import numba
-from apertura.core.focus.inputs import PhaseHistory
+from apertura.core.backprojection.engines import numba
+from apertura.core.backprojection.inputs import PhaseHistory
 from apertura.core.imaging.backproject import backproject
 from apertura.core.quality.measures import coherence_factor
 from apertura.core.quality.point_targets import BandLimitedPatch, find_peak

@@ -8,8 +8,8 @@ import numpy as np
 
 from apertura.common.arrays import Complexes, Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.core.backprojection.inputs import PhaseHistory
 from apertura.core.echo.sidelink import divide
-from apertura.core.focus.inputs import PhaseHistory
 from apertura.simulation.impairments import Clock, Impairments, Timing, UniformPhase
 from apertura.simulation.presets import paper_waveform
 from apertura.simulation.scene import Scatterers

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from apertura.common.arrays import Complexes, Floats
 from apertura.common.errors import CampaignError
+from apertura.core.backprojection.inputs import PhaseHistory
 from apertura.core.echo.line_of_sight import fit_line_of_sight
 from apertura.core.echo.sidelink import METHODS, choose, measure
-from apertura.core.focus.inputs import PhaseHistory
 from apertura_research import point_response
 from apertura_research.paper_scene import receive_pair
 from apertura_research.point_response import find_peaks, mean_image

@@ -16,8 +16,8 @@ from apertura.common.errors import CampaignError, quoted
 from apertura.common.flags import Flags
 from apertura.core.antenna.beam import Beams
 from apertura.core.antenna.illumination import illuminate
-from apertura.core.focus.inputs import PhaseHistory, Profiles
-from apertura.core.focus.job import Job
+from apertura.core.backprojection.inputs import PhaseHistory, Profiles
+from apertura.core.backprojection.job import Job
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.atmosphere import Atmosphere, SceneAir
 from apertura.core.geometry.geodesy import LOCAL, geodetic_from_ecef
@@ -74,7 +74,7 @@ def backproject(  # noqa: PLR0913 - each choice is a keyword, so that an editor 
         Heights of the ground, or one height (m): above the ellipsoid of the grid's CRS; in a local frame z, and 0 by
         default.
     engine
-        'auto' or a key of `apertura.core.focus.engines.ENGINES`.
+        'auto' or a key of `apertura.core.backprojection.engines.ENGINES`.
     beams
         Of the antennas; isotropic by default.
     atmosphere

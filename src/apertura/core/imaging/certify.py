@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.common.contracts import Window
-from apertura.core.focus.tiles import compute_tiles
+from apertura.core.backprojection.tiles import compute_tiles
 from apertura.core.imaging.formation import Formation
 from apertura.core.quality.error_check import CONFIDENCE, Brightness, Certificate, ErrorBound, random_pixels
 from apertura.core.quality.measures import coherence_factor, image_statistics

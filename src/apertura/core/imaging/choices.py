@@ -4,7 +4,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
-from apertura.core.focus.engines import ENGINES, PATCH_PX, load_engine
+from apertura.core.backprojection.engines import ENGINES, PATCH_PX, load_engine
 
 
 class Degrees(BaseModel):

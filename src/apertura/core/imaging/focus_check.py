@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from apertura.common.flags import Flags
 from apertura.core.antenna.beam import Beams
 from apertura.core.antenna.illumination import illumination_mask
+from apertura.core.backprojection.engines import ENGINES, load_engine
+from apertura.core.backprojection.engines.engine import Engine
+from apertura.core.backprojection.inputs import PhaseHistory, Profiles
+from apertura.core.backprojection.reach import PULSES
 from apertura.core.echo.compression import compress, range_step
-from apertura.core.focus.engines import ENGINES, load_engine
-from apertura.core.focus.engines.engine import Engine
-from apertura.core.focus.inputs import PhaseHistory, Profiles
-from apertura.core.focus.reach import PULSES
 from apertura.core.geometry.aperture import Aperture, Weigh
 from apertura.core.imaging.formation import PULSES_READ, Formation
 from apertura.core.imaging.range_profiles import GUARD_SAMPLES, OVERSAMPLING, RangeWindow, range_compress

@@ -12,12 +12,12 @@ from numpy.typing import ArrayLike, NDArray
 from apertura.common.contracts import Window
 from apertura.core.antenna.beam import Beams
 from apertura.core.antenna.illumination import illumination_mask
-from apertura.core.focus.contributions import band_limited_image, band_limited_terms
-from apertura.core.focus.engines import load_engine, pieces, reference
-from apertura.core.focus.engines.engine import Setting
-from apertura.core.focus.inputs import PhaseHistory, Profiles
-from apertura.core.focus.reach import PULSES, Reach, pulse_blocks_of
-from apertura.core.focus.tiles import Weighing, image_array
+from apertura.core.backprojection.contributions import band_limited_image, band_limited_terms
+from apertura.core.backprojection.engines import load_engine, pieces, reference
+from apertura.core.backprojection.engines.engine import Setting
+from apertura.core.backprojection.inputs import PhaseHistory, Profiles
+from apertura.core.backprojection.reach import PULSES, Reach, pulse_blocks_of
+from apertura.core.backprojection.tiles import Weighing, image_array
 from apertura.core.planning.plan import Plan
 from apertura.core.scene.grid import SceneGrid
 

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
 from apertura.core.antenna.beam import Beams
+from apertura.core.backprojection.engines import reference
+from apertura.core.backprojection.inputs import PhaseHistory, Profiles
+from apertura.core.backprojection.job import Integration, Job, Signal
 from apertura.core.echo.compression import centre_frequency, range_step
-from apertura.core.focus.engines import reference
-from apertura.core.focus.inputs import PhaseHistory, Profiles
-from apertura.core.focus.job import Integration, Job, Signal
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.geodesy import LOCAL
 from apertura.core.imaging.range_profiles import RangeWindow

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from apertura.core.antenna.beam import Beams
 from apertura.core.antenna.illumination import illumination_mask
+from apertura.core.backprojection.contributions import Echoes
+from apertura.core.backprojection.inputs import PhaseHistory, Profiles
+from apertura.core.backprojection.reach import PULSES
 from apertura.core.echo.sidelink import METHODS
-from apertura.core.focus.contributions import Echoes
-from apertura.core.focus.inputs import PhaseHistory, Profiles
-from apertura.core.focus.reach import PULSES
 from apertura.core.imaging.range_profiles import range_compress
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import Terrain

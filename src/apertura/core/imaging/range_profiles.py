@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from apertura.common.errors import CampaignError
 from apertura.core.antenna.beam import Beams
+from apertura.core.backprojection.inputs import PhaseHistory, Profiles
 from apertura.core.echo.compression import centre_frequency, compress, range_step, window_weights
-from apertura.core.focus.inputs import PhaseHistory, Profiles
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.swath import swath

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from apertura.common.errors import CampaignError
 from apertura.core.antenna.beam import Beams
-from apertura.core.focus.job import Integration, Job
+from apertura.core.backprojection.job import Integration, Job
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.sector import TAPER, Sector, response
 from apertura.core.planning.plan import Decision, vertical

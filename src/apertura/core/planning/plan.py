@@ -14,10 +14,10 @@ from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
 from apertura.core.antenna.beam import Beams
 from apertura.core.antenna.illumination import Illumination
-from apertura.core.focus.engines.engine import Setting
-from apertura.core.focus.inputs import Profiles
-from apertura.core.focus.job import Integration, Job
-from apertura.core.focus.presum import Presum, presummed
+from apertura.core.backprojection.engines.engine import Setting
+from apertura.core.backprojection.inputs import Profiles
+from apertura.core.backprojection.job import Integration, Job
+from apertura.core.backprojection.presum import Presum, presummed
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.scene.terrain import Terrain
 

@@ -8,10 +8,10 @@ from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
 from apertura.common.flags import Flags
 from apertura.core.antenna.illumination import decide_antennas
-from apertura.core.focus.engines import ENGINES, load_engine
-from apertura.core.focus.engines.engine import Setting, power_sum_db
-from apertura.core.focus.job import Integration, Job
-from apertura.core.focus.presum import PRESUM_S, Presum, design, presum_error_db
+from apertura.core.backprojection.engines import ENGINES, load_engine
+from apertura.core.backprojection.engines.engine import Setting, power_sum_db
+from apertura.core.backprojection.job import Integration, Job
+from apertura.core.backprojection.presum import PRESUM_S, Presum, design, presum_error_db
 from apertura.core.planning.decisions import decide_terrain
 from apertura.core.planning.plan import Decision, Plan, block_decision, bytes_needed, check_geometry, pulse_blocks
 

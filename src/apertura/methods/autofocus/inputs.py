@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from apertura.common.arrays import Floats
 from apertura.core.antenna.beam import Beams
-from apertura.core.focus.inputs import Profiles
+from apertura.core.backprojection.inputs import Profiles
 from apertura.core.geometry.phase_centres import TrackCorrection
 
 # ---- Inputs: data of each pair, errors of the logs, reference points ------------------------------------------------

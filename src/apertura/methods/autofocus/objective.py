@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.common.arrays import Floats
-from apertura.core.focus.contributions import block_contributions
-from apertura.core.focus.inputs import Profiles
+from apertura.core.backprojection.contributions import block_contributions
+from apertura.core.backprojection.inputs import Profiles
 from apertura.core.geometry.aperture import Aperture
 from apertura.methods.autofocus.inputs import PairRecord
 from apertura.methods.autofocus.patches import Patch, bandwidth_hz

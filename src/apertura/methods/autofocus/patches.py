@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from apertura.common.arrays import Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.antenna.beam import Beams
-from apertura.core.focus.engines import load_engine
-from apertura.core.focus.inputs import Profiles
+from apertura.core.backprojection.engines import load_engine
+from apertura.core.backprojection.inputs import Profiles
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.geodesy import ned_axes
 from apertura.core.geometry.phase_centres import TrackCorrection

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from apertura.common.arrays import Bools, Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
-from apertura.core.focus.contributions import block_contributions
+from apertura.core.backprojection.contributions import block_contributions
 from apertura.core.geometry.phase_centres import TrackCorrection
 from apertura.core.quality.budget import NodePositions, position_lines
 from apertura.core.quality.path_errors import Effect, PointPaths

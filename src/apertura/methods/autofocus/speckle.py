@@ -70,7 +70,7 @@ def tiles(
 
     Examples
     --------
-    >>> from apertura.core.focus.inputs import Profiles
+    >>> from apertura.core.backprojection.inputs import Profiles
     >>> from apertura.core.geometry.aperture import Aperture
     >>> from apertura.core.scene.terrain import FlatGround
     >>> time_s = np.arange(0, 20, 0.1)

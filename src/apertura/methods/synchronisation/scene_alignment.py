@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.common.arrays import Floats
+from apertura.core.backprojection.engines import load_engine
+from apertura.core.backprojection.inputs import Profiles
 from apertura.core.echo.compression import centre_frequency, compress, range_step
-from apertura.core.focus.engines import load_engine
-from apertura.core.focus.inputs import Profiles
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import Terrain
 from apertura.methods.autofocus.motion import Logged, Recorded, plausible_offsets

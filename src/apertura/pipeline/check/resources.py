@@ -108,7 +108,7 @@ def check_scheduler(examined: Examination) -> Iterable[CampaignError]:
     """Raise for a scheduler that whoever runs this has not named."""
     scheduler = examined.campaign.settings.processing.scheduler
     if scheduler != "threads":
-        from apertura.core.focus.tiles import check_named
+        from apertura.core.backprojection.tiles import check_named
 
         check_named(scheduler)
     return ()

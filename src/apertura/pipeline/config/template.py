@@ -12,7 +12,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
 from apertura.common.errors import CampaignError, quoted
-from apertura.core.focus.engines import ENGINES, load_engine
+from apertura.core.backprojection.engines import ENGINES, load_engine
 from apertura.pipeline.config import Node, Settings
 from apertura.pipeline.config.waveform import Waveform
 

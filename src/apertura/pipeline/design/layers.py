@@ -11,8 +11,8 @@ from apertura.common.arrays import Floats
 from apertura.common.flags import Flags
 from apertura.core.antenna.beam import Beams
 from apertura.core.antenna.illumination import decide_antennas
+from apertura.core.backprojection.job import Integration, Job, Signal
 from apertura.core.echo.compression import centre_frequency
-from apertura.core.focus.job import Integration, Job, Signal
 from apertura.core.imaging.radiometry import point_weights
 from apertura.core.imaging.resolution import Resolution
 from apertura.core.planning.plan import check_geometry

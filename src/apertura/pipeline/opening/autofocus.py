@@ -9,7 +9,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from apertura.common.arrays import Times
-from apertura.core.focus.inputs import Profiles
+from apertura.core.backprojection.inputs import Profiles
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.phase_centres import TrackCorrection
 from apertura.core.planning.decisions import decide_autofocus

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from apertura.common.arrays import Times
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
-from apertura.core.focus.inputs import PhaseHistory
+from apertura.core.backprojection.inputs import PhaseHistory
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.imaging.range_profiles import aperture_of, phase_history_of
 from apertura.pipeline.opening.acquisition import Acquisition

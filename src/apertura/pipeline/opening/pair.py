@@ -16,10 +16,10 @@ from apertura.common.flags import Flags
 from apertura.common.provenance import sha256_file
 from apertura.core.antenna.beam import LIMITS_RAD, Beam, Beams, antenna_axes, gaussian_cut, sampled_cut, sampled_phase
 from apertura.core.antenna.illumination import Illumination, illuminate
+from apertura.core.backprojection.inputs import PhaseHistory
 from apertura.core.echo.association import missing_flags
 from apertura.core.echo.compression import window_weights
 from apertura.core.echo.dechirp import sweep_motion_flags
-from apertura.core.focus.inputs import PhaseHistory
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.geodesy import LOCAL
 from apertura.core.imaging.range_profiles import phase_history_of

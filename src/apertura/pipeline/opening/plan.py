@@ -12,8 +12,8 @@ from rich.filesize import decimal
 from apertura.common.errors import CampaignError, number_of
 from apertura.common.flags import Flags
 from apertura.core.antenna.beam import Beams
+from apertura.core.backprojection.job import Integration, Job
 from apertura.core.echo.compression import centre_frequency
-from apertura.core.focus.job import Integration, Job
 from apertura.core.imaging.job import decide_integration, imaging_job
 from apertura.core.imaging.range_profiles import GUARD_SAMPLES, RangeWindow
 from apertura.core.planning.decisions import decide_accuracy

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from apertura.common.errors import CampaignError, number_of
 from apertura.common.flags import Flags
 from apertura.common.provenance import chained_sha256
+from apertura.core.backprojection.inputs import PhaseHistory
 from apertura.core.combination import CoherentSum, agreement_between, choose_fusion
 from apertura.core.echo.compression import centre_frequency
-from apertura.core.focus.inputs import PhaseHistory
 from apertura.core.imaging.focus_check import UNEXPECTED_DB, joint_peak_power, strongest_echo
 from apertura.core.quality.agreement import Agreement
 from apertura.core.scene.grid import SceneGrid

@@ -12,8 +12,8 @@ from apertura.common.atomic import write_json
 from apertura.common.contracts import Window
 from apertura.common.errors import number_of
 from apertura.common.flags import Flags
-from apertura.core.focus.engines import instruction_set
-from apertura.core.focus.tiles import compute_tiles
+from apertura.core.backprojection.engines import instruction_set
+from apertura.core.backprojection.tiles import compute_tiles
 from apertura.core.imaging.certify import certified, measures
 from apertura.core.imaging.formation import Formation
 from apertura.core.imaging.judgement import judgement

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from apertura.common.arrays import Floats
 from apertura.common.flags import Flags
 from apertura.common.provenance import merged
-from apertura.core.focus.inputs import Profiles
+from apertura.core.backprojection.inputs import Profiles
 from apertura.core.geometry.geodesy import frame_from_map
 from apertura.core.geometry.phase_centres import TrackCorrection
 from apertura.core.imaging.range_profiles import profiles_of

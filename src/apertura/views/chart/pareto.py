@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from apertura.common.atomic import write_text
-from apertura.core.focus.engines import ENGINES
+from apertura.core.backprojection.engines import ENGINES
 from apertura.views.chart.png import save_png
 
 _COLOURS = ("#0072b2", "#e69f00", "#000000", "#cc79a7", "#56b4e9", "#009e73")

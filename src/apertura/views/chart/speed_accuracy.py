@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from apertura.common.tables import write_table
 from apertura.core.antenna.beam import Beams
-from apertura.core.focus.engines import load_engine, reference
-from apertura.core.focus.engines.engine import Setting
-from apertura.core.focus.inputs import PhaseHistory, Profiles
+from apertura.core.backprojection.engines import load_engine, reference
+from apertura.core.backprojection.engines.engine import Setting
+from apertura.core.backprojection.inputs import PhaseHistory, Profiles
 from apertura.core.imaging.certify import BRIGHT_PIXELS, RANDOM_PIXELS
 from apertura.core.imaging.range_profiles import profiles_of
 from apertura.core.planning.plan import Plan

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.core.antenna.beam import Beams
+from apertura.core.backprojection.contributions import band_limited_image
+from apertura.core.backprojection.inputs import PhaseHistory, Profiles
+from apertura.core.backprojection.tiles import Weighing, image_array
 from apertura.core.echo.compression import centre_frequency, window_weights
-from apertura.core.focus.contributions import band_limited_image
-from apertura.core.focus.inputs import PhaseHistory, Profiles
-from apertura.core.focus.tiles import Weighing, image_array
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.sector import TAPER, Sector
 from apertura.core.imaging.focus_check import LEAST_PULSES, resolution_cell_m

@@ -13,7 +13,7 @@ from rasterio import Affine
 from apertura.common.arrays import Floats
 from apertura.common.progress import progress
 from apertura.common.provenance import Provenance
-from apertura.core.focus.contributions import block_contributions
+from apertura.core.backprojection.contributions import block_contributions
 from apertura.core.geometry.geodesy import LOCAL, map_from_frame
 from apertura.core.imaging.range_profiles import aperture_of, profiles_of
 from apertura.formats.export.coverage import footprint

@@ -1,0 +1,368 @@
+"""Contributions of pulses and of blocks of pulses at single places, in float64: for certificates and autofocus."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apertura.core.antenna.beam import Beams
+from apertura.core.backprojection.engines.native_binding import KERNEL, EchoJob, available, call
+from apertura.core.backprojection.inputs import Profiles
+from apertura.core.interpolation import kaiser_sinc
+
+# ---- Contributions of profiles by band-limited interpolation in float64
+
+_HALF_TAPS = 24
+_KAISER_BETA = 22.0  # -190 dB with half the band free for the transition
+_PULSES_AT_ONCE = 16
+
+
+def band_limited_image(
+    profiles: Profiles, pixels: NDArray[np.float64], *, beams: Beams | None = None
+) -> NDArray[np.complex128]:
+    """Return the sum of `band_limited_terms` over the pulses, (pixel,) complex128."""
+    image = np.zeros(len(pixels), np.complex128)
+    for first in range(0, len(profiles), _PULSES_AT_ONCE):
+        part = slice(first, first + _PULSES_AT_ONCE)
+        image += band_limited_terms(profiles[part], pixels, beams=beams and beams[part]).sum(axis=0)
+    return image
+
+
+def band_limited_terms(
+    profiles: Profiles, pixels: NDArray[np.float64], *, beams: Beams | None = None
+) -> NDArray[np.complex128]:
+    """Return p(ρ)·exp(+j2πf_mid ρ/c) of each pulse at each pixel, p between samples by a long windowed sinc.
+
+    Parameters
+    ----------
+    profiles
+        Twice oversampled or more, with 24 samples or more beyond the scene at both ends; samples beyond count as zero.
+    pixels
+        (pixel, 3) float64, metres, in the frame of the phase centres.
+    beams
+        Weight of each pulse at each pixel by its antennas; none by default.
+
+    Returns
+    -------
+    ndarray
+        (pulse, pixel) complex128.
+
+    Notes
+    -----
+    Source: docs/theory.md, eq. 6.
+    """
+    k = profiles.wavenumber_rad_m
+    taps = np.arange(1 - _HALF_TAPS, _HALF_TAPS + 1)
+    padded = np.pad(profiles.samples.astype(np.complex128), [(0, 0), (_HALF_TAPS, _HALF_TAPS)])
+    terms = np.empty((len(profiles), len(pixels)), np.complex128)
+    for first in range(0, len(profiles), _PULSES_AT_ONCE):
+        part = slice(first, first + _PULSES_AT_ONCE)
+        path = profiles.aperture[part].path(pixels)
+        place = (path - profiles.start_m[part, None]) / profiles.step_m
+        base = np.floor(place).astype(np.int64)
+        distance = (place - base)[..., None] - taps
+        weights = kaiser_sinc(distance, half=_HALF_TAPS, beta=_KAISER_BETA)
+        index = np.clip(base[..., None] + taps + _HALF_TAPS, 0, padded.shape[1] - 1)
+        samples = np.take_along_axis(padded[part, None], index, axis=2)
+        value = (samples * weights).sum(-1) * np.exp(1j * np.remainder(k * path, 2 * np.pi))
+        if beams is not None:
+            value *= beams[part].weight(profiles.aperture[part], pixels)
+        terms[part] = value
+    return terms
+
+
+# ---- Echoes of single pulses at single places
+
+TAPS, DEGREE = KERNEL.echo_taps, KERNEL.echo_degree
+
+_BYTES_AT_ONCE = 2**25  # of samples
+_VALUES_AT_ONCE = 2**17  # pulses × places: of beams, and without the compiled library
+
+
+@lru_cache
+def tap_polynomials() -> NDArray[np.float64]:
+    """Return the weight of each sample about a place as a polynomial of the place between its neighbours.
+
+    Returns
+    -------
+    ndarray
+        (degree + 1, tap) float64, constant term first; of -½…½ from the middle between taps 3 and 4.
+
+    Notes
+    -----
+    Source: docs/theory/autofocus.md, eq. 5: least squares over the band of twice oversampled profiles, value and
+    slope steady from one sample to the next.
+
+    Examples
+    --------
+    >>> weights = 0.25 ** np.arange(DEGREE + 1) @ tap_polynomials()
+    >>> tone = np.exp(0.5j * np.pi * 0.9 * np.arange(TAPS))
+    >>> bool(abs(weights @ tone - np.exp(0.5j * np.pi * 0.9 * 3.75)) < 1e-3)
+    True
+    """
+    omega = np.pi / 2 * np.cos(np.pi * (np.arange(160) + 0.5) / 160)
+    place, share = (part / 2 for part in np.polynomial.legendre.leggauss(24))
+    powers = place[:, None] ** np.arange(DEGREE + 1)
+    tap = np.arange(TAPS) - (TAPS - 1) / 2
+    root = np.sqrt(share)
+    given = np.einsum("wt,un,u->wutn", np.exp(1j * omega[:, None] * tap), powers, root).reshape(
+        -1, powers[0].size * TAPS
+    )
+    ideal = (np.exp(1j * omega[:, None] * place) * root).ravel()
+    left, right = (np.concatenate([part.real, part.imag]) for part in (given, ideal))
+    free = _joined()
+    coefficients = free @ np.linalg.lstsq(left @ free, right, rcond=None)[0]
+    return np.ascontiguousarray(coefficients.reshape(TAPS, DEGREE + 1).T)
+
+
+@lru_cache
+def _rounded_taps() -> NDArray[np.float32]:
+    return tap_polynomials().astype(np.float32)
+
+
+def _joined() -> NDArray[np.float64]:
+    """Return (tap·power, free) the polynomials with weights and slopes continuous where the nearest sample changes."""
+    power = np.arange(DEGREE + 1)
+    joins: list[NDArray[np.float64]] = []
+    for end in (0.5**power, power * 0.5 ** (power - 1.0)):
+        parity = end * (-1.0) ** (power + len(joins))
+        joins.append(np.kron(np.eye(TAPS + 1, TAPS), end) - np.kron(np.eye(TAPS + 1, TAPS, k=-1), parity))
+    conditions = np.concatenate(joins)
+    return np.linalg.qr(conditions.T, mode="complete")[0][:, len(conditions) :]
+
+
+@dataclass(frozen=True, eq=False)
+class Echoes:
+    """Samples of some pulses with zeros around them, as the compiled library reads them.
+
+    Attributes
+    ----------
+    samples
+        (pulse, 2, sample) float32: real and imaginary parts.
+    tx_m, rx_m
+        (3, pulse) float64, phase centres, metres, in the frame of the places.
+    start_m
+        (pulse,) float64, total path of sample 0.
+    step_m
+        Total path between samples.
+    turns_per_m
+        f_mid/v.
+    """
+
+    samples: NDArray[np.float32]
+    tx_m: NDArray[np.float64]
+    rx_m: NDArray[np.float64]
+    start_m: NDArray[np.float64]
+    step_m: float
+    turns_per_m: float
+
+    @classmethod
+    def read(cls, profiles: Profiles, parts: list[slice]) -> "Echoes":
+        """Return the pulses of some slices one after the other; no other pulses are read."""
+        read = np.concatenate([np.asarray(profiles.samples[part]) for part in parts])
+        samples = np.zeros((len(read), 2, read.shape[1] + 2 * TAPS), np.float32)
+        samples[:, 0, TAPS:-TAPS], samples[:, 1, TAPS:-TAPS] = read.real, read.imag
+        tx, rx = (np.concatenate([leg[part] for part in parts]).T for leg in profiles.aperture.legs)
+        return cls(
+            samples,
+            np.ascontiguousarray(tx, np.float64),
+            np.ascontiguousarray(rx, np.float64),
+            np.concatenate([profiles.start_m[part] for part in parts]) - TAPS * profiles.step_m,
+            profiles.step_m,
+            profiles.centre_frequency_hz / profiles.wave_speed_m_s,
+        )
+
+    def __len__(self) -> int:
+        """Return the number of pulses."""
+        return len(self.samples)
+
+    def at(self, places_m: NDArray[np.float64]) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
+        """Return s(R)·exp(j2πf_mid R/c) at some places and its derivative with respect to the path R.
+
+        The same as the compiled library, in float64.
+
+        Parameters
+        ----------
+        places_m
+            (place, 3) float64, metres.
+
+        Returns
+        -------
+        value, slope
+            (pulse, place) complex128; the slope per metre.
+
+        Notes
+        -----
+        Source: docs/theory/autofocus.md, eq. 4 and 5.
+        """
+        tx, rx = (np.linalg.norm(places_m - leg.T[:, None], axis=-1) for leg in (self.tx_m, self.rx_m))
+        path = tx + rx
+        at = (path - self.start_m[:, None]) / self.step_m
+        at = np.clip(at, TAPS / 2 - 0.5, self.samples.shape[-1] - TAPS / 2 - 0.5)
+        base = np.rint(at - 0.5)
+        first = np.nan_to_num(base).astype(np.int64) - (TAPS // 2 - 1)
+        near = np.clip(first, 0, None)[..., None] + np.arange(TAPS)
+        pulse = np.arange(len(self))[:, None, None]
+        samples = self.samples[pulse, 0, near] + 1j * self.samples[pulse, 1, near]
+        u, taps = at - 0.5 - base, tap_polynomials()
+        powers = u[..., None] ** np.arange(DEGREE + 1)
+        level = np.einsum("pxn,nt,pxt->px", powers, taps, samples)
+        rate = np.einsum("pxn,nt,pxt->px", powers[..., :-1], taps[1:] * np.arange(1, DEGREE + 1)[:, None], samples)
+        carrier = np.exp(2j * np.pi * np.remainder(self.turns_per_m * path, 1.0))
+        return level * carrier, (rate / self.step_m + 2j * np.pi * self.turns_per_m * level) * carrier
+
+
+def job_of(echoes: Echoes, places_m: NDArray[np.float64], weight: NDArray[np.float32]) -> EchoJob:
+    """Return the job of some places for the compiled library; the caller sets the outputs.
+
+    Parameters
+    ----------
+    echoes
+        Kept alive by the caller while the job runs, as are the other arrays.
+    places_m
+        (place, 3) float64, contiguous.
+    weight
+        (place or 1, pulse) float32, contiguous: of each pulse at each place, or at all.
+    """
+    arrays = (echoes.samples, _rounded_taps(), echoes.tx_m, echoes.rx_m, echoes.start_m, weight, places_m)
+    return EchoJob(
+        *(array.ctypes.data for array in arrays),
+        pulses=len(echoes),
+        length=echoes.samples.shape[2],
+        count=len(places_m),
+        weight_step=len(echoes) if len(weight) > 1 else 0,
+        samples_per_metre=1 / echoes.step_m,
+        turns_per_metre=echoes.turns_per_m,
+    )
+
+
+def pulses_at_once(profiles: Profiles) -> int:
+    """Return how many pulses are read at once."""
+    return max(1, _BYTES_AT_ONCE // (8 * (int(profiles.samples.shape[1]) + 2 * TAPS)))
+
+
+def tiles(places: int, pulses: int) -> Iterator[slice]:
+    """Yield slices of places, computed together, that bound memory."""
+    step = max(1, _VALUES_AT_ONCE // max(1, pulses))
+    for first in range(0, places, step):
+        yield slice(first, first + step)
+
+
+# ---- Contributions of blocks of pulses
+
+Piece = tuple[int, slice]
+"""A block and some of its pulses."""
+
+
+def block_contributions(
+    profiles: Profiles,
+    places_m: NDArray[np.float64],
+    *,
+    edges: NDArray[np.int64],
+    weights: NDArray[np.float64] | None = None,
+) -> NDArray[np.complex64]:
+    """Return Σ w·s(R)·exp(+j2πf_mid·R/c) over the pulses of each block at each place, R the total path.
+
+    Parameters
+    ----------
+    profiles
+        At least twice oversampled; samples beyond theirs count as zero. They may be read on access.
+    places_m
+        (place, 3) float64, metres, in the frame of the phase centres.
+    edges
+        (block + 1,) int64, ascending: block b is pulses edges[b] to edges[b + 1].
+    weights
+        (pulse,) float64, of each pulse; 1 by default. Blocks without weight are not read.
+
+    Returns
+    -------
+    ndarray
+        (place, block) complex64, not divided by anything; NaN where a place is not finite.
+
+    Raises
+    ------
+    ValueError
+        If shapes differ, or edges do not ascend within the pulses.
+
+    Notes
+    -----
+    Source: docs/theory/autofocus.md, eq. 4 and 5: errs by less than -65 dB in the whole band of twice oversampled
+    profiles. Paths and the carrier's whole turns are float64. Without the compiled library numpy does the same.
+
+    Examples
+    --------
+    >>> from apertura.core.geometry.aperture import Aperture
+    >>> track = np.array([[0.0, 0.0, 5.0]] * 4)
+    >>> echo = np.exp(-((np.arange(32) - 16.0) ** 2) / 8).astype(np.complex64)
+    >>> profiles = Profiles(np.tile(echo, (4, 1)), np.full(4, 2.0), 0.5, 299792458.0, 2.0, Aperture(track, track))
+    >>> abs(block_contributions(profiles, np.zeros((1, 3)), edges=np.array([0, 1, 4]))).round(2)
+    array([[1., 3.]], dtype=float32)
+    """
+    weights = np.ones(len(profiles)) if weights is None else weights
+    edges = np.asarray(edges, np.int64)
+    if places_m.ndim != 2 or places_m.shape[1] != 3 or weights.shape != (len(profiles),):
+        raise ValueError(f"{places_m.shape=}, {weights.shape=}: must be (place, 3) and ({len(profiles)},)")
+    if edges.size < 2 or (np.diff(edges) < 0).any() or edges[0] < 0 or edges[-1] > len(profiles):
+        raise ValueError(f"{edges=}: must ascend within {len(profiles)} pulses")
+    places_m = np.ascontiguousarray(places_m, np.float64)
+    sums = np.zeros((len(places_m), edges.size - 1), np.complex64)
+    add = _add_compiled if available() else _add
+    for pieces in _chunks(edges, weights, pulses_at_once(profiles)):
+        parts = [part for _block, part in pieces]
+        add(Echoes.read(profiles, parts), places_m, pieces, np.concatenate([weights[part] for part in parts]), sums)
+    return sums
+
+
+def _chunks(edges: NDArray[np.int64], weights: NDArray[np.float64], most: int) -> Iterator[list[Piece]]:
+    """Yield the blocks with weight, cut where one chunk has `most` pulses."""
+    chunk: list[Piece] = []
+    room = most
+    for block, (first, end) in enumerate(pairwise(edges.tolist())):
+        begin = first
+        while begin < end and weights[begin:end].any():
+            taken = min(room, end - begin)
+            chunk.append((block, slice(begin, begin + taken)))
+            begin += taken
+            room -= taken
+            if not room:
+                yield chunk
+                chunk, room = [], most
+    if chunk:
+        yield chunk
+
+
+def _borders(pieces: list[Piece]) -> NDArray[np.int64]:
+    """Return the offsets of pieces in their concatenation."""
+    return np.cumsum([0, *(part.stop - part.start for _block, part in pieces)])
+
+
+def _add_compiled(
+    echoes: Echoes,
+    places_m: NDArray[np.float64],
+    pieces: list[Piece],
+    weights: NDArray[np.float64],
+    sums: NDArray[np.complex64],
+) -> None:
+    columns = np.array([block for block, _part in pieces], np.int64)
+    weight, borders = weights.astype(np.float32)[None], _borders(pieces)
+    job = job_of(echoes, places_m, weight)
+    job.edges, job.columns, job.sums = borders.ctypes.data, columns.ctypes.data, sums.ctypes.data
+    job.blocks, job.width = columns.size, sums.shape[1]
+    call("apertura_contribute", job)
+
+
+def _add(
+    echoes: Echoes,
+    places_m: NDArray[np.float64],
+    pieces: list[Piece],
+    weights: NDArray[np.float64],
+    sums: NDArray[np.complex64],
+) -> None:
+    borders = _borders(pieces)
+    for tile in tiles(len(places_m), len(echoes)):
+        values = echoes.at(places_m[tile])[0] * weights[:, None]
+        for (block, _part), (begin, end) in zip(pieces, pairwise(borders), strict=True):
+            sums[tile, block] += values[begin:end].sum(axis=0)

@@ -1,0 +1,77 @@
+"""Backprojection engines: one file and one row each; every one is tested against `reference`."""
+
+from collections.abc import Mapping
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, cast
+
+if TYPE_CHECKING:
+    from apertura.common.contracts import Window
+    from apertura.core.backprojection.engines.engine import Engine
+
+ENGINES: dict[str, str] = {
+    "tree": "apertura.core.backprojection.engines.tree",
+    "native": "apertura.core.backprojection.engines.native",
+    "numba": "apertura.core.backprojection.engines.numba",
+    "cuda": "apertura.core.backprojection.engines.cuda",
+    "reference": "apertura.core.backprojection.engines.reference",
+}
+"""Name → module that is an `Engine`; a module is imported when its engine is loaded."""
+
+PATCH_PX = 16
+"""Tiles begin at multiples of this: an engine may work in patches of it and give the same bits in every tiling."""
+
+
+def load_engine(name: str) -> "Engine":
+    """Return an engine.
+
+    Parameters
+    ----------
+    name
+        A key of `ENGINES`.
+
+    Examples
+    --------
+    >>> load_engine("reference").READS
+    'phase_history'
+    """
+    return cast("Engine", import_module(ENGINES[name]))
+
+
+def pieces(name: str, shape: tuple[int, ...], form_options: Mapping[str, Any]) -> "list[Window]":
+    """Return windows of a tile for which an engine gives the same bits when they are formed alone.
+
+    Parameters
+    ----------
+    name
+        A key of `ENGINES`.
+    shape
+        Of the tile, pixels.
+    form_options
+        Of the engine's `form`.
+
+    Examples
+    --------
+    >>> pieces("reference", (20, 16), {})
+    [(slice(0, 16, None), slice(0, 16, None)), (slice(16, 20, None), slice(0, 16, None))]
+    """
+    own = getattr(load_engine(name), "pieces", None)
+    if own is not None:
+        return list(own(shape, form_options))
+    rows, columns = ([slice(at, min(at + PATCH_PX, size)) for at in range(0, size, PATCH_PX)] for size in shape)
+    return [(row, column) for row in rows for column in columns]
+
+
+def instruction_set(name: str) -> str:
+    """Return the instructions that an engine's sums run with on this machine; 'unknown' where it states none.
+
+    Parameters
+    ----------
+    name
+        A key of `ENGINES`.
+
+    Examples
+    --------
+    >>> instruction_set("reference").split()[0]
+    'numba:'
+    """
+    return str(getattr(load_engine(name), "instruction_set", lambda: "unknown")())

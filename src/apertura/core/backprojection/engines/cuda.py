@@ -1,0 +1,293 @@
+"""Backprojection on an NVIDIA GPU: range tables, a block of threads per patch of pixels; the extra ``cuda``."""
+
+import ctypes
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
+from threading import Lock
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from apertura.common.errors import CampaignError
+from apertura.core.antenna.beam import Beams
+from apertura.core.backprojection.engines.cuda_prediction import DEGREE, SIDE, candidates, simulated
+from apertura.core.backprojection.engines.engine import EngineOptions, checked_pixels
+from apertura.core.backprojection.engines.native_tables import PHASE_POLYNOMIALS, TableDesign, design_table
+from apertura.core.backprojection.inputs import Profiles
+
+# ---- The device, and arrays on it
+#
+# numba.cuda is imported when a device is used. One call is on the device at a time: threads that form tiles wait for
+# its lock without the GIL.
+
+_LOCK = Lock()
+_THREADS = 128  # of a block that fills tables
+
+
+@cache
+def available() -> bool:
+    """Return whether a device can be used, or numba's simulator is enabled; never raises.
+
+    Examples
+    --------
+    >>> available() in (True, False)
+    True
+    """
+    try:
+        if not simulated():
+            ctypes.CDLL("libcuda.so.1")  # the driver's own library: without it the import below would be for nothing
+        from numba import cuda
+
+        return bool(cuda.is_available())
+    except Exception:  # driver, toolkit or package missing or incompatible
+        return False
+
+
+def instruction_set() -> str:
+    """Return which device forms images here, and by which package.
+
+    Examples
+    --------
+    >>> instruction_set().split()[0]
+    'cuda:'
+    """
+    if not available():
+        return "cuda: no device"
+    from numba import cuda
+
+    try:
+        by = f"numba-cuda {version('numba-cuda')}"
+    except PackageNotFoundError:  # numba's own numba.cuda
+        by = f"numba {version('numba')}"
+    if simulated():
+        return f"cuda: simulator of {by}"
+    device = cuda.get_current_device()
+    name = device.name.decode() if isinstance(device.name, bytes) else device.name
+    return f"cuda: {name}, compute capability {'.'.join(map(str, device.compute_capability))}, {by}"
+
+
+class Resident:
+    """Arrays on the device, shared by all slices of one engine's tables from the first tile on; not pickled."""
+
+    def __init__(self) -> None:
+        self.arrays: tuple[Any, ...] | None = None
+
+    def __reduce__(self) -> tuple[type["Resident"], tuple[()]]:
+        return Resident, ()
+
+
+def sum_on_device(tables: "ResidentTables", pixels: NDArray[np.float64], tolerance_rad: float) -> NDArray[np.complex64]:
+    """Return what `apertura.core.backprojection.engines.cuda.form` returns, of one or more pixels.
+
+    Raises
+    ------
+    CampaignError
+        If no device can be used, or it fails.
+    """
+    with _device() as cuda:
+        from apertura.core.backprojection.engines.cuda_kernels import ROWS, form
+
+        if tables.resident.arrays is None:
+            tables.resident.arrays = _tables_on_device(cuda, tables)
+        places, start_m, cells = (array[tables.pulses] for array in tables.resident.arrays)
+        scales = (1 / tables.cell_m, tables.wavenumber_rad_m, tolerance_rad, cells.shape[2])
+        numbers = np.array([*scales, *tables.design.phase_coefficients], np.float64)
+        if not PHASE_POLYNOMIALS[tables.design.phase_polynomial][2]:
+            numbers[-1] = 0  # no half turns are removed
+        rows, columns = pixels.shape[:2]
+        image = cuda.device_array((rows, columns), np.complex64)
+        patches = (-(-columns // SIDE), -(-rows // SIDE))
+        form[patches, (SIDE, ROWS)](cuda.to_device(pixels), places, start_m, cells, cuda.to_device(numbers), image)
+        return np.asarray(image.copy_to_host())
+
+
+def _tables_on_device(cuda: Any, tables: "ResidentTables") -> tuple[Any, ...]:
+    """Return phase centres, starts and cells of all pulses on the device."""
+    from apertura.core.backprojection.engines.cuda_kernels import expand
+
+    design, k = tables.design, tables.wavenumber_rad_m
+    pulses, length = tables.samples.shape
+    used = (length - 1) * design.up // design.down + 1
+    carrier = np.exp(1j * np.remainder(k * tables.cell_m * np.arange(used), 2 * np.pi)).astype(np.complex64)
+    turn = np.exp(1j * np.remainder(k * tables.start_m, 2 * np.pi)).astype(np.complex64)
+    cells = cuda.device_array((pulses, 6, used), np.float32)
+    samples, taps, lead, carrier, turn = map(cuda.to_device, (tables.samples, design.taps, design.lead, carrier, turn))
+    expand[-(-pulses * used // _THREADS), _THREADS](samples, taps, lead, design.down, carrier, turn, cells)
+    return cuda.to_device(tables.places_m), cuda.to_device(tables.start_m), cells
+
+
+@contextmanager
+def _device() -> Iterator[Any]:
+    """Yield numba.cuda under the device's lock; its failures become one message."""
+    if not available():
+        raise _unusable("no device can be used")
+    from numba import cuda
+    from numba.cuda.cudadrv.driver import CudaAPIError, LinkerError
+
+    with _LOCK:
+        try:
+            yield cuda
+        except (CudaAPIError, LinkerError, ImportError) as error:  # ImportError: driver or compiler missing
+            raise _unusable(f"the device failed: {' '.join(str(error).split())}") from error
+
+
+def _unusable(found: str) -> CampaignError:
+    return CampaignError(
+        f"engine cuda: {found}",
+        where="processing.engine",
+        expected="an NVIDIA GPU with its driver and memory for a block of pulses (docs/howto/gpu.md)",
+        remedy="Choose engine native or numba, or free the device.",
+    )
+
+
+# ---- The engine
+#
+# Kernels are in `cuda_kernels`, predictions in `cuda_prediction`.
+
+__all__ = ["NEEDS", "READS", "TIMED", "available", "candidates", "form", "instruction_set", "prepare"]
+
+READS: Literal["profiles"] = "profiles"
+TIMED = False  # the seconds of cuda_prediction are published ones of others, auto compares measured ones
+NEEDS = "an NVIDIA GPU with its driver, and apertura[cuda] (docs/howto/gpu.md)"
+
+
+class Options(EngineOptions):
+    """Options of the engine."""
+
+    oversampling: Annotated[int, Field(ge=2, le=64)] | None = Field(
+        None, description="table cells per resolution cell c/B of total path"
+    )
+    tolerance_rad: Annotated[float, Field(gt=0, le=0.1)] | None = Field(
+        None, description="largest phase error that the path series may make, rad"
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class ResidentTables:
+    """Profiles, and their tables on the device: polynomials per cell, carrier folded in.
+
+    Attributes
+    ----------
+    samples
+        (pulse, range) complex64.
+    places_m
+        (pulse, 2, 3) float64, phase centres of transmitter and receiver in the frame of the pixels.
+    start_m
+        (pulse,) float64, total path of sample 0 and of the middle of cell 0, metres.
+    cell_m
+        Total path across one cell, metres.
+    wavenumber_rad_m
+        2πf_mid/c.
+    design
+        Filters from samples to cells.
+    error_db
+        Predicted RMS error on random pixels of a profile with a flat spectrum.
+    pulses
+        Pulses of these tables.
+    resident
+        Arrays on the device.
+    """
+
+    samples: NDArray[np.complex64]
+    places_m: NDArray[np.float64]
+    start_m: NDArray[np.float64]
+    cell_m: float
+    wavenumber_rad_m: float
+    design: TableDesign
+    error_db: float
+    pulses: slice
+    resident: Resident
+
+    def __getitem__(self, pulses: slice) -> "ResidentTables":
+        """Return the tables of some pulses; they are on the device once."""
+        first, last, _ = pulses.indices(self.pulses.stop - self.pulses.start)
+        start = self.pulses.start
+        return replace(self, pulses=slice(start + first, start + max(first, last)))
+
+
+def prepare(profiles: Profiles, *, oversampling: int = 6) -> ResidentTables:
+    """Return the inputs of tables; the tables are made on the device with the first tile.
+
+    Parameters
+    ----------
+    profiles
+        Band-limited profiles with eight samples or more beyond the scene at both ends.
+    oversampling
+        Table cells per Nyquist cell c/B of total path; `ResidentTables.error_db` predicts their error.
+
+    Returns
+    -------
+    Tables
+        On the device pulses × cells × 24 bytes.
+
+    Raises
+    ------
+    ValueError
+        If the profiles are oversampled less than 1.5 times or have no pulse, or a position or start is not finite.
+
+    Notes
+    -----
+    Source: docs/theory/engine.md, "Cells" and "A GPU".
+    """
+    samples, start_m, places = profiles.for_tables()
+    wavenumber = profiles.wavenumber_rad_m
+    design = design_table(profiles.oversampling, wavenumber * profiles.step_m, oversampling=oversampling, degree=DEGREE)
+    return ResidentTables(
+        samples=samples,
+        places_m=np.ascontiguousarray(np.stack(places, axis=1)),
+        start_m=start_m,
+        cell_m=profiles.step_m * design.down / design.up,
+        wavenumber_rad_m=wavenumber,
+        design=design,
+        error_db=design.error_db(np.ones(1)),
+        pulses=slice(0, len(samples)),
+        resident=Resident(),
+    )
+
+
+def form(
+    tables: ResidentTables, pixels: NDArray[np.float64], *, beams: Beams | None = None, tolerance_rad: float = 1.5e-3
+) -> NDArray[np.complex64]:
+    """Sum the tables over the pixels of one tile.
+
+    Parameters
+    ----------
+    tables
+        From `prepare`.
+    pixels
+        (y, x, 3) float64, metres, in the frame of the phase centres: any surface. A tile of a larger grid that begins
+        at multiples of 16 pixels gets the same bits as in the larger grid.
+    beams
+        Must be None: this engine does not weight pulses.
+    tolerance_rad
+        Largest phase error that the path series may make anywhere in a patch of 16 × 16 pixels; patches and pulses that
+        would exceed it take exact paths, pixel by pixel in float64.
+
+    Returns
+    -------
+    ndarray
+        (y, x) complex64. Pulses whose profile does not reach a pixel add zero; a pixel without a finite position is
+        NaN.
+
+    Raises
+    ------
+    ValueError
+        If `pixels` has another shape, or there are beams.
+    CampaignError
+        If no device can be used, or it fails.
+
+    Notes
+    -----
+    Source: docs/theory/engine.md, "A GPU".
+    """
+    pixels = checked_pixels(pixels)
+    if beams is not None:
+        raise ValueError("engine cuda does not weigh pulses by antennas or a sector")
+    if not pixels.size:
+        return np.zeros(pixels.shape[:2], np.complex64)
+    return sum_on_device(tables, pixels, tolerance_rad)

@@ -1,0 +1,451 @@
+"""Binding of the compiled library: structures, sizes and error bounds, instruction sets."""
+
+import ctypes
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apertura.common.errors import CampaignError, quoted, shown
+from apertura.core.antenna.beam import Beam, Beams
+from apertura.core.geometry.sector import Sector
+
+# ---- Sizes and error bounds of the compiled kernel
+#
+# The engine may not be compiled where a plan is made, so they are not read from the library; a test compares the two.
+
+
+@dataclass(frozen=True)
+class KernelConstants:
+    """Sizes and error bounds of the kernel.
+
+    D is the largest distance of a block from its patch's origin, δ of a pixel from its block's centre, R the range;
+    errors are of one leg's path, in the unit of D, δ and R.
+
+    Attributes
+    ----------
+    patch_side, block_side
+        Pixels along a patch, whose paths are series about its origin, and along a block, of one polynomial.
+    batch
+        Pulses whose paths are computed together: phase centres are padded to a multiple of it.
+    taps
+        Taps of a table's filters.
+    window
+        Table cells that one look-up can reach; tables have as many empty cells at both ends.
+    echo_taps, echo_degree
+        Samples that make an echo at a single place, and the degree of the polynomials that weigh them
+        (docs/theory/autofocus.md, "What pulses add").
+    window_margin
+        Cells: a path lies up to ½ beyond the cell it is rounded to, the rest is what float32 may err.
+    fifth_order
+        Of D⁵/R⁴. Order n of |w + d| is at most max |P_{n-2} − P_n| / (2n − 1) · dⁿ/Rⁿ⁻¹, 0.083 for n = 5, with room for
+        higher orders.
+    third_order
+        Of δ³/R²: 1/(3√3).
+    shared_curvature_error
+        Of Dδ²/R², where all blocks of a patch share one curvature: three terms of 1/(3√3).
+    own_curvature_error
+        Of D²δ²/R³, where each has its own: six terms of 1/8, of which all but a tenth is in the block's curvature.
+    curvature_span
+        Second-order terms move a pixel of a block by at most 1.5² their coefficients; twice that bounds all blocks.
+    weight_change, weight_curvature
+        Of the beam's peak: how much antenna weights may differ between the nodes of a patch, first and second
+        difference, to be taken as a polynomial.
+    sector_bend
+        Of the width of a sector's edge: how much a pixel's place in it may bend inside a block to be taken as linear.
+
+    Notes
+    -----
+    Source: docs/theory/engine.md, "Paths", "Look-ups" and "Antennas".
+    """
+
+    patch_side: int = 16
+    block_side: int = 4
+    batch: int = 8
+    taps: int = 16
+    window: int = 16
+    echo_taps: int = 8
+    echo_degree: int = 4
+    window_margin: float = 0.51
+    fifth_order: float = 0.14
+    third_order: float = 0.19
+    shared_curvature_error: float = 0.58
+    own_curvature_error: float = 0.075
+    curvature_span: float = 4.5
+    weight_change: float = 0.12
+    weight_curvature: float = 0.025
+    sector_bend: float = 0.002
+
+
+KERNEL = KernelConstants()
+
+
+# ---- Structures of the compiled library
+
+_pointer = ctypes.c_void_p
+_int64 = ctypes.c_int64
+_double = ctypes.c_double
+
+TREE_NODES, TREE_SLOTS, TREE_LEVELS, TREE_GROUP, TREE_SIDE, TREE_DELAYS, TREE_FEWER = 128, 136, 4, 64, 256, 12, 28
+TREE_TERMS, TREE_MORE, TREE_WEIGHTS, TREE_WEIGHTED = 21, 4, 16, 1.5
+"""As in native/tree_job.hpp: nodes along an axis; places of them and of pixels; levels; pulses of
+a leaf; pixels along a tile; taps that align a pulse; pulses that replace those of a leaf, at most; rad that smooth
+weights add to a band."""
+
+
+class BeamJob(ctypes.Structure):
+    """native/job.hpp, BeamJob."""
+
+    _fields_ = [
+        ("axes", _pointer),
+        ("gain", _pointer * 2),
+        ("count", _int64 * 2),
+        ("first_rad", _double * 2),
+        ("samples_per_rad", _double * 2),
+        ("peak", _double),
+    ]
+
+
+class SectorJob(ctypes.Structure):
+    """native/job.hpp, SectorJob."""
+
+    _fields_ = [
+        ("axis", _pointer * 2),
+        *((name, _double) for name in ("centre", "inner", "outer")),
+        *((name, _pointer * 2) for name in ("end", "end_axis")),
+        ("ends", _int64),
+    ]
+
+
+class ApertureJob(ctypes.Structure):
+    """native/job.hpp, ApertureJob."""
+
+    _fields_ = [
+        *((name, _pointer) for name in ("cells", "transmitter", "receiver", "first_path", "pixels")),
+        *((name, _pointer) for name in ("image", "counts")),
+        *((name, _int64) for name in ("pulses", "padded", "width", "rows", "columns")),
+        *((name, _double) for name in ("cells_per_metre", "radians_per_cell", "tolerance_rad")),
+        *((name, ctypes.c_int32) for name in ("degree", "phase_polynomial", "wide_sum")),
+        ("phase_coefficients", ctypes.c_float * 9),
+        ("beam", ctypes.POINTER(BeamJob) * 2),
+        ("sector", ctypes.POINTER(SectorJob)),
+    ]
+
+
+class TableJob(ctypes.Structure):
+    """native/job.hpp, TableJob."""
+
+    _fields_ = [
+        *((name, _pointer) for name in ("samples", "taps", "lead", "carrier", "turn", "cells")),
+        *((name, _int64) for name in ("pulses", "length", "width", "up", "down", "steps", "margin", "used")),
+        ("degree", ctypes.c_int32),
+    ]
+
+
+class EchoJob(ctypes.Structure):
+    """native/job.hpp, EchoJob."""
+
+    _fields_ = [
+        *((name, _pointer) for name in ("samples", "taps", "transmitter", "receiver", "start", "weight", "pixels")),
+        *((name, _pointer) for name in ("edges", "columns", "sums", "objective", "slopes")),
+        *((name, _int64) for name in ("pulses", "length", "count", "blocks", "width", "weight_step")),
+        *((name, _double) for name in ("samples_per_metre", "turns_per_metre")),
+    ]
+
+
+class TreeTile(ctypes.Structure):
+    """native/tree_job.hpp, TreeTile."""
+
+    _fields_ = [
+        *((name, _pointer) for name in ("surface", "pixels", "image", "weight", "way", "nodes", "fewer")),
+        *((name, _pointer) for name in ("edge", "slope")),
+        ("centre", _double * 3),
+        ("rest", _double),
+        ("first_path", _double),
+        *((name, _int64) for name in ("degree", "rows", "columns", "row_slot", "column_slot", "samples", "top")),
+    ]
+
+
+class TreeJob(ctypes.Structure):
+    """native/tree_job.hpp, TreeJob."""
+
+    _fields_ = [
+        *((name, _pointer) for name in ("samples", "start", "transmitter", "receiver", "stray", "rough", "track")),
+        *((name, _pointer) for name in ("taps", "delay", "presum", "curve", "supports", "places", "spread", "mix")),
+        ("tiles", _pointer),
+        *((name, _int64) for name in ("pulses", "length", "up", "lead", "stride", "count", "levels", "mono")),
+        *((name, _int64) for name in ("phase_polynomial", "taps_count", "delay_terms")),
+        ("sizes", _int64 * TREE_LEVELS),
+        *((name, _double) for name in ("step", "wavenumber", "band", "smooth", "node_error")),
+        ("beam", ctypes.POINTER(BeamJob) * 2),
+        ("sector", ctypes.POINTER(SectorJob)),
+        ("phase_coefficients", ctypes.c_float * 9),
+    ]
+
+
+STRUCTS = (BeamJob, SectorJob, ApertureJob, TableJob, EchoJob, TreeTile, TreeJob)
+"""All of them."""
+
+
+# ---- Loading the compiled library
+#
+# Bound with ctypes: the GIL is released during a call, and one wheel serves every Python version. The library says
+# the layout of its structs; a library whose layout differs from the mirrors here is refused when it is loaded.
+
+INSTRUCTION_SETS = ("avx512", "avx2", "portable")
+
+NAMED_BY = "APERTURA_KERNEL"
+"""Environment variable: another library than the one installed."""
+
+_BUILT = str(files("apertura.core.backprojection.engines") / "_backprojection.so")  # resolved once: calls may be short
+
+
+def layout() -> dict[str, str]:
+    """Return the layout of the structs of this module: field → offset and size, struct → its size.
+
+    Examples
+    --------
+    >>> layout()["ApertureJob.transmitter"]
+    'byte 8, 8 bytes'
+    """
+    lines: dict[str, str] = {}
+    for struct in STRUCTS:
+        for name, *_ in struct._fields_:
+            field = getattr(struct, name)
+            lines[f"{struct.__name__}.{name}"] = _place(field.offset, field.size)
+        lines[struct.__name__] = _place(0, ctypes.sizeof(struct))
+    return lines
+
+
+def _place(offset: int, size: int) -> str:
+    return f"byte {offset}, {size} bytes"
+
+
+def check_layout(theirs: dict[str, str], path: Path) -> None:
+    """Refuse a library whose structs are not those of this module.
+
+    Parameters
+    ----------
+    theirs
+        As `layout`, from the library.
+    path
+        Of the library.
+
+    Raises
+    ------
+    CampaignError
+        Naming the first field that differs, as it is there and here.
+    """
+    ours = layout()
+    for name in [*ours, *(theirs.keys() - ours.keys())]:
+        if ours.get(name) != theirs.get(name):
+            raise CampaignError(
+                f"{name} at {theirs.get(name, 'no place')}",
+                where=str(path),
+                expected=f"{name} at {ours.get(name, 'no place')}, as in apertura's native_structs.py",
+                remedy="Reinstall apertura, so that the library and Python are of one version; unset APERTURA_KERNEL.",
+            )
+
+
+def available() -> bool:
+    """Return whether the kernel was compiled when the package was installed.
+
+    Examples
+    --------
+    >>> available() in (True, False)
+    True
+    """
+    return library_path().is_file()
+
+
+def instruction_set() -> str:
+    """Return the instruction set in use: the best of this machine, or what APERTURA_ISA names.
+
+    Raises
+    ------
+    RuntimeError
+        If the kernel was not compiled.
+    CampaignError
+        If APERTURA_ISA is unknown, or one that this machine lacks.
+
+    Examples
+    --------
+    >>> not available() or instruction_set() in INSTRUCTION_SETS
+    True
+    """
+    requested = os.environ.get("APERTURA_ISA", "")
+    if requested and requested not in INSTRUCTION_SETS:
+        raise _unfit(requested, f"one of {', '.join(INSTRUCTION_SETS)}, or unset")
+    chosen = library().apertura_isa(requested.encode())
+    if chosen is None:
+        raise _unfit(requested, "instructions that this machine has")
+    return str(chosen.decode())
+
+
+def supports(isa: str) -> bool:
+    """Return whether the kernel was compiled and this machine has the instruction set of that name."""
+    return available() and library().apertura_isa(isa.encode()) is not None
+
+
+def _unfit(requested: str, expected: str) -> CampaignError:
+    return CampaignError(
+        f"{requested!r}", where="environment variable APERTURA_ISA", expected=expected, remedy="Unset it."
+    )
+
+
+def call(function: str, job: ctypes.Structure) -> None:
+    """Run `function` of the library on `job`; the GIL is released meanwhile.
+
+    Raises
+    ------
+    MemoryError
+        If the library found no memory for its scratch.
+    """
+    status = getattr(library(), function)(instruction_set().encode(), ctypes.byref(job))
+    if status == 1:
+        raise MemoryError(f"{function}: no memory for scratch")
+    if status:
+        raise RuntimeError(f"{function}: failed with status {status}")
+
+
+def library_path() -> Path:
+    """Return where the library lies once it is compiled; APERTURA_KERNEL names another, such as one with sanitizers.
+
+    Raises
+    ------
+    CampaignError
+        If APERTURA_KERNEL names no file, or a relative path: every process has a working folder of its own.
+    """
+    named = os.environ.get(NAMED_BY)
+    if not named:
+        return Path(_BUILT)
+    if not (Path(named).is_absolute() and Path(named).is_file()):
+        raise _no_kernel(named, "no such file" if Path(named).is_absolute() else "a relative path")
+    return Path(named)
+
+
+def _no_kernel(named: str, found: str) -> CampaignError:
+    where = f"environment variable {NAMED_BY}"
+    expected = "the whole path of a library built from native/ of this version"
+    return CampaignError(f"{quoted(named)}: {found}", where=where, expected=expected, remedy="Unset it.")
+
+
+def library() -> ctypes.CDLL:
+    """Return the compiled library.
+
+    Raises
+    ------
+    RuntimeError
+        If it was not compiled.
+    CampaignError
+        If the layout of its structs differs from that of this module.
+    """
+    path = library_path()
+    if not path.is_file():
+        raise RuntimeError(
+            "the compiled kernel is missing: install a C++ compiler and reinstall apertura, or use numba"
+        )
+    return _load(path)
+
+
+def kernel_constants() -> dict[str, float]:
+    """Return the constants that the library was compiled with, by name (native/bounds.hpp).
+
+    Examples
+    --------
+    >>> not available() or kernel_constants()["window"] == 16
+    True
+    """
+    return {name: float(value) for name, value in _lines(library().apertura_constants)}
+
+
+@lru_cache
+def _load(path: Path) -> ctypes.CDLL:
+    try:
+        loaded = ctypes.CDLL(str(path))
+    except OSError as error:
+        raise _no_kernel(str(path), shown(error, 200)) from error
+    if not hasattr(loaded, "apertura_layout"):
+        check_layout({}, path)
+    for function in (loaded.apertura_isa, loaded.apertura_layout, loaded.apertura_constants):
+        function.restype = ctypes.c_char_p
+    loaded.apertura_isa.argtypes = [ctypes.c_char_p]
+    check_layout({name: _place(int(at), int(size)) for name, at, size in _lines(loaded.apertura_layout)}, path)
+    return loaded
+
+
+def _lines(function: Callable[[], bytes]) -> list[list[str]]:
+    return [line.split() for line in function().decode().splitlines()]
+
+
+# ---- Beams and sectors as structures
+
+KeptArrays = list[NDArray[np.generic]]
+"""Arrays that a struct points into, kept alive as long as the struct is used."""
+
+
+def weights_of(beams: Beams | None, pulses: int, padded: int) -> tuple[Any, Any, KeptArrays]:
+    """Return the pointers `beam` and `sector` of a job, and the arrays that they point into.
+
+    Parameters
+    ----------
+    beams
+        Over as many pulses.
+    pulses, padded
+        Of the tables, without and with those that fill a batch.
+
+    Raises
+    ------
+    ValueError
+        If a beam or the sector is of other pulses.
+    """
+    beams = beams or Beams()
+    pointers, kept = (ctypes.POINTER(BeamJob) * 2)(), KeptArrays()
+    for leg, beam in enumerate((beams.transmit, beams.receive)):
+        if beam is not None:
+            job, arrays = _beam(beam, pulses, padded)
+            pointers[leg] = ctypes.pointer(job)
+            kept += arrays
+    if beams.sector is None:
+        return pointers, None, kept
+    sector, arrays = _sector(beams.sector, pulses, padded)
+    return pointers, ctypes.pointer(sector), kept + arrays
+
+
+def _beam(beam: Beam, pulses: int, padded: int) -> tuple[BeamJob, KeptArrays]:
+    if len(beam.axes) != pulses:
+        raise ValueError(f"{len(beam.axes)=}: must be one for each of {pulses} pulses")
+    axes = np.ascontiguousarray(np.moveaxis(_filled(beam.axes, padded), 0, -1), np.float64)
+    angles = (beam.azimuth_rad, beam.elevation_rad)
+    gains = [np.ascontiguousarray(gain, np.float32) for gain in (beam.azimuth_gain, beam.elevation_gain)]
+    job = BeamJob(
+        axes.ctypes.data,
+        (ctypes.c_void_p * 2)(*(gain.ctypes.data for gain in gains)),
+        (ctypes.c_int64 * 2)(*(gain.size for gain in gains)),
+        (ctypes.c_double * 2)(*(angle[0] for angle in angles)),
+        (ctypes.c_double * 2)(*((angle.size - 1) / (angle[-1] - angle[0]) for angle in angles)),
+        float(np.prod([np.abs(gain).max() for gain in gains])),
+    )
+    return job, [axes, *gains]
+
+
+def _filled(axes: NDArray[np.float64], padded: int) -> NDArray[np.float64]:
+    """Return the axes of pulses, the last one repeated."""
+    return np.concatenate([axes, np.repeat(axes[-1:], padded - len(axes), axis=0)]) if padded > len(axes) else axes
+
+
+def _sector(sector: Sector, pulses: int, padded: int) -> tuple[SectorJob, KeptArrays]:
+    if len(sector.tx_axis) != pulses:
+        raise ValueError(f"{len(sector.tx_axis)=}: must be one for each of {pulses} pulses")
+    axes = [np.ascontiguousarray(_filled(axis, padded).T, np.float64) for axis in (sector.tx_axis, sector.rx_axis)]
+    at = [] if sector.ends is None else [*sector.ends[0].legs, sector.ends[1].tx_axis, sector.ends[1].rx_axis]
+    kept: KeptArrays = [*axes, *(np.ascontiguousarray(array, np.float64) for array in at)]
+    pair, pointers = ctypes.c_void_p * 2, [one.ctypes.data for one in kept]
+    fields = pair(*pointers[:2]), sector.centre, sector.inner, sector.outer, pair(*pointers[2:4]), pair(*pointers[4:])
+    return SectorJob(*fields, len(at[0]) if at else 0), kept

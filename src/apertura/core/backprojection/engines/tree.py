@@ -1,0 +1,240 @@
+"""Backprojection by subaperture trees on Cartesian tiles: of lower order of cost for large images.
+
+A tile's tree sums few pulses at few nodes, and merges subapertures on ever more nodes until the pixels themselves are
+the nodes (docs/theory/tree.md). Tiles depend on nothing but their own pixels. Pulses and tiles that a tree cannot sum
+go through the direct kernel.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from itertools import pairwise, product
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from apertura.common.contracts import Window
+from apertura.core.antenna.beam import Beams
+from apertura.core.backprojection.engines import native
+from apertura.core.backprojection.engines.engine import EngineOptions, checked_pixels
+from apertura.core.backprojection.engines.native_binding import TREE_GROUP, TREE_SIDE, available, instruction_set
+from apertura.core.backprojection.engines.native_tables import Tables
+from apertura.core.backprojection.engines.tree_inputs import (
+    LEAST_PIXELS,
+    LEAST_QUARTER_PX,
+    Chunk,
+    JobTile,
+    Task,
+    Trees,
+    prepare,
+)
+from apertura.core.backprojection.engines.tree_nodes import DIRECTLY, surfaces_of, windows
+from apertura.core.backprojection.engines.tree_prediction import candidates
+from apertura.core.backprojection.engines.tree_view import (
+    MOST_SHEETS,
+    Sheets,
+    SurfaceResidual,
+    sheets_for,
+    subaperture_sizes,
+)
+
+__all__ = ["READS", "VARIANTS", "available", "candidates", "form", "instruction_set", "pieces", "prepare"]
+
+READS: Literal["profiles"] = "profiles"
+
+VARIANTS = ("by tree", "directly", "without an echo")
+
+
+class Options(EngineOptions):
+    """Options of the engine."""
+
+    oversampling: Annotated[int, Field(ge=8, le=64)] | None = Field(
+        None, description="table cells per resolution cell c/B of total path"
+    )
+    nodes_db: Literal[-50, -56, -62, -68, -74, -80, -86, -92, -98] | None = Field(
+        None, description="what one interpolation between nodes may err by, dB"
+    )
+    presum_db: Annotated[int, Field(ge=-100, le=-40)] | None = Field(
+        None, description="what pulses may err by for which fewer stand, of what their track leaves a smooth curve, dB"
+    )
+    side_px: Annotated[int, Field(ge=16, le=TREE_SIDE)] | None = Field(
+        None, description="largest side of a tree's tile, pixels"
+    )
+    chunk: Literal[256, 512, 1024, 2048] | None = Field(None, description="pulses of the largest subaperture")
+    sheets: Annotated[int, Field(ge=0, le=MOST_SHEETS)] | None = Field(
+        None, description="between which a tile of rough ground is read, at most"
+    )
+
+
+def form(
+    trees: Trees,
+    pixels: NDArray[np.float64],
+    *,
+    beams: Beams | None = None,
+    nodes_db: int = -74,
+    presum_db: int = -74,
+    side_px: int = 128,
+    chunk: int = 1024,
+    sheets: int = 0,
+    counts: NDArray[np.int64] | None = None,
+) -> NDArray[np.complex64]:
+    """Sum the pulses over a block of pixels.
+
+    Parameters
+    ----------
+    trees
+        From `prepare`.
+    pixels
+        (y, x, 3) float64, metres, in the frame of the phase centres: any surface.
+    beams
+        Weight of each pulse at each pixel; none by default.
+    nodes_db
+        Tolerated error of one interpolation between nodes, dB.
+    presum_db
+        Tolerated error of pulses replaced by fewer, by deviations of their track from a smooth curve, dB RMS.
+    side_px
+        Largest side of the tiles that the block is cut into; the bits of each do not depend on the others.
+    chunk
+        Pulses of the largest subaperture.
+    sheets
+        Most sheets between which a tile of rough ground is interpolated; where more are needed it is summed directly.
+    counts
+        (3,) int64 to which the number of pixels × pulses is added that were summed by tree, directly, or had no echo.
+
+    Returns
+    -------
+    ndarray
+        (y, x) complex64. Pulses whose profile does not reach a pixel add zero; a pixel without a finite position is
+        NaN.
+
+    Raises
+    ------
+    ValueError
+        If `pixels` has another shape, beams are of other pulses, or an option is none of `Options`.
+    MemoryError
+        If the library found no memory.
+
+    Notes
+    -----
+    Source: docs/theory/tree.md.
+    """
+    requested = {"nodes_db": nodes_db, "presum_db": presum_db, "side_px": side_px, "chunk": chunk, "sheets": sheets}
+    Options.model_validate(requested)
+    if beams is not None and any(b is not None and len(b.axes) != len(trees) for b in (beams.transmit, beams.receive)):
+        raise ValueError(f"beams must be of {len(trees)} pulses")
+    pixels = checked_pixels(pixels)
+    image = np.zeros(pixels.shape[:2], np.complex64)
+    block = partial(_Block, trees, nodes_db, presum_db, chunk)
+    flat = block(pixels, image)
+    tiles = flat.tiles(list(windows(pixels.shape[:2], side_px)))
+    raised = {tile: sheeting for tile in tiles if not tile.by_tree and (sheeting := flat.sheets(tile, sheets))}
+    flat.sum(beams, [tile for tile in tiles if tile not in raised])
+    total = flat.counts
+    for tile, sheeting in raised.items():
+        places = sheeting.pixels
+        on_sheets = block(places, np.zeros(places.shape[:2], np.complex64))
+        on_sheets.sum(beams, on_sheets.tiles(sheeting.windows))
+        image[tile.window] = sheeting.read(on_sheets.image, trees.middle, trees.wavenumber_rad_m)
+        variant = on_sheets.counts // len(sheeting.heights_m)
+        total += variant
+        total[0] += image[tile.window].size * len(trees) - variant.sum()
+    if counts is not None:
+        counts += total
+    return image
+
+
+def pieces(shape: tuple[int, ...], form_options: Mapping[str, Any]) -> Iterator[Window]:
+    """Yield the windows of a block of pixels that get the same bits when they are formed alone: its tiles."""
+    return windows(shape, form_options["side_px"])
+
+
+@dataclass(eq=False)
+class _Block:
+    """A block of pixels and all pulses: its image, tolerated errors, and pixels × pulses of each variant."""
+
+    trees: Trees
+    nodes_db: int
+    presum_db: int
+    chunk: int
+    pixels: NDArray[np.float64]
+    image: NDArray[np.complex64]
+    counts: NDArray[np.int64] = field(default_factory=lambda: np.zeros(len(VARIANTS), np.int64))
+    _quarters: dict[JobTile, list[JobTile]] = field(default_factory=dict)
+
+    def tiles(self, parts: list[Window]) -> list[JobTile]:
+        """Return tiles of the block; small and rough ones are not summed by tree."""
+        limit = 2 * 10 ** (self.nodes_db / 10)
+        return [
+            JobTile(
+                part, surface, self.pixels[part].size >= 3 * LEAST_PIXELS and self.trees.roughness(surface) <= limit
+            )
+            for part, surface in zip(parts, surfaces_of(self.pixels, parts), strict=True)
+        ]
+
+    def sheets(self, tile: JobTile, most: int) -> Sheets | None:
+        """Return the sheets between which a rough tile is interpolated; None where too many are needed."""
+        trees, limit = self.trees, 10 ** (self.nodes_db / 20)
+        pixels = self.pixels[tile.window]
+        if not most or not np.isfinite(tile.surface.rough_m) or pixels.size < 3 * LEAST_PIXELS:
+            return None
+        relief = SurfaceResidual.of(tile.surface, pixels)
+        if trees.wavenumber_rad_m * relief.aside_m > limit:
+            return None
+        wave = {"wavenumber_rad_m": trees.wavenumber_rad_m, "band_rad_m": trees.band_rad_m}
+        band = relief.band_rad(trees.profiles.aperture, **wave)
+        return Sheets.of(relief, band, self.nodes_db) if sheets_for(band, self.nodes_db) <= most else None
+
+    def sum(self, beams: Beams | None, tiles: list[JobTile]) -> None:
+        """Add all pulses to tiles."""
+        for pulses in self.trees.chunks(self.chunk):
+            some = self.trees[pulses]
+            every = np.ones(-(-len(some) // TREE_GROUP), bool)
+            if tiles:
+                self.add(some, beams and beams[pulses], [(tile, every) for tile in tiles])
+
+    def add(self, trees: Trees, beams: Beams | None, tasks: list[Task]) -> None:
+        """Add groups of some pulses to tiles; those that a tree cannot sum go to quarters of the tile, or directly."""
+        chunk = Chunk(
+            trees, beams, self.nodes_db, self.presum_db, subaperture_sizes(self.chunk), self.pixels, self.image
+        )
+        pulses_of = np.minimum(TREE_GROUP, len(trees) - TREE_GROUP * np.arange(-(-len(trees) // TREE_GROUP)))
+        left: list[Task] = []
+        for (tile, selected), variant in zip(tasks, chunk.add(tasks), strict=True):
+            direct = selected & (variant == DIRECTLY)
+            smaller = self._quartered(tile) if direct.any() else []
+            left += [(quarter, direct) for quarter in smaller]
+            done = selected & ~direct if smaller else selected
+            self.counts += self.image[tile.window].size * np.bincount(variant[done], pulses_of[done], 3).astype(
+                np.int64
+            )
+            for run in () if smaller else _runs(direct, len(trees)):
+                self._add_directly(trees.direct_tables(self.nodes_db)[run], beams and beams[run], tile.window)
+        if left:
+            self.add(trees, beams, left)
+
+    def _quartered(self, tile: JobTile) -> list[JobTile]:
+        """Return the quarters of a tile, over which geometry is smoother; none of a tile too small."""
+        rows, columns = tile.window
+        if min(rows.stop - rows.start, columns.stop - columns.start) < 2 * LEAST_QUARTER_PX:
+            return []
+        if tile not in self._quarters:
+            tops, lefts = (
+                (slice(part.start, middle), slice(middle, part.stop))
+                for part, middle in ((part, (part.start + part.stop) // 2) for part in tile.window)
+            )
+            self._quarters[tile] = self.tiles(list(product(tops, lefts)))
+        return self._quarters[tile]
+
+    def _add_directly(self, tables: Tables, beams: Beams | None, window: Window) -> None:
+        tolerance_rad = self.trees.direct_setting(self.nodes_db).tolerance_rad
+        self.image[window] += native.form(tables, self.pixels[window], beams=beams, tolerance_rad=tolerance_rad)
+
+
+def _runs(groups: NDArray[np.bool_], pulses: int) -> Iterator[slice]:
+    """Yield runs of pulses in these groups."""
+    edges = [0, *(np.flatnonzero(np.diff(groups)) + 1).tolist(), len(groups)]
+    for first, last in pairwise(edges):
+        if groups[first]:
+            yield slice(first * TREE_GROUP, min(pulses, last * TREE_GROUP))

@@ -1,0 +1,550 @@
+"""Inputs of trees: filters and tracks of all tiles, tables of the direct kernel, and jobs of chunks of pulses."""
+
+import ctypes
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from itertools import pairwise
+from threading import Lock
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apertura.common.contracts import Window
+from apertura.core.antenna.beam import Beams
+from apertura.core.backprojection.engines import native
+from apertura.core.backprojection.engines.native_binding import (
+    TREE_DELAYS,
+    TREE_FEWER,
+    TREE_GROUP,
+    TREE_NODES,
+    TREE_SLOTS,
+    TREE_WEIGHTS,
+    TreeJob,
+    TreeTile,
+    call,
+    weights_of,
+)
+from apertura.core.backprojection.engines.native_tables import BAND, TableDesign, Tables, design_table
+from apertura.core.backprojection.engines.tree_nodes import (
+    BY_TREE,
+    DIRECTLY,
+    WITHOUT_ECHO,
+    Surface,
+    matrices,
+    nodes,
+    pixel_places,
+    supports,
+)
+from apertura.core.backprojection.engines.tree_view import (
+    LEAF,
+    curve,
+    leaf_roughness,
+    leaves_of,
+    parabola_deviation,
+    tracks,
+)
+from apertura.core.backprojection.inputs import Profiles
+from apertura.core.geometry.aperture import Aperture
+
+# ---- The direct kernel beside trees
+
+
+class DirectSetting(NamedTuple):
+    """Setting of the direct kernel beside trees."""
+
+    oversampling: int
+    tolerance_rad: float
+
+
+_TOLERANCES_RAD = {-74: 1.5e-3, -80: 7e-4, -86: 3e-4, -92: 1.5e-4, -98: 1e-4}
+
+
+@lru_cache
+def direct_setting(nodes_db: int, profile_oversampling: float, carrier_rad_per_sample: float) -> DirectSetting:
+    """Return the setting of the direct kernel beside trees of such nodes: its error is below theirs.
+
+    Examples
+    --------
+    >>> [direct_setting(nodes_db, 2.0, 1.5).oversampling for nodes_db in (-50, -74, -98)]
+    [4, 5, 12]
+    """
+    least: tuple[float, int] = (np.inf, 0)
+    for oversampling in range(4, 33):  # more cells need not err less: the polynomial of the phase changes
+        design = design_table(profile_oversampling, carrier_rad_per_sample, oversampling=float(oversampling), degree=2)
+        least = min(least, (design.error_db(np.ones(64)), oversampling))
+        if least[0] <= nodes_db + 5:
+            break
+    return DirectSetting(least[1], _TOLERANCES_RAD.get(nodes_db, 1.5e-3))
+
+
+class DirectTables:
+    """Tables of the direct kernel, made when a tile first asks for them and shared by all."""
+
+    def __init__(self, profiles: Profiles):
+        self._profiles, self._lock, self._tables = profiles, Lock(), dict[int, Tables]()
+
+    def __getitem__(self, oversampling: int) -> Tables:
+        with self._lock:
+            if oversampling not in self._tables:
+                self._tables[oversampling] = native.prepare(self._profiles, oversampling=oversampling, degree=2)
+            return self._tables[oversampling]
+
+
+# ---- Inputs that all tiles share
+
+CELLS_AT_ONCE = 4
+"""Cells per sample are a multiple of it: the lanes of an AVX-512 vector."""
+
+LEAST_PIXELS = 32**2
+"""Pixels of a tile at least: the overhead of a tree is larger than the direct sum of fewer."""
+
+LEAST_QUARTER_PX = 64
+"""Pixels, side of the quarter of a tile at least: smaller ones are cheaper by the direct sum."""
+
+_SAMPLED = 64  # pulses at which roughness is evaluated
+_DELAY_DEGREE = 9
+
+
+@dataclass(frozen=True, eq=False)
+class Trees:
+    """Pulses as inputs of trees.
+
+    Attributes
+    ----------
+    profiles
+        The pulses, contiguous.
+    design
+        Filters of the cells.
+    deviation_m
+        (leaf,) float32, deviation of the pulses of a leaf from the parabola through its first, middle and last one,
+        metres.
+    rough_m
+        (leaf, 4) float32, deviation from curves of growing degree, metres RMS.
+    tracks_m
+        (leaf, antenna, term, 3) float64, phase centres over each leaf as polynomials.
+    first
+        Number of the first pulse among those prepared.
+    tables
+        Of the direct kernel, for all pulses prepared.
+    """
+
+    profiles: Profiles
+    design: TableDesign
+    deviation_m: NDArray[np.float32]
+    rough_m: NDArray[np.float32]
+    tracks_m: NDArray[np.float64]
+    first: int
+    tables: DirectTables
+
+    def __len__(self) -> int:
+        """Return the number of pulses."""
+        return len(self.profiles)
+
+    def __getitem__(self, pulses: slice) -> "Trees":
+        """Return the trees of pulses from a multiple of a leaf on.
+
+        Raises
+        ------
+        ValueError
+            If they begin elsewhere, or are not in a row.
+        """
+        first, last, step = pulses.indices(len(self))
+        if step != 1 or first % LEAF:
+            raise ValueError(f"{pulses}: pulses of a tree are taken from a multiple of {LEAF} on, and in a row")
+        leaves = slice(first // LEAF, -(-last // LEAF))
+        return replace(
+            self,
+            profiles=self.profiles[first:last],
+            deviation_m=self.deviation_m[leaves],
+            rough_m=self.rough_m[leaves],
+            tracks_m=self.tracks_m[leaves],
+            first=self.first + first,
+        )
+
+    def chunks(self, size: int) -> Iterator[slice]:
+        """Yield slices of `size` pulses; they end at the same pulses for every tile."""
+        first = 0
+        while first < len(self):
+            last = min(len(self), first + size - (self.first + first) % size)
+            yield slice(first, last)
+            first = last
+
+    def direct_tables(self, nodes_db: int) -> Tables:
+        """Return the direct kernel's tables for these pulses."""
+        return self.tables[self.direct_setting(nodes_db).oversampling][self.first : self.first + len(self)]
+
+    def direct_setting(self, nodes_db: int) -> DirectSetting:
+        """Return the direct kernel's setting beside trees of such nodes."""
+        return direct_setting(nodes_db, self.profiles.oversampling, self.wavenumber_rad_m * self.profiles.step_m)
+
+    def roughness(self, surface: Surface) -> float:
+        """Return the error by pixels off the surface of a tile, as the function of that name."""
+        aperture = self.profiles.aperture
+        some = aperture[aperture.sample(_SAMPLED)]
+        return roughness(some, surface, wavenumber_rad_m=self.wavenumber_rad_m, band_rad_m=self.band_rad_m)
+
+    @property
+    def middle(self) -> Aperture:
+        """The middle pulse."""
+        return self.profiles.aperture[len(self) // 2 : len(self) // 2 + 1]
+
+    @property
+    def wavenumber_rad_m(self) -> float:
+        """2πf_mid/v."""
+        return self.profiles.wavenumber_rad_m
+
+    @property
+    def band_rad_m(self) -> float:
+        """Half the band as a wavenumber, πB/c."""
+        return float(np.pi / (self.profiles.step_m * self.profiles.oversampling))
+
+
+def roughness(aperture: Aperture, surface: Surface, *, wavenumber_rad_m: float, band_rad_m: float) -> float:
+    """Return the relative mean squared error by pixels off the surface of their tile.
+
+    Parameters
+    ----------
+    aperture
+        Some of the pulses, evenly spread.
+    surface
+        Of the tile.
+    wavenumber_rad_m, band_rad_m
+        2πf_mid/c and πB/c.
+
+    Notes
+    -----
+    Source: docs/theory/tree.md, eq. 9.
+    """
+    if not np.isfinite(surface.rough_m):
+        return np.inf
+    rate = aperture.path_gradient(surface.centre_m[None])[:, 0] @ surface.up
+    against = rate[len(rate) // 2]  # the middle pulse of the flight, not of each chunk
+    of_phase, of_delay = wavenumber_rad_m**2 * ((rate - against) ** 2).mean(), band_rad_m**2 / 3 * (rate**2).mean()
+    return float(surface.rough_m**2 * (of_phase + of_delay))
+
+
+def cells_per_sample(profile_oversampling: float, oversampling: float) -> int:
+    """Return how many cells a sample is expanded to, for at least so many per resolution cell.
+
+    Examples
+    --------
+    >>> cells_per_sample(2.0, 24), cells_per_sample(2.5, 24)
+    (12, 12)
+    """
+    return CELLS_AT_ONCE * int(np.ceil(oversampling / profile_oversampling / CELLS_AT_ONCE - 1e-9))
+
+
+def cells(profile_oversampling: float, carrier_rad_per_sample: float, oversampling: float, taps: int) -> TableDesign:
+    """Return the filters that expand profiles to cells: straight lines in each, of so many taps."""
+    count = cells_per_sample(profile_oversampling, oversampling)
+    return design_table(
+        profile_oversampling, carrier_rad_per_sample, oversampling=count * profile_oversampling, degree=1, taps=taps
+    )
+
+
+@lru_cache
+def delay_filter(profile_oversampling: float) -> NDArray[np.float32]:
+    """Return the filter that gives a profile between two samples, as polynomials of the place between them.
+
+    Returns
+    -------
+    ndarray
+        (degree + 1, tap) float32, constant term first; of 0…1 from the sample before to the one after. The first tap
+        is that of the sample `tap / 2 - 1` before.
+
+    Notes
+    -----
+    Source: docs/theory/tree.md, eq. 7: least squares over the band.
+
+    Examples
+    --------
+    >>> weights = 0.3 ** np.arange(10) @ delay_filter(2.0)
+    >>> tone = np.exp(0.5j * np.pi * 0.9 * (np.arange(12) - 5))
+    >>> bool(abs(weights @ tone - np.exp(0.5j * np.pi * 0.9 * 0.3)) < 1e-4)
+    True
+    """
+    omega = np.pi / profile_oversampling * BAND
+    basis = np.exp(1j * omega[:, None] * (np.arange(TREE_DELAYS) - TREE_DELAYS // 2 + 1))
+    u = 0.5 - 0.5 * np.cos(np.pi * (np.arange(24) + 0.5) / 24)
+    selected = np.exp(1j * omega[:, None] * u)
+    left, right = (np.concatenate([part.real, part.imag]) for part in (basis, selected))
+    taps = np.linalg.lstsq(left, right, rcond=1e-9)[0].T
+    return np.ascontiguousarray(np.linalg.lstsq(np.vander(u, _DELAY_DEGREE + 1, increasing=True), taps)[0], np.float32)
+
+
+def prepare(profiles: Profiles, *, oversampling: int = 24, taps: int = 8) -> Trees:
+    """Return the inputs that trees of all tiles share; pulses are expanded to cells later, tile by tile.
+
+    Parameters
+    ----------
+    profiles
+        Band-limited profiles.
+    oversampling
+        Table cells per Nyquist cell c/B of total path, at least.
+    taps
+        Of the filters that make cells, 8 or 16.
+
+    Raises
+    ------
+    ValueError
+        If the profiles are oversampled less than 1.5 times or have no pulse, or a position or start is not finite.
+
+    Notes
+    -----
+    Source: docs/theory/tree.md, "Leaves"; the cells are those of docs/theory/engine.md, "Cells".
+    """
+    samples, start_m, places = profiles.for_tables()
+    contiguous = replace(profiles, samples=samples, start_m=start_m)
+    legs = [leaves_of(leg) for leg in places]
+    deviation, rough = parabola_deviation(legs[0]) + parabola_deviation(legs[1]), leaf_roughness(*legs)
+    turn = profiles.wavenumber_rad_m * profiles.step_m
+    design = cells(profiles.oversampling, turn, float(oversampling), taps)
+    polynomials = np.stack([tracks(leg) for leg in legs], axis=1)
+    return Trees(
+        contiguous,
+        design,
+        deviation.astype(np.float32),
+        rough.astype(np.float32),
+        polynomials,
+        0,
+        DirectTables(contiguous),
+    )
+
+
+# ---- Weights of antennas and of the sector over a tile
+
+
+class Weighed(NamedTuple):
+    """What weights make of groups of 64 pulses over a tile.
+
+    Attributes
+    ----------
+    variant
+        (group,) uint8.
+    edge
+        (group,) bool: the sector ends within the tile.
+    slope
+        (group, 3) float32: change of the depth in its edge along ξ, along η and over the pulses, per half of them.
+    each
+        (group,) bool: weights jump from pulse to pulse, so that no fewer pulses can replace them.
+    """
+
+    variant: NDArray[np.uint8]
+    edge: NDArray[np.bool_]
+    slope: NDArray[np.float32]
+    each: NDArray[np.bool_]
+
+
+def weighed(beams: Beams, aperture: Aperture, surface: Surface, nodes_db: float) -> Weighed:
+    """Return what weights make of the groups of an aperture over a tile with this surface.
+
+    Notes
+    -----
+    Source: docs/theory/tree.md, "Weights".
+    """
+    pulses, groups = len(aperture), -(-len(aperture) // TREE_GROUP)
+    tx, rx = (np.ascontiguousarray(leg, np.float64) for leg in aperture.legs)
+    stray = np.ascontiguousarray(sum(parabola_deviation(leaves_of(leg)) for leg in aperture.legs), np.float32)
+    variant, each, edge = np.zeros((3, groups), np.uint8)
+    slope, weight = np.zeros((groups, 3), np.float32), np.zeros((pulses, TREE_WEIGHTS), np.float32)
+    coefficients = np.ascontiguousarray(surface.coefficients)
+    tile = TreeTile(
+        *(coefficients.ctypes.data, None, None, weight.ctypes.data, variant.ctypes.data, None, each.ctypes.data),
+        edge.ctypes.data,
+        slope.ctypes.data,
+        degree=len(coefficients) - 1,
+    )
+    tile.centre[:] = surface.centre_m.tolist()
+    beam, sector, _kept = weights_of(beams, pulses, pulses)
+    call(
+        "apertura_weigh_tree",
+        TreeJob(
+            transmitter=tx.ctypes.data,
+            receiver=rx.ctypes.data,
+            stray=stray.ctypes.data,
+            tiles=ctypes.addressof(tile),
+            pulses=pulses,
+            count=1,
+            node_error=10 ** (nodes_db / 20),
+            beam=beam,
+            sector=sector,
+        ),
+    )
+    return Weighed(variant, edge.astype(bool), slope, each.astype(bool))
+
+
+# ---- Trees of one chunk of pulses over the tiles of a block
+
+
+@dataclass(frozen=True, eq=False)
+class JobTile:
+    """A part of a block: its window, the surface of its pixels, and whether that is smooth enough for a tree."""
+
+    window: Window
+    surface: Surface
+    by_tree: bool
+
+
+Task = tuple[JobTile, NDArray[np.bool_]]
+"""A tile, and the groups of 64 pulses to add to it, (group,) bool."""
+
+
+@dataclass(eq=False)
+class Chunk:
+    """Some pulses over a block of pixels.
+
+    Attributes
+    ----------
+    trees, beams
+        Of the pulses.
+    nodes_db, presum_db
+        Tolerated error of one interpolation, dB, and of pulses of a leaf off a smooth track.
+    sizes
+        Pulses of the subapertures of each level.
+    pixels, image
+        (y, x, 3) float64 and (y, x) complex64, to which the pulses are added.
+    """
+
+    trees: Trees
+    beams: Beams | None
+    nodes_db: int
+    presum_db: int
+    sizes: tuple[int, ...]
+    pixels: NDArray[np.float64]
+    image: NDArray[np.complex64]
+    _kept: list[NDArray[np.generic]] = field(default_factory=list)  # arrays that the structs point into
+    _counts: list[NDArray[np.uint8]] = field(default_factory=list)  # numbers of nodes of each tile
+    _fewer: list[NDArray[np.uint8]] = field(default_factory=list)  # numbers of pulses that replace those of a leaf
+
+    def add(self, tasks: list[Task]) -> list[NDArray[np.uint8]]:
+        """Add by tree the groups of 64 pulses given for each tile; return the variant of each group."""
+        variants = [
+            np.where(selected, BY_TREE if tile.by_tree else DIRECTLY, WITHOUT_ECHO).astype(np.uint8)
+            for tile, selected in tasks
+        ]
+        array = (TreeTile * len(tasks))(
+            *(self._struct(tile, variant) for (tile, _), variant in zip(tasks, variants, strict=True))
+        )
+        job = self._job(array)
+        beam, sector, kept = weights_of(self.beams, len(self.trees), len(self.trees))
+        job.beam, job.sector = beam, sector
+        self._kept += kept
+        call("apertura_plan_tree", job)
+        for struct, variant in zip(array, variants, strict=True):
+            if struct.top < 0:
+                variant[variant == BY_TREE] = DIRECTLY
+        self._fill(job, array)
+        call("apertura_form_tree", job)
+        return variants
+
+    def _pointer_to(self, array: NDArray[np.generic]) -> int:
+        self._kept.append(array)
+        return array.ctypes.data
+
+    def _struct(self, tile: JobTile, variant: NDArray[np.uint8]) -> TreeTile:
+        rows, columns = tile.window
+        surface, at = tile.surface, rows.start * self.image.shape[1] + columns.start
+        counts = np.zeros(sum(2 * -(-len(self.trees) // size) for size in self.sizes), np.uint8)
+        self._counts.append(counts)
+        fewer, edge = np.zeros((2, len(variant)), np.uint8)
+        self._fewer.append(fewer)
+        antennas = self.beams and self.beams.antennas
+        struct = TreeTile(
+            surface=self._pointer_to(np.ascontiguousarray(surface.coefficients)),
+            pixels=self.pixels.ctypes.data + 24 * at,
+            image=self.image.ctypes.data + 8 * at,
+            weight=self._pointer_to(np.zeros((len(self.trees), TREE_WEIGHTS), np.float32)) if antennas else None,
+            way=self._pointer_to(variant),
+            nodes=self._pointer_to(counts),
+            fewer=self._pointer_to(fewer),
+            edge=self._pointer_to(edge),
+            slope=self._pointer_to(np.zeros((len(variant), 3), np.float32)),
+            degree=len(surface.coefficients) - 1,
+            rows=rows.stop - rows.start,
+            columns=columns.stop - columns.start,
+            top=-1,
+        )
+        struct.centre[:] = surface.centre_m.tolist()
+        return struct
+
+    def _job(self, tiles: "ctypes.Array[TreeTile]") -> TreeJob:
+        profiles, design = self.trees.profiles, self.trees.design
+        tx, rx = (np.ascontiguousarray(leg, np.float64) for leg in profiles.aperture.legs)
+        delay = delay_filter(profiles.oversampling)
+        taps = np.repeat(design.taps.transpose(2, 0, 1)[..., None], 2, axis=-1)
+        job = TreeJob(
+            samples=self._pointer_to(np.ascontiguousarray(profiles.samples)),
+            start=self._pointer_to(np.ascontiguousarray(profiles.start_m)),
+            transmitter=self._pointer_to(tx),
+            receiver=self._pointer_to(rx),
+            stray=self._pointer_to(self.trees.deviation_m),
+            rough=self._pointer_to(self.trees.rough_m),
+            track=self._pointer_to(self.trees.tracks_m),
+            delay=self._pointer_to(delay),
+            taps=self._pointer_to(np.ascontiguousarray(taps, np.float32)),
+            supports=self._pointer_to(supports(self.nodes_db)),
+            tiles=ctypes.addressof(tiles),
+            pulses=len(profiles),
+            length=profiles.samples.shape[1],
+            up=design.up,
+            lead=int(design.lead[0]),
+            stride=self.image.shape[1],
+            count=len(tiles),
+            levels=len(self.sizes),
+            mono=int(tx is rx or np.array_equal(tx, rx)),
+            phase_polynomial=design.phase_polynomial,
+            taps_count=design.taps.shape[2],
+            delay_terms=len(delay),
+            step=profiles.step_m,
+            wavenumber=self.trees.wavenumber_rad_m,
+            band=self.trees.band_rad_m,
+            smooth=10 ** (self.presum_db / 20),
+            node_error=10 ** (self.nodes_db / 20),
+        )
+        job.sizes[: len(self.sizes)] = self.sizes
+        job.phase_coefficients[:] = design.phase_coefficients.tolist()
+        return job
+
+    def _fill(self, job: TreeJob, tiles: "ctypes.Array[TreeTile]") -> None:
+        """Fill in the nodes and matrices that the plan of the job needs."""
+        places = np.zeros(TREE_SLOTS, np.uintp)
+        spread, mix = (np.zeros((TREE_NODES + 1, TREE_SLOTS), np.uintp) for _ in range(2))
+        slots: dict[int, int] = {}  # pixels along a side → slot
+        steps: set[tuple[int, int]] = set()  # numbers of nodes, of slots that they are interpolated to
+        for tile, counts in zip(tiles, self._counts, strict=True):
+            sides = tile.columns, tile.rows
+            tile.column_slot, tile.row_slot = (slots.setdefault(n, TREE_NODES + 1 + len(slots)) for n in sides)
+            levels = self._levels(counts)[: tile.top + 1]
+            for (below, above), ratio in zip(pairwise(levels), self._ratios, strict=False):
+                parents = above[np.arange(len(below)) // ratio]
+                steps.update(zip(below.ravel().tolist(), parents.ravel().tolist(), strict=True))
+            for top in levels[-1:]:
+                for axis, slot in enumerate((tile.column_slot, tile.row_slot)):
+                    steps.update((count, slot) for count in set(top[:, axis].tolist()))
+        sizes = {slot: size for size, slot in slots.items()}
+        for child, slot in steps:
+            one, other = matrices(child, sizes.get(slot, slot), self.nodes_db, pixels=slot in sizes)
+            spread[child, slot], mix[child, slot] = self._pointer_to(one), self._pointer_to(other)
+        for slot in {slot for step in steps for slot in step}:
+            at = pixel_places(sizes[slot]) if slot in sizes else nodes(slot, self.nodes_db)
+            places[slot] = self._pointer_to(np.ascontiguousarray(at))
+        presum, curves = (np.zeros(TREE_FEWER + 1, np.uintp) for _ in range(2))
+        for fewer in {int(n) for counts in self._fewer for n in counts if n > 1}:
+            presum[fewer] = self._pointer_to(
+                np.ascontiguousarray(matrices(fewer, LEAF, self.nodes_db, pixels=True)[1].T)
+            )
+            places[fewer] = self._pointer_to(np.ascontiguousarray(nodes(fewer, self.nodes_db)))
+            curves[fewer] = self._pointer_to(curve(fewer, self.nodes_db))
+        job.places, job.spread, job.mix = map(self._pointer_to, (places, spread, mix))
+        job.presum, job.curve = map(self._pointer_to, (presum, curves))
+
+    @property
+    def _ratios(self) -> list[int]:
+        return [above // below for below, above in pairwise(self.sizes)]
+
+    def _levels(self, counts: NDArray[np.uint8]) -> list[NDArray[np.uint8]]:
+        """Return the numbers of nodes of each level, (subaperture, 2)."""
+        ends = np.cumsum([-(-len(self.trees) // size) for size in self.sizes])
+        return np.split(counts.reshape(-1, 2), ends[:-1])

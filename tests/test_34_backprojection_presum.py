@@ -1,0 +1,61 @@
+"""Presummed pulses: only where the aperture is oversampled, and with the error that was predicted."""
+
+import numpy as np
+import pytest
+from campaigns import draw
+from scenes import compiled, monostatic, plan, straight_track
+
+from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
+from apertura.common.errors import CampaignError
+from apertura.core.backprojection.engines import native
+from apertura.core.backprojection.presum import design, presum_error_db, presummed
+from apertura.core.quality.measures import numerical_error
+
+
+@pytest.mark.quick("0.1-False")
+@pytest.mark.parametrize(("step_m", "summed"), [(0.002, True), (0.1, False)])
+def test_pulses_are_summed_only_where_the_aperture_is_oversampled(step_m, summed):
+    tx = straight_track(2000, length_m=2000 * step_m)
+    job = {"aperture": monostatic(tx), "shape": (2000, 2000), "spacing_m": 0.005}
+    planned = plan(overrides={"engine": "native"}, **job)
+    assert (planned.presum is not None) == summed
+    if summed:
+        assert planned.presum.factor >= 4
+        assert plan(overrides={"engine": "native", "presum": 1}, **job).presum is None
+        # the tree makes pulses fewer tile by tile: it stands against the direct kernel with a sum of pulses
+        asked = ({"engine": "native"}, {"engine": "tree", "presum": 1})
+        either = [plan(overrides=overrides, **job).predicted_seconds for overrides in asked]
+        assert plan(**job).predicted_seconds <= min(either) / 0.9
+
+
+def test_a_presum_beyond_the_doppler_band_of_a_wide_scene_is_refused():
+    with pytest.raises(CampaignError, match="presum is 32"):
+        plan(overrides={"presum": 32}, aperture=monostatic(straight_track(length_m=30)))
+
+
+def oversampled(noise: float = 1.0):
+    """Noise everywhere, a few targets, an aperture sampled ten times too finely."""
+    for seed in range(100):
+        drawn = draw(np.random.default_rng(seed), pixels=40, pulses=400)
+        _, widest = drawn.job.aperture.phase_rates(drawn.job.points_m, wavelength_m=C / drawn.job.band_hz[1])
+        if 0.01 < widest < 0.03:
+            return drawn, widest
+    raise AssertionError("no campaign is oversampled")
+
+
+@pytest.mark.slow
+@compiled
+def test_a_presummed_image_equals_that_of_all_pulses_where_leaving_pulses_out_does_not():
+    drawn, widest = oversampled()
+    presum = design(400, 4, widest_cycles=widest)
+    points = drawn.job.points_m
+    predicted = presum_error_db(presum, drawn.job.aperture, points, highest_hz=drawn.job.band_hz[1])
+    fewer = presummed(drawn.profiles, presum, points[len(points) // 2])
+    assert len(fewer) < 0.4 * 400
+    images = [
+        native.form(native.prepare(profiles, oversampling=16), drawn.grid.positions(0.0), tolerance_rad=1e-5)
+        for profiles in (drawn.profiles, fewer, drawn.profiles[::4])
+    ]
+    error, left_out = (numerical_error(image.ravel(), images[0].ravel()).rms_db for image in images[1:])
+    assert error <= predicted + 3 <= -65
+    assert left_out > -45
