@@ -1,5 +1,5 @@
-// Sizes and error bounds of the kernel, each once. `core/backprojection/engines/native_prediction.py` predicts with the same
-// numbers; contract.cpp exports them and a test compares the two. docs/theory/engine.md derives them.
+// Sizes and error bounds of the kernel, each once. `core/backprojection/engines/native_prediction.py` predicts with the
+// same numbers; contract.cpp exports them and a test compares the two. docs/theory/engine.md derives them.
 #pragma once
 #include <cstdint>
 

@@ -1,5 +1,5 @@
-// What Python hands over. `core/backprojection/engines/native_binding.py` mirrors these structs field by field and compares the
-// two layouts when it loads the library (contract.cpp lists them).
+// What Python hands over. `core/backprojection/engines/native_binding.py` mirrors these structs field by field and
+// compares the two layouts when it loads the library (contract.cpp lists them).
 #pragma once
 #include <cstdint>
 

@@ -1,6 +1,6 @@
 // What Python hands over for a subaperture tree: one chunk of pulses on some tiles of pixels. Mirrored, field by field,
-// in `core/backprojection/engines/native_binding.py`; contract.cpp lists the layout. docs/theory/tree.md derives what is
-// computed.
+// in `core/backprojection/engines/native_binding.py`; contract.cpp lists the layout. docs/theory/tree.md derives what
+// is computed.
 #pragma once
 #include <cstdint>
 
