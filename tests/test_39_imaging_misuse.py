@@ -112,7 +112,7 @@ REFUSED = {
     ),
     "terrain a path": (lambda: HISTORY, {"terrain": "dem.tif"}, "open_dem"),
     "terrain heights alone": (lambda: HISTORY, {"terrain": np.zeros((160, 160))}, "open_dem|a height"),
-    "terrain NaN": (lambda: HISTORY, {"terrain": np.nan}, "not finite"),
+    "terrain NaN": (lambda: HISTORY, {"terrain": np.nan}, "metres, finite"),
     "terrain above the antennas": (lambda: HISTORY, {"terrain": 15.0}, "in or below the ground"),
     "accuracy positive": (lambda: HISTORY, {"accuracy_db": 60.0}, "accuracy_db"),
     "accuracy a word": (lambda: HISTORY, {"accuracy_db": "high"}, "accuracy_db"),
@@ -254,6 +254,14 @@ def test_errors_of_positions_that_are_stated_are_expected():
         ap.judge(image, position_std_m=0.01, time_s=np.arange(3.0))
 
 
+LINK = ap.Link(30.0, 10.0, 10.0, 40.0, 0.0, 8192.0)
+SECONDS = np.arange(len(HISTORY)) / 10
+
+
+def judged(**stated):
+    return ap.judge(ap.backproject(HISTORY, TARGET_GRID), **stated)
+
+
 @pytest.mark.parametrize(
     ("call", "told"),
     [
@@ -265,6 +273,26 @@ def test_errors_of_positions_that_are_stated_are_expected():
         (lambda: ap.gradient(HISTORY, TARGET_GRID, np.ones(TARGET_GRID.shape)), "expected Profiles"),
         (lambda: ap.gradient(PROFILES, TARGET_GRID, "x"), "of the grid's shape"),
         (lambda: ap.open_campaign(3), "expected the path of a campaign folder"),
+        (lambda: ap.backproject(HISTORY, TARGET_GRID, atmosphere=1.0003), "expected N units"),
+        (lambda: ap.backproject(HISTORY, TARGET_GRID, atmosphere=True), "expected auto, vacuum"),
+        (lambda: ap.backproject(HISTORY, TARGET_GRID, terrain=True), "expected a height in metres"),
+        (lambda: ap.backproject(HISTORY, TARGET_GRID, terrain=ap.FlatGround("a")), "FlatGround: height_m"),
+        (lambda: ap.backproject(HISTORY, TARGET_GRID, judge=1), "True, False or 'auto'"),
+        (lambda: ap.backproject(of(weight=np.ones(200))(), TARGET_GRID, calibration=1.0), "whose sum is 200"),
+        (lambda: ap.Link(30.0, 10.0, 10.0, 40.0, 0.0, -8192.0), "Link: full_scale_counts"),
+        (lambda: ap.Link("30", 10.0, 10.0, 40.0, 0.0, 8192.0), "Link: transmit_power_dbm"),
+        (lambda: ap.Link(1000.0, 10.0, 10.0, 40.0, 0.0, 8192.0), "Link: transmit_power_dbm"),
+        (lambda: LINK.constant(wavelength_m=-0.22, sent_power=1.0), "wavelength_m"),
+        (lambda: ap.Aperture(*2 * [np.full((4, 3), 4e6, np.float32)]), "0.25 m apart"),
+        (lambda: ap.SceneGrid.from_bounds("local", (5.0, 5.0, -5.0, -5.0), spacing_m=0.1), "xmin, ymin, xmax, ymax"),
+        (lambda: ap.SceneGrid.from_bounds("local", (1, 2, 3), spacing_m=0.1), "xmin, ymin, xmax, ymax"),
+        (lambda: ap.SceneGrid.from_bounds("local", (np.nan, 0, 1, 1), spacing_m=0.1), "xmin, ymin, xmax, ymax"),
+        (lambda: ap.SceneGrid.from_bounds("local", (0, 0, 1, 1), spacing_m=0), "SceneGrid.from_bounds: spacing_m"),
+        (lambda: TARGET_GRID[5], "slices of rows and of columns"),
+        (lambda: judged(position_std_m=np.nan, time_s=SECONDS), "position_std_m of nan"),
+        (lambda: judged(position_std_m="1cm", time_s=SECONDS), "position_std_m of '1cm'"),
+        (lambda: judged(position_std_m=0.01, time_s=SECONDS.astype("datetime64[s]")), "seconds of any origin"),
+        (lambda: judged(position_std_m=0.01, time_s=SECONDS[::-1]), "seconds of any origin"),
     ],
 )
 def test_other_doors_refuse_what_is_of_another_kind(call, told):
@@ -275,3 +303,16 @@ def test_other_doors_refuse_what_is_of_another_kind(call, told):
 
 def test_one_height_is_flat_ground_for_every_door():
     assert np.array_equal(ap.range_compress(HISTORY, TARGET_GRID, 0.0).samples, PROFILES.samples)
+
+
+def test_arrays_of_xarray_and_dask_are_arrays():
+    given = replace(HISTORY, transfer=xr.DataArray(ECHO), aperture=ap.Aperture(*map(xr.DataArray, APERTURE.legs)))
+    lazy = replace(HISTORY, transfer=xr.DataArray(ECHO).chunk().data)
+    expected = ap.backproject(HISTORY, TARGET_GRID).values
+    assert all(np.array_equal(ap.backproject(one, TARGET_GRID).values, expected) for one in (given, lazy))
+
+
+def test_what_the_arithmetic_could_not_form_is_not_called_focused():
+    """Profiles that begin a thousandth of the way out: no pixel lies in them."""
+    image = ap.backproject(replace(PROFILES, start_m=PROFILES.start_m / 1e3), TARGET_GRID, judge=True)
+    assert image.attrs["verdict"] == "cannot tell"

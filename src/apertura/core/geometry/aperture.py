@@ -19,6 +19,10 @@ _STRETCHES = 64  # of the aperture, in which phase rates are compared
 _STEPS_IN_A_ROW = 63  # of which the median is taken, so that missed pulses do not count
 
 
+_FLOAT32_M = 2.0**13
+"""Metres beyond which float32 rounds by half a millimetre or more: a hundredth of a cycle at L-band there and back."""
+
+
 def as_array(value: Any, kind: type, where: str) -> Any:
     """Return what a caller gave as an array of real or complex numbers; what is one, or lazily, stays as it is.
 
@@ -42,7 +46,9 @@ def as_array(value: Any, kind: type, where: str) -> Any:
     array([1., 2.])
     """
     try:
-        found = value if hasattr(value, "ndim") else np.asarray(value)
+        # What is lazy by rows (a table of another module) stays lazy; xarray's and dask's arrays become numpy's.
+        lazy = hasattr(value, "ndim") and not hasattr(value, "__dask_graph__")
+        found = value if lazy else np.asarray(value)
         usable = found.dtype.kind in ("c" if kind is np.complex64 else "iuf")
     except (TypeError, ValueError, AttributeError):
         usable = False
@@ -87,6 +93,15 @@ class Aperture:
     def __post_init__(self) -> None:
         for name in ("tx_m", "rx_m"):
             object.__setattr__(self, name, as_array(getattr(self, name), np.float64, f"Aperture: {name}"))
+            found = getattr(self, name)
+            if found.dtype == np.float32 and found.size and np.abs(found).max() > _FLOAT32_M:
+                farthest = np.abs(found).max()
+                raise CampaignError(
+                    f"float32, whose numbers near {farthest:.3g} m are {np.spacing(farthest):.2g} m apart",
+                    where=f"Aperture: {name}",
+                    expected="float64: phase centres count to fractions of a wavelength",
+                    remedy="Keep float64 from the log on.",
+                )
         if self.tx_m.shape != self.rx_m.shape or self.tx_m.ndim != 2 or self.tx_m.shape[1] != 3:
             raise CampaignError(
                 f"tx_m {self.tx_m.shape}, rx_m {self.rx_m.shape}",

@@ -7,6 +7,7 @@ import numpy as np
 
 from apertura.common.arrays import Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.common.errors import CampaignError
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.geodesy import LOCAL, geodetic_from_ecef
 
@@ -21,6 +22,7 @@ _HIGHEST_M = 11_000.0  # where its lapse ends
 _UNKNOWN = 10.0, 20.0, 100 / np.sqrt(12)  # K, hPa, % (any humidity alike): weather against the standard atmosphere
 _MEASURED = 1.0, 1.0, 5.0  # K, hPa, %: a thermometer, a barometer and a hygrometer in the field
 _STATED_N = 1.0  # N units: to which a refractivity is given
+_LEAST_N, _MOST_N = 20.0, 1000.0  # N units: air 20 km up has 20, the wettest and hottest at sea level 500
 _PROFILE = 0.1  # of what refractivity falls by from the ground to the path's mean: scale heights of 6.5 to 8.2 km
 
 
@@ -135,6 +137,13 @@ class Atmosphere:
     @classmethod
     def stated(cls, refractivity_n: float, *, ground_m: float) -> "Atmosphere":
         """Return air of a refractivity that is given for the ground, N units."""
+        if not (refractivity_n == 0 or _LEAST_N <= refractivity_n <= _MOST_N):
+            raise CampaignError(
+                f"a refractivity of {refractivity_n:g}",
+                where="atmosphere",
+                expected=f"N units, (n - 1)·10⁶: {_LEAST_N:g} to {_MOST_N:g}, or 0 for vacuum",
+                remedy="Of an index n give (n - 1)·10⁶.",
+            )
         return cls(refractivity_n, ground_m, f"N = {refractivity_n:g} at the ground, as stated", _STATED_N)
 
     def at_n(self, height_m: Any) -> Floats:

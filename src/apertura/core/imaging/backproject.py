@@ -192,6 +192,9 @@ def backproject(  # noqa: PLR0913 - each choice is a keyword, so that an editor 
             sure = f"up to {error.bound_db:.1f} dB ({CONFIDENCE:.0%} sure)"
             flags["accuracy_missed"] = f"{sure}, {accuracy_db:g} dB asked"
     told = _judged(formation, judge, error_db=attributes.get("numerical_error_db"))
+    missed = "accuracy_missed" in flags and attributes["numerical_error_db"] > _BLIND_DB
+    if told.verdict == "focused" and missed:
+        told = replace(told, verdict="cannot tell", why=f"the image itself errs: {flags['accuracy_missed']}")
     attributes |= {
         "units": "1",
         "wave_speed_m_s": inputs.wave_speed_m_s,
@@ -235,13 +238,19 @@ def _check_kinds(inputs: PhaseHistory | Profiles, beams: Any, certified_pixels: 
             )
 
 
+_SUM = 1e-3
+"""Of 1, by which the sum of weights may be off: a hundredth of a decibel."""
+
+_BLIND_DB = -20.0
+"""dB below the peak of the numerical error above which, where less was asked, points may be its own: not focused."""
+
 _AT_ONCE_S = 10.0
 """Seconds that the plan may take for an image that is formed to be judged, where the caller does not say."""
 
 
 def _judged(formation: Formation, asked: bool | str, *, error_db: float | None) -> Judgement:
     """Return the judgement of an image, or why there is none yet."""
-    if asked not in {True, False, "auto"}:
+    if not (isinstance(asked, bool) or asked == "auto"):
         raise CampaignError(quoted(asked), "backproject: judge", "True, False or 'auto'", "Take one of these.")
     lines = budget_by_hand(formation, error_db=error_db)
     seconds = formation.plan.predicted_seconds
@@ -258,7 +267,8 @@ def _wave_speed(
     middle_m = ground.positions_at(grid, *(np.array([size // 2]) for size in grid.shape))[0]
     frame = LOCAL if grid.crs == LOCAL else "ecef"
     ground_m = float(middle_m[2] if frame == LOCAL else geodetic_from_ecef(middle_m)[2])
-    if not isinstance(atmosphere, Atmosphere | Real) and atmosphere not in ("auto", "vacuum"):
+    number = isinstance(atmosphere, Real) and not isinstance(atmosphere, bool)
+    if not (number or isinstance(atmosphere, Atmosphere)) and atmosphere not in ("auto", "vacuum"):
         raise CampaignError(
             quoted(atmosphere),
             where="backproject: atmosphere",
@@ -287,6 +297,13 @@ def _check_calibration(constant: float | None, inputs: PhaseHistory | Profiles) 
             where="backproject: calibration",
             expected="a positive number: |H|² of 1 m² at R_tx·R_rx = 1 m²",
             remedy="Take that of Link.constant, or measure it on a reflector.",
+        )
+    if isinstance(inputs, PhaseHistory) and abs(float(inputs.weight.sum()) - 1) > _SUM:
+        raise CampaignError(
+            f"weights of the subcarriers whose sum is {float(inputs.weight.sum()):.4g}",
+            where="backproject: calibration",
+            expected="a sum of 1: a profile then peaks at the echo's amplitude, to which the constant refers",
+            remedy="Divide PhaseHistory.weight by its sum.",
         )
     if isinstance(inputs, Profiles):
         raise CampaignError(

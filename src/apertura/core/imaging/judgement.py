@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from numbers import Real
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -124,7 +125,8 @@ def judge(
     ['echo_elsewhere']
     """
     formation = _formation_of(image)
-    if position_std_m is not None and (time_s is None or not position_std_m >= 0):
+    stated = position_std_m is None or (isinstance(position_std_m, Real) and 0 <= position_std_m < np.inf)
+    if not stated or (position_std_m is not None and time_s is None):
         raise CampaignError(
             f"position_std_m of {position_std_m!r}{' without times' if time_s is None else ''}",
             where="judge",
@@ -136,6 +138,11 @@ def judge(
         raise CampaignError(
             f"shape {np.shape(time_s)}", "judge: time_s", f"seconds of each of {pulses} pulses", "Give one per pulse."
         )
+    if time_s is not None:
+        times = np.asarray(time_s)
+        if times.dtype.kind not in "iuf" or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
+            found = f"{times.dtype}, or not all finite and rising"
+            raise CampaignError(found, "judge: time_s", "seconds of any origin", "Subtract the first time, in seconds.")
     error_db = image.attrs.get("numerical_error_db")
     lines = budget_by_hand(formation, error_db=error_db, position_std_m=position_std_m, time_s=time_s)
     return judgement(formation, np.asarray(formation.image), lines)

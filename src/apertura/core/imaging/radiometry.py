@@ -1,8 +1,9 @@
 """Radiometry of an image: from the power of a pixel to the radar cross-section of a point, and to σ⁰ of ground."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, fields
+from numbers import Real
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 from apertura.common.arrays import Floats
 from apertura.common.constants import BOLTZMANN_J_K, REFERENCE_K, SPEED_OF_LIGHT_M_S
 from apertura.common.contracts import Window
+from apertura.common.errors import CampaignError, quoted
 from apertura.core.antenna.beam import Beams
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.scene.grid import SceneGrid
@@ -19,6 +21,13 @@ from apertura.core.scene.terrain import FlatGround, Terrain
 Quantity = Literal["sigma0", "beta0", "gamma0"]
 
 # ---- The radio link of a pair: radar cross-section to numbers recorded
+
+MOST_DBM = 90.0
+"""A megawatt: more is a slip of units."""
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, Real) and not isinstance(value, bool) and bool(np.isfinite(float(value)))
 
 
 @dataclass(frozen=True)
@@ -52,6 +61,16 @@ class Link:
     full_scale_dbm: float
     full_scale_counts: float
 
+    def __post_init__(self) -> None:
+        wrong = [one.name for one in fields(self) if not _is_number(getattr(self, one.name))]
+        wrong += ["full_scale_counts"] * (not wrong and self.full_scale_counts <= 0)
+        wrong += ["transmit_power_dbm"] * (not wrong and self.transmit_power_dbm > MOST_DBM)
+        if wrong:
+            expected = f"numbers in dB, counts above 0, and no more than {MOST_DBM:g} dBm sent"
+            raise CampaignError(
+                quoted(getattr(self, wrong[0])), f"Link: {wrong[0]}", expected, "Correct what is named."
+            )
+
     @property
     def counts_w(self) -> float:
         """|y|² of the numbers recorded per watt at the receiving antenna's port."""
@@ -66,7 +85,17 @@ class Link:
             At the middle of the band.
         sent_power
             Mean |s|² of the transmitted signal in the units that echoes are divided by: Σ|c_n|² of an OFDM symbol.
+
+        Raises
+        ------
+        CampaignError
+            If one of them is no number above 0.
         """
+        for name, value in (("wavelength_m", wavelength_m), ("sent_power", sent_power)):
+            if not (_is_number(value) and value > 0):
+                raise CampaignError(
+                    quoted(value), f"Link.constant: {name}", "a number above 0", "Correct what is named."
+                )
         sent_dbw = self.transmit_power_dbm - 30 + self.transmit_gain_dbi + self.receive_gain_dbi
         return 10 ** (sent_dbw / 10) * wavelength_m**2 / (4 * np.pi) ** 3 * self.counts_w / sent_power
 

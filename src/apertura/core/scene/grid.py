@@ -81,9 +81,24 @@ class SceneGrid:
         Raises
         ------
         CampaignError
-            If the CRS is unknown, is not in metres, or its area of use does not contain the bounds.
+            If the CRS is unknown, is not in metres, or its area of use does not contain the bounds; if these are not
+            [xmin, ymin, xmax, ymax] or the spacing is not positive.
         """
-        xmin, ymin, xmax, ymax = bounds_m
+        try:
+            xmin, ymin, xmax, ymax = map(float, bounds_m)
+            ordered = -np.inf < xmin < xmax < np.inf and -np.inf < ymin < ymax < np.inf
+        except (TypeError, ValueError):
+            ordered = False
+        if not ordered:
+            raise CampaignError(
+                quoted(bounds_m),
+                where="SceneGrid.from_bounds: bounds_m",
+                expected="xmin, ymin, xmax, ymax in metres: outer edges, west of east and south of north",
+                remedy="Give them in that order.",
+            )
+        if isinstance(spacing_m, bool) or not (isinstance(spacing_m, Real) and 0 < spacing_m < np.inf):
+            where = "SceneGrid.from_bounds: spacing_m"
+            raise CampaignError(quoted(spacing_m), where, "metres, finite above 0", "Correct what is named.")
         shape = (max(1, round((ymax - ymin) / spacing_m)), max(1, round((xmax - xmin) / spacing_m)))
         if crs != LOCAL:
             check_crs(crs, bounds_m)
@@ -144,6 +159,10 @@ class SceneGrid:
 
     def __getitem__(self, window: tuple[slice, slice]) -> "SceneGrid":
         """Return the grid of a window of rows and columns, without steps."""
+        if not (isinstance(window, tuple) and len(window) == 2 and all(isinstance(one, slice) for one in window)):
+            raise CampaignError(
+                quoted(window), "SceneGrid[…]", "slices of rows and of columns", "Write grid[0:5, 0:5]."
+            )
         rows, columns = (range(size)[part] for part, size in zip(window, self.shape, strict=True))
         first = (self.first[0] + rows.start, self.first[1] + columns.start)
         return replace(self, first=first, shape=(len(rows), len(columns)))

@@ -1,6 +1,7 @@
 """The ground under a scene: at one height, a plane, or heights from a DEM; and its two cheaper models."""
 
 from dataclasses import asdict, dataclass
+from numbers import Real
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -82,6 +83,10 @@ class FlatGround(Terrain):
     """
 
     height_m: float
+
+    def __post_init__(self) -> None:
+        if isinstance(self.height_m, bool) or not (isinstance(self.height_m, Real) and np.isfinite(self.height_m)):
+            raise CampaignError(quoted(self.height_m), "FlatGround: height_m", "metres, finite", "Give one number.")
 
     def heights(self, grid: SceneGrid) -> Floats:
         """Return the height at every pixel, as a broadcast without memory."""
@@ -181,9 +186,9 @@ def ground_of(terrain: Terrain | float | None, grid: SceneGrid) -> Terrain:
             expected=f"how high the ground of {grid.crs} is above its ellipsoid",
             remedy="Give a height in metres, or a terrain such as that of an opened campaign's scene.",
         )
-    if terrain is None or isinstance(terrain, int | float | np.floating):
+    if terrain is None or (isinstance(terrain, int | float | np.floating) and not isinstance(terrain, bool)):
         return FlatGround(float(terrain or 0.0))
-    if not hasattr(terrain, "positions_at"):
+    if isinstance(terrain, bool) or not hasattr(terrain, "positions_at"):
         raise CampaignError(
             quoted(terrain) if isinstance(terrain, str | Path) else f"an object of type {type(terrain).__name__}",
             where="terrain",
