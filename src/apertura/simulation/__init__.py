@@ -2,12 +2,13 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from numbers import Integral
 from pathlib import Path
 
 from numpy.random import Generator, default_rng
 
 from apertura.common.documents import validated
-from apertura.common.errors import CampaignError
+from apertura.common.errors import CampaignError, quoted
 from apertura.simulation.campaign import write_campaign
 from apertura.simulation.continuous import Framing
 from apertura.simulation.impairments import Impairments, Radio
@@ -105,6 +106,12 @@ def simulate(
     ...     sorted(path.name for path in made.rglob("*") if path.is_file())
     ['codes.npy', 'config.yaml', 'flights.tsv', 'truth.json', 'uav1.sigmf-data', 'uav1.sigmf-meta', 'uav1.track.csv']
     """
+    if not isinstance(directory, str | Path):
+        raise CampaignError(quoted(directory), "simulate: directory", "the path of a folder", "Give it as text.")
+    if targets is not None and not len(targets):
+        raise CampaignError("no targets", "simulate: targets", "one or more", "Leave it out for those of the preset.")
+    if not isinstance(seed, Generator) and (isinstance(seed, bool) or not isinstance(seed, Integral) or seed < 0):
+        raise CampaignError(quoted(seed), "simulate: seed", "a whole number from 0 on, or a Generator", "Give one.")
     base = specification
     if not isinstance(base, CampaignSpecification):
         base = preset(base) if isinstance(base, str) and base in PRESETS else read_specification(Path(base))

@@ -150,6 +150,10 @@ def backproject(  # noqa: PLR0913 - each choice is a keyword, so that an editor 
     """
     import xarray as xr
 
+    if isinstance(accuracy_db, bool) or not isinstance(accuracy_db, Real):
+        raise CampaignError(
+            quoted(accuracy_db), "backproject: accuracy_db", "a number, dB of the peak", "Give -60, say."
+        )
     choices = validated(
         ImagingChoices,
         {

@@ -11,7 +11,7 @@ from pyproj import CRS, Transformer
 from pyproj.exceptions import ProjError
 
 from apertura.common.arrays import Floats
-from apertura.common.errors import CampaignError, shown
+from apertura.common.errors import CampaignError, quoted, shown
 from apertura.common.raster import opened_raster
 from apertura.core.geometry.geodesy import LOCAL
 from apertura.core.scene.geoid import declared_datum, geoid_file, grid_names, undulation
@@ -310,6 +310,8 @@ def open_dem(
     ...     float(open_dem(f"{folder}/dem.tif", grid, datum="ellipsoid").heights(grid)[0, 0])
     612.5
     """
+    if not isinstance(scene, str | SceneGrid):
+        raise CampaignError(quoted(scene), "open_dem: scene", "a SceneGrid, or its CRS", "Give the grid of the images.")
     crs = scene if isinstance(scene, str) else scene.crs
     dem = _dem(Path(path), crs, datum=datum, geoid=None if geoid is None else Path(geoid))
     if not isinstance(scene, str):

@@ -13,6 +13,7 @@ import numpy as np
 import xarray as xr
 
 from apertura.common.documents import validated
+from apertura.common.errors import CampaignError, quoted
 from apertura.pipeline.config.flight_plan import FlightPlan, read_flight_plan
 from apertura.pipeline.design.computed import Design, designed
 from apertura.pipeline.design.judgement import report_of
@@ -71,6 +72,9 @@ def as_plan(plan: FlightPlan | Mapping[str, Any] | str | Path, root: Path | None
     if isinstance(plan, str | Path):
         return read_flight_plan(Path(plan)), root or Path(plan).absolute().parent
     if not isinstance(plan, FlightPlan):
+        if not isinstance(plan, Mapping):
+            expected = "a flight plan: a YAML file, its keys as a mapping, or a FlightPlan"
+            raise CampaignError(quoted(plan), "design: plan", expected, "Begin with that of docs/howto/design.md.")
         plan = validated(FlightPlan, dict(plan), where="plan", expected="keys of a flight plan, docs/howto/design.md")
     return plan, root or Path.cwd()
 
