@@ -120,9 +120,9 @@ def test_automatic_bounds_hold_ground_on_both_sides_of_the_track():
     tx = np.stack([np.linspace(-4, 4, 5), np.zeros(5), np.full(5, 5.0)], -1)
     _, ymin, _, ymax = auto_bounds(Aperture(tx, tx), crs="local", height_m=0.0, path_limit_m=np.inf)
     assert ymax == -ymin == pytest.approx(5 / np.tan(np.radians(10)), abs=1)
-    assert auto_bounds(Aperture(tx, tx), crs="local", height_m=0.0, path_limit_m=20.0)[3] == pytest.approx(
-        np.sqrt(75), abs=1
-    )
+    xmin, ymin, xmax, ymax = auto_bounds(Aperture(tx, tx), crs="local", height_m=0.0, path_limit_m=20.0)
+    farthest = Aperture(tx, tx).path(np.array([[x, y, 0.0] for x in (xmin, xmax) for y in (ymin, ymax)])).max()
+    assert 16 < farthest <= 20  # the corners, from the ends of the track; in whole metres
     assert utm_crs(ecef_from_projected("EPSG:32755", *map(np.array, (5e5, 6.1e6, 0.0)))) == "EPSG:32755"
 
 

@@ -7,7 +7,7 @@ from pyproj.database import query_utm_crs_info
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.geometry.aperture import Aperture
-from apertura.core.geometry.geodesy import geodetic_from_ecef, map_from_frame
+from apertura.core.geometry.geodesy import frame_from_map, geodetic_from_ecef, map_from_frame
 from apertura.core.scene.grid import SceneGrid
 
 GRAZING_LIMIT_DEG = 10.0
@@ -68,6 +68,16 @@ def auto_bounds(
     slant = min(path_limit_m / 2, altitude / np.sin(np.radians(GRAZING_LIMIT_DEG)))
     reach = np.sqrt(max(slant**2 - altitude**2, 1.0))
     middle = (flat[:, :2].min(axis=0) + flat[:, :2].max(axis=0)) / 2
+    some, corners = aperture[aperture.sample(64)], np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])
+
+    def longest_m(reach: float) -> float:
+        east, north = (middle + (reach + 1) * corners).T  # outer corners in whole metres
+        return float(some.path(frame_from_map(crs, east, north, np.full(4, height_m))).max())
+
+    # The square's corners lie beyond the circle, and the ends of a track beyond its middle: it shrinks until they fit.
+    # Where nothing near the track's middle does, it stays, and what is beyond the limit is told of the scene.
+    fitting = (reach * share for share in np.linspace(1, 0.1, 91) if longest_m(reach * share) <= path_limit_m)
+    reach = next(fitting, reach)
     low, high = np.floor(middle - reach), np.ceil(middle + reach)
     return (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
 
