@@ -1,14 +1,19 @@
 """The command line as people type it: a folder or the one in hand, one message and one exit status for each mistake."""
 
 import os
+import re
 import sys
 from pathlib import Path
 
 import pytest
 import yaml
+from folders import copy_writable, state
 
 from apertura.common import processes
+from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import FUSED
+from apertura.pipeline.opening.scene import settled_scene
+from apertura.pipeline.steps.align import align
 from apertura.views import cli
 
 
@@ -53,7 +58,8 @@ WRONG = [
     "run --until", "map --port 99999", "plan --threads 0",     "run export", "align . f01 uav1 --point 1 2",
     "align . f01 uav1 --search-s -1", "check --product", "step", "step nothing",     "step image f01",
     "step image f01 uav1-uav9", "check-crate .", "design nowhere",
-    "design", "compare nowhere", "init new --from nowhere",
+    "design", "compare nowhere", "init new --from nowhere", "simulate new --seed -1",
+    "simulate config/config.yaml/new", "init config/config.yaml/new", "simulate /proc/new", "init /proc/new",
 ]  # fmt: skip
 
 
@@ -95,6 +101,64 @@ def test_options_of_run_reach_snakemake(monkeypatch, typed, tiny):
         ("--until", "echo", "scene", "terrain"),
         ("--until", "echo", "scene"),
     ]
+
+
+WRONG_RUNS = {
+    "--set-scatter tile=3": "tiles=N, N >= 1",
+    "--set-scatter tiles=0": "tiles=N, N >= 1",
+    "--set-scat=tiles=0": "tiles=N, N >= 1",
+    "--until imag": "ingest, bench, echo",
+    "results/f01/uav2-uav2/echo.manifest.json": "one of fused, tracks, uav1, uav1-uav1, uav1-uav2, uav2",
+    "results/f01/uav9/track.manifest.json": "f01 has no uav9",
+    "results/f09/uav1-uav1/echo.manifest.json": "no flight 'f09'",
+}
+
+
+@pytest.mark.parametrize("words", WRONG_RUNS)
+def test_what_snakemake_would_ignore_or_make_of_no_flight_is_refused(typed, tiny, words):
+    status, out, err = typed("run", tiny, *words.split(), "-n")
+    assert (status, out) == (2, "")
+    assert err.count("\n") == 1
+    assert WRONG_RUNS[words] in err
+    assert not (tiny / "results").exists()
+
+
+def test_a_last_step_that_another_one_needs_is_no_error(typed, tiny):
+    alone = typed("run", tiny, "--until", "image", "-n")
+    assert alone[0] == 0
+    assert "2 image" in alone[1]
+    for words in ("echo image", "image echo ingest", "tiles image", "image tiles"):
+        assert typed("run", tiny, "--until", *words.split(), "-n") == alone
+    assert "1 scene, 2 echo" in typed("run", tiny, "--until", "echo", "scene", "-n")[1]
+
+
+@pytest.mark.parametrize("node", ["uav2", "uav9"])
+def test_a_node_that_sends_nothing_is_not_aligned(typed, tiny, node):
+    status, _, err = typed("align", tiny, "f01", node)
+    assert status == 2
+    assert f"{node} does not send and receive in f01" in err
+    assert "--until echo" in typed("align", tiny, "f01", "uav1")[2]
+
+
+def test_a_summary_says_how_many_results_a_setting_has_overtaken(finished_tiny, tmp_path, typed):
+    root = copy_writable(finished_tiny.root, tmp_path / "campaign")
+    assert "stale" not in typed("summary", root)[1]
+    state(root, "scene", height_m=finished_tiny.settings.scene.height_m + 0.5)
+    last = typed("summary", root)[1].splitlines()[-1]
+    assert re.fullmatch(r"\d+ results are stale: apertura run", last)
+
+
+@pytest.mark.parametrize("settled", [True, False])
+def test_a_reflector_is_given_in_the_zone_that_auto_stands_for(finished_tiny, tmp_path, settled):
+    root = copy_writable(finished_tiny.root, tmp_path / "campaign")
+    grid = settled_scene(finished_tiny).grid
+    xmin, ymin, xmax, ymax = grid.bounds_m
+    point = ((xmin + xmax) / 2, (ymin + ymax) / 2, finished_tiny.settings.scene.height_m)
+    expected = align(finished_tiny, "f01", "uav1", point=point, search_s=0.01)[1]
+    state(root, "scene", crs="auto", bounds_m="auto")
+    if not settled:
+        (root / "results/scene.manifest.json").unlink()
+    assert align(Campaign.load(root), "f01", "uav1", point=point, search_s=0.01)[1] == expected
 
 
 def test_a_summary_shows_what_is_there_and_names_what_is_missing(finished_tiny, tiny, typed, monkeypatch):

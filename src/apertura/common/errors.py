@@ -18,6 +18,8 @@ _REMEDIES = {
     errno.EMFILE: "Raise the limit of open files (ulimit -n)",
     errno.ENFILE: "Close other programs",
     errno.ENOMEM: "Give the job more memory",
+    errno.ENOENT: "Check the path; to write, name a folder that can be written to,",
+    errno.EEXIST: "Move away what stands there, or name another place,",
     errno.ENOTDIR: "Move away what stands where a folder should be",
     errno.EISDIR: "Move away the folder that stands where a file should be",
     errno.ENOTEMPTY: "Move away what stands there",
@@ -158,15 +160,18 @@ def explained(error: BaseException) -> str | None:
 
 
 _OF_SPACE = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+_OF_PLACE = {errno.ENOENT, errno.EEXIST}
+"""Without the name of a file they are defects: a person can do nothing about them."""
 
 
 def _error_number(error: BaseException) -> int | None:
     """Return the system's number of an error; GDAL's errors only quote its words."""
     if isinstance(error, OSError) and error.errno is not None:
-        return error.errno if error.errno in _REMEDIES else None
+        known = error.errno in _REMEDIES and (error.filename is not None or error.errno not in _OF_PLACE)
+        return error.errno if known else None
     if isinstance(error, OSError) or type(error).__module__.startswith("rasterio"):
         text = f"{error} {error.__cause__ or error.__context__ or ''}"
-        return next((number for number in _REMEDIES if os.strerror(number) in text), None)
+        return next((number for number in _REMEDIES.keys() - _OF_PLACE if os.strerror(number) in text), None)
     return None
 
 

@@ -256,7 +256,8 @@ _OF_IMAGES = {
     "echo_elsewhere": Flag(
         "where the pulses hold the strong echo",
         "pulses hold a strong echo outside the scene's ranges, or that no place gathers",
-        "heights and datum of log and scene; scene.bounds_m; path offsets; waveform.iq: I and Q swapped",
+        "heights and datum of log and scene; scene.bounds_m; path offsets; I and Q swapped: "
+        "waveform.iq of fmcw, else conjugate the samples",
         "core/imaging/focus_check.py"),
     "pairs_apart": Flag(
         "cm between the points, east and north",

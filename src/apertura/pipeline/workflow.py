@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import IO, Literal
 
 from apertura.common.atomic import remove
@@ -22,7 +22,9 @@ from apertura.common.processes import INTERRUPTED, STATUS_FILE, die_with_parent,
 from apertura.common.progress import RUN
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.check import print_problems
-from apertura.pipeline.lineage import on_demand
+from apertura.pipeline.config.section import RESERVED_NAMES
+from apertura.pipeline.lineage import on_demand, results_of
+from apertura.pipeline.rules import RULES
 from apertura.pipeline.runs.journal import JOURNAL, NAME, RECORDER, JournalReader, failures, note
 from apertura.pipeline.runs.outlook import Outlook
 from apertura.pipeline.runs.screen import NOTHING, Screen, listed
@@ -47,6 +49,10 @@ _SHORT = re.compile(r"(-[hntkfFlSDvpa]*s)(.*)")
 _PROFILE = "SNAKEMAKE_PROFILE"
 """Environment variable: the profile where the command line names none."""
 _DRY_RUN = re.compile(r"-n|-np|--dry-?run")
+_SCATTER = "--set-scatter"
+_UNTIL = ("--until", "-U")
+_TARGETS = ("all", "pages", "phase_history")
+"""Rules of the workflow that only gather results of others."""
 _LOG = "snakemake.log"
 
 
@@ -113,6 +119,7 @@ def run_workflow(root: Path, cores: int, *arguments: str, paranoid: bool = False
     """
     elsewhere = _runs_elsewhere(arguments)
     options = code_from_outside(root, arguments)
+    _check_values(options)
     if _PROFILE in os.environ:
         os.environ[_PROFILE] = _whole(root, _PROFILE, os.environ[_PROFILE])
     if elsewhere:
@@ -123,6 +130,7 @@ def run_workflow(root: Path, cores: int, *arguments: str, paranoid: bool = False
             return 2
         root = root.absolute()
         campaign = Campaign.load(root)
+        _check_targets(campaign, options)
         if forms:
             hold(root).close()
         stale = stale_results(campaign, paranoid=paranoid)
@@ -130,7 +138,7 @@ def run_workflow(root: Path, cores: int, *arguments: str, paranoid: bool = False
             print(*stale_lines(stale), sep="\n", end="\n" if stale else "", file=sys.stderr, flush=True)
         overtaken = [manifest for manifest in stale if not on_demand(manifest)]
         forced = ["--forcerun", *overtaken] if overtaken else []  # in time for a dry run; the workflow says why
-        words = _words(root, cores, [*options, *forced])
+        words = _words(root, cores, [*_without_inner_steps(campaign, options), *forced])
         if forms:
             files, at_once = _Files.of(campaign), 0 if elsewhere else cores
             note(files.journal, "start", cores=at_once)
@@ -278,6 +286,76 @@ def apart(argument: str) -> list[str]:
     if short:
         return [word for word in short.groups() if word]
     return argument.split("=", 1) if argument.startswith("--") else [argument]
+
+
+def _values(options: Sequence[str], *names: str) -> Iterator[int]:
+    """Yield where the values of an option stand, which snakemake knows by its beginning, too."""
+    option = ""
+    for at, word in enumerate(options):
+        if word.startswith("-"):
+            option = word
+        elif option in names or (len(option) > len("--set-") and any(name.startswith(option) for name in names)):
+            yield at
+
+
+def _check_values(options: Sequence[str]) -> None:
+    """Refuse shares and names of steps that snakemake ignores, or explains by its own rules."""
+    for shares in (options[at] for at in _values(options, _SCATTER)):
+        if not re.fullmatch(r"tiles=0*[1-9][0-9]*", shares):
+            raise CampaignError(
+                f"{_SCATTER} {shares}",
+                "apertura run",
+                "tiles=N, N >= 1",
+                "Give the number of jobs that form each image.",
+            )
+    for step in (options[at] for at in _values(options, *_UNTIL)):
+        if step not in (*RULES, *_TARGETS) and "/" not in step:  # a file may be named, too
+            raise CampaignError(
+                f"{_UNTIL[0]} {step}", "apertura run", f"a step: {', '.join(RULES)}", "Correct the name of the step."
+            )
+
+
+def _check_targets(campaign: Campaign, options: Sequence[str]) -> None:
+    """Refuse files in the results of a flight, pair or node that is not there: rules would make some of them."""
+    asked = [path for path in map(PurePosixPath, options) if path.parts[:1] == ("results",) and len(path.parts) > 3]
+    asked = [path for path in asked if path.parts[1] not in RESERVED_NAMES]
+    made = [PurePosixPath(result.manifest).parts for _, result in results_of(campaign)] if asked else []
+    for path in asked:
+        flight, name = campaign.flight(path.parts[1]).name, path.parts[2]
+        own = sorted({parts[2] for parts in made if parts[1] == flight and len(parts) > 3})
+        if name not in own:
+            raise CampaignError(
+                f"{path}: {flight} has no {name}", "apertura run", f"one of {', '.join(own)}", "Correct the name."
+            )
+
+
+def _without_inner_steps(campaign: Campaign, options: Sequence[str]) -> list[str]:
+    """Return the options without last steps that other last steps need: Snakemake ends in an error over both."""
+    places = [at for at in _values(options, *_UNTIL) if options[at] in RULES]
+    if len(places) < 2:
+        return list(options)
+    results = list(results_of(campaign))
+    sources = {result.manifest: result.sources for _, result in results}
+
+    def made(step: str) -> set[str]:
+        return {result.manifest for name, result in results if name == RULES[step].result}
+
+    def needed(step: str) -> set[str]:
+        found = set() if RULES[step].shares else made(step)  # a share alone does not complete its result
+        left = [source for one in made(step) for source in sources[one]]
+        while left:
+            one = left.pop()
+            if one in sources and one not in found:
+                found.add(one)
+                left += sources[one]
+        return found
+
+    kept = list(places)
+    for at in places:
+        others = [options[other] for other in kept if other != at]
+        if others and made(options[at]) <= set().union(*map(needed, others)):
+            kept.remove(at)
+    return [word for at, word in enumerate(options) if at in kept or at not in places]
 
 
 def _holds_code(option: str) -> bool:

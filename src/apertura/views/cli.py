@@ -365,9 +365,10 @@ def chart(context: typer.Context, campaign: CampaignFolder = HERE, cores: Cores 
 def summary(campaign: CampaignFolder = HERE) -> None:
     """Print what every finished image says of itself: focus, agreement, numerical error, flags."""
     opened = _opened(campaign)
-    from apertura.views.summary import print_summary
+    from apertura.views.summary import print_stale, print_summary
 
     print_summary(opened)
+    print_stale(opened)
 
 
 @app.command()
@@ -553,7 +554,7 @@ def simulate(
             "paper-lab, paper-static, paper-uav"
         ),
     ] = None,
-    seed: Annotated[int, typer.Option(help="of the random generator")] = 1,
+    seed: Annotated[int, typer.Option(min=0, help="of the random generator")] = 1,
     print_spec: Annotated[str | None, typer.Option(metavar="PRESET", help="print a preset to start from")] = None,
 ) -> None:
     """Write a simulated campaign folder of raw IQ, with truth.json, from a YAML specification or a preset."""

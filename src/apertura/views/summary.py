@@ -9,7 +9,9 @@ from apertura.common.errors import number_of, shown
 from apertura.formats.export import MAP, exports_in
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import FUSED
+from apertura.pipeline.lineage import on_demand
 from apertura.pipeline.rules import INTERFEROMETRY
+from apertura.pipeline.stale import stale_results
 from apertura.pipeline.store import open_listed
 from apertura.views.image_report import (
     REPORT,
@@ -69,6 +71,12 @@ def print_summary(campaign: Campaign) -> None:
     if missing := [" ".join(image) for image in names if image not in there]:
         console.print(f"not there yet: {_some(missing)}; apertura run makes what is missing", soft_wrap=True)
     print_products(campaign)
+
+
+def print_stale(campaign: Campaign) -> None:
+    """Print a line where results are overtaken by a file, a setting or code; those made on demand do not count."""
+    if stale := [manifest for manifest in stale_results(campaign) if not on_demand(manifest)]:
+        print(f"{number_of(len(stale), 'result')} {'is' if len(stale) == 1 else 'are'} stale: apertura run")
 
 
 def print_benches(campaign: Campaign) -> None:

@@ -476,7 +476,8 @@ def _conjugated(formation: Formation, peak: float) -> str | None:
         return None
     return (
         f"with conjugated samples its brightest place is {min(gained_db, 99):.0f} dB brighter: "
-        "I and Q are swapped, waveform.iq says the other sign, or phases count the other way"
+        "I and Q are swapped, waveform.iq (fmcw) says the other sign, or phases count the other way; "
+        "of other kinds, conjugate the samples"
     )
 
 

@@ -20,7 +20,7 @@ from apertura.formats.recordings.sample_file import SampleFile, SampleLayout
 from apertura.formats.times import FIRST
 from apertura.methods.autofocus.motion import Logged, Recorded
 from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.config import CONFIG, SampledWaveform
+from apertura.pipeline.config import CONFIG, FLIGHTS, SampledWaveform
 from apertura.pipeline.digests import digest_of
 from apertura.pipeline.opening.air import scene_air
 from apertura.pipeline.opening.node_log import NodeLog, raw_log, shortest_wave
@@ -269,8 +269,16 @@ def unaligned(campaign: Campaign, flight: str, node: str) -> Unaligned:
     Raises
     ------
     CampaignError
-        If the node has no log, or its echoes are not there yet.
+        If the node does not send and receive in that flight, has no log, or its echoes are not there yet.
     """
+    flown = campaign.flight(flight)
+    if f"{node}-{node}" not in flown.pairs:
+        raise CampaignError(
+            f"{node} does not send and receive in {flight}",
+            where=campaign.root / FLIGHTS,
+            expected=f"a node whose own pulses come back to it; pairs of {flight}: {', '.join(flown.pairs)}",
+            remedy="Name such a node, or correct the line of the flight.",
+        )
     clock = campaign.clock(flight, node)
     applied_ns, applied_ppm = 0, 0.0
     sampled = isinstance(campaign.settings.waveform, SampledWaveform)
@@ -281,7 +289,7 @@ def unaligned(campaign: Campaign, flight: str, node: str) -> Unaligned:
                 "not there yet",
                 where=path,
                 expected=f"the echo of {node} by its own pulses",
-                remedy=f"Run `snakemake results/{flight}/{node}-{node}/echo.manifest.json` first.",
+                remedy="Run `apertura run CAMPAIGN --until echo` first.",
             )
         history = _some(open_stage(path, "echo"))
         off_m, applied_ns = float(history.attrs["stated_offset_m"]), clock.offset_ns

@@ -4,10 +4,13 @@ from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from apertura.common.atomic import write_text
 from apertura.common.errors import CampaignError
 from apertura.common.paths import inside
 from apertura.core.geometry.geodesy import frame_from_map
+from apertura.core.scene.auto_grid import utm_crs
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import FlatGround
 from apertura.methods.synchronisation.clock_alignment import Alignment, align_on_point, estimate_drift
@@ -15,7 +18,8 @@ from apertura.methods.synchronisation.scene_alignment import align_on_scene
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import CLOCK_COLUMNS, CLOCKS, CONFIG
 from apertura.pipeline.opening.acquisition import Unaligned, unaligned
-from apertura.pipeline.opening.scene import ConfiguredGround
+from apertura.pipeline.opening.scene import ConfiguredGround, settled_scene
+from apertura.pipeline.store import manifest_of
 
 NEAR_S = 5.0
 """Largest offset searched for a clock in UTC, seconds; of a clock without UTC every offset is searched."""
@@ -74,7 +78,7 @@ def align(
         if point is None:
             found = align_on_scene(given.echo, given.log, *_scene(campaign), within_s=within_s, search_m=search_m)
         else:
-            place = frame_from_map(campaign.settings.scene.crs, *point)
+            place = frame_from_map(_crs(campaign, given), *point)
             found = align_on_point(given.echo, given.log, place, within_s=within_s, search_m=search_m)
             found = estimate_drift(found, given.echo, given.log, place) if drift else found
     except ValueError as error:
@@ -139,6 +143,16 @@ def _within(given: Unaligned, search_s: float | None) -> tuple[float, float]:
         return overlapping
     near_s = NEAR_S if search_s is None else search_s
     return max(overlapping[0], given.stated_s - near_s), min(overlapping[1], given.stated_s + near_s)
+
+
+def _crs(campaign: Campaign, given: Unaligned) -> str:
+    """Return the CRS that a place is in; `auto` is as settled, and before that the UTM zone of the log."""
+    if campaign.settings.scene.crs != "auto":
+        return campaign.settings.scene.crs
+    if manifest_of(campaign.result("scene.json")).is_file():
+        return settled_scene(campaign).grid.crs
+    middle_s = np.array([given.log.first_s + given.log.last_s]) / 2
+    return utm_crs(given.log.phase_centres(middle_s).tx_m[0])
 
 
 def _scene(campaign: Campaign) -> tuple[SceneGrid, FlatGround]:
