@@ -201,6 +201,7 @@ def test_samples_of_the_other_sign_are_told_as_such():
     for name in ("conjugated", "I and Q swapped", "conjugated profiles"):
         (line,) = json.loads(ap.backproject(FLAGGED[name][0](), TARGET_GRID).attrs["flags"]).values()
         assert "I and Q are swapped" in line
+        assert "conjugate the samples" in line
     for name in ("paths one way", "square array transposed", "track half as long"):
         assert "I and Q" not in ap.backproject(FLAGGED[name][0](), TARGET_GRID).attrs["flags"]
 
