@@ -1,6 +1,7 @@
-"""Types of arrays, by the names that signatures use; shapes and units stand in docstrings."""
+"""Types of arrays, by the names that signatures use, and what a number is; shapes and units stand in docstrings."""
 
-from typing import TypeAlias
+from numbers import Real
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,3 +10,14 @@ Floats: TypeAlias = NDArray[np.float64]
 Complexes: TypeAlias = NDArray[np.complex64]
 Bools: TypeAlias = NDArray[np.bool_]
 Times: TypeAlias = NDArray[np.datetime64]
+
+
+def is_number(value: Any) -> bool:
+    """Return whether a value is one finite real number; true and false are none.
+
+    Examples
+    --------
+    >>> [is_number(value) for value in (1, np.float32(2), np.nan, True, "3", None)]
+    [True, True, False, False, False, False]
+    """
+    return isinstance(value, Real) and not isinstance(value, bool) and bool(np.isfinite(float(value)))

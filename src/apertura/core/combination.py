@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apertura.common.errors import number_of
 from apertura.core.quality.agreement import OUT_OF_PHASE_RAD, Agreement
 
 # ---- How well the images of a sum add up
@@ -245,10 +244,8 @@ def _named(pairs: Collection[str]) -> str:
 
 
 def _phase_line(found: Agreement, reference: str) -> str:
-    where = (
-        number_of(found.points, "bright point") if found.by == "bright points" else f"{found.points} looks of ground"
-    )
-    return f"{found.phase_rad:+.2f} ± {found.phase_std_rad:.2f} rad from {reference} at {where}"
+    ground = " of ground" if found.by == "looks" else ""
+    return f"{found.phase_rad:+.2f} ± {found.phase_std_rad:.2f} rad from {reference} at {found.evidence}{ground}"
 
 
 def _reason(found: Agreement, agreeing: str, reference: str, *, align: bool) -> str:

@@ -92,10 +92,9 @@ class Aperture:
 
     def __post_init__(self) -> None:
         for name in ("tx_m", "rx_m"):
-            object.__setattr__(self, name, as_array(getattr(self, name), np.float64, f"Aperture: {name}"))
-            found = getattr(self, name)
-            if found.dtype == np.float32 and found.size and np.abs(found).max() > _FLOAT32_M:
-                farthest = np.abs(found).max()
+            found = as_array(getattr(self, name), np.float64, f"Aperture: {name}")
+            object.__setattr__(self, name, found)
+            if found.dtype == np.float32 and (farthest := np.abs(found).max(initial=0)) > _FLOAT32_M:
                 raise CampaignError(
                     f"float32, whose numbers near {farthest:.3g} m are {np.spacing(farthest):.2g} m apart",
                     where=f"Aperture: {name}",

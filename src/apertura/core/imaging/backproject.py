@@ -3,13 +3,13 @@
 import json
 from collections.abc import Mapping
 from dataclasses import replace
-from numbers import Real
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.common.arrays import is_number
 from apertura.common.contracts import CF_SIGMA0, Window
 from apertura.common.documents import validated
 from apertura.common.errors import CampaignError, quoted
@@ -150,7 +150,7 @@ def backproject(  # noqa: PLR0913 - each choice is a keyword, so that an editor 
     """
     import xarray as xr
 
-    if isinstance(accuracy_db, bool) or not isinstance(accuracy_db, Real):
+    if not is_number(accuracy_db):
         raise CampaignError(
             quoted(accuracy_db), "backproject: accuracy_db", "a number, dB of the peak", "Give -60, say."
         )
@@ -271,8 +271,7 @@ def _wave_speed(
     middle_m = ground.positions_at(grid, *(np.array([size // 2]) for size in grid.shape))[0]
     frame = LOCAL if grid.crs == LOCAL else "ecef"
     ground_m = float(middle_m[2] if frame == LOCAL else geodetic_from_ecef(middle_m)[2])
-    number = isinstance(atmosphere, Real) and not isinstance(atmosphere, bool)
-    if not (number or isinstance(atmosphere, Atmosphere)) and atmosphere not in ("auto", "vacuum"):
+    if not (is_number(atmosphere) or isinstance(atmosphere, Atmosphere)) and atmosphere not in ("auto", "vacuum"):
         raise CampaignError(
             quoted(atmosphere),
             where="backproject: atmosphere",
@@ -295,7 +294,7 @@ def _wave_speed(
 def _check_calibration(constant: float | None, inputs: PhaseHistory | Profiles) -> None:
     if constant is None:
         return
-    if not (isinstance(constant, Real) and 0 < constant < np.inf):
+    if not (is_number(constant) and constant > 0):
         raise CampaignError(
             f"a constant of {quoted(constant)}",
             where="backproject: calibration",

@@ -2,12 +2,12 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from numbers import Real
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.common.arrays import is_number
 from apertura.common.errors import CampaignError
 from apertura.common.flags import Flags
 from apertura.core.imaging.focus_check import focus_flags, focus_report
@@ -125,7 +125,7 @@ def judge(
     ['echo_elsewhere']
     """
     formation = _formation_of(image)
-    stated = position_std_m is None or (isinstance(position_std_m, Real) and 0 <= position_std_m < np.inf)
+    stated = position_std_m is None or (is_number(position_std_m) and position_std_m >= 0)
     if not stated or (position_std_m is not None and time_s is None):
         raise CampaignError(
             f"position_std_m of {position_std_m!r}{' without times' if time_s is None else ''}",

@@ -2,13 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from numbers import Real
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apertura.common.arrays import Floats
+from apertura.common.arrays import Floats, is_number
 from apertura.common.constants import BOLTZMANN_J_K, REFERENCE_K, SPEED_OF_LIGHT_M_S
 from apertura.common.contracts import Window
 from apertura.common.errors import CampaignError, quoted
@@ -24,10 +23,6 @@ Quantity = Literal["sigma0", "beta0", "gamma0"]
 
 MOST_DBM = 90.0
 """A megawatt: more is a slip of units."""
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, Real) and not isinstance(value, bool) and bool(np.isfinite(float(value)))
 
 
 @dataclass(frozen=True)
@@ -62,7 +57,7 @@ class Link:
     full_scale_counts: float
 
     def __post_init__(self) -> None:
-        wrong = [one.name for one in fields(self) if not _is_number(getattr(self, one.name))]
+        wrong = [one.name for one in fields(self) if not is_number(getattr(self, one.name))]
         wrong += ["full_scale_counts"] * (not wrong and self.full_scale_counts <= 0)
         wrong += ["transmit_power_dbm"] * (not wrong and self.transmit_power_dbm > MOST_DBM)
         if wrong:
@@ -92,7 +87,7 @@ class Link:
             If one of them is no number above 0.
         """
         for name, value in (("wavelength_m", wavelength_m), ("sent_power", sent_power)):
-            if not (_is_number(value) and value > 0):
+            if not (is_number(value) and value > 0):
                 raise CampaignError(
                     quoted(value), f"Link.constant: {name}", "a number above 0", "Correct what is named."
                 )

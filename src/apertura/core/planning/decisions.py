@@ -210,18 +210,48 @@ def integrate(
     straight = flight[aperture.sample(_PULSES)]
     place, squint = straight.place(some, points), _squint(flight, antennas)
     per_path = _gradient_per_path(some, straight, points)
+    half, why = sector_half(requested, wavelength_m, spacing_m, per_path=per_path, squint=squint), "asked for"
     if requested == "auto":
-        half, why = wavelength_m / (2 * per_path * spacing_m) / (1 + TAPER), f"pixels of {spacing_m:g} m carry no more"
+        why = f"pixels of {spacing_m:g} m carry no more"
         flown = float(np.ptp(place, axis=0).max())
         if flown <= 2 * half * (1 + TAPER):
             cell_m = wavelength_m / (per_path * flown) if flown else np.inf
             reason = f"every pulse counts: pixels of {spacing_m:g} m carry the {cell_m:.3g} m that was flown"
             return Integration(None, len(aperture), "all", reason)
-    else:
-        why, half = "asked for", float(np.sin(np.radians(requested.get("degrees", 0)) / 2) * np.sqrt(1 - squint**2))
-        half = wavelength_m / (2 * per_path * requested["resolution_m"]) if "resolution_m" in requested else half
     sector = Sector(flight.tx_axis, flight.rx_axis, squint, half).following(aperture, points)
     return _integration_of(sector, aperture, points_m, wavelength_m / (2 * per_path * half), why, where)
+
+
+def sector_half(
+    requested: Any, wavelength_m: float, spacing_m: float, *, per_path: float = 2.0, squint: float = 0.0
+) -> float:
+    """Return the half width in s of the sector that is asked for.
+
+    Parameters
+    ----------
+    requested
+        'auto', or a mapping with `degrees` or `resolution_m`.
+    wavelength_m, spacing_m
+        Of the band's middle, and of the pixels.
+    per_path
+        Change of the path's gradient along the flight per change of s: 2 for antennas flying in parallel.
+    squint
+        s of the sector's middle.
+
+    Notes
+    -----
+    Source: docs/theory/integration.md.
+
+    Examples
+    --------
+    >>> round(sector_half({"resolution_m": 0.5}, 0.2, 0.1), 3), round(sector_half({"degrees": 60}, 0.2, 0.1), 3)
+    (0.1, 0.5)
+    """
+    if requested == "auto":
+        return wavelength_m / (2 * per_path * spacing_m) / (1 + TAPER)
+    if "resolution_m" in requested:
+        return float(wavelength_m / (2 * per_path * requested["resolution_m"]))
+    return float(np.sin(np.radians(requested["degrees"]) / 2) * np.sqrt(1 - squint**2))
 
 
 def _squint(flight: Sector, antennas: Beams | None) -> float:

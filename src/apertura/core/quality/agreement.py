@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.common.contracts import Window
+from apertura.common.errors import number_of
 from apertura.core.quality.bright_points import BrightPoint, common_shift
 from apertura.core.quality.measures import BlockRaster, weighted_median
 from apertura.core.quality.point_targets import PATCH_PX, BandLimitedPatch
@@ -77,6 +78,11 @@ class Agreement:
     phase_rad: float
     phase_std_rad: float
     coherence: float
+
+    @property
+    def evidence(self) -> str:
+        """How many bright points or looks are common, in words."""
+        return number_of(self.points, "bright point" if self.by == "bright points" else "look")
 
     @property
     def shift_m(self) -> float:

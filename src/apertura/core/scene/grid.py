@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from apertura.common.arrays import Floats
+from apertura.common.arrays import Floats, is_number
 from apertura.common.errors import CampaignError, quoted
 from apertura.core.geometry.geodesy import LOCAL, frame_from_map, local_crs, map_from_frame
 from apertura.core.scene.map_crs import BLOCK_PX, axis_attributes, block, check_crs, grid_mapping
@@ -96,7 +96,7 @@ class SceneGrid:
                 expected="xmin, ymin, xmax, ymax in metres: outer edges, west of east and south of north",
                 remedy="Give them in that order.",
             )
-        if isinstance(spacing_m, bool) or not (isinstance(spacing_m, Real) and 0 < spacing_m < np.inf):
+        if not (is_number(spacing_m) and spacing_m > 0):
             where = "SceneGrid.from_bounds: spacing_m"
             raise CampaignError(quoted(spacing_m), where, "metres, finite above 0", "Correct what is named.")
         shape = (max(1, round((ymax - ymin) / spacing_m)), max(1, round((xmax - xmin) / spacing_m)))

@@ -1,14 +1,13 @@
 """The ground under a scene: at one height, a plane, or heights from a DEM; and its two cheaper models."""
 
 from dataclasses import asdict, dataclass
-from numbers import Real
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from apertura.common.arrays import Floats
+from apertura.common.arrays import Floats, is_number
 from apertura.common.errors import CampaignError, quoted
 from apertura.core.scene.grid import SceneGrid
 
@@ -85,7 +84,7 @@ class FlatGround(Terrain):
     height_m: float
 
     def __post_init__(self) -> None:
-        if isinstance(self.height_m, bool) or not (isinstance(self.height_m, Real) and np.isfinite(self.height_m)):
+        if not is_number(self.height_m):
             raise CampaignError(quoted(self.height_m), "FlatGround: height_m", "metres, finite", "Give one number.")
 
     def heights(self, grid: SceneGrid) -> Floats:

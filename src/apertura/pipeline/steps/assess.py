@@ -11,7 +11,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from apertura.common.errors import CampaignError, number_of
+from apertura.common.errors import CampaignError
 from apertura.common.flags import Flags
 from apertura.common.provenance import chained_sha256
 from apertura.core.backprojection.inputs import PhaseHistory
@@ -421,7 +421,7 @@ def _disagreement(chosen: CoherentSum, pair: str, blind: Sequence[str]) -> dict[
     if one is None:
         line = f"{pair} shows none of the bright points of {' and '.join(blind)}: its echo is too weak, or it is wrong"
         return {"pair_unconfirmed": line} if blind else {}
-    where = number_of(one.points, "bright point") if one.by == "bright points" else f"{one.points} {one.by}"
+    where = one.evidence
     if one.shifted:
         return {
             "pairs_apart": (

@@ -10,6 +10,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.common.arrays import Times
 from apertura.core.antenna.beam import Beams
 from apertura.core.backprojection.contributions import band_limited_image
 from apertura.core.backprojection.inputs import PhaseHistory, Profiles
@@ -22,7 +23,7 @@ from apertura.core.imaging.formation import Formation
 from apertura.core.imaging.job import profiles_job
 from apertura.core.imaging.judgement import budget_by_hand, judgement
 from apertura.core.imaging.range_profiles import RangeWindow, range_compress
-from apertura.core.planning.decisions import CHORD
+from apertura.core.planning.decisions import CHORD, sector_half
 from apertura.core.planning.plan import Plan
 from apertura.core.planning.planner import make_plan
 from apertura.core.quality.error_check import error_bound
@@ -32,7 +33,6 @@ from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import CONFIG
 from apertura.pipeline.opening.pair import beams_of
 
-Times = NDArray[np.datetime64]
 Axes = dict[str, NDArray[np.float64]]
 """As of `apertura.pipeline.opening.pair.beams_of`."""
 
@@ -222,13 +222,8 @@ class ImageSoFar:
         antennas = beams_of(self._campaign, self._pair, axes)
         if asked == "all" or len(aperture) < 2:
             return antennas
-        wavelength_m = self._speed_m_s / centre_hz
-        if asked == "auto":
-            half = wavelength_m / (4 * self.grid.spacing_m) / (1 + TAPER)
-        elif "degrees" in asked:
-            half = float(np.sin(np.radians(asked["degrees"]) / 2)) / self.share
-        else:
-            half = wavelength_m / (4 * asked["resolution_m"] * self.share)
+        half = sector_half(asked, self._speed_m_s / centre_hz, self.grid.spacing_m)
+        half /= 1 if asked == "auto" else self.share  # what pixels carry follows from their spacing
         if half * (1 - TAPER) >= 1:  # all directions
             return antennas
         middle_m = self._terrain.positions_at(self.grid, *((size - 1) / 2 for size in self.grid.shape))

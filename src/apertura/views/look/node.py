@@ -10,6 +10,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from apertura.common.arrays import Times
 from apertura.common.errors import CampaignError
 from apertura.formats.names import GROWING, TRACKS, log_format
 from apertura.formats.reading import open_recording, read_track
@@ -19,8 +20,6 @@ from apertura.pipeline.opening.acquisition import Acquisition, Captured
 from apertura.pipeline.opening.node_log import shortest_wave
 from apertura.pipeline.opening.recordings import captures_of
 from apertura.pipeline.opening.transmitted import Transmitted
-
-Times = NDArray[np.datetime64]
 
 _ABOUT_S = 60.0  # of the log about the pulses of a block: farther epochs do not move a spline
 _EPOCHS = 4  # that a log must be ahead of a pulse: those to come would move it by 0.27⁴ of its error at the end

@@ -7,6 +7,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.common.arrays import Times
 from apertura.common.errors import CampaignError
 from apertura.common.flags import Flags
 from apertura.core.echo.association import associate
@@ -23,7 +24,7 @@ from apertura.pipeline.opening.positions import inside_segments, place
 from apertura.pipeline.opening.scene import ConfiguredGround
 from apertura.pipeline.opening.transmitted import Transmitted
 from apertura.pipeline.steps.calibration import calibrated
-from apertura.views.look.image import Block, Compressed, ImageSoFar, Times
+from apertura.views.look.image import Block, Compressed, ImageSoFar
 from apertura.views.look.node import NodeSoFar
 
 AT_ONCE = 2048
