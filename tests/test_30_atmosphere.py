@@ -246,7 +246,6 @@ VACUUM = {
     "pipeline/check/reach.py": _SIZE,
     "pipeline/resources.py": _SIZE,
     "pipeline/examination/facts.py": _DRAWN,
-    "pipeline/opening/acquisition.py": _ELECTRICAL,
     "pipeline/opening/diagnosis.py": _SIZE,
     "pipeline/opening/echo.py": _ELECTRICAL,
     "pipeline/opening/node_log.py": _SIZE,

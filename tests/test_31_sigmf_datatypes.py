@@ -18,6 +18,7 @@ from apertura.formats.recordings.sample_file import EDGE, SETTLING, Mixing, Samp
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.check.recordings import check_recordings
 from apertura.pipeline.examination.campaign import Examination
+from apertura.pipeline.opening.echo import PairEcho
 from apertura.pipeline.steps import echo, ingest
 from apertura.pipeline.store import open_stage
 from apertura.simulation.campaign import write_campaign
@@ -70,7 +71,7 @@ def transfers(root):
         check(open_stage(opened.stage("raw", "f01", node), "raw"), "raw")
     for pair in ("a-a", "a-b"):
         echo.echo(opened, "f01", pair)
-    return {pair: open_stage(opened.stage("echo", "f01", pair), "echo").transfer.values for pair in ("a-a", "a-b")}
+    return {pair: PairEcho.opened(opened, "f01", pair).stage.transfer.values for pair in ("a-a", "a-b")}
 
 
 @pytest.fixture(scope="module")

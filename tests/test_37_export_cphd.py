@@ -15,6 +15,7 @@ from apertura.formats.reading import read_phase_history
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.check import problems
 from apertura.pipeline.lineage import on_demand, results_of
+from apertura.pipeline.opening.echo import PairEcho
 from apertura.pipeline.stale import stale_results
 from apertura.pipeline.steps import cphd, echo
 from apertura.pipeline.store import open_stage
@@ -91,7 +92,7 @@ def test_gotcha_through_cphd_gives_the_same_image_to_80_db(gotcha, tmp_path):
     assert failures(gotcha.result("pass1", "radar-radar", "phase_history.cphd")) == {}
     one, other = (image_of(each, "pass1", "radar-radar") for each in (gotcha, again))
     assert difference_db(one, other) < -80
-    echoes = [open_stage(each.stage("echo", "pass1", "radar-radar"), "echo") for each in (gotcha, again)]
+    echoes = [PairEcho.opened(each, "pass1", "radar-radar").stage for each in (gotcha, again)]
     assert echoes[1].attrs["frame"] == "local"
     np.testing.assert_allclose(echoes[1].tx_position.values, echoes[0].tx_position.values, atol=2e-9)
     np.testing.assert_array_equal(echoes[1].time.values, echoes[0].time.values)
@@ -121,7 +122,7 @@ def test_a_simulated_pair_through_cphd_gives_the_same_image_to_80_db(fine_tiny, 
     again = reimported(fine_tiny, "f01", pair, tmp_path / "again")
     assert failures(fine_tiny.result("f01", pair, "phase_history.cphd")) == {}
     assert difference_db(image_of(fine_tiny, "f01", pair), image_of(again, "f01", pair)) < -80
-    one, other = (open_stage(each.stage("echo", "f01", pair), "echo") for each in (fine_tiny, again))
+    one, other = (PairEcho.opened(each, "f01", pair).stage for each in (fine_tiny, again))
     for name in ("time", "tx_position", "rx_position", "path_limit"):
         np.testing.assert_array_equal(one[name].values, other[name].values, err_msg=name)
 
@@ -178,7 +179,7 @@ def test_cphd_is_made_when_it_is_asked_for_and_goes_stale_with_its_echo(fine_tin
     made = [result for name, result in results_of(fine_tiny) if name == "cphd"]
     assert [on_demand(result.manifest) for result in made] == [True, True]
     cphd.cphd(fine_tiny, "f01", "uav1-uav1")
-    stage = open_stage(fine_tiny.stage("echo", "f01", "uav1-uav1"), "echo")
+    stage = PairEcho.opened(fine_tiny, "f01", "uav1-uav1").stage
     assert stage.sizes["pulse"] == 40
     assert stale_results(fine_tiny) == {}
     path = fine_tiny.result("f01", "uav1-uav1", "phase_history.cphd")

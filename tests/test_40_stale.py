@@ -222,7 +222,7 @@ def test_what_was_edited_by_hand_is_kept_beside_what_is_made_again(finished, bef
 
 
 def test_a_stage_of_which_a_chunk_is_gone_is_made_again(finished):
-    shutil.rmtree(finished / "results/f01/uav1-uav1/echo.zarr/transfer")
+    shutil.rmtree(finished / "results/f01/uav1-uav1/echo.zarr/path_removed")
     found = stale_results(Campaign.load(finished))
     assert found["results/f01/uav1-uav1/echo.manifest.json"].endswith(" is gone")
 

@@ -15,6 +15,7 @@ from apertura.core.geometry.aperture import Aperture
 from apertura.core.quality.measures import numerical_error
 from apertura.core.quality.point_targets import BandLimitedPatch, find_peak
 from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.opening.echo import PairEcho
 from apertura.pipeline.opening.scene import open_scene
 from apertura.pipeline.steps import echo
 from apertura.pipeline.store import open_stage
@@ -63,11 +64,11 @@ def test_without_the_sidelink_the_bistatic_image_falls_apart(finished_sample, mo
     pair = ("f01", "uav1-uav2")
     scene = open_scene(finished_sample)
     grid, ground = scene.grid, scene.terrain
-    with_division = open_stage(finished_sample.stage("echo", *pair), "echo").load()
+    with_division = PairEcho.opened(finished_sample, *pair).stage.load()
     monkeypatch.setitem(METHODS, "divide", lambda radar, *_: radar)
     copy = Campaign.load(copy_writable(finished_sample.root, tmp_path / "campaign"))
     echo.echo(copy, *pair)
-    uncorrected = open_stage(copy.stage("echo", *pair), "echo").load()
+    uncorrected = PairEcho.opened(copy, *pair).stage.load()
     peaks = []
     for dataset in (with_division, uncorrected):
         transfer = dataset.transfer.values / np.sqrt((np.abs(dataset.transfer.values) ** 2).mean())
@@ -126,7 +127,7 @@ def test_gotcha_trihedrals_focus_within_30_cm(shared, tmp_path):
 @pytest.mark.parametrize("window", ["hann", "none"])
 @pytest.mark.parametrize("pair", ["uav1-uav1", "uav1-uav2"])
 def test_the_table_engine_meets_its_error(finished_sample, window, pair):
-    dataset = open_stage(finished_sample.stage("echo", "f01", pair), "echo")
+    dataset = PairEcho.opened(finished_sample, "f01", pair).stage
     scene = open_scene(finished_sample)
     grid, ground = scene.grid, scene.terrain
     frequency, weight = dataset.frequency.values, window_weights(window, 1024)
@@ -148,7 +149,7 @@ def test_what_the_product_says_of_its_error_is_true(finished_tiny):
     """Recomputed here at other pixels than those it was certified on."""
     pair = ("f01", "uav1-uav2")
     said = json.loads((finished_tiny.results / "f01" / "uav1-uav2" / "image.json").read_text())
-    dataset = open_stage(finished_tiny.stage("echo", *pair), "echo")
+    dataset = PairEcho.opened(finished_tiny, *pair).stage
     formed = open_stage(finished_tiny.stage("image", *pair), "image").image.values
     frequency, places = dataset.frequency.values, (dataset.tx_position.values, dataset.rx_position.values)
     sampled = dataset.transfer.values, frequency, window_weights("hann", 1024), np.zeros(len(places[0]))

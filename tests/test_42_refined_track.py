@@ -24,6 +24,7 @@ from apertura.pipeline.check import as_line, problems
 from apertura.pipeline.opening.acquisition import open_acquisition
 from apertura.pipeline.opening.autofocus import RefinedTrack, clock_s, open_refined
 from apertura.pipeline.opening.diagnosis import evidence_of, moved_evidence
+from apertura.pipeline.opening.echo import PairEcho
 from apertura.pipeline.opening.pair import open_pair
 from apertura.pipeline.opening.results import open_campaign
 from apertura.pipeline.opening.scene import open_scene
@@ -188,7 +189,7 @@ def test_hypotheses_begin_where_the_images_do(spoilt):
     nodes = {name: track.node(node) for name, node in logged.items()}
     for name in PAIRS:
         pair = open_pair(campaign, "f01", name)
-        told = evidence_of(logged, name, open_stage(campaign.stage("echo", "f01", name), "echo"), "hann")
+        told = evidence_of(logged, name, PairEcho.opened(campaign, "f01", name).stage, "hann")
         (moved,) = moved_evidence(nodes, [told])
         imaged = track.pair(pair).history
         assert np.abs(imaged.aperture.tx_m - pair.aperture.tx_m).max() > 0.02

@@ -15,6 +15,7 @@ from apertura.core.quality.point_targets import find_peak
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.check import problems
 from apertura.pipeline.config import validated
+from apertura.pipeline.opening.echo import PairEcho
 from apertura.pipeline.opening.pair import open_pair
 from apertura.pipeline.opening.plan import budget_of
 from apertura.pipeline.opening.scene import open_scene
@@ -93,7 +94,7 @@ def alone(request, tmp_path_factory):
 @pytest.mark.quick("chirp-*")
 @pytest.mark.parametrize("pair", PAIRS)
 def test_range_profiles_of_a_pulse_have_the_sidelobes_of_the_window_at_every_delay(alone, pair):
-    stage = open_stage(alone.stage("echo", "f01", pair), "echo")
+    stage = PairEcho.opened(alone, "f01", pair).stage
     place = preset("demo").origin.ecef(np.zeros(3))
     path = sum(np.linalg.norm(stage[leg].values - place, axis=1) for leg in ("tx_position", "rx_position"))
     turn = np.exp(2j * np.pi * np.outer(path / 299792458, stage.frequency.values))
@@ -105,7 +106,7 @@ def test_range_profiles_of_a_pulse_have_the_sidelobes_of_the_window_at_every_del
 
 def test_the_echo_says_which_filter_and_why(imaged):
     for pair in PAIRS:
-        attrs = open_stage(imaged.stage("echo", "f01", pair), "echo").attrs
+        attrs = PairEcho.opened(imaged, "f01", pair).stage.attrs
         assert attrs["waveform"]["filter"] == "inverse"
         assert attrs["waveform"]["loss_db"] < 4.5
         assert attrs["code"]["carried"] is True
@@ -122,7 +123,7 @@ def test_what_the_logs_promise_is_what_the_echo_has(tiny):
         formed = open_pair(campaign, "f01", pair)
         np.testing.assert_allclose(before.frequency_hz, formed.frequency_hz, rtol=1e-12)
         assert before.path_limit_m == pytest.approx(formed.path_limit_m, abs=0.05)
-        offset_m = open_stage(campaign.stage("echo", "f01", pair), "echo").attrs["stated_offset_m"]
+        offset_m = PairEcho.opened(campaign, "f01", pair).stage.attrs["stated_offset_m"]
         if pair == "uav1-uav1":
             assert formed.path_limit_m == pytest.approx(
                 (0.5e-6 - offset_m / 299792458) * formed.wave_speed_m_s, abs=1e-6
@@ -179,7 +180,7 @@ def test_captures_that_begin_in_the_direct_pulse_or_end_in_it_are_flagged(tmp_pa
     for node in ("uav1", "uav2"):
         ingest.ingest(campaign, "f01", node)
     echo.echo(campaign, "f01", "uav1-uav2")
-    assert ("pulse_cut" in open_stage(campaign.stage("echo", "f01", "uav1-uav2"), "echo").attrs["flags"]) is cut
+    assert ("pulse_cut" in PairEcho.opened(campaign, "f01", "uav1-uav2").stage.attrs["flags"]) is cut
 
 
 def test_captures_shorter_than_a_pulse_and_its_echoes_are_refused_by_the_step(tiny):

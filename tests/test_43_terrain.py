@@ -18,6 +18,7 @@ from apertura.core.geometry.geodesy import projected_from_ecef
 from apertura.core.imaging.range_profiles import profiles_of
 from apertura.core.scene.grid import SceneGrid
 from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.opening.echo import PairEcho
 from apertura.pipeline.opening.pair import open_pair
 from apertura.pipeline.opening.plan import job_of, plan_pair
 from apertura.pipeline.opening.scene import ConfiguredGround, expected_scene, open_scene, settled_scene
@@ -120,7 +121,7 @@ def test_layers_lie_on_the_grid_and_hold_the_angles_of_the_slope(hillside):
             assert tuple(raster.transform)[:6] == grid.transform
             assert raster.crs.to_epsg() == 32632
             values[name] = raster.read(1)
-    echo = open_stage(hillside.stage("echo", "f01", "uav1-uav2"), "echo")
+    echo = PairEcho.opened(hillside, "f01", "uav1-uav2").stage
     middle = tuple(size // 2 for size in grid.shape)
     place = grid.positions_at(*middle, heights[middle])
     legs = [echo[name].values for name in ("tx_position", "rx_position")]
@@ -180,7 +181,7 @@ def test_the_plan_predicts_the_profiles_of_a_hillside(hillside, made, tmp_path):
 def test_an_echo_that_is_open_is_not_read_again(hillside, tmp_path):
     """Its stage may even be gone: the pair is opened and planned from the arrays that are held."""
     campaign = Campaign.load(copy_writable(hillside.root, tmp_path / "campaign"))
-    echo = open_stage(campaign.stage("echo", *PAIR), "echo").load()
+    echo = PairEcho.opened(campaign, *PAIR).stage.load()
     shutil.rmtree(campaign.stage("echo", *PAIR))
     opened = open_pair(campaign, *PAIR, echo=echo)
     assert np.shares_memory(opened.history.transfer, echo.transfer.values)

@@ -7,8 +7,8 @@ import pytest
 from folders import complaint, edit_config, ingest_all, quality_of
 
 from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.opening.echo import PairEcho
 from apertura.pipeline.steps import echo, image, profile, refine, scene
-from apertura.pipeline.store import open_stage
 from apertura.simulation import ImageGrid, preset, simulate
 from apertura.simulation.impairments import Adc, Blockage, Clock, Reflection, Ripple, TimeTag, UniformPhase
 
@@ -26,7 +26,7 @@ def flown(folder, node="uav2", *, pulses=40, **impairments):
 
 def echo_of(campaign, pair="uav1-uav2"):
     echo.echo(campaign, "f01", pair)
-    return open_stage(campaign.stage("echo", "f01", pair), "echo")
+    return PairEcho.opened(campaign, "f01", pair).stage
 
 
 def test_an_undisturbed_flight_raises_no_flag(tmp_path):
@@ -69,7 +69,11 @@ def test_ripple_that_may_be_an_echo_is_flagged(tmp_path, peak_to_peak_db, flagge
 @pytest.mark.quick("4.0-True")
 @pytest.mark.parametrize(("backoff_db", "flagged"), [(4.0, True), (14.0, False)])
 def test_a_saturated_converter_is_flagged(tmp_path, backoff_db, flagged):
-    flags = echo_of(flown(tmp_path, adc=Adc(backoff_db=backoff_db))).attrs["flags"]
+    campaign = flown(tmp_path, adc=Adc(backoff_db=backoff_db))
+    echo.echo(campaign, "f01", "uav1-uav2")
+    opened = PairEcho.opened(campaign, "f01", "uav1-uav2")
+    opened.stage.transfer.load()
+    flags = opened.flags
     assert ("saturated_radar" in flags) is flagged
     assert ("saturated_sidelink" in flags) is flagged
 

@@ -13,13 +13,13 @@ from apertura.core.geometry.geodesy import ecef_from_geodetic
 from apertura.formats.tracks.track import make_track
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import Node
+from apertura.pipeline.opening.echo import PairEcho
 from apertura.pipeline.opening.node_log import NodeLog, raw_log
 from apertura.pipeline.opening.pair import open_pair
 from apertura.pipeline.opening.plan import budget_of
 from apertura.pipeline.opening.positions import place
 from apertura.pipeline.opening.scene import expected_scene
 from apertura.pipeline.steps import echo, ingest
-from apertura.pipeline.store import open_stage
 from apertura.simulation import Impairments, PointTarget, Straight, simulate
 from apertura.simulation.impairments import TimeTag
 from apertura.simulation.scene import Wobble
@@ -43,7 +43,7 @@ def echo_of(campaign, pair="a-b"):
     for node in ("a", "b"):
         ingest.ingest(campaign, "f01", node)
     echo.echo(Campaign.load(campaign.root), "f01", pair)
-    return open_stage(campaign.stage("echo", "f01", pair), "echo")
+    return PairEcho.opened(campaign, "f01", pair).stage
 
 
 def flags_of(dataset):

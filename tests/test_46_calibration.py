@@ -10,8 +10,8 @@ from folders import complaint, edit_config
 
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.lineage import result_of
+from apertura.pipeline.opening.echo import PairEcho
 from apertura.pipeline.steps import calibration, echo, ingest
-from apertura.pipeline.store import open_stage
 from apertura.simulation import ImageGrid, preset, simulate
 from apertura.simulation.scene import PointTarget
 
@@ -68,7 +68,7 @@ def test_a_reflector_alone_is_coherent(calibrated):
 
 def test_imaging_flights_take_the_offset_by_reference_and_say_so(calibrated):
     echo.echo(calibrated, "f01", "uav1-uav2")
-    dataset = open_stage(calibrated.stage("echo", "f01", "uav1-uav2"), "echo")
+    dataset = PairEcho.opened(calibrated, "f01", "uav1-uav2").stage
     estimate = report(calibrated)["uav1-uav2"]
     assert dataset.attrs["calibration"] == {name: estimate.get(name, "c01") for name in ("flight", "offset_m", "std_m")}
     assert "raw/c01/uav2.sigmf-data" in dataset.attrs["inputs"]

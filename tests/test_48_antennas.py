@@ -12,6 +12,7 @@ from apertura.core.quality.point_targets import cut_through, find_peak
 from apertura.formats.export.layers import OUTSIDE
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.lineage import result_of
+from apertura.pipeline.opening.echo import PairEcho
 from apertura.pipeline.steps import echo, image, ingest, layers, profile, refine, scene
 from apertura.pipeline.store import open_stage
 from apertura.simulation import (
@@ -240,7 +241,7 @@ def test_the_echo_carries_the_body_s_axes_only_where_a_beam_needs_them(beamed):
     def axes(campaign):
         ingest.ingest(campaign, "f01", "uav1")
         echo.echo(campaign, "f01", "uav1-uav1")
-        stored = open_stage(campaign.stage("echo", "f01", "uav1-uav1"), "echo")
+        stored = PairEcho.opened(campaign, "f01", "uav1-uav1").stage
         return {name: stored[name].values for name in ("tx_axes", "rx_axes") if name in stored}
 
     assert axes(stated(beamed, None)) == {}

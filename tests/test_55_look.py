@@ -20,6 +20,7 @@ from apertura.common.errors import CampaignError
 from apertura.core.echo.compression import window_weights
 from apertura.formats.recordings.sigmf import GrowingSigmf, open_sigmf
 from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.opening.echo import PairEcho
 from apertura.pipeline.opening.scene import settled_scene
 from apertura.pipeline.opening.transmitted import transmitted
 from apertura.pipeline.runs.results import clean
@@ -75,7 +76,7 @@ def test_an_image_added_in_blocks_is_that_of_all_pulses_at_once(finished_tiny, t
     state(root, "processing", integration="all")
     for pair in in_blocks(root, pulses, monkeypatch)[:1]:
         coarse, fine = pair.images
-        echo = open_stage(finished_tiny.stage("echo", "f01", pair.name), "echo").load()
+        echo = PairEcho.opened(finished_tiny, "f01", pair.name).stage.load()
         assert fine.pulses == coarse.pulses == len(echo.pulse)
         height_m = finished_tiny.settings.scene.height_m
         exact = ap.backproject(echo, fine.grid, terrain=height_m, engine="reference", certified_pixels=0, judge=False)

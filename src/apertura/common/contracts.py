@@ -175,18 +175,28 @@ STAGES: Mapping[str, Stage] = {
     "echo": Stage(
         {
             **_PULSE_GEOMETRY,
-            "transfer": Variable(("pulse", "subcarrier"), "complex64", "1", "Σ a·exp(-j2πf(τ-τ_ref)) over the paths"),
             "frequency": Variable(("subcarrier",), "float64", "Hz", "RF frequency of each subcarrier, ascending"),
             "reference_delay": Variable(("pulse",), "float64", "s", "τ_ref, already removed from `transfer`"),
             "path_limit": Variable(("pulse",), "float64", "m", "total path beyond which an echo leaves the prefix"),
         },
         _FRAME | _WAVE,
         {
+            "transfer": Variable(("pulse", "subcarrier"), "complex64", "1", "Σ a·exp(-j2πf(τ-τ_ref)) over the paths"),
+            "capture": Variable(("pulse",), "int64", "1", "capture of the receiver's recording that `transfer` is of"),
+            "path_removed": Variable(
+                ("pulse",), "float64", "m", "electrical path beyond that by the scene, already removed from `transfer`"
+            ),
+            "clock_offset": Variable(
+                ("pulse",), "float64", "Hz", "carrier offset of the receiver, already removed from its samples"
+            ),
             "sidelink_delay": Variable(
                 ("pulse",), "float64", "m", "measured delay of the sidelink times c, any constant in it; NaN: no lock"
             ),
             "sidelink_snr": Variable(("pulse",), "float64", "dB", "of the sidelink per subcarrier; NaN: no lock"),
             "sidelink_phase": Variable(("pulse",), "float64", "rad", "of the sidelink at mid-band; NaN: no lock"),
+            "sidelink_amplitude": Variable(
+                ("pulse",), "float64", "1", "of the sidelink per subcarrier, ADC counts; NaN: no lock"
+            ),
             "sidelink_vector": Variable(
                 ("pulse", "axis"), "float64", "m", "receiver's sidelink point to transmitter's"
             ),
@@ -213,6 +223,7 @@ STAGES: Mapping[str, Stage] = {
             "centre_frequency_hz": "f_mid, to which the profile is referenced, Hz",
             "oversampling": "samples per resolution cell c/B of total path",
             "window": "weighting over the subcarriers",
+            "compression_error_db": "RMS error against the sum over the subcarriers, measured at some samples, dB",
         },
     ),
     "refined_track": Stage(

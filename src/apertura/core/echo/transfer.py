@@ -1,11 +1,12 @@
 """Transfer functions from the captures of a pair: by the code alone, or against the sidelink.
 
 In two passes: the first measures clock, sidelink and a few numbers per pulse, the second forms
-transfer functions, block by block. No more than a block of captures is in memory, however long the flight is.
+transfer functions, block by block, from these numbers alone: when they are needed, as often as they are. No more than a
+block of captures is in memory, however long the flight is.
 """
 
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -17,14 +18,84 @@ from apertura.common.flags import Flags
 from apertura.common.progress import progress
 from apertura.core.echo.baseline import BaselineResidual, baseline_residual, detect_wrong_association
 from apertura.core.echo.captures import Pulses, Read, Samples, Saturation, blocks_of, correct_clock, spread
-from apertura.core.echo.clock import GROUPS, ClockOffset, clock_of, decide_clock
+from apertura.core.echo.clock import GROUPS, clock_of, decide_clock
 from apertura.core.echo.demodulate import Numerology, demodulate
+from apertura.core.echo.line_of_sight import LineOfSight
 from apertura.core.echo.own_pulses import CodeEvidence, own_code, phase_stability
 from apertura.core.echo.sidelink import DIVIDING, METHODS, choose, edges
 from apertura.core.echo.sidelink_state import SidelinkState, measure_blocks, second_path_flags
 
 _STRETCH = 128  # neighbouring pulses on which own code and phase are checked
 _CLOCK_STRETCH = 256
+
+
+@dataclass(frozen=True)
+class Correction:
+    """What the transfer functions of a secondary node are corrected by, pulse by pulse.
+
+    Attributes
+    ----------
+    method
+        A key of `METHODS`.
+    path
+        The direct path in the sidelink of each pulse.
+    clock_hz
+        (pulse,) float64, carrier offset of the receiver that is taken off its samples; None: none is.
+    sfo_ppm
+        Offset of its sampling rate, taken off with it.
+    """
+
+    method: str
+    path: LineOfSight
+    clock_hz: Floats | None
+    sfo_ppm: float
+
+    def select(self, pulses: Pulses | NDArray[np.bool_]) -> "Correction":
+        """Return the correction of some pulses."""
+        clock_hz = None if self.clock_hz is None else self.clock_hz[pulses]
+        return replace(self, path=self.path.select(pulses), clock_hz=clock_hz)
+
+
+@dataclass(frozen=True)
+class Demodulator:
+    """What turns samples of a capture into symbols.
+
+    Attributes
+    ----------
+    inverse, numerology
+        (subcarrier,) complex64 that removes the transmitted signal, 1/c_n of a symbol, and its grid.
+    symbol_samples
+        (T_cp + T)·f_s, or all of a capture: nothing beyond is used.
+    """
+
+    inverse: Complexes
+    numerology: Numerology
+    symbol_samples: int
+
+    def symbols(self, iq: Samples, clock_hz: Floats | None = None, sfo_ppm: float = 0.0) -> Complexes:
+        """Return (pulse, subcarrier) complex64 of samples (pulse, sample, 2), on the transmitter's clock."""
+        numerology = self.numerology
+        if clock_hz is None:
+            return demodulate(as_complex(iq), numerology) * self.inverse
+        samples = as_complex(iq[:, : self.symbol_samples])
+        corrected = correct_clock(samples, numerology, cfo_hz=clock_hz, sfo_ppm=sfo_ppm)
+        return demodulate(corrected, numerology) * self.inverse
+
+    def transfer(self, iq: Mapping[str, Samples], correction: Correction | None = None) -> Complexes:
+        """Return the transfer functions of a few captures, (pulse, subcarrier) complex64.
+
+        Parameters
+        ----------
+        iq
+            Channel → (pulse, sample, 2): `radar`, and `sidelink` where there is a correction.
+        correction
+            Of these pulses; None: of a node that hears itself.
+        """
+        if correction is None:
+            return self.symbols(iq["radar"])
+        clock = correction.clock_hz, correction.sfo_ppm
+        radar, sidelink = (self.symbols(iq[name], *clock) for name in ("radar", "sidelink"))
+        return METHODS[correction.method](radar, sidelink, correction.path)
 
 
 @dataclass(frozen=True)
@@ -47,6 +118,8 @@ class Transfer:
         removed; electrical paths are not removed.
     saturation
         Of the samples of the transfer functions formed so far.
+    correction
+        (capture,) what `form` corrects by; None of a node that hears itself.
     """
 
     kept: NDArray[np.bool_]
@@ -57,6 +130,7 @@ class Transfer:
     saturation: Saturation
     sidelink_snr_db: Floats | None = None
     sidelink_phase_rad: Floats | None = None
+    correction: Correction | None = None
 
 
 def transfer_by_code(read: Read, inverse: Complexes, numerology: Numerology, *, time_s: Floats) -> Transfer:
@@ -85,18 +159,10 @@ def transfer_by_code(read: Read, inverse: Complexes, numerology: Numerology, *, 
     >>> abs(measured.form(np.arange(1))).round(0)
     array([[  0.,   0.,   0., 500.,   0.,   0.,   0.,   0.]], dtype=float32)
     """
-    saturation = Saturation()
-
-    def demodulated(radar: Samples) -> Complexes:
-        return demodulate(as_complex(radar), numerology) * inverse
-
-    def form(captures: Pulses) -> Complexes:
-        radar = read(captures)["radar"]
-        saturation.count({"radar": radar})
-        return demodulated(radar)
-
+    demodulator = Demodulator(inverse, numerology, 0)
+    form, saturation = _forming(read, demodulator, None)
     some = np.concatenate(spread(len(time_s), groups=GROUPS, each=_STRETCH))
-    sample = np.concatenate([demodulated(read(block)["radar"]) for block in blocks_of(some)])
+    sample = np.concatenate([demodulator.transfer(read(block)) for block in blocks_of(some)])
     code = own_code(sample, prefix_cells=numerology.delay_cells)
     phase = phase_stability(sample, time_s[some], prefix_cells=numerology.delay_cells)
     flags = Flags.merged(code.flags, phase.flags if phase else {})
@@ -144,7 +210,8 @@ def transfer_by_sidelink(
     Source: docs/theory/echo_methods.md. The clock is measured on up to 4096 captures, 16 stretches spread over the
     flight, the state of the sidelink on all.
     """
-    receiver = _Receiver.measured(read, inverse, numerology, symbol_samples, len(sidelink_m), accuracy_db)
+    demodulator = Demodulator(inverse, numerology, symbol_samples)
+    receiver = _Receiver.measured(read, demodulator, len(sidelink_m), accuracy_db)
     with progress("sidelinks", len(sidelink_m)) as done:
         state = measure_blocks(lambda: receiver.sidelink(done), f"{where}: sidelink")
     chosen, reason = choose(state) if method == "auto" else (method, "asked for")
@@ -161,17 +228,34 @@ def transfer_by_sidelink(
         {"association_suspect": wrong} if wrong else {},
     )
     quality = {"method": chosen, "reason": reason, **_sidelink_report(state, residual)}
+    correction = Correction(chosen, state.path, receiver.clock_hz, receiver.sfo_ppm)
+    form, saturation = _forming(read, demodulator, correction)
+    report = {"clock": receiver.report, "sidelink": quality, "code": _sidelink_code(state).report}
+    return Transfer(
+        state.locked,
+        flags,
+        report,
+        delay_m[state.locked],
+        form,
+        saturation,
+        state.snr_of_pulses_db[state.locked],
+        state.phase_rad[state.locked],
+        correction,
+    )
+
+
+def _forming(
+    read: Read, demodulator: Demodulator, correction: Correction | None
+) -> tuple[Callable[[Pulses], Complexes], Saturation]:
+    """Return what forms transfer functions of captures, and the saturation of the samples that it read."""
     saturation = Saturation()
 
     def form(captures: Pulses) -> Complexes:
         iq = read(captures)
         saturation.count(iq)
-        radar, sidelink = (receiver.received(iq[name], captures) for name in ("radar", "sidelink"))
-        return METHODS[chosen](radar, sidelink, state.path.select(captures))
+        return demodulator.transfer(iq, correction and correction.select(captures))
 
-    report = {"clock": receiver.report, "sidelink": quality, "code": _sidelink_code(state).report}
-    of_pulses = (values[state.locked] for values in (state.snr_of_pulses_db, state.phase_rad))
-    return Transfer(state.locked, flags, report, delay_m[state.locked], form, saturation, *of_pulses)
+    return form, saturation
 
 
 def as_complex(iq: Samples) -> Complexes:
@@ -181,30 +265,27 @@ def as_complex(iq: Samples) -> Complexes:
 
 @dataclass(frozen=True)
 class _Receiver:
-    """Demodulation of captures of a node with its own clock, corrected in the samples if decided."""
+    """The clock of captures of a node with its own, corrected in the samples if decided."""
 
     read: Read
-    inverse: Complexes  # of the code
-    numerology: Numerology
-    symbol_samples: int
-    clock: ClockOffset | None  # to be corrected
-    cfo_hz: Floats
+    demodulator: Demodulator
+    count: int  # of captures
     report: dict[str, Any]
     clock_flags: dict[str, str]
+    clock_hz: Floats | None = None  # of each capture, to be corrected
+    sfo_ppm: float = 0.0
 
     @classmethod
-    def measured(
-        cls, read: Read, inverse: Complexes, numerology: Numerology, symbol_samples: int, count: int, accuracy_db: float
-    ) -> "_Receiver":
+    def measured(cls, read: Read, demodulator: Demodulator, count: int, accuracy_db: float) -> "_Receiver":
         """Measure the clock, and decide whether it is corrected in the samples."""
-        groups = spread(count, groups=GROUPS, each=_CLOCK_STRETCH)
-        sidelink: Iterable[Complexes] = (as_complex(read(some)["sidelink"][:, :symbol_samples]) for some in groups)
-        kept = read, inverse, numerology, symbol_samples
+        groups, numerology = spread(count, groups=GROUPS, each=_CLOCK_STRETCH), demodulator.numerology
+        length = demodulator.symbol_samples
+        sidelink: Iterable[Complexes] = (as_complex(read(some)["sidelink"][:, :length]) for some in groups)
         try:
             clock = clock_of(sidelink, numerology, pulses=count)
         except ValueError as error:
             report = {"corrected": False, "reason": str(error)}
-            return cls(*kept, None, np.zeros(count), report, {"clock_unmeasured": str(error)})
+            return cls(read, demodulator, count, report, {"clock_unmeasured": str(error)})
         decision = decide_clock(clock, numerology, accuracy_db=accuracy_db)
         ppm, std_ppm = clock.ppm(numerology)
         report = {
@@ -214,22 +295,17 @@ class _Receiver:
             "ppm": round(ppm, 4),
             "std_ppm": None if std_ppm is None else round(std_ppm, 4),
         }
-        cfo_hz = clock.cfo_of_pulses_hz(count)
-        return cls(*kept, clock if decision.correct else None, cfo_hz, report, decision.flags)
+        if decision.correct:
+            report["sfo_ppm"] = clock.sfo_ppm
+        corrected = (clock.cfo_of_pulses_hz(count), clock.sfo_ppm) if decision.correct else ()
+        return cls(read, demodulator, count, report, decision.flags, *corrected)
 
     def sidelink(self, done: Callable[[int], None]) -> Iterator[Complexes]:
         """Yield the symbols of the sidelink, (pulse, subcarrier) complex64, the code removed."""
-        for some in blocks_of(np.arange(len(self.cfo_hz))):
-            yield self.received(self.read(some)["sidelink"], some)
+        for some in blocks_of(np.arange(self.count)):
+            clock_hz = None if self.clock_hz is None else self.clock_hz[some]
+            yield self.demodulator.symbols(self.read(some)["sidelink"], clock_hz, self.sfo_ppm)
             done(len(some))
-
-    def received(self, iq: Samples, captures: Pulses) -> Complexes:
-        """Return the symbols of some captures' samples."""
-        samples = as_complex(iq[:, : self.symbol_samples])
-        if self.clock is not None:
-            cfo_hz = self.cfo_hz[captures]
-            samples = correct_clock(samples, self.numerology, cfo_hz=cfo_hz, sfo_ppm=self.clock.sfo_ppm)
-        return demodulate(samples, self.numerology) * self.inverse
 
 
 def _sidelink_report(state: SidelinkState, residual: BaselineResidual | None) -> dict[str, float]:

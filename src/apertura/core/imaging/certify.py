@@ -79,7 +79,7 @@ def _random_certificate(formation: Formation) -> Certificate:
 def _error(formation: Formation, certificate: Certificate, target: Any, brightness: Brightness) -> ErrorBound:
     """Return the error of the image as it is now; its bright pixels are drawn from the image alone."""
     bright = brightness.draw(target, formation.windows, BRIGHT_PIXELS, np.random.default_rng(1))
-    return certificate.error(target, brightness, bright, formation.exact(bright))
+    return certificate.error(target, brightness, bright, formation.exact(bright)).with_error(formation.compression_db)
 
 
 def measures(formation: Formation, target: Any) -> dict[str, Any]:

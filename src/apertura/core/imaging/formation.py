@@ -35,7 +35,7 @@ class Formation:
     Attributes
     ----------
     history
-        Phase history for the double sum; None where there are only profiles.
+        Phase history; None where there are only profiles.
     profiles
         The same as range profiles, for the engines that use tables.
     grid
@@ -44,6 +44,8 @@ class Formation:
         Engine, model of the ground and weights of pulses.
     side_px
         Of a tile.
+    compression_db
+        Error of the profiles against the history, measured where they were compressed, dB; None: not measured.
     """
 
     history: PhaseHistory | None
@@ -51,6 +53,12 @@ class Formation:
     grid: SceneGrid
     plan: Plan
     side_px: int
+    compression_db: float | None = None
+
+    @property
+    def summed(self) -> PhaseHistory | Profiles:
+        """Input of the double sum: the history, unless it is known how far the profiles are from it."""
+        return self.profiles if self.history is None or self.compression_db is not None else self.history
 
     @property
     def beams(self) -> Beams | None:
@@ -100,14 +108,14 @@ class Formation:
         return self.plan.terrain.positions_at(self.grid, row, column)
 
     def exact(self, pixels: NDArray[np.int64]) -> NDArray[np.complex128]:
-        """Return the image at (pixel, 2) rows and columns, (pixel,) complex128, by the double sum over the history.
+        """Return the image at (pixel, 2) rows and columns, (pixel,) complex128, by the double sum over `summed`.
 
-        Where there are only profiles, by their band-limited interpolation in float64.
+        Of profiles, by their band-limited interpolation in float64.
         """
         places = self.positions_at(*pixels.T)
         total = np.zeros(len(places), np.complex128)
         for pulses, parts_of in self.illuminating_pulses(places):
-            some = (self.history or self.profiles)[pulses]
+            some = self.summed[pulses]
             for part, inside in parts_of:
                 weights = self.beams and self.beams[pulses][part]
                 total[inside] += _exact_sum(some[part], places[inside], weights)
@@ -164,12 +172,12 @@ class Formation:
     def contributions(self, row: ArrayLike, column: ArrayLike) -> list[NDArray[np.complex128]]:
         """Return the contributions of the pulses that illuminate each fractional pixel, (pulse,) complex128 each.
 
-        By the sum over the history's subcarriers, or of profiles by their band-limited interpolation.
+        By the sum over a history's subcarriers, or of profiles by their band-limited interpolation.
         """
         places = self.positions_at(np.atleast_1d(row), np.atleast_1d(column))
         parts: list[list[NDArray[np.complex128]]] = [[np.empty(0, np.complex128)] for _ in places]
         for pulses, parts_of in self.illuminating_pulses(places):
-            some = (self.history or self.profiles)[pulses]
+            some = self.summed[pulses]
             for part, inside in parts_of:
                 terms = _terms(some[part], places[inside], self.beams and self.beams[pulses][part])
                 for place, column_of in zip(np.flatnonzero(inside), terms.T, strict=True):

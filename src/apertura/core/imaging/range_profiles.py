@@ -176,6 +176,56 @@ def range_compress(
     )
 
 
+class CompressionError:
+    """Error of range profiles against their transfer functions, at some samples of some pulses of every block.
+
+    Parameters
+    ----------
+    generator
+        Draws them.
+
+    Notes
+    -----
+    Source: docs/theory.md, eq. 4 and 5: the sum over the subcarriers at the path of a sample, in float64.
+
+    Examples
+    --------
+    >>> frequency = 1.2e9 + 1e6 * np.arange(64)
+    >>> track = np.zeros((4, 3))
+    >>> history = PhaseHistory(np.ones((4, 64), np.complex64), frequency, np.full(64, 1 / 64), np.zeros(4),
+    ...                        Aperture(track, track))
+    >>> samples = compress(history.transfer, frequency, weight=history.weight, reference_delay_s=np.zeros(4),
+    ...                    start_m=np.full(4, -20.0), count=20, oversampling=2.0)
+    >>> error = CompressionError(np.random.default_rng(1))
+    >>> error.add(history, Profiles(samples, np.full(4, -20.0), 299792458.0 / 1.28e8, frequency[32], 2.0,
+    ...                             history.aperture))
+    >>> error.decibels < -110
+    True
+    """
+
+    _PULSES, _SAMPLES = 2, 16
+
+    def __init__(self, generator: np.random.Generator):
+        self._generator, self._wrong, self._power = generator, 0.0, 0.0
+
+    def add(self, history: PhaseHistory, profiles: Profiles) -> None:
+        """Compare some samples of some pulses, the same in both."""
+        for pulse in self._generator.integers(len(history), size=self._PULSES):
+            numbers = self._generator.integers(profiles.samples.shape[1], size=self._SAMPLES)
+            path_m = profiles.start_m[pulse] + profiles.step_m * numbers
+            delay_s = path_m / history.wave_speed_m_s - history.reference_delay_s[pulse]
+            turns = history.frequency_hz[:, None] * delay_s
+            exact = (history.weight * history.transfer[pulse]) @ np.exp(2j * np.pi * (turns % 1.0))
+            carrier = np.exp(1j * np.remainder(profiles.wavenumber_rad_m * path_m, 2 * np.pi))
+            self._wrong += float((np.abs(profiles.samples[pulse, numbers] * carrier - exact) ** 2).sum())
+            self._power += float((np.abs(exact) ** 2).sum())
+
+    @property
+    def decibels(self) -> float:
+        """RMS error over RMS of the samples, dB; -300 of nothing."""
+        return 10 * float(np.log10(max(self._wrong / max(self._power, 1e-300), 1e-30)))
+
+
 # ---- Stages as inputs of engines
 
 _SPARSE_STEP = 64  # pulses: at larger steps they are read one by one

@@ -31,6 +31,20 @@ class ErrorBound:
     bound_db: float
     estimate_db: float
 
+    def with_error(self, error_db: float | None) -> "ErrorBound":
+        """Return the bound with another error that is independent of this one, dB; None: there is none.
+
+        Examples
+        --------
+        >>> round(ErrorBound(-60.0, -63.0).with_error(-60.0).bound_db, 2)
+        -56.99
+        """
+        if error_db is None:
+            return self
+        powers = 10 ** (np.array([self.bound_db, self.estimate_db]) / 10) + 10 ** (error_db / 10)
+        bound_db, estimate_db = (10 * np.log10(powers)).tolist()
+        return ErrorBound(bound_db, estimate_db)
+
 
 def error_bound(
     computed: NDArray[np.complexfloating],

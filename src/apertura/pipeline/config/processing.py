@@ -64,6 +64,11 @@ class Processing(ImagingChoices):
         description="mean power of squares of pixels, multilook_db.tif and so on, such as {spacing_m: 1.0, "
         "subtract_noise: true, speckle_filter: lee}; null: none",
     )
+    keep: tuple[Literal["echo"], ...] = Field(
+        (),
+        description="what is written though no image needs it: echo, the transfer functions of every pulse in "
+        "echo.zarr, which otherwise are formed from the recording when they are read",
+    )
     scheduler: str = Field(
         "threads",
         description="who forms the tiles: threads of the step, or the dask scheduler at tcp://host:port, if whoever "

@@ -1,84 +1,210 @@
 """The echo of a pair from the recordings of its nodes: pulses, positions, transfer functions."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
+from xarray.backends import BackendArray
+from xarray.core import indexing
 
 from apertura.common.arrays import Complexes, Times
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.common.errors import CampaignError
 from apertura.common.flags import Flags
 from apertura.core.echo.association import Association, missing_flags, tag_jitter_s
 from apertura.core.echo.captures import Pulses, Saturation, blocks_of
 from apertura.core.echo.demodulate import remove_path
+from apertura.core.echo.line_of_sight import LineOfSight
 from apertura.core.echo.pulse_filter import truncation_flags
 from apertura.core.echo.sidelink import DIVIDING
-from apertura.core.echo.transfer import Transfer, transfer_by_code, transfer_by_sidelink
+from apertura.core.echo.transfer import Correction, Demodulator, Transfer, transfer_by_code, transfer_by_sidelink
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.atmosphere import SceneAir
+from apertura.core.imaging.range_profiles import wave_speed_of
 from apertura.core.quality.budget import strictest_accuracy_db
+from apertura.formats.times import FIRST
+from apertura.methods.autofocus.motion import Logged, Recorded
 from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.config import Processing, PulseWaveform
-from apertura.pipeline.opening.acquisition import Acquisition, common_pulses
-from apertura.pipeline.opening.air import stated_air
+from apertura.pipeline.config import FLIGHTS, Processing, PulseWaveform, SampledWaveform
+from apertura.pipeline.opening.acquisition import Acquisition, common_pulses, open_acquisition
+from apertura.pipeline.opening.air import scene_air, stated_air
+from apertura.pipeline.opening.node_log import NodeLog, raw_log, shortest_wave
 from apertura.pipeline.opening.positions import PulsePositions, keep_segments, place
-from apertura.pipeline.opening.transmitted import Transmitted
+from apertura.pipeline.opening.reading import read_history
+from apertura.pipeline.opening.transmitted import Transmitted, transmitted
+from apertura.pipeline.store import manifest_of, open_stage
+
+# ---- The echo of a pair: its stage, and transfer functions that are formed when they are needed ---------------------
+
+Form = Callable[[Pulses, Correction | None], Complexes]
+"""Captures, ascending, and their correction → transfer functions, (pulse, subcarrier) complex64."""
 
 
 @dataclass(frozen=True, eq=False)
 class PairEcho:
-    """The echo of a pair, whose transfer functions are formed lazily, block by block.
+    """The echo of a pair, whose transfer functions are formed as often as they are needed, block by block.
 
     Attributes
     ----------
     dataset
-        The stage without `transfer`, and with `row` (pulse,): index of each pulse for `form`.
-    form
-        Rows (pulse,) int64, ascending → transfer functions of a few pulses, (pulse, subcarrier) complex64.
+        The stage; without `transfer`, `capture` (pulse,) says what each pulse is formed of.
+    source
+        Of captures, or of pulses of a recorder that stores transfer functions.
     saturation
         Of the samples read so far.
     """
 
     dataset: xr.Dataset
-    form: Callable[[Pulses], Complexes]
-    saturation: Saturation
+    source: Form
+    saturation: Saturation = field(default_factory=Saturation)
 
     @classmethod
     def recorded(cls, echo: xr.Dataset) -> "PairEcho":
         """Return the echo of a recorder that stores transfer functions."""
         history = echo.transfer
 
-        def form(rows: Pulses) -> Complexes:
+        def form(rows: Pulses, _: Correction | None) -> Complexes:
             return np.asarray(history[rows].values)
 
-        return cls(echo.drop_vars("transfer").assign(row=_rows(len(history))), form, Saturation())
+        return cls(echo.drop_vars("transfer").assign(capture=("pulse", np.arange(len(history)))), form)
+
+    @classmethod
+    def opened(cls, campaign: Campaign, flight: str, pair: str) -> "PairEcho":
+        """Return that of a finished stage `echo`; the recording is opened when a transfer function is asked for.
+
+        Raises
+        ------
+        CampaignError
+            If the stage is damaged or missing; when it is opened, if the recording is.
+        """
+        stage, saturation = open_stage(campaign.stage("echo", flight, pair), "echo"), Saturation()
+
+        @cache
+        def source() -> Form:
+            waveform = campaign.settings.waveform
+            if not isinstance(waveform, SampledWaveform):
+                raise TypeError("the echo of a recorder of transfer functions holds them")
+            sent = transmitted(campaign, waveform)
+            receiver = open_acquisition(campaign, flight, pair.split("-")[1], sent)
+            return _source(receiver, sent, saturation, divided="sidelink_amplitude" in stage)
+
+        def form(captures: Pulses, correction: Correction | None) -> Complexes:
+            return source()(captures, correction)
+
+        return cls(stage, form, saturation)
 
     def within(self, campaign: Campaign, flight: str, pair: str) -> "PairEcho":
         """Return the echo inside the segments of its pair."""
         return replace(self, dataset=keep_segments(campaign, flight, pair, self.dataset))
 
     @property
-    def promised(self) -> xr.Dataset:
-        """The stage, with zeros that take no memory for `transfer`."""
-        shape = self.dataset.sizes["pulse"], self.dataset.sizes["subcarrier"]
-        zeros = np.broadcast_to(np.complex64(0), shape)
-        return self.dataset.drop_vars("row").assign(transfer=(("pulse", "subcarrier"), zeros))
+    def flags(self) -> dict[str, str]:
+        """Flags of the stage, and of the samples read so far."""
+        return Flags.merged(self.dataset.attrs["flags"], self.saturation.flags)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Pulses and subcarriers."""
+        return self.dataset.sizes["pulse"], self.dataset.sizes["subcarrier"]
+
+    @property
+    def stage(self) -> xr.Dataset:
+        """The stage, its `transfer` read or formed on access."""
+        if "transfer" in self.dataset:
+            return self.dataset
+        return self.dataset.assign(transfer=xr.Variable(_HISTORY, indexing.LazilyIndexedArray(_Transfer(self))))
+
+    @property
+    def kept(self) -> xr.Dataset:
+        """The stage that keeps its transfer functions, with zeros that take no memory for `transfer`."""
+        zeros = np.broadcast_to(np.complex64(0), self.shape)
+        return self.dataset.drop_vars("capture").assign(transfer=(_HISTORY, zeros))
+
+    @cached_property
+    def form(self) -> Callable[[Pulses], Complexes]:
+        """Numbers of a few pulses, ascending → their transfer functions, (pulse, subcarrier) complex64."""
+        captures, correction, frequency = self.dataset.capture.values, _correction(self.dataset), self.frequency_hz
+        path_m = self.dataset.path_removed.values if "path_removed" in self.dataset else None
+
+        def form(pulses: Pulses) -> Complexes:
+            measured = self.source(captures[pulses], correction and correction.select(pulses))
+            if path_m is None:
+                return measured
+            return remove_path(measured, frequency, delay_s=path_m[pulses] / SPEED_OF_LIGHT_M_S)
+
+        return form
+
+    @property
+    def frequency_hz(self) -> NDArray[np.float64]:
+        """(subcarrier,) float64."""
+        return np.asarray(self.dataset.frequency.values)
 
     def blocks(self) -> Iterator[Complexes]:
         """Yield `transfer` from its beginning, some pulses at a time."""
-        return map(self.form, blocks_of(self.dataset.row.values))
+        return map(self.form, blocks_of(np.arange(len(self.dataset.time))))
 
     def at(self, pulses: slice) -> xr.Dataset:
         """Return the stage at some pulses, formed."""
-        some = replace(self, dataset=self.dataset.isel(pulse=pulses))
-        return some.promised.assign(transfer=(("pulse", "subcarrier"), np.concatenate(list(some.blocks()))))
+        return self.stage.isel(pulse=pulses).load()
 
 
-def _rows(count: int) -> tuple[str, Pulses]:
-    return "pulse", np.arange(count)
+_HISTORY = ("pulse", "subcarrier")
+
+
+class _Transfer(BackendArray):
+    """Transfer functions as an array that is formed where it is read."""
+
+    def __init__(self, echo: PairEcho) -> None:
+        self._echo, self.shape, self.dtype = echo, echo.shape, np.dtype(np.complex64)
+
+    def __getitem__(self, key: indexing.ExplicitIndexer) -> Complexes:
+        support = indexing.IndexingSupport.OUTER
+        return np.asarray(indexing.explicit_indexing_adapter(key, self.shape, support, self._formed))
+
+    def _formed(self, key: tuple[Any, Any]) -> Complexes:
+        pulses = np.arange(self.shape[0])[key[0]]
+        some, back = np.unique(pulses, return_inverse=True)
+        blocks = [self._echo.form(block) for block in blocks_of(some)]
+        transfer = np.concatenate(blocks) if blocks else np.empty((0, self.shape[1]), np.complex64)
+        if len(some) != pulses.size or (np.diff(np.atleast_1d(pulses)) < 0).any():
+            transfer = transfer[back]
+        return np.asarray((transfer if pulses.ndim else transfer[0])[..., key[1]])
+
+
+def _source(rx: Acquisition, sent: Transmitted, saturation: Saturation, *, divided: bool) -> Form:
+    """Return what forms transfer functions of captures of a recording."""
+    read = rx.reader(["radar", "sidelink"] if divided else ["radar"], np.arange(len(rx.raw.start)))
+    demodulator = Demodulator(sent.inverse, rx.numerology, sent.waveform.capture_samples)
+
+    def form(captures: Pulses, correction: Correction | None) -> Complexes:
+        iq = read(captures)
+        saturation.count(iq)
+        return demodulator.transfer(iq, correction)
+
+    return form
+
+
+def _correction(stage: xr.Dataset) -> Correction | None:
+    """Return what the pulses of a stage are corrected by; None where a node hears itself."""
+    if "sidelink_amplitude" not in stage:
+        return None
+    amplitude, cell_m = stage.sidelink_amplitude.values, SPEED_OF_LIGHT_M_S / _bandwidth_hz(stage)
+    noise = amplitude**2 / 10 ** (stage.sidelink_snr.values / 10)
+    locked = np.isfinite(amplitude)
+    delay, phase = stage.sidelink_delay.values / cell_m, stage.sidelink_phase.values
+    known = [np.where(locked, values, 0.0) for values in (delay, phase, amplitude, noise)]
+    path = LineOfSight(known[0], known[1], known[2], known[3], locked)
+    clock_hz = stage.clock_offset.values if "clock_offset" in stage else None
+    return Correction(stage.attrs["sidelink"]["method"], path, clock_hz, stage.attrs["clock"].get("sfo_ppm", 0.0))
+
+
+def _bandwidth_hz(stage: xr.Dataset) -> float:
+    frequency = stage.frequency.values
+    return float((frequency[-1] - frequency[0]) * len(frequency) / (len(frequency) - 1))
 
 
 def pair_echo(
@@ -106,19 +232,15 @@ def pair_echo(
     beyond_m = offset_m - sidelink_m  # electrical path of an echo beyond tx → scene → rx
     aperture = Aperture(tx.antenna("radar_tx", at), rx.antenna("radar_rx", at))
     flown = air.over(aperture)
-    frequency, delay_s = rx.numerology.frequency_hz, beyond_m / SPEED_OF_LIGHT_M_S
-    captures = np.flatnonzero(measured.kept)
-
-    def form(rows: Pulses) -> Complexes:
-        return remove_path(measured.form(captures[rows]), frequency, delay_s=delay_s[rows])
-
+    delay_s = beyond_m / SPEED_OF_LIGHT_M_S
     dataset = xr.Dataset(
         {
             "time": ("pulse", at),
-            "row": _rows(len(at)),
+            "capture": ("pulse", pulses.rx_index[paired][measured.kept]),
+            "path_removed": ("pulse", beyond_m),
             "tx_position": (("pulse", "axis"), aperture.tx_m),
             "rx_position": (("pulse", "axis"), aperture.rx_m),
-            "frequency": ("subcarrier", frequency),
+            "frequency": ("subcarrier", rx.numerology.frequency_hz),
             "reference_delay": ("pulse", np.zeros(len(beyond_m))),
             "path_limit": ("pulse", flown.wave_speed_m_s * (sent.waveform.longest_delay_s - delay_s)),
             **_sidelink(measured),
@@ -128,7 +250,8 @@ def pair_echo(
         attrs=_attributes((tx, rx), pulses, positions, measured, at=at, calibration=calibration)
         | {"stated_offset_m": offset_m, **stated_air(flown)},
     )
-    return PairEcho(dataset, form, measured.saturation)
+    saturation = Saturation()
+    return PairEcho(dataset, _source(rx, sent, saturation, divided=tx.name != rx.name), saturation)
 
 
 def _attributes(
@@ -191,10 +314,15 @@ def _transfer(
 
 def _sidelink(measured: Transfer) -> dict[str, tuple[str, Any]]:
     """Return what was measured of the sidelink in each pulse; nothing of a node that hears itself."""
+    correction, kept = measured.correction, measured.kept
+    if correction is None:
+        return {}
     known = {
         "sidelink_delay": measured.sidelink_delay_m,
         "sidelink_snr": measured.sidelink_snr_db,
         "sidelink_phase": measured.sidelink_phase_rad,
+        "sidelink_amplitude": np.where(correction.path.locked, correction.path.amplitude, np.nan)[kept],
+        "clock_offset": correction.clock_hz if correction.clock_hz is None else correction.clock_hz[kept],
     }
     return {name: ("pulse", values) for name, values in known.items() if values is not None}
 
@@ -252,3 +380,135 @@ def _sidelink_vector(nodes: tuple[Acquisition, Acquisition], at: Times) -> dict[
 def _stated_offset_m(rx: Acquisition, *, monostatic: bool) -> float:
     stated = rx.settings.path_offset_m
     return stated.radar if monostatic else stated.radar - stated.sidelink
+
+
+# ---- Echoes by the recorder's clock and antennas by the log's -------------------------------------------------------
+
+MOST_PULSES = 8192
+"""Of a recording, evenly spread: bounds memory; their changes show when the node moved."""
+
+_SECOND = np.timedelta64(1, "s")
+
+
+@dataclass(frozen=True, eq=False)
+class Unaligned:
+    """Echoes and log of a node before alignment.
+
+    Attributes
+    ----------
+    echo, log
+        As `apertura.methods.synchronisation` takes them: each by seconds of its own, from its first pulse and epoch.
+    apart_ns
+        Delay of the log's first epoch against the recorder's first pulse, nanoseconds.
+    applied_ns
+        Offset of config/clocks.tsv that the recorder's times already contain, nanoseconds.
+    stated_ns
+        That offset, 0 without.
+    applied_ppm
+        Drift stated there that they already contain.
+    taken_off_m
+        Path beyond geometry that was already removed from the echoes.
+    own_clock
+        Whether the recorder's times mean nothing but differences.
+    """
+
+    echo: Recorded
+    log: Logged
+    apart_ns: int
+    applied_ns: int
+    stated_ns: int
+    applied_ppm: float
+    taken_off_m: float
+    own_clock: bool
+
+    def less_path(self, path_m: float) -> "Unaligned":
+        """Return the same without so much path beyond geometry in the echoes."""
+        delay_s = self.echo.reference_delay_s - (path_m - self.taken_off_m) / SPEED_OF_LIGHT_M_S
+        return replace(self, echo=replace(self.echo, reference_delay_s=delay_s), taken_off_m=path_m)
+
+    def offset_ns(self, offset_s: float) -> int:
+        """Return the offset for clocks.tsv, given one between the first pulse and the first epoch."""
+        return self.applied_ns + self.apart_ns + round(offset_s * 1e9)
+
+    @property
+    def stated_s(self) -> float:
+        """Offset at which `offset_ns` returns the stated one, seconds."""
+        return (self.stated_ns - self.applied_ns - self.apart_ns) * 1e-9
+
+
+def unaligned(campaign: Campaign, flight: str, node: str) -> Unaligned:
+    """Return echoes and log of a node that sends and receives.
+
+    Raises
+    ------
+    CampaignError
+        If the node does not send and receive in that flight, has no log, or its echoes are not there yet.
+    """
+    flown = campaign.flight(flight)
+    if f"{node}-{node}" not in flown.pairs:
+        raise CampaignError(
+            f"{node} does not send and receive in {flight}",
+            where=campaign.root / FLIGHTS,
+            expected=f"a node whose own pulses come back to it; pairs of {flight}: {', '.join(flown.pairs)}",
+            remedy="Name such a node, or correct the line of the flight.",
+        )
+    clock = campaign.clock(flight, node)
+    applied_ns, applied_ppm = 0, 0.0
+    sampled = isinstance(campaign.settings.waveform, SampledWaveform)
+    if sampled:
+        path = campaign.stage("echo", flight, f"{node}-{node}")
+        if not manifest_of(path).is_file():
+            raise CampaignError(
+                "not there yet",
+                where=path,
+                expected=f"the echo of {node} by its own pulses",
+                remedy="Run `apertura run CAMPAIGN --until echo` first.",
+            )
+        history = _some(PairEcho.opened(campaign, flight, f"{node}-{node}").stage)
+        off_m, applied_ns = float(history.attrs["stated_offset_m"]), clock.offset_ns
+        applied_ppm = clock.drift_ppm
+    else:
+        history = _some(read_history(campaign, flight, node, pair=f"{node}-{node}"))
+        off_m = 0.0
+    times = history.time.values
+    log = raw_log(campaign, flight, node, shortest_wave(history.frequency.values))
+    speed = wave_speed_of(history) if sampled else _wave_speed(campaign, log)
+    echo = Recorded(
+        np.asarray(history.transfer.values),
+        history.frequency.values,
+        history.reference_delay.values,
+        _seconds(times, times[0]),
+        speed,
+    )
+    apart_ns = int((log.track.time.values[0] - times[0]).astype("timedelta64[ns]").astype(np.int64))
+    own_clock = bool(times[0] < FIRST)
+    return Unaligned(echo, _logged(log), apart_ns, applied_ns, clock.offset_ns, applied_ppm, off_m, own_clock)
+
+
+def _some(history: xr.Dataset) -> xr.Dataset:
+    """Return at most `MOST_PULSES` pulses, evenly spread."""
+    return history.isel(pulse=slice(None, None, -(-history.sizes["pulse"] // MOST_PULSES)))
+
+
+def _wave_speed(campaign: Campaign, log: NodeLog) -> float:
+    """Return the speed of the wave over a whole log: which part of it was recorded is not known before alignment."""
+    times = log.track.time.values[log.checked.kept]
+    times = times[:: -(-len(times) // MOST_PULSES)][1:-1]
+    aperture = Aperture(log.antenna("radar_tx", times), log.antenna("radar_rx", times))
+    return scene_air(campaign, aperture.tx_m).over(aperture).wave_speed_m_s
+
+
+def _logged(log: NodeLog) -> Logged:
+    times = log.track.time.values[log.checked.kept]
+    began = log.track.time.values[0]
+
+    def phase_centres(at_s: NDArray[np.float64]) -> Aperture:
+        at = began + np.round(at_s * 1e9).astype("timedelta64[ns]")
+        return Aperture(log.antenna("radar_tx", at), log.antenna("radar_rx", at))
+
+    first_s, last_s = _seconds(times[[0, -1]], began)
+    return Logged(phase_centres, first_s + 1e-9, last_s - 1e-9)
+
+
+def _seconds(times: NDArray[np.datetime64], began: np.datetime64) -> NDArray[np.float64]:
+    return np.asarray((times - began) / _SECOND, np.float64)

@@ -30,12 +30,13 @@ from apertura.formats.reading import open_recording
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import CONFIG, Antenna, SampledWaveform
 from apertura.pipeline.opening.air import in_air, scene_air
+from apertura.pipeline.opening.echo import PairEcho
 from apertura.pipeline.opening.node_log import NodeLog, raw_log, shortest_wave
 from apertura.pipeline.opening.positions import inside_segments, keep_segments, place, position_error, stated_error
 from apertura.pipeline.opening.reading import read_history
 from apertura.pipeline.opening.scene import Flown, OpenScene
 from apertura.pipeline.opening.transmitted import transmitted
-from apertura.pipeline.store import manifest_of, open_stage
+from apertura.pipeline.store import manifest_of
 
 # ---- Antennas of a pair: from the config to the beams that weigh pulses ---------------------------------------------
 
@@ -335,7 +336,7 @@ def open_pair(
     """
     waveform = campaign.settings.waveform
     if echo is None and recorded is None and manifest_of(campaign.stage("echo", flight, pair)).is_file():
-        echo = open_stage(campaign.stage("echo", flight, pair), "echo")
+        echo = PairEcho.opened(campaign, flight, pair).stage
     if echo is None:
         if isinstance(waveform, SampledWaveform):
             return _expected(campaign, flight, pair, waveform, recorded)

@@ -9,6 +9,7 @@ from apertura.common.contracts import STAGES
 from apertura.common.documents import undamaged
 from apertura.common.errors import CampaignError, quoted
 from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.opening.echo import PairEcho
 from apertura.pipeline.opening.scene import OpenScene, open_scene
 from apertura.pipeline.store import open_document, open_listed, open_stage, remake
 
@@ -45,7 +46,7 @@ class OpenCampaign:
         return open_scene(self.campaign)
 
     def stage(self, name: str, *where: str) -> "xr.Dataset":
-        """Return a finished stage, read lazily.
+        """Return a finished stage, read lazily; `transfer` of an echo is formed from the recording where it is read.
 
         Parameters
         ----------
@@ -72,6 +73,8 @@ class OpenCampaign:
             flight = self.campaign.flight(where[0])
             known = flight.nodes if kind == "node" else flight.pairs
             _check_name(where[1], kind, known, where=f"campaign.stage({name!r}, {flight.name!r})")
+        if name == "echo":
+            return PairEcho.opened(self.campaign, where[0], where[1]).stage
         return open_stage(self.campaign.stage(name, *where), name)
 
     def image(self, flight: str, pair: str) -> "xr.DataArray":

@@ -19,6 +19,7 @@ from apertura.methods.interferometry.sensitivity import FlownAntenna, Legs, Sens
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import CONFIG
 from apertura.pipeline.opening.autofocus import clock_s, open_refined
+from apertura.pipeline.opening.echo import PairEcho
 from apertura.pipeline.opening.images import opened_layer
 from apertura.pipeline.opening.pair import OpenPair, open_pair
 from apertura.pipeline.opening.plan import weighing
@@ -70,7 +71,8 @@ def open_two(campaign: Campaign, name: str, scene: OpenScene) -> TwoImages:
     bands, legs, looks, antennas = [], [], [], list[FlownAntenna]()
     began: np.datetime64 | None = None
     for sign, (flight, pair) in zip((1, -1), images, strict=True):
-        echo, profile = (open_stage(campaign.stage(stage, flight, pair), stage) for stage in ("echo", "profile"))
+        echo = PairEcho.opened(campaign, flight, pair).stage
+        profile = open_stage(campaign.stage("profile", flight, pair), "profile")
         opened = open_pair(campaign, flight, pair, echo=echo)
         bands.append((float(opened.frequency_hz.min()), float(opened.frequency_hz.max())))
         looks.append(Looks.of(scene.grid, scene.terrain, aperture_of(profile), weighing(campaign, opened, scene)))

@@ -17,7 +17,7 @@ from apertura.methods.synchronisation.clock_alignment import Alignment, align_on
 from apertura.methods.synchronisation.scene_alignment import align_on_scene
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import CLOCK_COLUMNS, CLOCKS, CONFIG
-from apertura.pipeline.opening.acquisition import Unaligned, unaligned
+from apertura.pipeline.opening.echo import Unaligned, unaligned
 from apertura.pipeline.opening.scene import ConfiguredGround, settled_scene
 from apertura.pipeline.store import manifest_of
 

@@ -38,7 +38,7 @@ from apertura.pipeline.opening.diagnosis import (
     moved_evidence,
     some_pulses,
 )
-from apertura.pipeline.opening.echo import pair_echo
+from apertura.pipeline.opening.echo import PairEcho, pair_echo
 from apertura.pipeline.opening.images import (
     ComparedImage,
     agreement_of,
@@ -98,7 +98,7 @@ def hypotheses(
     logged = {node: open_acquisition(campaign, flight, node, sent) for node in campaign.flight(flight).nodes}
     window, track = campaign.settings.processing.window, open_refined(campaign, flight)
     found = [
-        _evidence(logged, pair, open_stage(campaign.stage("echo", flight, pair), "echo"), window)
+        _evidence(logged, pair, PairEcho.opened(campaign, flight, pair).stage, window)
         for pair in campaign.flight(flight).pairs
     ]
     nodes = {name: track.node(node) for name, node in logged.items()}

@@ -4,7 +4,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import xarray as xr
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.documents import undamaged
@@ -19,7 +18,8 @@ from apertura.core.quality.measures import coherence_factor
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import Calibration
 from apertura.pipeline.lineage import result_of
-from apertura.pipeline.store import open_document, open_stage, remake, save_document
+from apertura.pipeline.opening.echo import PairEcho
+from apertura.pipeline.store import open_document, remake, save_document
 
 
 def calibrate(campaign: Campaign, flight: str) -> Path:
@@ -34,10 +34,10 @@ def calibrate(campaign: Campaign, flight: str) -> Path:
     report: dict[str, Any] = {"flight": flight, "reflector_m": list(requested.reflector_m), "pairs": {}}
     codes = []
     for pair in campaign.flight(flight).pairs:
-        echo = open_stage(campaign.stage("echo", flight, pair), "echo")
-        codes.append(echo.attrs["code_sha256"])
-        report["pairs"][pair] = _pair(campaign, echo, requested, where=f"flight {flight}, pair {pair}") | {
-            "inputs": echo.attrs["inputs"]
+        opened = PairEcho.opened(campaign, flight, pair)
+        codes.append(opened.dataset.attrs["code_sha256"])
+        report["pairs"][pair] = _pair(campaign, opened, requested, where=f"flight {flight}, pair {pair}") | {
+            "inputs": opened.dataset.attrs["inputs"]
         }
     report["code_sha256"] = chained_sha256(lineage.result.code_sha256, codes)
     path = campaign.result(flight, "calibration.json")
@@ -86,7 +86,8 @@ def _settings(campaign: Campaign) -> Calibration:
     return campaign.settings.calibration
 
 
-def _pair(campaign: Campaign, echo: xr.Dataset, requested: Calibration, *, where: str) -> dict[str, Any]:
+def _pair(campaign: Campaign, opened: PairEcho, requested: Calibration, *, where: str) -> dict[str, Any]:
+    echo = opened.stage
     reflector = frame_from_map(campaign.settings.scene.crs, *requested.reflector_m)
     path_m = Aperture(echo.tx_position.values, echo.rx_position.values).path(reflector)
     path_m = path_m * (SPEED_OF_LIGHT_M_S / wave_speed_of(echo))  # electrical, as path offsets are
@@ -103,7 +104,7 @@ def _pair(campaign: Campaign, echo: xr.Dataset, requested: Calibration, *, where
         "coherence_factor": coherence_factor(history),
         "phase_rad": [round(float(value), 4) for value in phase],
         "phase_std_rad": round(float(np.std(phase)), 4),
-        "flags": Flags.merged(echo.attrs["flags"], offset.flags),
+        "flags": Flags.merged(opened.flags, offset.flags),
     }
 
 

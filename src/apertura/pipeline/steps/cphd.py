@@ -18,6 +18,7 @@ from apertura.formats.export import PHASE_HISTORY
 from apertura.formats.export.cphd import CphdCollection, write_cphd
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.lineage import result_of
+from apertura.pipeline.opening.echo import PairEcho
 from apertura.pipeline.opening.scene import OpenScene, settled_scene
 from apertura.pipeline.steps.stamping import tags_of
 from apertura.pipeline.store import blocks_of_rows, open_stage, record_files
@@ -29,7 +30,9 @@ _NULL_ISLAND = (0.0, 0.0, 0.0)
 def cphd(campaign: Campaign, flight: str, pair: str) -> Path:
     """Write results/<flight>/<pair>/phase_history.cphd."""
     lineage = result_of(campaign, "cphd", flight, pair).begin(campaign.root)
-    echo, scene = open_stage(campaign.stage("echo", flight, pair), "echo"), settled_scene(campaign)
+    echo, scene = PairEcho.opened(campaign, flight, pair).stage, settled_scene(campaign)
+    flags = open_stage(campaign.stage("profile", flight, pair), "profile").attrs["flags"]
+    echo = echo.assign_attrs(flags=flags)  # those of its samples, too
     collection = _collection(campaign, flight, echo, scene, tags_of(Provenance.of(lineage.modules, [echo]), lineage))
     path = campaign.result(flight, pair, PHASE_HISTORY)
     if collection.swath_s[1] <= 0:

@@ -1,11 +1,14 @@
-"""Rule `echo`: recordings and tracks of a pair become calibrated transfer functions and phase centres."""
+"""Rule `echo`: what is measured of a pair's recordings and tracks: pulses, phase centres, clock and sidelink.
+
+The calibrated transfer functions follow from it and the recordings; they are written where `processing.keep` says so,
+and of a recorder that stores transfer functions itself.
+"""
 
 from pathlib import Path
 from typing import Any
 
 import xarray as xr
 
-from apertura.common.flags import Flags
 from apertura.common.provenance import merged
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import SampledWaveform
@@ -17,7 +20,7 @@ from apertura.pipeline.opening.pair import recorded_echo
 from apertura.pipeline.opening.transmitted import transmitted
 from apertura.pipeline.steps.calibration import calibrated, calibration_spec
 from apertura.pipeline.steps.stamping import stamped
-from apertura.pipeline.store import finish, write_blocks, writing
+from apertura.pipeline.store import finish, save_stage, write_blocks, writing
 
 
 def echo(campaign: Campaign, flight: str, pair: str) -> Path:
@@ -45,8 +48,11 @@ def echo(campaign: Campaign, flight: str, pair: str) -> Path:
     relevant = {**lineage.result.settings, "calibration": calibration_spec(calibration)}
     folder = campaign.stage("echo", flight, pair)
     how: dict[str, Any] = {"modules": lineage.modules, "parents": parents, "settings": relevant, "inputs": inputs}
-    stage = stamped(formed.promised, "echo", **how)
+    if isinstance(waveform, SampledWaveform) and "echo" not in campaign.settings.processing.keep:
+        save_stage(stamped(formed.dataset, "echo", **how), folder, lineage=lineage)
+        return folder
+    stage = stamped(formed.kept, "echo", **how)
     with writing(folder) as wip:
         write_blocks(wip, stage, "transfer", formed.blocks())
-        finish(wip, folder, lineage=lineage, flags=Flags.merged(stage.attrs["flags"], formed.saturation.flags))
+        finish(wip, folder, lineage=lineage, flags=formed.flags)
     return folder

@@ -23,6 +23,7 @@ from apertura.core.quality.budget import arithmetic_line
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.lineage import result_of
 from apertura.pipeline.opening.autofocus import RefinedTrack, open_refined
+from apertura.pipeline.opening.echo import PairEcho
 from apertura.pipeline.opening.pair import OpenPair, antennas_report, open_pair, pattern_digests
 from apertura.pipeline.opening.plan import budget_of, plan_pair
 from apertura.pipeline.opening.scene import OpenScene, open_scene
@@ -71,7 +72,7 @@ def image(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Pa
         }
         told = judgement(work.formation, target, [*budget, arithmetic_line(quality["numerical_error_db"])])
         quality |= {"focus": told.focus, "budget": told.budget}
-        of_stages = echo.attrs["flags"], work.track.stage.attrs["flags"]
+        of_stages = work.empty.attrs["flags"], work.track.stage.attrs["flags"]
         quality["flags"] = Flags.merged(*of_stages, plan.flags, quality["flags"], told.flags)
         finish(wip, folder, lineage=lineage, quality=quality, flags=quality["flags"])
     return folder
@@ -148,7 +149,8 @@ class _Work:
 
 
 def _open(campaign: Campaign, flight: str, pair: str, *, threads: int) -> _Work:
-    echo, profile = (open_stage(campaign.stage(stage, flight, pair), stage) for stage in ("echo", "profile"))
+    echo = PairEcho.opened(campaign, flight, pair).stage
+    profile = open_stage(campaign.stage("profile", flight, pair), "profile")
     scene, logged = open_scene(campaign), open_pair(campaign, flight, pair, echo=echo)
     track = open_refined(campaign, flight)
     opened, profiles = track.pair(logged), track.profiles(logged, profiles_of(profile, lazy=True))
@@ -156,7 +158,10 @@ def _open(campaign: Campaign, flight: str, pair: str, *, threads: int) -> _Work:
         raise TypeError("an open echo stage holds a phase history")
     plan = plan_pair(campaign, opened, scene, threads=threads)
     plan = replace(plan, decisions=(*plan.decisions, *track.decisions))
-    formation = Formation(opened.history, profiles, scene.grid, plan, campaign.settings.processing.tile_px)
+    compression_db = profile.attrs["compression_error_db"]
+    formation = Formation(
+        opened.history, profiles, scene.grid, plan, campaign.settings.processing.tile_px, compression_db
+    )
     result = result_of(campaign, "image", flight, pair)
     # Blocks of pulses are of the machine, not of the work: jobs with less memory share it all the same.
     choices = {name: value for name, value in plan.choices.items() if name != "pulse_blocks"}
@@ -164,7 +169,7 @@ def _open(campaign: Campaign, flight: str, pair: str, *, threads: int) -> _Work:
         xr.Dataset(
             {"image": (("y", "x"), np.broadcast_to(_MISSING, scene.grid.shape))},
             coords=scene.grid.coordinates,
-            attrs={"frame": scene.grid.frame, "pair": pair, "flags": echo.attrs["flags"], "quality": {}},
+            attrs={"frame": scene.grid.frame, "pair": pair, "flags": profile.attrs["flags"], "quality": {}},
         ),
         "image",
         modules=result.modules,

@@ -32,6 +32,7 @@ from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import polarisation_of
 from apertura.pipeline.config.processing import Multilooking
 from apertura.pipeline.lineage import result_of
+from apertura.pipeline.opening.echo import PairEcho
 from apertura.pipeline.opening.pair import open_pair, pattern_digests
 from apertura.pipeline.opening.plan import integration_of, weighing
 from apertura.pipeline.opening.radiometry import CalibratedPair, calibrated_pair, points_of
@@ -47,7 +48,8 @@ def layers(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> l
     Returns their paths. What the radio makes of bright points and of noise is in radiometry.json.
     """
     lineage = result_of(campaign, "layers", flight, pair).begin(campaign.root)
-    echo, profile = (open_stage(campaign.stage(stage, flight, pair), stage) for stage in ("echo", "profile"))
+    echo = PairEcho.opened(campaign, flight, pair).stage
+    profile = open_stage(campaign.stage("profile", flight, pair), "profile")
     scene, profiles = open_scene(campaign), profiles_of(profile, lazy=True)
     opened = open_pair(campaign, flight, pair, echo=echo)
     beams, calibrated = weighing(campaign, opened, scene), calibrated_pair(campaign, opened, scene, threads=threads)

@@ -11,20 +11,22 @@ from numpy.typing import NDArray
 
 from apertura.common.provenance import merged
 from apertura.core.echo.compression import centre_frequency
-from apertura.core.imaging.range_profiles import RangeWindow, phase_history_of, range_compress
+from apertura.core.imaging.range_profiles import CompressionError, RangeWindow, phase_history_of, range_compress
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.lineage import result_of
+from apertura.pipeline.opening.echo import PairEcho
 from apertura.pipeline.opening.pair import open_pair, pattern_digests
 from apertura.pipeline.opening.plan import ranges_of
 from apertura.pipeline.opening.scene import OpenScene, open_scene
 from apertura.pipeline.steps.stamping import stamped
-from apertura.pipeline.store import blocks_of_rows, finish, open_stage, write_blocks, writing
+from apertura.pipeline.store import blocks_of_rows, finish, write_blocks, writing
 
 
 def profile(campaign: Campaign, flight: str, pair: str) -> Path:
     """Write results/<flight>/<pair>/profile.zarr, block by block."""
     lineage = result_of(campaign, "profile", flight, pair).begin(campaign.root)
-    source, scene = open_stage(campaign.stage("echo", flight, pair), "echo"), open_scene(campaign)
+    echo, scene = PairEcho.opened(campaign, flight, pair), open_scene(campaign)
+    source = echo.stage
     window = ranges_of(campaign, open_pair(campaign, flight, pair, echo=source), scene)
     frequency, requested = source.frequency.values, campaign.settings.processing.window
     zeros = np.broadcast_to(np.complex64(0), (source.sizes["pulse"], window.samples))
@@ -37,19 +39,21 @@ def profile(campaign: Campaign, flight: str, pair: str) -> Path:
         "oversampling": window.unambiguous / len(frequency),
         "window": requested,
         "wave_speed_m_s": window.wave_speed_m_s,
+        "compression_error_db": 0.0,  # not known before the last pulse
     }
     settings, parents = {**lineage.result.settings, **scene.spec}, [source, *scene.parents]
     inputs = merged(scene.inputs, pattern_digests(campaign, pair))
     how: dict[str, Any] = {"modules": lineage.modules, "parents": parents, "settings": settings, "inputs": inputs}
     stage, folder = stamped(dataset, "profile", **how), campaign.stage("profile", flight, pair)
+    error = CompressionError(np.random.default_rng(0))
     with writing(folder) as wip:
-        write_blocks(wip, stage, "profile", _compressed(source, requested, window, scene))
-        finish(wip, folder, lineage=lineage)
+        write_blocks(wip, stage, "profile", _compressed(source, requested, window, scene, error))
+        finish(wip, folder, lineage=lineage, flags=echo.flags, compression_error_db=round(error.decibels, 2))
     return folder
 
 
 def _compressed(
-    source: xr.Dataset, requested: str, window: RangeWindow, scene: OpenScene
+    source: xr.Dataset, requested: str, window: RangeWindow, scene: OpenScene, error: CompressionError
 ) -> Iterator[NDArray[np.complex64]]:
     """Yield the profiles of one chunk of the echo at a time; zeros where none of its pulses adds to the scene."""
     for part in blocks_of_rows(source, "transfer"):
@@ -58,4 +62,6 @@ def _compressed(
             continue
         history = phase_history_of(source.isel(pulse=part), requested)
         here = replace(window, start_m=window.start_m[part], farthest_m=window.farthest_m[part])
-        yield range_compress(history, scene.grid, scene.terrain, window=here).samples
+        profiles = range_compress(history, scene.grid, scene.terrain, window=here)
+        error.add(history, profiles)
+        yield profiles.samples

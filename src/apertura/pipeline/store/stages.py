@@ -128,9 +128,10 @@ def _counted(blocks: Iterable[NDArray[Any]], array: "xr.DataArray") -> Iterator[
 
 
 def blocks_of_rows(stage: "xr.Dataset", name: str) -> Iterator[slice]:
-    """Yield rows of an array of a stage, as many at a time as one of its chunks holds."""
-    rows = len(stage[name])
-    size = int(stage[name].encoding.get("chunks", (rows,))[0]) or rows
+    """Yield rows of an array of a stage, as many at a time as one of its chunks holds, or would hold."""
+    array, rows = stage[name], len(stage[name])
+    would = rows_of_chunk(array.dtype.itemsize * int(np.prod(array.shape[1:], dtype=int)))
+    size = int(array.encoding.get("chunks", (would,))[0]) or would
     for first in range(0, rows, size):
         yield slice(first, min(first + size, rows))
 
