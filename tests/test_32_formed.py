@@ -1,0 +1,129 @@
+"""Transfer functions formed where they are read: those that a stage keeps, whoever reads them in whatever order."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from folders import complaint, copy_writable, ingest_all, state
+
+from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.core.backprojection.inputs import PhaseHistory
+from apertura.core.echo.demodulate import remove_path
+from apertura.core.echo.transfer import transfer_by_sidelink
+from apertura.core.geometry.aperture import Aperture
+from apertura.core.imaging.range_profiles import CompressionError, range_compress
+from apertura.core.scene.grid import SceneGrid
+from apertura.core.scene.terrain import FlatGround
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.opening.acquisition import open_acquisition
+from apertura.pipeline.opening.echo import PairEcho
+from apertura.pipeline.opening.transmitted import transmitted
+from apertura.pipeline.steps import echo, profile, scene
+from apertura.pipeline.store import open_stage
+from apertura.simulation import ImageGrid, preset, simulate
+from apertura.simulation.impairments import Clock
+
+PAIRS = "uav1-uav1", "uav1-uav2"
+
+
+@pytest.fixture(scope="module")
+def drifting(tmp_path_factory):
+    """A flight whose receiver's clock is corrected in its samples."""
+    plan = replace(preset("demo", pulses=90), scene=ImageGrid("EPSG:32632", half_width_m=3.0, spacing_m=0.1))
+    changed = {"uav2": replace(plan.nodes["uav2"].impairments, clock=Clock(cfo_hz=12e3, sfo_hz=1e3))}
+    root = simulate(tmp_path_factory.mktemp("drifting") / "campaign", plan, impairments=changed, seed=5)
+    ingest_all(Campaign.load(root))
+    return root
+
+
+def formed(root, tmp_path, name, **processing):
+    campaign = state(copy_writable(root, tmp_path / name), "processing", autofocus=False, **processing)
+    for pair in PAIRS:
+        echo.echo(campaign, "f01", pair)
+    return campaign
+
+
+@pytest.mark.parametrize("method", ["divide", "wiener", "gated", "two_parameter"])
+def test_what_is_formed_is_what_a_stage_keeps_to_the_bit(drifting, tmp_path, method):
+    thin, full = (
+        formed(drifting, tmp_path, name, sidelink=method, keep=keep) for name, keep in (("a", []), ("b", ["echo"]))
+    )
+    for pair in PAIRS:
+        stage, kept = PairEcho.opened(thin, "f01", pair).stage, open_stage(full.stage("echo", "f01", pair), "echo")
+        assert "transfer" not in open_stage(thin.stage("echo", "f01", pair), "echo")
+        np.testing.assert_array_equal(stage.transfer.values, kept.transfer.values)
+    assert kept.attrs["clock"]["corrected"], kept.attrs["clock"]
+    assert stage.clock_offset.values == pytest.approx(12e3, rel=0.1)
+
+
+@pytest.mark.parametrize("method", ["divide", "two_parameter"])
+def test_what_a_stage_says_of_its_pulses_forms_what_was_measured(drifting, tmp_path, method):
+    """Clock, direct path and path taken off go through the stage and back."""
+    campaign = formed(drifting, tmp_path, "a", sidelink=method)
+    stage, sent = PairEcho.opened(campaign, "f01", "uav1-uav2").stage, transmitted(campaign, campaign.settings.waveform)
+    rx, captures = open_acquisition(campaign, "f01", "uav2", sent), stage.capture.values
+    measured = transfer_by_sidelink(
+        rx.reader(["radar", "sidelink"], captures),
+        sent.inverse,
+        rx.numerology,
+        symbol_samples=sent.waveform.capture_samples,
+        sidelink_m=np.linalg.norm(stage.sidelink_vector.values, axis=1),
+        method=method,
+        accuracy_db=-60.0,
+        where="here",
+    )
+    some = np.arange(64)
+    delay_s = stage.path_removed.values[some] / SPEED_OF_LIGHT_M_S
+    wanted = remove_path(measured.form(some), stage.frequency.values, delay_s=delay_s)
+    assert measured.report["clock"]["corrected"]
+    np.testing.assert_allclose(stage.transfer[some].values, wanted, rtol=1e-5, atol=1e-3)
+
+
+def test_profiles_do_not_depend_on_what_is_kept(drifting, tmp_path):
+    profiles = []
+    for name, keep in (("a", []), ("b", ["echo"])):
+        campaign = formed(drifting, tmp_path, name, keep=keep)
+        scene.scene(campaign)
+        profile.profile(campaign, "f01", "uav1-uav2")
+        profiles.append(open_stage(campaign.stage("profile", "f01", "uav1-uav2"), "profile").profile.values)
+    np.testing.assert_array_equal(*profiles)
+
+
+def test_pulses_come_in_the_order_they_are_asked_for(drifting, tmp_path):
+    transfer = PairEcho.opened(formed(drifting, tmp_path, "a"), "f01", "uav1-uav2").stage.transfer
+    whole = transfer.values
+    some = np.array([7, 3, 3, 40])
+    for key in (some, slice(None, None, 9), slice(60, 10, -7), 5, (some, slice(2, 9)), (slice(3), 4)):
+        np.testing.assert_allclose(transfer[key].values, whole[key], rtol=2e-6, atol=1e-4)  # of 100: a DFT's last bit
+    assert transfer[:0].values.shape == (0, whole.shape[1])
+
+
+@pytest.mark.parametrize("lost", [True, False])
+def test_a_recording_that_is_gone_or_another_is_told_where_a_pulse_is_read(drifting, tmp_path, lost):
+    campaign = formed(drifting, tmp_path, "a")
+    samples = campaign.root / "raw/f01/uav2.sigmf-data"
+    stage = PairEcho.opened(campaign, "f01", "uav1-uav2").stage
+    if lost:
+        samples.unlink()
+    else:
+        samples.write_bytes(samples.read_bytes()[::-1])
+    assert len(stage.time) == stage.sizes["pulse"]
+    told = complaint(lambda: stage.transfer[0].values)
+    assert told.startswith("raw/f01/uav2.sigmf-data") or "uav2.sigmf-data" in told
+    assert ("no such file" in told) is lost
+    assert ("changed since it was ingested" in told) is not lost
+
+
+@pytest.mark.parametrize(("wrong_m", "least_db", "most_db"), [(0.0, -300, -120), (0.5, -30, 0)])
+def test_profiles_at_wrong_paths_are_measured_as_wrong(wrong_m, least_db, most_db):
+    """Half a metre is a fifth of a cell of c/B."""
+    rng = np.random.default_rng(2)
+    frequency = 1.2e9 + 1e6 * np.arange(128)
+    track = np.stack([np.linspace(-1, 1, 64), np.full(64, -20.0), np.full(64, 10.0)], -1)
+    transfer = (rng.standard_normal((64, 128)) + 1j * rng.standard_normal((64, 128))).astype(np.complex64)
+    history = PhaseHistory(transfer, frequency, np.hanning(128), np.zeros(64), Aperture(track, track))
+    grid = SceneGrid("local", -5.0, 5.0, 0.5, (20, 20))
+    profiles = range_compress(history, grid, FlatGround(0.0))
+    error = CompressionError(np.random.default_rng(3))
+    error.add(history, replace(profiles, start_m=profiles.start_m + wrong_m))
+    assert least_db <= error.decibels <= most_db
