@@ -1,10 +1,12 @@
-"""A whole flight, step by step: wall and CPU seconds, peak memory, and rates beside a plain read and a plain FFT.
+"""A whole flight, step by step: wall and CPU seconds, peak memory, and rates beside a plain read, hash and FFT.
 
 ``python benchmarks/flight.py WORK --minutes 1 3 10`` simulates `--preset flight` of each length into WORK where it is
-not there yet (13 GB for ten minutes), runs every step alone, and prints a table (docs/howto/long_flights.md).
+not there yet (13 GB for ten minutes), runs every step alone, prints a table, and draws where the CPU seconds went into
+WORK/flight_<minutes>min.png (docs/howto/long_flights.md).
 """
 
 import argparse
+import hashlib
 import json
 import os
 import subprocess
@@ -12,12 +14,17 @@ import sys
 import time
 from pathlib import Path
 
+import matplotlib
 import numpy as np
 from scipy import fft
 
+matplotlib.use("agg")
+from matplotlib import pyplot as plt
+
 from apertura.formats.reading import open_recording
 from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.lineage import results_of
+from apertura.pipeline.lineage import places
+from apertura.pipeline.rules import RESULTS
 from apertura.simulation import preset, simulate
 
 PRF_HZ = 500
@@ -44,21 +51,9 @@ def main() -> None:
 
 def steps(root: Path) -> list[tuple[str, ...]]:
     """Return the steps of a campaign in order, as `apertura step` takes them."""
-    campaign, found = Campaign.load(root), []
-    for name, result in results_of(campaign):
-        where = Path(result.manifest).parts[1:-1]
-        step = {
-            "raw": "ingest",
-            "track": "",
-            "assessment": "assess",
-            "refined_track": "refine",
-            "calibration": "calibrate",
-            "fused": "export",
-        }
-        step |= {"refined_track": "refine", "speed_accuracy": "", "whole": ""}
-        if step.get(name, name):
-            found.append((step.get(name, name), *where))
-    return [one if one[0] not in {"scene", "cube", "terrain", "coverage", "map"} else one[:1] for one in found]
+    campaign = Campaign.load(root)
+    rules = {rule.name: rule for rule in RESULTS.values() if not rule.on_demand}
+    return [(rule.command, *where, *rule.last_words) for rule in rules.values() for where in places(campaign, rule)]
 
 
 def measured(root: Path, step: tuple[str, ...], threads: int) -> dict[str, object]:
@@ -80,8 +75,8 @@ def measured(root: Path, step: tuple[str, ...], threads: int) -> dict[str, objec
 
 
 def plain(root: Path) -> dict[str, float]:
-    """Return bytes recorded, and CPU seconds that reading them and one FFT per capture and channel take."""
-    campaign, found = Campaign.load(root), {"bytes": 0.0, "read_s": 0.0, "fft_s": 0.0}
+    """Return bytes recorded, and CPU seconds to read and to hash them, and of one FFT per capture and channel."""
+    campaign, found = Campaign.load(root), {"bytes": 0.0, "read_s": 0.0, "hash_s": 0.0, "fft_s": 0.0}
     waveform = campaign.settings.waveform
     length = round(waveform.sample_rate_hz / waveform.subcarrier_spacing_hz)
     for node in campaign.flight(FLIGHT).nodes:
@@ -97,6 +92,9 @@ def plain(root: Path) -> dict[str, float]:
                 began = time.process_time()
                 fft.fft(some, axis=-1)
                 found["fft_s"] += 16 * (time.process_time() - began)
+                began = time.process_time()
+                hashlib.sha256(np.ascontiguousarray(iq))
+                found["hash_s"] += 16 * (time.process_time() - began)
     return found
 
 
@@ -108,12 +106,36 @@ def show(root: Path, minutes: float, rows: list[dict[str, object]]) -> None:
     print(f"{'step':28}{'wall s':>9}{'CPU s':>9}{'peak MB':>9}{'load':>7}")
     for row in rows:
         print(f"{row['step']:28}{row['wall_s']:9.1f}{row['cpu_s']:9.1f}{row['peak_mb']:9.0f}{row['load']:7.1f}")
-    print(f"plain read {bare['read_s']:.1f} CPU s, plain FFT {bare['fft_s']:.1f} CPU s")
+    total = {key: sum(float(row[key]) for row in rows) for key in ("wall_s", "cpu_s")}
+    print(f"{'all, one by one':28}{total['wall_s']:9.1f}{total['cpu_s']:9.1f}")
+    floor = {name: value for name, value in bare.items() if name != "bytes"}
+    print("plain " + ", ".join(f"{name.removesuffix('_s')} {value:.1f}" for name, value in floor.items()) + " CPU s")
     if front:
         print(f"front half {front:.1f} CPU s: {bare['bytes'] / front / 1e6:.0f} MB/s per core, ", end="")
-        print(f"{front / (bare['read_s'] + bare['fft_s']):.1f} × reading and one FFT of every capture")
+        print(f"{front / sum(floor.values()):.1f} × one read, one hash and one FFT of every capture")
+    draw(root.with_suffix(".png"), minutes, rows, floor)
     report = {"minutes": minutes, "plain": bare, "steps": rows}
     (root.parent / f"{root.name}.json").write_text(json.dumps(report, indent=1))
+
+
+def draw(picture: Path, minutes: float, rows: list[dict[str, object]], floor: dict[str, float]) -> None:
+    """Draw CPU seconds by step, the jobs of a step side by side; below, what reading, hashing and FFTs alone take."""
+    names = list(dict.fromkeys(str(row["step"]).split()[0] for row in rows))
+    figure, axes = plt.subplots(figsize=(6.4, 0.3 * len(names) + 1.6), layout="constrained")
+    for name in names:
+        left = 0.0
+        for row in (row for row in rows if str(row["step"]).split()[0] == name):
+            axes.barh(name, float(row["cpu_s"]), left=left, color="tab:blue", edgecolor="white")
+            left += float(row["cpu_s"])
+        axes.text(left, name, f" {left:.0f}", va="center")
+    left = 0.0
+    for part, seconds in floor.items():
+        axes.barh("(floor)", seconds, left=left, color="0.6", edgecolor="white", label=part)
+        left += seconds
+    axes.text(left, "(floor)", " one read, hash and FFT of every capture", va="center")
+    axes.invert_yaxis()
+    axes.set(xlabel="CPU seconds", title=f"{minutes:g} minutes of flight")
+    figure.savefig(picture, dpi=120)
 
 
 if __name__ == "__main__":
