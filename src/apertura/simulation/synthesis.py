@@ -19,7 +19,7 @@ from scipy import fft
 
 from apertura.common.arrays import Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
-from apertura.core.echo.compression import rotated
+from apertura.core.echo.compression import unit_phasor
 from apertura.simulation.echoes import Paths, TrueAir, direct_path, echo_paths, spectrum
 from apertura.simulation.impairments import Adc, ChannelName, ImpairmentDraw, Impairments, Ripple
 from apertura.simulation.scene import Scatterers
@@ -242,11 +242,11 @@ def periodic_samples(channel: Channel, generator: Generator | None, pulses: NDAr
     bins = np.zeros((len(pulses), waveform.dft_samples), np.complex64)
     bins[:, waveform.first_subcarrier + np.arange(len(waveform.codes))] = echoes
     period = fft.ifft(bins, axis=1, norm="forward")
-    period *= rotated(np.ones(1), channel.phase_rad[pulses, None] / (2 * np.pi))
+    period *= unit_phasor(channel.phase_rad[pulses, None] / (2 * np.pi))
     captures = np.take(period, np.arange(waveform.capture_samples) % waveform.dft_samples, axis=1)
     if channel.cfo_hz:
         turns = -channel.cfo_hz / sampling_rate(channel) * np.arange(waveform.capture_samples)
-        captures = captures * rotated(np.ones(1), np.asarray(turns, np.float64))
+        captures = captures * unit_phasor(np.asarray(turns, np.float64))
     if generator is not None and channel.noise_variance:
         parts = captures.view(np.float32)
         parts += generator.standard_normal(parts.shape, np.float32) * np.float32(np.sqrt(channel.noise_variance / 2))

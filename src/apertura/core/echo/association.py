@@ -21,6 +21,9 @@ LARGEST_DRIFT_PPM = 100.0
 """ppm, largest drift of the tags that is searched: free-running crystals stay inside."""
 
 
+_MOST_TAGS = 16_384  # spread over the flight, of which an offset modulo the interval is told as well as of all
+
+
 class TagLine(NamedTuple):
     """Offset of the receiver's tags: offset_ns + drift·(tag - origin_ns)."""
 
@@ -32,6 +35,7 @@ class TagLine(NamedTuple):
 def fit_modulo_interval(tags: Pairs, interval_ns: float) -> TagLine:
     """Return the offset line under which the receiver's tags best fall on the transmitter's, modulo the interval."""
     tx, rx = tags
+    rx = rx[:: -(-rx.size // _MOST_TAGS)]
     some = np.minimum(np.searchsorted(tx, rx), tx.size - 1)  # any nearby pulse: modulo the interval all give the same
     cycles = (rx - tx[some]) / interval_ns
     elapsed_ns = (rx - rx[0]).astype(np.float64)

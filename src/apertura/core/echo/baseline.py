@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from apertura.common.arrays import Floats
 
@@ -17,7 +18,6 @@ SIGMAS = 5.0
 _MEDIAN_PULSES = 15, 61, 241
 """Lengths of the running medians that separate movement from jitter, odd: the longer, the less noise and the slower."""
 
-_WINDOWS_AT_ONCE = 4096
 _ENOUGH = 64  # disjoint windows from which their noise is estimated
 
 
@@ -75,10 +75,8 @@ def baseline_residual(delay_m: Floats, baseline_m: Floats) -> BaselineResidual |
 
 
 def _smoothed(pulse: NDArray[np.intp], residual: Floats, jitter_m: float, width: int) -> BaselineResidual:
-    windows = np.lib.stride_tricks.sliding_window_view(residual, width)
-    parts = range(0, len(windows), _WINDOWS_AT_ONCE)  # a median copies its windows
-    smooth = np.concatenate([np.median(windows[first : first + _WINDOWS_AT_ONCE], axis=1) for first in parts])
-    middle = pulse[width // 2 : -(width // 2)]
+    inside = slice(width // 2, -(width // 2))  # full windows
+    smooth, middle = ndimage.median_filter(residual, width)[inside], pulse[inside]
     smooth = smooth - np.polyval(np.polyfit(middle, smooth, 1), middle)
     noise_m = 1.2533 * jitter_m / np.sqrt(width)  # standard deviation of a median of so many Gaussian samples
     steps = np.diff(smooth[::width])

@@ -13,9 +13,24 @@ from apertura.core.interpolation import kaiser_window
 # ---- Phasors along a band of equal steps
 
 
+def unit_phasor(turns: NDArray[np.float64]) -> NDArray[np.complex64]:
+    """Return exp(j2π·turns), complex64; whole turns are removed in float64, the rest is of float32.
+
+    Examples
+    --------
+    >>> unit_phasor(np.array([1e6 + 0.25])).round(6) + 0
+    array([0.+1.j], dtype=complex64)
+    """
+    angle = ((turns - np.rint(turns)) * (2 * np.pi)).astype(np.float32)
+    out = np.empty(angle.shape, np.complex64)
+    np.cos(angle, out=out.real)
+    np.sin(angle, out=out.imag)
+    return out
+
+
 def rotated(values: NDArray[np.number], turns: NDArray[np.float64]) -> NDArray[np.complex64]:
-    """Return values·exp(j2π·turns), complex64; integer turns are removed in float64."""
-    return np.asarray(values * np.exp(2j * np.pi * (turns % 1.0)), np.complex64)
+    """Return values·exp(j2π·turns), complex64."""
+    return np.asarray(values * unit_phasor(turns), np.complex64)
 
 
 def phasors(turns: NDArray[np.float64], count: int, *, first: float = 0.0) -> NDArray[np.complex64]:
@@ -40,8 +55,8 @@ def phasors(turns: NDArray[np.float64], count: int, *, first: float = 0.0) -> ND
     array([[ 1.+0.j,  0.+1.j, -1.+0.j,  0.-1.j]], dtype=complex64)
     """
     side = int(np.ceil(np.sqrt(count)))
-    fine = rotated(np.ones(1), turns[:, None] * np.arange(side))
-    coarse = rotated(np.ones(1), turns[:, None] * (first + side * np.arange(-(-count // side))))
+    fine = unit_phasor(turns[:, None] * np.arange(side))
+    coarse = unit_phasor(turns[:, None] * (first + side * np.arange(-(-count // side))))
     return (coarse[:, :, None] * fine[:, None]).reshape(len(turns), -1)[:, :count]
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from apertura.core.echo.compression import phasors, rotated
+from apertura.core.echo.compression import phasors, unit_phasor
 
 _PULSES_AT_ONCE = 64
 
@@ -129,10 +129,10 @@ def remove_path(
 
     Examples
     --------
-    >>> remove_path(np.ones((1, 2), np.complex64), np.array([1e9, 2e9]), delay_s=np.array([0.25e-9])).round(6)
+    >>> remove_path(np.ones((1, 2), np.complex64), np.array([1e9, 2e9]), delay_s=np.array([0.25e-9])).round(6) + 0
     array([[ 0.+1.j, -1.+0.j]], dtype=complex64)
     """
     count = len(frequency_hz)
     spacing_hz = (frequency_hz[-1] - frequency_hz[0]) / max(count - 1, 1)
     along = phasors(delay_s * spacing_hz, count)
-    return transfer * along * rotated(np.ones(1), delay_s * frequency_hz[0])[:, None]
+    return transfer * along * unit_phasor(delay_s * frequency_hz[0])[:, None]

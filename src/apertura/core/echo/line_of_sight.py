@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from apertura.common.arrays import Complexes, Floats
-from apertura.core.echo.compression import phasors
+from apertura.core.echo.compression import phasors, unit_phasor
 
 LOCK_FALSE_ALARM = 1e-3
 """Probability that a pulse of pure noise is detected as one with a sidelink."""
@@ -105,7 +105,10 @@ def fit_block(sidelink: Complexes) -> tuple[LineOfSight, Complexes]:
     some = profile[:, :: max(1, subcarriers // _NOISE_CELLS)]
     power = np.square(some.real) + np.square(some.imag)
     # the median of an exponential variable is ln 2 of its mean; few strong cells (echoes, ripple) do not move it
-    noise = np.median(power, axis=1).astype(np.float64) / np.log(2) * subcarriers
+    half = power.shape[1] // 2
+    power.sort(axis=1)  # five times as fast as numpy's median
+    middle = (power[:, half] + power[:, (power.shape[1] - 1) // 2]).astype(np.float64) / 2
+    noise = middle / np.log(2) * subcarriers
     amplitude = np.abs(direct)
     locked = amplitude**2 > _lock_threshold(subcarriers) * noise / subcarriers
     return LineOfSight(delay, np.angle(direct), amplitude, noise, locked), profile
@@ -120,7 +123,7 @@ def _residual_cells(sums: NDArray[np.complex128], number: Floats, subcarriers: i
     """Return (pulse,) the residual delay in (pulse, group) sums, whose groups are centred on `number`."""
     delay = np.zeros(len(sums))
     for _ in range(4):  # Newton's steps on the power |Σ S_n exp(+j2πn·delay/N)|²
-        aligned = sums * np.exp(2j * np.pi / subcarriers * np.outer(delay, number))
+        aligned = sums * unit_phasor(np.outer(delay, number / subcarriers))
         total, first, second = aligned.sum(1), (aligned @ number), (aligned @ number**2)
         slope = -2 * np.imag(total.conj() * first)
         curvature = 2 * (np.abs(first) ** 2 - np.real(total.conj() * second))

@@ -49,14 +49,15 @@ class Averaging:
         locked = path.locked
         if not locked.any():
             return
-        direct = path.select(locked)
+        kept = slice(None) if locked.all() else locked  # a mask copies
+        direct = path.select(kept)
         size = 1 / direct.amplitude
         inverse = (size * np.exp(-1j * direct.phase_rad)).astype(np.complex64)
-        unit = profile[locked] * inverse[:, None]
+        unit, symbols = profile[kept] * inverse[:, None], sidelink[kept]
         power = np.square(unit.real) + np.square(unit.imag)
         self._power += power.sum(0)
         self._mean += unit.sum(0)
-        self._spectrum += (np.square(np.abs(sidelink[locked])) * np.square(size)[:, None]).sum(0)
+        self._spectrum += np.square(size).astype(np.float32) @ (np.square(symbols.real) + np.square(symbols.imag))
         self._noise.append(direct.noise_power * np.square(size))
         self._cells.append(power[:, 2:-1].argmax(1) + 2)
         self._levels.append(power[:, 2:-1].max(1))
