@@ -177,6 +177,15 @@ def test_time_left_is_told_within_a_factor_of_two_or_not_at_all(finished_tiny, w
     assert all((left is not None) == ("image" in timed) for left, _, timed in found)
 
 
+@pytest.mark.parametrize(("timed_rule", "told"), [("layers", True), ("image", False)])
+def test_jobs_of_rasters_tell_how_long_others_take(finished_tiny, timed_rule, told):
+    outlook, where = Outlook(finished_tiny, cores=1), ("f01", "uav1-uav1")
+    outlook._expected = lambda rule, _: {"layers": 20.0, "image": 20.0, "export": 30.0}[rule]
+    done = JobRecord(timed_rule, (timed_rule, *where), "", 0.0, 60.0)
+    left_s = outlook.left(RunRecord(planned={timed_rule: 1, "export": 1}, jobs={1: done}), 60.0, {})[1]
+    assert left_s == (pytest.approx(90.0) if told else None)
+
+
 def test_a_share_of_an_images_tiles_takes_its_share_of_the_time(finished_tiny):
     outlook, shares = Outlook(finished_tiny, cores=0), (8, 80)
     runs = [

@@ -57,7 +57,7 @@ class Demand:
 
 @dataclass(frozen=True)
 class Cost:
-    """How long a job is expected to take on two cores of 2023: a run tells it in the measure of its own steps.
+    """How long a job is expected to take on one core of 2025: a run tells it in the measure of its own steps.
 
     Attributes
     ----------
@@ -77,6 +77,11 @@ class Cost:
     mb_mpx_s: float = 0.0
     all_cores: bool = False
     last: bool = False
+
+    @property
+    def of_rasters(self) -> bool:
+        """Whether a job reads and writes rasters and does little else: such jobs are alike."""
+        return bool(self.mpx_s) and not self.mb_s and not self.mb_mpx_s
 
 
 @dataclass(frozen=True)
@@ -234,7 +239,7 @@ _INGEST = Rule(
     kinds=("calibration", "image"),
     needed=inputs.of_samples,
     demand=Demand(250, pulse_bytes=100, recorded_s=60),
-    cost=Cost(1.3, mb_s=0.01),
+    cost=Cost(1.3, mb_s=0.0015),
 )
 
 _IMAGE = Rule(
@@ -255,7 +260,7 @@ _IMAGE = Rule(
         pixel_s=5,
         sum_s=3,
     ),
-    cost=Cost(3.5, mpx_s=2.0, mb_mpx_s=0.06, all_cores=True),
+    cost=Cost(3.5, mpx_s=1.0, mb_mpx_s=0.0002, all_cores=True),
     options=("threads",),
 )
 
@@ -293,7 +298,7 @@ _ROWS = (
         ),
         kinds=("calibration", "image"),
         demand=Demand(400, pulse_bytes=400, recorded_s=120),
-        cost=Cost(2.8, mb_s=0.02),
+        cost=Cost(2.0, mb_s=0.0012),
     ),
     Rule(
         "calibrate",
@@ -336,7 +341,7 @@ _ROWS = (
         sources=("echo", *_GROUND, inputs.patterns),
         settings=("processing.window", "processing.integration", inputs.antennas),
         demand=Demand(500, pulse_bytes=500, recorded_s=120),
-        cost=Cost(1.8, mb_s=0.01),
+        cost=Cost(1.8, mb_s=0.001),
     ),
     Rule(
         "refine",
@@ -371,7 +376,7 @@ _ROWS = (
         command="tiles",
         shares=True,
         arguments=("flight", "pair", "share"),
-        cost=Cost(3.0, mb_mpx_s=0.06, all_cores=True),
+        cost=Cost(3.0, mpx_s=1.0, mb_mpx_s=0.0002, all_cores=True),
     ),
     _IMAGE,
     Rule(
@@ -383,7 +388,7 @@ _ROWS = (
         settings=("campaign", "processing.integration", inputs.antennas, inputs.radio, inputs.multilook),
         exports="layers",
         demand=Demand(600, pulse_bytes=500, pixel_bytes=30, pixel_s=5, recorded_s=20, threads=2),
-        cost=Cost(1.4, mpx_s=0.5, last=True),
+        cost=Cost(1.4, mpx_s=0.35, last=True),
         options=("threads",),
     ),
     Rule(
@@ -396,7 +401,7 @@ _ROWS = (
         settings=("processing.fusion",),
         documents=("assessment.json",),
         demand=Demand(500, pulse_bytes=500, pixel_bytes=30, pixel_s=5),
-        cost=Cost(1.3, mpx_s=0.5),
+        cost=Cost(1.3, mpx_s=0.2),
     ),
     Rule(
         "export",
@@ -408,7 +413,7 @@ _ROWS = (
         documents=("image.json",),
         exports="pair",
         demand=Demand(500, pixel_bytes=50, pixel_s=30),
-        cost=Cost(3.0, mpx_s=1.0, last=True),
+        cost=Cost(2.0, mpx_s=0.45, last=True),
     ),
     Rule(
         "cphd",
@@ -457,7 +462,7 @@ _ROWS = (
         command="export",
         last_words=("fused",),
         demand=Demand(500, pixel_bytes=50, pixel_s=30),
-        cost=Cost(3.0, mpx_s=2.0),
+        cost=Cost(3.0, mpx_s=1.0),
     ),
     Rule(
         "interferogram",
@@ -489,6 +494,7 @@ _ROWS = (
         styles=True,
         manifest="mosaic/mosaic",
         demand=Demand(500),
+        cost=Cost(mpx_s=0.2),
     ),
     Rule(
         "stac",

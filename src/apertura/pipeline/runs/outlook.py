@@ -4,6 +4,7 @@ A job of rule r takes b + w seconds by the cost of its rule: its start and what 
 what was timed in this run to that, it is expected to take
 
     ρ_r (b + w)       where a job of its rule has ended, or tells how far it is;
+    ρ_p (b + w)       of rasters, where those of another rule have: they are alike;
     ρ_b b + ρ_w w     elsewhere: ρ_b by jobs that are mostly start, ρ_w by the others.
 
 The last is only told of a job that is mostly start, w ≤ b, when such jobs of two rules were timed: starts are alike,
@@ -68,6 +69,8 @@ class Measure:
     ----------
     of_rule
         Rule → how much longer than expected its jobs take, of those that were timed.
+    of_rasters
+        The same of any job of rasters; None where none was timed.
     of_start, of_work
         The same of the start of any job, and of what grows with its work; None where nothing was timed.
     starts
@@ -75,6 +78,7 @@ class Measure:
     """
 
     of_rule: dict[str, float]
+    of_rasters: float | None
     of_start: float | None
     of_work: float | None
     starts: bool
@@ -90,9 +94,11 @@ class Measure:
         of_rule = {rule: median(found) for rule, found in ratios.items()}
         starts = [ratio for rule, ratio in of_rule.items() if not any(grows[rule])]
         works = [ratio for rule, ratio in of_rule.items() if any(grows[rule])]
+        rasters = [ratio for rule, ratio in of_rule.items() if _cost(rule).of_rasters]
         every = median_low(of_rule.values()) if timed else None
         return cls(
             of_rule,
+            median(rasters) if rasters else None,
             median_low(starts) if starts else every,
             median_low(works) if works else every,
             len(starts) > 1,
@@ -102,6 +108,8 @@ class Measure:
         """Return what a job is expected to take, and whether that is to be told."""
         if rule in self.of_rule:
             return self.of_rule[rule] * (start_s + work_s), True
+        if self.of_rasters is not None and _cost(rule).of_rasters:
+            return self.of_rasters * (start_s + work_s), True
         if self.of_start is None or self.of_work is None:
             return start_s + work_s, False
         return self.of_start * start_s + self.of_work * work_s, self.starts and work_s <= start_s
