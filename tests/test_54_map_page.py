@@ -19,8 +19,10 @@ from folders import ROOT, copy_writable, run_steps
 from matplotlib.image import imread
 from pyproj import Transformer
 
+from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.store import record_files
 from apertura.simulation import preset, simulate
+from apertura.views.look.follow import Look
 from apertura.views.webmap.server import is_built
 
 APERTURA = Path(sys.executable).parent / "apertura"
@@ -40,9 +42,9 @@ pytestmark = [
 
 
 @contextmanager
-def serving(root):
+def serving(root, *options):
     """Run `apertura map` as a person would, and end it with Ctrl-C."""
-    command = [APERTURA, "map", root]
+    command = [APERTURA, "map", root, *options]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         try:
             yield process.stdout.readline().strip()
@@ -475,3 +477,30 @@ def test_a_page_that_came_with_the_results_is_not_shown_and_its_address_leads_to
         until(page, lambda: page.url.startswith(f"{address}#image=") and "colours=inferno" in page.url)
         assert page.title() == "tandem_demo · apertura map"
         page.close()
+
+
+def test_a_page_of_a_look_shows_what_came_since_and_keeps_what_the_reader_chose(browser, tmp_path):
+    """A campaign of which half the pulses are there, then all: the page changes without being loaded again."""
+    root = simulate(tmp_path / "campaign", preset("demo", pulses=120), seed=1)
+    look = Look(Campaign.load(root), follow=True, every_s=1.0, end_after_s=1e6)
+    for node in look.nodes.values():
+        node.read()
+    assert all(pair.add_next(ended=True) for pair in look.pairs)
+    look.show(ended=False, elapsed_s=1.0)
+    with serving(root, "--look") as address, shown(browser, address) as (frame, wrong):
+        frame.locator("#image").select_option("f01/uav1-uav2")
+        frame.locator("#low").fill(str(float(frame.locator("#low").get_attribute("min"))))
+        low = frame.locator("#low").input_value()
+        while any(pair.add_next(ended=True) for pair in look.pairs):
+            pass
+        document = root / "results/look/map/map.json"
+        look.show(ended=True, elapsed_s=1.0)
+        changed = json.loads(document.read_text())
+        assert changed["again_s"] is None
+        words = next(one["why"] for one in changed["images"] if one["image"] == "uav1-uav2")
+        assert words not in frame.locator("#verdict").text_content()
+        until(frame, lambda: words in frame.locator("#verdict").text_content())
+        assert frame.locator("#image").input_value() == "f01/uav1-uav2"
+        assert float(frame.locator("#low").input_value()) == pytest.approx(float(low), abs=0.5)
+        assert frame.locator("#notices").text_content() == ""
+    assert wrong == []

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import rasterio
 from folders import ROOT, copy_writable, ingest_all, settle_ground, state
 
 import apertura as ap
@@ -31,6 +32,7 @@ from apertura.views.look import image as look_image
 from apertura.views.look import pair as look_pair
 from apertura.views.look.follow import Look
 from apertura.views.look.node import NodeSoFar
+from apertura.views.webmap.server import served_look
 
 sys.path.insert(0, str(ROOT / "benchmarks"))
 import look as replayed  # the writers of benchmarks/look.py, which end files wherever a write may
@@ -287,13 +289,40 @@ def test_a_delay_doubles_the_decimation_and_ease_halves_it(tiny, monkeypatch):
     assert told == [1, 2, 2, 4, 2, 1]  # not at first, when it still plans, nor while it catches up
 
 
+def test_a_map_of_a_look_serves_the_last_pictures_and_nothing_else(tiny):
+    """Two pictures of a pair stay, the image is on the scene's grid whatever it was formed on."""
+    look = Look(Campaign.load(tiny), follow=True, every_s=2.0, end_after_s=1e6)
+    with pytest.raises(CampaignError, match=r"look/map/map\.json: no such file.*apertura look CAMPAIGN"):
+        served_look(look.campaign)
+    for node in look.nodes.values():
+        node.read()
+    assert all(pair.add_next(ended=True) for pair in look.pairs)
+    for number in range(4):
+        look.show(ended=number == 3, elapsed_s=1.0)
+    folder = tiny / "results/look"
+    document = json.loads((folder / "map/map.json").read_text())
+    assert document["again_s"] is None
+    with served_look(look.campaign) as server:
+        listed = server.files()
+        assert sorted(listed) == ["f01/uav1-uav1/db.3.tif", "f01/uav1-uav2/db.3.tif", "map/map.json"]
+        assert all(server.sha256_of(name) == sha256 for name, sha256 in listed.items())
+    assert sorted(path.name for path in (folder / "f01/uav1-uav1").iterdir()) == ["db.2.tif", "db.3.tif"]
+    with rasterio.open(folder / "f01/uav1-uav1/db.3.tif") as raster:
+        assert (*raster.shape, *raster.bounds) == (*document["grid"]["shape"], *document["grid"]["bounds_m"])
+        level = raster.read(1)
+    x, y = (document["places"][-2][name] for name in ("x_m", "y_m"))
+    row, column = raster.index(x, y)
+    assert np.nanmax(level[row - 2 : row + 3, column - 2 : column + 3]) == pytest.approx(np.nanmax(level), abs=0.5)
+
+
 def test_a_look_writes_beside_the_results_and_nowhere_else(finished_tiny, tmp_path):
     root = copy_writable(finished_tiny.root, tmp_path / "campaign")
     before = files_of(root)
     Look(Campaign.load(root), follow=False).run()
     assert files_of(root) == before
     shown = {path.relative_to(root / "results/look").as_posix() for path in (root / "results/look").rglob("*.*")}
-    assert shown == {"index.html", "status.json", "f01/uav1-uav1.png", "f01/uav1-uav2.png"}
+    pictures = {f"f01/uav1-uav{node}{end}" for node in (1, 2) for end in (".png", "/db.0.tif")}
+    assert shown == {"index.html", "status.json", "map/map.json"} | pictures
     told = json.loads((root / "results/look/status.json").read_text())["pairs"]["f01/uav1-uav1"]
     assert told["verdict"] in {"focused", "cannot tell"}
     assert told["share"] == 1

@@ -60,12 +60,7 @@ class Page {
 
   /** Choices of the panel. */
   fill() {
-    const flights = new Map();
-    for (const { flight, image } of this.data.images) {
-      if (!flights.has(flight)) flights.set(flight, element('optgroup', { label: flight }));
-      flights.get(flight).append(element('option', { value: `${flight}/${image}`, textContent: `${flight} · ${image}` }));
-    }
-    byId('image').append(...flights.values());
+    this.list();
     byId('colours').append(...Object.keys(RAMPS).map((name) => element('option', { value: name, textContent: name })));
     this.boxes = {};
     for (const [name, words] of Object.entries(OVER)) {
@@ -74,6 +69,16 @@ class Page {
       byId('overlays').append(element('label', {}, box, ` ${words}`));
       box.addEventListener('change', () => this.over());
     }
+  }
+
+  /** Images to choose from. */
+  list() {
+    const flights = new Map();
+    for (const { flight, image } of this.data.images) {
+      if (!flights.has(flight)) flights.set(flight, element('optgroup', { label: flight }));
+      flights.get(flight).append(element('option', { value: `${flight}/${image}`, textContent: `${flight} · ${image}` }));
+    }
+    byId('image').replaceChildren(...flights.values());
   }
 
   listen() {
@@ -131,7 +136,8 @@ class Page {
   /** What the image says of itself. */
   say() {
     const { verdict, why, error_db: error, flags } = this.image;
-    byId('verdict').textContent = `${verdict}: ${why}; numerical error below ${number(error, 1)} dB`;
+    const known = error === null ? '' : `; numerical error below ${number(error, 1)} dB`;
+    byId('verdict').textContent = `${verdict}: ${why}${known}`;
     const raised = Object.entries(flags).flatMap(([name, words]) => [
       element('dt', { textContent: name }),
       element('dd', { textContent: words }),
@@ -182,6 +188,30 @@ class Page {
     this.remember();
   }
 
+  /** Show what the campaign has become; what the reader chose stays, and so do colours that were moved. */
+  update(data) {
+    const moved = this.low !== this.layer.low || this.high !== this.layer.high;
+    const known = this.data.images.map((one) => `${one.flight}/${one.image}`);
+    this.data = data;
+    this.rasters.clear();
+    this.targets.all = data.places;
+    if (data.images.some((one) => !known.includes(`${one.flight}/${one.image}`))) this.list();
+    const colours = byId('colours').value;
+    this.choose(`${this.image.flight}/${this.image.image}`, this.layer.file, { stretch: moved ? [this.low, this.high] : null, colours });
+  }
+
+  /** Read the document again and again while the campaign flies. */
+  async follow() {
+    let before = JSON.stringify(this.data);
+    while (this.data.again_s) {
+      await new Promise((done) => setTimeout(done, 1000 * this.data.again_s));
+      const data = await read().catch(() => this.data); // it is being written: next time
+      const now = JSON.stringify(data);
+      if (now !== before) this.update(data);
+      before = now;
+    }
+  }
+
   opened(layer) {
     if (!this.rasters.has(layer.url)) this.rasters.set(layer.url, new Raster(layer, this.places));
     return this.rasters.get(layer.url);
@@ -205,13 +235,18 @@ class Page {
   }
 }
 
-async function start() {
-  if (!canDraw()) notice('This browser has no WebGL, with which images are drawn; values, places and tracks are still told.');
+async function read() {
   const answer = await fetch('map.json');
   if (!answer.ok) throw new Error(`map.json: ${(await answer.text()).trim()}`);
   const data = await answer.json();
   if (data.format !== FORMAT) throw new Error('map.json is of another version than this page: run the workflow again');
-  const page = new Page(data);
+  return data;
+}
+
+async function start() {
+  if (!canDraw()) notice('This browser has no WebGL, with which images are drawn; values, places and tracks are still told.');
+  const page = new Page(await read());
+  page.follow().catch((error) => notice(error.message));
   page.chart.map.on('rendercomplete', () => {
     if (page.chart.drawn) document.documentElement.setAttribute('data-drawn', '');
   });

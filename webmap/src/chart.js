@@ -84,9 +84,14 @@ export class Chart {
   }
 
   replaced(before, layer, style, zIndex) {
-    if (before) this.map.removeLayer(before);
-    before?.dispose();
-    if (!layer || !canDraw()) return null;
+    const gone = () => {
+      if (before) this.map.removeLayer(before);
+      before?.dispose();
+    };
+    if (!layer || !canDraw()) {
+      gone();
+      return null;
+    }
     const source = new GeoTIFF({
       sources: [{ url: layer.url }],
       normalize: false,
@@ -99,6 +104,7 @@ export class Chart {
     });
     const made = new TileLayer({ source, style: style(), zIndex });
     this.map.addLayer(made);
+    this.map.once('rendercomplete', gone); // not before: the map would flash
     return made;
   }
 

@@ -506,14 +506,15 @@ def report(
 def map_page(
     campaign: CampaignFolder = HERE,
     port: Annotated[int, typer.Option(min=0, max=65535, help="to serve on; 0: a free one")] = 0,
+    look_: Annotated[bool, typer.Option("--look", help="what `apertura look` shows, as it flies")] = False,
     open_: Annotated[bool, typer.Option("--open", help="show it in the browser")] = False,
 ) -> None:
-    """Show a finished campaign as a map in a browser: served to this machine alone, until Ctrl-C."""
+    """Show a campaign as a map in a browser: served to this machine alone, until Ctrl-C."""
     opened = _opened(campaign)
     opened.check_images()
-    from apertura.views.webmap.server import served
+    from apertura.views.webmap.server import served, served_look
 
-    served(opened, port=port).show(in_browser=open_)
+    (served_look if look_ else served)(opened, port=port).show(in_browser=open_)
 
 
 @app.command()

@@ -193,6 +193,9 @@ COVERAGE = ("coverage.png", "coverage.geojson")
 MOSAICS = "mosaic"
 """Folder of the rasters of all flights."""
 
+LOOK = "look"
+"""Folder of what `apertura look` shows, laid out like the results."""
+
 MAP = "map/map.json"
 """What `apertura map` shows of all of them in a browser."""
 

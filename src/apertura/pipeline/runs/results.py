@@ -28,7 +28,7 @@ _OWN: Mapping[str, str | tuple[str, ...]] = {
     "benchmarks": ".tsv",
     ".hashes": ".json",
     RUN: "",
-    "look": (".png", ".json", ".html"),
+    "look": (".png", ".json", ".html", ".tif"),
 }
 """Folder of the results → how the names of the files end that a run, or a look, leaves there."""
 

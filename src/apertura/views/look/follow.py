@@ -22,6 +22,7 @@ from apertura.common.flags import Flags
 from apertura.common.processes import as_typed
 from apertura.core.planning.plan import Plan
 from apertura.core.scene.grid import SceneGrid
+from apertura.formats.export import LOOK
 from apertura.formats.export.quicklook import write_quicklook
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import CONFIG, SampledWaveform
@@ -30,11 +31,9 @@ from apertura.pipeline.opening.pair import open_pair, recorded_echo
 from apertura.pipeline.opening.scene import ConfiguredGround, Flown, settled
 from apertura.pipeline.opening.transmitted import transmitted
 from apertura.views.look.image import Block
+from apertura.views.look.live_map import LiveMap
 from apertura.views.look.node import NodeSoFar
 from apertura.views.look.pair import PairSoFar
-
-FOLDER = "look"
-"""Of the results, where it is shown."""
 
 _POLLS = 2  # looks at the files for each picture
 _BEHIND = 3  # times the seconds between pictures: a delay above it takes every other pulse
@@ -73,6 +72,7 @@ class Look:
         self.finish = threading.Event()
         """Set: the recordings have ended."""
         self.decimated, self.busy_s = 1, 0.0
+        self._map = LiveMap(campaign, LOOK, every_s=every_s)
         self._delay_s = np.inf  # of the picture before
         waveform = campaign.settings.waveform
         self.nodes: dict[tuple[str, str], NodeSoFar] = {}
@@ -168,8 +168,9 @@ class Look:
             "one_pulse_in": self.decimated,
             "pairs": pairs,
         }
-        folder = self.campaign.result(FOLDER)
+        folder = self.campaign.result(LOOK)
         write_json(folder / "status.json", status)
+        self._map.write(ended=ended)
         write_text(folder / "index.html", _page(status, refresh_s=0 if ended else max(1, round(self.every_s))))
         self.busy_s += time.monotonic() - began
         busy = self.busy_s / max(elapsed_s, 1e-3)
@@ -193,9 +194,10 @@ class Look:
         told |= {"share": shown.share, "error_db": error_db}
         told |= {"spacing_m": shown.grid.spacing_m, "setting": shown.setting}
         told["delay_s"] = pair.delay_s
-        path = self.campaign.result(FOLDER, pair.flight, f"{pair.name}.png")
+        path = self.campaign.result(LOOK, pair.flight, f"{pair.name}.png")
         path.parent.mkdir(parents=True, exist_ok=True)
         self._draw(path, pair, told)
+        self._map.add(pair, told)
         if pair.tx is not None:
             pair.tx.read()
         told |= {"delay_s": pair.delay_s, "pulses": pair.counts}  # when the picture is there
@@ -258,7 +260,7 @@ def finished_by_interrupt(look: Look) -> Iterator[None]:
 def look_at(campaign: Campaign, *, follow: bool, every_s: float, end_after_s: float, threads: int, fine: bool) -> None:
     """Show a campaign as far as it has come, until its recordings end."""
     look = Look(campaign, follow=follow, every_s=every_s, end_after_s=end_after_s, threads=threads)
-    print(f"shown in {as_typed(campaign.result(FOLDER, 'index.html'))}", flush=True)
+    print(f"shown in {as_typed(campaign.result(LOOK, 'index.html'))}", flush=True)
     if not follow:
         look.run(fine=fine)
         return

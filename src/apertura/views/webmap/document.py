@@ -176,6 +176,7 @@ def map_document(
     places: Iterable[Place],
     coverage_url: str | None,
     notes: Sequence[str] = (),
+    again_s: float | None = None,
 ) -> dict[str, Any]:
     """Return `map.json`.
 
@@ -196,6 +197,8 @@ def map_document(
         Of the GeoJSON with tracks and footprints; None where it has no place on Earth.
     notes
         What the reader should know of the map.
+    again_s
+        Seconds after which the page reads it again: images of a flight that goes on; None: it is as it will be.
     """
     return {
         "format": FORMAT,
@@ -207,4 +210,5 @@ def map_document(
         "places": [asdict(place) for place in places],
         "coverage_url": coverage_url,
         "notes": list(notes),
+        "again_s": again_s,
     }

@@ -20,11 +20,12 @@ from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO
 
-from apertura.common.documents import undamaged
+from apertura.common.documents import read_json, undamaged
 from apertura.common.errors import CampaignError
 from apertura.common.paths import inside
 from apertura.common.processes import Interrupted
-from apertura.formats.export import MAP, product_files
+from apertura.common.provenance import sha256_file
+from apertura.formats.export import LOOK, MAP, product_files
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.digests import digest_of
 from apertura.pipeline.store import manifest_of, open_listed, read_manifest
@@ -377,6 +378,20 @@ class _Handler(BaseHTTPRequestHandler):
 
     def log_message(self, format: str, *arguments: object) -> None:  # noqa: A002
         """Say nothing: a map asks for hundreds of ranges."""
+
+
+def served_look(campaign: Campaign, *, port: int = 0) -> MapServer:
+    """Return a server of what `apertura look` shows; parameters and errors as `served`."""
+    folder = campaign.result(LOOK)
+    path = folder / MAP
+
+    def files() -> Mapping[str, str]:
+        document = read_json(path, expected="what apertura look writes", remedy="Run `apertura look CAMPAIGN` first.")
+        with undamaged(path, expected="what apertura look writes", remedy="Run `apertura look CAMPAIGN` again."):
+            return {**named_files(document), MAP: sha256_file(path)}
+
+    files()
+    return MapServer(folder, files, page=page_files(), sha256_of=lambda name: sha256_file(folder / name), port=port)
 
 
 def served(campaign: Campaign, *, port: int = 0) -> MapServer:

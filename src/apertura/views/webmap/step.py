@@ -13,12 +13,13 @@ from apertura.common.errors import CampaignError
 from apertura.common.paths import inside
 from apertura.common.raster import opened_raster
 from apertura.core.geometry.geodesy import LOCAL, frame_from_map, geodetic_from_ecef
+from apertura.core.scene.grid import SceneGrid
 from apertura.formats.export import COVERAGE, MAP, Export, exports_in
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import FUSED
 from apertura.pipeline.digests import digest_of
 from apertura.pipeline.lineage import result_of
-from apertura.pipeline.opening.scene import OpenScene, settled_scene
+from apertura.pipeline.opening.scene import settled_scene
 from apertura.pipeline.store import check_listed, read_manifest, record_files
 from apertura.views.image_report import read_report
 from apertura.views.webmap.document import Layer, Place, found_places, image_entry, map_document, url_of
@@ -31,9 +32,9 @@ def webmap(campaign: Campaign) -> list[Path]:
     """Write results/map/map.json; return its path."""
     lineage = result_of(campaign, "map").begin(campaign.root)
     scene = settled_scene(campaign)
-    images, places = [], [*_stated(campaign)]
+    images, places = [], [*stated_places(campaign)]
     notes: list[str] = []
-    places += _true(campaign, scene, notes)
+    places += true_places(campaign, scene.grid.crs, notes)
     # Sums, the last of a flight, are what a map opens on.
     for flight, image in ((name, one) for name, (*pairs, last) in campaign.images.items() for one in (last, *pairs)):
         report = read_report(campaign, flight, image)
@@ -43,7 +44,7 @@ def webmap(campaign: Campaign) -> list[Path]:
     document = map_document(
         campaign.settings.campaign,
         grid={"bounds_m": scene.grid.bounds_m, "spacing_m": scene.grid.spacing_m, "shape": scene.grid.shape},
-        crs=_crs(scene),
+        crs=crs_of(scene.grid),
         images=images,
         places=places,
         coverage_url=None if scene.grid.crs == LOCAL else _coverage_url(campaign),
@@ -102,17 +103,16 @@ def _rounded(value: float) -> float:
     return float(f"{value:.4g}") + 0.0  # no -0
 
 
-def _crs(scene: OpenScene) -> dict[str, Any]:
-    """Return the campaign's CRS as the page needs it, with places by which it proves its own arithmetic."""
+def crs_of(grid: SceneGrid) -> dict[str, Any]:
+    """Return the CRS of a grid as the page needs it, with places by which it proves its own arithmetic."""
     from pyproj import CRS
 
-    grid = scene.grid
     known = CRS.from_user_input(grid.crs_wkt)
     if grid.crs == LOCAL:
         return {"name": known.name, "code": None, "local": True, "proj4": None, "control": []}
     west, south, east, north = grid.bounds_m
     x, y = np.array([(x, y) for x in (west, (west + east) / 2, east) for y in (south, (south + north) / 2, north)]).T
-    latitude, longitude, _ = geodetic_from_ecef(frame_from_map(grid.crs, x, y, scene.level.height_m)).T
+    latitude, longitude, _ = geodetic_from_ecef(frame_from_map(grid.crs, x, y, np.zeros(len(x)))).T
     control = np.stack([x, y, longitude, latitude], axis=-1).round(10).tolist()
     return {"name": known.name, "code": grid.crs, "local": False, "proj4": _proj4(known), "control": control}
 
@@ -131,7 +131,7 @@ def _coverage_url(campaign: Campaign) -> str | None:
     return url_of(name, digest) if digest else None
 
 
-def _stated(campaign: Campaign) -> list[Place]:
+def stated_places(campaign: Campaign) -> list[Place]:
     """Return the places that the config knows."""
     scene, calibration = campaign.settings.scene, campaign.settings.calibration
     known = [(point.name, point.position_m) for point in scene.reference_points]
@@ -139,7 +139,7 @@ def _stated(campaign: Campaign) -> list[Place]:
     return [Place(name, "stated", float(x), float(y)) for name, (x, y, _) in known]
 
 
-def _true(campaign: Campaign, scene: OpenScene, notes: list[str]) -> list[Place]:
+def true_places(campaign: Campaign, crs: str, notes: list[str]) -> list[Place]:
     """Return the targets of a simulation, numbered as `apertura score` does; what cannot be read becomes a note."""
     path = inside(campaign.root, "truth.json", where=campaign.root)
     if not path.is_file():
@@ -148,7 +148,7 @@ def _true(campaign: Campaign, scene: OpenScene, notes: list[str]) -> list[Place]
         document = read_json(path, expected="the truth of a simulation", remedy="Delete it.")
         with undamaged(path, expected="the truth of a simulation", remedy="Delete it."):
             targets = [(float(target["x"]), float(target["y"])) for target in document["targets"]]
-            if document.get("crs", scene.grid.crs) != scene.grid.crs:
+            if document.get("crs", crs) != crs:
                 raise ValueError("its places are in another CRS than the images")
     except CampaignError as error:
         notes.append(f"No targets are listed: {error}".replace(f"{campaign.root}/", ""))
