@@ -247,7 +247,7 @@ def test_a_report_that_was_edited_is_not_believed(finished):
 def test_a_damaged_document_is_not_read(finished, file):
     path = finished / "results" / file
     path.write_text(path.read_text().replace("1", "2", 1))
-    from apertura.pipeline.opening.results import assessment_of
+    from apertura.pipeline.opening.images import assessment_of
     from apertura.pipeline.opening.scene import settled_scene
 
     campaign = Campaign.load(finished)

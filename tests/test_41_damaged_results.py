@@ -6,7 +6,8 @@ import pytest
 from folders import complaint, edit_config
 
 from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.opening.results import assessment_of, open_campaign
+from apertura.pipeline.opening.images import assessment_of
+from apertura.pipeline.opening.results import open_campaign
 from apertura.pipeline.opening.scene import settled_scene
 from apertura.pipeline.steps.calibration import calibrated
 from apertura.pipeline.store import manifest_of, record_files, save_document

@@ -9,7 +9,7 @@ from folders import SHARED, copy_writable, edit_config, edit_track, run_steps
 
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.opening.diagnosis import Hypothesis, Trial, explanation
-from apertura.pipeline.opening.results import assessment_of
+from apertura.pipeline.opening.images import assessment_of
 from apertura.pipeline.steps import assess, cube, echo, export, image, profile
 from apertura.pipeline.store import record_files
 from apertura.simulation import preset, simulate

@@ -423,6 +423,7 @@ _ROWS = (
         sources=("echo", "profile", "scene"),
         settings=("campaign",),
         products=("phase_history.cphd",),
+        reads=("recordings",),
         on_demand=True,
         demand=Demand(500, pulse_bytes=500, recorded_s=120),
         cost=Cost(2.0, mb_s=0.02, last=True),

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.common.contracts import Window
+from apertura.common.documents import undamaged
 from apertura.common.errors import CampaignError
 from apertura.common.provenance import sha256_file
 from apertura.core.quality.agreement import Agreement, agreement, agreement_of_ground
@@ -17,7 +18,7 @@ from apertura.core.quality.measures import BlockRaster
 from apertura.core.quality.point_targets import BandLimitedPatch, carrier_at
 from apertura.core.scene.grid import SceneGrid
 from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.store import read_manifest
+from apertura.pipeline.store import open_document, read_manifest, remake
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -214,3 +215,26 @@ def agreement_report(found: Agreement | None) -> dict[str, float | str] | None:
     if found is None:
         return None
     return {name: value if isinstance(value, str) else float(f"{value:.4g}") for name, value in asdict(found).items()}
+
+
+# ---- How the images of a flight agree, as step assess wrote it -----------------------------------------------------
+
+
+def assessment_of(campaign: Campaign, flight: str) -> dict[str, Any]:
+    """Return the assessment of a flight: agreement of its images, their flags, members of the coherent sum.
+
+    Raises
+    ------
+    CampaignError
+        If it is not there as the step left it.
+    """
+    path = campaign.result(flight, "assessment.json")
+    document = open_document(path)
+    with undamaged(path, expected="what step assess writes", remedy=remake(path)):
+        read = {name: document[name] for name in ("reference", "hypotheses", "code_sha256")}
+        fusion, pairs = document["fusion"], document["pairs"]
+        phases = {pair: float(phase_rad) for pair, phase_rad in fusion["phases_rad"].items()}
+        told = {name: {**fusion[name]} for name in ("left_out", "unmeasured")}
+        read["fusion"] = {**fusion, **told, "phases_rad": phases}
+        read["pairs"] = {pair: {**agreed, "flags": {**agreed["flags"]}} for pair, agreed in pairs.items()}
+    return {**document, **read}

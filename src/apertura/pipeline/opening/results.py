@@ -6,12 +6,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from apertura.common.contracts import STAGES
-from apertura.common.documents import undamaged
 from apertura.common.errors import CampaignError, quoted
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.opening.echo import PairEcho
 from apertura.pipeline.opening.scene import OpenScene, open_scene
-from apertura.pipeline.store import open_document, open_listed, open_stage, remake
+from apertura.pipeline.store import open_listed, open_stage
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -135,23 +134,3 @@ def open_campaign(path: str | Path) -> OpenCampaign:
         expected = "the path of a campaign folder, which holds config/config.yaml"
         raise CampaignError(quoted(path), "open_campaign: path", expected, "Give it as text or a pathlib.Path.")
     return OpenCampaign(Campaign.load(path))
-
-
-def assessment_of(campaign: Campaign, flight: str) -> dict[str, Any]:
-    """Return the assessment of a flight: agreement of its images, their flags, members of the coherent sum.
-
-    Raises
-    ------
-    CampaignError
-        If it is not there as the step left it.
-    """
-    path = campaign.result(flight, "assessment.json")
-    document = open_document(path)
-    with undamaged(path, expected="what step assess writes", remedy=remake(path)):
-        read = {name: document[name] for name in ("reference", "hypotheses", "code_sha256")}
-        fusion, pairs = document["fusion"], document["pairs"]
-        phases = {pair: float(phase_rad) for pair, phase_rad in fusion["phases_rad"].items()}
-        told = {name: {**fusion[name]} for name in ("left_out", "unmeasured")}
-        read["fusion"] = {**fusion, **told, "phases_rad": phases}
-        read["pairs"] = {pair: {**agreed, "flags": {**agreed["flags"]}} for pair, agreed in pairs.items()}
-    return {**document, **read}

@@ -19,8 +19,7 @@ from apertura.methods.interferometry.coherence import chance, coherence, common_
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import FUSED
 from apertura.pipeline.lineage import result_of
-from apertura.pipeline.opening.images import ComparedImage, agreement_of, agreement_report
-from apertura.pipeline.opening.results import assessment_of
+from apertura.pipeline.opening.images import ComparedImage, agreement_of, agreement_report, assessment_of
 from apertura.pipeline.opening.scene import settled_scene
 from apertura.pipeline.steps.stamping import stamped
 from apertura.pipeline.store import create, finish, open_array, open_stage, writing

@@ -30,8 +30,7 @@ from apertura.pipeline.config import FUSED
 from apertura.pipeline.config.processing import Multilooking
 from apertura.pipeline.digests import Lineage
 from apertura.pipeline.lineage import result_of
-from apertura.pipeline.opening.images import ComparedImage, bright_places
-from apertura.pipeline.opening.results import assessment_of
+from apertura.pipeline.opening.images import ComparedImage, assessment_of, bright_places
 from apertura.pipeline.opening.scene import settled_scene
 from apertura.pipeline.steps.multilook import LazyLayer, coarse, multilook_of, said_of
 from apertura.pipeline.steps.stamping import tags_of
