@@ -88,7 +88,7 @@ def test_the_report_opens_without_a_net_and_shows_names_as_text(written):
     assert links == 0
     assert menu.count("range profiles") == 2
     assert page == f"{NAME}, flight f01"
-    assert len(widths) == 15
+    assert len(widths) == 16
     assert min(widths) > 500
     assert errors == []
     assert [url for url in asked if not url.startswith(("file:", "data:", "blob:"))] == []
