@@ -125,7 +125,10 @@ def sum_on_device(
             blocks = -(-len(spread) // _CHUNK_THREADS)
             kernels.spread_of_chunks[blocks, _CHUNK_THREADS](places, *on_device[:2], spread)
         rows, columns = pixels.shape[:2]
-        image, tally = cuda.device_array((rows, columns), np.complex64), cuda.to_device(np.zeros(3, np.int64))
+        image, tally = (
+            cuda.device_array((rows, columns), np.complex64),
+            cuda.to_device(np.zeros(len(VARIANTS), np.int64)),
+        )
         patches = (-(-columns // SIDE), -(-rows // SIDE))
         form = kernels.form_weighed if beams else kernels.form
         form[patches, (SIDE, kernels.ROWS)](
@@ -213,7 +216,7 @@ __all__ = ["NEEDS", "READS", "TIMED", "VARIANTS", "available", "candidates", "fo
 
 READS: Literal["profiles"] = "profiles"
 TIMED = False  # the seconds of cuda_prediction are published ones of others, auto compares measured ones
-VARIANTS = ("by series", "by exact paths", "without an echo")
+VARIANTS = ("by series", "by exact paths", "without an echo", "without an echo of 64")
 NEEDS = "an NVIDIA GPU with its driver, and apertura[cuda] (docs/howto/gpu.md)"
 
 
@@ -334,8 +337,8 @@ def form(
         Largest phase error that the path series may make anywhere in a patch of 16 × 16 pixels; patches and pulses that
         would exceed it take exact paths, pixel by pixel in float64.
     counts
-        (3,) int64 to which the number of pixels × pulses is added that were summed by series, by exact paths, or had
-        no echo.
+        (4,) int64 to which the number of pixels × pulses is added that were summed by series, by exact paths, had no
+        echo, or no echo together with 63 others: those cost next to nothing.
 
     Returns
     -------

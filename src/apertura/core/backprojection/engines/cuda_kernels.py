@@ -57,7 +57,7 @@ ROWS = 4
 """Rows of threads of a patch: each thread sums every fourth pixel of a column, and reads their common values once."""
 
 _PIXELS, _EACH, _LANES = SIDE * SIDE, SIDE // ROWS, SIDE * ROWS
-_SERIES, _EXACT, _SKIPPED = range(3)  # as VARIANTS of the engine
+_SERIES, _EXACT, _SKIPPED, _UNSEEN = range(4)  # as VARIANTS of the engine; _UNSEEN: a whole chunk
 _NO_CELL = 2**32 - 1
 _ROUNDER = np.float32(1.5 * 2**23)  # adding and subtracting it rounds
 _ONE, _NONE, _TWO, _THREE = np.float32(1), np.float32(0), np.float32(2), np.float32(3)
@@ -88,7 +88,7 @@ def _over_an_image(weighed):  # type: ignore[no-untyped-def]
         reached = cuda.shared.array(_LANES, np.int32)
         near = cuda.local.array((_EACH, 5), np.float32)  # x, y, z from the origin, squared; centre from the patch's
         total = cuda.local.array((_EACH, 2), np.float64)
-        tally = cuda.local.array(3, np.int64)
+        tally = cuda.local.array(4, np.int64)
         lane = cuda.threadIdx.y * SIDE + cuda.threadIdx.x
         # The patch: positions, origin, offsets; with weights, where the sectors of its pixels are centred.
         _place(pixels, lane, place)
@@ -97,13 +97,14 @@ def _over_an_image(weighed):  # type: ignore[no-untyped-def]
         _offsets(lane, place, patch, near, total)
         if weighed:
             _centres(lane, place, weights, numbers, (patch, centres, near))
-        tally[_SERIES], tally[_EXACT], tally[_SKIPPED] = 0, 0, 0
+        for variant in range(4):
+            tally[variant] = 0
         turn, pulses = _carrier(numbers), len(tables[1])
         for first in range(0, pulses, CHUNK):
             count = min(CHUNK, pulses - first)
             # Pulses whose weights are zero all over the patch: whole chunks of them cost next to nothing.
             if weighed and not _is_reached(first // CHUNK, lane, patch, numbers, (tables, weights, reached, words)):
-                tally[_SKIPPED] += count if lane == 0 else 0
+                tally[_UNSEEN] += count if lane == 0 else 0
                 continue
             # A thread a pulse: how the patch sees it.
             if lane < count:
@@ -137,7 +138,7 @@ def _write(lane, place, total, tally, results):  # type: ignore[no-untyped-def]
             nowhere = math.isnan(place[0, lane + n * ROWS * SIDE])
             image[row, column] = complex(math.nan, math.nan) if nowhere else complex(total[n, 0], total[n, 1])
     pixels = min(SIDE, image.shape[0] - above) * min(SIDE, image.shape[1] - left)
-    for variant in range(3):
+    for variant in range(4):
         if tally[variant]:
             cuda.atomic.add(counts, variant, tally[variant] * pixels)
 
@@ -377,7 +378,7 @@ def spread_of_chunks(antennas, sector_axes, beam_axes, spread):  # type: ignore[
                         beam += (beam_axes[p, leg, axis, n] - beam_axes[middle, leg, axis, n]) ** 2
             strayed, turned, veered = max(strayed, metres), max(turned, beam), max(veered, sector)
         spread[chunk, leg, _STRAYED] = math.sqrt(strayed)
-        spread[chunk, leg, _TURNED] = math.sqrt(turned)
+        spread[chunk, leg, _TURNED] = math.sqrt(turned / 2)  # the largest change of a direction by a rotation
         spread[chunk, leg, _VEERED] = math.sqrt(veered)
 
 
