@@ -274,8 +274,18 @@ def steady(scene, turn_deg, width_deg=8.0):
     return Beams(replace(beam, axes=np.moveaxis(np.array(rows), -1, 0) @ beam.axes))
 
 
+def veering(sector, flown, place):
+    """The same sector of a flight that heads for its middle for some pulses at the end of each 64."""
+    axes = []
+    for leg, axis in zip(flown.legs, (sector.tx_axis, sector.rx_axis), strict=True):
+        toward = (place - leg) / np.linalg.norm(place - leg, axis=1, keepdims=True)
+        axes.append(np.where(np.arange(len(leg))[:, None] % 64 > 60, 0.35 * toward, axis))
+    return Beams(sector=replace(sector, tx_axis=axes[0], rx_axis=axes[1], centre=0.7))
+
+
 @pytest.mark.parametrize(
-    "kind", ["end of a sector", "middle of a sector", "a beam that leaves", "a beam that looks in"]
+    "kind",
+    ["end of a sector", "middle of a sector", "a flight that veers", "a beam that leaves", "a beam that looks in"],
 )
 def test_pulses_that_are_left_out_change_nothing_to_the_bit(long, kind):
     """Whole chunks of them, or single ones; also where the middle of a chunk is left out and its ends are not."""
@@ -286,6 +296,7 @@ def test_pulses_that_are_left_out_change_nothing_to_the_bit(long, kind):
     beams = {
         "end of a sector": Beams(sector=replace(sector, centre=float(at[4]))),
         "middle of a sector": Beams(sector=replace(sector, centre=float(at[70]))),
+        "a flight that veers": veering(sector, flown, places[1, 2]),
         "a beam that leaves": steady(scene, np.where(np.arange(130) < 64, 0.3 * np.arange(130), 100.0)),
         "a beam that looks in": steady(scene, np.where(np.arange(130) % 64 > 60, 0.0, 40.0)),
     }[kind]
@@ -301,6 +312,27 @@ def test_pulses_that_are_left_out_change_nothing_to_the_bit(long, kind):
     assert 12 * weight.sum() <= counts[0, 0] <= 12 * (weight.sum() + 4)
     parts = [cuda.form(tables[some], places, beams=beams[some]) for some in (slice(0, 64), slice(64, 130))]
     assert decibels(sum(parts) - image, image) <= -110
+
+
+def test_more_chunks_than_threads_are_looked_at_group_by_group(long):
+    """128 pulses flown 33 times over: 66 chunks, and ten pulses of the last one see the scene."""
+    from numba import cuda as numba_cuda
+
+    scene, places, tables = long
+    cuda.form(tables, places)
+    often, pulses = cuda.Resident(), 33 * 128
+    often.arrays = tuple(
+        numba_cuda.to_device(np.concatenate([array.copy_to_host()[:128]] * 33)) for array in tables.resident.arrays
+    )
+    many, turn = replace(tables, pulses=slice(0, pulses), resident=often), np.full(pulses, 100.0)
+    turn[-20:-10] = 0.0
+    beams, counts = steady(replace(scene, tx=np.tile(scene.tx[:128], (33, 1))), turn), np.zeros(4, np.int64)
+    image = cuda.form(many, places, beams=beams, counts=counts)
+    assert counts.tolist() == [12 * 10, 0, 12 * 54, 12 * (pulses - 64)]
+    last = slice(pulses - 64, pulses)
+    some = cuda.form(many[last], places, beams=beams[last])
+    np.testing.assert_array_equal(image.view(np.uint32), some.view(np.uint32))
+    assert np.all(image != 0)
 
 
 @compiled

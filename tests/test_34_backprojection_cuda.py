@@ -72,7 +72,7 @@ def test_the_series_errs_by_no_more_than_is_reckoned_with():
 
 
 def test_weights_err_by_no_more_than_is_reckoned_with():
-    """(10), and angles along axes, in float32 as the kernel has them."""
+    """(8a), and angles along axes, in float32 as the kernel has them."""
     draw = np.random.default_rng(0)
     for reach, distance in ((0.5, 20.0), (5.0, 500.0), (0.5, 1e4)):
         w, d = draw.standard_normal((2, 20000, 3))

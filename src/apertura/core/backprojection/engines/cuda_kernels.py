@@ -533,7 +533,7 @@ def _weight(w, zone, near, legs, given):  # type: ignore[no-untyped-def]
 
 @cuda.jit(device=True)
 def _change(along, s, relative):  # type: ignore[no-untyped-def]
-    """Return by how much s of one leg differs from that at the origin, (10)."""
+    """Return by how much s of one leg differs from that at the origin, (8a)."""
     longer = relative * _root(relative) / _TWO
     return (along - s * longer) / (_ONE + longer)
 
