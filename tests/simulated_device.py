@@ -168,7 +168,9 @@ def weights_of(scene, places, kind):
     flown = Aperture(scene.tx, scene.rx)
     sector = Sector.of(flown, chord_m=1.2, centre=0.02, half=0.12)
     ahead = Sector.of(flown, chord_m=1.2, centre=0.6, half=0.15).following(flown, places[::8, ::8].reshape(-1, 3))
-    beams = swaying_beam(scene.tx, (12, 0, 0), 25), swaying_beam(scene.rx, (11.5, 0.4, 0), 30)
+    other = swaying_beam(scene.rx, (11.5, 0.4, 0), 30)
+    other = replace(other, azimuth_rad=other.azimuth_rad[::2], azimuth_gain=other.azimuth_gain[::2] ** 2)
+    beams = swaying_beam(scene.tx, (12, 0, 0), 25), other
     return {
         "sector": Beams(sector=sector),
         "centre that follows": Beams(sector=ahead),
@@ -283,9 +285,25 @@ def veering(sector, flown, place):
     return Beams(sector=replace(sector, tx_axis=axes[0], rx_axis=axes[1], centre=0.7))
 
 
+def ending_near(sector, scene, place):
+    """The same sector, centred by a pulse so near that its s changes over a patch more than that of others."""
+    away = ecef(np.array([12.0, 0.0, 2.0]))[None]
+    along = (ecef(np.array([0.7, 0.7, 0.0])) - ecef(np.zeros(3)))[None] / 2
+    end = Sector(along, along, 0.0, sector.half)
+    at = float(end.place(Aperture(away, away), place[None])[0, 0])
+    return Beams(sector=replace(sector, centre=at, ends=(Aperture(away, away), end)))
+
+
 @pytest.mark.parametrize(
     "kind",
-    ["end of a sector", "middle of a sector", "a flight that veers", "a beam that leaves", "a beam that looks in"],
+    [
+        "end of a sector",
+        "middle of a sector",
+        "a flight that veers",
+        "a centre that moves",
+        "a beam that leaves",
+        "a beam that looks in",
+    ],
 )
 def test_pulses_that_are_left_out_change_nothing_to_the_bit(long, kind):
     """Whole chunks of them, or single ones; also where the middle of a chunk is left out and its ends are not."""
@@ -297,6 +315,7 @@ def test_pulses_that_are_left_out_change_nothing_to_the_bit(long, kind):
         "end of a sector": Beams(sector=replace(sector, centre=float(at[4]))),
         "middle of a sector": Beams(sector=replace(sector, centre=float(at[70]))),
         "a flight that veers": veering(sector, flown, places[1, 2]),
+        "a centre that moves": ending_near(sector, scene, places[1, 2]),
         "a beam that leaves": steady(scene, np.where(np.arange(130) < 64, 0.3 * np.arange(130), 100.0)),
         "a beam that looks in": steady(scene, np.where(np.arange(130) % 64 > 60, 0.0, 40.0)),
     }[kind]
