@@ -1,8 +1,9 @@
 """The engine `cuda` where there is a device: `python benchmarks/gpu.py [--size 4096] [--pulses 4096] [--rounds 5]`.
 
 Wall clock, host to host: pixels go there, the image comes back; medians of rounds that visit all rows in turn, without
-the first, in which kernels are compiled. Errors are those of random pixels against the exact image of job.py. Beside
-the rates stand what others publish of theirs, on their devices and jobs. Without a device it says so and ends with 1.
+the first, in which kernels are compiled. Rates are of pixels × pulses that have a weight, errors those of random pixels
+against the exact image of job.py. Beside the rates stand what others publish of theirs, on their devices and jobs.
+Without a device it says so and ends with 1.
 """
 
 import argparse
@@ -17,7 +18,9 @@ from typing import Any
 import numpy as np
 from job import Job, build, error_db
 
+from apertura.core.antenna.beam import Beam, Beams, gaussian_cut
 from apertura.core.backprojection.engines import cuda
+from apertura.core.geometry.sector import Sector
 
 PUBLISHED = (
     (
@@ -36,6 +39,7 @@ class Row:
     name: str
     job: Job
     run: Callable[[], Any]
+    beams: Beams | None = None
     seconds: list[float] = field(default_factory=list)
     image: Any = None
 
@@ -51,21 +55,46 @@ class Row:
         return self.seconds[min(1, len(self.seconds) - 1) :]
 
 
+def weights(job: Job) -> dict[str, Beams]:
+    """Return a sector of a tenth of the flight, beams of 40° by 60° that look at the scene's middle, and both."""
+    flown = job.profiles.aperture
+    sector, middle = Sector.of(flown, chord_m=1.5, centre=0.0, half=0.08), job.pixels.reshape(-1, 3).mean(axis=0)
+    cuts = gaussian_cut(40.0, cutoff_db=-20, limit_rad=np.pi), gaussian_cut(60.0, cutoff_db=-20, limit_rad=np.pi / 2)
+    antennas = []
+    for leg in flown.legs:
+        ahead = (middle - leg) / np.linalg.norm(middle - leg, axis=1, keepdims=True)
+        right = np.cross(ahead, [0.0, 0.0, 1.0])
+        right /= np.linalg.norm(right, axis=1, keepdims=True)
+        antennas.append(Beam(np.stack([ahead, right, np.cross(ahead, right)], axis=1), *cuts[0], *cuts[1]))
+    return {"sector": Beams(sector=sector), "beams": Beams(*antennas), "sector and beams": Beams(*antennas, sector)}
+
+
 def rows(size: int, pulses: int) -> list[Row]:
-    """Return what is timed: geometries and surfaces by the series, one by exact paths alone, and tables alone."""
+    """Return what is timed: geometries and surfaces by the series, exact paths alone, weights, and tables alone."""
     flat = build(size, pulses)
     mono, rough = build(size, pulses, bistatic=False), build(size, pulses, surface="natural")
+    weighed = [(f"bistatic, {name}", flat, {"beams": beams}) for name, beams in weights(flat).items()]
     found = []
     for name, job, options in (
         ("bistatic", flat, {}),
         ("monostatic", mono, {}),
         ("bistatic, DEM", rough, {}),
         ("bistatic, float64 paths", flat, {"tolerance_rad": 1e-12}),
+        *weighed,
     ):
-        found.append(Row(name, job, partial(cuda.form, cuda.prepare(job.profiles), job.pixels, **options)))
+        run = partial(cuda.form, cuda.prepare(job.profiles), job.pixels, **options)
+        found.append(Row(name, job, run, options.get("beams")))
     patch = flat.pixels[:16, :16]
     found.append(Row("tables and a patch", flat, lambda: cuda.form(cuda.prepare(flat.profiles), patch)))
     return found
+
+
+def share(row: Row) -> float:
+    """Return the share of pixels × pulses that have a weight: the rate is that of these."""
+    if row.beams is None:
+        return 1.0
+    some = row.job.pixels[:: max(1, row.job.pixels.shape[0] // 9), :: max(1, row.job.pixels.shape[1] // 9)]
+    return float((row.beams.weight(row.job.profiles.aperture, some.reshape(-1, 3)) != 0).mean())
 
 
 def main() -> int:
@@ -86,9 +115,11 @@ def main() -> int:
         seconds, spread = statistics.median(row.kept), max(row.kept) / min(row.kept)
         line = f"{row.name:<26}{seconds:>9.3f} s  first {row.seconds[0]:.2f} s  spread {spread:.2f}"
         if row.image.shape == row.job.pixels.shape[:2]:
-            rate = np.prod(row.image.shape) * asked.pulses / seconds
+            taken = share(row)
+            rate = taken * np.prod(row.image.shape) * asked.pulses / seconds
             ratios = ", ".join(f"{rate / theirs:.2f} of {who.split(',')[0]}" for theirs, who in PUBLISHED)
-            line += f"{rate:>11.3g} pixel·pulses/s{error_db(row.job, row.image):>7.1f} dB  {ratios}"
+            error = error_db(row.job, row.image, beams=row.beams)
+            line += f"{rate:>11.3g} pixel·pulses/s of {100 * taken:.0f} %{error:>7.1f} dB  {ratios}"
         print(line)
     for rate, who in PUBLISHED:
         print(f"published: {rate:.3g}/s, {who}")

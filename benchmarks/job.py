@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
+from apertura.core.antenna.beam import Beams
 from apertura.core.backprojection.inputs import Profiles
 from apertura.core.geometry.aperture import Aperture
 from apertura.simulation.echoes import transfer
@@ -125,20 +126,25 @@ def spectra(job: Job, reference_path_m: NDArray) -> NDArray[np.complex64]:
     return transfer(points, job.profiles.aperture, frequency_hz, longer_m=-reference_path_m, spreading=False)
 
 
-def exact(job: Job, places: NDArray[np.float64], *, carrier_hz: float = CENTRE_HZ) -> NDArray[np.complex128]:
+def exact(
+    job: Job, places: NDArray[np.float64], *, carrier_hz: float = CENTRE_HZ, beams: Beams | None = None
+) -> NDArray[np.complex128]:
     """Return the image at (place, 3), float64: the double sum, over subcarriers in closed form."""
-    wavenumber = 2 * np.pi * carrier_hz / C
+    wavenumber, weight = 2 * np.pi * carrier_hz / C, (beams or Beams()).weight(job.profiles.aperture, places)
     here = total_path(*job.profiles.aperture.legs, places)
     image = np.zeros(len(places), np.complex128)
     for place, gain in zip(job.scatterers, job.amplitude, strict=True):
         apart = here - total_path(*job.profiles.aperture.legs, place[None])
-        image += gain * (np.exp(1j * wavenumber * apart) * response(apart)).sum(0)
+        image += gain * (np.exp(1j * wavenumber * apart) * response(apart) * weight).sum(0)
     return image
 
 
-def error_db(job: Job, image: NDArray[np.complex64], count: int = 300) -> float:
+def error_db(job: Job, image: NDArray[np.complex64], count: int = 300, *, beams: Beams | None = None) -> float:
     """Return the RMS error on random pixels after one complex gain, dB."""
     index = np.random.default_rng(7).integers(0, job.pixels.shape[0], (2, count))
-    truth, value = exact(job, job.pixels[index[0], index[1]]), image[index[0], index[1]].astype(np.complex128)
+    truth, value = (
+        exact(job, job.pixels[index[0], index[1]], beams=beams),
+        image[index[0], index[1]].astype(np.complex128),
+    )
     gain = np.vdot(value, truth) / np.vdot(value, value)
     return float(10 * np.log10(np.sum(np.abs(gain * value - truth) ** 2) / np.sum(np.abs(truth) ** 2)))

@@ -229,3 +229,9 @@ def swaying_beam(
     angle = np.linspace(-edge, edge, 701)
     gain = np.exp(-2 * np.log(2) * (angle / np.radians(width_deg)) ** 2)
     return Beam(turn @ axes, angle, gain, angle[150:-150], gain[150:-150])
+
+
+def hard_beam(soft: Beam, half_deg: float) -> Beam:
+    """The same axes with a gain of one out to `half_deg`."""
+    angle = np.radians([-half_deg, 0, half_deg])
+    return Beam(soft.axes, angle, np.ones(3), angle, np.ones(3))

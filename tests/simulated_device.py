@@ -10,15 +10,31 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import BANDWIDTH_HZ, SUBCARRIERS, C, decibels, ecef, error_db, fly, pixel_grid, plan, scatter
+from scenes import (
+    BANDWIDTH_HZ,
+    SUBCARRIERS,
+    C,
+    compiled,
+    decibels,
+    ecef,
+    error_db,
+    fly,
+    hard_beam,
+    pixel_grid,
+    plan,
+    scatter,
+    swaying_beam,
+)
 
 import apertura as ap
 from apertura.common.errors import CampaignError
-from apertura.core.backprojection.engines import cuda
+from apertura.core.antenna.beam import Beams
+from apertura.core.backprojection.engines import cuda, native, reference
 from apertura.core.backprojection.engines.cuda_prediction import candidates
 from apertura.core.backprojection.inputs import PhaseHistory
 from apertura.core.backprojection.job import Job, Signal
 from apertura.core.geometry.aperture import Aperture
+from apertura.core.geometry.sector import Sector
 from apertura.core.scene.grid import SceneGrid
 
 PULSES = 12
@@ -37,13 +53,14 @@ def tables(plain):
     return cuda.prepare(plain[2])
 
 
-def predicted_db(scene, pixels, profiles, **requested):
+def predicted_db(scene, pixels, profiles, beams=None, **requested):
     """What the engine's own prediction says of a setting."""
     signal = Signal(scene.carrier_hz, 2.0, profiles.step_m, profiles.samples.shape[1])
     spacing = float(np.linalg.norm((pixels[0, 1] - pixels[0, 0])[:2]))
     job = Job(
         profiles.aperture, ecef(pixels), pixels.shape[:2], spacing, scene.carrier_hz, BANDWIDTH_HZ, SUBCARRIERS, signal
     )
+    job = replace(job, beams=beams)
     (setting,) = candidates(job, pulses=len(profiles), requested=requested)
     return setting.error_db
 
@@ -143,24 +160,257 @@ def test_pixels_beyond_the_profiles_are_zero_and_others_unharmed(plain, tables):
     assert np.all(image[(reach < end[:, None, None] - cut.step_m).all(axis=0)] != 0)
 
 
-def test_an_image_by_the_device_is_certified_like_any_other():
+# ---- Weights of pulses
+
+
+def weights_of(scene, places, kind):
+    """A sector, inside of which some pulses are, at whose edge and outside of it others; beams; both; or one beam."""
+    flown = Aperture(scene.tx, scene.rx)
+    sector = Sector.of(flown, chord_m=1.2, centre=0.02, half=0.12)
+    ahead = Sector.of(flown, chord_m=1.2, centre=0.6, half=0.15).following(flown, places[::8, ::8].reshape(-1, 3))
+    other = swaying_beam(scene.rx, (11.5, 0.4, 0), 30)
+    other = replace(other, azimuth_rad=other.azimuth_rad[::2], azimuth_gain=other.azimuth_gain[::2] ** 2)
+    beams = swaying_beam(scene.tx, (12, 0, 0), 25), other
+    return {
+        "sector": Beams(sector=sector),
+        "centre that follows": Beams(sector=ahead),
+        "beams": Beams(*beams),
+        "transmit": Beams(beams[0]),
+        "receive": Beams(None, beams[1]),
+        "both": Beams(*beams, sector),
+        "all": Beams(*beams, ahead),
+    }[kind]
+
+
+@pytest.mark.parametrize(
+    ("kind", "bistatic", "rough_m", "tolerance_rad"),
+    [
+        ("sector", True, 0.0, 1.5e-3),
+        ("sector", False, 0.3, 1.5e-3),
+        ("sector", True, 0.3, 1e-9),
+        ("centre that follows", True, 0.3, 1.5e-3),
+        ("centre that follows", False, 0.0, 1e-9),
+        ("beams", False, 0.0, 1.5e-3),
+        ("beams", True, 0.3, 1e-9),
+        ("transmit", True, 0.0, 1.5e-3),
+        ("receive", True, 0.0, 1e-9),
+        ("both", True, 0.3, 1.5e-3),
+        ("all", True, 0.0, 1e-9),
+    ],
+)
+def test_weighed_pulses_are_those_of_the_double_sum(kind, bistatic, rough_m, tolerance_rad):
+    """By series with weights in float32, and by exact paths with weights in float64; on any surface."""
+    pixels = pixel_grid(16, 18)
+    pixels[..., 2] = rough_m * np.random.default_rng(6).standard_normal((16, 18))
+    places = ecef(pixels)
+    scene = fly(scatter(pixels), pulses=PULSES, bistatic=bistatic)
+    profiles, beams = scene.profiles(places), weights_of(scene, places, kind)
+    weight = beams.weight(profiles.aperture, places.reshape(-1, 3))
+    assert np.any((weight > 0) & (weight < 1))
+    if beams.antennas is None:
+        assert {0.0, 1.0} <= set(weight.ravel())
+    if kind in {"centre that follows", "all"}:
+        assert np.ptp(beams.sector.centre_at(places)) > 0.01
+    counts = np.zeros(len(cuda.VARIANTS), np.int64)
+    tables = cuda.prepare(profiles, oversampling=6)
+    image = cuda.form(tables, places, beams=beams, tolerance_rad=tolerance_rad, counts=counts)
+    truth = reference.form(scene.history(), places, beams=beams)
+    said = predicted_db(scene, pixels, profiles, beams, oversampling=6, tolerance_rad=tolerance_rad)
+    assert -80 < said < -70
+    assert decibels(image - truth, truth) <= said + 3
+    assert decibels(reference.form(scene.history(), places) - truth, truth) > -20  # the weights matter
+    summed = counts[0] if tolerance_rad > 1e-6 else counts[1]
+    assert counts.sum() == weight.size
+    assert (weight != 0).sum() <= summed == counts[:2].sum()
+
+
+def test_a_sector_finer_than_float32_resolves_is_weighed_as_exactly():
+    """An edge 4e-5 wide, all over a patch at 28 km: s is taken from its change over the patch, not as a whole."""
+    pixels = pixel_grid(16, 16, range_m=20e3)
+    scene = fly(scatter(pixels), range_m=20e3, pulses=8)
+    places, profiles = ecef(pixels), scene.profiles(ecef(pixels))
+    sector = Sector.of(profiles.aperture, chord_m=2e3, centre=0.0, half=2e-4)
+    there = float(sector.place(profiles.aperture, places[8, 8][None])[2, 0])
+    beams = Beams(sector=replace(sector, centre=there + sector.half))
+    weight = beams.weight(profiles.aperture, places.reshape(-1, 3))
+    assert np.all((weight[2] > 0.05) & (weight[2] < 0.95))
+    assert np.all(np.delete(weight, 2, axis=0) == 0)
+    image = cuda.form(cuda.prepare(profiles, oversampling=16), places, beams=beams)
+    truth = reference.form(scene.history(), places, beams=beams)
+    assert decibels(image - truth, truth) <= -80
+
+
+def test_what_a_pattern_says_of_phase_is_taken_out_by_no_engine(plain, tables):
+    scene, pixels, _ = plain
+    places = ecef(pixels)[:, :16]
+    soft = swaying_beam(scene.tx, (12, 0, 0))
+    turned = replace(soft, azimuth_phase_rad=np.linspace(0, 3, 701), elevation_phase_rad=np.linspace(1, 0, 401))
+    with_phase, without = (cuda.form(tables, places, beams=Beams(beam)) for beam in (turned, soft))
+    np.testing.assert_array_equal(with_phase.view(np.uint32), without.view(np.uint32))
+
+
+def test_weighed_tiles_have_the_same_bits_and_so_has_what_is_one_everywhere(plain, tables):
+    scene, pixels, _ = plain
+    places = ecef(pixels)
+    beams = weights_of(scene, places, "all")
+    whole, part = (cuda.form(tables, some, beams=beams) for some in (places, places[:, 16:]))
+    np.testing.assert_array_equal(part.view(np.uint32), whole[:, 16:].view(np.uint32))
+    everywhere = Sector.of(Aperture(scene.tx, scene.rx), chord_m=1.2, centre=0.0, half=3.0)
+    inside, plainly = (cuda.form(tables, places[:, 16:], beams=beams) for beams in (Beams(sector=everywhere), None))
+    np.testing.assert_array_equal(inside.view(np.uint32), plainly.view(np.uint32))
+
+
+@pytest.fixture(scope="module")
+def long():
+    """More than two chunks of 64 pulses; an image of few pixels."""
+    pixels = pixel_grid(3, 4)
+    scene = fly(scatter(pixels), pulses=130)
+    return scene, ecef(pixels), cuda.prepare(scene.profiles(ecef(pixels)), oversampling=4)
+
+
+def steady(scene, turn_deg, width_deg=8.0):
+    """A beam that follows the scene but for an angle."""
+    beam = swaying_beam(scene.tx, (12, 0, 0), width_deg, sway_deg=0)
+    turn, zero = np.radians(turn_deg), np.zeros(len(scene.tx))
+    rows = [[np.cos(turn), np.sin(turn), zero], [-np.sin(turn), np.cos(turn), zero], [zero, zero, zero + 1]]
+    return Beams(replace(beam, axes=np.moveaxis(np.array(rows), -1, 0) @ beam.axes))
+
+
+def veering(sector, flown, place):
+    """The same sector of a flight that heads for its middle for some pulses at the end of each 64."""
+    axes = []
+    for leg, axis in zip(flown.legs, (sector.tx_axis, sector.rx_axis), strict=True):
+        toward = (place - leg) / np.linalg.norm(place - leg, axis=1, keepdims=True)
+        axes.append(np.where(np.arange(len(leg))[:, None] % 64 > 60, 0.35 * toward, axis))
+    return Beams(sector=replace(sector, tx_axis=axes[0], rx_axis=axes[1], centre=0.7))
+
+
+def ending_near(sector, scene, place):
+    """The same sector, centred by a pulse so near that its s changes over a patch more than that of others."""
+    away = ecef(np.array([12.0, 0.0, 2.0]))[None]
+    along = (ecef(np.array([0.7, 0.7, 0.0])) - ecef(np.zeros(3)))[None] / 2
+    end = Sector(along, along, 0.0, sector.half)
+    at = float(end.place(Aperture(away, away), place[None])[0, 0])
+    return Beams(sector=replace(sector, centre=at, ends=(Aperture(away, away), end)))
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        "end of a sector",
+        "middle of a sector",
+        "a flight that veers",
+        "a centre that moves",
+        "a beam that leaves",
+        "a beam that looks in",
+    ],
+)
+def test_pulses_that_are_left_out_change_nothing_to_the_bit(long, kind):
+    """Whole chunks of them, or single ones; also where the middle of a chunk is left out and its ends are not."""
+    scene, places, tables = long
+    flown = Aperture(scene.tx, scene.rx)
+    sector = Sector.of(flown, chord_m=1.2, centre=0.0, half=0.03)
+    at = sector.place(flown, places[1, 2][None])[:, 0]
+    beams = {
+        "end of a sector": Beams(sector=replace(sector, centre=float(at[4]))),
+        "middle of a sector": Beams(sector=replace(sector, centre=float(at[70]))),
+        "a flight that veers": veering(sector, flown, places[1, 2]),
+        "a centre that moves": ending_near(sector, scene, places[1, 2]),
+        "a beam that leaves": steady(scene, np.where(np.arange(130) < 64, 0.3 * np.arange(130), 100.0)),
+        "a beam that looks in": steady(scene, np.where(np.arange(130) % 64 > 60, 0.0, 40.0)),
+    }[kind]
+    weight = beams.weight(flown, places.reshape(-1, 3)).any(axis=1)
+    counts = np.zeros((2, 4), np.int64)
+    image = cuda.form(tables, places, beams=beams, counts=counts[0])
+    every = cuda.sum_on_device(tables, places, beams, 1.5e-3, counts[1], rejecting=False)
+    np.testing.assert_array_equal(image.view(np.uint32), every.view(np.uint32))
+    assert counts[1].tolist() == [12 * 130, 0, 0, 0]
+    chunks = np.add.reduceat(weight, [0, 64, 128]) > 0
+    unseen = 12 * np.array([64, 64, 2])[~chunks].sum()
+    assert counts[0, 3] == unseen  # a whole chunk costs one look
+    assert 12 * weight.sum() <= counts[0, 0] <= 12 * (weight.sum() + 4)
+    parts = [cuda.form(tables[some], places, beams=beams[some]) for some in (slice(0, 64), slice(64, 130))]
+    assert decibels(sum(parts) - image, image) <= -110
+
+
+def test_more_chunks_than_threads_are_looked_at_group_by_group(long):
+    """128 pulses flown 33 times over: 66 chunks, and ten pulses of the last one see the scene."""
+    from numba import cuda as numba_cuda
+
+    scene, places, tables = long
+    cuda.form(tables, places)
+    often, pulses = cuda.Resident(), 33 * 128
+    often.arrays = tuple(
+        numba_cuda.to_device(np.concatenate([array.copy_to_host()[:128]] * 33)) for array in tables.resident.arrays
+    )
+    many, turn = replace(tables, pulses=slice(0, pulses), resident=often), np.full(pulses, 100.0)
+    turn[-20:-10] = 0.0
+    beams, counts = steady(replace(scene, tx=np.tile(scene.tx[:128], (33, 1))), turn), np.zeros(4, np.int64)
+    image = cuda.form(many, places, beams=beams, counts=counts)
+    assert counts.tolist() == [12 * 10, 0, 12 * 54, 12 * (pulses - 64)]
+    last = slice(pulses - 64, pulses)
+    some = cuda.form(many[last], places, beams=beams[last])
+    np.testing.assert_array_equal(image.view(np.uint32), some.view(np.uint32))
+    assert np.all(image != 0)
+
+
+@compiled
+def test_pixels_that_no_pulse_reaches_are_those_of_the_compiled_engine(plain, tables):
+    """Zero, which the steps write as no data."""
+    scene, pixels, profiles = plain
+    places, flown = ecef(pixels), Aperture(scene.tx, scene.rx)
+    beams = Beams(None, hard_beam(swaying_beam(scene.rx, (11.8, 0, 0), sway_deg=1), 0.8))
+    lit = beams.weight(flown, places.reshape(-1, 3)).any(axis=0).reshape(16, 18)
+    assert 0.1 < lit.mean() < 0.9
+    image, compiled_image = (
+        cuda.form(tables, places, beams=beams),
+        native.form(native.prepare(profiles), places, beams=beams),
+    )
+    np.testing.assert_array_equal(image != 0, compiled_image != 0)
+    np.testing.assert_array_equal(image != 0, lit)
+    truth = reference.form(scene.history(), places, beams=beams)
+    assert decibels(image - truth, truth) <= -70  # to the very edge
+
+
+def test_a_pixel_without_a_position_spoils_no_weight(plain, tables):
+    scene, pixels, _ = plain
+    places = ecef(pixels)[:, :16]
+    beams = weights_of(scene, places, "all")
+    whole = cuda.form(tables, places, beams=beams)
+    places[3, 5] = np.nan
+    image = cuda.form(tables, places, beams=beams)
+    assert np.argwhere(np.isnan(image)).tolist() == [[3, 5]]
+    image[3, 5] = whole[3, 5]
+    assert decibels(image - whole, whole) <= -100
+
+
+# ---- The engine
+
+
+@pytest.mark.parametrize("weights", [{}, {"integration": {"degrees": 20.0}}])
+def test_an_image_by_the_device_is_certified_like_any_other(weights):
     frequency = 1.2e9 + 4e6 * np.arange(64)
     along = np.linspace(-4, 4, 12)
     track = np.stack([along, np.full(12, -10.0), np.full(12, 5.0)], -1)
     flown = Aperture(track, track + [1.0, 0.5, 0.0])
     echo = np.exp(-2j * np.pi * frequency * flown.path(np.array([[0.05, -0.05, 0.0]])) / C).astype(np.complex64)
     history = PhaseHistory(echo, frequency, np.full(64, 1 / 64), np.zeros(12), flown)
-    image = ap.backproject(
-        history,
-        SceneGrid("local", -0.8, 0.8, 0.1, (16, 16)),
-        accuracy_db=-50,
-        engine="cuda",
-        engine_options={"cuda": {"oversampling": 4}},
-        certified_pixels=4,
-    ).compute()
+    image, exact = (
+        ap.backproject(
+            history,
+            SceneGrid("local", -0.8, 0.8, 0.1, (16, 16)),
+            accuracy_db=-50,
+            engine=engine,
+            engine_options={"cuda": {"oversampling": 4}},
+            certified_pixels=4,
+            **weights,
+        ).compute()
+        for engine in ("cuda", "reference")
+    )
     assert image.attrs["setting"].startswith("cuda ")
     assert image.attrs["numerical_error_db"] <= -50
-    assert np.abs(image).max().item() == pytest.approx(1.0, abs=0.05)
+    assert decibels(image - exact, exact) <= -50
+    assert np.abs(image).max().item() == pytest.approx(1.0, abs=0.05) or weights
 
 
 def test_the_simulator_is_taken_where_it_is_asked_for_and_nowhere_else():

@@ -5,19 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scenes import Scene, decibels, ecef, fly, pixel_grid, scatter, swaying_beam
+from scenes import Scene, decibels, ecef, fly, hard_beam, pixel_grid, scatter, swaying_beam
 
-from apertura.core.antenna.beam import Beam, Beams
+from apertura.core.antenna.beam import Beams
 from apertura.core.backprojection.engines import native, numba, reference
 from apertura.core.geometry.aperture import Aperture
 
 pytestmark = pytest.mark.skipif(not native.available(), reason="apertura was installed without a compiler")
-
-
-def hard(soft: Beam, half_deg: float) -> Beam:
-    """The same axes with a gain of one out to `half_deg`."""
-    angle = np.radians([-half_deg, 0, half_deg])
-    return Beam(soft.axes, angle, np.ones(3), angle, np.ones(3))
 
 
 def exact(scene: Scene, pixels: NDArray[np.float64], beams: Beams) -> NDArray[np.complex128]:
@@ -78,7 +72,7 @@ def test_pulses_whose_beam_points_away_add_nothing(isa, plain):
 
 def test_pixels_outside_the_beam_of_all_pulses_are_zero(isa, plain):
     scene, pixels, profiles = plain
-    beams = Beams(None, hard(swaying_beam(scene.rx, (11.4, 0, 0), sway_deg=1), 2.0))
+    beams = Beams(None, hard_beam(swaying_beam(scene.rx, (11.4, 0, 0), sway_deg=1), 2.0))
     tables, places = native.prepare(profiles), ecef(pixels)
     counts = np.zeros(4, np.int64)
     image, truth = native.form(tables, places, beams=beams, counts=counts), exact(scene, pixels, beams)
@@ -101,7 +95,7 @@ def test_a_beam_that_is_one_everywhere_changes_nothing(isa, plain):
 
 def test_weighed_tiles_have_the_same_bits(isa, plain):
     scene, pixels, profiles = plain
-    beams = Beams(swaying_beam(scene.tx, (12, 0, 0)), hard(swaying_beam(scene.rx, (11.5, 0, 0)), 4.0))
+    beams = Beams(swaying_beam(scene.tx, (12, 0, 0)), hard_beam(swaying_beam(scene.rx, (11.5, 0, 0)), 4.0))
     tables, places = native.prepare(profiles), ecef(pixels)
     whole = native.form(tables, places, beams=beams)
     part = native.form(tables, places[16:, 32:], beams=beams)

@@ -257,6 +257,13 @@ class Beam:
         widest = [float(np.cos(np.abs(angle[[0, -1]]).max())) for angle in (self.azimuth_rad, self.elevation_rad)]
         return float(np.arccos(widest[0] if widest[0] < 0 else widest[0] * max(widest[1], 0.0)))
 
+    @property
+    def steepest(self) -> float:
+        """The largest change of its gain, per radian: both cuts together."""
+        slopes = [np.abs(np.diff(gain)).max() / (angle[1] - angle[0]) for _, angle, gain in self._patterns()]
+        peaks = [np.abs(gain).max() for _, _, gain in self._patterns()]
+        return float(np.hypot(slopes[0] * peaks[1], slopes[1] * peaks[0]))
+
     def _patterns(self) -> list[tuple[str, NDArray[np.float64], NDArray[np.float64]]]:
         return [
             ("azimuth", self.azimuth_rad, self.azimuth_gain),
@@ -289,6 +296,14 @@ class Beams:
         """Return the beams over some pulses."""
         transmit, receive = (beam and beam[pulses] for beam in (self.transmit, self.receive))
         return Beams(transmit, receive, self.sector and self.sector[pulses])
+
+    def check_pulses(self, pulses: int) -> None:
+        """Raise ValueError unless all of them are of as many pulses."""
+        for beam in (self.transmit, self.receive):
+            if beam is not None and len(beam.axes) != pulses:
+                raise ValueError(f"{len(beam.axes)=}: must be one for each of {pulses} pulses")
+        if self.sector is not None and len(self.sector.tx_axis) != pulses:
+            raise ValueError(f"{len(self.sector.tx_axis)=}: must be one for each of {pulses} pulses")
 
     @property
     def antennas(self) -> "Beams | None":

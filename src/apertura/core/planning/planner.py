@@ -93,17 +93,13 @@ class SettingSearch:
         Raises
         ------
         CampaignError
-            If the requested engine cannot run here, or cannot form this image.
+            If the requested engine cannot run here.
         """
         options = [
             replace(setting, form_seconds=setting.form_seconds + self.tile_seconds)
             for name in self._engines()
             for setting in load_engine(name).candidates(self.job, pulses=pulses, requested=self.options.get(name, {}))
         ]
-        if not options:
-            able = sorted({setting.engine for setting in replace(self, engine=None, options={}).settings(pulses)})
-            weighed = ", whose pulses are weighed by antennas or a sector of the flight" if self.job.weights else ""
-            raise self._unsuitable(f"cannot form this image{weighed}", able)
         return sorted(options, key=lambda setting: (setting.seconds, setting.error_db))
 
     def fallbacks(self, chosen: Setting) -> tuple[Setting, ...]:
@@ -153,19 +149,17 @@ class SettingSearch:
                 "cannot run here" if engine.READS in reads else f"reads the {engine.READS.replace('_', ' ')}: none here"
             )
             needs = getattr(engine, "NEEDS", None)
-            raise self._unsuitable(what, runnable, f"It needs {needs}. " if needs and engine.READS in reads else "")
+            remedy = f"It needs {needs}. " if needs and engine.READS in reads else ""
+            raise CampaignError(
+                f"engine {self.engine} {what}",
+                where=f"{self.where}.engine",
+                expected=f"an engine that can: {', '.join(runnable)}",
+                remedy=f"{remedy}Choose one of these, or auto.",
+            )
         if self.engine is not None:
             return [self.engine]
         stated = [name for name in runnable if any(v is not None for v in self.options.get(name, {}).values())]
         return stated or [name for name in runnable if getattr(load_engine(name), "TIMED", True)]
-
-    def _unsuitable(self, what: str, alternatives: list[str], remedy: str = "") -> CampaignError:
-        return CampaignError(
-            f"engine {self.engine or ', '.join(self._engines())} {what}",
-            where=f"{self.where}.engine",
-            expected=f"an engine that can: {', '.join(alternatives)}",
-            remedy=f"{remedy}Choose one of these, or auto.",
-        )
 
 
 # ---- The planner

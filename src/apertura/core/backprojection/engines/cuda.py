@@ -15,7 +15,7 @@ from pydantic import Field
 
 from apertura.common.errors import CampaignError
 from apertura.core.antenna.beam import Beams
-from apertura.core.backprojection.engines.cuda_prediction import DEGREE, SIDE, candidates, simulated
+from apertura.core.backprojection.engines.cuda_prediction import CHUNK, DEGREE, SIDE, candidates, simulated
 from apertura.core.backprojection.engines.engine import EngineOptions, checked_pixels
 from apertura.core.backprojection.engines.native_tables import PHASE_POLYNOMIALS, TableDesign, design_table
 from apertura.core.backprojection.inputs import Profiles
@@ -26,7 +26,7 @@ from apertura.core.backprojection.inputs import Profiles
 # its lock without the GIL.
 
 _LOCK = Lock()
-_THREADS = 128  # of a block that fills tables
+_THREADS, _CHUNK_THREADS = 128, 32  # of blocks that fill tables, and that compare pulses of chunks
 
 
 @cache
@@ -81,29 +81,92 @@ class Resident:
         return Resident, ()
 
 
-def sum_on_device(tables: "ResidentTables", pixels: NDArray[np.float64], tolerance_rad: float) -> NDArray[np.complex64]:
+def sum_on_device(
+    tables: "ResidentTables",
+    pixels: NDArray[np.float64],
+    beams: Beams | None,
+    tolerance_rad: float,
+    counts: NDArray[np.int64] | None = None,
+    *,
+    rejecting: bool = True,
+) -> NDArray[np.complex64]:
     """Return what `apertura.core.backprojection.engines.cuda.form` returns, of one or more pixels.
+
+    Parameters
+    ----------
+    tables, pixels, beams, tolerance_rad, counts
+        As of `form`.
+    rejecting
+        False: every pulse is weighed at every pixel, also where its weight is one or zero all over a patch. The same
+        bits, for tests.
 
     Raises
     ------
     CampaignError
         If no device can be used, or it fails.
     """
+    sector = beams and beams.sector
+    weights = _weights(beams or Beams())
     with _device() as cuda:
-        from apertura.core.backprojection.engines.cuda_kernels import ROWS, form
+        from apertura.core.backprojection.engines import cuda_kernels as kernels
 
         if tables.resident.arrays is None:
             tables.resident.arrays = _tables_on_device(cuda, tables)
         places, start_m, cells = (array[tables.pulses] for array in tables.resident.arrays)
         scales = (1 / tables.cell_m, tables.wavenumber_rad_m, tolerance_rad, cells.shape[2])
-        numbers = np.array([*scales, *tables.design.phase_coefficients], np.float64)
+        bounds = (sector.centre, sector.inner, sector.outer) if sector else (0.0, 0.0, 0.0)
+        phase = tables.design.phase_coefficients.copy()
         if not PHASE_POLYNOMIALS[tables.design.phase_polynomial][2]:
-            numbers[-1] = 0  # no half turns are removed
+            phase[-1] = 0  # no half turns are removed
+        numbers = np.array([*scales, *phase, *bounds], np.float64)
+        on_device = [cuda.to_device(array) for array in weights]
+        spread = cuda.to_device(np.full((-(-len(start_m) // CHUNK) + 1, 2, 3), np.inf))
+        if beams and rejecting:
+            blocks = -(-len(spread) // _CHUNK_THREADS)
+            kernels.spread_of_chunks[blocks, _CHUNK_THREADS](places, *on_device[:2], spread)
         rows, columns = pixels.shape[:2]
-        image = cuda.device_array((rows, columns), np.complex64)
+        image, tally = (
+            cuda.device_array((rows, columns), np.complex64),
+            cuda.to_device(np.zeros(len(VARIANTS), np.int64)),
+        )
         patches = (-(-columns // SIDE), -(-rows // SIDE))
-        form[patches, (SIDE, ROWS)](cuda.to_device(pixels), places, start_m, cells, cuda.to_device(numbers), image)
+        form = kernels.form_weighed if beams else kernels.form
+        form[patches, (SIDE, kernels.ROWS)](
+            cuda.to_device(pixels),
+            (places, start_m, cells),
+            cuda.to_device(numbers),
+            (*on_device, spread),
+            (image, tally),
+        )
+        if counts is not None:
+            counts += tally.copy_to_host()
         return np.asarray(image.copy_to_host())
+
+
+def _weights(beams: Beams) -> tuple[NDArray[Any], ...]:
+    """Return beams and sector as arrays of the kernels; empty where there are none.
+
+    (pulse, 2, 3) float64, axes of the sector for transmitter and receiver; (pulse, 2, 3, 3) float64, those of their
+    beams; (2, 2, 3) float32, first angle, samples per radian and place of the last sample of both cuts, or -1 without a
+    beam; (2, 2, sample) float32, gains; (end, 2, 2, 3) float64, phase centres and axes of the sector's ends.
+    """
+    sector, legs = beams.sector, [(n, beam) for n, beam in enumerate((beams.transmit, beams.receive)) if beam]
+    axes = np.zeros((len(legs[0][1].axes) if legs else 0, 2, 3, 3))
+    longest = max((gain.size for _, beam in legs for gain in (beam.azimuth_gain, beam.elevation_gain)), default=2)
+    cuts, gains = np.full((2, 2, 3), -1, np.float32), np.zeros((2, 2, longest), np.float32)
+    for leg, beam in legs:
+        axes[:, leg] = beam.axes
+        patterns = ((beam.azimuth_rad, beam.azimuth_gain), (beam.elevation_rad, beam.elevation_gain))
+        for cut, (angle, gain) in enumerate(patterns):
+            cuts[leg, cut] = angle[0], (angle.size - 1) / (angle[-1] - angle[0]), angle.size - 1
+            gains[leg, cut, : gain.size] = gain
+    flown, ends = np.zeros((0, 2, 3)), np.zeros((0, 2, 2, 3))
+    if sector:
+        flown = np.stack([sector.tx_axis, sector.rx_axis], axis=1)
+    if sector and sector.ends:
+        aperture, there = sector.ends
+        ends = np.stack([np.stack(aperture.legs, 1), np.stack([there.tx_axis, there.rx_axis], 1)], axis=1)
+    return flown, axes, cuts, gains, ends
 
 
 def _tables_on_device(cuda: Any, tables: "ResidentTables") -> tuple[Any, ...]:
@@ -149,10 +212,11 @@ def _unusable(found: str) -> CampaignError:
 #
 # Kernels are in `cuda_kernels`, predictions in `cuda_prediction`.
 
-__all__ = ["NEEDS", "READS", "TIMED", "available", "candidates", "form", "instruction_set", "prepare"]
+__all__ = ["NEEDS", "READS", "TIMED", "VARIANTS", "available", "candidates", "form", "instruction_set", "prepare"]
 
 READS: Literal["profiles"] = "profiles"
 TIMED = False  # the seconds of cuda_prediction are published ones of others, auto compares measured ones
+VARIANTS = ("by series", "by exact paths", "without an echo", "without an echo of 64")
 NEEDS = "an NVIDIA GPU with its driver, and apertura[cuda] (docs/howto/gpu.md)"
 
 
@@ -251,7 +315,12 @@ def prepare(profiles: Profiles, *, oversampling: int = 6) -> ResidentTables:
 
 
 def form(
-    tables: ResidentTables, pixels: NDArray[np.float64], *, beams: Beams | None = None, tolerance_rad: float = 1.5e-3
+    tables: ResidentTables,
+    pixels: NDArray[np.float64],
+    *,
+    beams: Beams | None = None,
+    tolerance_rad: float = 1.5e-3,
+    counts: NDArray[np.int64] | None = None,
 ) -> NDArray[np.complex64]:
     """Sum the tables over the pixels of one tile.
 
@@ -263,10 +332,13 @@ def form(
         (y, x, 3) float64, metres, in the frame of the phase centres: any surface. A tile of a larger grid that begins
         at multiples of 16 pixels gets the same bits as in the larger grid.
     beams
-        Must be None: this engine does not weight pulses.
+        Weight of each pulse at each pixel; none by default. Pulses whose beam or sector misses a patch cost little.
     tolerance_rad
         Largest phase error that the path series may make anywhere in a patch of 16 × 16 pixels; patches and pulses that
         would exceed it take exact paths, pixel by pixel in float64.
+    counts
+        (4,) int64 to which the number of pixels × pulses is added that were summed by series, by exact paths, had no
+        echo, or no echo together with 63 others: those cost next to nothing.
 
     Returns
     -------
@@ -277,17 +349,17 @@ def form(
     Raises
     ------
     ValueError
-        If `pixels` has another shape, or there are beams.
+        If `pixels` has another shape, or a beam or the sector is of other pulses.
     CampaignError
         If no device can be used, or it fails.
 
     Notes
     -----
-    Source: docs/theory/engine.md, "A GPU".
+    Source: docs/theory/engine.md, "A GPU" and "Antennas"; docs/theory/integration.md.
     """
     pixels = checked_pixels(pixels)
     if beams is not None:
-        raise ValueError("engine cuda does not weigh pulses by antennas or a sector")
+        beams.check_pulses(tables.pulses.stop - tables.pulses.start)
     if not pixels.size:
         return np.zeros(pixels.shape[:2], np.complex64)
-    return sum_on_device(tables, pixels, tolerance_rad)
+    return sum_on_device(tables, pixels, beams, tolerance_rad, counts)

@@ -1,4 +1,4 @@
-"""Kernels of the GPU: tables of profiles, and their sums over patches; imported only where that is done."""
+"""Kernels of the GPU: tables of profiles, and their weighted sums over patches; imported only where that is done."""
 
 import math
 import warnings
@@ -49,50 +49,98 @@ def expand(samples, taps, lead, down, carrier, turn, cells):  # type: ignore[no-
 #
 # numba compiles these functions for the device, or its simulator runs them as Python (NUMBA_ENABLE_CUDASIM=1).
 # Literals are float64 to numba: float32 constants have names, since one literal would slow every pixel down.
-# Equations are those of docs/theory/engine.md, "A GPU".
+# Equations are those of docs/theory/engine.md, "A GPU"; of weights those of "Antennas" there and of integration.md.
 
 warnings.filterwarnings("ignore", "Grid size .* low occupancy")  # expected of the certificate's patches
 
 ROWS = 4
 """Rows of threads of a patch: each thread sums every fourth pixel of a column, and reads their common values once."""
 
-_PIXELS, _EACH = SIDE * SIDE, SIDE // ROWS
-_SKIPPED, _SERIES, _EXACT = 0, 1, 2
+_PIXELS, _EACH, _LANES = SIDE * SIDE, SIDE // ROWS, SIDE * ROWS
+_SERIES, _EXACT, _SKIPPED, _UNSEEN = range(4)  # as VARIANTS of the engine; _UNSEEN: a whole chunk
 _NO_CELL = 2**32 - 1
 _ROUNDER = np.float32(1.5 * 2**23)  # adding and subtracting it rounds
-_ONE, _NONE = np.float32(1), np.float32(0)
+_ONE, _NONE, _TWO, _THREE = np.float32(1), np.float32(0), np.float32(2), np.float32(3)
 _B1, _B2, _B3, _B4 = np.float32(-1 / 4), np.float32(1 / 8), np.float32(-5 / 64), np.float32(7 / 128)  # of (8)
 _LEG, _MIDDLE, _WORDS = 5, 10, 11  # of a pulse in shared memory: five numbers of each leg, and the origin's place
 _PER_CELL, _WAVENUMBER, _TOLERANCE, _CELLS, _TURN = range(5)  # places in `numbers`
+_CENTRE, _INNER, _OUTER = 13, 14, 15  # those of a sector
+_X, _Y, _Z, _REACH, _PATCH_CENTRE, _MOVED = range(6)  # places in `patch`: origin, reach, sector's centre and its reach
+_WAY, _ORIGIN, _ZONE = range(3)  # places in `steps`: path variant, cell of the origin, zone of the sector
 
 
-@cuda.jit
-def form(pixels, antennas, start_m, cells, numbers, image):  # type: ignore[no-untyped-def]
-    """Sum the cells over an image (y, x): a block of threads a patch, a thread four pixels of a column."""
-    place = cuda.shared.array((3, _PIXELS), np.float64)
-    patch = cuda.shared.array(4, np.float64)  # origin, reach
-    words = cuda.shared.array((CHUNK, _WORDS), np.float32)
-    steps = cuda.shared.array((CHUNK, 2), np.int32)  # way, cell of the origin
-    near = cuda.local.array((_EACH, 4), np.float32)  # from the origin: x, y, z, squared
-    total = cuda.local.array((_EACH, 2), np.float64)
-    lane = cuda.threadIdx.y * SIDE + cuda.threadIdx.x
-    _place(pixels, lane, place)
-    cuda.syncthreads()
-    _fit(lane, place, patch)
-    _offsets(lane, place, patch, near, total)
-    turn = _carrier(numbers)
-    for first in range(0, len(start_m), CHUNK):
-        count = min(CHUNK, len(start_m) - first)
-        if lane < count:
-            _view(antennas[first + lane], start_m[first + lane], patch, numbers, (words[lane], steps[lane]))
+def _over_an_image(weighed):  # type: ignore[no-untyped-def]
+    """Return the kernel that sums the cells over an image (y, x): a block of threads a patch, a thread four pixels.
+
+    Its arguments: pixels; phase centres, starts and cells; numbers; axes of the sector and of beams, cuts, gains, ends
+    of the sector, spread of chunks; image and counts. `weighed` is known when it is compiled: a sum without weights
+    takes no registers for them.
+    """
+    width, own = (_WEIGHED_WORDS, _PIXELS) if weighed else (_WORDS, 1)
+
+    @cuda.jit
+    def kernel(pixels, tables, numbers, weights, results):  # type: ignore[no-untyped-def]
+        place = cuda.shared.array((3, _PIXELS), np.float64)
+        patch = cuda.shared.array(6, np.float64)
+        words = cuda.shared.array((CHUNK, width), np.float32)
+        steps = cuda.shared.array((CHUNK, 3), np.int32)
+        centres = cuda.shared.array(own, np.float64)
+        reached = cuda.shared.array(_LANES, np.int32)
+        near = cuda.local.array((_EACH, 5), np.float32)  # x, y, z from the origin, squared; centre from the patch's
+        total = cuda.local.array((_EACH, 2), np.float64)
+        tally = cuda.local.array(4, np.int64)
+        lane = cuda.threadIdx.y * SIDE + cuda.threadIdx.x
+        # The patch: positions, origin, offsets; with weights, where the sectors of its pixels are centred.
+        _place(pixels, lane, place)
         cuda.syncthreads()
-        _chunk(first, count, (lane, place, near, total), (words, steps), (antennas, start_m, cells, turn, numbers))
-        cuda.syncthreads()
+        _fit(lane, place, patch)
+        _offsets(lane, place, patch, near, total)
+        if weighed:
+            _centres(lane, place, weights, numbers, (patch, centres, near))
+        for variant in range(4):
+            tally[variant] = 0
+        turn, pulses = _carrier(numbers), len(tables[1])
+        for first in range(0, pulses, CHUNK):
+            count = min(CHUNK, pulses - first)
+            # Pulses whose weights are zero all over the patch: whole chunks of them cost next to nothing.
+            if weighed and not _is_reached(first // CHUNK, lane, patch, numbers, (tables, weights, reached, words)):
+                tally[_UNSEEN] += count if lane == 0 else 0
+                continue
+            # A thread a pulse: how the patch sees it.
+            if lane < count:
+                _view(first + lane, patch, numbers, tables, (words[lane], steps[lane]))
+                if weighed:
+                    _weigh(first + lane, patch, numbers, (tables, weights), (words[lane], steps[lane]))
+                tally[steps[lane, _WAY]] += 1
+            cuda.syncthreads()
+            # A thread four pixels: the sum over these pulses.
+            _chunk(
+                (first, count),
+                (lane, place, near, total),
+                (words, steps, patch),
+                (tables, turn, numbers),
+                (weights, weighed),
+            )
+            cuda.syncthreads()
+        _write(lane, place, total, tally, results)
+
+    return kernel
+
+
+@cuda.jit(device=True)
+def _write(lane, place, total, tally, results):  # type: ignore[no-untyped-def]
+    """Put the sums of a thread into the image; pixels × pulses of its pulses to the counts of their variants."""
+    image, counts = results
+    above, left = cuda.blockIdx.y * SIDE, cuda.blockIdx.x * SIDE
     for n in range(_EACH):
-        row, column = cuda.blockIdx.y * SIDE + cuda.threadIdx.y + n * ROWS, cuda.blockIdx.x * SIDE + cuda.threadIdx.x
+        row, column = above + cuda.threadIdx.y + n * ROWS, left + cuda.threadIdx.x
         if row < image.shape[0] and column < image.shape[1]:
             nowhere = math.isnan(place[0, lane + n * ROWS * SIDE])
             image[row, column] = complex(math.nan, math.nan) if nowhere else complex(total[n, 0], total[n, 1])
+    pixels = min(SIDE, image.shape[0] - above) * min(SIDE, image.shape[1] - left)
+    for variant in range(4):
+        if tally[variant]:
+            cuda.atomic.add(counts, variant, tally[variant] * pixels)
 
 
 @cuda.jit(device=True)
@@ -135,7 +183,7 @@ def _fit(lane, place, patch):  # type: ignore[no-untyped-def]
             if not math.isnan(place[0, other]):
                 x, y, z = place[0, other] - patch[0], place[1, other] - patch[1], place[2, other] - patch[2]
                 reach = max(reach, x * x + y * y + z * z)
-        patch[3] = math.sqrt(reach)
+        patch[_REACH] = math.sqrt(reach)
     cuda.syncthreads()
 
 
@@ -150,15 +198,17 @@ def _offsets(lane, place, patch, near, total):  # type: ignore[no-untyped-def]
             near[n, axis] = offset
             squared += offset * offset
         near[n, 3] = squared
+        near[n, 4] = _NONE
         total[n, 0] = 0.0
         total[n, 1] = 0.0
 
 
 @cuda.jit(device=True)
-def _view(antennas, start_m, patch, numbers, shared):  # type: ignore[no-untyped-def]
+def _view(p, patch, numbers, tables, shared):  # type: ignore[no-untyped-def]
     """Put into shared memory the series of one pulse's paths over a patch, (8), and the path variant of its pixels."""
+    antennas, start_m = tables[0][p], tables[1][p]
     words, step = shared
-    reach, per_cell = patch[3], numbers[_PER_CELL]
+    reach, per_cell = patch[_REACH], numbers[_PER_CELL]
     path, error = 0.0, 2 * FLOAT32_ERROR * reach
     for leg in range(2):
         x, y, z = patch[0] - antennas[leg, 0], patch[1] - antennas[leg, 1], patch[2] - antennas[leg, 2]
@@ -178,40 +228,49 @@ def _view(antennas, start_m, patch, numbers, shared):  # type: ignore[no-untyped
             error = math.inf
     middle, spread = (path - start_m) * per_cell, 2 * reach * per_cell
     if not (middle + spread > -1 and middle - spread < numbers[_CELLS]):
-        step[0] = _SKIPPED
+        step[_WAY] = _SKIPPED
     elif numbers[_WAVENUMBER] * error <= numbers[_TOLERANCE] and spread < MOST_CELLS:
         nearest = math.floor(middle + 0.5)
-        step[0] = _SERIES
-        step[1] = int(nearest)
+        step[_WAY] = _SERIES
+        step[_ORIGIN] = int(nearest)
         words[_MIDDLE] = middle - nearest
     else:
-        step[0] = _EXACT
+        step[_WAY] = _EXACT
 
 
 @cuda.jit(device=True)
-def _chunk(first, count, mine, shared, given):  # type: ignore[no-untyped-def]
+def _chunk(chunk, mine, shared, given, weighing):  # type: ignore[no-untyped-def]
     """Add some pulses to a thread's pixels; they are summed in float32 first."""
+    first, count = chunk
     lane, place, near, total = mine
-    words, steps = shared
-    antennas, start_m, cells, turn, numbers = given
+    words, steps, patch = shared
+    (antennas, start_m, cells), turn, numbers = given
+    weights, weighed = weighing
     part = cuda.local.array((_EACH, 2), np.float32)
     for n in range(_EACH):
         part[n, 0], part[n, 1] = _NONE, _NONE
+    weight = _ONE
     for number in range(count):
         c, p = np.uint64(number), np.uint64(first + number)  # signed ones would be taken as counted from the end
-        if steps[c, 0] == _SKIPPED:
+        if steps[c, _WAY] == _SKIPPED:
             continue
         rows = (cells[p, 0], cells[p, 1], cells[p, 2], cells[p, 3], cells[p, 4], cells[p, 5])
-        if steps[c, 0] == _SERIES:
+        if steps[c, _WAY] == _SERIES:
             w = words[c]
             word = (w[0], w[1], w[2], w[3], w[4], w[5], w[6], w[7], w[8], w[9], w[10])
             for n in range(_EACH):
-                at, u = _by_series(word, steps[c, 1], near[n, 0], near[n, 1], (near[n, 2], near[n, 3]))
-                _add(rows, at, u, turn, part[n])
+                at, u, legs = _by_series(word, steps[c, _ORIGIN], near[n, 0], near[n, 1], (near[n, 2], near[n, 3]))
+                if weighed:
+                    weight = _weight(w, steps[c, _ZONE], near[n], legs, (weights, numbers))
+                _add(rows, at, u, turn, (weight, part[n]))
         else:
             for n in range(_EACH):
-                at, u = _exact(antennas[p], start_m[p], numbers, place, lane + n * ROWS * SIDE)
-                _add(rows, at, u, turn, part[n])
+                pixel = lane + n * ROWS * SIDE
+                at, u = _exact(antennas[p], start_m[p], numbers, place, pixel)
+                if weighed:
+                    centre = patch[_PATCH_CENTRE] + near[n, 4]
+                    weight = _exact_weight(p, steps[c, _ZONE], (place, pixel), centre, (antennas, weights, numbers))
+                _add(rows, at, u, turn, (weight, part[n]))
     for n in range(_EACH):
         total[n, 0] += part[n, 0]
         total[n, 1] += part[n, 1]
@@ -219,13 +278,13 @@ def _chunk(first, count, mine, shared, given):  # type: ignore[no-untyped-def]
 
 @cuda.jit(device=True)
 def _by_series(word, middle, x, y, rest):  # type: ignore[no-untyped-def]
-    """Return cell and place in it of a pixel's path, (8)."""
+    """Return cell and place in it of a pixel's path, (8), and s of both legs."""
     z, squared = rest
     s = word[3] * squared + word[0] * x + word[1] * y + word[2] * z
     t = word[8] * squared + word[5] * x + word[6] * y + word[7] * z
     path = word[10] + word[4] * s * _root(s) + word[9] * t * _root(t)
     rounded = (path + _ROUNDER) - _ROUNDER
-    return np.uint32(middle + np.int32(rounded)), path - rounded
+    return np.uint32(middle + np.int32(rounded)), path - rounded, (s, t)
 
 
 @cuda.jit(device=True)
@@ -249,12 +308,13 @@ def _exact(antennas, start_m, numbers, place, at):  # type: ignore[no-untyped-de
 
 
 @cuda.jit(device=True)
-def _add(rows, i, u, turn, part):  # type: ignore[no-untyped-def]
-    """Add the polynomial of a cell at place u, times the carrier there, (2); nothing where there is no such cell."""
-    if i >= np.uint32(len(rows[0])):
+def _add(rows, i, u, turn, sums):  # type: ignore[no-untyped-def]
+    """Add the weighted polynomial of a cell at place u, times the carrier there, (2); nothing without such a cell."""
+    weight, part = sums
+    if i >= np.uint32(len(rows[0])) or weight == _NONE:
         return
-    re = rows[0][i] + u * (rows[2][i] + u * rows[4][i])
-    im = rows[1][i] + u * (rows[3][i] + u * rows[5][i])
+    re = weight * (rows[0][i] + u * (rows[2][i] + u * rows[4][i]))
+    im = weight * (rows[1][i] + u * (rows[3][i] + u * rows[5][i]))
     cosine, sine = _carrier_at(turn, u)
     part[0] = part[0] + re * cosine - im * sine
     part[1] = part[1] + re * sine + im * cosine
@@ -274,3 +334,260 @@ def _carrier_at(turn, u):  # type: ignore[no-untyped-def]
     cosine = turn[0] + v * (turn[1] + v * (turn[2] + v * turn[3]))
     sine = turn[4] + v * (turn[5] + v * (turn[6] + v * turn[7]))
     return sign * cosine, sign * u * sine
+
+
+# ---- Weights of pulses: beams of antennas, and the sector integrated
+#
+# What a pulse weighs at a patch is looked at once for the patch, and written beside the series of its paths; pixels of
+# the patch take weights from there, at offsets from the origin.
+
+_INSIDE, _EDGE, _OUTSIDE = range(3)
+"""Zones of a sector over a patch: its weight is one, differs, or is zero; it is zero, too, where a beam does not go."""
+
+_ENDS, _SPREAD = 4, 5  # places in `weights`
+_FIRST, _PER_RAD, _LAST = range(3)  # of a cut: first angle, samples per radian, and place of the last one; -1: no beam
+_STRAYED, _TURNED, _VEERED = range(3)  # by how much pulses of a chunk differ from its middle: place, beam, sector
+_SECTOR, _PLACE, _BEAM, _BEAM_WORDS = 11, 19, 20, 12  # of a pulse in shared memory, behind the series of its paths
+_WEIGHED_WORDS = 45  # an odd number: threads that write them do not wait for each other
+_QUARTER = np.float32(math.pi / 2)
+_HALF_TURN = np.float32(math.pi)
+_MARGIN = 1e-5  # rad, and of s: more than float32 errs by, so that a weight called zero or one is that at each pixel
+
+
+@cuda.jit
+def spread_of_chunks(antennas, sector_axes, beam_axes, spread):  # type: ignore[no-untyped-def]
+    """Fill how far the pulses of each chunk differ from its middle one, (chunk, 2, 3): one thread a chunk.
+
+    Metres, change of beam axes and of a sector's axis, of each leg. The last row is that of a pulse alone: zeros.
+    """
+    chunk = cuda.grid(1)
+    if chunk >= len(spread):
+        return
+    pulses = len(antennas)
+    first, middle = chunk * CHUNK, min(chunk * CHUNK + CHUNK // 2, pulses - 1)
+    for leg in range(2):
+        strayed, turned, veered = 0.0, 0.0, 0.0
+        for p in range(first, min(first + CHUNK, pulses)):
+            metres, beam, sector = 0.0, 0.0, 0.0
+            for n in range(3):
+                metres += (antennas[p, leg, n] - antennas[middle, leg, n]) ** 2
+                if len(sector_axes):
+                    sector += (sector_axes[p, leg, n] - sector_axes[middle, leg, n]) ** 2
+                if len(beam_axes):
+                    for axis in range(3):
+                        beam += (beam_axes[p, leg, axis, n] - beam_axes[middle, leg, axis, n]) ** 2
+            strayed, turned, veered = max(strayed, metres), max(turned, beam), max(veered, sector)
+        spread[chunk, leg, _STRAYED] = math.sqrt(strayed)
+        spread[chunk, leg, _TURNED] = math.sqrt(turned / 2)  # the largest change of a direction by a rotation
+        spread[chunk, leg, _VEERED] = math.sqrt(veered)
+
+
+@cuda.jit(device=True)
+def _centres(lane, place, weights, numbers, mine):  # type: ignore[no-untyped-def]
+    """Find the sector's centre of each pixel, integration.md (4), the middle of the patch's, and the rest to it."""
+    ends, (patch, centres, near) = weights[_ENDS], mine
+    for n in range(_EACH):
+        at = lane + n * ROWS * SIDE
+        centres[at] = _centre(place[0, at], place[1, at], place[2, at], ends, numbers)
+    cuda.syncthreads()
+    if lane == 0:
+        low, high = math.inf, -math.inf
+        for other in range(_PIXELS):
+            if not math.isnan(place[0, other]):
+                low, high = min(low, centres[other]), max(high, centres[other])
+        patch[_PATCH_CENTRE], patch[_MOVED] = (low + high) / 2, (high - low) / 2
+    cuda.syncthreads()
+    for n in range(_EACH):
+        at = lane + n * ROWS * SIDE
+        if not math.isnan(place[0, at]):
+            near[n, 4] = centres[at] - patch[_PATCH_CENTRE]
+
+
+@cuda.jit(device=True)
+def _centre(x, y, z, ends, numbers):  # type: ignore[no-untyped-def]
+    """Return where the sector of a pixel is centred: the stated centre, or the nearest whose sector was flown."""
+    if not len(ends):
+        return numbers[_CENTRE]
+    low, high = math.inf, -math.inf
+    for end in range(len(ends)):
+        s = 0.0
+        for leg in range(2):
+            antenna, axis = ends[end, 0, leg], ends[end, 1, leg]
+            u, v, w = x - antenna[0], y - antenna[1], z - antenna[2]
+            s += (u * axis[0] + v * axis[1] + w * axis[2]) / math.sqrt(u * u + v * v + w * w)
+        low, high = min(low, s), max(high, s)
+    middle = (low + high) / 2
+    lowest, highest = min(low + numbers[_OUTER], middle), max(high - numbers[_OUTER], middle)
+    return min(max(numbers[_CENTRE], lowest), highest)
+
+
+@cuda.jit(device=True)
+def _is_reached(chunk, lane, patch, numbers, given):  # type: ignore[no-untyped-def]
+    """Return whether any pulse of a chunk may have a weight in a patch; as many chunks as threads are asked at once."""
+    tables, weights, reached, words = given
+    if chunk % _LANES == 0:
+        spread, mine = weights[_SPREAD], chunk + lane
+        cuda.syncthreads()  # what is written below, no thread reads any more
+        reached[lane] = 0
+        if mine < len(spread) - 1:
+            middle = min(mine * CHUNK + CHUNK // 2, len(tables[1]) - 1)
+            reached[lane] = _zone(middle, spread[mine], patch, numbers, (tables[0], weights, words[lane])) != _OUTSIDE
+        cuda.syncthreads()
+    return reached[chunk % _LANES] != 0
+
+
+@cuda.jit(device=True)
+def _weigh(p, patch, numbers, given, shared):  # type: ignore[no-untyped-def]
+    """Put into shared memory what weights one pulse has over a patch, and its zone; without a weight it is skipped."""
+    (tables, weights), (word, step) = given, shared
+    if step[_WAY] != _SKIPPED:
+        spread = weights[_SPREAD]
+        step[_ZONE] = _zone(p, spread[len(spread) - 1], patch, numbers, (tables[0], weights, word))
+        if step[_ZONE] == _OUTSIDE:
+            step[_WAY] = _SKIPPED
+
+
+@cuda.jit(device=True)
+def _zone(p, spread, patch, numbers, pulse):  # type: ignore[no-untyped-def]
+    """Return the zone of a patch by a pulse, and by others that differ from it by no more than `spread`.
+
+    Puts into `word` what the weights of the patch's pixels are computed from: of each leg the sector's axis over range
+    and s at the origin, (1) of integration.md; s of both less the centre; of each beam, the way from antenna to origin
+    along its axes, and the axes.
+    """
+    antennas, (sector_axes, beam_axes, cuts, _, _, _), word = pulse
+    place, slack = -patch[_PATCH_CENTRE], patch[_MOVED] + _MARGIN
+    for leg in range(2):
+        x, y, z = patch[_X] - antennas[p, leg, 0], patch[_Y] - antennas[p, leg, 1], patch[_Z] - antennas[p, leg, 2]
+        distance, reach = math.sqrt(x * x + y * y + z * z), patch[_REACH] + spread[leg, _STRAYED]
+        if len(sector_axes):
+            axis, at = sector_axes[p, leg], _SECTOR + 4 * leg
+            a, b, c = axis[0] / distance, axis[1] / distance, axis[2] / distance
+            along = a * x + b * y + c * z
+            word[at], word[at + 1], word[at + 2], word[at + 3] = a, b, c, along
+            # A direction turns by asin(reach / distance) at most, which is no more than π/2 times that.
+            turn = math.pi / 2 * reach / distance if reach < distance else 2.0
+            place += along
+            slack += turn * distance * math.sqrt(a * a + b * b + c * c) + spread[leg, _VEERED]
+        if len(beam_axes) and cuts[leg, 0, _LAST] > _NONE:
+            at = _BEAM + leg * _BEAM_WORDS
+            for n in range(3):
+                axis = beam_axes[p, leg, n]
+                word[at + n] = axis[0] * x + axis[1] * y + axis[2] * z
+                first = at + 3 + 3 * n
+                word[first], word[first + 1], word[first + 2] = axis[0], axis[1], axis[2]
+            # Axes that turn move a place along them by that times its distance.
+            moved = reach + spread[leg, _TURNED] * (distance + reach)
+            if _misses(word[at], word[at + 1], word[at + 2], np.float32(moved), cuts[leg]):
+                return _OUTSIDE
+    if not len(sector_axes):
+        return _INSIDE
+    word[_PLACE] = place
+    if abs(place) + slack <= numbers[_INNER]:
+        return _INSIDE
+    return _OUTSIDE if abs(place) - slack >= numbers[_OUTER] else _EDGE
+
+
+@cuda.jit(device=True)
+def _misses(ahead, right, above, reach, cuts):  # type: ignore[no-untyped-def]
+    """Return whether a ball about a place along an antenna's axes lies outside of one of its cuts."""
+    margin, level = np.float32(_MARGIN), np.float32(math.sqrt(ahead * ahead + right * right))
+    if reach < np.float32(math.sqrt(level * level + above * above)):
+        elevation = np.float32(math.atan2(above, level))
+        near = _QUARTER * reach / np.float32(math.sqrt(level * level + above * above)) + margin
+        if elevation + near < cuts[1, _FIRST] or elevation - near > _last_angle(cuts[1]):
+            return True
+    if reach < level:
+        azimuth, near = np.float32(math.atan2(right, ahead)), _QUARTER * reach / level + margin
+        if abs(azimuth) + near < _HALF_TURN:  # not across the cut at half a turn
+            return azimuth + near < cuts[0, _FIRST] or azimuth - near > _last_angle(cuts[0])
+    return False
+
+
+@cuda.jit(device=True)
+def _last_angle(cut):  # type: ignore[no-untyped-def]
+    return cut[_FIRST] + cut[_LAST] / cut[_PER_RAD]
+
+
+@cuda.jit(device=True)
+def _weight(w, zone, near, legs, given):  # type: ignore[no-untyped-def]
+    """Return the weight of a pulse at a pixel by its offset from the origin, in float32; s of (8) is that of `legs`."""
+    (_, _, cuts, gains, _, _), numbers = given
+    x, y, z, weight = near[0], near[1], near[2], _ONE
+    if zone == _EDGE:
+        # s of (1) changes by little over a patch, and that change is what float32 errs by.
+        place = w[_PLACE] - near[4]
+        place += _change(w[_SECTOR] * x + w[_SECTOR + 1] * y + w[_SECTOR + 2] * z, w[_SECTOR + 3], legs[0])
+        place += _change(w[_SECTOR + 4] * x + w[_SECTOR + 5] * y + w[_SECTOR + 6] * z, w[_SECTOR + 7], legs[1])
+        outer, inner = np.float32(numbers[_OUTER]), np.float32(numbers[_INNER])
+        weight = _smooth((outer - abs(place)) / (outer - inner))
+    for leg in range(2):
+        if cuts[leg, 0, _LAST] > _NONE:
+            b = _BEAM + leg * _BEAM_WORDS
+            ahead = w[b] + (w[b + 3] * x + w[b + 4] * y + w[b + 5] * z)
+            right = w[b + 1] + (w[b + 6] * x + w[b + 7] * y + w[b + 8] * z)
+            above = w[b + 2] + (w[b + 9] * x + w[b + 10] * y + w[b + 11] * z)
+            weight *= _gain(ahead, right, above, cuts[leg], gains[leg])
+    return weight
+
+
+@cuda.jit(device=True)
+def _change(along, s, relative):  # type: ignore[no-untyped-def]
+    """Return by how much s of one leg differs from that at the origin, (8a)."""
+    longer = relative * _root(relative) / _TWO
+    return (along - s * longer) / (_ONE + longer)
+
+
+@cuda.jit(device=True)
+def _smooth(depth):  # type: ignore[no-untyped-def]
+    """Return (3) of integration.md."""
+    held = min(max(depth, _NONE), _ONE)
+    return held * held * (_THREE - _TWO * held)
+
+
+@cuda.jit(device=True)
+def _gain(ahead, right, above, cuts, gains):  # type: ignore[no-untyped-def]
+    """Return the gain of an antenna in a direction along its axes, (6)."""
+    azimuth = np.float32(math.atan2(right, ahead))
+    elevation = np.float32(math.atan2(above, np.float32(math.sqrt(ahead * ahead + right * right))))
+    return _look_up(azimuth, cuts[0], gains[0]) * _look_up(elevation, cuts[1], gains[1])
+
+
+@cuda.jit(device=True)
+def _look_up(radians, cut, gains):  # type: ignore[no-untyped-def]
+    """Return the gain at an angle of a cut, linear between samples and zero beyond them."""
+    place = (radians - cut[_FIRST]) * cut[_PER_RAD]
+    if not _NONE <= place <= cut[_LAST]:
+        return _NONE
+    at = np.uint32(min(place, cut[_LAST] - _ONE))
+    low, high = gains[at], gains[at + np.uint32(1)]
+    return low + (place - np.float32(at)) * (high - low)
+
+
+@cuda.jit(device=True)
+def _exact_weight(p, zone, pixel, centre, given):  # type: ignore[no-untyped-def]
+    """Return the weight of a pulse at a pixel by its place, in float64."""
+    antennas, (sector_axes, beam_axes, cuts, gains, _, _), numbers = given
+    place, at = pixel
+    s, weight = -centre, _ONE
+    for leg in range(2):
+        x, y, z = (
+            place[0, at] - antennas[p, leg, 0],
+            place[1, at] - antennas[p, leg, 1],
+            place[2, at] - antennas[p, leg, 2],
+        )
+        if zone == _EDGE:
+            axis = sector_axes[p, leg]
+            s += (x * axis[0] + y * axis[1] + z * axis[2]) / math.sqrt(x * x + y * y + z * z)
+        if cuts[leg, 0, _LAST] > _NONE:
+            axes = beam_axes[p, leg]
+            ahead = np.float32(axes[0, 0] * x + axes[0, 1] * y + axes[0, 2] * z)
+            right = np.float32(axes[1, 0] * x + axes[1, 1] * y + axes[1, 2] * z)
+            above = np.float32(axes[2, 0] * x + axes[2, 1] * y + axes[2, 2] * z)
+            weight *= _gain(ahead, right, above, cuts[leg], gains[leg])
+    if zone == _EDGE:
+        weight *= _smooth(np.float32((numbers[_OUTER] - abs(s)) / (numbers[_OUTER] - numbers[_INNER])))
+    return weight
+
+
+form, form_weighed = map(_over_an_image, (False, True))

@@ -406,21 +406,20 @@ def weights_of(beams: Beams | None, pulses: int, padded: int) -> tuple[Any, Any,
         If a beam or the sector is of other pulses.
     """
     beams = beams or Beams()
+    beams.check_pulses(pulses)
     pointers, kept = (ctypes.POINTER(BeamJob) * 2)(), KeptArrays()
     for leg, beam in enumerate((beams.transmit, beams.receive)):
         if beam is not None:
-            job, arrays = _beam(beam, pulses, padded)
+            job, arrays = _beam(beam, padded)
             pointers[leg] = ctypes.pointer(job)
             kept += arrays
     if beams.sector is None:
         return pointers, None, kept
-    sector, arrays = _sector(beams.sector, pulses, padded)
+    sector, arrays = _sector(beams.sector, padded)
     return pointers, ctypes.pointer(sector), kept + arrays
 
 
-def _beam(beam: Beam, pulses: int, padded: int) -> tuple[BeamJob, KeptArrays]:
-    if len(beam.axes) != pulses:
-        raise ValueError(f"{len(beam.axes)=}: must be one for each of {pulses} pulses")
+def _beam(beam: Beam, padded: int) -> tuple[BeamJob, KeptArrays]:
     axes = np.ascontiguousarray(np.moveaxis(_filled(beam.axes, padded), 0, -1), np.float64)
     angles = (beam.azimuth_rad, beam.elevation_rad)
     gains = [np.ascontiguousarray(gain, np.float32) for gain in (beam.azimuth_gain, beam.elevation_gain)]
@@ -440,9 +439,7 @@ def _filled(axes: NDArray[np.float64], padded: int) -> NDArray[np.float64]:
     return np.concatenate([axes, np.repeat(axes[-1:], padded - len(axes), axis=0)]) if padded > len(axes) else axes
 
 
-def _sector(sector: Sector, pulses: int, padded: int) -> tuple[SectorJob, KeptArrays]:
-    if len(sector.tx_axis) != pulses:
-        raise ValueError(f"{len(sector.tx_axis)=}: must be one for each of {pulses} pulses")
+def _sector(sector: Sector, padded: int) -> tuple[SectorJob, KeptArrays]:
     axes = [np.ascontiguousarray(_filled(axis, padded).T, np.float64) for axis in (sector.tx_axis, sector.rx_axis)]
     at = [] if sector.ends is None else [*sector.ends[0].legs, sector.ends[1].tx_axis, sector.ends[1].rx_axis]
     kept: KeptArrays = [*axes, *(np.ascontiguousarray(array, np.float64) for array in at)]
