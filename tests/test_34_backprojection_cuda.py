@@ -46,7 +46,7 @@ def test_the_simulated_device_passes_its_tests():
     environment = {**os.environ, "NUMBA_ENABLE_CUDASIM": "1", "OPENBLAS_NUM_THREADS": "1"}
     run = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
     assert run.returncode == 0, run.stdout[-4000:] + run.stderr[-1000:]
-    assert int(re.search(r"(\d+) passed", run.stdout)[1]) >= 39
+    assert int(re.search(r"(\d+) passed", run.stdout)[1]) >= 38
 
 
 def test_the_series_errs_by_no_more_than_is_reckoned_with():
