@@ -32,7 +32,8 @@ from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import Flight, PulseWaveform, read_clocks, read_flights, read_segments, read_settings
 from apertura.pipeline.config.flight_plan import read_flight_plan
 from apertura.pipeline.opening.constants import read_constants
-from apertura.pipeline.opening.results import OpenCampaign, assessment_of
+from apertura.pipeline.opening.images import assessment_of
+from apertura.pipeline.opening.results import OpenCampaign
 from apertura.pipeline.opening.scene import settled_scene
 from apertura.pipeline.opening.transmitted import read_codes, read_framing, read_pulse
 from apertura.pipeline.steps.calibration import calibrated
