@@ -304,10 +304,10 @@ def test_a_map_of_a_look_serves_the_last_pictures_and_nothing_else(tiny):
     assert document["again_s"] is None
     with served_look(look.campaign) as server:
         listed = server.files()
-        assert sorted(listed) == ["f01/uav1-uav1/db.3.tif", "f01/uav1-uav2/db.3.tif", "map/map.json"]
+        assert sorted(listed) == ["f01/uav1-uav1/db.1.tif", "f01/uav1-uav2/db.1.tif", "map/map.json"]
         assert all(server.sha256_of(name) == sha256 for name, sha256 in listed.items())
-    assert sorted(path.name for path in (folder / "f01/uav1-uav1").iterdir()) == ["db.2.tif", "db.3.tif"]
-    with rasterio.open(folder / "f01/uav1-uav1/db.3.tif") as raster:
+    assert sorted(path.name for path in (folder / "f01/uav1-uav1").iterdir()) == ["db.0.tif", "db.1.tif"]
+    with rasterio.open(folder / "f01/uav1-uav1/db.1.tif") as raster:
         assert (*raster.shape, *raster.bounds) == (*document["grid"]["shape"], *document["grid"]["bounds_m"])
         level = raster.read(1)
     x, y = (document["places"][-2][name] for name in ("x_m", "y_m"))

@@ -10,7 +10,7 @@ from apertura.common.flag_table import FLAGS
 from apertura.core.quality.budget import is_counted
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import FUSED
-from apertura.pipeline.store import open_listed
+from apertura.pipeline.opening.images import report_of
 
 REPORT = "image.json"
 
@@ -99,9 +99,10 @@ def read_report(campaign: Campaign, flight: str, image: str) -> dict[str, Any]:
     CampaignError
         If it is not there, not as it was written, or lacks what every view shows.
     """
-    path = campaign.result(flight, image, REPORT)
-    report = open_listed(path, path.with_name("export.manifest.json"))
-    with undamaged(path, expected="the report of an image", remedy="Run the workflow again."):
+    report = report_of(campaign, flight, image)
+    with undamaged(
+        campaign.result(flight, image, REPORT), expected="the report of an image", remedy="Run the workflow again."
+    ):
         report = {**report, "flags": printable(report["flags"])}
         ImageValues.of(report)
     return report

@@ -159,8 +159,13 @@ def transfer_by_code(read: Read, inverse: Complexes, numerology: Numerology, *, 
     >>> abs(measured.form(np.arange(1))).round(0)
     array([[  0.,   0.,   0., 500.,   0.,   0.,   0.,   0.]], dtype=float32)
     """
-    demodulator = Demodulator(inverse, numerology, 0)
-    form, saturation = _forming(read, demodulator, None)
+    symbol_samples = numerology.prefix_samples + numerology.dft_samples
+    demodulator, saturation = Demodulator(inverse, numerology, symbol_samples), Saturation()
+    formed = forming(read, demodulator, saturation)
+
+    def form(captures: Pulses) -> Complexes:
+        return formed(captures, None)
+
     some = np.concatenate(spread(len(time_s), groups=GROUPS, each=_STRETCH))
     sample = np.concatenate([demodulator.transfer(read(block)) for block in blocks_of(some)])
     code = own_code(sample, prefix_cells=numerology.delay_cells)
@@ -229,7 +234,12 @@ def transfer_by_sidelink(
     )
     quality = {"method": chosen, "reason": reason, **_sidelink_report(state, residual)}
     correction = Correction(chosen, state.path, receiver.clock_hz, receiver.sfo_ppm)
-    form, saturation = _forming(read, demodulator, correction)
+    saturation = Saturation()
+    formed = forming(read, demodulator, saturation)
+
+    def form(captures: Pulses) -> Complexes:
+        return formed(captures, correction.select(captures))
+
     report = {"clock": receiver.report, "sidelink": quality, "code": _sidelink_code(state).report}
     return Transfer(
         state.locked,
@@ -244,18 +254,17 @@ def transfer_by_sidelink(
     )
 
 
-def _forming(
-    read: Read, demodulator: Demodulator, correction: Correction | None
-) -> tuple[Callable[[Pulses], Complexes], Saturation]:
-    """Return what forms transfer functions of captures, and the saturation of the samples that it read."""
-    saturation = Saturation()
+def forming(
+    read: Read, demodulator: Demodulator, saturation: Saturation
+) -> Callable[[Pulses, Correction | None], Complexes]:
+    """Return what forms transfer functions of captures, given their correction, and counts their samples."""
 
-    def form(captures: Pulses) -> Complexes:
+    def form(captures: Pulses, correction: Correction | None) -> Complexes:
         iq = read(captures)
         saturation.count(iq)
-        return demodulator.transfer(iq, correction and correction.select(captures))
+        return demodulator.transfer(iq, correction)
 
-    return form, saturation
+    return form
 
 
 def as_complex(iq: Samples) -> Complexes:

@@ -21,7 +21,14 @@ from apertura.core.echo.demodulate import remove_path
 from apertura.core.echo.line_of_sight import LineOfSight
 from apertura.core.echo.pulse_filter import truncation_flags
 from apertura.core.echo.sidelink import DIVIDING
-from apertura.core.echo.transfer import Correction, Demodulator, Transfer, transfer_by_code, transfer_by_sidelink
+from apertura.core.echo.transfer import (
+    Correction,
+    Demodulator,
+    Transfer,
+    forming,
+    transfer_by_code,
+    transfer_by_sidelink,
+)
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.atmosphere import SceneAir
 from apertura.core.imaging.range_profiles import wave_speed_of
@@ -127,7 +134,8 @@ class PairEcho:
     @cached_property
     def form(self) -> Callable[[Pulses], Complexes]:
         """Numbers of a few pulses, ascending → their transfer functions, (pulse, subcarrier) complex64."""
-        captures, correction, frequency = self.dataset.capture.values, _correction(self.dataset), self.frequency_hz
+        captures, correction = self.dataset.capture.values, _correction(self.dataset)
+        frequency = self.dataset.frequency.values
         path_m = self.dataset.path_removed.values if "path_removed" in self.dataset else None
 
         def form(pulses: Pulses) -> Complexes:
@@ -137,11 +145,6 @@ class PairEcho:
             return remove_path(measured, frequency, delay_s=path_m[pulses] / SPEED_OF_LIGHT_M_S)
 
         return form
-
-    @property
-    def frequency_hz(self) -> NDArray[np.float64]:
-        """(subcarrier,) float64."""
-        return np.asarray(self.dataset.frequency.values)
 
     def blocks(self) -> Iterator[Complexes]:
         """Yield `transfer` from its beginning, some pulses at a time."""
@@ -179,13 +182,7 @@ def _source(rx: Acquisition, sent: Transmitted, saturation: Saturation, *, divid
     """Return what forms transfer functions of captures of a recording."""
     read = rx.reader(["radar", "sidelink"] if divided else ["radar"], np.arange(len(rx.raw.start)))
     demodulator = Demodulator(sent.inverse, rx.numerology, sent.waveform.capture_samples)
-
-    def form(captures: Pulses, correction: Correction | None) -> Complexes:
-        iq = read(captures)
-        saturation.count(iq)
-        return demodulator.transfer(iq, correction)
-
-    return form
+    return forming(read, demodulator, saturation)
 
 
 def _correction(stage: xr.Dataset) -> Correction | None:

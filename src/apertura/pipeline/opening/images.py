@@ -18,7 +18,7 @@ from apertura.core.quality.measures import BlockRaster
 from apertura.core.quality.point_targets import BandLimitedPatch, carrier_at
 from apertura.core.scene.grid import SceneGrid
 from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.store import open_document, read_manifest, remake
+from apertura.pipeline.store import open_document, open_listed, read_manifest, remake
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -217,7 +217,13 @@ def agreement_report(found: Agreement | None) -> dict[str, float | str] | None:
     return {name: value if isinstance(value, str) else float(f"{value:.4g}") for name, value in asdict(found).items()}
 
 
-# ---- How the images of a flight agree, as step assess wrote it -----------------------------------------------------
+# ---- What images say of themselves, and how those of a flight agree, as steps wrote it ------------------------------
+
+
+def report_of(campaign: Campaign, flight: str, image: str) -> dict[str, Any]:
+    """Return image.json of a pair or of 'fused'; raise CampaignError if it is not there as step export left it."""
+    path = campaign.result(flight, image, "image.json")
+    return open_listed(path, path.with_name("export.manifest.json"))
 
 
 def assessment_of(campaign: Campaign, flight: str) -> dict[str, Any]:

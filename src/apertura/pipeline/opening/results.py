@@ -9,8 +9,9 @@ from apertura.common.contracts import STAGES
 from apertura.common.errors import CampaignError, quoted
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.opening.echo import PairEcho
+from apertura.pipeline.opening.images import report_of
 from apertura.pipeline.opening.scene import OpenScene, open_scene
-from apertura.pipeline.store import open_listed, open_stage
+from apertura.pipeline.store import open_stage
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -84,8 +85,7 @@ class OpenCampaign:
     def report(self, flight: str, pair: str) -> dict[str, Any]:
         """Return image.json of a pair or of 'fused': engine, models and reasons, errors, measures, flags."""
         _check_name(pair, "pair", self.campaign.flight(flight).images, where=f"campaign.report({flight!r})")
-        path = self.campaign.result(flight, pair, "image.json")
-        return open_listed(path, path.with_name("export.manifest.json"))
+        return report_of(self.campaign, flight, pair)
 
     def flags(self, flight: str, pair: str) -> dict[str, str]:
         """Return the limits that an image exceeds: name → what was measured, in one line."""

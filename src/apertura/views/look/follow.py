@@ -13,7 +13,6 @@ from types import FrameType
 from typing import Any
 
 import numpy as np
-from rasterio import Affine
 
 from apertura import __version__
 from apertura.common.atomic import write_json, write_text
@@ -31,7 +30,7 @@ from apertura.pipeline.opening.pair import open_pair, recorded_echo
 from apertura.pipeline.opening.scene import ConfiguredGround, Flown, settled
 from apertura.pipeline.opening.transmitted import transmitted
 from apertura.views.look.image import Block
-from apertura.views.look.live_map import LiveMap
+from apertura.views.look.live_map import LiveMap, placed_on
 from apertura.views.look.node import NodeSoFar
 from apertura.views.look.pair import PairSoFar
 
@@ -217,12 +216,10 @@ class Look:
             **({} if told["error_db"] is None else {"APERTURA_ERROR_DB": f"{told['error_db']:g}"}),
             **({"APERTURA_FLAGS": json.dumps(told["flags"])} if told["flags"] else {}),
         }
-        crs = grid.crs_wkt if grid.crs == "local" else grid.crs
         write_quicklook(
             path,
             image,
-            transform=Affine(*grid.transform),
-            crs=crs,
+            **placed_on(grid),
             tags=tags,
             title=f"{self.campaign.settings.campaign} · {pair.flight} {pair.name}, so far",
             subtitle=_subtitle(pair, told, self.decimated),

@@ -1,7 +1,9 @@
 """The look on the map page: the image so far of each pair as a GeoTIFF in dB, and the document that names them."""
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import asdict
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -10,6 +12,7 @@ from rasterio import Affine
 
 from apertura.common.atomic import write_json
 from apertura.common.provenance import sha256_file
+from apertura.core.geometry.geodesy import LOCAL
 from apertura.core.scene.grid import SceneGrid
 from apertura.formats.export import MAP
 from apertura.formats.export.cog import power, write_cog
@@ -21,7 +24,7 @@ from apertura.views.webmap.document import Layer, Place, map_document, url_of
 from apertura.views.webmap.step import crs_of, stated_places, true_places
 
 _KEPT = 2
-"""Pictures of a pair that stay: a page that has just read the document still finds the one before the last."""
+"""Pictures of a pair, in turn: a page that has just read the document still finds the one before the last."""
 
 
 class LiveMap:
@@ -42,7 +45,20 @@ class LiveMap:
         self._grid: SceneGrid | None = None
         self._entries: dict[str, dict[str, Any]] = {}
         self._places: dict[str, Place] = {}
-        self._numbers: dict[str, int] = {}
+        self._shown: Counter[str] = Counter()
+
+    @cached_property
+    def _fixed(self) -> dict[str, Any]:
+        """What the document says of the campaign whatever comes."""
+        if self._grid is None:
+            raise ValueError("no image was added")
+        campaign, grid, notes = self._campaign, self._grid, list[str]()
+        return {
+            "grid": {"bounds_m": grid.bounds_m, "spacing_m": grid.spacing_m, "shape": grid.shape},
+            "crs": crs_of(grid),
+            "places": [*stated_places(campaign), *true_places(campaign, grid.crs, notes)],
+            "notes": notes,
+        }
 
     def add(self, pair: PairSoFar, told: Mapping[str, Any]) -> None:
         """Write the image so far of a pair, of which `told` is known."""
@@ -51,16 +67,11 @@ class LiveMap:
             return
         self._grid = grid
         where = f"{pair.flight}/{pair.name}"
-        number = self._numbers[where] = self._numbers.get(where, -1) + 1
         image = on_grid(shown.image, shown.share, grid.shape)
-        path = self._folder / where / f"db.{number}.tif"
+        path = self._folder / where / f"db.{self._shown[where] % _KEPT}.tif"
+        self._shown[where] += 1
         path.parent.mkdir(parents=True, exist_ok=True)
-        crs = grid.crs_wkt if grid.crs == "local" else grid.crs
-        placed: dict[str, Any] = {"transform": Affine(*grid.transform), "crs": crs, "tags": {}}
-        write_cog(path, image, DB, value=lambda block: decibels(power(block)), **placed)
-        for old in path.parent.glob("db.*.tif"):
-            if int(old.name.split(".")[1]) <= number - _KEPT:
-                old.unlink(missing_ok=True)
+        write_cog(path, image, DB, value=lambda block: decibels(power(block)), tags={}, **placed_on(grid))
         level = decibels(power(image[image != 0]))
         high = round(float(np.nanmax(level, initial=-300.0)), 1)
         low = min(round(float(np.nanmedian(level)), 1), high - 1.0) if np.isfinite(level).any() else high - 60.0
@@ -81,21 +92,21 @@ class LiveMap:
         """Write the document of what was added; nothing before there is an image."""
         if self._grid is None:
             return
-        campaign, grid, notes = self._campaign, self._grid, list[str]()
-        places = [*stated_places(campaign), *true_places(campaign, grid.crs, notes), *self._places.values()]
         document = map_document(
-            campaign.settings.campaign,
-            grid={"bounds_m": grid.bounds_m, "spacing_m": grid.spacing_m, "shape": grid.shape},
-            crs=crs_of(grid),
+            self._campaign.settings.campaign,
+            **self._fixed | {"places": [*self._fixed["places"], *self._places.values()]},
             images=list(self._entries.values()),
-            places=places,
             coverage_url=None,
-            notes=notes,
             again_s=None if ended else self._every_s,
         )
         path = self._folder / MAP
         path.parent.mkdir(parents=True, exist_ok=True)
         write_json(path, document)
+
+
+def placed_on(grid: SceneGrid) -> dict[str, Any]:
+    """Return transform and crs of a grid, as exports take them."""
+    return {"transform": Affine(*grid.transform), "crs": grid.crs_wkt if grid.crs == LOCAL else grid.crs}
 
 
 def on_grid(image: NDArray[np.complex64], side: int, shape: tuple[int, ...]) -> NDArray[np.complex64]:

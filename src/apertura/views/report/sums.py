@@ -10,10 +10,10 @@ from apertura.formats.export import product
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import FUSED
 from apertura.pipeline.lineage import result_of
-from apertura.pipeline.opening.images import averaged
+from apertura.pipeline.opening.images import averaged, report_of
 from apertura.pipeline.opening.scene import settled_scene
 from apertura.pipeline.steps.stamping import tags_of
-from apertura.pipeline.store import open_listed, open_stage, record_files
+from apertura.pipeline.store import open_stage, record_files
 from apertura.views.report import SUM_PICTURES
 from apertura.views.report.image_drawings import draw_cuts, drawn_cuts
 from apertura.views.report.panels import draw_panels
@@ -27,8 +27,7 @@ def pictures_fused(campaign: Campaign, flight: str) -> list[Path]:
     lineage = result_of(campaign, "pictures_fused", flight).begin(campaign.root)
     written = [campaign.result(flight, FUSED, f"{name}.png") for name in SUM_PICTURES]
     panels, cuts = written
-    path = campaign.result(flight, FUSED, "image.json")
-    grid, report = settled_scene(campaign).grid, open_listed(path, path.with_name("export.manifest.json"))
+    grid, report = settled_scene(campaign).grid, report_of(campaign, flight, FUSED)
     files = {
         pair: campaign.result(flight, pair, product("image", "write_power").file)
         for pair in campaign.flight(flight).pairs[:_MOST_PANELS]

@@ -390,8 +390,7 @@ def served_look(campaign: Campaign, *, port: int = 0) -> MapServer:
         with undamaged(path, expected="what apertura look writes", remedy="Run `apertura look CAMPAIGN` again."):
             return {**named_files(document), MAP: sha256_file(path)}
 
-    files()
-    return MapServer(folder, files, page=page_files(), sha256_of=lambda name: sha256_file(folder / name), port=port)
+    return _serving(campaign, folder, files, port)
 
 
 def served(campaign: Campaign, *, port: int = 0) -> MapServer:
@@ -409,14 +408,18 @@ def served(campaign: Campaign, *, port: int = 0) -> MapServer:
     CampaignError
         If there is no map, it is not as it was written, or the port is taken.
     """
-    files = _listing(campaign)
+    return _serving(campaign, campaign.results, _listing(campaign), port)
+
+
+def _serving(campaign: Campaign, folder: Path, files: Callable[[], Mapping[str, str]], port: int) -> MapServer:
+    """Return a server of a folder of the campaign; raise CampaignError if its files are not known."""
     files()
-    results = campaign.relative(campaign.results)
+    place = campaign.relative(folder)
 
     def sha256_of(name: str) -> str:
-        return digest_of(campaign.root, f"{results}/{name}")
+        return digest_of(campaign.root, f"{place}/{name}")
 
-    return MapServer(campaign.results, files, page=page_files(), sha256_of=sha256_of, port=port)
+    return MapServer(folder, files, page=page_files(), sha256_of=sha256_of, port=port)
 
 
 def _listing(campaign: Campaign) -> Callable[[], Mapping[str, str]]:
