@@ -1,5 +1,6 @@
 """Rules `image` and `tiles`: a focused image of one pair with its measured error, by one job or by many."""
 
+import shutil
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -75,6 +76,8 @@ def image(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Pa
         of_stages = work.empty.attrs["flags"], work.track.stage.attrs["flags"]
         quality["flags"] = Flags.merged(*of_stages, plan.flags, quality["flags"], told.flags)
         finish(wip, folder, lineage=lineage, quality=quality, flags=quality["flags"])
+    # Also those of another number of jobs, of a run that was killed: the workflow only knows of the present ones.
+    shutil.rmtree(_receipts(folder), ignore_errors=True)
     return folder
 
 
@@ -105,9 +108,14 @@ def tiles(campaign: Campaign, flight: str, pair: str, share: str, *, threads: in
         todo = [window for window in mine if window in missing]
         if todo:
             work.compute(todo, open_array(wip, "image"))
-    receipt = work.folder.with_name("tiles") / f"{share}.json"
+    receipt = _receipts(work.folder) / f"{share}.json"
     write_json(receipt, {"tiles": len(mine), "formed": len(todo), "with": work.formation.plan.setting.line})
     return receipt
+
+
+def _receipts(folder: Path) -> Path:
+    """Where the shares say that they are done, until their image is."""
+    return folder.with_name("tiles")
 
 
 @dataclass(frozen=True, eq=False)
