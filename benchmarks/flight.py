@@ -9,6 +9,7 @@ import argparse
 import hashlib
 import json
 import os
+import shutil
 import subprocess
 import sys
 import time
@@ -58,6 +59,8 @@ def steps(root: Path) -> list[tuple[str, ...]]:
 
 def measured(root: Path, step: tuple[str, ...], threads: int) -> dict[str, object]:
     """Run one step in a process of its own; return what it took."""
+    if step[0] == "image":  # else its tiles are kept
+        shutil.rmtree(root / "results" / step[1] / step[2] / "image.zarr", ignore_errors=True)
     command = [str(Path(sys.executable).with_name("apertura")), "step", *step, "--campaign", str(root)]
     command += ["--threads", str(threads)] * (step[0] in {"image", "layers"})
     began = time.perf_counter()

@@ -17,6 +17,7 @@ using apertura::Patch;
   extern "C" void apertura_expand_##isa(const TableJob*, float*);                                 \
   extern "C" void apertura_contribute_##isa(const EchoJob*);                                      \
   extern "C" void apertura_differentiate_##isa(const EchoJob*);                                   \
+  extern "C" void apertura_terms_##isa(const TermsJob*);                                          \
   extern "C" void apertura_rest_tree_##isa(TreeJob*);                                             \
   extern "C" void apertura_weigh_tree_##isa(TreeJob*);                                            \
   extern "C" void apertura_plan_tree_##isa(TreeJob*);                                             \
@@ -38,6 +39,7 @@ struct Isa {
   void (*expand)(const TableJob*, float*);
   void (*contribute)(const EchoJob*);
   void (*differentiate)(const EchoJob*);
+  void (*terms)(const TermsJob*);
   void (*rest_tree)(TreeJob*);
   void (*weigh_tree)(TreeJob*);
   void (*plan_tree)(TreeJob*);
@@ -54,14 +56,15 @@ const Isa* find(const char* name) {
   static const Isa isas[] = {
 #ifdef APERTURA_X86
       {"avx512", has_avx512, apertura_add_avx512, apertura_expand_avx512, apertura_contribute_avx512,
-       apertura_differentiate_avx512, apertura_rest_tree_avx512, apertura_weigh_tree_avx512, apertura_plan_tree_avx512,
-       apertura_form_tree_avx512},
+       apertura_differentiate_avx512, apertura_terms_avx512, apertura_rest_tree_avx512, apertura_weigh_tree_avx512,
+       apertura_plan_tree_avx512, apertura_form_tree_avx512},
       {"avx2", has_avx2, apertura_add_avx2, apertura_expand_avx2, apertura_contribute_avx2, apertura_differentiate_avx2,
-       apertura_rest_tree_avx2, apertura_weigh_tree_avx2, apertura_plan_tree_avx2, apertura_form_tree_avx2},
+       apertura_terms_avx2, apertura_rest_tree_avx2, apertura_weigh_tree_avx2, apertura_plan_tree_avx2,
+       apertura_form_tree_avx2},
 #endif
       {"portable", true, apertura_add_portable, apertura_expand_portable, apertura_contribute_portable,
-       apertura_differentiate_portable, apertura_rest_tree_portable, apertura_weigh_tree_portable,
-       apertura_plan_tree_portable, apertura_form_tree_portable},
+       apertura_differentiate_portable, apertura_terms_portable, apertura_rest_tree_portable,
+       apertura_weigh_tree_portable, apertura_plan_tree_portable, apertura_form_tree_portable},
   };
   for (const Isa& isa : isas)
     if (isa.runs && (!*name || std::strcmp(name, isa.name) == 0)) return &isa;
@@ -160,6 +163,10 @@ __attribute__((visibility("default"))) int apertura_contribute(const char* name,
 
 __attribute__((visibility("default"))) int apertura_differentiate(const char* name, const EchoJob* job) {
   return run(name, [job](const Isa& isa) { isa.differentiate(job); });
+}
+
+__attribute__((visibility("default"))) int apertura_terms(const char* name, const TermsJob* job) {
+  return run(name, [job](const Isa& isa) { isa.terms(job); });
 }
 
 __attribute__((visibility("default"))) int apertura_rest_tree(const char* name, TreeJob* job) {

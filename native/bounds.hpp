@@ -12,6 +12,7 @@ constexpr int64_t kTaps = 16;       // of a table's filters
 constexpr int64_t kWindow = 16;     // table cells that one look-up can reach
 constexpr int64_t kEchoTaps = 8;    // samples that make an echo at a single place
 constexpr int64_t kEchoDegree = 4;  // of the polynomials that weigh them
+constexpr int64_t kTermTaps = 24;   // samples that make one in float64
 // A path may lie half a cell beyond the cell it is rounded to; the rest is what float32 may err.
 constexpr float kWindowMargin = 0.51f;
 

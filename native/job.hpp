@@ -74,6 +74,19 @@ struct EchoJob {
   double samples_per_metre, turns_per_metre;
 };
 
+// What each pulse adds at each place, in float64.
+struct TermsJob {
+  const float* samples;   // (pulse, length, 2): re, im
+  const double* weights;  // (fractions + 1, kTermTaps, 2): of the samples about a place so far behind one, twice each
+  const double* transmitter;  // (pulse, 3)
+  const double* receiver;     // (pulse, 3)
+  const double* start;        // (pulse): total path of sample 0
+  const double* pixels;       // (count, 3)
+  double* terms;              // (pulse, count, 2): re, im
+  int64_t pulses, length, count, fractions;
+  double step, turns_per_metre;
+};
+
 // Static: compiled for several instruction sets, whose copies the linker must never merge.
 namespace apertura {
 

@@ -2,6 +2,7 @@
 #include "beam.hpp"
 #include "echoes.hpp"
 #include "expand.hpp"
+#include "terms.hpp"
 
 #define APERTURA_JOIN2(a, b) a##b
 #define APERTURA_JOIN(a, b) APERTURA_JOIN2(a, b)
@@ -97,3 +98,5 @@ extern "C" void APERTURA_JOIN(apertura_expand_, APERTURA_ISA)(const TableJob* jo
 extern "C" void APERTURA_JOIN(apertura_contribute_, APERTURA_ISA)(const EchoJob* job) { contribute(*job); }
 
 extern "C" void APERTURA_JOIN(apertura_differentiate_, APERTURA_ISA)(const EchoJob* job) { differentiate(*job); }
+
+extern "C" void APERTURA_JOIN(apertura_terms_, APERTURA_ISA)(const TermsJob* job) { add_terms(*job); }

@@ -10,6 +10,7 @@ from apertura.core.backprojection.contributions import (
     DEGREE,
     TAPS,
     band_limited_image,
+    band_limited_terms,
     block_contributions,
     tap_polynomials,
 )
@@ -34,6 +35,11 @@ def way(request, monkeypatch):
 def exact(block: slice) -> np.ndarray:
     """The double sum over some pulses and all subcarriers."""
     return replace(SCENE, transfer=SCENE.transfer[block], tx=SCENE.tx[block], rx=SCENE.rx[block]).exact(PLACES)
+
+
+def exact_terms() -> np.ndarray:
+    """What each pulse adds, by the double sum."""
+    return np.stack([exact(slice(pulse, pulse + 1)) for pulse in range(PULSES)])
 
 
 @pytest.mark.usefixtures("way")
@@ -67,6 +73,28 @@ def test_every_instruction_set_adds_what_numpy_adds(monkeypatch):
     without_library(monkeypatch)
     slow = block_contributions(PROFILES, PLACES, edges=EVEN, weights=weights)
     assert decibels(fast - slow, slow) < -115
+
+
+@pytest.mark.usefixtures("way")
+def test_terms_in_float64_are_those_of_the_double_sum():
+    found, truth = band_limited_terms(PROFILES, PLACES), exact_terms()
+    assert decibels(found - truth, truth) < -115  # what float32 samples hold
+
+
+@compiled
+@pytest.mark.usefixtures("isa")
+def test_every_instruction_set_gives_the_terms_of_numpy(monkeypatch):
+    """Inside the samples, across both ends, beyond them, and at a place that is none."""
+    line = np.stack([np.linspace(-200, 200, 401), np.zeros(401), np.zeros(401)], -1)
+    places = ecef(np.concatenate([line, [[np.nan, 0, 0]]]))
+    fast = band_limited_terms(PROFILES, places)
+    without_library(monkeypatch)
+    slow = band_limited_terms(PROFILES, places)
+    assert np.isnan(fast[:, -1]).all()
+    at = (PROFILES.aperture.path(places[:-1]) - PROFILES.start_m[:, None]) / PROFILES.step_m
+    assert at.min() < -TAPS < 0 < PROFILES.samples.shape[1] + TAPS < at.max()
+    assert ((fast[:, :-1] == 0) == (slow[:, :-1] == 0)).all()
+    assert decibels(fast[:, :-1] - slow[:, :-1], slow[:, :-1]) < -240
 
 
 @pytest.mark.usefixtures("way")

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from apertura.common.arrays import Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
-from apertura.core.geometry.aperture import Aperture
+from apertura.core.geometry.aperture import Aperture, distance
 from apertura.core.geometry.atmosphere import Atmosphere
 from apertura.simulation.scene import Scatterers
 
@@ -113,7 +113,7 @@ def _pulses_at_once(scatterers: int, subcarriers: int, *, gridded: bool) -> int:
 def _summed(
     scatterers: Scatterers, aperture: Aperture, frequency_hz: Floats, longer_m: Floats, *, spreading: bool
 ) -> NDArray[np.complex128]:
-    there, back = (np.linalg.norm(leg[:, None] - scatterers.position_m, axis=-1) for leg in aperture.legs)
+    there, back = (distance(leg[:, None], scatterers.position_m) for leg in aperture.legs)
     amplitude = np.broadcast_to(scatterers.amplitude / (there * back if spreading else 1.0), there.shape)
     return spectrum((there + back + longer_m[:, None]) / SPEED_OF_LIGHT_M_S, amplitude, frequency_hz)
 

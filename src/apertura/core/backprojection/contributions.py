@@ -9,16 +9,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.core.antenna.beam import Beams
-from apertura.core.backprojection.engines.native_binding import KERNEL, EchoJob, available, call
+from apertura.core.backprojection.engines.native_binding import KERNEL, EchoJob, TermsJob, available, call
 from apertura.core.backprojection.inputs import Profiles
+from apertura.core.geometry.aperture import distance
 from apertura.core.interpolation import kaiser_sinc
 
 # ---- Contributions of profiles by band-limited interpolation in float64
 
-_HALF_TAPS = 24
-_KAISER_BETA = 22.0  # -190 dB with half the band free for the transition
+_HALF_TAPS = KERNEL.term_taps // 2
+_KAISER_BETA = 16.0  # with so many taps -148 dB at most, half the band free for the transition
 _FRACTIONS = 4096  # of a sample, at which weights are tabulated; linear between: the error of a weight is 3e-8
-_PULSES_AT_ONCE = 16
+_PULSES_AT_ONCE = 256  # of terms, in memory
+_ROWS_AT_ONCE = 16  # of samples gathered by numpy: what a cache holds
 
 
 def band_limited_image(
@@ -40,7 +42,7 @@ def band_limited_terms(
     Parameters
     ----------
     profiles
-        Twice oversampled or more, with 24 samples or more beyond the scene at both ends; samples beyond count as zero.
+        Twice oversampled or more, with 12 samples or more beyond the scene at both ends; samples beyond count as zero.
     pixels
         (pixel, 3) float64, metres, in the frame of the phase centres.
     beams
@@ -49,30 +51,53 @@ def band_limited_terms(
     Returns
     -------
     ndarray
-        (pulse, pixel) complex128.
+        (pulse, pixel) complex128; NaN where a pixel is not finite.
 
     Notes
     -----
-    Source: docs/theory.md, eq. 6.
+    Source: docs/theory.md, eq. 6. Errs by -148 dB of a tone at the edge of the band. In float64, by code that no engine
+    uses; without the compiled library numpy does the same.
     """
+    terms = (_compiled_terms if available() else _terms)(profiles, np.ascontiguousarray(pixels, np.float64))
+    if beams is not None:
+        terms *= beams.weight(profiles.aperture, pixels)
+    return terms
+
+
+def _compiled_terms(profiles: Profiles, pixels: NDArray[np.float64]) -> NDArray[np.complex128]:
+    terms = np.empty((len(profiles), len(pixels)), np.complex128)
+    samples = np.ascontiguousarray(profiles.samples, np.complex64)
+    geometry = [np.ascontiguousarray(one, np.float64) for one in (*profiles.aperture.legs, profiles.start_m, pixels)]
+    arrays = (samples, _paired_weights(), *geometry, terms)
+    job = TermsJob(
+        *(array.ctypes.data for array in arrays),
+        pulses=len(profiles),
+        length=samples.shape[1],
+        count=len(pixels),
+        fractions=_FRACTIONS,
+        step=profiles.step_m,
+        turns_per_metre=profiles.centre_frequency_hz / profiles.wave_speed_m_s,
+    )
+    call("apertura_terms", job)
+    return terms
+
+
+def _terms(profiles: Profiles, pixels: NDArray[np.float64]) -> NDArray[np.complex128]:
     k = profiles.wavenumber_rad_m
     taps = np.arange(1 - _HALF_TAPS, _HALF_TAPS + 1)
     padded = np.pad(profiles.samples.astype(np.complex128), [(0, 0), (_HALF_TAPS, _HALF_TAPS)])
     terms, table = np.empty((len(profiles), len(pixels)), np.complex128), _interpolator()
-    for first in range(0, len(profiles), _PULSES_AT_ONCE):
-        part = slice(first, first + _PULSES_AT_ONCE)
+    for first in range(0, len(profiles), _ROWS_AT_ONCE):
+        part = slice(first, first + _ROWS_AT_ONCE)
         path = profiles.aperture[part].path(pixels)
         place = (path - profiles.start_m[part, None]) / profiles.step_m
-        base = np.floor(place).astype(np.int64)
+        base = np.nan_to_num(np.floor(place)).astype(np.int64)
         fraction = (place - base) * _FRACTIONS
-        row = np.minimum(fraction.astype(np.int64), _FRACTIONS - 1)
+        row = np.clip(np.nan_to_num(fraction).astype(np.int64), 0, _FRACTIONS - 1)
         index = np.clip(base[..., None] + taps + _HALF_TAPS, 0, padded.shape[1] - 1)
         samples = padded[np.arange(first, first + len(path))[:, None, None], index]
         here, next_one = (np.einsum("pxt,pxt->px", samples, table[row + more]) for more in (0, 1))
-        value = (here + (fraction - row) * (next_one - here)) * np.exp(1j * np.remainder(k * path, 2 * np.pi))
-        if beams is not None:
-            value *= beams[part].weight(profiles.aperture[part], pixels)
-        terms[part] = value
+        terms[part] = (here + (fraction - row) * (next_one - here)) * np.exp(1j * np.remainder(k * path, 2 * np.pi))
     return terms
 
 
@@ -81,6 +106,12 @@ def _interpolator() -> NDArray[np.float64]:
     """Return (fraction, tap) weights of the samples around a place that lies so far behind one."""
     distance = np.arange(_FRACTIONS + 1)[:, None] / _FRACTIONS - np.arange(1 - _HALF_TAPS, _HALF_TAPS + 1)
     return kaiser_sinc(distance, half=_HALF_TAPS, beta=_KAISER_BETA)
+
+
+@lru_cache(maxsize=1)
+def _paired_weights() -> NDArray[np.float64]:
+    """Return `_interpolator` with each weight twice, for real and imaginary parts that lie side by side."""
+    return np.repeat(_interpolator(), 2, axis=1)
 
 
 # ---- Echoes of single pulses at single places
@@ -207,7 +238,7 @@ class Echoes:
         -----
         Source: docs/theory/autofocus.md, eq. 4 and 5.
         """
-        tx, rx = (np.linalg.norm(places_m - leg.T[:, None], axis=-1) for leg in (self.tx_m, self.rx_m))
+        tx, rx = (distance(leg.T[:, None], places_m) for leg in (self.tx_m, self.rx_m))
         path = tx + rx
         at = (path - self.start_m[:, None]) / self.step_m
         at = np.clip(at, TAPS / 2 - 0.5, self.samples.shape[-1] - TAPS / 2 - 0.5)

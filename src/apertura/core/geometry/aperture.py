@@ -14,13 +14,38 @@ from apertura.common.errors import CampaignError, quoted
 Weigh = Callable[[slice, NDArray[np.float64]], NDArray[np.float64]]
 """Pulses and points (point, 3) → (pulse, point) float64."""
 
-_PULSES_AT_ONCE = 256
+_PULSES_AT_ONCE = 2048
 _STRETCHES = 64  # of the aperture, in which phase rates are compared
 _STEPS_IN_A_ROW = 63  # of which the median is taken, so that missed pulses do not count
 
 
 _FLOAT32_M = 2.0**13
 """Metres beyond which float32 rounds by half a millimetre or more: a hundredth of a cycle at L-band there and back."""
+
+
+def distance(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the distance between places, (...,) float64.
+
+    Parameters
+    ----------
+    first, second
+        (..., 3) float64, in shapes that go together.
+
+    Notes
+    -----
+    To the bit `numpy.linalg.norm` of the difference, in a quarter of its time or less: axis by axis nothing is gathered
+    from rows of three.
+
+    Examples
+    --------
+    >>> distance(np.zeros((2, 1, 3)), np.array([[3.0, 4.0, 0.0], [2.0, 3.0, 6.0]]))
+    array([[5., 7.],
+           [5., 7.]])
+    """
+    total, *others = (np.square(second[..., axis] - first[..., axis]) for axis in range(3))
+    for other in others:
+        total += other
+    return np.sqrt(total)
 
 
 def as_array(value: Any, kind: type, where: str) -> Any:
@@ -167,7 +192,7 @@ class Aperture:
         -----
         Source: docs/theory.md, eq. 3.
         """
-        tx, rx = (np.linalg.norm(points_m - self._against(leg, points_m), axis=-1) for leg in self.legs)
+        tx, rx = (distance(self._against(leg, points_m), points_m) for leg in self.legs)
         return np.asarray(tx + rx)
 
     def path_gradient(self, points_m: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from apertura.core.geometry.aperture import Aperture, Weigh
+from apertura.core.geometry.aperture import Aperture, Weigh, distance
 
 TAPER = 0.1
 """Of the half width: the weight falls from 1 to 0 between 1 - TAPER and 1 + TAPER (docs/theory/integration.md)."""
@@ -199,10 +199,10 @@ class Sector:
                 .max(axis=0)
             )
         for axis, leg in zip((self.tx_axis, self.rx_axis), aperture.legs, strict=True):
-            leg_m = points_m - leg.reshape(-1, *(1,) * (points_m.ndim - 1), 3)
+            range_m = distance(leg.reshape(-1, *(1,) * (points_m.ndim - 1), 3), points_m)
             length = np.linalg.norm(axis, axis=1).reshape(-1, *(1,) * (points_m.ndim - 1))
             # a direction rotates by asin(radius/range) at most; the difference of the unit vectors is less
-            turn = np.minimum(1.0, radius_m / np.linalg.norm(leg_m, axis=-1))
+            turn = np.minimum(1.0, radius_m / range_m)
             slack += length * np.where(turn < 1, np.pi / 2 * turn, 2.0)
         return slack
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from apertura.common.contracts import Window
 from apertura.core.backprojection.tiles import compute_tiles
 from apertura.core.imaging.formation import Formation
-from apertura.core.quality.error_check import CONFIDENCE, Brightness, Certificate, ErrorBound, random_pixels
+from apertura.core.quality.error_check import CONFIDENCE, Brightness, Certificate, random_pixels
 from apertura.core.quality.measures import coherence_factor, image_statistics
 from apertura.core.quality.point_targets import CUT_REACH_M, cuts_report, find_peak
 from apertura.core.scene.grid import SceneGrid
@@ -44,13 +44,19 @@ def certified(
     rewriting
         Called with the tiles before they are formed again, so that a run killed meanwhile begins them as planned.
     """
-    certificate = _random_certificate(formation)
+    drawn, certificate = random_pixels(formation.windows, RANDOM_PIXELS, np.random.default_rng(0)), None
     settings, redone = iter(formation.plan.fallbacks), []
     while True:
         brightness, setting = Brightness.of(target, formation.windows), next(settings, None)
+        # Random pixels do not depend on the image, bright ones do: of the first image pulses are read once for both.
+        bright = brightness.draw(target, formation.windows, BRIGHT_PIXELS, np.random.default_rng(1))
+        pixels = bright if certificate else np.concatenate([drawn, bright])
+        exact = formation.exact(pixels, threads=threads)
+        certificate = certificate or Certificate(formation.windows, drawn, exact[: len(drawn)])
         uncertified, worse = certificate.failing(target, accuracy_db, power=brightness.mean_power)
         if not worse or setting is None:
-            error = _error(formation, certificate, target, brightness)
+            error = certificate.error(target, brightness, bright, exact[len(pixels) - len(bright) :])
+            error = error.with_error(formation.compression_db)
             if error.bound_db <= accuracy_db or setting is None:
                 break
             worse = formation.windows  # each tile passes, but the bound of the image does not
@@ -69,17 +75,6 @@ def certified(
         "redone": redone,
         "flags": {"accuracy_missed": line} if error.bound_db > accuracy_db else {},
     }
-
-
-def _random_certificate(formation: Formation) -> Certificate:
-    pixels = random_pixels(formation.windows, RANDOM_PIXELS, np.random.default_rng(0))
-    return Certificate(formation.windows, pixels, formation.exact(pixels))
-
-
-def _error(formation: Formation, certificate: Certificate, target: Any, brightness: Brightness) -> ErrorBound:
-    """Return the error of the image as it is now; its bright pixels are drawn from the image alone."""
-    bright = brightness.draw(target, formation.windows, BRIGHT_PIXELS, np.random.default_rng(1))
-    return certificate.error(target, brightness, bright, formation.exact(bright)).with_error(formation.compression_db)
 
 
 def measures(formation: Formation, target: Any) -> dict[str, Any]:

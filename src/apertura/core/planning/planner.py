@@ -4,7 +4,6 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
 from apertura.common.flags import Flags
 from apertura.core.antenna.illumination import decide_antennas
@@ -248,7 +247,7 @@ def _decide_presum(
 ) -> tuple[Decision, Presum | None, Setting]:
     """Return the decision, the low-pass sum over pulses, and the setting with it."""
     job, pulses = search.job, len(search.job.aperture)
-    _, widest = job.aperture.phase_rates(job.points_m, wavelength_m=SPEED_OF_LIGHT_M_S / job.band_hz[1])
+    _, widest = job.phase_rates
     oversampled = f"the scene's middle and its edges differ by up to {widest:.3f} cycles per pulse"
 
     def keep(why: str) -> tuple[Decision, None, Setting]:

@@ -40,7 +40,7 @@ class StageStore(LocalStore):
     """A folder of a stage, as zarr reads and writes it.
 
     A file is complete or absent, also after a power failure; a chunk that is not what was written is never handed out:
-    by its own sum, and of a finished stage by its hash in the manifest, where that is given.
+    by its own sum, and of a finished stage by its hash in the manifest, where that is given, when it is first read.
 
     Parameters
     ----------
@@ -52,7 +52,7 @@ class StageStore(LocalStore):
 
     def __init__(self, folder: Path, *, read_only: bool = False, sha256: Mapping[str, str] | None = None) -> None:
         super().__init__(folder, read_only=read_only)
-        self._sha256 = sha256 or {}
+        self._unchecked = dict(sha256 or {})
 
     def _unlinked(self, key: str) -> str:
         """Return a name in the folder; raise the error of damage if it leads through a link, which we never write."""
@@ -94,11 +94,13 @@ class StageStore(LocalStore):
             raise damaged(self.root, key)
         if value is None or byte_range is not None or name == _METADATA:
             return value
-        content = value.as_numpy_array().tobytes()
-        whole = google_crc32c.value(content[:-_SUM_BYTES]) == int.from_bytes(content[-_SUM_BYTES:], "little")
-        if whole and self._sha256.get(key) in {None, hashlib.sha256(content).hexdigest() if self._sha256 else None}:
-            return value
-        raise damaged(self.root, key)
+        content = value.as_numpy_array()
+        whole = google_crc32c.value(content[:-_SUM_BYTES]) == int.from_bytes(content[-_SUM_BYTES:].tobytes(), "little")
+        expected = self._unchecked.get(key)
+        if not whole or (expected is not None and expected != hashlib.sha256(content).hexdigest()):
+            raise damaged(self.root, key)
+        self._unchecked.pop(key, None)
+        return value
 
 
 def _json(value: Buffer) -> object:

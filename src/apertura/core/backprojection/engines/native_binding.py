@@ -41,6 +41,8 @@ class KernelConstants:
     echo_taps, echo_degree
         Samples that make an echo at a single place, and the degree of the polynomials that weigh them
         (docs/theory/autofocus.md, "What pulses add").
+    term_taps
+        Samples that make one in float64, for certificates.
     window_margin
         Cells: a path lies up to ½ beyond the cell it is rounded to, the rest is what float32 may err.
     fifth_order
@@ -72,6 +74,7 @@ class KernelConstants:
     window: int = 16
     echo_taps: int = 8
     echo_degree: int = 4
+    term_taps: int = 24
     window_margin: float = 0.51
     fifth_order: float = 0.14
     third_order: float = 0.19
@@ -159,6 +162,16 @@ class EchoJob(ctypes.Structure):
     ]
 
 
+class TermsJob(ctypes.Structure):
+    """native/job.hpp, TermsJob."""
+
+    _fields_ = [
+        *((name, _pointer) for name in ("samples", "weights", "transmitter", "receiver", "start", "pixels", "terms")),
+        *((name, _int64) for name in ("pulses", "length", "count", "fractions")),
+        *((name, _double) for name in ("step", "turns_per_metre")),
+    ]
+
+
 class TreeTile(ctypes.Structure):
     """native/tree_job.hpp, TreeTile."""
 
@@ -189,7 +202,7 @@ class TreeJob(ctypes.Structure):
     ]
 
 
-STRUCTS = (BeamJob, SectorJob, ApertureJob, TableJob, EchoJob, TreeTile, TreeJob)
+STRUCTS = (BeamJob, SectorJob, ApertureJob, TableJob, EchoJob, TermsJob, TreeTile, TreeJob)
 """All of them."""
 
 
@@ -203,7 +216,9 @@ INSTRUCTION_SETS = ("avx512", "avx2", "portable")
 NAMED_BY = "APERTURA_KERNEL"
 """Environment variable: another library than the one installed."""
 
-_BUILT = str(files("apertura.core.backprojection.engines") / "_backprojection.so")  # resolved once: calls may be short
+_BUILT = Path(
+    str(files("apertura.core.backprojection.engines") / "_backprojection.so")
+)  # resolved once: calls may be short
 
 
 def layout() -> dict[str, str]:
@@ -324,7 +339,7 @@ def library_path() -> Path:
     """
     named = os.environ.get(NAMED_BY)
     if not named:
-        return Path(_BUILT)
+        return _BUILT
     if not (Path(named).is_absolute() and Path(named).is_file()):
         raise _no_kernel(named, "no such file" if Path(named).is_absolute() else "a relative path")
     return Path(named)
@@ -346,12 +361,7 @@ def library() -> ctypes.CDLL:
     CampaignError
         If the layout of its structs differs from that of this module.
     """
-    path = library_path()
-    if not path.is_file():
-        raise RuntimeError(
-            "the compiled kernel is missing: install a C++ compiler and reinstall apertura, or use numba"
-        )
-    return _load(path)
+    return _load(library_path())
 
 
 def kernel_constants() -> dict[str, float]:
@@ -367,6 +377,10 @@ def kernel_constants() -> dict[str, float]:
 
 @lru_cache
 def _load(path: Path) -> ctypes.CDLL:
+    if not path.is_file():
+        raise RuntimeError(
+            "the compiled kernel is missing: install a C++ compiler and reinstall apertura, or use numba"
+        )
     try:
         loaded = ctypes.CDLL(str(path))
     except OSError as error:

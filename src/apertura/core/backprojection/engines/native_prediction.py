@@ -13,7 +13,7 @@ from apertura.core.backprojection.engines.engine import Setting, option_values, 
 from apertura.core.backprojection.engines.native_binding import KERNEL
 from apertura.core.backprojection.engines.native_tables import MARGIN, TAPS, design_table, ratio
 from apertura.core.backprojection.job import Job
-from apertura.core.geometry.aperture import Aperture
+from apertura.core.geometry.aperture import Aperture, distance
 
 # ---- Weights of antennas over patches
 
@@ -163,7 +163,7 @@ def view_of(job: Job) -> View:
     some = job.aperture.sample(_PULSES if job.sector is None else _PULSES_OF_SECTOR)
     aperture, points = job.aperture[some], job.points_m
     right, down = (pixel_steps(job.ground_m, axis, job.spacing_m).reshape(-1, 3) for axis in (1, 0))
-    range_m = np.stack([np.linalg.norm(points - leg[:, None], axis=-1) for leg in aperture.legs])
+    range_m = np.stack([distance(leg[:, None], points) for leg in aperture.legs])
     gradient = aperture.path_gradient(points)
     slope = np.stack([(gradient * step).sum(-1) for step in (right, down)])
     weights = (
