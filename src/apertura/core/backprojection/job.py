@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -187,11 +186,6 @@ class Job:
     def wavelength_m(self) -> float:
         """Of the band centre."""
         return self.signal.wave_speed_m_s / self.centre_hz
-
-    @cached_property
-    def phase_rates(self) -> tuple[float, float]:
-        """Spread of phase rates over the scene and largest against its middle, `Aperture.phase_rates` of the band."""
-        return self.aperture.phase_rates(self.points_m, wavelength_m=SPEED_OF_LIGHT_M_S / self.band_hz[1])
 
     @property
     def points_m(self) -> NDArray[np.float64]:

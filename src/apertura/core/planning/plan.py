@@ -112,7 +112,7 @@ def _sparse(job: Job) -> str | None:
     Source: docs/theory/planner.md, eq. 4 and 5.
     """
     wavelength_m, (lowest_hz, highest_hz) = SPEED_OF_LIGHT_M_S / job.band_hz[1], job.band_hz
-    spread, _ = job.phase_rates
+    spread, _ = job.aperture.phase_rates(job.points_m, wavelength_m=wavelength_m)
     if spread <= 1:
         return None
     folded = job.aperture.ambiguities(job.points_m, wavelength_m=wavelength_m)

@@ -2,8 +2,10 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
+from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
 from apertura.common.flags import Flags
 from apertura.core.antenna.illumination import decide_antennas
@@ -53,6 +55,11 @@ class SettingSearch:
     pulse_blocks: int | None = None
     where: str = "processing"
 
+    @cached_property
+    def _predicted(self) -> dict[int, list[Setting]]:
+        """Pulses → settings."""
+        return {}
+
     @property
     def content_db(self) -> float:
         """How much more errors may weigh at the scene's pixels than at those of a flat, incoherent one."""
@@ -94,18 +101,25 @@ class SettingSearch:
         CampaignError
             If the requested engine cannot run here.
         """
-        options = [
-            replace(setting, form_seconds=setting.form_seconds + self.tile_seconds)
-            for name in self._engines()
-            for setting in load_engine(name).candidates(self.job, pulses=pulses, requested=self.options.get(name, {}))
-        ]
-        return sorted(options, key=lambda setting: (setting.seconds, setting.error_db))
+        if pulses not in self._predicted:
+            options = [
+                replace(setting, form_seconds=setting.form_seconds + self.tile_seconds)
+                for name in self._engines()
+                for setting in load_engine(name).candidates(self.job, pulses=pulses, requested=self._asked(name))
+            ]
+            self._predicted[pulses] = sorted(options, key=lambda setting: (setting.seconds, setting.error_db))
+        return self._predicted[pulses]
+
+    def _asked(self, engine: str) -> dict[str, Any]:
+        return {option: value for option, value in self.options.get(engine, {}).items() if value is not None}
 
     def fallbacks(self, chosen: Setting) -> tuple[Setting, ...]:
         """Return the cheapest setting per 6 dB gained, whatever was requested, ending with the double sum."""
         if chosen.engine == "reference":
             return ()
-        options = replace(self, engine=None, options={}).settings(len(self.job.aperture))
+        asked = self.engine is not None or any(self._asked(engine) for engine in self.options)
+        free = replace(self, engine=None, options={}) if asked else self
+        options = free.settings(len(self.job.aperture))
         last = [setting for setting in options if setting.engine == "reference"]
         options = [setting for setting in options if not last or setting.seconds < last[0].seconds]
         better: list[Setting] = []
@@ -126,7 +140,7 @@ class SettingSearch:
 
     def decisions(self, chosen: Setting, accuracy_db: float) -> Iterator[Decision]:
         """Yield the choices that make up a setting, with their reasons."""
-        requested = {name for name, value in self.options.get(chosen.engine, {}).items() if value is not None}
+        requested = self._asked(chosen.engine)
         verdict = "meets" if chosen.error_db <= accuracy_db else "does not meet"
         rank = "what was asked for" if requested or self.engine else "cheapest of every engine and setting, to 5 %"
         why = "asked for; " if self.engine else ""
@@ -157,7 +171,7 @@ class SettingSearch:
             )
         if self.engine is not None:
             return [self.engine]
-        stated = [name for name in runnable if any(v is not None for v in self.options.get(name, {}).values())]
+        stated = [name for name in runnable if self._asked(name)]
         return stated or [name for name in runnable if getattr(load_engine(name), "TIMED", True)]
 
 
@@ -247,7 +261,7 @@ def _decide_presum(
 ) -> tuple[Decision, Presum | None, Setting]:
     """Return the decision, the low-pass sum over pulses, and the setting with it."""
     job, pulses = search.job, len(search.job.aperture)
-    _, widest = job.phase_rates
+    _, widest = job.aperture.phase_rates(job.points_m, wavelength_m=SPEED_OF_LIGHT_M_S / job.band_hz[1])
     oversampled = f"the scene's middle and its edges differ by up to {widest:.3f} cycles per pulse"
 
     def keep(why: str) -> tuple[Decision, None, Setting]:
