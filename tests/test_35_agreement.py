@@ -85,6 +85,7 @@ def test_speckle_of_two_pairs_agrees_from_the_true_tracks_only():
     assert coherence[1] > 0.75
 
 
+@pytest.mark.slow
 def test_the_gradient_is_that_of_the_value():
     records, unknowns = seen(1)
     tracks = PRIOR.tracks(0.3 * unknowns)

@@ -36,6 +36,7 @@ def test_ground_that_lies_higher_is_as_if_all_flew_lower():
     assert np.linalg.norm(flown + moved[0] - target * [1, 1, 0]) == pytest.approx(true_m)
 
 
+@pytest.mark.slow
 def test_the_arm_that_is_wrong_is_found_to_centimetres():
     """Beside errors of the logs of 3 mm, on a pass of 7.5 s."""
     made, causes, (node, arm_m) = wrong_case("lever arm", "points-5", "short", 0.003, 2)

@@ -186,6 +186,7 @@ def test_a_path_a_whole_wavelength_off_is_told_from_its_place_although_the_phase
     assert not difference(0.0, shift_m=0.03, cycles=0.9).shifted  # less than a tenth of a cell harms nothing
 
 
+@pytest.mark.slow
 def test_the_phase_scatters_as_it_says_although_carriers_differ_and_clutter_moves_the_peaks():
     found = []
     for draw in range(20):

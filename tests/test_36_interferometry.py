@@ -155,6 +155,7 @@ def test_heights_are_the_root_of_their_phase():
         assert told.height(told.slope * height_m + told.bend * height_m**2) == pytest.approx(height_m)
 
 
+@pytest.mark.slow
 def test_the_phase_of_a_ramp_is_that_of_its_heights():
     for rise_m in (1.0, 4.0):
         found, told = parts(rise_m)
@@ -253,6 +254,7 @@ def test_errors_of_the_tracks_turn_the_phase_as_much_as_told(same, correlation_s
     np.testing.assert_allclose((phase - phase[:, reference].mean(axis=1, keepdims=True)).std(axis=0), told, rtol=0.15)
 
 
+@pytest.mark.slow
 def test_another_scene_is_decorrelated_and_tells_no_height():
     found, _ = parts(1.0, common=0.0)
     assert "interferogram_decorrelated" in interferogram_flags(found.measured)

@@ -139,6 +139,7 @@ def coarse_report(targets, *, seed, bow_m=0.0):
     return focus_report(formation, formation.image.compute()), places, flown
 
 
+@pytest.mark.quick("1-5")
 @pytest.mark.quick("1-5", "2-30")
 @pytest.mark.parametrize("targets", [5, 12, 30])
 @pytest.mark.parametrize("seed", [1, 2, 3])
@@ -153,6 +154,7 @@ def test_sidelobes_along_a_coarse_range_cell_are_no_points(targets, seed):
     assert report["loss_db"] == pytest.approx(0.0, abs=0.2)
 
 
+@pytest.mark.quick("5")
 @pytest.mark.parametrize("targets", [5, 12])
 def test_the_loss_of_points_along_a_coarse_range_cell_is_told(targets):
     """Truth: the phases between the paths flown to a target and those of the log to where the image has it."""

@@ -197,6 +197,7 @@ def test_what_forms_an_image_of_nothing_is_flagged(name):
     assert flag is None or flag in flags
 
 
+@pytest.mark.slow
 def test_samples_of_the_other_sign_are_told_as_such():
     for name in ("conjugated", "I and Q swapped", "conjugated profiles"):
         (line,) = json.loads(ap.backproject(FLAGGED[name][0](), TARGET_GRID).attrs["flags"]).values()

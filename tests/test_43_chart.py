@@ -81,6 +81,7 @@ def test_a_point_as_exact_as_a_faster_one_is_not_on_the_front(tmp_path):
     assert np.genfromtxt(tmp_path / "points.csv", delimiter=",", skip_header=1, usecols=3).tolist() == [1.0, 2.0, 3.0]
 
 
+@pytest.mark.slow
 def test_a_toy_engine_is_configured_planned_charted_run_and_written(finished_tiny, tmp_path, toy):
     """One file and one row: the config knows its name and options, the plan its prediction, the product its report."""
     root = copy_writable(finished_tiny.root, tmp_path / "campaign")

@@ -95,6 +95,7 @@ def test_the_config_states_the_error_where_the_log_does_not(tmp_path, asked, exp
     assert stated["rx"]["stated_by"] == "log"
 
 
+@pytest.mark.slow
 def test_pulses_of_a_float_solution_are_left_out_unless_allowed(tmp_path):
     campaign = small_campaign(tmp_path)
 
@@ -114,6 +115,7 @@ def test_pulses_of_a_float_solution_are_left_out_unless_allowed(tmp_path):
     assert echo_of(campaign).attrs["pulses"]["used"] == 40
 
 
+@pytest.mark.slow
 def test_a_log_of_a_poor_fix_throughout_is_refused_and_one_without_rtk_is_not(tmp_path):
     campaign = small_campaign(tmp_path)
     for quality, refused in (("2", True), ("5", False)):
@@ -144,6 +146,7 @@ def test_pulses_in_a_gap_of_the_log_are_left_out_with_its_place_and_length(tmp_p
     assert attrs["pulses"]["used"] == 40 - attrs["pulses"]["reasons"]["track_gap"]
 
 
+@pytest.mark.slow
 def test_a_single_outlier_is_mended_and_counted(tmp_path):
     campaign = small_campaign(tmp_path)
     clean = echo_of(campaign).tx_position.values
@@ -159,6 +162,7 @@ def test_a_single_outlier_is_mended_and_counted(tmp_path):
     np.testing.assert_allclose(dataset.tx_position.values, clean, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_log_that_repeats_positions_is_read_through_those_that_are_new(tmp_path):
     campaign = small_campaign(tmp_path)
     clean = echo_of(campaign).rx_position.values
@@ -190,6 +194,7 @@ def test_a_log_with_rounded_times_is_flagged_with_how_far_that_moves_its_positio
     assert not flagged or "positions err by 0.29 m along the flight" in flags["track_times"]
 
 
+@pytest.mark.quick("-0.004")
 @pytest.mark.quick("-0.004")
 @pytest.mark.parametrize("offset_s", [0.0, 1e-3, -4e-3])
 def test_an_offset_between_the_nodes_tags_does_not_turn_the_bistatic_phase(tmp_path, offset_s):

@@ -260,6 +260,7 @@ def test_what_beams_forbid_is_refused_when_asked_for_and_not_chosen_otherwise(be
     assert "antenna" not in expected_plan(stated(beamed, None), "f01", "uav1-uav1").reasons
 
 
+@pytest.mark.slow
 def test_the_phase_of_a_pattern_is_in_the_budget_and_flagged_where_it_costs_more_than_images_tell(beamed):
     """A parabola of 120° at 10° off boresight in each antenna, and none."""
     azimuth = [(angle, -12.04 * (angle / 15) ** 2) for angle in range(-20, 21, 2)]

@@ -220,6 +220,7 @@ def with_longer_path(root, added_m):
     return json.loads((campaign.results / "f01" / "fused" / "image.json").read_text())
 
 
+@pytest.mark.slow
 def test_a_sum_whose_phase_nothing_tells_says_so_and_that_its_peaks_are_lost(finished_tiny, tmp_path, monkeypatch):
     root = copy_writable(finished_tiny.root, tmp_path / "campaign")
     monkeypatch.setattr("apertura.pipeline.steps.assess.agreement_of", lambda *_: None)

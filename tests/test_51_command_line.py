@@ -109,6 +109,7 @@ def test_a_study_is_a_group_of_commands_where_its_distribution_is_installed():
     assert "paper-part" in done.stdout
 
 
+@pytest.mark.slow
 def test_a_study_looks_for_its_results_in_the_folder_that_it_is_started_in(tmp_path):
     done = run("study", "chart", "stability", "timing", cwd=tmp_path)
     assert done.returncode == 2

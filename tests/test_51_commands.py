@@ -123,6 +123,7 @@ def test_what_snakemake_would_ignore_or_make_of_no_flight_is_refused(typed, tiny
     assert not (tiny / "results").exists()
 
 
+@pytest.mark.slow
 def test_a_last_step_that_another_one_needs_is_no_error(typed, tiny):
     alone = typed("run", tiny, "--until", "image", "-n")
     assert alone[0] == 0

@@ -80,6 +80,7 @@ def test_a_product_made_of_other_samples_is_not_the_same(root, capsys):
     assert told[-1].endswith("is results/f01/uav1/track.manifest.json")
 
 
+@pytest.mark.slow
 def test_only_what_the_product_needs_is_asked_for(root, again, capsys):
     assert print_reproduced(root / PAIR / "db.tif", cores=3) == 0
     ((folder, cores, targets),) = again
