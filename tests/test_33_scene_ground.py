@@ -12,7 +12,7 @@ from apertura.core.geometry.aperture import Aperture
 from apertura.core.quality.point_targets import find_peak
 from apertura.core.scene.clearance import check_antennas, clearance
 from apertura.core.scene.grid import SceneGrid
-from apertura.core.scene.swath import swath
+from apertura.core.scene.swath import balls, swath
 from apertura.core.scene.terrain import FlatGround, GridHeights, Plane
 
 FREQUENCY = 1.2e9 + 4e6 * np.arange(100)
@@ -91,6 +91,18 @@ def test_the_swath_holds_the_path_of_every_pixel_on_terrain():
     assert (near <= path.min(axis=(1, 2))).all()
     assert (far >= path.max(axis=(1, 2))).all()
     assert (far - near).max() < np.ptp(path) + 4 * np.ptp(heights)
+
+
+def test_windows_read_together_are_bounded_as_each_by_itself():
+    """Strips of 1200 × 1800 pixels are read in two, windows that are not neighbours each by itself."""
+    grid = SceneGrid("local", 0.0, 120.0, 0.1, (1200, 1800))
+    terrain = GridHeights(grid, np.random.default_rng(5).standard_normal(grid.shape))
+    tiles = list(grid.tiles(600))
+    windows = [*tiles, tiles[4], tiles[2], tiles[0]]
+    middle_m, radius_m = balls(grid, terrain, windows)
+    alone = [balls(grid, terrain, [window]) for window in windows]
+    assert np.array_equal(middle_m, np.concatenate([middle for middle, _ in alone]))
+    assert np.array_equal(radius_m, np.concatenate([radius for _, radius in alone]))
 
 
 def test_clearance_is_height_above_the_pixel_below_on_earth_too():

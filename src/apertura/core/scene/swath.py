@@ -1,11 +1,12 @@
 """Total paths from each pulse to the scene, bounded by blocks of pixels."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.common.contracts import Window
 from apertura.core.antenna.beam import Beams
 from apertura.core.antenna.illumination import illumination_mask
 from apertura.core.geometry.aperture import Aperture
@@ -14,6 +15,7 @@ from apertura.core.scene.terrain import Terrain
 
 _BLOCKS = 33
 _PULSES_AT_ONCE = 256
+_PIXELS_AT_ONCE = 2**20  # heights read together, for a DEM is slow to open and to read in part
 _MOST_PULSES = 4096  # whose paths are computed; others are bounded
 
 
@@ -86,11 +88,35 @@ def _spans(
 
 
 def balls(
-    grid: SceneGrid, terrain: Terrain, windows: Sequence[tuple[slice, slice]]
+    grid: SceneGrid, terrain: Terrain, windows: Sequence[Window]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return middles (window, 3) and radii (window,), metres, of balls that contain the pixels of windows."""
     centre = np.array([[(part.start + part.stop - 1) / 2 for part in window] for window in windows])
     half_m = np.array([[(part.stop - part.start - 1) / 2 * grid.spacing_m for part in window] for window in windows])
-    low, high = np.array([[(height := terrain.heights(grid[window])).min(), height.max()] for window in windows]).T
+    low, high = np.array([ends for strip in _strips(windows) for ends in _height_ranges(grid, terrain, strip)]).T
     middle_m = grid.positions_at(centre[:, 0], centre[:, 1], (low + high) / 2)
     return middle_m, np.sqrt((half_m**2).sum(axis=1) + ((high - low) / 2) ** 2)
+
+
+def _strips(windows: Sequence[Window]) -> Iterator[list[Window]]:
+    """Yield the windows in runs of the same rows, one right of the other, of few pixels together."""
+    strip: list[Window] = []
+    for rows, columns in windows:
+        if strip:
+            (beside, before), width = strip[-1], columns.stop - strip[0][1].start
+            apart = rows != beside or columns.start != before.stop
+            if apart or width * (rows.stop - rows.start) > _PIXELS_AT_ONCE:
+                yield strip
+                strip = []
+        strip.append((rows, columns))
+    if strip:
+        yield strip
+
+
+def _height_ranges(grid: SceneGrid, terrain: Terrain, strip: list[Window]) -> Iterator[tuple[float, float]]:
+    """Yield the lowest and highest height in each window of a strip."""
+    rows, (left, right) = strip[0][0], (strip[0][1].start, strip[-1][1].stop)
+    heights = terrain.heights(grid[rows, slice(left, right)])
+    for _, columns in strip:
+        part = heights[:, columns.start - left : columns.stop - left]
+        yield float(part.min()), float(part.max())
