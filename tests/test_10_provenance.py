@@ -1,16 +1,18 @@
 """The code hash follows imports: it changes with what a stage can run and with nothing else."""
 
 import ast
+import hashlib
 import json
 import shutil
 import subprocess
 import sys
 from types import EllipsisType, SimpleNamespace
 
+import numpy as np
 import pytest
 
 from apertura.common.code_imports import PACKAGE, import_closure, without_description
-from apertura.common.provenance import Provenance, code_sha256, merged
+from apertura.common.provenance import Provenance, code_sha256, hashes_of_file, merged
 from apertura.core.backprojection.engines import ENGINES
 from apertura.formats.export import export_modules
 
@@ -152,3 +154,12 @@ def test_settings_of_one_line_join_and_those_of_several_lines_stay_apart():
 def test_the_code_of_a_parent_changes_the_code_of_its_child():
     hashes = {Provenance.of(["apertura.common.errors"], [stage(code)]).code_sha256 for code in ("1", "2")}
     assert len(hashes) == 2
+
+
+@pytest.mark.parametrize("size", [0, 1, 4 << 20, (4 << 20) + 1, 8 << 20, (13 << 20) + 7])
+def test_both_hashes_of_a_file_are_those_of_its_bytes(tmp_path, size):
+    """Of none, of part of a block and of several: a block is read over only when both hashes have taken it."""
+    content = np.random.default_rng(size).bytes(size)
+    (tmp_path / "samples").write_bytes(content)
+    expected = {name: hashlib.new(name, content).hexdigest() for name in ("sha256", "sha512")}
+    assert hashes_of_file(tmp_path / "samples", ["sha256", "sha512"]) == expected

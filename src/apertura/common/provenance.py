@@ -5,9 +5,11 @@ import json
 import platform
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field
 from functools import cache
 from importlib.metadata import PackageNotFoundError, requires, version
+from itertools import cycle
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -77,7 +79,7 @@ def lock_sha256() -> str:
 
 # ---- Settings, inputs and code of a result and of the stages before it ----------------------------------------------
 
-_READ_BYTES = 1 << 20
+_READ_BYTES = 1 << 22
 
 
 class StampedStage(Protocol):
@@ -202,12 +204,13 @@ def sha256_file(path: Path) -> str:
 
 
 def hashes_of_file(path: Path, algorithms: Sequence[str]) -> dict[str, str]:
-    """Return algorithm → hash of a file's bytes, hex; it is read once."""
+    """Return algorithm → hash of a file's bytes, hex; read once, each hash taken by a thread of its own."""
     digests = {name: hashlib.new(name) for name in algorithms}
-    with path.open("rb") as stream:
-        while block := stream.read(_READ_BYTES):
-            for digest in digests.values():
-                digest.update(block)
+    blocks, updates = cycle([memoryview(bytearray(_READ_BYTES)) for _ in range(2)]), list[Future[None]]()
+    with path.open("rb", buffering=0) as stream, ThreadPoolExecutor(len(digests)) as pool:
+        while size := stream.readinto(block := next(blocks)):  # while the block before is hashed
+            wait(updates)
+            updates = [pool.submit(digest.update, block[:size]) for digest in digests.values()]
     return {name: digest.hexdigest() for name, digest in digests.items()}
 
 
