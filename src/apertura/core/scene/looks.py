@@ -88,7 +88,10 @@ class Lattice:
         values, left, right = values[:, left[0] : right[-1] + 1], left - left[0], right - left[0]
         # First between rows of nodes, of few columns, so that one pass over all pixels is left.
         rows = values[low] + up * (values[high] - values[low])
-        smooth = np.asarray(rows[:, left] + across * (rows[:, right] - rows[:, left]), np.float64)
+        smooth = rows.take(left, axis=1)
+        more = (rows.take(np.arange(1, rows.shape[1] + 1), axis=1, mode="clip") - rows).take(left, axis=1)
+        more *= across
+        smooth += more
         if farthest is None:
             return smooth
         # Corners are compared once a cell.
@@ -105,9 +108,18 @@ class Lattice:
 
     def inside_positive(self, values: NDArray[Any], window: Window) -> NDArray[np.bool_]:
         """Return which pixels of a window, (row, column), lie among corners that are all positive."""
+        if (values[self.around(window)] > 0).all():
+            return np.ones([part.stop - part.start for part in window], bool)
         (low, high, _), (left, right, _) = (_cells(at, part) for at, part in zip(self.nodes, window, strict=True))
         corners = [values[np.ix_(row, column)] > 0 for row in (low, high) for column in (left, right)]
         return np.asarray(np.logical_and.reduce(corners))
+
+    def around(self, window: Window) -> Window:
+        """Return the window of those nodes that the pixels of a window lie between."""
+        rows, columns = (
+            slice(int(before[0]), int(after[-1]) + 1) for before, after, _ in map(_cells, self.nodes, window)
+        )
+        return rows, columns
 
     def nearest(self, window: Window) -> list[tuple[tuple[int, int], Window]]:
         """Return the nodes nearest to the pixels of a window, each with the part of the window that is its."""
@@ -296,6 +308,8 @@ class Looks:
 
     def _fill_mask(self, mask: NDArray[np.bool_], tile: Window) -> None:
         """Set the pixels of a tile that a pulse illuminates, cell by cell, from every pulse that may reach them."""
+        if mask.all():
+            return
         part = self.grid[tile]
         cells = [cell for cell in part.tiles(_CELL_PX) if not mask[cell].all()]
         if not cells or self.beams is None:
@@ -316,21 +330,24 @@ class Looks:
             some = slice(first, first + _PIXELS)
             mask[rows[some], columns[some]] = _any(self.beams, self.aperture, points[some], mine)
 
-    @cached_property
-    def _has_pulses(self) -> NDArray[np.float32]:
-        return (self.total > 0).astype(np.float32)
-
     def _sums(self, tile: Window) -> list[Floats]:
         """Return Σ|w| and Σw² at the pixels of a tile, between those nodes that have pulses; 0 where none has."""
-        share = self.lattice.between(self._has_pulses, tile)
-        share[share == 0] = np.inf
-        return [self.lattice.between(values, tile) / share for values in (self.total, self.squares)]
+        sums = [self.lattice.between(values, tile) for values in (self.total, self.squares)]
+        lit = self.total[self.lattice.around(tile)] > 0
+        if not lit.all():
+            share = self.lattice.between((self.total > 0).astype(np.float32), tile)
+            share[share == 0] = np.inf
+            sums = [values / share for values in sums]
+        return sums
 
     def effective(self, tile: Window) -> NDArray[np.float32]:
         """Return the looks of the pixels of a tile, (row, column) float32; 0 where no pulse illuminates them."""
         total, squares = self._sums(tile)
-        looks = np.maximum(1.0, total**2 / np.where(squares > 0, squares, np.inf))
-        return np.where(self.illuminated(tile), looks, 0).astype(np.float32)
+        total *= total
+        total /= np.where(squares > 0, squares, np.inf)
+        looks = np.maximum(1.0, total, out=total).astype(np.float32)
+        lit = self.illuminated(tile)
+        return looks if lit.all() else np.where(lit, looks, np.float32(0))
 
     def weight_squares(self, window: Window) -> Floats:
         """Return Σw² at the pixels of a window, (row, column) float64; 0 where no node about them has pulses."""
@@ -379,9 +396,7 @@ class Looks:
         """Return whether angles are those between nodes: level ground, nodes that its range is many of, no jump."""
         if not isinstance(self.terrain, FlatGround) or self.lattice.pitch_px == PITCHES_PX[-1]:
             return False
-        near = tuple(
-            slice(int(before[0]), int(after[-1]) + 1) for before, after, _ in map(_cells, self.lattice.nodes, tile)
-        )
+        near = self.lattice.around(tile)
         steps = (np.linalg.norm(np.diff(self.centres[near], axis=axis), axis=-1) for axis in (0, 1))
         return all((step <= self._jump_m).all() for step in steps)
 

@@ -238,7 +238,8 @@ def layer_rasters(
 
 
 def _inside(looks: Looks, window: Window, values: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.where(looks.illuminated(window), values, np.nan)
+    lit = looks.illuminated(window)
+    return values if lit.all() else np.where(lit, values, np.nan)
 
 
 def _mask(scene: OpenScene, looks: Looks) -> Callable[[Window], NDArray[np.uint8]]:
