@@ -10,7 +10,7 @@ from apertura.core.geometry.aperture import Aperture, Weigh
 TAPER = 0.1
 """Of the half width: the weight falls from 1 to 0 between 1 - TAPER and 1 + TAPER (docs/theory/integration.md)."""
 
-_SAMPLES = 4096  # of the window, and 64 times as many of its response
+_SAMPLES = 256  # of the window: its response is known to 1e-7
 _TRIED = 256  # pulses among which those are looked for that end what was flown
 _END = 0.01  # of the half width: how well these know it
 

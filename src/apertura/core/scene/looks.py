@@ -14,6 +14,7 @@ from apertura.common.contracts import Window
 from apertura.core.antenna.beam import Beams
 from apertura.core.antenna.illumination import illumination_mask
 from apertura.core.geometry.aperture import Aperture
+from apertura.core.scene.angles import bistatic_angle_deg, incidence_deg, surface
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.swath import balls
 from apertura.core.scene.terrain import FlatGround, Terrain
@@ -369,23 +370,17 @@ class Looks:
         """
         if self._smooth(tile):
             return self.lattice.between(self._angles_deg[0], tile)
-        from apertura.core.scene.visibility import incidence_deg, surface  # slow to import: it brings a compiler
-
         return incidence_deg(*surface(self.grid, self.terrain, tile), self.centre(tile)[0])
 
     def bistatic_angle_deg(self, tile: Window) -> Floats:
         """Return the angle between both antennas at closest approach, (row, column) degrees; as `incidence_deg`."""
         if self._smooth(tile):
             return self.lattice.between(self._angles_deg[1], tile)
-        from apertura.core.scene.visibility import bistatic_angle_deg
-
         return bistatic_angle_deg(self.terrain.positions(self.grid[tile]), *self.centre(tile))
 
     @cached_property
     def _angles_deg(self) -> tuple[Floats, Floats]:
         """(node row, node column), over level ground."""
-        from apertura.core.scene.visibility import bistatic_angle_deg, incidence_deg
-
         row, column = np.meshgrid(*self.lattice.nodes, indexing="ij")
         height_m = self.terrain.heights_at(self.grid, row, column)
         place_m, above_m = (self.grid.positions_at(row, column, height_m + more) for more in (0.0, 1.0))

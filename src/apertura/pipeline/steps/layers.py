@@ -22,9 +22,9 @@ from apertura.core.imaging.noise import PulseNoise, noise_places, noise_power
 from apertura.core.imaging.radiometry import Quantity
 from apertura.core.imaging.range_profiles import profiles_of
 from apertura.core.imaging.speckle import Multilook
+from apertura.core.scene.angles import surface
 from apertura.core.scene.looks import BLOCK_PX, Looks
 from apertura.core.scene.terrain import FlatGround
-from apertura.core.scene.visibility import Relief, surface, visibility
 from apertura.formats.export import product, remove_outdated, write_exports
 from apertura.formats.export.layers import OUTSIDE
 from apertura.formats.export.radiometry import CROSS_SECTIONS, ECHO, of_coefficient
@@ -244,13 +244,19 @@ def _inside(looks: Looks, window: Window, values: NDArray[np.float64]) -> NDArra
 
 def _mask(scene: OpenScene, looks: Looks) -> Callable[[Window], NDArray[np.uint8]]:
     """Return the mask of a window, each pixel by the pulses that form the nearest node of the lattice."""
-    level = isinstance(scene.terrain, FlatGround)
-    relief = None if level else Relief.of(scene.grid, scene.terrain, scene.level.height_m)
+
+    def outside(window: Window) -> NDArray[np.uint8]:
+        return np.where(looks.illuminated(window), 0, OUTSIDE).astype(np.uint8)
+
+    if isinstance(scene.terrain, FlatGround):
+        return outside
+    from apertura.core.scene.visibility import Relief, visibility  # slow to import: it brings a compiler
+
+    relief = Relief.of(scene.grid, scene.terrain, scene.level.height_m)
 
     def mask(window: Window) -> NDArray[np.uint8]:
-        illuminated = looks.illuminated(window)
-        marked = np.where(illuminated, 0, OUTSIDE).astype(np.uint8)
-        if relief is None or not illuminated.any():
+        illuminated, marked = looks.illuminated(window), outside(window)
+        if not illuminated.any():
             return marked
         for node, part in looks.lattice.nearest(window):
             here = tuple(slice(at.start - by.start, at.stop - by.start) for at, by in zip(part, window, strict=True))
