@@ -215,18 +215,20 @@ def layer_rasters(
         Tiles computed at once.
     """
     grid, terrain = scene.grid, scene.terrain
-    level = isinstance(terrain, FlatGround)
+    level, noise_db = isinstance(terrain, FlatGround), np.float32(10 * np.log10(noise or np.nan))
 
-    def angle(of: Callable[[Window], Floats], window: Window) -> Floats:
+    def angle(of: Callable[[Window], NDArray[Any]], window: Window) -> NDArray[Any]:
         return _inside(looks, window, of(window))
 
-    def nesz(window: Window) -> NDArray[np.float64]:
+    def nesz(window: Window) -> NDArray[Any]:
         if calibrated is not None:
             calibration, normal = calibrated.calibration, None if level else surface(grid, terrain, window)[1]
             power = (noise or np.nan) * calibration.pixel_noise(window) / calibration.power(window, "sigma0", normal)
             return _inside(looks, window, 10 * np.log10(power))
-        effective = looks.effective(window).astype(np.float64)
-        return 10 * np.log10((noise or np.nan) / np.where(effective > 0, effective, np.nan))
+        effective = looks.effective(window)
+        with np.errstate(divide="ignore"):
+            power_db = noise_db - 10 * np.log10(effective)
+        return np.where(effective > 0, power_db, np.float32(np.nan))
 
     return {
         "incidence": LazyLayer(grid, np.float32, partial(angle, looks.incidence_deg), threads),
@@ -237,9 +239,9 @@ def layer_rasters(
     }
 
 
-def _inside(looks: Looks, window: Window, values: NDArray[np.float64]) -> NDArray[np.float64]:
+def _inside(looks: Looks, window: Window, values: NDArray[Any]) -> NDArray[Any]:
     lit = looks.illuminated(window)
-    return values if lit.all() else np.where(lit, values, np.nan)
+    return values if lit.all() else np.where(lit, values, values.dtype.type(np.nan))
 
 
 def _mask(scene: OpenScene, looks: Looks) -> Callable[[Window], NDArray[np.uint8]]:
