@@ -20,7 +20,7 @@ from rich.table import Table
 
 from apertura.core.geometry.geodesy import frame_from_map, geodetic_from_ecef
 from apertura.core.quality.point_targets import cut_through, find_peak
-from apertura.core.scene.visibility import surface
+from apertura.core.scene.angles import surface
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config.flight_plan import FlightPlan
 from apertura.pipeline.design import designed

@@ -7,10 +7,10 @@ from scenes import monostatic, straight_track
 from apertura.core.antenna.beam import Beam, Beams, gaussian_cut
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.sector import Sector
+from apertura.core.scene.angles import bistatic_angle_deg, incidence_deg
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.looks import BLOCK_PX, Looks
 from apertura.core.scene.terrain import FlatGround
-from apertura.core.scene.visibility import bistatic_angle_deg, incidence_deg
 
 GROUND = FlatGround(0.0)
 GRID = SceneGrid("local", -60.0, 70.0, 0.25, (200, 480))

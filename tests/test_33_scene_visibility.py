@@ -4,17 +4,10 @@ import numpy as np
 import pytest
 from scenes import UTM_GRID
 
+from apertura.core.scene.angles import bistatic_angle_deg, incidence_deg, surface_normals
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import GridHeights
-from apertura.core.scene.visibility import (
-    LAYOVER,
-    SHADOW,
-    Relief,
-    bistatic_angle_deg,
-    incidence_deg,
-    surface_normals,
-    visibility,
-)
+from apertura.core.scene.visibility import LAYOVER, SHADOW, Relief, visibility
 from apertura.formats.export import layers as exported
 
 STREET = SceneGrid("local", 0.0, 3.0, 0.25, (12, 240))

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rasterio
+import rasterio.shutil
 import zarr
 from rasterio import Affine
 
@@ -18,9 +19,10 @@ from apertura.common.errors import CampaignError, ContractError
 from apertura.common.flag_table import FLAGS
 from apertura.core.geometry.geodesy import local_crs
 from apertura.formats.export import exports_in
-from apertura.formats.export.cog import write_power, write_slc
+from apertura.formats.export.cog import MAGNITUDE, POWER, SLC, write_cog, write_power, write_slc
 from apertura.formats.export.db import write_db
-from apertura.formats.export.layers import LAYOVER, OUTSIDE, SHADOW, write_mask
+from apertura.formats.export.interferogram import PHASE
+from apertura.formats.export.layers import LAYOVER, LOOKS, MASK, OUTSIDE, SHADOW, write_mask
 from apertura.formats.export.map_layout import DPI, LEFT, TOP, MapLayout
 from apertura.formats.export.quicklook import below_peak, shrink, write_quicklook
 from apertura.formats.export.writing import READ
@@ -101,6 +103,43 @@ def test_every_raster_is_a_cog_in_the_strict_sense(tmp_path, name, shape):
     with rasterio.open(tmp_path / name) as raster:
         assert raster.block_shapes == [(512, 512)]
         assert raster.overviews(1) == [factor for factor in (2, 4) if max(shape) > 256 * factor]
+
+
+@pytest.mark.parametrize("band", [POWER, SLC, MASK, LOOKS, PHASE], ids=lambda band: f"{band.overviews}-{band.nodata}")
+def test_overviews_are_those_that_gdal_builds(tmp_path, band):
+    """Beyond the blocks that pass through memory, too, and beside places that hold nothing."""
+    rng, shape = np.random.default_rng(5), (READ + 256, 1040)
+    image = {"complex64": speckle(*shape), "uint8": rng.integers(0, 4, shape, np.uint8)}.get(band.dtype)
+    image = np.abs(speckle(*shape)) if image is None else image
+    image[rng.random(shape) < 0.4] = band.nodata
+    image[:70, 30:200] = band.nodata
+    write_cog(tmp_path / "own.tif", image, band, **UTM, tags={})
+    plain = {"driver": "GTiff", "count": 1, "dtype": band.dtype, "nodata": band.nodata, "tiled": True}
+    with rasterio.open(tmp_path / "plain.tif", "w", height=shape[0], width=shape[1], **UTM, **plain) as raster:
+        raster.write(image, 1)
+    as_cog = {"driver": "COG", "blocksize": 512, "overview_resampling": band.overviews}
+    rasterio.shutil.copy(tmp_path / "plain.tif", tmp_path / "gdal.tif", **as_cog)
+    with rasterio.open(tmp_path / "own.tif") as raster:
+        assert np.array_equal(raster.read(1), image, equal_nan=band.dtype != "uint8")
+    own, gdal = overviews(tmp_path / "own.tif"), overviews(tmp_path / "gdal.tif")
+    assert [level.shape for level in own] == [level.shape for level in gdal] == [(1152, 520), (576, 260), (288, 130)]
+    for mine, theirs in zip(own, gdal, strict=True):
+        told = ~np.isnan(theirs) if band is SLC else np.ones(theirs.shape, bool)  # GDAL lets a complex NaN spread
+        assert told.mean() > 0.1 or theirs.shape != own[0].shape
+        apart = 1e-3 if band is SLC else 1e-6  # what cancels has few digits of its phase left
+        assert np.allclose(np.abs(mine[told]), np.abs(theirs[told]), rtol=1e-6, equal_nan=band.dtype != "uint8")
+        assert np.allclose(mine[told], theirs[told], rtol=0, atol=apart, equal_nan=band.dtype != "uint8")
+
+
+def test_an_odd_edge_counts_the_pixels_that_are_there(tmp_path):
+    image = np.full((601, 1027), 3, np.float32)
+    image[:, -1] = 7
+    write_cog(tmp_path / "x.tif", image, MAGNITUDE, **UTM, tags={})
+    half, quarter = overviews(tmp_path / "x.tif")
+    assert (half.shape, quarter.shape) == ((301, 514), (151, 257))
+    assert (half[:, -1] == 7).all()
+    assert (half[:, :-1] == 3).all()
+    assert (quarter[:, -1] == 5).all()
 
 
 def test_slc_overviews_keep_a_target_that_a_plain_average_loses(tmp_path):

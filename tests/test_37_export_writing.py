@@ -7,7 +7,7 @@ import pytest
 import rasterio
 from rasterio import Affine
 
-from apertura.formats.export import cog, db, writing
+from apertura.formats.export import cog, writing
 from apertura.formats.export.cog import power, write_power, write_slc
 from apertura.formats.export.db import write_db
 from apertura.formats.export.writing import added, check_written
@@ -22,7 +22,7 @@ def image():
 @pytest.fixture
 def on_disk(monkeypatch):
     """Nothing is small enough for memory."""
-    for module in (cog, db, writing):
+    for module in (cog, writing):
         monkeypatch.setattr(module, "IN_MEMORY_BYTES", 0)
 
 

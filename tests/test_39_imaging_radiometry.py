@@ -15,9 +15,9 @@ from apertura.core.echo.compression import window_weights
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.sector import Sector
 from apertura.core.imaging.radiometry import Calibration, Link, cell_constant, pointing_std_db
+from apertura.core.scene.angles import surface
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import FlatGround, Plane
-from apertura.core.scene.visibility import surface
 from apertura.simulation.echoes import transfer
 from apertura.simulation.scene import Scatterers
 

@@ -4,8 +4,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from apertura.common.arrays import Floats
 
@@ -76,7 +76,7 @@ def baseline_residual(delay_m: Floats, baseline_m: Floats) -> BaselineResidual |
 
 def _smoothed(pulse: NDArray[np.intp], residual: Floats, jitter_m: float, width: int) -> BaselineResidual:
     inside = slice(width // 2, -(width // 2))  # full windows
-    smooth, middle = ndimage.median_filter(residual, width)[inside], pulse[inside]
+    smooth, middle = scipy.ndimage.median_filter(residual, width)[inside], pulse[inside]
     smooth = smooth - np.polyval(np.polyfit(middle, smooth, 1), middle)
     noise_m = 1.2533 * jitter_m / np.sqrt(width)  # standard deviation of a median of so many Gaussian samples
     steps = np.diff(smooth[::width])

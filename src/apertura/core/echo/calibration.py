@@ -6,8 +6,8 @@ from itertools import pairwise
 from typing import Protocol
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import fft
 from scipy.special import gammainccinv, gammaincinv
 
 from apertura.common.arrays import Complexes, Floats
@@ -168,11 +168,11 @@ def _mean(transfer: Pulses, frequency_hz: Floats, path_m: Floats, first: int, la
 
 def _offset_profile(groups: NDArray[np.complex128], frequency_hz: Floats, search_m: float) -> tuple[Floats, Floats]:
     """Return offsets within the search and the mean power of the groups there."""
-    length = fft.next_fast_len(_OVERSAMPLING * frequency_hz.size)
+    length = scipy.fft.next_fast_len(_OVERSAMPLING * frequency_hz.size)
     spacing_hz = float(frequency_hz[-1] - frequency_hz[0]) / (frequency_hz.size - 1)
     step_m = SPEED_OF_LIGHT_M_S / (spacing_hz * length)
     reach = min(int(search_m / step_m), length // 2 - 1)
-    power = (np.abs(fft.ifft(groups, length, axis=1)) ** 2).mean(0)
+    power = (np.abs(scipy.fft.ifft(groups, length, axis=1)) ** 2).mean(0)
     cells = np.arange(-reach, reach + 1)
     return cells * step_m, np.asarray(power[cells])
 

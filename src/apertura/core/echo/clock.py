@@ -10,8 +10,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import fft
 
 from apertura.common.arrays import Complexes, Floats
 from apertura.core.echo.captures import AT_ONCE, spread
@@ -205,7 +205,7 @@ def _repetition(groups: Iterable[Complexes], numerology: Numerology) -> tuple[Fl
     size = crosses[0].size
     lowest_hz = numerology.middle_hz - numerology.sample_rate_hz / 2
     frequency_hz = (
-        fft.fftfreq(size, 1 / numerology.sample_rate_hz) - lowest_hz
+        scipy.fft.fftfreq(size, 1 / numerology.sample_rate_hz) - lowest_hz
     ) % numerology.sample_rate_hz + lowest_hz
     occupied = np.abs(frequency_hz - numerology.middle_hz) <= numerology.numbers.size * numerology.spacing_hz / 2
     return frequency_hz[occupied], np.array(crosses)[:, occupied]
@@ -218,12 +218,12 @@ def _cross_spectrum(sidelink: Complexes, numerology: Numerology) -> NDArray[np.c
     if length < _SMALLEST_REPEAT:
         raise ValueError(f"captures of {count} samples repeat only {length} of them; {_SMALLEST_REPEAT} are needed")
     taper = _taper(length)
-    size = fft.next_fast_len(length)
+    size = scipy.fft.next_fast_len(length)
     cross = np.zeros(size, np.complex128)
     for first in range(0, len(sidelink), AT_ONCE):
         block = sidelink[first : first + AT_ONCE].astype(np.complex128)
-        early = fft.fft(block[:, start : start + length] * taper, size, axis=1)
-        late = fft.fft(block[:, start + period : start + period + length] * taper, size, axis=1)
+        early = scipy.fft.fft(block[:, start : start + length] * taper, size, axis=1)
+        late = scipy.fft.fft(block[:, start + period : start + period + length] * taper, size, axis=1)
         cross += (late * early.conj()).sum(0)
     return cross
 

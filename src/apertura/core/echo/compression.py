@@ -3,8 +3,8 @@
 from collections.abc import Callable, Mapping
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import fft
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
@@ -119,7 +119,7 @@ def range_step(
             expected="two or more that ascend in equal steps",
             remedy="Sort subcarriers by frequency; leave none out: a missing one is 0.",
         )
-    length = fft.next_fast_len(int(np.ceil(oversampling * len(frequency_hz))))
+    length = scipy.fft.next_fast_len(int(np.ceil(oversampling * len(frequency_hz))))
     return wave_speed_m_s / (spacing * length), length
 
 
@@ -202,7 +202,7 @@ def compress(
         spectrum = np.zeros((len(here), length // factor), np.complex64)
         for tap in range(filters.shape[1]):
             spectrum[:, tap : tap + blocks] += sums[:, :, tap]
-        swath = fft.ifft(spectrum, axis=1, norm="forward", overwrite_x=True)
+        swath = scipy.fft.ifft(spectrum, axis=1, norm="forward", overwrite_x=True)
         profiles[part] = swath[:, after % (length // factor)] * response
     return profiles
 

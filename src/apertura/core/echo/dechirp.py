@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import fft
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 
@@ -153,8 +153,8 @@ def transfer_of(
     kept, slope = sweep.samples, sweep.slope_hz_s
     low, high = sweep.beats_hz
     farthest = min(round((high - min(low, 0.0)) / abs(slope) * sweep.sample_rate_hz) + 1, kept)
-    length = fft.next_fast_len(kept + farthest)  # room for shifts, so that none wraps around
-    bins = -np.sign(slope) * fft.fftfreq(length, 1 / sweep.sample_rate_hz)
+    length = scipy.fft.next_fast_len(kept + farthest)  # room for shifts, so that none wraps around
+    bins = -np.sign(slope) * scipy.fft.fftfreq(length, 1 / sweep.sample_rate_hz)
     shift = (bins - low) % sweep.sample_rate_hz + low  # γΔ of each bin; f_b = -γΔ, eq. 1
     turn = np.exp(-1j * np.pi * shift**2 / slope) if deskewed else np.ones(length, np.complex128)
     if sweep.iq == "real":
@@ -164,10 +164,10 @@ def transfer_of(
     for begin in range(0, len(beat), _SWEEPS_AT_ONCE):
         part = slice(begin, begin + _SWEEPS_AT_ONCE)
         some = np.asarray(beat[part, sweep.first : sweep.sweep_samples])
-        spectrum = fft.fft(some.conj() if sweep.iq == "conjugate" else some, length, axis=1) * turn
+        spectrum = scipy.fft.fft(some.conj() if sweep.iq == "conjugate" else some, length, axis=1) * turn
         if late_s is not None:
             spectrum = spectrum * np.exp(-2j * np.pi * late_s[part, None] * beat_hz)
-        transfer[part] = fft.ifft(spectrum, axis=1)[:, :kept]
+        transfer[part] = scipy.fft.ifft(spectrum, axis=1)[:, :kept]
     return transfer if slope > 0 else np.ascontiguousarray(transfer[:, ::-1])
 
 

@@ -7,8 +7,8 @@ c_n·exp(-j2π(f_c+nΔf)τ), as long as τ stays inside the cyclic prefix (docs/
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import fft
 
 from apertura.core.echo.compression import phasors, unit_phasor
 
@@ -113,7 +113,7 @@ def demodulate(captures: NDArray[np.complex64], numerology: Numerology) -> NDArr
     count, lowest = numerology.numbers.size, int(numerology.numbers[0]) % numerology.dft_samples
     below = min(count, numerology.dft_samples - lowest)  # of those from `lowest` on; the others lie at the beginning
     for first in range(0, pulses, _PULSES_AT_ONCE):
-        spectrum = fft.fft(captures[first : first + _PULSES_AT_ONCE, start:stop], axis=1, norm="forward")
+        spectrum = scipy.fft.fft(captures[first : first + _PULSES_AT_ONCE, start:stop], axis=1, norm="forward")
         rows = slice(first, first + len(spectrum))
         symbols[rows, :below] = spectrum[:, lowest : lowest + below]
         symbols[rows, below:] = spectrum[:, : count - below]

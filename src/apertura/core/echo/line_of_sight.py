@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import fft
 
 from apertura.common.arrays import Complexes, Floats
 from apertura.core.echo.compression import phasors, unit_phasor
@@ -95,12 +95,12 @@ def fit_block(sidelink: Complexes) -> tuple[LineOfSight, Complexes]:
     over groups of neighbouring subcarriers, within which a quarter of a cell turns the phase by less than 0.05 rad.
     """
     subcarriers = sidelink.shape[1]
-    coarse = np.abs(fft.ifft(sidelink, 2 * subcarriers, axis=1)).argmax(axis=1) / 2
+    coarse = np.abs(scipy.fft.ifft(sidelink, 2 * subcarriers, axis=1)).argmax(axis=1) / 2
     delay = np.where(coarse >= subcarriers / 2, coarse - subcarriers, coarse)
     edges = np.unique(np.linspace(0, subcarriers, _GROUPS + 1).astype(int))
     sums = np.add.reduceat(_aligned(sidelink, delay), edges[:-1], axis=1).astype(np.complex128)
     delay = delay + _residual_cells(sums, (edges[:-1] + edges[1:] - subcarriers) / 2, subcarriers)
-    profile = fft.ifft(_aligned(sidelink, delay), axis=1)
+    profile = scipy.fft.ifft(_aligned(sidelink, delay), axis=1)
     direct = profile[:, 0].astype(np.complex128)
     some = profile[:, :: max(1, subcarriers // _NOISE_CELLS)]
     power = np.square(some.real) + np.square(some.imag)

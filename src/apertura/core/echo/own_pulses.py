@@ -4,9 +4,8 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import fft
-from scipy.special import gammainccinv
 
 # ---- Code of a node's own pulses
 
@@ -71,7 +70,7 @@ def own_code(transfer: NDArray[np.complex64], *, prefix_cells: int) -> CodeEvide
     outside = slice(prefix_cells + _GUARD_CELLS, cells - _GUARD_CELLS)
     if not prefix_cells or outside.stop - outside.start < _FEWEST_CELLS:
         return CodeEvidence(None, f"{prefix_cells} of {cells} delay cells may hold echoes: nothing to compare with")
-    profile = fft.ifft(transfer, 2 * cells, axis=1)  # half cells, so that no echo falls between two
+    profile = scipy.fft.ifft(transfer, 2 * cells, axis=1)  # half cells, so that no echo falls between two
     scattered, beyond = -np.inf, slice(2 * outside.start, -2 * _GUARD_CELLS, 2)
     for run in [run for run in _COHERENT_PULSES if run <= pulses] or [pulses]:
         level, needed, scatter = _strongest(profile, run, 2 * prefix_cells, beyond)
@@ -97,7 +96,7 @@ def _strongest(profile: NDArray[np.complex64], run: int, inside: int, beyond: sl
     blocks = len(profile) // run
     power = np.zeros((2 * run, profile.shape[1]), np.float32)
     for first in range(0, blocks * run, run):
-        power += np.abs(fft.fft(profile[first : first + run], 2 * run, axis=0)) ** 2
+        power += np.abs(scipy.fft.fft(profile[first : first + run], 2 * run, axis=0)) ** 2
     floor = power[:, beyond].astype(np.float64)
     mean = np.maximum(floor.mean(1), 1e-30)
     scatter = floor.std(1) / mean
@@ -105,7 +104,7 @@ def _strongest(profile: NDArray[np.complex64], run: int, inside: int, beyond: sl
     sigmas = (blocks * scatter**2 - 1) / np.sqrt((2 + 6 / blocks) / floor.shape[1])
     # a wrong code's floor repeats in all pulses, unlike noise: exponential from cell to cell, however many are added
     noise = sigmas.max() < _NOISE_SIGMAS
-    needed = gammainccinv(blocks, chance) / blocks if noise else 1 - scatter * (1 + np.log(chance))
+    needed = scipy.special.gammainccinv(blocks, chance) / blocks if noise else 1 - scatter * (1 + np.log(chance))
     level = power[:, :inside].max(1) / mean
     best = int((level / needed).argmax())
     return float(level[best]), float(np.broadcast_to(needed, level.shape)[best]), float(sigmas.max())
@@ -196,7 +195,7 @@ def phase_stability(
     triples = even[1:] & even[:-1]
     if triples.sum() < _FEWEST_TRIPLES or not 0 < prefix_cells < transfer.shape[1]:
         return None
-    profile = fft.ifft(transfer, axis=1)
+    profile = scipy.fft.ifft(transfer, axis=1)
     power = (np.abs(profile) ** 2).mean(0)
     # the median of an exponential variable's mean over many pulses is its mean
     strong = np.flatnonzero(power[:prefix_cells] > 10 ** (ECHO_DB / 10) * np.median(power[prefix_cells:]))

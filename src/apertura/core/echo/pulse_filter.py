@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import fft, ndimage
 
 from apertura.common.arrays import Floats
 
@@ -72,8 +72,8 @@ def pulse_spectrum(pulse: NDArray[np.complexfloating], *, lead: float, length: i
     >>> pulse_spectrum(np.array([4.0 + 0j]), lead=1, length=4).round(6) + 0
     array([ 1.+0.j,  0.-1.j, -1.+0.j,  0.+1.j])
     """
-    number = fft.fftfreq(length, 1 / length)
-    return np.asarray(fft.fft(pulse, length, norm="forward") * np.exp(-2j * np.pi * number * lead / length))
+    number = scipy.fft.fftfreq(length, 1 / length)
+    return np.asarray(scipy.fft.fft(pulse, length, norm="forward") * np.exp(-2j * np.pi * number * lead / length))
 
 
 def occupied_band(power: Floats) -> tuple[int, int]:
@@ -86,12 +86,12 @@ def occupied_band(power: Floats) -> tuple[int, int]:
 
     Examples
     --------
-    >>> occupied_band(np.where(abs(fft.fftfreq(640, 1 / 640)) <= 50, 1.0, 1e-6))
+    >>> occupied_band(np.where(abs(scipy.fft.fftfreq(640, 1 / 640)) <= 50, 1.0, 1e-6))
     (-50, 50)
     """
     length = len(power)
-    ordered = fft.fftshift(power)
-    level = ndimage.uniform_filter1d(ordered, max(1, length // _SMOOTH), mode="wrap")
+    ordered = scipy.fft.fftshift(power)
+    level = scipy.ndimage.uniform_filter1d(ordered, max(1, length // _SMOOTH), mode="wrap")
     threshold = level.max() * 10 ** (BAND_FLOOR_DB / 10)
     below = np.flatnonzero(level < threshold)
     top = int(level.argmax())
@@ -193,7 +193,7 @@ def _loss_db(spectrum: NDArray[np.complexfloating], filtered: NDArray[np.complex
 def _sidelobes_db(response: NDArray[np.complexfloating]) -> float:
     """Return the highest sidelobe in range of a response over the band, dB: a Hann window's main lobe left out."""
     window = np.hanning(len(response))
-    profile = np.abs(fft.ifft(response * window, 4 * len(response)))
+    profile = np.abs(scipy.fft.ifft(response * window, 4 * len(response)))
     lobe = 4 * 2 + 2  # two cells to its first null
     beyond = profile[lobe:-lobe].max(initial=1e-12 * profile[0])
     return float(20 * np.log10(beyond / profile[0]))

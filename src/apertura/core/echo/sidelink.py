@@ -8,8 +8,8 @@ sidelink that fades does not amplify its pulse. To add a method: one function, o
 from collections.abc import Callable, Mapping
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import fft
 
 from apertura.common.arrays import Complexes
 from apertura.core.echo.line_of_sight import LineOfSight, fit_line_of_sight, phasor
@@ -99,9 +99,9 @@ def gated(radar: Complexes, sidelink: Complexes, path: LineOfSight | None = None
     def inverse(symbols: Complexes, path: LineOfSight) -> Complexes:
         subcarriers = symbols.shape[1]
         direct = phasor(path, subcarriers)
-        profile = fft.ifft(symbols * direct.conj(), axis=1)
+        profile = scipy.fft.ifft(symbols * direct.conj(), axis=1)
         profile[:, GATE_CELLS + 1 : subcarriers - GATE_CELLS] = 0  # no cells to remove below 33 subcarriers
-        clean = fft.fft(profile, axis=1) * direct
+        clean = scipy.fft.fft(profile, axis=1) * direct
         return _bounded_inverse(clean, path.amplitude[:, None].astype(np.float32))
 
     return _correct(radar, sidelink, path, inverse)

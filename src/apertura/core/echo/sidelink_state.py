@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.special import gammainccinv
 
 from apertura.common.arrays import Complexes, Floats
 from apertura.common.errors import CampaignError
@@ -96,7 +96,7 @@ def strongest_echo(average: SidelinkAverage) -> tuple[float, int]:
     best = int(np.argmax(one_sided))
     level, cell = float(one_sided[best]), int(cells[best])
     # threshold of the highest of N averages of exponential noise, at the probability of a false lock
-    highest = gammainccinv(average.pulses, LOCK_FALSE_ALARM / average.power.size) / average.pulses
+    highest = scipy.special.gammainccinv(average.pulses, LOCK_FALSE_ALARM / average.power.size) / average.pulses
     threshold = average.noise * (float(highest) - 1)
     # an arrival that moves from pulse to pulse averages out: another transmitter with a clock of its own
     highest_noise = average.noise * np.log(average.power.size / LOCK_FALSE_ALARM)

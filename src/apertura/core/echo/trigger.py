@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import fft
 
 from apertura.common.arrays import Complexes
 from apertura.core.echo.captures import Samples
@@ -187,11 +187,11 @@ def _scores(blocks: Iterable[Samples], template: Complexes) -> Iterator[tuple[in
     """Yield first sample and score of every place the template fits, by overlap-save transforms."""
     length = template.size
     size = max(_SMALLEST_TRANSFORM, 1 << int(8 * length - 1).bit_length())
-    matched = fft.fft(template, size).conj() / np.sqrt((np.abs(template) ** 2).sum())
+    matched = scipy.fft.fft(template, size).conj() / np.sqrt((np.abs(template) ** 2).sum())
     energy = np.zeros(size + 1)
     for first, window in _windows(blocks, size, overlap=length - 1):
         fitting = window.size - length + 1
-        matches = fft.ifft(fft.fft(window, size) * matched)[:fitting]
+        matches = scipy.fft.ifft(scipy.fft.fft(window, size) * matched)[:fitting]
         energy[1 : window.size + 1] = np.cumsum(_power(window), dtype=np.float64)
         under = (energy[length : window.size + 1] - energy[:fitting]).astype(np.float32)
         silence = np.float32(_NO_SIGNAL * energy[window.size]) + np.finfo(np.float32).tiny  # samples may be of any unit

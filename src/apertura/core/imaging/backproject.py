@@ -31,6 +31,7 @@ from apertura.core.planning.plan import memory_limit
 from apertura.core.planning.planner import make_plan
 from apertura.core.quality.budget import MOST_ACCURACY_DB
 from apertura.core.quality.error_check import CONFIDENCE, ErrorBound, error_bound
+from apertura.core.scene.angles import surface
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import FlatGround, GroundModels, Terrain, ground_of
 
@@ -321,8 +322,6 @@ def _calibrated(
     image: Any, formation: Formation, history: PhaseHistory, ground: Terrain, constant: float
 ) -> dict[str, tuple[tuple[str, str], Any, dict[str, str]]]:
     """Return lazy σ⁰ and radar cross-section of an image, as coordinates."""
-    from apertura.core.scene.visibility import surface
-
     grid, level = formation.grid, isinstance(ground, FlatGround)
     found = Calibration.of(
         grid,

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
 from apertura.core.antenna.beam import Beams
-from apertura.core.backprojection.engines import reference
 from apertura.core.backprojection.inputs import PhaseHistory, Profiles
 from apertura.core.backprojection.job import Integration, Job, Signal
 from apertura.core.echo.compression import centre_frequency, range_step
@@ -304,6 +303,8 @@ def _content_db(history: PhaseHistory, grid: SceneGrid, terrain: Terrain, beams:
     """Return how much errors weigh at some random pixels of the scene; None where a flight is too long to be read."""
     if len(history) > _CONTENT_PULSES:
         return None
+    from apertura.core.backprojection.engines import reference  # slow to import: it brings a compiler
+
     rows, columns = np.random.default_rng(0).integers(0, grid.shape, (_CONTENT_PIXELS, 2)).T
     places = terrain.positions_at(grid, rows, columns)
     parts = [slice(first, first + 64) for first in range(0, len(history), 64)]

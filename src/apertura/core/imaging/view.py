@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.core.imaging.formation import Formation
-from apertura.core.scene.visibility import bistatic_angle_deg, incidence_deg
+from apertura.core.scene.angles import bistatic_angle_deg, incidence_deg
 
 _COUNTS = 0.5
 """Weight of a pulse at the middle from which it counts as illuminating it: half amplitude."""

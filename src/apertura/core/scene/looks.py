@@ -14,6 +14,7 @@ from apertura.common.contracts import Window
 from apertura.core.antenna.beam import Beams
 from apertura.core.antenna.illumination import illumination_mask
 from apertura.core.geometry.aperture import Aperture
+from apertura.core.scene.angles import bistatic_angle_deg, incidence_deg, surface
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.swath import balls
 from apertura.core.scene.terrain import FlatGround, Terrain
@@ -70,8 +71,8 @@ class Lattice:
         )
         return [(row, column) for row in rows for column in columns]
 
-    def between(self, values: NDArray[Any], window: Window, *, farthest: float | None = None) -> NDArray[np.float64]:
-        """Return values at the pixels of a window, bilinear between nodes.
+    def between(self, values: NDArray[Any], window: Window, *, farthest: float | None = None) -> NDArray[Any]:
+        """Return values at the pixels of a window, bilinear between nodes: in float32 of float32, else in float64.
 
         Parameters
         ----------
@@ -83,12 +84,15 @@ class Lattice:
             Length of the difference (last axis) of two corners of a cell above which the nearest corner counts.
         """
         (low, high, up), (left, right, across) = (_cells(at, part) for at, part in zip(self.nodes, window, strict=True))
-        extra = (1,) * (values.ndim - 2)
-        up, across = up.reshape(-1, 1, *extra), across.reshape(1, -1, *extra)
+        extra, dtype = (1,) * (values.ndim - 2), np.float32 if values.dtype == np.float32 else np.float64
+        up, across = up.reshape(-1, 1, *extra).astype(dtype), across.reshape(1, -1, *extra).astype(dtype)
         values, left, right = values[:, left[0] : right[-1] + 1], left - left[0], right - left[0]
         # First between rows of nodes, of few columns, so that one pass over all pixels is left.
         rows = values[low] + up * (values[high] - values[low])
-        smooth = np.asarray(rows[:, left] + across * (rows[:, right] - rows[:, left]), np.float64)
+        smooth: NDArray[Any] = rows.take(left, axis=1)
+        more = (rows.take(np.arange(1, rows.shape[1] + 1), axis=1, mode="clip") - rows).take(left, axis=1)
+        more *= across
+        smooth += more
         if farthest is None:
             return smooth
         # Corners are compared once a cell.
@@ -105,9 +109,18 @@ class Lattice:
 
     def inside_positive(self, values: NDArray[Any], window: Window) -> NDArray[np.bool_]:
         """Return which pixels of a window, (row, column), lie among corners that are all positive."""
+        if (values[self.around(window)] > 0).all():
+            return np.ones([part.stop - part.start for part in window], bool)
         (low, high, _), (left, right, _) = (_cells(at, part) for at, part in zip(self.nodes, window, strict=True))
         corners = [values[np.ix_(row, column)] > 0 for row in (low, high) for column in (left, right)]
         return np.asarray(np.logical_and.reduce(corners))
+
+    def around(self, window: Window) -> Window:
+        """Return the window of those nodes that the pixels of a window lie between."""
+        rows, columns = (
+            slice(int(before[0]), int(after[-1]) + 1) for before, after, _ in map(_cells, self.nodes, window)
+        )
+        return rows, columns
 
     def nearest(self, window: Window) -> list[tuple[tuple[int, int], Window]]:
         """Return the nodes nearest to the pixels of a window, each with the part of the window that is its."""
@@ -296,6 +309,8 @@ class Looks:
 
     def _fill_mask(self, mask: NDArray[np.bool_], tile: Window) -> None:
         """Set the pixels of a tile that a pulse illuminates, cell by cell, from every pulse that may reach them."""
+        if mask.all():
+            return
         part = self.grid[tile]
         cells = [cell for cell in part.tiles(_CELL_PX) if not mask[cell].all()]
         if not cells or self.beams is None:
@@ -316,25 +331,28 @@ class Looks:
             some = slice(first, first + _PIXELS)
             mask[rows[some], columns[some]] = _any(self.beams, self.aperture, points[some], mine)
 
-    @cached_property
-    def _has_pulses(self) -> NDArray[np.float32]:
-        return (self.total > 0).astype(np.float32)
-
-    def _sums(self, tile: Window) -> list[Floats]:
+    def _sums(self, tile: Window) -> list[NDArray[np.float32]]:
         """Return Σ|w| and Σw² at the pixels of a tile, between those nodes that have pulses; 0 where none has."""
-        share = self.lattice.between(self._has_pulses, tile)
-        share[share == 0] = np.inf
-        return [self.lattice.between(values, tile) / share for values in (self.total, self.squares)]
+        sums = [self.lattice.between(values, tile) for values in (self.total, self.squares)]
+        lit = self.total[self.lattice.around(tile)] > 0
+        if not lit.all():
+            share = self.lattice.between((self.total > 0).astype(np.float32), tile)
+            share[share == 0] = np.inf
+            sums = [values / share for values in sums]
+        return sums
 
     def effective(self, tile: Window) -> NDArray[np.float32]:
         """Return the looks of the pixels of a tile, (row, column) float32; 0 where no pulse illuminates them."""
         total, squares = self._sums(tile)
-        looks = np.maximum(1.0, total**2 / np.where(squares > 0, squares, np.inf))
-        return np.where(self.illuminated(tile), looks, 0).astype(np.float32)
+        total *= total
+        total /= np.where(squares > 0, squares, np.inf)
+        looks = np.maximum(1.0, total, out=total)
+        lit = self.illuminated(tile)
+        return looks if lit.all() else np.where(lit, looks, np.float32(0))
 
     def weight_squares(self, window: Window) -> Floats:
         """Return Σw² at the pixels of a window, (row, column) float64; 0 where no node about them has pulses."""
-        return self._sums(window)[1]
+        return self._sums(window)[1].astype(np.float64)
 
     def centre(self, tile: Window) -> tuple[Floats, Floats]:
         """Return transmitter and receiver at each pixel's closest approach, (row, column, 3) float64 metres each."""
@@ -345,43 +363,36 @@ class Looks:
     def _jump_m(self) -> float:
         return _JUMP_PITCHES * self.lattice.pitch_px * self.grid.spacing_m
 
-    def incidence_deg(self, tile: Window) -> Floats:
+    def incidence_deg(self, tile: Window) -> NDArray[Any]:
         """Return the angle from the ground's normal to the transmitter at closest approach, (row, column) degrees.
 
         Over level ground bilinear between nodes (docs/theory/layers.md, section 4).
         """
         if self._smooth(tile):
             return self.lattice.between(self._angles_deg[0], tile)
-        from apertura.core.scene.visibility import incidence_deg, surface  # slow to import: it brings a compiler
-
         return incidence_deg(*surface(self.grid, self.terrain, tile), self.centre(tile)[0])
 
-    def bistatic_angle_deg(self, tile: Window) -> Floats:
+    def bistatic_angle_deg(self, tile: Window) -> NDArray[Any]:
         """Return the angle between both antennas at closest approach, (row, column) degrees; as `incidence_deg`."""
         if self._smooth(tile):
             return self.lattice.between(self._angles_deg[1], tile)
-        from apertura.core.scene.visibility import bistatic_angle_deg
-
         return bistatic_angle_deg(self.terrain.positions(self.grid[tile]), *self.centre(tile))
 
     @cached_property
-    def _angles_deg(self) -> tuple[Floats, Floats]:
+    def _angles_deg(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """(node row, node column), over level ground."""
-        from apertura.core.scene.visibility import bistatic_angle_deg, incidence_deg
-
         row, column = np.meshgrid(*self.lattice.nodes, indexing="ij")
         height_m = self.terrain.heights_at(self.grid, row, column)
         place_m, above_m = (self.grid.positions_at(row, column, height_m + more) for more in (0.0, 1.0))
         tx_m, rx_m = np.moveaxis(self.centres, 2, 0)
-        return incidence_deg(place_m, above_m - place_m, tx_m), bistatic_angle_deg(place_m, tx_m, rx_m)
+        angles = incidence_deg(place_m, above_m - place_m, tx_m), bistatic_angle_deg(place_m, tx_m, rx_m)
+        return angles[0].astype(np.float32), angles[1].astype(np.float32)
 
     def _smooth(self, tile: Window) -> bool:
         """Return whether angles are those between nodes: level ground, nodes that its range is many of, no jump."""
         if not isinstance(self.terrain, FlatGround) or self.lattice.pitch_px == PITCHES_PX[-1]:
             return False
-        near = tuple(
-            slice(int(before[0]), int(after[-1]) + 1) for before, after, _ in map(_cells, self.lattice.nodes, tile)
-        )
+        near = self.lattice.around(tile)
         steps = (np.linalg.norm(np.diff(self.centres[near], axis=axis), axis=-1) for axis in (0, 1))
         return all((step <= self._jump_m).all() for step in steps)
 
@@ -457,6 +468,9 @@ def _centres(aperture: Aperture, beams: Beams | None, points: Floats, weight: Fl
 def _spread(weight: Floats) -> NDArray[np.int64]:
     """Return pulses (point, `SPREAD`) evenly spread over those that weigh half or more of the most, of all if none."""
     size = np.abs(weight)
-    count = np.cumsum(size >= size.max(axis=0) / 2, axis=0)
-    ranks = 1 + np.round(np.linspace(0, 1, SPREAD)[:, None] * (count[-1] - 1))
-    return np.stack([(count >= number).argmax(axis=0) for number in ranks], axis=-1)
+    count = np.cumsum(size >= size.max(axis=0) / 2, axis=0).T
+    ranks = 1 + np.round(np.linspace(0, 1, SPREAD) * (count[:, -1:] - 1))
+    # Counts of all points in one row that ascends.
+    point = np.arange(len(count))[:, None]
+    found = np.searchsorted((count + point * (len(size) + 1)).ravel(), ranks + point * (len(size) + 1))
+    return np.asarray(found - point * len(size))

@@ -5,10 +5,12 @@ zarr or dask. Nothing here reads a clock: identical inputs give identical bytes.
 """
 
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
+from math import ceil, log2
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 import rasterio
@@ -21,7 +23,15 @@ from rasterio.windows import Window
 
 from apertura.common.errors import CampaignError, ContractError
 from apertura.formats.export.radiometry import with_radiometry
-from apertura.formats.export.writing import IN_MEMORY_BYTES, Block, added, blocks_of, check_written, gdal_replacement
+from apertura.formats.export.writing import (
+    IN_MEMORY_BYTES,
+    READ,
+    Block,
+    added,
+    blocks_of,
+    check_written,
+    gdal_replacement,
+)
 
 BLOCK = 512  # pixels along a side of a COG tile; overviews halve the raster until it fits into one tile
 
@@ -48,17 +58,20 @@ class Band:
     unit, meaning
         Written beside the band and as a tag; see `apertura.formats.export.radiometry.with_radiometry`.
     overviews
-        How the COG driver shrinks it: its OVERVIEW_RESAMPLING.
+        What an overview makes of two by two pixels: see `halved`.
     colours
         Value → (red, green, blue), 0 to 255, of a band of classes.
+    smooth
+        Whether neighbouring pixels of floats are alike: whole differences of them are compressed, else their bytes.
     """
 
     dtype: str
     nodata: float
     unit: str
     meaning: str
-    overviews: str
+    overviews: Literal["AVERAGE", "AVERAGE_MAGPHASE", "MODE", "NEAREST"]
     colours: Mapping[int, tuple[int, int, int]] | None = None
+    smooth: bool = False
 
 
 SLC = Band("complex64", np.nan, "1", "{amplitude}, complex, carrier kept", "AVERAGE_MAGPHASE")
@@ -137,8 +150,9 @@ def write_cog(
     tags: Mapping[str, str],
     title: str = "",
     value: Callable[[Pixels], Pixels] = np.asarray,
+    shown: Callable[[Pixels], Pixels] = np.asarray,
 ) -> None:
-    """Write any north-up raster as a COG whose overviews GDAL builds.
+    """Write any north-up raster as a COG.
 
     Parameters
     ----------
@@ -149,7 +163,9 @@ def write_cog(
     band
         Dtype, no data, unit and description.
     value
-        Block of `image` → block of the file, in the dtype of `band`.
+        Block of `image` → values of which overviews are made.
+    shown
+        These values, or those of an overview → block of the file, in the dtype of `band`.
 
     Raises
     ------
@@ -158,18 +174,13 @@ def write_cog(
     """
     place = placed(image, transform, crs)
     band, tags = with_radiometry(band, tags)
-    words = described(tags, title)
-    with gdal_replacement(path, size=(size := size_of(image, band))) as temporary:
+    words, size = _described(tags, title), int(np.prod(image.shape)) * np.dtype(band.dtype).itemsize
+    with gdal_replacement(path, size=size) as temporary:
         source = temporary.with_name("source.tif")
-        checksum = fill(source, lambda block: value(np.asarray(image[block])), band, place, words)
-        finish(source, temporary, band)
+        checksum = _fill(source, lambda block: value(np.asarray(image[block])), shown, band, place, words)
+        _finish(source, temporary, band)
         if size > IN_MEMORY_BYTES:
             check_written(temporary, checksum, words)
-
-
-def size_of(image: NorthUpRaster, band: Band) -> int:
-    """Return the bytes of the pixels of a file."""
-    return int(np.prod(image.shape)) * np.dtype(band.dtype).itemsize
 
 
 def power(image: Pixels) -> NDArray[np.float32]:
@@ -210,43 +221,119 @@ def placed(image: NorthUpRaster, transform: Affine, crs: str) -> dict[str, Any]:
     return {"height": image.shape[0], "width": image.shape[1], "transform": transform, "crs": known}
 
 
-def described(tags: Mapping[str, str], title: str) -> dict[str, str]:
+def halved(pixels: Pixels, band: Band) -> Pixels:
+    """Return pixels at half the resolution, each of two by two that are not no data; at an odd edge, of fewer.
+
+    Their mean (AVERAGE), their mean magnitude with the phase of their mean (AVERAGE_MAGPHASE), the commonest, of
+    equally common ones that which is so first (MODE), or the first (NEAREST).
+
+    Examples
+    --------
+    >>> halved(np.array([[1, 3, np.nan], [5, 7, 8]], np.float32), POWER)
+    array([[4., 8.]], dtype=float32)
+    """
+    odd = [(0, size % 2) for size in pixels.shape]
+    pixels = np.pad(pixels, odd, constant_values=band.nodata) if np.any(odd) else pixels
+    four = [pixels[row::2, column::2] for row in (0, 1) for column in (0, 1)]
+    match band.overviews:
+        case "AVERAGE":
+            return _mean(four, band.nodata)
+        case "AVERAGE_MAGPHASE":
+            mean, magnitude = _mean(four, band.nodata), _mean([np.abs(one) for one in four], band.nodata)
+            size = np.abs(mean)
+            return np.where(size > 0, mean * (magnitude / np.where(size > 0, size, 1)), magnitude).astype(pixels.dtype)
+        case "MODE":
+            return _commonest(four, band.nodata)
+        case "NEAREST":
+            return four[0]
+
+
+def _mean(four: Sequence[Pixels], nodata: float) -> Pixels:
+    """Return the mean of those of four pixels each that hold something, no data where none does."""
+    if not np.isnan(nodata):
+        known_mean = _mean([np.where(one == nodata, np.nan, one) for one in four], np.nan)
+        return np.asarray(np.where(np.isnan(known_mean), nodata, known_mean))
+    mean: Pixels = (four[0] + four[1] + (four[2] + four[3])) / 4
+    some = np.nonzero(np.isnan(mean))
+    if some[0].size:
+        few = np.array([one[some] for one in four])
+        known = ~np.isnan(few)
+        count = known.sum(axis=0)
+        mean[some] = np.where(count > 0, np.where(known, few, 0).sum(axis=0) / np.maximum(count, 1), np.nan)
+    return mean
+
+
+def _commonest(four: Sequence[Pixels], nodata: float) -> Pixels:
+    """Return the commonest of those of four pixels each that hold something, no data where none does."""
+    if all((one == four[0][0, 0]).all() for one in four):
+        return four[0]
+    found, most = np.full_like(four[0], nodata), np.zeros(four[0].shape, np.uint8)
+    for number, one in enumerate(four):
+        count = np.sum([one == other for other in four[: number + 1]], axis=0, dtype=np.uint8) * (one != nodata)
+        found, most = np.where(count > most, one, found), np.maximum(count, most)
+    return found
+
+
+def _described(tags: Mapping[str, str], title: str) -> dict[str, str]:
     """Return the tags of the file; GDAL sorts them by name."""
     return dict(tags) | ({"TIFFTAG_IMAGEDESCRIPTION": title} if title else {})
 
 
-def fill(
-    path: Path, read: Callable[[Block], Pixels], band: Band, place: Mapping[str, Any], tags: Mapping[str, str]
+def _fill(
+    path: Path,
+    read: Callable[[Block], Pixels],
+    shown: Callable[[Pixels], Pixels],
+    band: Band,
+    place: Mapping[str, Any],
+    tags: Mapping[str, str],
 ) -> int:
-    """Write a plain tiled GeoTIFF block by block, tags included; return a sum over its pixels."""
-    checksum = 0
+    """Write a plain tiled GeoTIFF and its overviews block by block, tags included; return a sum over its pixels.
+
+    Blocks are halved while they pass: GDAL, which would read them again, takes several times as long.
+    """
+    checksum, shape = 0, (place["height"], place["width"])
+    levels = min(max(0, ceil(log2(max(shape) / BLOCK))), int(log2(READ)))
+    with ExitStack() as opened:
+        # GDAL finds the first overview of source.tif in source.tif.ovr, the next in source.tif.ovr.ovr, …
+        files = [opened.enter_context(_created(path, band, place))]
+        for level in range(1, levels + 1):
+            height, width = (-(-size // 2**level) for size in shape)
+            overview = path.with_name(path.name + level * ".ovr")
+            files.append(opened.enter_context(_created(overview, band, {"height": height, "width": width})))
+        files[0].update_tags(**tags)
+        files[0].set_band_description(1, band.meaning)
+        files[0].set_band_unit(1, band.unit)
+        if band.colours:
+            files[0].write_colormap(1, band.colours)
+        for rows, columns in blocks_of(shape):
+            pixels = read((rows, columns))
+            for level, file in enumerate(files):
+                pixels = halved(pixels, band) if level else pixels
+                written = shown(pixels).astype(band.dtype, copy=False)
+                at = Window(columns.start >> level, rows.start >> level, *written.shape[::-1])
+                file.write(written, 1, window=at)
+                checksum = checksum if level else added(checksum, written)
+    return checksum
+
+
+def _created(path: Path, band: Band, place: Mapping[str, Any]) -> Any:
     layout = {"tiled": True, "blockxsize": BLOCK, "blockysize": BLOCK, "BIGTIFF": "IF_SAFER"}
     form = {"driver": "GTiff", "count": 1, "dtype": band.dtype, "nodata": band.nodata}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)  # an overview has no georeference of its own
-        raster = rasterio.open(path, "w", **form, **layout, **place)
-    with raster:
-        raster.update_tags(**tags)
-        raster.set_band_description(1, band.meaning)
-        raster.set_band_unit(1, band.unit)
-        if band.colours:
-            raster.write_colormap(1, band.colours)
-        for block in blocks_of(raster.shape):
-            pixels = read(block).astype(band.dtype, copy=False)
-            checksum = added(checksum, pixels)
-            raster.write(pixels, 1, window=Window.from_slices(*block))
-    return checksum
+        return rasterio.open(path, "w", **form, **layout, **place)
 
 
-def finish(source: Path, target: Path, band: Band) -> None:
-    """Turn a GeoTIFF into a COG; overviews that `source` has are kept."""
+def _finish(source: Path, target: Path, band: Band) -> None:
+    """Turn a GeoTIFF with overviews into a COG."""
+    differences = "STANDARD" if band.smooth else "YES"
     rasterio.shutil.copy(
         source,
         target,
         driver="COG",
         COMPRESS="DEFLATE",
-        PREDICTOR="NO" if band.dtype.startswith("complex") else "YES",
+        LEVEL=1,  # noise is no smaller at any other, and takes twice as long
+        PREDICTOR="NO" if band.dtype.startswith("complex") else differences,
         BLOCKSIZE=BLOCK,
         BIGTIFF="IF_SAFER",
-        OVERVIEW_RESAMPLING=band.overviews,
     )

@@ -23,8 +23,12 @@ CLASSES = {
 }
 """Value of the mask → meaning and colour."""
 
-INCIDENCE = Band("float32", np.nan, "deg", "incidence at closest approach, from the terrain's normal", "AVERAGE")
-BISTATIC_ANGLE = Band("float32", np.nan, "deg", "angle between transmitter and receiver at closest approach", "AVERAGE")
+INCIDENCE = Band(
+    "float32", np.nan, "deg", "incidence at closest approach, from the terrain's normal", "AVERAGE", smooth=True
+)
+BISTATIC_ANGLE = Band(
+    "float32", np.nan, "deg", "angle between transmitter and receiver at closest approach", "AVERAGE", smooth=True
+)
 MASK = Band(
     "uint8",
     OUTSIDE,
@@ -33,8 +37,10 @@ MASK = Band(
     "MODE",
     {value: colour for value, (_, colour) in CLASSES.items()},
 )
-LOOKS = Band("float32", 0, "pulses", "effective number of pulses that make the pixel", "AVERAGE")
-NESZ = Band("float32", np.nan, "dB", "echo per pulse as strong as the noise: relative, no sigma0", "AVERAGE")
+LOOKS = Band("float32", 0, "pulses", "effective number of pulses that make the pixel", "AVERAGE", smooth=True)
+NESZ = Band(
+    "float32", np.nan, "dB", "echo per pulse as strong as the noise: relative, no sigma0", "AVERAGE", smooth=True
+)
 
 NESZ_ABSOLUTE = "noise-equivalent sigma0"
 """Meaning of `NESZ` of a calibrated pair."""

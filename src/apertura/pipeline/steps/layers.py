@@ -22,9 +22,9 @@ from apertura.core.imaging.noise import PulseNoise, noise_places, noise_power
 from apertura.core.imaging.radiometry import Quantity
 from apertura.core.imaging.range_profiles import profiles_of
 from apertura.core.imaging.speckle import Multilook
+from apertura.core.scene.angles import surface
 from apertura.core.scene.looks import BLOCK_PX, Looks
 from apertura.core.scene.terrain import FlatGround
-from apertura.core.scene.visibility import Relief, surface, visibility
 from apertura.formats.export import product, remove_outdated, write_exports
 from apertura.formats.export.layers import OUTSIDE
 from apertura.formats.export.radiometry import CROSS_SECTIONS, ECHO, of_coefficient
@@ -215,18 +215,20 @@ def layer_rasters(
         Tiles computed at once.
     """
     grid, terrain = scene.grid, scene.terrain
-    level = isinstance(terrain, FlatGround)
+    level, noise_db = isinstance(terrain, FlatGround), np.float32(10 * np.log10(noise or np.nan))
 
-    def angle(of: Callable[[Window], Floats], window: Window) -> Floats:
+    def angle(of: Callable[[Window], NDArray[Any]], window: Window) -> NDArray[Any]:
         return _inside(looks, window, of(window))
 
-    def nesz(window: Window) -> NDArray[np.float64]:
+    def nesz(window: Window) -> NDArray[Any]:
         if calibrated is not None:
             calibration, normal = calibrated.calibration, None if level else surface(grid, terrain, window)[1]
             power = (noise or np.nan) * calibration.pixel_noise(window) / calibration.power(window, "sigma0", normal)
             return _inside(looks, window, 10 * np.log10(power))
-        effective = looks.effective(window).astype(np.float64)
-        return 10 * np.log10((noise or np.nan) / np.where(effective > 0, effective, np.nan))
+        effective = looks.effective(window)
+        with np.errstate(divide="ignore"):
+            power_db = noise_db - 10 * np.log10(effective)
+        return np.where(effective > 0, power_db, np.float32(np.nan))
 
     return {
         "incidence": LazyLayer(grid, np.float32, partial(angle, looks.incidence_deg), threads),
@@ -237,19 +239,26 @@ def layer_rasters(
     }
 
 
-def _inside(looks: Looks, window: Window, values: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.where(looks.illuminated(window), values, np.nan)
+def _inside(looks: Looks, window: Window, values: NDArray[Any]) -> NDArray[Any]:
+    lit = looks.illuminated(window)
+    return values if lit.all() else np.where(lit, values, values.dtype.type(np.nan))
 
 
 def _mask(scene: OpenScene, looks: Looks) -> Callable[[Window], NDArray[np.uint8]]:
     """Return the mask of a window, each pixel by the pulses that form the nearest node of the lattice."""
-    level = isinstance(scene.terrain, FlatGround)
-    relief = None if level else Relief.of(scene.grid, scene.terrain, scene.level.height_m)
+
+    def outside(window: Window) -> NDArray[np.uint8]:
+        return np.where(looks.illuminated(window), 0, OUTSIDE).astype(np.uint8)
+
+    if isinstance(scene.terrain, FlatGround):
+        return outside
+    from apertura.core.scene.visibility import Relief, visibility  # slow to import: it brings a compiler
+
+    relief = Relief.of(scene.grid, scene.terrain, scene.level.height_m)
 
     def mask(window: Window) -> NDArray[np.uint8]:
-        illuminated = looks.illuminated(window)
-        marked = np.where(illuminated, 0, OUTSIDE).astype(np.uint8)
-        if relief is None or not illuminated.any():
+        illuminated, marked = looks.illuminated(window), outside(window)
+        if not illuminated.any():
             return marked
         for node, part in looks.lattice.nearest(window):
             here = tuple(slice(at.start - by.start, at.stop - by.start) for at, by in zip(part, window, strict=True))

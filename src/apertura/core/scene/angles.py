@@ -1,0 +1,107 @@
+"""Angles under which antennas see the ground, and the surface that they are of."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from apertura.common.arrays import Floats
+from apertura.common.contracts import Window
+from apertura.core.scene.grid import SceneGrid
+from apertura.core.scene.terrain import FlatGround, Terrain
+
+
+def surface_normals(position: Floats) -> Floats:
+    """Return the unit normals, upward, of a surface given at pixels.
+
+    Parameters
+    ----------
+    position
+        (row, column, 3) float64 metres, rows southward and columns eastward, at least 2 × 2.
+
+    Returns
+    -------
+    ndarray
+        (row, column, 3) float64; central differences, one-sided at the edges.
+
+    Examples
+    --------
+    >>> east, north = np.meshgrid(np.arange(3.0), -np.arange(3.0))
+    >>> surface_normals(np.stack([east, north, east], -1))[1, 1].round(4)
+    array([-0.7071,  0.    ,  0.7071])
+    """
+    normal = np.cross(np.gradient(position, axis=0), np.gradient(position, axis=1))
+    return np.asarray(normal / np.linalg.norm(normal, axis=-1, keepdims=True))
+
+
+def surface(grid: SceneGrid, terrain: Terrain, window: Window) -> tuple[Floats, Floats]:
+    """Return positions and unit normals of the ground in a window; its neighbours count, so that tiles leave no seams.
+
+    Parameters
+    ----------
+    grid, terrain
+        The scene.
+    window
+        Rows and columns of the grid.
+
+    Returns
+    -------
+    tuple of ndarray
+        (row, column, 3) float64 each: metres in the grid's processing frame; normals upward.
+    """
+    if isinstance(terrain, FlatGround):
+        position = terrain.positions(grid[window])
+        return position, _unit(grid[window].positions(terrain.height_m + 1.0) - position)
+    around = [
+        np.arange(max(0, part.start - 1), max(2, min(size, part.stop + 1)))
+        for part, size in zip(window, grid.shape, strict=True)
+    ]
+    rows, columns = around
+    wider = replace(grid, first=(grid.first[0] + rows[0], grid.first[1] + columns[0]), shape=(rows.size, columns.size))
+    known = terrain.heights(grid[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1])
+    lacking = [(0, axis.size - size) for axis, size in zip(around, known.shape, strict=True)]
+    position = wider.positions(np.pad(known, lacking, mode="edge"))  # a grid of one row or column is continued level
+    inner = tuple(slice(part.start - axis[0], part.stop - axis[0]) for part, axis in zip(window, around, strict=True))
+    return position[inner], surface_normals(position)[inner]
+
+
+def incidence_deg(position: Floats, normal: Floats, antenna: Floats) -> Floats:
+    """Return the angle between the direction to an antenna and the surface normal.
+
+    Parameters
+    ----------
+    position, normal
+        (..., 3) float64, metres and unit vectors, of one frame.
+    antenna
+        (3,) float64, metres.
+
+    Returns
+    -------
+    ndarray
+        (...) float64 degrees, above 90 where the surface faces away.
+
+    Examples
+    --------
+    >>> incidence_deg(np.zeros(3), np.array([0.0, 0.0, 1.0]), np.array([5.0, 0.0, 5.0])).round(6).item()
+    45.0
+    """
+    return np.degrees(_angle(antenna - position, normal))
+
+
+def bistatic_angle_deg(position: Floats, tx: Floats, rx: Floats) -> Floats:
+    """Return the angle (degrees) at each position (..., 3) between the directions to two antennas (3,), metres.
+
+    Examples
+    --------
+    >>> bistatic_angle_deg(np.zeros(3), np.array([1.0, 0.0, 1.0]), np.array([-2.0, 0.0, 2.0])).round(6).item()
+    90.0
+    """
+    return np.degrees(_angle(tx - position, rx - position))
+
+
+def _angle(one: Floats, other: Floats) -> Floats:
+    apart = _unit(one) - _unit(other)  # of small angles the arc is exact, where the cosine is not
+    return np.asarray(2 * np.arcsin(np.minimum(1.0, np.sqrt(np.einsum("...i,...i", apart, apart)) / 2)))
+
+
+def _unit(vector: Floats) -> Floats:
+    return np.asarray(vector / np.sqrt(np.einsum("...i,...i", vector, vector))[..., None])
