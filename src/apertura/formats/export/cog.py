@@ -51,6 +51,8 @@ class Band:
         How the COG driver shrinks it: its OVERVIEW_RESAMPLING.
     colours
         Value → (red, green, blue), 0 to 255, of a band of classes.
+    effort
+        How hard the COG driver packs it: its LEVEL. Speckle is not made smaller by more than 1, smooth layers by half.
     """
 
     dtype: str
@@ -59,11 +61,12 @@ class Band:
     meaning: str
     overviews: str
     colours: Mapping[int, tuple[int, int, int]] | None = None
+    effort: int = 6
 
 
-SLC = Band("complex64", np.nan, "1", "{amplitude}, complex, carrier kept", "AVERAGE_MAGPHASE")
-MAGNITUDE = Band("float32", np.nan, "1", "{amplitude}", "AVERAGE")
-POWER = Band("float32", np.nan, "1", "{power}, linear", "AVERAGE")
+SLC = Band("complex64", np.nan, "1", "{amplitude}, complex, carrier kept", "AVERAGE_MAGPHASE", effort=1)
+MAGNITUDE = Band("float32", np.nan, "1", "{amplitude}", "AVERAGE", effort=1)
+POWER = Band("float32", np.nan, "1", "{power}, linear", "AVERAGE", effort=1)
 
 
 def write_slc(
@@ -245,6 +248,7 @@ def finish(source: Path, target: Path, band: Band) -> None:
         target,
         driver="COG",
         COMPRESS="DEFLATE",
+        LEVEL=band.effort,
         PREDICTOR="NO" if band.dtype.startswith("complex") else "YES",
         BLOCKSIZE=BLOCK,
         BIGTIFF="IF_SAFER",

@@ -26,7 +26,7 @@ from apertura.formats.export.cog import (
 from apertura.formats.export.radiometry import with_radiometry
 from apertura.formats.export.writing import IN_MEMORY_BYTES, Block, check_written, gdal_replacement
 
-DB = Band("float32", np.nan, "dB", "{power}, 10 log10", "AVERAGE")
+DB = Band("float32", np.nan, "dB", "{power}, 10 log10", "AVERAGE", effort=1)
 
 
 def write_db(
@@ -38,6 +38,7 @@ def write_db(
     tags: Mapping[str, str],
     title: str = "",
     value: Callable[[Pixels], Pixels] = power,
+    band: Band = DB,
 ) -> None:
     """Write 20 log10 |image| as a float32 COG whose overviews are the dB of averaged power.
 
@@ -50,6 +51,8 @@ def write_db(
         As `write_slc`.
     value
         Block of `image` → its power.
+    band
+        Of the file.
 
     Notes
     -----
@@ -66,7 +69,7 @@ def write_db(
     array([[20., nan]], dtype=float32)
     """
     place = placed(image, transform, crs)
-    band, tags = with_radiometry(DB, tags)
+    band, tags = with_radiometry(band, tags)
     words, size = described(tags, title), size_of(image, POWER)
     with gdal_replacement(path, size=size) as temporary:
         linear = temporary.with_name("power.tif")

@@ -1,6 +1,7 @@
 """Mean power of squares of pixels, on a coarser grid: linear, for measuring, and in decibels."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,9 @@ from rasterio import Affine
 
 from apertura.common.errors import ContractError
 from apertura.formats.export.cog import POWER, NorthUpRaster, Pixels, write_cog
-from apertura.formats.export.db import write_db
+from apertura.formats.export.db import DB, write_db
+
+_EFFORT = 6  # of many looks, and of noise alone, less is speckle
 
 
 def write_mean_power(
@@ -18,7 +21,8 @@ def write_mean_power(
 
     Else as `cog.write_slc`.
     """
-    write_cog(path, power, POWER, transform=transform, crs=crs, tags=tags, title=title, value=_real)
+    band = replace(POWER, effort=_EFFORT)
+    write_cog(path, power, band, transform=transform, crs=crs, tags=tags, title=title, value=_real)
 
 
 def write_mean_db(
@@ -39,7 +43,8 @@ def write_mean_db(
     ...         raster.read(1)
     array([[20., nan]], dtype=float32)
     """
-    write_db(path, power, transform=transform, crs=crs, tags=tags, title=title, value=_real)
+    band = replace(DB, effort=_EFFORT)
+    write_db(path, power, transform=transform, crs=crs, tags=tags, title=title, value=_real, band=band)
 
 
 def _real(power: Pixels) -> Pixels:

@@ -20,7 +20,11 @@ from rasterio.windows import Window
 from apertura.common.atomic import replacement
 
 READ = 2048  # pixels along a side of a block in memory: four tiles of a COG
-GDAL = {"GDAL_CACHEMAX": 128, "GDAL_PAM_ENABLED": False}  # MB; no .aux.xml beside the file
+GDAL = {
+    "GDAL_CACHEMAX": 128,  # MB
+    "GDAL_PAM_ENABLED": False,  # no .aux.xml beside the file
+    "COG_TMP_COMPRESSION": "NONE",  # of overviews on the way into a COG: packed there, not before
+}
 
 IN_MEMORY_BYTES = 1 << 27
 """Pixels of a raster that GDAL writes in memory: 4096 x 4096 complex."""
@@ -75,6 +79,17 @@ def blocks_of(shape: tuple[int, ...]) -> Iterator[Block]:
     """
     for top, left in product(range(0, shape[0], READ), range(0, shape[1], READ)):
         yield slice(top, min(top + READ, shape[0])), slice(left, min(left + READ, shape[1]))
+
+
+def held(raster: Any) -> Any:
+    """Return a raster in memory, read once, if GDAL would hold it there; a larger one as it is, read block by block."""
+    first = raster[0:1, 0:1]
+    if isinstance(raster, np.ndarray) or np.prod(raster.shape) * first.dtype.itemsize > IN_MEMORY_BYTES:
+        return raster
+    array = np.empty(raster.shape, first.dtype)
+    for block in blocks_of(raster.shape):
+        array[block] = raster[block]
+    return array
 
 
 def added(checksum: int, pixels: NDArray[Any]) -> int:
