@@ -268,6 +268,30 @@ def two_images():
     return images, [some[:3] for some in points]
 
 
+def test_bright_points_are_the_same_in_whichever_windows_and_order_an_image_is_read():
+    places = [*PLACES, (40.0, 200.0, 0.27), (220.0, 30.0, 0.24), (128.0, 16.0, 0.9)]  # the last on an edge of windows
+    image = lobes(places)
+    tiles = [
+        (slice(row, row + 64), slice(column, column + 64)) for row in range(0, 256, 64) for column in range(0, 256, 64)
+    ]
+    found = [bright_points(image, some, cell_px=8, shown=sinc_response) for some in (tiles, tiles[::-1])]
+    assert found[0] == found[1]
+    whole = bright_points(image, [(slice(0, 256), slice(0, 256))], cell_px=8, shown=sinc_response)
+    assert [(p.row, p.column) for p in found[0]] == [(p.row, p.column) for p in whole]
+    assert sorted(round(p.amplitude, 2) for p in whole) == [0.27, 0.5, 0.8, 0.9, 1.0]  # 0.24 is 12.4 dB below the first
+
+
+@pytest.mark.parametrize("turned", range(4))
+def test_the_skirt_of_a_point_hides_no_weaker_maximum_in_the_square_it_reaches_into(turned):
+    image = np.zeros((64, 64), np.complex64)
+    image[20, 31:33], image[20, 36] = (1.0, 0.9), 0.5  # squares of 8 pixels begin at 24 and 32
+    image = np.rot90(image, turned)
+    found = bright_points(
+        image, [(slice(0, 64), slice(0, 64))], cell_px=8, shown=lambda _, others: np.zeros(len(others))
+    )
+    assert len(found) == 2
+
+
 def test_place_and_phase_between_images_are_told_to_a_tenth_of_a_cell(two_images):
     images, points = two_images
     found = agreement(images, points, spacing_m=0.1, cell_m=0.4, spectrum=WIDE)

@@ -74,6 +74,26 @@ def test_looks_are_the_resolution_cells_of_a_window(width, window):
     assert looks == pytest.approx((width * window) ** 2, rel=0.3)  # and what the border cuts
 
 
+def autocorrelation(image, most):
+    """At lags up to `most`, term by term in double precision."""
+    padded = np.pad(image.astype(np.complex128), most)
+    rows, columns = image.shape
+    lags = range(-most, most + 1)
+    alike = [[(padded[most + d :, most + r :][:rows, :columns] * image.conj()).sum() for r in lags] for d in lags]
+    return np.array(alike) / (np.abs(image.astype(np.complex128)) ** 2).sum()
+
+
+@pytest.mark.parametrize("scale", [1e-18, 1.0, 1e15])
+@pytest.mark.parametrize("point", [0.0, 1e5])
+def test_looks_are_right_to_a_millionth_however_bright_the_image(scale, point):
+    first, second = (imaged(ground(seed), width=0.5)[:40, :33].copy() for seed in (7, 8))
+    first[20, 11] += point
+    looks = coherence(first * np.float32(scale), second, window=7)[2]
+    lag = 7 - np.abs(np.arange(-6, 7))
+    alike = autocorrelation(first, 6) * autocorrelation(second, 6).conj() * np.multiply.outer(lag, lag)
+    assert looks == pytest.approx(7**4 / alike.sum().real, rel=1e-6)
+
+
 @pytest.mark.parametrize(("window", "width"), [(5, 0.99), (7, 0.5), (9, 0.5)])
 def test_coherence_of_nothing_in_common_is_that_of_chance(window, width):
     magnitude, phase, looks = coherence(imaged(ground(5), width=width), imaged(ground(6), width=width), window=window)

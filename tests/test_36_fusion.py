@@ -31,6 +31,14 @@ def test_blocks_add_up_to_the_whole():
     np.testing.assert_array_equal(whole[5:9, 7:20], coherent_sum(images[:, 5:9, 7:20], peaks))
 
 
+def test_amplitudes_are_divided_in_double_precision():
+    generator = np.random.default_rng(2)
+    images = generator.normal(size=(2, 40, 50, 2)).astype(np.float32).view(np.complex64)[..., 0]
+    peaks = generator.uniform(1e-3, 1e3, 2)
+    divided = (images.astype(np.complex128) / peaks[:, None, None]).astype(np.complex64)
+    np.testing.assert_array_equal(magnitude_sum(images, peaks), np.abs(divided).mean(axis=0))
+
+
 def test_an_empty_image_is_refused():
     with pytest.raises(ValueError, match="empty image"):
         coherent_sum(np.zeros((2, 4, 4), np.complex64), np.array([1.0, 0.0]))

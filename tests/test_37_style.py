@@ -10,7 +10,8 @@ from rasterio import Affine
 from apertura.common.errors import ContractError
 from apertura.common.provenance import canonical_json
 from apertura.formats.export.db import write_db
-from apertura.formats.export.layers import CLASSES, OUTSIDE, write_incidence, write_mask
+from apertura.formats.export.layers import CLASSES, OUTSIDE, write_incidence, write_looks, write_mask
+from apertura.formats.export.mosaic import write_mosaic
 from apertura.formats.export.radiometry import ECHO, TAG, of_sums
 from apertura.formats.export.style import write_db_style, write_layer_style, write_mask_style
 
@@ -68,6 +69,21 @@ def test_a_layer_is_coloured_from_its_smallest_to_its_largest_value(tmp_path, va
     items = list(ET.parse(tmp_path / "incidence.qml").iter("item"))
     assert (float(items[0].get("value")), float(items[-1].get("value"))) == ends
     assert items[-1].get("label") == f"{ends[1]} deg"
+
+
+def test_places_without_data_count_nothing_in_the_colours_of_a_file_and_of_a_mosaic(tmp_path):
+    looks = np.zeros((2050, 2100), np.float32)
+    looks[3:1000, 5:900], looks[1003:2000, 1001:2003] = 4, 25
+    for name, part in (("above", np.s_[:1001]), ("below", np.s_[1001:])):
+        one = np.zeros_like(looks)
+        one[part] = looks[part]
+        write_looks(tmp_path / f"{name}.tif", one, **GRID, tags={})
+    write_looks(tmp_path / "looks.tif", looks, **GRID, tags={})
+    write_mosaic(tmp_path / "both.vrt", [tmp_path / "above.tif", tmp_path / "below.tif"])
+    for name in ("looks.qml", "both.qml"):
+        write_layer_style(tmp_path / name)
+        items = list(ET.parse(tmp_path / name).iter("item"))
+        assert (float(items[0].get("value")), float(items[-1].get("value"))) == (4, 25)
 
 
 def test_sums_say_what_they_were_divided_by_and_which_pairs_they_hold():

@@ -192,6 +192,14 @@ def test_a_cube_made_again_is_the_same_to_the_byte(campaign, tmp_path):
     assert manifest_of(Campaign.load(root).stage("cube")).read_bytes() == before
 
 
+def test_threads_change_no_byte_of_a_cube(campaign, tmp_path):
+    root = copy_writable(campaign.root, tmp_path / "campaign")
+    cube.cube(Campaign.load(root), threads=3)
+    assert (
+        manifest_of(Campaign.load(root).stage("cube")).read_bytes() == manifest_of(campaign.stage("cube")).read_bytes()
+    )
+
+
 def test_images_of_an_older_version_end_in_one_message(campaign, tmp_path):
     root = copy_writable(campaign.root, tmp_path / "campaign")
     folder = Campaign.load(root).stage("image", "f01", "uav1-uav1")

@@ -19,4 +19,4 @@ rule cube:
     message:
         "stacking and adding up every image"
     shell:
-        "apertura step cube > {log} 2>&1"
+        "apertura step cube --threads {threads} > {log} 2>&1"

@@ -29,7 +29,7 @@ rule export:
     message:
         "{wildcards.flight}: writing the files of {wildcards.pair}"
     shell:
-        "apertura step export {wildcards.flight} {wildcards.pair} > {log} 2>&1"
+        "apertura step export {wildcards.flight} {wildcards.pair} --threads {threads} > {log} 2>&1"
 
 
 # As large as the echo: made where somebody asks for it, by its name or by rule phase_history.
@@ -87,7 +87,7 @@ rule export_fused:
     message:
         "{wildcards.flight}: writing what the pairs add up to"
     shell:
-        "apertura step export {wildcards.flight} fused > {log} 2>&1"
+        "apertura step export {wildcards.flight} fused --threads {threads} > {log} 2>&1"
 
 
 rule coverage:

@@ -414,6 +414,7 @@ _ROWS = (
         exports="pair",
         demand=Demand(500, pixel_bytes=50, pixel_s=30),
         cost=Cost(2.0, mpx_s=0.45, last=True),
+        options=("threads",),
     ),
     Rule(
         "cphd",
@@ -445,8 +446,9 @@ _ROWS = (
         f"{_STEPS}.cube:cube",
         sources=("image", "assessment", "scene"),
         settings=("campaign", "processing.tile_px"),
-        demand=Demand(500, pixel_bytes=50, pixel_s=10),
+        demand=Demand(500, pixel_bytes=50, pixel_s=10, threads=2),
         cost=Cost(2.5, mpx_s=1.0),
+        options=("threads",),
     ),
     Rule(
         "export_fused",
@@ -462,8 +464,9 @@ _ROWS = (
         needed=inputs.adds_up,
         command="export",
         last_words=("fused",),
-        demand=Demand(500, pixel_bytes=50, pixel_s=30),
+        demand=Demand(500, pixel_bytes=50, pixel_s=30, threads=2),
         cost=Cost(3.0, mpx_s=1.0),
+        options=("threads",),
     ),
     Rule(
         "interferogram",

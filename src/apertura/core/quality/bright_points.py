@@ -250,16 +250,19 @@ def bright_points(
     >>> [(round(p.row, 1), round(p.column, 1)) for p in bright_points(image, [whole], cell_px=8, shown=shown)]
     [(30.2, 33.5), (20.0, 90.0)]
     """
-    found: list[tuple[float, int, int]] = []
+    found, floor = np.zeros((0, 3)), 0.0
     for window in windows:
         magnitude = np.abs(np.nan_to_num(np.asarray(image[window])))
-        found += _cell_maxima(magnitude, window, cell_px)
-    found.sort(key=lambda one: (-one[0], one[1], one[2]))
-    found = [one for one in found[:_MOST_MAXIMA] if one[0] > found[0][0] * 10 ** (DEEPEST_DB / 20)]
-    found = [one for one in found if _stands_out(image, *one)]
-    pixels = np.array([one[1:] for one in found], np.int64).reshape(-1, 2)
+        if (top := float(magnitude.max(initial=0.0))) > floor:
+            floor = max(floor, top * 10 ** (DEEPEST_DB / 20))
+            found = np.concatenate([found, _cell_maxima(magnitude, window, cell_px)])
+            found = found[found[:, 0] > floor]
+    found = found[np.lexsort((found[:, 2], found[:, 1], -found[:, 0]))][:_MOST_MAXIMA]
+    maxima = [(top, int(row), int(column)) for top, row, column in found.tolist()]
+    maxima = [one for one in maxima if _stands_out(image, *one)]
+    pixels = np.array([one[1:] for one in maxima], np.int64).reshape(-1, 2)
     kept = separated(
-        np.array([one[0] for one in found]), lambda one, others: shown(pixels[one], pixels[others]), most=MOST_POINTS
+        np.array([one[0] for one in maxima]), lambda one, others: shown(pixels[one], pixels[others]), most=MOST_POINTS
     )
     return [bright_point(image, int(row), int(column)) for row, column in pixels[kept]]
 
@@ -308,14 +311,17 @@ def brightest_near(image: BlockRaster, row: float, column: float, reach: float) 
     return first[0] + int(down), first[1] + int(right)
 
 
-def _cell_maxima(magnitude: NDArray[np.float32], window: Window, cell_px: int) -> list[tuple[float, int, int]]:
+def _cell_maxima(magnitude: NDArray[np.float32], window: Window, cell_px: int) -> NDArray[np.float64]:
     """Return (magnitude, row, column) of the largest local maximum in each square cell of a block, where there is one.
 
     Pixels at the block's edges are compared with their neighbours inside it.
     """
-    about = np.pad(magnitude, 1)
-    rows, columns = magnitude.shape
-    highest = np.max([about[d : d + rows, r : r + columns] for d in range(3) for r in range(3)], axis=0)
+    highest = magnitude
+    for axis in (0, 1):
+        lines, about = np.swapaxes(highest, 0, axis), np.swapaxes(highest.copy(), 0, axis)
+        np.maximum(about[1:], lines[:-1], out=about[1:])
+        np.maximum(about[:-1], lines[1:], out=about[:-1])
+        highest = np.swapaxes(about, 0, axis)
     rows, columns = (-(-size // cell_px) * cell_px for size in magnitude.shape)
     padded = np.zeros((rows, columns), magnitude.dtype)
     padded[: magnitude.shape[0], : magnitude.shape[1]] = np.where(magnitude == highest, magnitude, 0)
@@ -325,8 +331,7 @@ def _cell_maxima(magnitude: NDArray[np.float32], window: Window, cell_px: int) -
     down, right = np.indices(best.shape)
     row = window[0].start + down * cell_px + best // cell_px
     column = window[1].start + right * cell_px + best % cell_px
-    top = flat.max(axis=-1)
-    return [(float(a), int(r), int(c)) for a, r, c in zip(top.flat, row.flat, column.flat, strict=True) if a > 0]
+    return np.stack([flat.max(axis=-1), row, column], axis=-1, dtype=np.float64).reshape(-1, 3)
 
 
 def _stands_out(image: BlockRaster, magnitude: float, row: int, column: int) -> bool:

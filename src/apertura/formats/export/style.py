@@ -135,10 +135,9 @@ def _few(raster: rasterio.DatasetReader) -> NDArray[np.float32]:
     """Return a raster averaged to few places, NaN where it holds nothing."""
     fewer = max(1.0, max(raster.shape) / _DOTS)
     shape = tuple(ceil(size / fewer) for size in raster.shape)
-    values: NDArray[np.float32] = raster.read(1, out_shape=shape, resampling=Resampling.average, masked=True).filled(
-        np.nan
-    )
-    return values
+    # Not as a masked array: for its mask rasterio reads every pixel of a mosaic.
+    values = raster.read(1, out_shape=shape, resampling=Resampling.average)
+    return np.where(values == raster.nodata, np.nan, values).astype(np.float32, copy=False)
 
 
 def _round_ends(values: NDArray[np.float32]) -> tuple[float, float]:

