@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,7 +69,7 @@ def _compiled_terms(profiles: Profiles, pixels: NDArray[np.float64]) -> NDArray[
     terms = np.empty((len(profiles), len(pixels)), np.complex128)
     samples = np.ascontiguousarray(profiles.samples, np.complex64)
     geometry = [np.ascontiguousarray(one, np.float64) for one in (*profiles.aperture.legs, profiles.start_m, pixels)]
-    arrays = (samples, _paired_weights(), *geometry, terms)
+    arrays: list[NDArray[Any]] = [samples, _paired_weights(), *geometry, terms]
     job = TermsJob(
         *(array.ctypes.data for array in arrays),
         pulses=len(profiles),

@@ -97,7 +97,7 @@ class StageStore(LocalStore):
         content = value.as_numpy_array()
         whole = google_crc32c.value(content[:-_SUM_BYTES]) == int.from_bytes(content[-_SUM_BYTES:].tobytes(), "little")
         expected = self._unchecked.get(key)
-        if not whole or (expected is not None and expected != hashlib.sha256(content).hexdigest()):
+        if not whole or (expected is not None and expected != hashlib.sha256(content.data).hexdigest()):
             raise damaged(self.root, key)
         self._unchecked.pop(key, None)
         return value
