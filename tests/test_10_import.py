@@ -1,5 +1,6 @@
 """Importing apertura is cheap, and its public names come from where they are defined."""
 
+import ctypes
 import json
 import re
 import subprocess
@@ -33,6 +34,32 @@ def test_the_command_line_loads_no_library_of_a_step():
 
 def test_reading_a_config_loads_no_arrays():
     assert not (HEAVY - {"pydantic"}) & loaded_by("import apertura.pipeline.campaign")
+
+
+_ARRAYS = """
+import resource, threading
+def arrays():
+    for _ in range(50):
+        [bytearray(1 << 20) for _ in range(8)]
+before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+worker = threading.Thread(target=arrays)
+worker.start()
+worker.join()
+print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+"""
+
+
+@pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "mallopt"), reason="not the C library of GNU")
+def test_a_command_fills_the_memory_of_arrays_again_and_takes_no_other():
+    """Else the kernel clears the 2048 pages of 8 MB each time: a fault each."""
+    command = "import sys\nfrom apertura.__main__ import main\nsys.argv[1:] = ['--version']"
+    run = f"{command}\ntry:\n    main()\nexcept SystemExit:\n    pass"
+    faults = []
+    for begun in ("pass", run):
+        ended = subprocess.run([sys.executable, "-c", begun + _ARRAYS], capture_output=True, text=True, check=True)
+        faults.append(int(ended.stdout.splitlines()[-1]))
+    assert faults[0] > 25 * 2048
+    assert faults[1] < 3 * 2048
 
 
 def test_every_public_name_is_documented_and_listed():

@@ -12,7 +12,7 @@ from apertura.formats.export import cog, db, writing
 from apertura.formats.export.cog import MAGNITUDE, POWER, SLC, power, write_cog, write_power, write_slc
 from apertura.formats.export.db import DB, write_db
 from apertura.formats.export.layers import INCIDENCE
-from apertura.formats.export.writing import added, check_written, held
+from apertura.formats.export.writing import added, check_written
 
 UTM = {"transform": Affine(1, 0, 5, 0, -1, 9), "crs": "EPSG:32632", "tags": {"APERTURA_RUNSPEC": "{}"}}
 
@@ -59,25 +59,6 @@ def test_speckle_is_packed_fast_and_a_smooth_layer_well(tmp_path):
     assert sizes["speckle", 1] < 1.02 * sizes["speckle", 6]
     assert sizes["smooth", 1] > 1.1 * sizes["smooth", 6]
     assert [band.effort for band in (SLC, POWER, MAGNITUDE, DB, INCIDENCE)] == [1, 1, 1, 1, 6]
-
-
-class Counted:
-    """A raster that counts how often each of its pixels is read."""
-
-    def __init__(self, pixels):
-        self.pixels, self.read, self.shape = pixels, np.zeros(pixels.shape, int), pixels.shape
-
-    def __getitem__(self, block):
-        self.read[block] += 1
-        return self.pixels[block]
-
-
-def test_a_raster_that_several_files_are_written_from_is_read_once_if_it_is_small(request):
-    small = Counted(np.tile(image(), (4, 1)))
-    np.testing.assert_array_equal(held(small), small.pixels)
-    assert small.read[1:, 1:].max() == 1
-    request.getfixturevalue("on_disk")
-    assert held(small) is small
 
 
 @pytest.fixture

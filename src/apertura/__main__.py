@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 from typing import NoReturn
 
-from apertura.common.processes import ALGEBRA_THREADS, leave_working_folder
+from apertura.common.processes import ALGEBRA_THREADS, keep_freed_memory, leave_working_folder
 
 _ENCODING, _BACKEND = "PYTHONIOENCODING", "MPLBACKEND"
 _PROJ = ("PROJ_DATA", "PROJ_LIB")
@@ -32,6 +32,7 @@ def main() -> None:
         stream.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
     os.environ[_ENCODING] = f"{os.environ.get(_ENCODING, '').partition(':')[0]}:backslashreplace"
     os.environ[ALGEBRA_THREADS] = "1"
+    keep_freed_memory()
     os.environ[_BACKEND] = "agg"  # pictures are files; a backend of the caller's may be none that is here
     from apertura.views.cli import main as run
 

@@ -35,6 +35,9 @@ with one); engines have threads of their own. What is computed then has the same
 
 _PR_SET_PDEATHSIG = 1  # of prctl(2)
 
+_KEPT = {-3: 32 << 20, -1: 64 << 20, -2: 16 << 20}
+"""Of mallopt(3), bytes: smaller blocks are kept, so much of them in each thread, and taken so many at a time."""
+
 
 class Interrupted(SystemExit):
     """The process was ended by a signal."""
@@ -58,6 +61,17 @@ def die_with_parent(parent: int) -> None:
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:
         os._exit(SIGNALLED + signal.SIGKILL)
+
+
+def keep_freed_memory() -> None:
+    """Have the C library keep up to 64 MB in each thread of what is freed; nothing where it is not that of GNU.
+
+    It would give back every array of a tile, and the kernel clear every page of the next: a tenth of the CPU seconds of
+    an image.
+    """
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    for parameter, size in _KEPT.items() if mallopt else ():
+        mallopt(parameter, size)
 
 
 @contextmanager
