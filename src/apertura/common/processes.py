@@ -69,9 +69,10 @@ def keep_freed_memory() -> None:
     It would give back every array of a tile, and the kernel clear every page of the next: a tenth of the CPU seconds of
     an image.
     """
-    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
-    for parameter, size in _KEPT.items() if mallopt else ():
-        mallopt(parameter, size)
+    library = ctypes.CDLL(None)
+    if hasattr(library, "mallopt"):
+        for parameter, size in _KEPT.items():
+            library.mallopt(parameter, size)
 
 
 @contextmanager
