@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from apertura.core.quality.error_check import Brightness, Certificate, error_bound, random_pixels
-from apertura.core.quality.measures import coherence_factor, image_statistics, numerical_error
+from apertura.core.quality.measures import coherence_factor, held, image_statistics, numerical_error
 from apertura.core.quality.point_targets import BandLimitedPatch, cut_through, find_peak
 from apertura.core.scene.grid import SceneGrid
 
@@ -164,3 +164,22 @@ def test_draws_follow_brightness_and_their_density_is_what_was_drawn():
 def test_a_dark_image_has_no_bright_pixels_to_draw():
     dark, windows = np.zeros((8, 8), np.complex64), [(slice(0, 8), slice(0, 8))]
     assert Brightness.of(dark, windows).draw(dark, windows, 5, np.random.default_rng(0)).shape == (0, 2)
+
+
+class Counted:
+    """A raster that counts how often each of its pixels is read."""
+
+    def __init__(self, shape):
+        self.shape, self.read = shape, np.zeros(shape, np.int16)
+
+    def __getitem__(self, block):
+        self.read[block] += 1
+        return np.ones(self.shape, np.complex64)[block]
+
+
+def test_a_small_raster_is_read_once_and_one_too_large_for_memory_block_by_block():
+    small = Counted((30, 40))
+    np.testing.assert_array_equal(held(small), np.ones((30, 40)))
+    assert (small.read[1:, 1:] == 1).all()
+    large = Counted((4096, 4097))
+    assert held(large) is large

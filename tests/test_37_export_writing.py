@@ -10,7 +10,7 @@ from rasterio import Affine
 from apertura.formats.export import cog, writing
 from apertura.formats.export.cog import power, write_power, write_slc
 from apertura.formats.export.db import write_db
-from apertura.formats.export.writing import added, check_written, held
+from apertura.formats.export.writing import added, check_written
 
 UTM = {"transform": Affine(1, 0, 5, 0, -1, 9), "crs": "EPSG:32632", "tags": {"APERTURA_RUNSPEC": "{}"}}
 
@@ -43,25 +43,6 @@ def test_threads_of_gdal_change_no_byte(tmp_path, write):
         with rasterio.Env(GDAL_NUM_THREADS=threads):
             write(tmp_path / f"{threads}.tif", several, **UTM)
     assert (tmp_path / "1.tif").read_bytes() == (tmp_path / "3.tif").read_bytes()
-
-
-class Counted:
-    """A raster that counts how often each of its pixels is read."""
-
-    def __init__(self, pixels):
-        self.pixels, self.read, self.shape = pixels, np.zeros(pixels.shape, int), pixels.shape
-
-    def __getitem__(self, block):
-        self.read[block] += 1
-        return self.pixels[block]
-
-
-def test_a_raster_that_several_files_are_written_from_is_read_once_if_it_is_small(request):
-    small = Counted(np.tile(image(), (4, 1)))
-    np.testing.assert_array_equal(held(small), small.pixels)
-    assert small.read[1:, 1:].max() == 1
-    request.getfixturevalue("on_disk")
-    assert held(small) is small
 
 
 @pytest.fixture

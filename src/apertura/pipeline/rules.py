@@ -401,7 +401,7 @@ _ROWS = (
         settings=("processing.fusion",),
         documents=("assessment.json",),
         demand=Demand(500, pulse_bytes=500, pixel_bytes=30, pixel_s=5),
-        cost=Cost(1.3, mpx_s=0.2),
+        cost=Cost(1.3, mpx_s=0.1),
     ),
     Rule(
         "export",
@@ -413,7 +413,7 @@ _ROWS = (
         documents=("image.json",),
         exports="pair",
         demand=Demand(500, pixel_bytes=50, pixel_s=30),
-        cost=Cost(2.0, mpx_s=0.45, last=True),
+        cost=Cost(2.0, mpx_s=0.27, last=True),
         options=("threads",),
     ),
     Rule(
@@ -447,7 +447,7 @@ _ROWS = (
         sources=("image", "assessment", "scene"),
         settings=("campaign", "processing.tile_px"),
         demand=Demand(500, pixel_bytes=50, pixel_s=10, threads=2),
-        cost=Cost(2.5, mpx_s=1.0),
+        cost=Cost(2.5, mpx_s=0.75),
         options=("threads",),
     ),
     Rule(
@@ -465,7 +465,7 @@ _ROWS = (
         command="export",
         last_words=("fused",),
         demand=Demand(500, pixel_bytes=50, pixel_s=30, threads=2),
-        cost=Cost(3.0, mpx_s=1.0),
+        cost=Cost(3.0, mpx_s=0.6),
         options=("threads",),
     ),
     Rule(
@@ -498,7 +498,7 @@ _ROWS = (
         styles=True,
         manifest="mosaic/mosaic",
         demand=Demand(500),
-        cost=Cost(mpx_s=0.2),
+        cost=Cost(mpx_s=0.03),
     ),
     Rule(
         "stac",

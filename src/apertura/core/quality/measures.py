@@ -19,6 +19,24 @@ class BlockRaster(Protocol):
     def __getitem__(self, window: tuple[slice, slice], /) -> Any: ...
 
 
+HELD_BYTES = 1 << 27
+"""Pixels of a raster that is held in memory: 4096 x 4096 complex."""
+
+
+def held(raster: BlockRaster) -> BlockRaster:
+    """Return a raster that is read more than once in memory, read once, unless it is larger than `HELD_BYTES`.
+
+    Examples
+    --------
+    >>> held(Amplitude(np.array([[4.0, 9.0]], np.float32)))
+    array([[2.+0.j, 3.+0.j]], dtype=complex64)
+    """
+    rows, columns = raster.shape
+    if isinstance(raster, np.ndarray) or rows * columns * raster[0:1, 0:1].dtype.itemsize > HELD_BYTES:
+        return raster
+    return np.asarray(raster[0:rows, 0:columns])
+
+
 @dataclass(frozen=True)
 class NumericalError:
     """Difference of an image from `reference` at some pixels, after one complex gain.

@@ -77,17 +77,6 @@ def blocks_of(shape: tuple[int, ...]) -> Iterator[Block]:
         yield slice(top, min(top + READ, shape[0])), slice(left, min(left + READ, shape[1]))
 
 
-def held(raster: Any) -> Any:
-    """Return a raster in memory, read once, if GDAL would hold it there; a larger one as it is, read block by block."""
-    first = raster[0:1, 0:1]
-    if isinstance(raster, np.ndarray) or np.prod(raster.shape) * first.dtype.itemsize > IN_MEMORY_BYTES:
-        return raster
-    array = np.empty(raster.shape, first.dtype)
-    for block in blocks_of(raster.shape):
-        array[block] = raster[block]
-    return array
-
-
 def added(checksum: int, pixels: NDArray[Any]) -> int:
     """Return a sum over pixels with those of another block."""
     total: int = google_crc32c.extend(checksum, np.ascontiguousarray(pixels).view(np.uint8).ravel())

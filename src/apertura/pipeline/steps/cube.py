@@ -14,7 +14,7 @@ from apertura.common.contracts import MEASURED, QUOTED, RASTERS, SUMMED, Window
 from apertura.common.documents import undamaged
 from apertura.common.flags import Flags
 from apertura.core.combination import clutter_reduction_db, coherent_sum, magnitude_sum, noncoherent_sum
-from apertura.core.quality.measures import image_statistics
+from apertura.core.quality.measures import BlockRaster, held, image_statistics
 from apertura.core.scene.grid import SceneGrid
 from apertura.methods.interferometry.coherence import chance, coherence, common_band, window_px
 from apertura.pipeline.campaign import Campaign
@@ -116,7 +116,7 @@ def _quoted(image: xr.Dataset, assessed: Mapping[str, Any]) -> dict[str, float |
 
 # ---- Coherence and phase between the images of a cube ---------------------------------------------------------------
 
-_TILES_AT_ONCE = 8
+_TILES_AT_ONCE = 4
 """Along a side: tiles are read with a margin, and what they share is read once."""
 
 Compared = Mapping[str, Mapping[tuple[str, str], tuple[str, str]]]
@@ -154,7 +154,7 @@ def shared_band(one: xr.Dataset, other: xr.Dataset) -> float:
 
 
 def write_phase(
-    images: tuple[xr.Dataset, xr.Dataset],
+    images: tuple[BlockRaster, BlockRaster],
     arrays: tuple[Any, Any],
     grid: SceneGrid,
     *,
@@ -185,7 +185,7 @@ def write_phase(
     shares: list[float] = []
     for block in grid.tiles(_TILES_AT_ONCE * side):
         wide = _widened(block, window // 2, grid.shape)
-        first, second = (image.image[wide].values for image in images)
+        first, second = (np.asarray(image[wide]) for image in images)
 
         def measured(tile: Window, wide: Window = wide, first: Any = first, second: Any = second) -> float | None:
             around = _widened(tile, window // 2, grid.shape)
@@ -357,11 +357,17 @@ def _compare(
     """Write coherence and phase of each image with its flight's reference pair and its pair's first flight."""
     window = window_of(images, grid.spacing_m)
     for kind, rows in compared(images, references, reference_flights(images, arrays.pairs)).items():
-        for one, other in rows.items():
-            both, planes = (images[one], images[other]), [arrays.plane(f"{kind}_{name}", *one) for name in _PHASE]
-            measures = write_phase(both, (planes[0], planes[1]), grid, side=side, window=window, workers=workers)
-            for name, value in zip(("looks", "chance", "common_band"), (*measures, shared_band(*both)), strict=True):
-                arrays.plane(f"{kind}_{name}", *one)[()] = value
+        for other in dict.fromkeys(rows.values()):
+            against = held(images[other].image)
+            for one in (image for image, its in rows.items() if its == other):
+                planes, rasters = (
+                    [arrays.plane(f"{kind}_{name}", *one) for name in _PHASE],
+                    (held(images[one].image), against),
+                )
+                measures = write_phase(rasters, (planes[0], planes[1]), grid, side=side, window=window, workers=workers)
+                shared = shared_band(images[one], images[other])
+                for name, value in zip(("looks", "chance", "common_band"), (*measures, shared), strict=True):
+                    arrays.plane(f"{kind}_{name}", *one)[()] = value
 
 
 def _between_flights(

@@ -21,12 +21,11 @@ from apertura.common.raster import opened_raster
 from apertura.core.combination import InPhase, in_phase
 from apertura.core.quality.budget import NO_EFFECT, BudgetLine
 from apertura.core.quality.focus import DEFOCUSED_DB
-from apertura.core.quality.measures import Amplitude, BlockRaster, image_statistics
+from apertura.core.quality.measures import Amplitude, BlockRaster, held, image_statistics
 from apertura.core.quality.point_targets import CUT_REACH_M, cuts_report, find_peak
 from apertura.core.scene.grid import SceneGrid
 from apertura.formats.export import product, remove_outdated, write_exports
 from apertura.formats.export.radiometry import CROSS_SECTIONS, ECHO, Radiometry, of_sums
-from apertura.formats.export.writing import held
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import FUSED
 from apertura.pipeline.config.processing import Multilooking
