@@ -35,6 +35,12 @@ def test_reading_a_config_loads_no_arrays():
     assert not (HEAVY - {"pydantic"}) & loaded_by("import apertura.pipeline.campaign")
 
 
+def test_a_step_over_level_ground_loads_neither_a_compiler_nor_transforms():
+    """Each costs a tenth of a second of every job."""
+    heavy = {"numba", "scipy.fft", "scipy.ndimage", "scipy.special"}
+    loaded_by(f"import sys, apertura.pipeline.steps.layers\nassert not {heavy} & set(sys.modules)")
+
+
 def test_every_public_name_is_documented_and_listed():
     for name in apertura.__all__:
         assert getattr(apertura, name).__doc__, name

@@ -1,15 +1,18 @@
 """Which pulses make a pixel: looks, the centre of its aperture, and what lies outside."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scenes import monostatic, straight_track
+from scipy.interpolate import RegularGridInterpolator
 
 from apertura.core.antenna.beam import Beam, Beams, gaussian_cut
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.sector import Sector
 from apertura.core.scene.angles import bistatic_angle_deg, incidence_deg
 from apertura.core.scene.grid import SceneGrid
-from apertura.core.scene.looks import BLOCK_PX, Looks
+from apertura.core.scene.looks import BLOCK_PX, SPREAD, Lattice, Looks
 from apertura.core.scene.terrain import FlatGround
 
 GROUND = FlatGround(0.0)
@@ -65,6 +68,81 @@ def test_looks_between_nodes_are_those_of_every_pulse_at_every_pixel(kind):
     inside = exact > 0.5 * exact.max()
     assert inside.mean() > 0.3
     assert np.abs(found / np.maximum(exact, 1) - 1)[inside].max() < 0.01
+
+
+def of_sums(looks):
+    """S₁²/S₂ with both sums bilinear between nodes, in float64."""
+    whole = tuple(slice(0, size) for size in looks.grid.shape)
+    total, squares = (looks.lattice.between(one.astype(float), whole) for one in (looks.total, looks.squares))
+    return total**2 / squares
+
+
+@pytest.mark.parametrize("turn", [0.019, 0.021])
+@pytest.mark.parametrize("growth", [1.0, 0.55, 1.9])
+def test_looks_are_bilinear_where_both_sums_change_alike_and_those_of_the_sums_elsewhere(turn, growth):
+    """The worst that is allowed errs by 0.08 % at most, and by something; a little more is refused."""
+    looks = Looks.of(GRID, GROUND, FLOWN, None)
+    row, column = np.ogrid[: looks.lattice.shape[0], : looks.lattice.shape[1]]
+    total = 1e3 * growth ** (row % 2) * np.ones(column.shape)
+    squares = total * (1 + turn * (column % 2))
+    of = replace(looks, total=total.astype(np.float32), squares=squares.astype(np.float32))
+    found, exact = assembled(of, of.effective), of_sums(of)
+    off = np.abs(found / exact - 1).max()
+    if turn > 0.02:
+        assert off < 1e-6
+    else:
+        assert 1e-5 < off < 8e-4
+
+
+def test_looks_at_an_edge_are_those_of_the_sums():
+    """A sum that falls to less than half from node to node, or ends, is not passed over."""
+    looks = Looks.of(GRID, GROUND, FLOWN, None)
+    total = np.full(looks.lattice.shape, 1e3, np.float32)
+    total[:, 3:] *= 0.45
+    squares = 1.015 ** np.arange(total.shape[1], dtype=np.float32) * total
+    steep = replace(looks, total=total, squares=squares)
+    off = np.abs(assembled(steep, steep.effective) / of_sums(steep) - 1)
+    assert off[:, :BLOCK_PX].max() < 1e-6
+    assert 1e-5 < off[:, BLOCK_PX:].max() < 1e-4  # beyond the fall both change alike
+    dark = np.arange(total.shape[1]) >= 3
+    ends = replace(looks, total=np.where(dark, 0, total), squares=np.where(dark, 0, squares))
+    beside = assembled(ends, ends.effective)[
+        :, 3 * looks.lattice.pitch_px - 1
+    ]  # of the pulses of the last node with any
+    assert np.abs(beside / (1e3 / 1.015**2) - 1).max() < 1e-6
+
+
+def test_rows_and_columns_lie_between_their_own_nodes():
+    lattice, window = Lattice.of((300, 500), 32), (slice(280, 300), slice(280, 300))
+    found = lattice.between(np.subtract.outer(lattice.nodes[0], 1000.0 * lattice.nodes[1]), window)
+    assert np.allclose(found, np.subtract.outer(np.arange(280, 300), 1000.0 * np.arange(280, 300)), atol=1e-9)
+
+
+def test_values_of_float32_are_interpolated_in_float32_and_others_in_float64():
+    lattice, rng = Lattice.of((300, 500), 32), np.random.default_rng(2)
+    values, window = 50 + rng.random((*lattice.shape, 2)), (slice(100, 300), slice(7, 450))
+    exact = lattice.between(values, window)
+    found = lattice.between(values.astype(np.float32), window)
+    assert (exact.dtype, found.dtype) == (np.float64, np.float32)
+    assert np.abs(found / exact - 1).max() < 3e-7
+    rows, columns = np.meshgrid(*(np.arange(at.start, at.stop) for at in window), indexing="ij")
+    by_scipy = RegularGridInterpolator(lattice.nodes, values)(np.stack([rows, columns], -1))
+    assert np.allclose(exact, by_scipy, rtol=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["sector", "beam"])
+def test_pulses_of_a_node_weigh_half_or_more_and_are_spread_evenly(kind):
+    looks = Looks.of(GRID, GROUND, FLOWN, WEIGHED[kind])
+    rows, columns = np.meshgrid(*looks.lattice.nodes, indexing="ij")
+    weight = np.abs(every_weight(WEIGHED[kind], GROUND.positions_at(GRID, rows.ravel(), columns.ravel())))
+    most = weight.max(axis=0)
+    lit = np.flatnonzero(most > 0.5 * most.max())
+    assert lit.size > 30
+    for node in lit.tolist():
+        pulses, counted = looks.pulses.reshape(-1, SPREAD)[node], np.flatnonzero(weight[:, node] >= most[node] / 2)
+        assert (weight[pulses, node] > 0.45 * most[node]).all()
+        place = np.searchsorted(counted, pulses) / len(counted)
+        assert np.abs(place - np.linspace(0, 1, SPREAD)).max() < 0.06
 
 
 def test_looks_are_the_pulses_that_count_and_fewer_at_a_smooth_edge():

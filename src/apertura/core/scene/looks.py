@@ -47,6 +47,7 @@ class Lattice:
 
     nodes: tuple[NDArray[np.int64], NDArray[np.int64]]
     pitch_px: int
+    _known: "dict[tuple[int, int, int], _Cells]" = field(default_factory=dict, repr=False)
 
     @classmethod
     def of(cls, shape: tuple[int, int], pitch_px: int = 16) -> "Lattice":
@@ -83,7 +84,7 @@ class Lattice:
         farthest
             Length of the difference (last axis) of two corners of a cell above which the nearest corner counts.
         """
-        (low, high, up), (left, right, across) = (_cells(at, part) for at, part in zip(self.nodes, window, strict=True))
+        (low, high, up), (left, right, across) = self._cells(window)
         extra, dtype = (1,) * (values.ndim - 2), np.float32 if values.dtype == np.float32 else np.float64
         up, across = up.reshape(-1, 1, *extra).astype(dtype), across.reshape(1, -1, *extra).astype(dtype)
         values, left, right = values[:, left[0] : right[-1] + 1], left - left[0], right - left[0]
@@ -111,16 +112,27 @@ class Lattice:
         """Return which pixels of a window, (row, column), lie among corners that are all positive."""
         if (values[self.around(window)] > 0).all():
             return np.ones([part.stop - part.start for part in window], bool)
-        (low, high, _), (left, right, _) = (_cells(at, part) for at, part in zip(self.nodes, window, strict=True))
+        (low, high, _), (left, right, _) = self._cells(window)
         corners = [values[np.ix_(row, column)] > 0 for row in (low, high) for column in (left, right)]
         return np.asarray(np.logical_and.reduce(corners))
 
     def around(self, window: Window) -> Window:
         """Return the window of those nodes that the pixels of a window lie between."""
-        rows, columns = (
-            slice(int(before[0]), int(after[-1]) + 1) for before, after, _ in map(_cells, self.nodes, window)
-        )
+        rows, columns = (slice(int(before[0]), int(after[-1]) + 1) for before, after, _ in self._cells(window))
         return rows, columns
+
+    def _cells(self, window: Window) -> "tuple[_Cells, _Cells]":
+        """Return along both axes the nodes before and after each pixel, and how far between them it lies."""
+        return self._along(0, window[0]), self._along(1, window[1])
+
+    def _along(self, axis: int, part: slice) -> "_Cells":
+        key, nodes = (axis, part.start, part.stop), self.nodes[axis]
+        if key not in self._known:  # tiles of one row ask for the same
+            at = np.arange(part.start, part.stop)
+            before = np.clip(np.searchsorted(nodes, at, side="right") - 1, 0, max(0, len(nodes) - 2))
+            after = np.minimum(before + 1, len(nodes) - 1)
+            self._known[key] = before, after, (at - nodes[before]) / np.maximum(1, nodes[after] - nodes[before])
+        return self._known[key]
 
     def nearest(self, window: Window) -> list[tuple[tuple[int, int], Window]]:
         """Return the nodes nearest to the pixels of a window, each with the part of the window that is its."""
@@ -138,12 +150,7 @@ class Lattice:
         return [((row, column), (rows, columns)) for row, rows in owned[0] for column, columns in owned[1]]
 
 
-def _cells(nodes: NDArray[np.int64], part: slice) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-    """Return the nodes before and after each pixel, and how far between them it lies."""
-    at = np.arange(part.start, part.stop)
-    before = np.clip(np.searchsorted(nodes, at, side="right") - 1, 0, max(0, len(nodes) - 2))
-    after = np.minimum(before + 1, len(nodes) - 1)
-    return before, after, (at - nodes[before]) / np.maximum(1, nodes[after] - nodes[before])
+_Cells = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]
 
 
 def fill(
@@ -189,6 +196,7 @@ _CELL_PX = 8  # side of the cells of which it is first asked whether a pulse can
 _PIXELS = 4096  # that are decided together
 _DARK_PULSES = 64  # evaluated for the centres of a block that no pulse reaches: its neighbours interpolate with them
 _NO_WEIGHT_PENALTY = 1e6  # added to the distance of a pulse without weight: it is a centre only where none has weight
+_ALIKE = 0.02  # change of Σ|w|/Σw² from node to node up to which looks are bilinear: 0.08 % off the two sums at most
 _JUMP_PITCHES = 4.0  # node pitches: centres of neighbouring nodes further apart belong to different passes
 
 
@@ -342,13 +350,35 @@ class Looks:
         return sums
 
     def effective(self, tile: Window) -> NDArray[np.float32]:
-        """Return the looks of the pixels of a tile, (row, column) float32; 0 where no pulse illuminates them."""
-        total, squares = self._sums(tile)
-        total *= total
-        total /= np.where(squares > 0, squares, np.inf)
-        looks = np.maximum(1.0, total, out=total)
+        """Return the looks of the pixels of a tile, (row, column) float32; 0 where no pulse illuminates them.
+
+        Bilinear between nodes themselves where Σ|w| and Σw² change alike, else by these two.
+        """
+        if self._alike(tile):
+            looks = self.lattice.between(self._node_looks, tile)
+        else:
+            total, squares = self._sums(tile)
+            looks = total**2 / np.where(squares > 0, squares, np.float32(np.inf))
+        looks = np.maximum(np.float32(1), looks, out=looks)
         lit = self.illuminated(tile)
         return looks if lit.all() else np.where(lit, looks, np.float32(0))
+
+    @cached_property
+    def _node_looks(self) -> NDArray[np.float32]:
+        return np.asarray(self.total**2 / np.where(self.squares > 0, self.squares, np.float32(np.inf)))
+
+    def _alike(self, tile: Window) -> bool:
+        """Return whether both sums change alike from node to node, and none to more than twice (docs, section 4)."""
+        near = self.lattice.around(tile)
+        total = self.total[near]
+        if not total.all():
+            return False
+        inverse = total / self.squares[near]
+        return all(
+            (np.abs(np.diff(of, axis=axis)) <= most * of.min()).all()
+            for of, most in ((total, 1.0), (inverse, _ALIKE))
+            for axis in (0, 1)
+        )
 
     def weight_squares(self, window: Window) -> Floats:
         """Return Σw² at the pixels of a window, (row, column) float64; 0 where no node about them has pulses."""
