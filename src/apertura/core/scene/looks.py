@@ -368,7 +368,7 @@ class Looks:
         return np.asarray(self.total**2 / np.where(self.squares > 0, self.squares, np.float32(np.inf)))
 
     def _alike(self, tile: Window) -> bool:
-        """Return whether both sums change alike from node to node, and none to more than twice (docs, section 4)."""
+        """Return whether both sums change alike from node to node, none to more than twice: layers.md, eq. 4."""
         near = self.lattice.around(tile)
         total = self.total[near]
         if not total.all():

@@ -6,6 +6,7 @@ from math import exp, lgamma
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from apertura.common.contracts import Window
@@ -197,16 +198,15 @@ def _looks(one: NDArray[np.complex128], other: NDArray[np.complex128], window: i
 
 def _correlation(image: NDArray[np.complex128], window: int) -> NDArray[np.complex128]:
     """Return the autocorrelation at lags below `window`: (2 `window` - 1,) twice, 1 in the middle."""
-    from scipy.fft import fft2, ifft, next_fast_len
-
-    longer = [next_fast_len(size + window - 1) for size in image.shape]  # else the correlation would be circular
+    # Longer, else the correlation would be circular.
+    longer = [scipy.fft.next_fast_len(size + window - 1) for size in image.shape]
     near = np.arange(1 - window, window)
     with np.errstate(divide="ignore", invalid="ignore"):
         # In single precision, as the image came: its peak at 1, so that powers of any image fit.
-        spectrum = fft2((image / np.abs(image).max()).astype(np.complex64), longer)
+        spectrum = scipy.fft.fft2((image / np.abs(image).max()).astype(np.complex64), longer)
         alike = spectrum.real**2 + spectrum.imag**2
         for axis in (0, 1):
-            alike = np.take(ifft(alike, axis=axis), near, axis=axis)
+            alike = np.take(scipy.fft.ifft(alike, axis=axis), near, axis=axis)
         return np.asarray(alike / alike[window - 1, window - 1].real, np.complex128)
 
 

@@ -360,11 +360,9 @@ def _compare(
         for other in dict.fromkeys(rows.values()):
             against = held(images[other].image)
             for one in (image for image, its in rows.items() if its == other):
-                planes, rasters = (
-                    [arrays.plane(f"{kind}_{name}", *one) for name in _PHASE],
-                    (held(images[one].image), against),
-                )
-                measures = write_phase(rasters, (planes[0], planes[1]), grid, side=side, window=window, workers=workers)
+                planes = [arrays.plane(f"{kind}_{name}", *one) for name in _PHASE]
+                both, to = (held(images[one].image), against), (planes[0], planes[1])
+                measures = write_phase(both, to, grid, side=side, window=window, workers=workers)
                 shared = shared_band(images[one], images[other])
                 for name, value in zip(("looks", "chance", "common_band"), (*measures, shared), strict=True):
                     arrays.plane(f"{kind}_{name}", *one)[()] = value

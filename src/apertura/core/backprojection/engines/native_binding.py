@@ -216,9 +216,8 @@ INSTRUCTION_SETS = ("avx512", "avx2", "portable")
 NAMED_BY = "APERTURA_KERNEL"
 """Environment variable: another library than the one installed."""
 
-_BUILT = Path(
-    str(files("apertura.core.backprojection.engines") / "_backprojection.so")
-)  # resolved once: calls may be short
+# Resolved once: calls may be short.
+_BUILT = Path(str(files("apertura.core.backprojection.engines") / "_backprojection.so"))
 
 
 def layout() -> dict[str, str]:
@@ -263,7 +262,7 @@ def check_layout(theirs: dict[str, str], path: Path) -> None:
             raise CampaignError(
                 f"{name} at {theirs.get(name, 'no place')}",
                 where=str(path),
-                expected=f"{name} at {ours.get(name, 'no place')}, as in apertura's native_structs.py",
+                expected=f"{name} at {ours.get(name, 'no place')}, as in apertura's native_binding.py",
                 remedy="Reinstall apertura, so that the library and Python are of one version; unset APERTURA_KERNEL.",
             )
 
