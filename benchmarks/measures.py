@@ -58,7 +58,7 @@ def formation(size: int, pulses: int, subcarriers: int) -> Formation:
     weight = window_weights("hann", subcarriers)
     history = PhaseHistory(echoes, frequency, weight, np.zeros(pulses), flown)
     grid, ground = SceneGrid("local", -half, half, SPACING_M, (size, size)), FlatGround(0.0)
-    job = imaging_job(flown, frequency, weight, grid, GroundModels.of(ground, None, grid), history=history)
+    job = imaging_job(flown, frequency, weight, grid, GroundModels.of(ground, None, grid))
     plan = make_plan(job, accuracy_db=-60.0)
     return Formation(history, range_compress(history, grid, ground), grid, plan, TILE)
 

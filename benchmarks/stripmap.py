@@ -196,7 +196,7 @@ def imaged(pulses: int, pixels: int, folder: Path) -> None:
     window = np.load(folder / "window.npz")
     history = replace(flight.history, transfer=Rows(stage.transfer))  # type: ignore[arg-type]
     ground = GroundModels.of(FLAT, None, grid)
-    job = imaging_job(flight.aperture, flight.frequency_hz, history.weight, grid, ground, history=history, beams=beams)
+    job = imaging_job(flight.aperture, flight.frequency_hz, history.weight, grid, ground, beams=beams)
     lit = illuminate(job.beams, job.aperture, job.points_m) if job.beams else None
     plan = make_plan(replace(job, illumination=lit, threads=2, memory_bytes=8 << 30), accuracy_db=-60.0)
     planned = time.process_time()

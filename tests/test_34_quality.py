@@ -136,6 +136,17 @@ def test_only_the_tile_that_misses_the_accuracy_is_named():
     assert certificate.failing(worse, -30, power=2.0) == ([], [])
 
 
+def test_a_tile_whose_only_pixel_is_bright_is_judged_by_what_is_there():
+    """In a dark image, 36 dB above its mean: an error of -50 dB is no more there than -50 dB; one of -30 dB is."""
+    image = np.full((64, 64), 1e-3, np.complex64)
+    image[5, 5] = 1.0
+    windows, pixels = list(SceneGrid("local", 0, 0, 1, (64, 64)).tiles(32)), np.array([[5, 5], [40, 40]])
+    power = float((np.abs(image) ** 2).mean())
+    for error_db, failing in ((-50, []), (-30, [windows[0]])):
+        exact = image[tuple(pixels.T)] * (1 + 10 ** (error_db / 20) * np.array([1.0, 0.0]))
+        assert Certificate(windows, pixels, exact).failing(image, -40, power=power)[1] == failing
+
+
 @pytest.mark.parametrize(("count", "seen"), [(9, 9), (40, 9), (4, 4)])
 def test_every_tile_gets_a_pixel_as_long_as_there_are_as_many(count, seen):
     windows = list(SceneGrid("local", 0, 0, 1, (70, 90)).tiles(32))

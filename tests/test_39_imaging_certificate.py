@@ -98,7 +98,7 @@ def test_what_no_tile_misses_for_itself_but_the_bound_does_is_formed_again(speck
 def test_the_brightest_target_is_measured_where_it_stands_with_its_amplitude_and_width():
     history, ground = point_history(), GroundModels.flat(0.0)
     aperture, frequency = history.aperture, history.frequency_hz
-    job = imaging_job(aperture, frequency, history.weight, TARGET_GRID, ground, history=history)
+    job = imaging_job(aperture, frequency, history.weight, TARGET_GRID, ground)
     plan = make_plan(job, accuracy_db=-60.0)
     formation = Formation(history, range_compress(history, TARGET_GRID, ground.full), TARGET_GRID, plan, SIDE_PX)
     brightest = measures(formation, formation.image.compute())["brightest"]

@@ -133,7 +133,7 @@ def coarse_report(targets, *, seed, bow_m=0.0):
     history = PhaseHistory(echo, COARSE_HZ, window / window.sum(), np.zeros(512), Aperture(LOGGED, LOGGED))
     grid, ground = SceneGrid("local", -20.0, 20.0, 0.08, (500, 500)), FlatGround(0.0)
     models = GroundModels.of(ground, None, grid)
-    job = imaging_job(history.aperture, COARSE_HZ, history.weight, grid, models, history=history)
+    job = imaging_job(history.aperture, COARSE_HZ, history.weight, grid, models)
     plan = make_plan(job, accuracy_db=-50.0)
     formation = Formation(history, range_compress(history, grid, ground), grid, plan, 256)
     return focus_report(formation, formation.image.compute()), places, flown

@@ -116,7 +116,7 @@ class House:
         self.compressions: list[float] = []
         known = (history.aperture, history.frequency_hz, history.weight)
         models = GroundModels.of(scene.ground, None, grid)
-        self.job: Job = imaging_job(*known, grid, models, history=history, integration="all")
+        self.job: Job = imaging_job(*known, grid, models, integration="all")
 
     def compress(self) -> None:
         """Compress once more in range, and note the time."""

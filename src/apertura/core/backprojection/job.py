@@ -105,9 +105,6 @@ class Job:
         Longest total path inside the cyclic prefix.
     memory_bytes
         What the imaging step may use.
-    content_db
-        How much weaker the scene's pixels are than the incoherent sum of the contributions, from `content_loss_db`:
-        errors of tables weigh that much more. None before anything was recorded.
     beams, illumination
         Of the antennas, where they have any, and of the sector integrated; over all pulses.
     integration
@@ -134,7 +131,6 @@ class Job:
     terrain: GroundModels = field(default_factory=GroundModels.flat)
     path_limit_m: float = np.inf
     memory_bytes: float = np.inf
-    content_db: float | None = None
     beams: Beams | None = None
     illumination: Illumination | None = None
     integration: Integration | None = None

@@ -393,6 +393,6 @@ def _job(
         job = profiles_job(inputs, grid, ground, **weighed)
     else:
         known = (inputs.aperture, inputs.frequency_hz, inputs.weight)
-        job = imaging_job(*known, grid, ground, history=inputs, wave_speed_m_s=inputs.wave_speed_m_s, **weighed)
+        job = imaging_job(*known, grid, ground, wave_speed_m_s=inputs.wave_speed_m_s, **weighed)
     illumination = None if job.beams is None else illuminate(job.beams, job.aperture, job.points_m)
     return replace(job, illumination=illumination, memory_bytes=memory_limit())

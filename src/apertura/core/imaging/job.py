@@ -17,7 +17,6 @@ from apertura.core.geometry.geodesy import LOCAL
 from apertura.core.imaging.range_profiles import RangeWindow
 from apertura.core.planning.decisions import integrate
 from apertura.core.planning.plan import check_positions
-from apertura.core.quality.measures import content_loss_db
 from apertura.core.scene.clearance import check_antennas
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.map_crs import check_crs
@@ -167,8 +166,6 @@ def _outside(inputs: PhaseHistory | Profiles, points: np.ndarray) -> float:
 # ---- The planner's job of a pair and a scene
 
 _PATCH_PX = 256  # side of the windows whose positions predictions use
-_CONTENT_PIXELS = 128  # random ones for `content_loss_db`
-_CONTENT_PULSES = 16384  # at most: their terms at so many pixels take 32 MB
 
 
 def decide_integration(
@@ -203,7 +200,6 @@ def imaging_job(
     grid: SceneGrid,
     ground: GroundModels,
     *,
-    history: PhaseHistory | None = None,
     beams: Beams | None = None,
     integration: Any = "auto",
     wave_speed_m_s: float = SPEED_OF_LIGHT_M_S,
@@ -218,8 +214,6 @@ def imaging_job(
         (subcarrier,) float64, RF frequency and window.
     grid, ground
         The scene: its pixels, its ground and cheaper models of the ground.
-    history
-        What was recorded, where there is a recording: gives the weight of errors between the scene's targets.
     beams
         Of the antennas, where they have any.
     integration
@@ -249,7 +243,6 @@ def imaging_job(
         frame=grid.frame,
         terrain=ground,
         patches_on=partial(_patches, grid),
-        content_db=None if history is None else _content_db(history, grid, ground.full, beams),
         beams=beams,
         integration=decided,
     )
@@ -258,7 +251,7 @@ def imaging_job(
 def profiles_job(
     profiles: Profiles, grid: SceneGrid, ground: GroundModels, *, beams: Beams | None = None, integration: Any = "auto"
 ) -> Job:
-    """Return the planner's job of range profiles alone: their band is taken as full and flat, their content as unknown.
+    """Return the planner's job of range profiles alone: their band is taken as full and flat.
 
     Parameters
     ----------
@@ -297,17 +290,3 @@ def _patches(grid: SceneGrid, ground: Terrain) -> tuple[NDArray[np.float64], ...
         tuple(slice(at, at + side) for at, side in zip(corner, sides, strict=True)) for corner in sorted(corners)
     ]
     return tuple(ground.positions(grid[rows, columns]) for rows, columns in windows)
-
-
-def _content_db(history: PhaseHistory, grid: SceneGrid, terrain: Terrain, beams: Beams | None) -> float | None:
-    """Return how much errors weigh at some random pixels of the scene; None where a flight is too long to be read."""
-    if len(history) > _CONTENT_PULSES:
-        return None
-    from apertura.core.backprojection.engines import reference  # slow to import: it brings a compiler
-
-    rows, columns = np.random.default_rng(0).integers(0, grid.shape, (_CONTENT_PIXELS, 2)).T
-    places = terrain.positions_at(grid, rows, columns)
-    parts = [slice(first, first + 64) for first in range(0, len(history), 64)]
-    return content_loss_db(
-        np.concatenate([reference.terms(history[part], places, beams and beams[part]) for part in parts])
-    )

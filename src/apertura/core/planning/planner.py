@@ -18,14 +18,8 @@ from apertura.core.planning.plan import Decision, Plan, block_decision, bytes_ne
 
 # ---- Search among the settings of all engines
 
-UNKNOWN_CONTENT_DB = 3.0
-"""dB reserved before an echo is recorded: at random pixels of a sparse scene errors weigh more (`content_loss_db`)."""
-
-CONTENT_COST = 1.3
-"""Cost relative to the cheapest setting up to which the margin for content is paid; beyond, tiles are redone."""
-
 EQUAL_COST = 1.05
-"""Cost relative to the chosen setting that counts as equal; the most exact of equals is taken."""
+"""Cost relative to the cheapest setting that counts as equal; the most exact of equals is taken."""
 
 _PLACE_S = {"ecef": 2.0e-8, "local": 2.7e-9}  # per pixel position
 _TILE_S = 4.0e-3  # per tile: task and write
@@ -61,20 +55,12 @@ class SettingSearch:
         return {}
 
     @property
-    def content_db(self) -> float:
-        """How much more errors may weigh at the scene's pixels than at those of a flat, incoherent one."""
-        return UNKNOWN_CONTENT_DB if self.job.content_db is None else max(0.0, self.job.content_db)
-
-    @property
     def tile_seconds(self) -> float:
         """Seconds of tiles apart from their sums: placing pixels, and writing."""
         return self.job.pixels * _PLACE_S[self.job.frame] + self.job.tiles * _TILE_S
 
     def cheapest(self, pulses: int, target_db: float) -> Setting:
-        """Return the cheapest setting that meets the target, or the best there is.
-
-        The margin for the scene's content is applied as long as it is cheap: beyond that the certificate decides, and
-        tiles that need it are formed again.
+        """Return the most exact of the settings about as cheap as the cheapest that meets the target; else the best.
 
         Raises
         ------
@@ -85,10 +71,7 @@ class SettingSearch:
         exact = [setting for setting in options if setting.error_db <= target_db]
         if not exact:
             return min(options, key=lambda setting: setting.error_db)
-        near = [setting for setting in exact if setting.seconds <= CONTENT_COST * exact[0].seconds]
-        sure = (setting for setting in near if setting.error_db <= target_db - self.content_db)
-        chosen = next(sure, min(near, key=lambda setting: setting.error_db))
-        equal = (setting for setting in exact if setting.seconds <= EQUAL_COST * chosen.seconds)
+        equal = (setting for setting in exact if setting.seconds <= EQUAL_COST * exact[0].seconds)
         return min(equal, key=lambda setting: setting.error_db)
 
     def settings(self, pulses: int) -> list[Setting]:
@@ -138,13 +121,11 @@ class SettingSearch:
         more = (blocks - 1) * self.tile_seconds
         return replace(setting, pulse_blocks=blocks, form_seconds=setting.form_seconds + more)
 
-    def decisions(self, chosen: Setting, accuracy_db: float) -> Iterator[Decision]:
-        """Yield the choices that make up a setting, with their reasons."""
+    def decisions(self, chosen: Setting, verdict: str) -> Iterator[Decision]:
+        """Yield the choices that make up a setting, with their reasons; the verdict says whether it is exact enough."""
         requested = self._asked(chosen.engine)
-        verdict = "meets" if chosen.error_db <= accuracy_db else "does not meet"
-        rank = "what was asked for" if requested or self.engine else "cheapest of every engine and setting, to 5 %"
-        why = "asked for; " if self.engine else ""
-        yield Decision("engine", chosen.engine, f"{why}{rank}, {verdict} {accuracy_db:.0f} dB", chosen.error_db)
+        every = "engine and setting" if self.engine is None and not requested else "setting that was asked for"
+        yield Decision("engine", chosen.engine, f"cheapest of every {every}, to 5 %, {verdict}", chosen.error_db)
         for name, reason in chosen.reasons.items():
             why = "asked for; " if name in requested else ""
             yield Decision(name, chosen.all_options[name], why + reason)
@@ -179,6 +160,9 @@ class SettingSearch:
 
 MARGIN_DB = 3.0
 """dB of predicted errors below the requested accuracy: what predictions may be too low by (benchmarks/planner.py)."""
+
+_PRESUM_DB = 6.0
+"""dB of a low-pass sum's error below that of all: a quarter, so that tables may err by the rest."""
 
 PRESUM_FACTORS = (16, 12, 8, 6, 5, 4, 3, 2)
 """Pulses per virtual pulse that are tried, the largest first."""
@@ -223,10 +207,10 @@ def make_plan(
     antennas, missed = decide_antennas(job.beams, job.illumination)
     chosen = search.fitted(chosen, presum)
     expected_db = power_sum_db(chosen.error_db, *([] if presumming.error_db is None else [presumming.error_db]))
+    verdict = f"meets {accuracy_db:.0f} dB"
     if expected_db > accuracy_db:
-        flags["prediction_misses"] = (
-            f"predicted {expected_db:.1f} dB, {accuracy_db:.0f} dB asked: tiles that miss it are formed again"
-        )
+        verdict = f"predicted {expected_db:.1f} dB, {accuracy_db:.0f} dB asked: tiles that miss it are formed again"
+        flags["prediction_misses"] = verdict
     integrated = job.integration or Integration(None, len(job.aperture), "all", "every pulse counts for every pixel")
     memory, disk = bytes_needed(job, chosen, presum)
     blocks = block_decision(chosen, job, presum, requested="pulse_blocks" in requested)
@@ -234,7 +218,7 @@ def make_plan(
         setting=chosen,
         fallbacks=search.fallbacks(chosen),
         decisions=(
-            *search.decisions(chosen, accuracy_db),
+            *search.decisions(chosen, verdict),
             Decision("integration", integrated.value, integrated.reason),
             presumming,
             blocks,
@@ -242,7 +226,7 @@ def make_plan(
             *(Decision("antenna", value, reason) for value, reason in antennas),
         ),
         accuracy_db=accuracy_db,
-        predicted_error_db=expected_db + max(0.0, job.content_db or 0.0),
+        predicted_error_db=expected_db,
         predicted_seconds=chosen.table_seconds + chosen.form_seconds / min(job.threads, job.tiles),
         memory_bytes=memory,
         disk_bytes=disk,
@@ -275,7 +259,7 @@ def _decide_presum(
         return keep(f"{'the antennas weigh' if job.antennas else 'the sector weighs'} every pulse for itself")
     if every_pulse.engine == "reference":
         return keep("the double sum takes every pulse")
-    limit_db = accuracy_db - MARGIN_DB - search.content_db - 3
+    limit_db = accuracy_db - MARGIN_DB - _PRESUM_DB
     best = _best_presum(job, (requested,) if requested else PRESUM_FACTORS, widest, limit_db)
     if best is None and requested:
         raise CampaignError(
@@ -287,7 +271,7 @@ def _decide_presum(
     if best is None:
         return keep(
             f"a low-pass sum of fewer pulses would err by more than {limit_db:.0f} dB, "
-            f"which leaves room for tables and for what is weak in the scene"
+            f"which leaves room for tables"
         )
     presum, error_db = best
     spent = PRESUM_S * pulses * job.signal.samples

@@ -228,18 +228,19 @@ class Certificate:
     def failing(self, image: BlockRaster, accuracy_db: float, *, power: float) -> tuple[list[Window], list[Window]]:
         """Return (tiles without a drawn pixel, tiles worse than requested); both empty when all tiles pass.
 
-        A tile is worse when the mean squared difference at its pixels exceeds the accuracy times `power`, the mean
-        |I|² of the image. The pixels do not depend on the image, so a run that was killed while it
-        redid tiles makes the same choice again, provided the failing tiles are redone last.
+        A tile is worse when the mean squared difference at its pixels exceeds the accuracy times the larger of `power`,
+        the mean |I|² of the image, and of what is there: a pixel on a bright target may err by more than a dark one.
+        The pixels do not depend on the image, so a run that was killed while it redid tiles makes the same choice
+        again, provided the failing tiles are redone last.
         """
-        squared = np.abs(values_at(image, self.pixels) - self.exact) ** 2
-        budget = 10 ** (accuracy_db / 10) * power
+        squared, there = np.abs(values_at(image, self.pixels) - self.exact) ** 2, np.abs(self.exact) ** 2
+        asked = 10 ** (accuracy_db / 10)
         empty, worse = [], []
         for window in self.windows:
             inside = _inside(self.pixels, window)
             if not inside.any():
                 empty.append(window)
-            elif not squared[inside].mean() <= budget:
+            elif not squared[inside].mean() <= asked * max(power, float(there[inside].mean())):
                 worse.append(window)
         return (empty if worse else []), worse
 

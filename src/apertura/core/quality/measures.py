@@ -171,30 +171,6 @@ def coherence_factor(contributions: NDArray[np.complex128]) -> float:
     return float(np.round(np.abs(contributions.sum()) ** 2 / energy, 12)) if energy else 0.0
 
 
-def content_loss_db(terms: NDArray[np.complex128]) -> float:
-    """Return how much weaker pixels are than the incoherent sum of their contributions, dB.
-
-    Errors of tables and paths differ from pulse to pulse and add incoherently; pixels between a few bright targets are
-    the rest of echoes that cancel, so the same errors weigh more there.
-
-    Parameters
-    ----------
-    terms
-        (pulse, pixel) complex128, from `reference.terms` at random pixels. The brightest twentieth is left out: another
-        draw of pixels may miss it.
-
-    Examples
-    --------
-    >>> content_loss_db(np.ones((100, 3), complex))  # in phase: a hundredfold gain of power
-    -20.0
-    """
-    power = np.abs(terms.sum(axis=0)) ** 2
-    usual = power <= np.quantile(power, 0.95)
-    incoherent = float((np.abs(terms[:, usual]) ** 2).sum(axis=0).mean())
-    coherent = float(power[usual].mean())
-    return float(10 * np.log10(incoherent / coherent)) if coherent > 0 and incoherent > 0 else 0.0
-
-
 def weighted_median(values: NDArray[np.float64], weights: NDArray[np.float64]) -> float:
     """Return the value with half of the weight on either side, interpolated.
 

@@ -301,7 +301,6 @@ def job_of(campaign: Campaign, pair: OpenPair, scene: OpenScene, *, threads: int
         pair.weight,
         scene.grid,
         ground,
-        history=pair.history,
         beams=pair.beams,
         integration=campaign.settings.processing.integrated,
         wave_speed_m_s=pair.wave_speed_m_s,

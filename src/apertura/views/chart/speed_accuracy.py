@@ -80,8 +80,7 @@ def speed_accuracy(campaign: Campaign, flight: str, pair: str, *, seconds: float
 
     Notes
     -----
-    Engines are charted: placing pixels and storing tiles, which all share, is in no seconds. What the scene's content
-    adds to the planned error is added to that of every setting.
+    Engines are charted: placing pixels and storing tiles, which all share, is in no seconds.
     """
     lineage = result_of(campaign, "speed_accuracy").begin(campaign.root)
     logged, track = open_pair(campaign, flight, pair), open_refined(campaign, flight)
@@ -99,11 +98,7 @@ def speed_accuracy(campaign: Campaign, flight: str, pair: str, *, seconds: float
     plan, search = plan_job(campaign, job, accuracy_db=accuracy_db), SettingSearch(job)
     part = _part(history, profiles[block], scene, plan, total_pixels=job.pixels, beams=beams)
     points = [
-        replace(
-            point,
-            predicted_seconds=point.predicted_seconds - search.tile_seconds,
-            predicted_error_db=point.predicted_error_db + (0.0 if point.planned else max(0.0, job.content_db or 0.0)),
-        )
+        replace(point, predicted_seconds=point.predicted_seconds - search.tile_seconds)
         for point in measure(part, plan, _settings(search), seconds=seconds)
     ]
     size = f"{scene.grid.shape[0]} × {scene.grid.shape[1]} pixels, {len(history)} pulses"
