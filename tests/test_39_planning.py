@@ -123,7 +123,9 @@ def test_predictions_hold_over_all_pixels_whatever_the_scene_holds(seed):
     image = formed(drawn, planned.setting, planned.inputs(drawn.profiles))
     assert error_db(drawn, image) <= planned.predicted_error_db + MARGIN_DB
     if seed == 609:
-        quarters = [(rows, columns) for rows in (slice(0, 48), slice(48, 96)) for columns in (slice(0, 44), slice(44, 89))]
+        quarters = [
+            (rows, columns) for rows in (slice(0, 48), slice(48, 96)) for columns in (slice(0, 44), slice(44, 89))
+        ]
         dark = min(quarters, key=lambda where: np.abs(image[where]).mean())
         assert error_db(drawn, image, dark) > drawn.accuracy_db
 

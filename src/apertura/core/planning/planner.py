@@ -270,8 +270,7 @@ def _decide_presum(
         )
     if best is None:
         return keep(
-            f"a low-pass sum of fewer pulses would err by more than {limit_db:.0f} dB, "
-            f"which leaves room for tables"
+            f"a low-pass sum of fewer pulses would err by more than {limit_db:.0f} dB, which leaves room for tables"
         )
     presum, error_db = best
     spent = PRESUM_S * pulses * job.signal.samples
