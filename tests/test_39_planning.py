@@ -176,6 +176,18 @@ def test_an_override_that_misses_the_accuracy_is_kept_and_predicted():
     assert planned.fallbacks[-1].engine == "reference"
 
 
+@compiled
+def test_every_setting_that_is_offered_may_be_asked_for():
+    """Down to the coarsest: what the planner may choose an engine takes."""
+    job = planning_job(shape=(4000, 4000))
+    for name in ("native", "tree", "numba", "reference"):
+        engine = load_engine(name)
+        for setting in engine.candidates(job, pulses=300, requested={}):
+            engine.Options.model_validate(
+                {n: v for n, v in setting.all_options.items() if n in engine.Options.model_fields}
+            )
+
+
 def test_each_fallback_errs_6_db_less_than_the_last():
     planned = plan()
     errors = [planned.setting.error_db, *(setting.error_db for setting in planned.fallbacks)]

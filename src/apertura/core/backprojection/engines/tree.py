@@ -56,7 +56,7 @@ class Options(EngineOptions):
     nodes_db: Literal[-50, -56, -62, -68, -74, -80, -86, -92, -98] | None = Field(
         None, description="what one interpolation between nodes may err by, dB"
     )
-    presum_db: Annotated[int, Field(ge=-100, le=-40)] | None = Field(
+    presum_db: Annotated[int, Field(ge=-100, le=-38)] | None = Field(
         None, description="what pulses may err by for which fewer stand, of what their track leaves a smooth curve, dB"
     )
     side_px: Annotated[int, Field(ge=16, le=TREE_SIDE)] | None = Field(
