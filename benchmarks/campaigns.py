@@ -53,7 +53,7 @@ def draw(generator: np.random.Generator, *, pixels: int = 80, pulses: int = 160)
     profiles = compressed(history, grid, window)
     name = f"{carrier / 1e9:.2f} GHz, {range_m:.0f} m, spacing {spacing:.3g} m, {window}, {accuracy:.0f} dB"
     ground = GroundModels.flat(0.0)
-    job = imaging_job(history.aperture, history.frequency_hz, history.weight, grid, ground)
+    job = imaging_job(history.aperture, history.frequency_hz, history.weight, grid, ground, integration="all")
     return Drawn(name, history, profiles, grid, job, accuracy)
 
 

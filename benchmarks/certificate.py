@@ -34,14 +34,14 @@ class Judged:
     drawn_alone_db: float
 
 
-def judged(seeds: range, *, pixels: int, pulses: int) -> Iterator[Judged]:
-    """Yield two images of every campaign: as planned, and by a setting of any engine and accuracy."""
+def judged(seeds: range, *, pixels: int, pulses: int, engine: str | None = None) -> Iterator[Judged]:
+    """Yield two images of every campaign: as planned, and by a setting of any accuracy, of one engine or any."""
     for seed in seeds:
         generator = np.random.default_rng(seed)
         drawn = draw(generator, pixels=pixels, pulses=pulses)
         plan = make_plan(drawn.job, accuracy_db=drawn.accuracy_db)
         exact = np.asarray(reference.form(drawn.history, drawn.grid.positions(0.0)) / pulses)
-        others = [one for one in SettingSearch(drawn.job).settings(pulses) if one.engine != "reference"]
+        others = [one for one in SettingSearch(drawn.job, engine).settings(pulses) if one.engine != "reference"]
         other = others[generator.integers(len(others))]
         for one in (plan, replace(plan, setting=other, presum=None)):
             yield _judge(drawn, one, exact, seed)
@@ -84,10 +84,11 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0, help="seed of the first campaign")
     parser.add_argument("--size", type=int, default=96)
     parser.add_argument("--pulses", type=int, default=80)
+    parser.add_argument("--engine", help="of the second image of each; any")
     asked = parser.parse_args()
     seeds = range(asked.first, asked.first + asked.campaigns)
     images = []
-    for one in judged(seeds, pixels=asked.size, pulses=asked.pulses):
+    for one in judged(seeds, pixels=asked.size, pulses=asked.pulses, engine=asked.engine):
         images.append(one)
         missed = "" if one.bound_db >= one.error_db else "  below the error"
         print(f"{one.name:<100}{one.error_db:>8.1f} dB, bound {one.bound_db:>7.1f} dB{missed}", flush=True)

@@ -62,6 +62,7 @@ rule layers:
         header["layers"].benchmark
     conda:
         "../../environment.yml"
+    priority: 1  # before images, which take all cores: what rasters take on this machine is then known early
     threads: header["layers"].threads
     resources:
         mem_mb=header["layers"].mem_mb,

@@ -57,7 +57,7 @@ class Demand:
 
 @dataclass(frozen=True)
 class Cost:
-    """How long a job is expected to take on one core of 2025: a run tells it in the measure of its own steps.
+    """How long a job is expected to take on two cores of 2025, begun by a fork: a run tells it by its own steps.
 
     Attributes
     ----------
@@ -71,12 +71,17 @@ class Cost:
         Whether no other rule waits for it, or hardly.
     """
 
-    begin_s: float = 1.5
+    begin_s: float = 0.4
     mb_s: float = 0.0
     mpx_s: float = 0.0
     mb_mpx_s: float = 0.0
     all_cores: bool = False
     last: bool = False
+
+    @property
+    def of_imaging(self) -> bool:
+        """Whether a job sums pulses over pixels: what that takes the plan decides, by orders of magnitude."""
+        return bool(self.mb_mpx_s)
 
     @property
     def of_rasters(self) -> bool:
@@ -239,7 +244,7 @@ _INGEST = Rule(
     kinds=("calibration", "image"),
     needed=inputs.of_samples,
     demand=Demand(250, pulse_bytes=100, recorded_s=60),
-    cost=Cost(1.3, mb_s=0.0015),
+    cost=Cost(0.3, mb_s=0.003),
 )
 
 _IMAGE = Rule(
@@ -260,7 +265,7 @@ _IMAGE = Rule(
         pixel_s=5,
         sum_s=3,
     ),
-    cost=Cost(3.5, mpx_s=1.0, mb_mpx_s=0.0002, all_cores=True),
+    cost=Cost(0.6, mpx_s=1.2, mb_mpx_s=0.00001, all_cores=True),
     options=("threads",),
 )
 
@@ -280,7 +285,7 @@ _ROWS = (
         reads=("recordings",),
         kinds=("bench",),
         demand=Demand(500, pulse_bytes=1000, recorded_s=240),
-        cost=Cost(2.0, mb_s=0.05, last=True),
+        cost=Cost(0.5, mb_s=0.05, last=True),
     ),
     Rule(
         "echo",
@@ -298,7 +303,7 @@ _ROWS = (
         ),
         kinds=("calibration", "image"),
         demand=Demand(400, pulse_bytes=400, recorded_s=120),
-        cost=Cost(2.0, mb_s=0.0012),
+        cost=Cost(0.3, mb_s=0.0011),
     ),
     Rule(
         "calibrate",
@@ -341,7 +346,7 @@ _ROWS = (
         sources=("echo", *_GROUND, inputs.patterns),
         settings=("processing.window", "processing.integration", inputs.antennas),
         demand=Demand(500, pulse_bytes=500, recorded_s=120),
-        cost=Cost(1.8, mb_s=0.001),
+        cost=Cost(0.3, mb_s=0.001),
     ),
     Rule(
         "refine",
@@ -352,7 +357,7 @@ _ROWS = (
         sources=(inputs.autofocused, *_GROUND),
         settings=("processing.autofocus", "processing.autofocus_method", "scene.reference_points"),
         demand=Demand(600, pulse_bytes=40_000, pixel_bytes=30, pixel_s=10, recorded_s=120),
-        cost=Cost(2.5, mb_s=0.02, mpx_s=0.5),
+        cost=Cost(0.3, mb_s=0.02, mpx_s=0.5),
     ),
     Rule(
         "tracks",
@@ -365,7 +370,7 @@ _ROWS = (
         manifest="{flight}/tracks/tracks",
         needed=inputs.of_samples,
         demand=Demand(500, recorded_s=5),
-        cost=Cost(2.0, last=True),
+        cost=Cost(0.5, last=True),
     ),
     replace(
         _IMAGE,
@@ -376,7 +381,7 @@ _ROWS = (
         command="tiles",
         shares=True,
         arguments=("flight", "pair", "share"),
-        cost=Cost(3.0, mpx_s=1.0, mb_mpx_s=0.0002, all_cores=True),
+        cost=Cost(0.6, mpx_s=0.8, mb_mpx_s=0.00001, all_cores=True),
     ),
     _IMAGE,
     Rule(
@@ -388,7 +393,7 @@ _ROWS = (
         settings=("campaign", "processing.integration", inputs.antennas, inputs.radio, inputs.multilook),
         exports="layers",
         demand=Demand(600, pulse_bytes=500, pixel_bytes=30, pixel_s=5, recorded_s=20, threads=2),
-        cost=Cost(1.4, mpx_s=0.35, last=True),
+        cost=Cost(0.4, mpx_s=0.12, last=True),
         options=("threads",),
     ),
     Rule(
@@ -401,7 +406,7 @@ _ROWS = (
         settings=("processing.fusion",),
         documents=("assessment.json",),
         demand=Demand(500, pulse_bytes=500, pixel_bytes=30, pixel_s=5),
-        cost=Cost(1.3, mpx_s=0.1),
+        cost=Cost(0.3, mpx_s=0.09),
     ),
     Rule(
         "export",
@@ -413,7 +418,7 @@ _ROWS = (
         documents=("image.json",),
         exports="pair",
         demand=Demand(500, pixel_bytes=50, pixel_s=30),
-        cost=Cost(2.0, mpx_s=0.27, last=True),
+        cost=Cost(0.4, mpx_s=0.3, last=True),
         options=("threads",),
     ),
     Rule(
@@ -427,7 +432,7 @@ _ROWS = (
         reads=("recordings",),
         on_demand=True,
         demand=Demand(500, pulse_bytes=500, recorded_s=120),
-        cost=Cost(2.0, mb_s=0.02, last=True),
+        cost=Cost(0.5, mb_s=0.02, last=True),
     ),
     Rule(
         "coverage",
@@ -447,7 +452,7 @@ _ROWS = (
         sources=("image", "assessment", "scene"),
         settings=("campaign", "processing.tile_px"),
         demand=Demand(500, pixel_bytes=50, pixel_s=10, threads=2),
-        cost=Cost(2.5, mpx_s=0.75),
+        cost=Cost(0.3, mpx_s=0.65),
         options=("threads",),
     ),
     Rule(
@@ -465,7 +470,7 @@ _ROWS = (
         command="export",
         last_words=("fused",),
         demand=Demand(500, pixel_bytes=50, pixel_s=30, threads=2),
-        cost=Cost(3.0, mpx_s=0.6),
+        cost=Cost(0.6, mpx_s=0.5),
         options=("threads",),
     ),
     Rule(
@@ -486,7 +491,7 @@ _ROWS = (
         manifest=f"{INTERFEROMETRY}/{{two}}/interferogram",
         arguments=("name",),
         demand=Demand(600, pulse_bytes=1000, pixel_bytes=700, pixel_s=60),
-        cost=Cost(3.0, mpx_s=20.0, last=True),
+        cost=Cost(1.0, mpx_s=20.0, last=True),
     ),
     Rule(
         "mosaic",
@@ -498,7 +503,7 @@ _ROWS = (
         styles=True,
         manifest="mosaic/mosaic",
         demand=Demand(500),
-        cost=Cost(mpx_s=0.03),
+        cost=Cost(mpx_s=0.11),
     ),
     Rule(
         "stac",
@@ -519,7 +524,7 @@ _ROWS = (
         settings=("campaign",),
         on_demand=True,
         demand=Demand(600, pulse_bytes=2000, pixel_s=5, recorded_s=60),
-        cost=Cost(5.0, mb_s=0.01, last=True),
+        cost=Cost(1.0, mb_s=0.01, last=True),
     ),
     Rule(
         "pictures_fused",
@@ -533,7 +538,7 @@ _ROWS = (
         needed=inputs.adds_up,
         on_demand=True,
         demand=Demand(500, pixel_s=5),
-        cost=Cost(2.0, mpx_s=0.5, last=True),
+        cost=Cost(0.6, mpx_s=0.5, last=True),
     ),
     Rule(
         "page",
@@ -544,7 +549,7 @@ _ROWS = (
         settings=(inputs.everything,),
         on_demand=True,
         demand=Demand(500, pixel_s=5),
-        cost=Cost(2.5, mpx_s=0.5),
+        cost=Cost(0.6, mpx_s=0.5),
     ),
     Rule(
         "report",
@@ -565,7 +570,7 @@ _ROWS = (
         products=("map.json",),
         manifest="map/map",
         demand=Demand(500, pixel_s=1),
-        cost=Cost(last=True),
+        cost=Cost(mpx_s=0.12, last=True),
     ),
     Rule(
         "speed_accuracy",
