@@ -59,7 +59,7 @@ def _judge(drawn: Drawn, plan: Plan, exact: NDArray[np.complex128], seed: int) -
         true_error_db(image, exact),
         stated["numerical_error_db"],
         stated["numerical_error_estimate_db"],
-        alone.bound_db,
+        max(alone.bound_db, plan.setting.error_db),
     )
 
 

@@ -3,6 +3,7 @@
 import io
 import json
 import os
+import re
 import shutil
 import subprocess
 import threading
@@ -303,6 +304,25 @@ def test_without_a_terminal_each_step_has_a_line_when_it_begins_and_one_when_it_
     ]
     assert "1 of 5 steps, time left unknown" in lines[1]
     assert "\x1b" not in stream.getvalue()
+
+
+def test_what_happened_between_two_looks_is_told_in_its_order_and_counted_one_by_one(finished_tiny):
+    run, stream = RunRecord(planned={"ingest": 2, "scene": 1}), io.StringIO()
+    run.jobs = {
+        1: JobRecord("ingest", ("ingest", "f01", "uav1"), "", 10.0, 14.0),
+        2: JobRecord("scene", ("scene",), "", 10.5, 12.0),
+        3: JobRecord("ingest", ("ingest", "f01", "uav2"), "", 12.0),
+    }
+    with Screen(finished_tiny, Outlook(finished_tiny, 2), stream=stream) as screen:
+        screen.update(run)
+    told = [re.sub(r"^\S+  |: .* s;|, (time|about) .*", "", line) for line in stream.getvalue().splitlines()]
+    assert told == [
+        "begun   ingest f01 uav1",
+        "begun   scene",
+        "done    scene 1 of 3 steps",
+        "begun   ingest f01 uav2",
+        "done    ingest f01 uav1 2 of 3 steps",
+    ]
 
 
 def test_a_terminal_shows_bars_and_gets_its_cursor_back(finished_tiny, journal, monkeypatch):

@@ -372,8 +372,10 @@ def _certified(formation: Formation, accuracy_db: float, count: int) -> tuple[Fo
 
 
 def _error(formation: Formation, pixels: NDArray[np.int64], exact: NDArray[np.complex128]) -> ErrorBound:
+    """Return the error at pixels drawn blindly: they may miss what is bright, so it is no lower than predicted."""
     values, power = formation.values(pixels)
-    return error_bound(values, exact, np.ones(len(pixels)), power=power)
+    error = error_bound(values, exact, np.ones(len(pixels)), power=power)
+    return replace(error, bound_db=max(error.bound_db, formation.plan.predicted_error_db))
 
 
 def _compressed(inputs: PhaseHistory | Profiles, grid: SceneGrid, ground: Terrain, beams: Beams | None) -> Profiles:

@@ -147,16 +147,25 @@ class Screen:
             self._live.stop()
 
     def update(self, run: RunRecord) -> None:
-        """Show what is new."""
-        whole: Bar | None = None  # of many jobs; the same for all that have ended since
+        """Show what is new, in the order in which it happened."""
+        news: list[tuple[float, bool, JobRecord]] = []  # when, whether it ended
         for number, job in [] if self._quiet else run.jobs.items():
             told = self._told.get((number, job.begun_s))  # a job that is tried again begins anew
-            if told is None and not self._live:
-                self._line(f"{_clock(job.begun_s)}  begun   {job.name}")
+            if told is None:
+                news.append((job.begun_s, False, job))
             if not told and not job.running:
-                whole = whole or (None if self._live else bars(self._campaign, run, self._outlook)[-1])
-                self._ended(job, whole)
+                news.append((job.ended_s or 0, True, job))
             self._told[number, job.begun_s] = not job.running
+        news.sort(key=lambda one: one[0])
+        ended = [job for _, has_ended, job in news if has_ended]
+        whole = bars(self._campaign, run, self._outlook)[-1] if ended and not self._live else None
+        done = len(run.finished) - sum(not job.failed for job in ended)
+        for _, has_ended, job in news:
+            if has_ended:
+                done += not job.failed
+                self._ended(job, whole, f"{done} of {run.total} steps")
+            elif not self._live:
+                self._line(f"{_clock(job.begun_s)}  begun   {job.name}")
         if self._live:
             from rich.constrain import Constrain
 
@@ -168,13 +177,13 @@ class Screen:
         done = f"{number_of(run.total, 'step')} done in {span((run.ended_s or time.time()) - run.begun_s)}"
         self._line(done if run.planned else NOTHING)
 
-    def _ended(self, job: JobRecord, whole: Bar | None) -> None:
+    def _ended(self, job: JobRecord, whole: Bar | None, done: str) -> None:
         word = "failed" if job.failed else "done"
         if self._live:
             self._live.console.print(_line(word, job))
         elif whole:
             left = f", {whole.left}" if not job.failed and whole.fraction < 1 else ""
-            self._line(f"{_clock(job.ended_s or 0)}  {word:6}  {job.name}: {span(job.seconds())}; {whole.name}{left}")
+            self._line(f"{_clock(job.ended_s or 0)}  {word:6}  {job.name}: {span(job.seconds())}; {done}{left}")
 
     def _line(self, line: str) -> None:
         if not self._quiet:
