@@ -85,8 +85,8 @@ def backproject(  # noqa: PLR0913 - each choice is a keyword, so that an editor 
         K, |H|² of a target of 1 m² whose distances from both antennas multiply to 1 m², on both boresights:
         ``ap.Link(...).constant(...)``, or measured on a reflector. The image then has coordinates `sigma0` and `rcs`.
     certified_pixels
-        Random pixels also computed exactly at once, for the certificate; 0 for none. A setting that misses the
-        accuracy on them is replaced by the plan's next.
+        Random pixels also computed exactly at once, for the certificate; 0 for none. Their bound is no lower than the
+        error predicted. A setting that misses the accuracy on them is replaced by the plan's next.
     judge
         Whether the image is formed at once, beside the lazy one, and judged by its focus and by echoes that it does not
         show, as `apertura.judge` does at any time. 'auto': where the plan takes no more than ten seconds for it.

@@ -11,7 +11,7 @@ from apertura.core.quality.measures import BlockRaster
 
 # ---- Error bound from drawn pixels
 
-CONFIDENCE = 0.95  # of the error bound: it held in 96.5 % of images or more (benchmarks/certificate.py)
+CONFIDENCE = 0.95  # of the error bound: it held in 98.5 % of images or more (benchmarks/certificate.py)
 
 _SIGMAS = 2.0  # 1.645 would leave out 5 % of a Gaussian; sums of skewed errors reach further
 
