@@ -31,6 +31,13 @@ def test_the_template_is_a_valid_config_and_comments_every_key():
     assert uncommented == []
 
 
+def test_the_template_says_what_range_and_words_the_options_of_engines_take():
+    template = config_template()
+    assert re.search(r"tree\.oversampling: .* \(8 to 64\)\n", template)
+    assert re.search(r"native\.tolerance_rad: .* \(above 0 to 0\.1\)\n", template)
+    assert re.search(r"tree\.chunk: .* \(256 \| 512 \| 1024 \| 2048\)\n", template)
+
+
 @pytest.mark.parametrize("kind", WAVEFORMS)
 def test_init_writes_a_valid_config_of_the_kind_asked_and_names_the_others(tmp_path, kind):
     run = CliRunner().invoke(app, ["init", str(tmp_path / "new"), "--kind", kind])

@@ -262,10 +262,11 @@ def _decide_presum(
     limit_db = accuracy_db - MARGIN_DB - _PRESUM_DB
     best = _best_presum(job, (requested,) if requested else PRESUM_FACTORS, widest, limit_db)
     if best is None and requested:
+        most = int(0.3 / max(widest, 1e-9))
         raise CampaignError(
             f"presum is {requested}",
             where=f"{search.where}.presum",
-            expected=f"at most {0.3 / max(widest, 1e-9):.1f} pulses made one: {oversampled}",
+            expected=f"{f'at most {most} pulses made one' if most > 1 else '1 or auto'}: {oversampled}",
             remedy="Use a smaller factor or auto.",
         )
     if best is None:

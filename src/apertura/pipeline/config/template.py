@@ -4,7 +4,7 @@ import json
 import types
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Any, get_args, get_origin
+from typing import Any, Union, get_args, get_origin
 
 import yaml
 from pydantic import BaseModel
@@ -88,7 +88,11 @@ def _section(model: type[BaseModel], depth: int, examples: Mapping[str, Any] = M
 
 def _options_of_each_engine() -> list[str]:
     engines = {name: load_engine(name).Options.model_fields for name in ENGINES}
-    return [f"{name}.{key}: {field.description}" for name, fields in engines.items() for key, field in fields.items()]
+    return [
+        f"{name}.{key}: {field.description}{_choices(field)}"
+        for name, fields in engines.items()
+        for key, field in fields.items()
+    ]
 
 
 def _value(field: FieldInfo) -> Any:
@@ -104,10 +108,18 @@ def _value(field: FieldInfo) -> Any:
 
 
 def _choices(field: FieldInfo) -> str:
-    kinds = get_args(field.annotation) if get_origin(field.annotation) is types.UnionType else (field.annotation,)
-    words = [word for kind in kinds if str(kind).startswith("typing.Literal") for word in get_args(kind)]
+    """Return the words or the range that a field takes, in brackets, unless its description names them."""
+    kinds = (
+        get_args(field.annotation) if get_origin(field.annotation) in (Union, types.UnionType) else (field.annotation,)
+    )
+    words = [str(word) for kind in kinds if str(kind).startswith("typing.Literal") for word in get_args(kind)]
     listed = [word for word in words if word not in (field.description or "")]
-    return f" ({' | '.join(words)})" if listed else ""
+    if listed and len(words) > 1:
+        return f" ({' | '.join(words)})"
+    limits = [limit for kind in kinds for about in getattr(kind, "__metadata__", ()) for limit in about.metadata]
+    ends = [getattr(limit, end, "") for end in ("gt", "ge", "lt", "le") for limit in limits if hasattr(limit, end)]
+    above = any(hasattr(limit, "gt") for limit in limits)
+    return f" ({'above ' if above else ''}{ends[0]:g} to {ends[1]:g})" if len(ends) == 2 else ""
 
 
 def _scalar(value: Any) -> str:
