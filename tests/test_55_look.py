@@ -187,6 +187,99 @@ def test_pulses_are_held_back_that_a_log_does_not_reach(tiny):
     assert np.ptp(apart_s) < 5e-3  # the same pulses, by tags of two clocks
 
 
+def other_flight(root, node="uav1"):
+    """Write half of a flight of another day over that of a node, as a recorder does that is started again."""
+    meta, data = (root / f"raw/f01/{node}.sigmf-{kind}" for kind in ("meta", "data"))
+    document = json.loads(meta.read_text())
+    for capture in document["captures"]:
+        capture["core:datetime"] = capture["core:datetime"].replace("T", "T", 1).replace("2025", "2024", 1)
+    del document["captures"][len(document["captures"]) // 2 :]
+    meta.write_text(json.dumps(document))
+    data.write_bytes(data.read_bytes()[: data.stat().st_size // 2])
+
+
+def shorter(root):
+    data = root / "raw/f01/uav1.sigmf-data"
+    data.write_bytes(data.read_bytes()[: data.stat().st_size // 2])
+
+
+def other_samples(root):
+    data = root / "raw/f01/uav1.sigmf-data"
+    data.write_bytes(bytes(100) + data.read_bytes()[100:])
+
+
+def other_log(root):
+    (log,) = (root / "raw/f01").glob("uav1.track.*")
+    head, *lines = log.read_text().splitlines(keepends=True)
+    log.write_text(head + "".join(lines[1:]))
+
+
+@pytest.mark.parametrize("change", [other_flight, shorter, other_samples, other_log])
+def test_a_recorder_that_is_started_again_under_the_same_name_is_shown_anew(tiny, change, capsys):
+    look = Look(Campaign.load(tiny), follow=True)
+    look._read()
+    for pair in look.pairs:
+        while pair.add_next(ended=False):
+            pass
+    look.show(ended=False, elapsed_s=1.0)
+    before = look.pairs[0].counts
+    assert before["added"] > 0
+    change(tiny)
+    look._read()
+    assert "is dropped, and begun anew" in capsys.readouterr().out
+    assert [pair.counts["added"] for pair in look.pairs] == [0, 0]  # both are sent by uav1
+    assert look._map._entries == {}
+    look._read()
+    for pair in look.pairs:
+        while pair.add_next(ended=True):
+            pass
+        assert pair.counts["added"] <= pair.counts["recorded"]
+    assert "anew" not in capsys.readouterr().out
+    assert (look.pairs[0].counts["recorded"] < before["recorded"]) == (change in (other_flight, shorter))
+
+
+def test_a_recorder_started_again_while_a_picture_is_drawn_leaves_none_of_the_flight_before(tiny, monkeypatch):
+    look = Look(Campaign.load(tiny), follow=True)
+    look._read()
+    look.pairs[0].add_next(ended=True)
+    monkeypatch.setattr(look, "_draw", lambda *_: other_flight(tiny))
+    told = look.show_pair(look.pairs[0])
+    assert (told["image"], told["pulses"]["added"]) == (None, 0)
+    look._read()
+    assert look.pairs[0].shown is None
+
+
+def test_metadata_that_are_half_written_anew_are_no_new_flight(tiny):
+    meta = tiny / "raw/f01/uav1.sigmf-meta"
+    document, node = json.loads(meta.read_text()), node_of(tiny, "uav1")
+    node.read()
+    count = len(node.time)
+    text = json.dumps({"global": {"core:extra": "x" * 999, **document["global"]}, "captures": document["captures"]})
+    for share in (0.5, 1.0):
+        meta.write_text(text[: int(share * len(text))])
+        node.read()
+        assert (node.begun_anew, len(node.time)) == ("", count)
+
+
+def test_a_recording_that_rests_is_ended_and_what_it_lacks_is_said(tiny, capsys):
+    meta = tiny / "raw/f01/uav1.sigmf-meta"
+    meta.write_text(meta.read_text().rstrip().rstrip("}"))
+    (log,) = (tiny / "raw/f01").glob("uav2.track.*")
+    log.write_bytes(log.read_bytes()[: log.stat().st_size // 2])
+    Look(Campaign.load(tiny), follow=True, every_s=1.0, end_after_s=1.0).run()
+    told = next(line for line in capsys.readouterr().out.splitlines() if "--end-after" in line)
+    assert "nothing has come for 1 s" in told
+    assert "the metadata of uav1 do not state" in told
+    assert "the log of uav2 ends before its last capture" in told
+
+
+def test_the_last_picture_is_the_fine_one(tiny):
+    look = Look(Campaign.load(tiny), follow=True, every_s=1.0, end_after_s=1.0)
+    look.run()
+    told = json.loads((tiny / "results/look/status.json").read_text())["pairs"]
+    assert [one["share"] for one in told.values()] == [1, 1]
+
+
 def test_files_that_are_not_there_yet_are_waited_for(tiny):
     for path in (tiny / "raw/f01").iterdir():
         path.unlink()
@@ -232,7 +325,7 @@ def test_a_scene_left_to_auto_is_that_of_the_run(tiny, tmp_path):
         echo.echo(other, "f01", pair)
     settle_ground(other)
     look = Look(Campaign.load(tiny), follow=False)
-    look.run(fine=False)
+    look.run()
     grids = {pair.images[1].grid for pair in look.pairs}
     assert grids == {settled_scene(other).grid}
 
@@ -289,16 +382,25 @@ def test_a_delay_doubles_the_decimation_and_ease_halves_it(tiny, monkeypatch):
     assert told == [1, 2, 2, 4, 2, 1]  # not at first, when it still plans, nor while it catches up
 
 
-def test_a_map_of_a_look_serves_the_last_pictures_and_nothing_else(tiny):
-    """Two pictures of a pair stay, the image is on the scene's grid whatever it was formed on."""
-    look = Look(Campaign.load(tiny), follow=True, every_s=2.0, end_after_s=1e6)
-    with pytest.raises(CampaignError, match=r"look/map/map\.json: no such file.*apertura look CAMPAIGN"):
-        served_look(look.campaign)
+def test_a_map_of_a_look_serves_the_last_pictures_and_nothing_else(tiny, capsys):
+    """It waits for the first; two of a pair stay, the image is on the scene's grid whatever it was formed on."""
+    look, waiting = Look(Campaign.load(tiny), follow=True, every_s=2.0, end_after_s=1e6), threading.Event()
+
+    def serve():
+        with served_look(look.campaign):
+            waiting.set()
+
+    serving = threading.Thread(target=serve)
+    serving.start()
+    assert not waiting.wait(0.5)
+    assert "waiting for the first picture" in capsys.readouterr().out
     for node in look.nodes.values():
         node.read()
     assert all(pair.add_next(ended=True) for pair in look.pairs)
     for number in range(4):
         look.show(ended=number == 3, elapsed_s=1.0)
+    assert waiting.wait(5.0)
+    serving.join()
     folder = tiny / "results/look"
     document = json.loads((folder / "map/map.json").read_text())
     assert document["again_s"] is None

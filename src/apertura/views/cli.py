@@ -260,7 +260,7 @@ def look(
     opened = _opened(campaign)
     from apertura.views.look.follow import look_at
 
-    look_at(opened, follow=follow, every_s=every, end_after_s=end_after, threads=cores, fine=not (follow and run_after))
+    look_at(opened, follow=follow, every_s=every, end_after_s=end_after, threads=cores)
     if follow and run_after:
         _run(campaign, cores)
 

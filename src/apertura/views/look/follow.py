@@ -122,22 +122,39 @@ class Look:
         )
         return Flown.together([pair.flown for pair in opened])
 
-    def run(self, *, fine: bool = True) -> None:
-        """Read, add and show until the recordings end; `fine`: then also what the fine images still lack."""
+    def _read(self) -> bool:
+        """Read what has come; begin anew the pairs of nodes whose files did. Return whether anything has come."""
+        grown = [node.read() for node in self.nodes.values()]
+        for node in self.nodes.values():
+            if not node.begun_anew:
+                continue
+            print(f"{datetime.now(UTC):%H:%M:%S}  {node.begun_anew}", flush=True)
+            node.begun_anew = ""
+            for number, pair in enumerate(self.pairs):
+                if node in (pair.tx, pair.rx):
+                    self._map.drop(pair)
+                    self.pairs[number] = pair.anew()
+        return any(grown)
+
+    def run(self) -> None:
+        """Read, add and show until the recordings end, and then what the fine images still lack."""
         poll_s, shown_at, ended = self.every_s / _POLLS, time.monotonic(), False
         while not ended:
             polled = time.monotonic()
-            grown = [node.read() for node in self.nodes.values()]
+            grown = self._read()
             grown_at = [node.grown_at for node in self.nodes.values() if node.grown_at is not None]
             idle = bool(grown_at) and time.monotonic() - max(grown_at) > self.end_after_s
-            complete = not any(grown) and all(node.complete for node in self.nodes.values())
+            complete = not grown and all(node.complete for node in self.nodes.values())
             ended = not self.follow or self.finish.is_set() or idle or complete
+            if self.follow and idle and not (complete or self.finish.is_set()):
+                lacks = "; ".join(node.lacks for node in self.nodes.values() if node.lacks)
+                print(f"ended: nothing has come for {self.end_after_s:g} s (--end-after); {lacks}", flush=True)
             self._add(ended=ended, until=shown_at + self.every_s)
             self.busy_s += time.monotonic() - polled
             while not ended and time.monotonic() < polled + poll_s and any(one.refine_next() for one in self.pairs):
                 pass
             if ended or time.monotonic() >= shown_at + self.every_s:
-                while ended and fine and any(one.refine_next() for one in self.pairs):
+                while ended and any(one.refine_next() for one in self.pairs):
                     pass
                 self.show(ended=ended, elapsed_s=time.monotonic() - shown_at)
                 shown_at = time.monotonic()
@@ -199,6 +216,8 @@ class Look:
         self._map.add(pair, told)
         if pair.tx is not None:
             pair.tx.read()
+            if pair.tx.begun_anew:
+                return {"pulses": pair.anew().counts, "waits": "", "delay_s": None, "image": None}
         told |= {"delay_s": pair.delay_s, "pulses": pair.counts}  # when the picture is there
         told["image"] = f"{pair.flight}/{pair.name}.png"
         return told
@@ -254,15 +273,15 @@ def finished_by_interrupt(look: Look) -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
-def look_at(campaign: Campaign, *, follow: bool, every_s: float, end_after_s: float, threads: int, fine: bool) -> None:
+def look_at(campaign: Campaign, *, follow: bool, every_s: float, end_after_s: float, threads: int) -> None:
     """Show a campaign as far as it has come, until its recordings end."""
     look = Look(campaign, follow=follow, every_s=every_s, end_after_s=end_after_s, threads=threads)
     print(f"shown in {as_typed(campaign.result(LOOK, 'index.html'))}", flush=True)
     if not follow:
-        look.run(fine=fine)
+        look.run()
         return
     with finished_by_interrupt(look):
-        look.run(fine=fine)
+        look.run()
 
 
 # ---- In words -------------------------------------------------------------------------------------------------------

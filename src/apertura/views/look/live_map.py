@@ -88,6 +88,12 @@ class LiveMap:
         peak = told["peak"]
         self._places[where] = Place("brightest", "found", float(peak["x_m"]), float(peak["y_m"]), where)
 
+    def drop(self, pair: PairSoFar) -> None:
+        """Leave a pair out until it is added again: its image was of what is no longer there."""
+        where = f"{pair.flight}/{pair.name}"
+        self._entries.pop(where, None)
+        self._places.pop(where, None)
+
     def write(self, *, ended: bool) -> None:
         """Write the document of what was added; nothing before there is an image."""
         if self._grid is None:

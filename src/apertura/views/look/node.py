@@ -1,7 +1,9 @@
 """What a node has recorded and logged so far: captures and lines that are whole, read once."""
 
+import os
 import pkgutil
 import time
+import zlib
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, cast
@@ -22,6 +24,7 @@ from apertura.pipeline.opening.recordings import captures_of
 from apertura.pipeline.opening.transmitted import Transmitted
 
 _ABOUT_S = 60.0  # of the log about the pulses of a block: farther epochs do not move a spline
+_HEAD_BYTES = 4096  # of the samples, by which they are known to be those that were read
 _EPOCHS = 4  # that a log must be ahead of a pulse: those to come would move it by 0.27⁴ of its error at the end
 
 
@@ -31,6 +34,9 @@ class NotFollowedError(CampaignError):
 
 class NodeSoFar:
     """What a node has recorded and logged so far; whole captures and whole lines alone.
+
+    What was read is dropped where the files no longer begin with it: a recorder that is started again under the same
+    name. A change in the middle of the samples is not seen; the run reads all of them.
 
     Parameters
     ----------
@@ -43,21 +49,33 @@ class NodeSoFar:
     """
 
     def __init__(self, campaign: Campaign, flight: str, node: str, sent: Transmitted, *, follow: bool) -> None:
-        self.name, self.waits, self.ended = node, "", False
+        self.name, self.waits = node, ""
         self.grown_at: float | None = None
         """When something was last found to have come, by the clock `time.monotonic`."""
+        self.begun_anew = ""
+        """Why all that was read has been dropped, until someone has taken note and emptied it."""
+        self._campaign, self._flight, self._sent, self._follow = campaign, flight, sent, follow
+        self._forget()
+
+    def _forget(self) -> None:
         self.time: Times = np.zeros(0, "datetime64[ns]")
         self.frame: NDArray[np.int64] = np.zeros(0, np.int64)
         self.track: xr.Dataset | None = None
-        self._campaign, self._flight, self._sent, self._follow = campaign, flight, sent, follow
+        self.ended = False
         self._recording: Recording | None = None
         self._found: xr.Dataset | None = None  # captures found in samples that never stopped
         self._growing: Any = None
-        self._log_bytes = -1
+        self._head, self._size = b"", 0  # of the samples
+        self._log_size, self._log_bytes, self._log_crc = -1, 0, 0  # of the file, of its whole lines
+
+    def _begin_anew(self, path: Path, found: str) -> None:
+        """Drop what was read: a file no longer begins with it."""
+        self._forget()
+        self.begun_anew = f"{path}: {found}: what was shown of {self._flight} {self.name} is dropped, and begun anew"
 
     def read(self) -> bool:
         """Read what has come since; return whether anything has."""
-        before = len(self.time), self._log_bytes
+        before = len(self.time), self._log_size
         self.waits = ""
         for read in (self._read_recording, self._read_log):
             try:
@@ -68,7 +86,7 @@ class NodeSoFar:
                 if not self._follow:
                     raise
                 self.waits = str(error)  # a file that is not there yet, or has only begun
-        grown = (len(self.time), self._log_bytes) != before
+        grown = (len(self.time), self._log_size) != before
         self.grown_at = time.monotonic() if grown else self.grown_at
         return grown
 
@@ -92,18 +110,39 @@ class NodeSoFar:
                 "Its pulses are found in all of its samples: look at it without --follow, or when it has ended.",
             )
         else:
-            self._recording = growing if growing or self._follow else open_recording(files)
-            if self._recording is None:
+            recording = growing if growing or self._follow else open_recording(files)
+            if changed := self._changed(recording, files[-1]):
+                self._begin_anew(files[-1], changed)
                 return
-            recorded, self.frame = self._recording.captures.time, self._recording.captures.frame
+            if recording is None or (self._recording and len(recording.captures.start) < len(self.time)):
+                return  # it has only begun, or its metadata are being written anew
+            with files[-1].open("rb") as samples:
+                self._head, self._size = samples.read(_HEAD_BYTES), samples.seek(0, os.SEEK_END)
+            self._recording = recording
+            recorded, self.frame = recording.captures.time, recording.captures.frame
         self.time = self._campaign.clock(self._flight, self.name).utc(recorded)
         self.ended = self._growing.ended
+
+    def _changed(self, recording: Recording | None, path: Path) -> str:
+        """Return what is no longer as it was read before, of captures and the file of samples; empty: nothing."""
+        if self._recording is None or not path.is_file():
+            return ""
+        known = self._recording.captures.time
+        now = known[:0] if recording is None else recording.captures.time
+        both = min(len(now), len(known))
+        with path.open("rb") as samples:
+            head, size = samples.read(_HEAD_BYTES), samples.seek(0, os.SEEK_END)
+        if not np.array_equal(now[:both], known[:both]):
+            return "holds captures of other times than before"
+        if size < self._size:
+            return f"holds {size} bytes where there were {self._size}"
+        return "" if head.startswith(self._head) else "does not begin with the samples that were read"
 
     def _read_log(self) -> None:
         path = self._campaign.track_file(self._flight, self.name)
         options = self._campaign.settings.nodes[self.name].log.options
         size = path.stat().st_size
-        if size == self._log_bytes:
+        if size == self._log_size:
             return
         kind = log_format(path, options)
         if not TRACKS[kind].by_lines:
@@ -118,11 +157,16 @@ class NodeSoFar:
             self.track = read_track(path, node=self.name, options=options)
         else:
             lines = path.read_bytes()
+            lines = lines[: lines.rfind(b"\n") + 1]
+            if self._log_bytes > 0 and zlib.crc32(lines[: self._log_bytes]) != self._log_crc:
+                self._begin_anew(path, "does not begin with the lines that were read")
+                return
             with TemporaryDirectory() as folder:
                 whole = Path(folder) / path.name
-                whole.write_bytes(lines[: lines.rfind(b"\n") + 1])
+                whole.write_bytes(lines)
                 self.track = read_track(whole, node=self.name, options=options)
-        self._log_bytes = size
+            self._log_bytes, self._log_crc = len(lines), zlib.crc32(lines)
+        self._log_size = size
 
     def known_until(self, *, ended: bool) -> np.datetime64:
         """Return up to when positions are known: by some epochs less than the log, unless that has ended."""
@@ -135,6 +179,13 @@ class NodeSoFar:
     def complete(self) -> bool:
         """Whether the recording says that it has ended, and the log reaches as far."""
         return bool(self.ended and len(self.time) and self.known_until(ended=True) >= self.time[-1])
+
+    @property
+    def lacks(self) -> str:
+        """What is missing for `complete`, in words."""
+        if not self.ended:
+            return f"the metadata of {self.name} do not state the hash of its samples, or not all of these are there"
+        return "" if self.complete else f"the log of {self.name} ends before its last capture"
 
     def acquisition(self, captures: NDArray[np.int64]) -> Acquisition:
         """Return some captures with the log about them; frames count them, as they are paired already."""
@@ -150,9 +201,16 @@ class NodeSoFar:
         about = np.timedelta64(round(_ABOUT_S * 1e9), "ns")
         epochs = self.track.time.values
         near = (epochs >= raw.time.values[0] - about) & (epochs <= raw.time.values[-1] + about)
+        log = str(self._campaign.track_file(self._flight, self.name))
+        if not near.any():
+            raise CampaignError(
+                f"no epoch within {_ABOUT_S:g} s of captures from {raw.time.values[0]} on",
+                log,
+                "the log of the same flight, and clocks that agree",
+                "Give the log of this flight, or the clock's offset in config/clocks.tsv.",
+            )
         files = Path("raw") / self._flight / self.name
         captured = Captured.of(raw, self._recording.samples.path, files, str(files), self._sent)
         settings = self._campaign.node(self._flight, self.name)
         wave_m = shortest_wave(self._sent.numerology.frequency_hz)
-        log = str(self._campaign.track_file(self._flight, self.name))
         return Acquisition(self.name, settings, self.track.isel(epoch=near), log, wave_m, **vars(captured))

@@ -80,6 +80,11 @@ class PairSoFar:
     _queue: list[Compressed] = field(default_factory=list)
     _fine: bool = True
 
+    def anew(self) -> "PairSoFar":
+        """Return the pair before its first pulse."""
+        given = ("campaign", "flight", "name", "scene", "echo", "tx", "rx", "sent", "threads", "plans")
+        return PairSoFar(*(getattr(self, name) for name in given))
+
     def ready(self, *, ended: bool) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return captures of transmitter and receiver that belong together and were not taken yet.
 

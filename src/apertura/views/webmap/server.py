@@ -10,6 +10,7 @@ import os
 import re
 import stat
 import sys
+import time
 import webbrowser
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -187,6 +188,7 @@ _TYPES = {
     ".tif": "image/tiff",
 }
 _AT_ONCE = 1 << 16
+_WAIT_S = 0.2  # between looks for the first picture
 _IDLE_S = 60.0
 
 
@@ -381,12 +383,16 @@ class _Handler(BaseHTTPRequestHandler):
 
 
 def served_look(campaign: Campaign, *, port: int = 0) -> MapServer:
-    """Return a server of what `apertura look` shows; parameters and errors as `served`."""
+    """Return a server of what `apertura look` shows, once it does; parameters and errors as `served`."""
     folder = campaign.result(LOOK)
     path = folder / MAP
+    if not path.is_file():
+        print("waiting for the first picture of `apertura look`, in another terminal; Ctrl-C ends", flush=True)
+    while not path.is_file():
+        time.sleep(_WAIT_S)
 
     def files() -> Mapping[str, str]:
-        document = read_json(path, expected="what apertura look writes", remedy="Run `apertura look CAMPAIGN` first.")
+        document = read_json(path, expected="what apertura look writes", remedy="Run `apertura look CAMPAIGN` again.")
         with undamaged(path, expected="what apertura look writes", remedy="Run `apertura look CAMPAIGN` again."):
             return {**named_files(document), MAP: sha256_file(path)}
 
