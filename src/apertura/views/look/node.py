@@ -71,7 +71,8 @@ class NodeSoFar:
     def _begin_anew(self, path: Path, found: str) -> None:
         """Drop what was read: a file no longer begins with it."""
         self._forget()
-        self.begun_anew = f"{path}: {found}: what was shown of {self._flight} {self.name} is dropped, and begun anew"
+        file = path.relative_to(self._campaign.root)
+        self.begun_anew = f"{file}: {found}: what was shown of {self._flight} {self.name} is dropped, and begun anew"
 
     def read(self) -> bool:
         """Read what has come since; return whether anything has."""
