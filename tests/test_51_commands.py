@@ -142,7 +142,8 @@ def test_after_a_part_of_the_workflow_a_run_says_what_is_finished_and_what_is_mi
     state(root, "processing", engine="numba")
     status, out, err = typed("run", root, "--cores", 1, "--until", "image")
     assert status == 0, err
-    assert re.search(r"^\d+ results finished, \d+ results missing: apertura run makes what is missing$", out, re.M)
+    told = r"^\d+ results finished, \d+ results stale, \d+ results missing: apertura run makes the rest$"
+    assert re.search(told, out, re.MULTILINE)
     assert "error" not in err
     assert typed("summary", root)[0] == 2  # no image is there
 
@@ -167,7 +168,7 @@ def test_results_are_read_where_their_recordings_are_not(finished_tiny, tmp_path
     makes = lost == "all" and command in {"check", "run"}  # which read logs and codes
     assert status == (1 if command == "verify" else 2 if makes else 0), out + err
     if command == "verify":
-        assert re.findall(r"^(\w+) +(\S+sigmf-data):", out, re.M) == [("missing", name) for name in SAMPLES]
+        assert re.findall(r"^(\w+) +(\S+sigmf-data):", out, re.MULTILINE) == [("missing", name) for name in SAMPLES]
         assert "changed" not in out
     elif command in {"check", "summary", "list"} and not makes:
         assert "not there, so results are not compared with it: raw/f01/uav1.sigmf-" in out

@@ -90,7 +90,7 @@ def print_stale(campaign: Campaign) -> None:
 
 def print_unfinished(campaign: Campaign) -> None:
     """Print how many results are finished and how many are not made yet, or stale; those on demand do not count."""
-    print(f"{counted(states(campaign))}: apertura run makes what is missing")
+    print(f"{counted(states(campaign))}: apertura run makes the rest")
 
 
 def print_benches(campaign: Campaign) -> None:
