@@ -177,7 +177,7 @@ def test_the_swath_ends_where_echoes_leave_the_prefix(tmp_path):
 @pytest.mark.slow
 def test_cphd_is_made_when_it_is_asked_for_and_goes_stale_with_its_echo(fine_tiny):
     made = [result for name, result in results_of(fine_tiny) if name == "cphd"]
-    assert [on_demand(result.manifest) for result in made] == [True, True]
+    assert [on_demand(fine_tiny, result.manifest) for result in made] == [True, True]
     cphd.cphd(fine_tiny, "f01", "uav1-uav1")
     stage = PairEcho.opened(fine_tiny, "f01", "uav1-uav1").stage
     assert stage.sizes["pulse"] == 40

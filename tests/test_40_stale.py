@@ -7,15 +7,27 @@ from pathlib import Path
 
 import pytest
 import yaml
-from folders import copy_writable
+from folders import copy_writable, state
 
 from apertura.common.errors import CampaignError
 from apertura.common.processes import hold
 from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.check import problems
 from apertura.pipeline.digests import Sources, digest_of
-from apertura.pipeline.lineage import modules_of, results_of
+from apertura.pipeline.lineage import modules_of, on_demand, results_of
+from apertura.pipeline.resources import Resources
 from apertura.pipeline.rules import RESULTS
-from apertura.pipeline.stale import damaged_results, make_again, stale_lines, stale_results
+from apertura.pipeline.stale import (
+    absent_files,
+    absent_lines,
+    any_is_missing,
+    damaged_results,
+    make_again,
+    stale_lines,
+    stale_results,
+    wanted_files,
+)
+from apertura.pipeline.steps import echo
 from apertura.views.summary import print_summary
 
 LOG = "raw/f01/uav2.track.pos"
@@ -52,7 +64,7 @@ def names(stale):
 
 def test_every_result_records_what_it_was_made_from_and_none_is_stale(finished_tiny):
     results = list(results_of(finished_tiny))
-    assert len(results) == 23 + 4 + 7
+    assert len(results) == 23 + 4 + 9
     for name, result in results:
         if RESULTS[name].on_demand:
             continue
@@ -264,3 +276,61 @@ def test_a_campaign_is_held_by_one_run_and_free_when_it_ends(tmp_path):
 def test_results_moved_into_another_folder_are_not_stale(finished, tmp_path):
     shutil.move(finished, tmp_path / "moved")
     assert stale_results(Campaign.load(tmp_path / "moved")) == {}
+
+
+# ---- Recordings that lie elsewhere, and what was kept of them -------------------------------------------------------
+
+SAMPLES = ["raw/f01/uav1.sigmf-data", "raw/f01/uav2.sigmf-data"]
+TOLD = "expected the recording of node uav2 in flight f01, to make results/f01/uav1-uav2/image.manifest.json again"
+
+
+def archive(root):
+    for name in SAMPLES:
+        (root / name).unlink()
+    return Campaign.load(root)
+
+
+def test_recordings_that_lie_elsewhere_overtake_nothing_and_nothing_is_wrong(finished):
+    campaign = archive(finished)
+    assert stale_results(campaign) == {}
+    assert (absent_files(campaign), wanted_files(campaign)) == (SAMPLES, {})
+    assert list(absent_lines(campaign)) == [f"not there, so results are not compared with it: {SAMPLES[0]} and 1 more"]
+    assert problems(finished, without=["memory"]) == []
+    assert Resources(campaign).work("f01", None, "uav1").pulses == 40
+
+
+def test_results_are_told_from_stale_ones_where_all_of_raw_was_left_behind(finished):
+    shutil.rmtree(finished / "raw")
+    campaign = Campaign.load(finished)
+    assert stale_results(campaign) == {}
+    assert {*SAMPLES, LOG, "raw/f01/uav1.track.csv", "raw/codes.npy"} < set(absent_files(campaign))
+
+
+def test_an_image_is_made_again_of_what_was_kept_of_a_recording_and_of_nothing_else(finished):
+    campaign = Campaign.load(finished)
+    for pair in ("uav1-uav1", "uav1-uav2"):
+        echo.transfer(campaign, "f01", pair)
+    archive(finished)
+    campaign = state(finished, "processing", engine="numba")
+    assert "image" in names(stale_results(campaign))
+    assert (wanted_files(campaign), problems(finished, without=["memory"])) == ({}, [])
+    (finished / "results/f01/uav1-uav2/transfer.manifest.json").unlink()
+    assert wanted_files(campaign) == {SAMPLES[1]: "results/f01/uav1-uav2/image.manifest.json"}
+    (told,) = map(str, problems(finished, without=["memory"]))
+    assert TOLD in told
+    assert "processing: {keep: [echo]}" in told
+
+
+def test_what_is_kept_overtakes_no_other_result_whether_it_is_asked_for_or_no_longer(finished):
+    campaign, kept = Campaign.load(finished), "results/f01/uav1-uav2/transfer.manifest.json"
+    assert on_demand(campaign, kept)
+    campaign = state(finished, "processing", keep=["echo"])
+    assert names(stale_results(campaign)) == {"ro_crate"}  # which lists it, and the config
+    assert not on_demand(campaign, kept)
+    assert any_is_missing(campaign)
+    for pair in ("uav1-uav1", "uav1-uav2"):
+        echo.transfer(campaign, "f01", pair)
+    assert not any_is_missing(campaign)
+    campaign = state(finished, "processing", keep=[])
+    assert names(stale_results(campaign)) == {"ro_crate"}
+    assert (finished / kept).is_file()

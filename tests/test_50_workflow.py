@@ -307,8 +307,10 @@ def test_steps_are_forks_that_end_with_the_run_whatever_is_killed_outright(tiny,
     warm, snakemake_itself, *steps = processes
     assert steps
     os.kill({"the run": run.pid, "snakemake": snakemake_itself}.get(killed, warm), signal.SIGKILL)
-    run.communicate(timeout=60)
-    assert run.returncode != 0
+    code, output = finished(run, timeout=60)
+    assert code == (-signal.SIGKILL if killed == "the run" else 1)
+    told = "error: SIGKILL has ended the process of the run, perhaps for lack of memory. Run again"
+    assert (told in output, output.count("error:")) == ((False, 0) if killed == "the run" else (True, 1))
     until = time.monotonic() + 10
     while any(map(lives, processes)):
         assert time.monotonic() < until, "a step lives on"

@@ -15,6 +15,9 @@ from apertura.pipeline.config import FUSED
 from apertura.pipeline.opening.scene import settled_scene
 from apertura.pipeline.steps.align import align
 from apertura.views import cli
+from apertura.views.summary import is_finished
+
+SAMPLES = ["raw/f01/uav1.sigmf-data", "raw/f01/uav2.sigmf-data"]
 
 
 @pytest.fixture
@@ -131,6 +134,44 @@ def test_a_last_step_that_another_one_needs_is_no_error(typed, tiny):
     for words in ("echo image", "image echo ingest", "tiles image", "image tiles"):
         assert typed("run", tiny, "--until", *words.split(), "-n") == alone
     assert "1 scene, 2 echo" in typed("run", tiny, "--until", "echo", "scene", "-n")[1]
+
+
+@pytest.mark.slow
+def test_after_a_part_of_the_workflow_a_run_says_what_is_finished_and_what_is_missing(finished_tiny, tmp_path, typed):
+    root = copy_writable(finished_tiny.root, tmp_path / "campaign")
+    state(root, "processing", engine="numba")
+    status, out, err = typed("run", root, "--cores", 1, "--until", "image")
+    assert status == 0, err
+    told = r"^\d+ results finished, \d+ results stale, \d+ results missing: apertura run makes the rest$"
+    assert re.search(told, out, re.MULTILINE)
+    assert "error" not in err
+    assert typed("summary", root)[0] == 2  # no image is there
+
+
+def test_an_image_that_was_overtaken_is_not_finished_although_its_report_is_there(finished_tiny, tmp_path, typed):
+    root = copy_writable(finished_tiny.root, tmp_path / "campaign")
+    (root / "results/f01/uav1-uav2/export.manifest.json").unlink()  # as a run does that does not come to it
+    assert not is_finished(Campaign.load(root))
+    status, out, _ = typed("summary", root)
+    assert status == 0
+    assert "not there yet: f01 uav1-uav2; apertura run" in " ".join(out.split())
+
+
+@pytest.mark.parametrize("words", ["check", "summary", "list", "status", "score --no-paths", "verify -q", "run -n"])
+@pytest.mark.parametrize("lost", ["samples", "all"])
+def test_results_are_read_where_their_recordings_are_not(finished_tiny, tmp_path, typed, words, lost):
+    root = copy_writable(finished_tiny.root, tmp_path / "campaign")
+    for path in list((root / "raw").rglob("*.sigmf-data" if lost == "samples" else "*.*")):
+        path.unlink()
+    command, *options = words.split()
+    status, out, err = typed(command, root, *options)
+    makes = lost == "all" and command in {"check", "run"}  # which read logs and codes
+    assert status == (1 if command == "verify" else 2 if makes else 0), out + err
+    if command == "verify":
+        assert re.findall(r"^(\w+) +(\S+sigmf-data):", out, re.MULTILINE) == [("missing", name) for name in SAMPLES]
+        assert "changed" not in out
+    elif command in {"check", "summary", "list"} and not makes:
+        assert "not there, so results are not compared with it: raw/f01/uav1.sigmf-" in out
 
 
 @pytest.mark.parametrize("node", ["uav2", "uav9"])

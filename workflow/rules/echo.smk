@@ -22,6 +22,30 @@ rule echo:
         "apertura step echo {wildcards.flight} {wildcards.pair} > {log} 2>&1"
 
 
+rule transfer:
+    input:
+        header["transfer"].sources,
+    output:
+        header["transfer"].output,
+    log:
+        header["transfer"].log,
+    benchmark:
+        header["transfer"].benchmark
+    conda:
+        "../../environment.yml"
+    threads: header["transfer"].threads
+    resources:
+        mem_mb=header["transfer"].mem_mb,
+        runtime=header["transfer"].runtime,
+    params:
+        settings=header["transfer"].settings,
+        code=header["transfer"].code,
+    message:
+        "{wildcards.flight}: keeping the transfer functions of {wildcards.pair}"
+    shell:
+        "apertura step transfer {wildcards.flight} {wildcards.pair} > {log} 2>&1"
+
+
 rule calibrate:
     input:
         header["calibrate"].sources,

@@ -122,6 +122,12 @@ _PULSE_GEOMETRY = {
     "rx_position": Variable(("pulse", "axis"), "float64", "m", "receiving phase centre, in `frame`"),
 }
 _CUBE = {name: Variable(*row) for part in (RASTERS, MEASURED, QUOTED, COORDINATES) for name, row in part.items()}
+_FREQUENCY = {
+    "frequency": Variable(("subcarrier",), "float64", "Hz", "RF frequency of each subcarrier, ascending"),
+}
+_TRANSFER = {
+    "transfer": Variable(("pulse", "subcarrier"), "complex64", "1", "Σ a·exp(-j2πf(τ-τ_ref)) over the paths"),
+}
 _KNOTS = "node", "knot", "axis"
 _FRAME = {
     "frame": "'ecef' (EPSG:4978) or 'local' (the campaign's own Cartesian axes, no place on Earth)",
@@ -175,13 +181,13 @@ STAGES: Mapping[str, Stage] = {
     "echo": Stage(
         {
             **_PULSE_GEOMETRY,
-            "frequency": Variable(("subcarrier",), "float64", "Hz", "RF frequency of each subcarrier, ascending"),
+            **_FREQUENCY,
             "reference_delay": Variable(("pulse",), "float64", "s", "τ_ref, already removed from `transfer`"),
             "path_limit": Variable(("pulse",), "float64", "m", "total path beyond which an echo leaves the prefix"),
         },
         _FRAME | _WAVE,
         {
-            "transfer": Variable(("pulse", "subcarrier"), "complex64", "1", "Σ a·exp(-j2πf(τ-τ_ref)) over the paths"),
+            **_TRANSFER,
             "capture": Variable(("pulse",), "int64", "1", "capture of the receiver's recording that `transfer` is of"),
             "path_removed": Variable(
                 ("pulse",), "float64", "m", "electrical path beyond that by the scene, already removed from `transfer`"
@@ -208,6 +214,7 @@ STAGES: Mapping[str, Stage] = {
             for leg, node in (("tx", "transmitter"), ("rx", "receiver"))
         },
     ),
+    "transfer": Stage({"time": _PULSE_GEOMETRY["time"], **_FREQUENCY, **_TRANSFER}, _FRAME),
     "profile": Stage(
         {
             **_PULSE_GEOMETRY,

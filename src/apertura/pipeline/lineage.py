@@ -14,14 +14,16 @@ from typing import Any
 
 from apertura.common.code_imports import import_closure
 from apertura.common.errors import CampaignError
+from apertura.common.provenance import code_sha256
 from apertura.core.backprojection.engines import ENGINES
 from apertura.formats.export import EXPORTS, export_modules, exports_in
 from apertura.formats.names import FINDERS, PHASE_HISTORIES, RECORDERS, TRACKS, log_format
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import KINDS
 from apertura.pipeline.digests import Result
-from apertura.pipeline.rule_inputs import JobPlace, Scope, SettingSpec, SourceSpec, is_sampled
+from apertura.pipeline.rule_inputs import JobPlace, Scope, SettingSpec, SourceSpec, is_sampled, received
 from apertura.pipeline.rules import EVERY, RESULTS, Rule
+from apertura.pipeline.store import read_manifest, sha256_present
 
 _READS = "apertura.formats.reading"
 """Calls the readers of rows: a result whose step imports it may read what was recorded."""
@@ -34,6 +36,9 @@ _FOCUSES = frozenset(
     }
 )
 """Call engines: a result whose step imports one of them may stand on pixels that any engine has formed."""
+
+_KEPT = {"transfer": "echo"}
+"""Result made on demand → word of `processing.keep` by which every run makes it."""
 
 _INPUTS = ("config", "raw")
 """Folders of a campaign that are inputs with all that is in them."""
@@ -82,16 +87,31 @@ def places_of(campaign: Campaign) -> Iterator[tuple[str, tuple[str, ...], Result
         yield rule.result, where, result_of(campaign, rule.result, *where)
 
 
-def on_demand(manifest: str) -> bool:
-    """Return whether a manifest is that of a result made when it is asked for.
-
-    Examples
-    --------
-    >>> on_demand("results/f01/a-b/cphd.manifest.json"), on_demand("results/f01/a-b/echo.manifest.json")
-    (True, False)
-    """
+def on_demand(campaign: Campaign, manifest: str) -> bool:
+    """Return whether a manifest is that of a result made when it is asked for, and not by every run."""
     rule = RESULTS.get(manifest.rpartition("/")[2].removesuffix(".manifest.json"))
-    return rule is not None and rule.on_demand
+    return rule is not None and _on_demand(campaign, rule)
+
+
+def reads_kept(campaign: Campaign, flight: str, pair: str) -> bool:
+    """Return whether a pair's transfer functions are read from stage `transfer`, and not formed from the recording.
+
+    They are where the recording is gone, and the stage is of the echo that is there.
+    """
+    manifest, echo = (campaign.root / campaign.manifest(stage, flight, pair) for stage in ("transfer", "echo"))
+    if campaign.promised_files(flight, pair.split("-")[1])[-1].is_file() or not manifest.is_file():
+        return False
+    return bool(read_manifest(manifest)["sources"].get(campaign.relative(echo)) == sha256_present(echo))
+
+
+def files_read(campaign: Campaign, result: str, *where: str) -> Iterator[str]:
+    """Yield the sources of a result, and the recordings that its step forms transfer functions from."""
+    rule = RESULTS[result]
+    yield from result_of(campaign, result, *where).sources
+    if rule.forms and is_sampled(campaign):
+        for pair in JobPlace(campaign, rule.of, where).pairs:
+            if not reads_kept(campaign, *pair):
+                yield from received(JobPlace(campaign, Scope.PAIR, pair))
 
 
 def places(campaign: Campaign, rule: Rule) -> list[tuple[str, ...]]:
@@ -142,13 +162,18 @@ def _read(place: JobPlace, source: SourceSpec) -> Iterable[str]:
     if callable(source):
         return source(place)
     if source == EVERY:
-        return [_manifest(rule, where) for rule, where in _jobs(place.campaign) if not _describes_all(rule)]
+        every = _jobs(place.campaign)
+        return [_manifest(rule, where) for rule, where in every if not _describes_all(place.campaign, rule)]
     rule = RESULTS[source]
     return [_manifest(rule, where) for where in _needed(rule, place.campaign, place.below(rule.of))]
 
 
-def _describes_all(rule: Rule) -> bool:
-    return rule.on_demand or EVERY in rule.sources
+def _on_demand(campaign: Campaign, rule: Rule) -> bool:
+    return rule.on_demand and _KEPT.get(rule.result) not in campaign.settings.processing.keep
+
+
+def _describes_all(campaign: Campaign, rule: Rule) -> bool:
+    return _on_demand(campaign, rule) or EVERY in rule.sources
 
 
 def _stated(place: JobPlace, setting: SettingSpec) -> dict[str, Any]:
@@ -204,12 +229,22 @@ def _readers(campaign: Campaign, rule: Rule, where: tuple[str, ...]) -> Iterator
             if not is_sampled(campaign):
                 yield _module(PHASE_HISTORIES[campaign.settings.waveform.format].reader)  # type: ignore[union-attr]
             elif "recordings" in rule.reads:
-                first = campaign.recording_files(flight.name, node)[0].name
+                first = campaign.promised_files(flight.name, node)[0].name
                 rows = [row for row in RECORDERS if first.endswith(row[0])]
                 yield from (_module(table[row]) for table in (RECORDERS, FINDERS) for row in rows if row in table)
             if "logs" in rule.reads and campaign.logged(flight.name, node):
-                options = campaign.settings.nodes[node].log.options
-                yield _module(TRACKS[log_format(campaign.track_file(flight.name, node), options)].reader)
+                yield _log_reader(campaign, flight.name, node)
+
+
+def _log_reader(campaign: Campaign, flight: str, node: str) -> str:
+    """Return the module that reads a log; of one that is not there, by its suffix, the module that has read it."""
+    path, options = campaign.track_file(flight, node), campaign.settings.nodes[node].log.options
+    manifest = campaign.root / campaign.manifest("track", flight, node)
+    readers = [_module(row.reader) for row in TRACKS.values() if path.suffix.lower() in row.suffixes]
+    if path.is_file() or options.format in TRACKS or not readers or not manifest.is_file():
+        return _module(TRACKS[log_format(path, options)].reader)
+    code = read_manifest(manifest)["code"]
+    return next((one for one in readers if code_sha256(RESULTS["track"].module, one) == code), readers[0])
 
 
 def _module(function: str) -> str:

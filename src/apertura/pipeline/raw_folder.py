@@ -1,5 +1,6 @@
 """Files of raw/ in a campaign folder, by the names of flights and nodes."""
 
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -7,6 +8,10 @@ from apertura.common.errors import CampaignError
 from apertura.common.paths import inside
 from apertura.formats.names import PHASE_HISTORIES, log_suffixes, recording_files
 from apertura.pipeline.config import FLIGHTS, SampledWaveform, Settings
+from apertura.pipeline.store import read_manifest
+
+_OF_RAW = ("track.manifest.json", "echo.manifest.json")
+"""Manifests that name logs and phase histories among their sources."""
 
 
 @dataclass(frozen=True)
@@ -25,19 +30,22 @@ class RawFolder:
     settings: Settings
 
     def raw_files(self, flight: str, node: str) -> dict[str, Path]:
-        """Return role → file of everything recorded by `node` in `flight`."""
+        """Return role → file of everything recorded by `node` in `flight`, whether it is there or not."""
         if isinstance(self.settings.waveform, SampledWaveform):
-            recorded = {path.suffix: path for path in self.recording_files(flight, node)}
+            recorded = {path.suffix: path for path in self.promised_files(flight, node)}
             return {**recorded, "track": self.track_file(flight, node)}
         folder = self.flight_folder(flight)
         files = self.history_files(flight, node)
         history = {f"history.{path.relative_to(folder).as_posix()}": path for path in files}
         return {**history, **({"track": self.track_file(flight, node)} if self.logged(flight, node) else {})}
 
+    def promised_files(self, flight: str, node: str) -> tuple[Path, ...]:
+        """Return the files that `recording_files` does, whether they are there or not."""
+        return tuple(self._recorded(flight, path.name) for path in recording_files(self.flight_folder(flight), node))
+
     def recording_files(self, flight: str, node: str) -> tuple[Path, ...]:
         """Return the files of the recording of `node` in `flight`, in the order of their row of `RECORDERS`."""
-        files = recording_files(self.flight_folder(flight), node)
-        return tuple(self._raw_file(flight, node, path.name) for path in files)
+        return tuple(self._raw_file(flight, node, path) for path in self.promised_files(flight, node))
 
     def history_files(self, flight: str, node: str) -> list[Path]:
         """Return the files of a node's phase history, in the order of their names; of a folder all that it holds."""
@@ -46,6 +54,7 @@ class RawFolder:
         named = [path for path in sorted(folder.glob(f"{node}*{suffix}")) if path.name[len(node)] == "."]
         found = [file for path in named if not _is_log(path, node) for file in _files(path)]
         own = [path.relative_to(folder).as_posix() for path in found]
+        own = own or [name for name in self._made_from(flight, node) if not _is_log(Path(name), node)]
         if not own:
             raise CampaignError(
                 "no such file",
@@ -56,20 +65,35 @@ class RawFolder:
         return [self._recorded(flight, name) for name in own]
 
     def logged(self, flight: str, node: str) -> bool:
-        """Return whether a flight log of a node lies there."""
-        return any((self.flight_folder(flight)).glob(f"{node}.track.*"))
+        """Return whether a flight log of a node lies there, or lay there when results were made."""
+        return bool(self._logs(flight, node))
 
     def track_file(self, flight: str, node: str) -> Path:
         """Return the one raw/<flight>/<node>.track.* file."""
-        logs = sorted((self.flight_folder(flight)).glob(f"{node}.track.*"))
+        logs = self._logs(flight, node)
         if len(logs) == 1:
-            return self._recorded(flight, logs[0].name)
+            return self._recorded(flight, logs[0])
         raise CampaignError(
-            f"{len(logs)} track files {[path.name for path in logs]}",
+            f"{len(logs)} track files {logs}",
             where=self.flight_folder(flight) / f"{node}.track.*",
             expected=f"exactly one flight log of node {node}",
             remedy=f"Copy the log there, named <node>.track.<{'|'.join(log_suffixes())}>.",
         )
+
+    def _logs(self, flight: str, node: str) -> list[str]:
+        there = sorted(path.name for path in self.flight_folder(flight).glob(f"{node}.track.*"))
+        return there or [name for name in self._made_from(flight, node) if _is_log(Path(name), node)]
+
+    def _made_from(self, flight: str, node: str) -> list[str]:
+        """Return the files of a node that results say they were made from, where none is there: raw/ stayed behind."""
+        sources, folder = set[str](), f"raw/{flight}/"
+        if any(self.flight_folder(flight).glob(f"{node}.*")):
+            return []
+        for path in inside(self.root, f"results/{flight}", where=self.root).glob("*/*.manifest.json"):
+            if path.name in _OF_RAW:
+                with suppress(CampaignError):
+                    sources |= read_manifest(path).get("sources", {}).keys()
+        return sorted(name.removeprefix(folder) for name in sources if name.startswith(f"{folder}{node}."))
 
     def flight_folder(self, flight: str) -> Path:
         """Return raw/<flight>, which is no link: not even its names are read through one."""
@@ -78,9 +102,8 @@ class RawFolder:
     def _recorded(self, flight: str, name: str) -> Path:
         return inside(self.root, f"raw/{flight}/{name}", where=self.root)
 
-    def _raw_file(self, flight: str, node: str, name: str) -> Path:
-        """Return raw/<flight>/<name>, which must exist."""
-        path = self._recorded(flight, name)
+    def _raw_file(self, flight: str, node: str, path: Path) -> Path:
+        """Return a file of a node, which must exist."""
         if not path.is_file():
             raise CampaignError(
                 "no such file",
@@ -89,6 +112,11 @@ class RawFolder:
                 remedy=f"Copy it there, or take {node} out of the nodes of {flight} in {FLIGHTS}.",
             )
         return path
+
+
+def size_of(path: Path) -> int:
+    """Return the bytes of a file; 0 where it is not there."""
+    return path.stat().st_size if path.is_file() else 0
 
 
 def _is_log(path: Path, node: str) -> bool:

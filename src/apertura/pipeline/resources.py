@@ -16,6 +16,7 @@ from apertura.common.documents import DAMAGED, read_json
 from apertura.common.errors import CampaignError
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import SampledWaveform
+from apertura.pipeline.raw_folder import size_of
 from apertura.pipeline.rules import RULES, Cost, Demand
 
 _CAPTURE_BYTES = 64  # of a recording's metadata at least
@@ -157,14 +158,24 @@ class Resources:
             return self.planned[flight, node]
         waveform = self.campaign.settings.waveform
         if not isinstance(waveform, SampledWaveform):
-            size = sum(path.stat().st_size for path in self.campaign.raw_files(flight, node).values())
+            size = sum(map(size_of, self.campaign.raw_files(flight, node).values()))
             return size, size // 1000
-        files = [path.stat().st_size for path in self.campaign.recording_files(flight, node)]
+        paths = self.campaign.promised_files(flight, node)
+        files = [size_of(path) for path in paths]
+        if not paths[-1].is_file():
+            return sum(files), self._captures(flight, node)
         samples = files[-1] / 4
         ran_through = samples / waveform.sample_rate_hz * waveform.prf_hz  # one capture, of all pulses
         return sum(files), math.ceil(
             min(samples / waveform.needed_samples, max(files[0] / _CAPTURE_BYTES, ran_through))
         )
+
+    def _captures(self, flight: str, node: str) -> int:
+        """Return how many captures stage `raw` has of a recording that is not there; 0 where nobody knows."""
+        with suppress(CampaignError, LookupError, TypeError, ValueError):
+            path = self.campaign.stage("raw", flight, node) / "start" / "zarr.json"
+            return int(read_json(path, expected="an array of stage raw", remedy=DAMAGED)["shape"][0])
+        return 0
 
     @cached_property
     def _shape(self) -> tuple[int, int] | None:

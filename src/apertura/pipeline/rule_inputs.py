@@ -118,7 +118,7 @@ def adds_up(place: JobPlace) -> bool:
 
 def recording(place: JobPlace) -> Iterable[str]:
     """Return the files of what a node recorded."""
-    return map(place.campaign.relative, place.campaign.recording_files(*place.where))
+    return map(place.campaign.relative, place.campaign.promised_files(*place.where))
 
 
 def recorded_on_the_bench(place: JobPlace) -> Iterable[str]:
@@ -126,7 +126,7 @@ def recorded_on_the_bench(place: JobPlace) -> Iterable[str]:
     campaign, flight = place.campaign, place.campaign.flight(place.where[0])
     if not is_sampled(campaign):
         return []
-    files = (path for node in flight.nodes for path in campaign.recording_files(flight.name, node))
+    files = (path for node in flight.nodes for path in campaign.promised_files(flight.name, node))
     return map(campaign.relative, (*files, campaign.sent_file))
 
 
@@ -148,12 +148,19 @@ def transmitted_and_received(place: JobPlace) -> Iterable[str]:
     if not is_sampled(campaign):
         logs = [campaign.track_file(flight, node) for node in nodes if campaign.logged(flight, node)]
         return map(campaign.relative, (*campaign.history_files(flight, nodes[-1]), *logs))
-    samples = [campaign.recording_files(flight, node)[-1] for node in nodes]
+    samples = [campaign.promised_files(flight, node)[-1] for node in nodes]
     files = [campaign.relative(path) for path in (campaign.sent_file, *samples)]
     calibration = campaign.settings.calibration
     if calibration is not None and campaign.flight(flight).kind == "image":
         files.append(campaign.manifest("calibration", calibration.flight))
     return files
+
+
+def received(place: JobPlace) -> Iterable[str]:
+    """Return the files that the transfer functions of the pairs are formed from, beside what was measured of these."""
+    campaign = place.campaign
+    samples = (campaign.promised_files(flight, pair.split("-")[1])[-1] for flight, pair in place.pairs)
+    return map(campaign.relative, (campaign.sent_file, *samples))
 
 
 def echoes_that_bound_the_scene(place: JobPlace) -> Iterable[str]:
@@ -337,7 +344,7 @@ def grid(place: JobPlace) -> Mapping[str, Any]:
     return {"scene": {key: value for key, value in stated.items() if key not in _POINTS}}
 
 
-_BEFORE_THE_IMAGE = frozenset({"window", "sidelink", "false_alarms_per_s", "autofocus", "autofocus_method"})
+_BEFORE_THE_IMAGE = frozenset({"window", "sidelink", "false_alarms_per_s", "autofocus", "autofocus_method", "keep"})
 _AFTER_THE_IMAGE = frozenset({"fusion", "radiometry", "radiometric_calibration", "multilook"})
 
 

@@ -132,6 +132,8 @@ class Rule:
         Whether it is made when it is asked for, and not with the images.
     shares
         Whether it only does a share of the work behind `result`, which another rule completes.
+    forms
+        Whether its step reads transfer functions of its pairs, which are formed from the recordings of receivers.
     reads
         Which readers of what was recorded count as its code, where its step reads: of recordings, of logs.
     command
@@ -160,6 +162,7 @@ class Rule:
     needed: Callable[[inputs.JobPlace], bool] = lambda _: True
     on_demand: bool = False
     shares: bool = False
+    forms: bool = False
     reads: tuple[str, ...] = ("recordings", "logs")
     command: str = ""
     arguments: tuple[str, ...] = ()
@@ -254,6 +257,7 @@ _IMAGE = Rule(
     f"{_STEPS}.image:image",
     sources=(*_FORMED, "refined_track"),
     settings=_IMAGE_SETTINGS,
+    forms=True,
     demand=Demand(
         900,
         pulse_bytes=1000,
@@ -297,13 +301,25 @@ _ROWS = (
             "waveform",
             "processing.sidelink",
             "processing.accuracy_db",
-            "processing.keep",
             inputs.pair_settings,
             inputs.air,
         ),
         kinds=("calibration", "image"),
         demand=Demand(400, pulse_bytes=400, recorded_s=120),
         cost=Cost(0.3, mb_s=0.0011),
+    ),
+    Rule(
+        "transfer",
+        Scope.PAIR,
+        "Keep the transfer functions of a pair, transfer.zarr, for when the recording is no longer there.",
+        f"{_STEPS}.echo:transfer",
+        sources=("echo", inputs.received),
+        reads=("recordings",),
+        kinds=("calibration", "image"),
+        needed=inputs.of_samples,
+        on_demand=True,
+        demand=Demand(400, pulse_bytes=400, recorded_s=120),
+        cost=Cost(2.0, mb_s=0.001, last=True),
     ),
     Rule(
         "calibrate",
@@ -314,6 +330,7 @@ _ROWS = (
         sources=("echo",),
         settings=("calibration", "scene.crs"),
         documents=("calibration.json",),
+        forms=True,
         kinds=("calibration",),
         demand=Demand(500, pulse_bytes=1000, recorded_s=60),
     ),
@@ -345,6 +362,7 @@ _ROWS = (
         f"{_STEPS}.profile:profile",
         sources=("echo", *_GROUND, inputs.patterns),
         settings=("processing.window", "processing.integration", inputs.antennas),
+        forms=True,
         demand=Demand(500, pulse_bytes=500, recorded_s=120),
         cost=Cost(0.3, mb_s=0.001),
     ),
@@ -392,6 +410,7 @@ _ROWS = (
         sources=(*_FORMED, inputs.measured_image),
         settings=("campaign", "processing.integration", inputs.antennas, inputs.radio, inputs.multilook),
         exports="layers",
+        forms=True,
         demand=Demand(600, pulse_bytes=500, pixel_bytes=30, pixel_s=5, recorded_s=20, threads=2),
         cost=Cost(0.4, mpx_s=0.12, last=True),
         options=("threads",),
@@ -429,6 +448,7 @@ _ROWS = (
         sources=("echo", "profile", "scene"),
         settings=("campaign",),
         products=("phase_history.cphd",),
+        forms=True,
         reads=("recordings",),
         on_demand=True,
         demand=Demand(500, pulse_bytes=500, recorded_s=120),
@@ -580,6 +600,7 @@ _ROWS = (
         sources=(*_FORMED, "refined_track"),
         settings=(inputs.charted_pair, *_IMAGE_SETTINGS),
         products=("speed_accuracy.csv", "speed_accuracy.png", "speed_accuracy.html"),
+        forms=True,
         manifest=f"{STUDY}/speed_accuracy",
         on_demand=True,
         command="chart",

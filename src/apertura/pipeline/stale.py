@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from apertura.common.atomic import date
-from apertura.common.errors import CampaignError
+from apertura.common.errors import CampaignError, shown
 from apertura.common.paths import inside
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.digests import Result, digest_of
-from apertura.pipeline.lineage import products_of, results_of
+from apertura.pipeline.lineage import files_read, on_demand, places_of, products_of, results_of
 from apertura.pipeline.rules import RESULTS
 from apertura.pipeline.store import compare, compare_origin, damaged_files, read_manifest, states_origin
 
@@ -23,13 +23,15 @@ _ONLY_LOOKS = (
 )
 """Options with which snakemake reads a workflow and runs none of it."""
 
+_RAW = "raw/"
 _SOURCE = {"missing": "is gone", "altered": "has changed", "added": "is new to it"}
 
 
 def stale_results(campaign: Campaign, *, paranoid: bool = False) -> dict[str, str]:
     """Return manifest → why its result has to be made again, of those that are there, each after those it stands on.
 
-    The reason is empty where it only stands on one that is made again.
+    The reason is empty where it only stands on one that is made again. A file of raw/ that is not there overtakes
+    nothing: it may lie elsewhere, see `absent_files`.
 
     Parameters
     ----------
@@ -54,9 +56,35 @@ def stale_results(campaign: Campaign, *, paranoid: bool = False) -> dict[str, st
     return stale
 
 
+def absent_files(campaign: Campaign) -> list[str]:
+    """Return the files of raw/ that results which are there were made from, and that are not there themselves."""
+    made = (result for _, result in results_of(campaign) if (campaign.root / result.manifest).is_file())
+    sources = dict.fromkeys(name for result in made for name in result.sources if name.startswith(_RAW))
+    return [name for name in sources if not (campaign.root / name).is_file()]
+
+
+def wanted_files(campaign: Campaign) -> dict[str, str]:
+    """Return file of raw/ that is not there and that a run would read → manifest of the first result it is read for."""
+    stale, wanted = stale_results(campaign), dict[str, str]()
+    for name, where, result in places_of(campaign):
+        made = (campaign.root / result.manifest).is_file() and result.manifest not in stale
+        if not made and not on_demand(campaign, result.manifest):
+            for source in files_read(campaign, name, *where):
+                if source.startswith(_RAW) and not (campaign.root / source).is_file():
+                    wanted.setdefault(source, result.manifest)
+    return wanted
+
+
+def absent_lines(campaign: Campaign) -> Iterator[str]:
+    """Yield a line where files of raw/ are not there, so that what was made from them is not compared with them."""
+    if absent := absent_files(campaign):
+        more = f" and {len(absent) - 1} more" if len(absent) > 1 else ""
+        yield f"not there, so results are not compared with it: {shown(absent[0])}{more}"
+
+
 def any_is_missing(campaign: Campaign) -> bool:
     """Return whether a result that is not made on demand is not there."""
-    made = (result.manifest for name, result in results_of(campaign) if not RESULTS[name].on_demand)
+    made = (result.manifest for _, result in results_of(campaign) if not on_demand(campaign, result.manifest))
     return not all((campaign.root / manifest).is_file() for manifest in made)
 
 
@@ -183,6 +211,8 @@ def _reasons(root: Path, result: Result, recorded: Mapping[str, Any], *, paranoi
         yield f"{difference.name} is not as it was written"
     for difference in compare_origin(recorded, result, source):
         if difference.part == "source":
-            yield f"{difference.name} {_SOURCE[difference.state]}"
+            elsewhere = difference.state == "missing" and difference.name.startswith(_RAW)
+            if not elsewhere or difference.name not in result.sources:
+                yield f"{difference.name} {_SOURCE[difference.state]}"
         else:
             yield {"settings": "its settings have changed", "code": "its code has changed"}[difference.part]

@@ -18,7 +18,7 @@ from apertura.common.atomic import remove
 from apertura.common.code_imports import PACKAGE
 from apertura.common.errors import CampaignError, number_of
 from apertura.common.paths import check_shell_name, shipped
-from apertura.common.processes import INTERRUPTED, STATUS_FILE, die_with_parent, given, hold, isolate
+from apertura.common.processes import INTERRUPTED, SIGNALLED, STATUS_FILE, die_with_parent, given, hold, isolate
 from apertura.common.progress import RUN
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.check import print_problems
@@ -30,7 +30,7 @@ from apertura.pipeline.runs.outlook import Outlook
 from apertura.pipeline.runs.screen import NOTHING, Screen, listed
 from apertura.pipeline.runs.warm import AT_ONCE, Order
 from apertura.pipeline.runs.warm import NAME as WARM
-from apertura.pipeline.stale import any_is_missing, forms_results, stale_lines, stale_results
+from apertura.pipeline.stale import absent_lines, any_is_missing, forms_results, stale_lines, stale_results
 
 Show = Literal["errors", "steps", "snakemake"]
 
@@ -86,7 +86,9 @@ class _Files:
         return {**os.environ, "PATH": path, STATUS_FILE: str(self.status), JOURNAL: str(self.journal)}
 
     def status_of(self, status: int) -> int:
-        """Return snakemake's exit status, or 2 where no step has ended with a defect."""
+        """Return snakemake's exit status, 2 where no step has ended with a defect, or 1 where a signal has ended it."""
+        if _ended_by(status):
+            return 1
         told = self.status.read_text(encoding="utf-8").split() if self.status.is_file() else []
         return 2 if status == 1 and "1" not in told else status
 
@@ -135,8 +137,9 @@ def run_workflow(root: Path, cores: int, *arguments: str, paranoid: bool = False
             hold(root).close()
         stale = stale_results(campaign, paranoid=paranoid)
         if show == "steps":
-            print(*stale_lines(stale), sep="\n", end="\n" if stale else "", file=sys.stderr, flush=True)
-        overtaken = [manifest for manifest in stale if not on_demand(manifest)]
+            for line in (*absent_lines(campaign), *stale_lines(stale)):
+                print(line, file=sys.stderr, flush=True)
+        overtaken = [manifest for manifest in stale if not on_demand(campaign, manifest)]
         forced = ["--forcerun", *overtaken] if overtaken else []  # in time for a dry run; the workflow says why
         words = _words(root, cores, [*_without_inner_steps(campaign, options), *forced])
         if forms:
@@ -177,7 +180,7 @@ def _formed(
     aloud: bool,
 ) -> int:
     """Run snakemake, by the process that waits for its order if any, and show what its journal tells."""
-    reader, killed, status = JournalReader(files.journal), _killed_for_memory(), INTERRUPTED
+    reader, killed, status, ended = JournalReader(files.journal), _killed_for_memory(), INTERRUPTED, 0
     try:
         with files.log.open("wb") as output, files.log.open("rb") as said, screen:
 
@@ -188,15 +191,16 @@ def _formed(
 
             if warm and warm.stdin:
                 Order(words, files.environment, str(files.log)).give(warm.stdin)
-            status = files.status_of(
-                _watched(warm or _started([RECORDER, *words], files.environment, output=output), look)
-            )
+            ended = _watched(warm or _started([RECORDER, *words], files.environment, output=output), look)
+            status = files.status_of(ended)
             look()
     finally:
         note(files.journal, "end", status=status)
     killed = _killed_for_memory() - killed
-    if status:
+    if status and not (by := _ended_by(ended)):
         _say(*failures(root, reader.run, files.log))
+    elif status and not killed:
+        _say(f"error: {by} has ended the process of the run, perhaps for lack of memory. Run again: it goes on there.")
     if status and killed:
         message = (
             f"out of memory: meanwhile the kernel has ended {killed} processes of this machine or job for lack of it"
@@ -229,6 +233,12 @@ def _words(root: Path, cores: int, arguments: Sequence[str]) -> list[str]:
     own = ["--snakefile", str(folder / "Snakefile"), "--directory", str(root), "--logger", NAME]
     own += ["--workflow-profile", str(folder / "profiles" / "default"), "--cores", str(cores)]
     return [*own, *arguments]
+
+
+def _ended_by(status: int) -> str:
+    """Return the signal that has ended a process, by its status or a shell's; empty: it ended itself, or by Ctrl-C."""
+    signalled = status < 0 or (status > SIGNALLED and status != INTERRUPTED)
+    return signal.Signals(abs(status) % SIGNALLED).name if signalled else ""
 
 
 def _killed_for_memory() -> int:

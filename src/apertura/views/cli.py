@@ -236,10 +236,12 @@ def _run(campaign: Path, cores: int, *asked: str, paranoid: bool = False, show: 
     status = run_workflow(given(campaign), cores, *asked, paranoid=paranoid, show=show)
     if status == 0 and forms_results(["", *asked]):
         opened = _opened(campaign)
-        from apertura.views.summary import is_finished, print_benches, print_products, print_summary
+        from apertura.views.summary import is_finished, print_benches, print_products, print_summary, print_unfinished
 
         print_benches(opened)
-        if opened.image_flights and is_finished(opened):  # not after `--until`
+        if not is_finished(opened):  # after `--until`
+            print_unfinished(opened)
+        elif opened.image_flights:
             print_products(opened) if show == "errors" else print_summary(opened)
     raise SystemExit(status)
 

@@ -11,10 +11,10 @@ from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import FUSED
 from apertura.pipeline.lineage import on_demand
 from apertura.pipeline.rules import INTERFEROMETRY
-from apertura.pipeline.stale import stale_results
+from apertura.pipeline.runs.results import counted, states
+from apertura.pipeline.stale import absent_lines, stale_results
 from apertura.pipeline.store import open_listed
 from apertura.views.image_report import (
-    REPORT,
     ImageValues,
     Report,
     decibels,
@@ -34,9 +34,14 @@ _MOST_FLIGHTS = 3
 
 
 def is_finished(campaign: Campaign) -> bool:
-    """Return whether every image has its report."""
+    """Return whether every image has its report, made and not overtaken since."""
     images = ((flight.name, name) for flight in campaign.image_flights for name in flight.images)
-    return all(campaign.result(*image, REPORT).is_file() for image in images)
+    return all(_is_made(campaign, *image, name="export") for image in images)
+
+
+def _is_made(campaign: Campaign, *where: str, name: str) -> bool:
+    """Return whether a result is finished: a run that made it stale and did not come to it has left its files alone."""
+    return (campaign.root / campaign.manifest(name, *where)).is_file()
 
 
 def print_summary(campaign: Campaign) -> None:
@@ -51,7 +56,7 @@ def print_summary(campaign: Campaign) -> None:
 
     campaign.check_images()
     names = [(flight.name, name) for flight in campaign.image_flights for name in flight.images]
-    there = [image for image in names if campaign.result(*image, REPORT).is_file()]
+    there = [image for image in names if _is_made(campaign, *image, name="export")]
     reports = {" ".join(image): read_report(campaign, *image) for image in there or names[:1]}
     values = {name: ImageValues.of(report) for name, report in reports.items()}
     console = Console(highlight=False)
@@ -74,16 +79,25 @@ def print_summary(campaign: Campaign) -> None:
 
 
 def print_stale(campaign: Campaign) -> None:
-    """Print a line where results are overtaken by a file, a setting or code; those made on demand do not count."""
-    if stale := [manifest for manifest in stale_results(campaign) if not on_demand(manifest)]:
+    """Print a line where results are overtaken by a file, a setting or code, but those made on demand.
+
+    And one where recordings are not there to tell.
+    """
+    print(*(f"{line}\n" for line in absent_lines(campaign)), sep="", end="")
+    if stale := [manifest for manifest in stale_results(campaign) if not on_demand(campaign, manifest)]:
         print(f"{number_of(len(stale), 'result')} {'is' if len(stale) == 1 else 'are'} stale: apertura run")
+
+
+def print_unfinished(campaign: Campaign) -> None:
+    """Print how many results are finished and how many are not made yet, or stale; those on demand do not count."""
+    print(f"{counted(states(campaign))}: apertura run makes the rest")
 
 
 def print_benches(campaign: Campaign) -> None:
     """Print a line for each flight of kind bench that was measured: how many lines carry a flag, and its page."""
     for flight in campaign.flights:
         report, page = (campaign.result(flight.name, name) for name in ("bench.json", "bench.html"))
-        if flight.kind == "bench" and report.is_file():
+        if flight.kind == "bench" and _is_made(campaign, flight.name, name="bench"):
             flags = open_listed(report, report.with_name("bench.manifest.json"))["flags"]
             verdict = f"look at {', '.join(printable(flags))}" if flags else "every line within its limit"
             print(f"bench {flight.name}: {verdict}: {campaign.relative(page)}")
@@ -112,7 +126,7 @@ def _interferograms(campaign: Campaign) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield what each interferogram that is there states."""
     for name in campaign.settings.interferometry.pairs:
         path = campaign.result(INTERFEROMETRY, name, "interferogram.json")
-        if path.is_file():
+        if _is_made(campaign, INTERFEROMETRY, name, name="interferogram"):
             report = open_listed(path, path.with_name("interferogram.manifest.json"))
             with undamaged(path, expected="the report of an interferogram", remedy="Run the workflow again."):
                 says = {"says": shown(report["says"], 400), "flags": printable(report["flags"])}

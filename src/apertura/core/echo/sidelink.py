@@ -216,5 +216,6 @@ def _correct(radar: Complexes, sidelink: Complexes, path: LineOfSight | None, in
     corrected = np.empty(radar.shape, np.complex64)
     for first in range(0, len(radar), _PULSES_AT_ONCE):
         pulses = slice(first, first + _PULSES_AT_ONCE)
-        corrected[pulses] = radar[pulses] * inverse(sidelink[pulses], path.select(pulses))
+        # `out`: of large blocks numpy would reuse the inverse and swap the factors, and so round otherwise
+        np.multiply(radar[pulses], inverse(sidelink[pulses], path.select(pulses)), out=corrected[pulses])
     return corrected

@@ -128,8 +128,10 @@ def print_findings(root: str | Path, *, products: bool = False, paranoid: bool =
     campaign, _ = load(Path(root))
     if campaign is None or count:
         return count
-    from apertura.pipeline.stale import damaged_results, stale_lines, stale_results
+    from apertura.pipeline.stale import absent_lines, damaged_results, stale_lines, stale_results
 
+    for line in absent_lines(campaign):  # nothing is wrong with that
+        print(line)
     lines = list(stale_lines(stale_results(campaign, paranoid=paranoid)))
     if products:
         damaged = damaged_results(campaign).items()

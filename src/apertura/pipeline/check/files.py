@@ -4,7 +4,7 @@ import json
 import os
 import time
 from collections.abc import Callable, Iterator
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,6 +13,7 @@ from apertura.common.paths import inside
 from apertura.formats.names import recording_files
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import CONFIG, FLIGHTS, Flight, SampledWaveform
+from apertura.pipeline.stale import absent_files, wanted_files
 
 if TYPE_CHECKING:
     from apertura.pipeline.examination.campaign import Examination
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
 _AHEAD_S = 5.0
 _IMPORTED = ".snakemake/pip-deployments"
 """Relative to the working folder (snakemake 9, `PIP_DEPLOYMENTS_PATH`): for plugins that a job installs itself."""
+
+_KEPT = "Where the echo stays as it is, transfer functions that `processing: {keep: [echo]}` has kept replace it."
 
 _RECORDS = ("metadata", "incomplete")
 """Folders of Snakemake's records, of no use where they are damaged, and of no harm to lose."""
@@ -39,8 +42,9 @@ def check_flights(examined: "Examination") -> Iterator[CampaignError]:
 def check_files(examined: "Examination") -> Iterator[CampaignError]:
     """Yield every file that is missing, empty, dated in the future or may not be read."""
     campaign = examined.campaign
+    wanted = _wanted(campaign)
     for flight in campaign.flights:
-        yield from _recorded(campaign, flight)
+        yield from _recorded(campaign, flight, wanted)
     lookups: list[Callable[[], dict[str, Path]]] = [
         lambda: {f"scene.{role}": path for role, path in campaign.height_files().items()}
     ]
@@ -60,7 +64,27 @@ def check_files(examined: "Examination") -> Iterator[CampaignError]:
             yield from _readable(path, f"the file of {CONFIG}: {key}", f"Copy it there, or correct {key}.")
 
 
-def _recorded(campaign: Campaign, flight: Flight) -> Iterator[CampaignError]:
+def _wanted(campaign: Campaign) -> Callable[[str], str | None]:
+    """Return a function of a recording's file that is not there: the result that a run would make of it.
+
+    Empty where it would make none, None where nothing was made of it or nobody knows.
+    """
+
+    @cache
+    def files() -> tuple[dict[str, str], list[str]] | None:
+        try:
+            return wanted_files(campaign), absent_files(campaign)
+        except CampaignError:  # for other checks to tell
+            return None
+
+    def wanted(name: str) -> str | None:
+        known = files()
+        return known[0].get(name, "") if known and name in known[1] else None
+
+    return wanted
+
+
+def _recorded(campaign: Campaign, flight: Flight, wanted: Callable[[str], str | None]) -> Iterator[CampaignError]:
     """Yield what is wrong with the files of a flight: samples and logs, or phase history."""
     if not isinstance(campaign.settings.waveform, SampledWaveform):
         for node in flight.nodes:
@@ -80,7 +104,10 @@ def _recorded(campaign: Campaign, flight: Flight) -> Iterator[CampaignError]:
             except CampaignError as problem:  # a link
                 yield problem
                 continue
-            yield from _readable(path, expected, remedy)
+            if path.is_file() or (made := wanted(campaign.relative(path))) is None:
+                yield from _readable(path, expected, remedy)
+            elif made:
+                yield from _readable(path, f"{expected}, to make {made} again", f"{remedy} {_KEPT}")
         if flight.kind != "bench":
             yield from _looked_up(lambda node=node: [campaign.track_file(flight.name, node)])  # type: ignore[misc]
 

@@ -67,7 +67,7 @@ class Processing(ImagingChoices):
     keep: tuple[Literal["echo"], ...] = Field(
         (),
         description="what is written though no image needs it: echo, the transfer functions of every pulse in "
-        "echo.zarr, which otherwise are formed from the recording when they are read",
+        "transfer.zarr, from which pairs are imaged again where the recording is no longer there",
     )
     scheduler: str = Field(
         "threads",

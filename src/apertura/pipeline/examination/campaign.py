@@ -18,6 +18,7 @@ from apertura.formats.reading import open_recording, read_track
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import SampledWaveform
 from apertura.pipeline.examination.facts import LogFacts, RecordingFacts, log_facts, recording_facts
+from apertura.pipeline.raw_folder import size_of
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -120,7 +121,7 @@ class Examination:
             keys = {(flight, node) for node in pair.split("-")}
             return keys <= self.tracks.keys() & self.recordings.keys()
         files = self.campaign.history_files(flight, pair.split("-")[1])
-        return 0 < sum(path.stat().st_size for path in files) <= _SMALL_BYTES
+        return 0 < sum(map(size_of, files)) <= _SMALL_BYTES
 
     @cached_property
     def history_problems(self) -> list[CampaignError]:
@@ -136,7 +137,7 @@ class Examination:
                 files = self.campaign.history_files(flight, pair.split("-")[1])
             except CampaignError:  # for 'files' to name
                 continue
-            size = sum(path.stat().st_size for path in files)
+            size = sum(map(size_of, files))
             if not size or (size > _SMALL_BYTES and (number or self.frame)):
                 continue
             try:
@@ -179,7 +180,7 @@ class Examination:
                 paths = files(flight, node)
             except CampaignError:
                 continue
-            if not all(path.stat().st_size for path in paths):
+            if not all(map(size_of, paths)):
                 continue
             try:
                 opened[flight, node] = open_files(paths, (flight, node))
@@ -262,7 +263,7 @@ class Examination:
             files = self.campaign.height_files()
         except CampaignError:
             return None, [], track_m
-        if self.crs is None or not all(path.is_file() and path.stat().st_size for path in files.values()):
+        if self.crs is None or not all(map(size_of, files.values())):
             return None, [], track_m
         try:
             ground = ConfiguredGround.of(requested, files, crs=self.crs)

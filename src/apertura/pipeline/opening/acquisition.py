@@ -112,6 +112,13 @@ class Captured:
         start, places = self.raw.start.values[pulses], {name: recorded.index(name) for name in channels}
 
         def read(captures: NDArray[np.int64]) -> dict[str, Samples]:
+            if not self.samples.path.is_file():
+                raise CampaignError(
+                    "no such file",
+                    where=self.samples.path,
+                    expected="the recording that transfer functions are formed from: stage `transfer` keeps none",
+                    remedy=f"Copy it there. `processing: {{keep: [echo]}}` in {CONFIG} keeps them from then on.",
+                )
             iq = self.samples.captures(start[captures], length)
             # I and Q move together: one by one they cost more than their transform
             both = np.dtype(f"i{2 * iq.itemsize}")
@@ -171,9 +178,9 @@ def open_acquisition(campaign: Campaign, flight: str, node: str, sent: Transmitt
 
 
 def _check_same(campaign: Campaign, raw: xr.Dataset) -> None:
-    """Raise CampaignError unless the recorder's file is the one that the stage describes."""
+    """Raise CampaignError where the recorder's file is there and not the one that the stage describes."""
     name = raw.attrs["samples"]
-    if digest_of(campaign.root, name) != raw.attrs["inputs"][name]:
+    if (campaign.root / name).is_file() and digest_of(campaign.root, name) != raw.attrs["inputs"][name]:
         raise CampaignError(
             "changed since it was ingested",
             where=campaign.root / name,

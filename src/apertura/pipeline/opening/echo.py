@@ -37,6 +37,7 @@ from apertura.formats.times import FIRST
 from apertura.methods.autofocus.motion import Logged, Recorded
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import FLIGHTS, Processing, PulseWaveform, SampledWaveform
+from apertura.pipeline.lineage import reads_kept
 from apertura.pipeline.opening.acquisition import Acquisition, common_pulses, open_acquisition
 from apertura.pipeline.opening.air import scene_air, stated_air
 from apertura.pipeline.opening.node_log import NodeLog, raw_log, shortest_wave
@@ -83,12 +84,18 @@ class PairEcho:
     def opened(cls, campaign: Campaign, flight: str, pair: str) -> "PairEcho":
         """Return that of a finished stage `echo`; the recording is opened when a transfer function is asked for.
 
+        Where the recording is not there its transfer functions are those that stage `transfer` keeps, to the bit.
+
         Raises
         ------
         CampaignError
-            If the stage is damaged or missing; when it is opened, if the recording is.
+            If the stage is damaged or missing; when a transfer function is asked for, if the recording is, and nothing
+            was kept of it.
         """
         stage, saturation = open_stage(campaign.stage("echo", flight, pair), "echo"), Saturation()
+        if "transfer" not in stage and reads_kept(campaign, flight, pair):
+            kept = open_stage(campaign.stage("transfer", flight, pair), "transfer")
+            stage = stage.assign(transfer=kept.transfer).assign_attrs(flags=kept.attrs["flags"])
 
         @cache
         def source() -> Form:
@@ -126,8 +133,8 @@ class PairEcho:
         return self.dataset.assign(transfer=xr.Variable(_HISTORY, indexing.LazilyIndexedArray(_Transfer(self))))
 
     @property
-    def kept(self) -> xr.Dataset:
-        """The stage that keeps its transfer functions, with zeros that take no memory for `transfer`."""
+    def hollow(self) -> xr.Dataset:
+        """The stage without what captures say, with zeros that take no memory for `transfer`."""
         zeros = np.broadcast_to(np.complex64(0), self.shape)
         return self.dataset.drop_vars("capture").assign(transfer=(_HISTORY, zeros))
 

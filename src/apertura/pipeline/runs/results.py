@@ -16,7 +16,7 @@ from apertura.common.processes import hold
 from apertura.common.progress import RUN
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.lineage import on_demand, results_of
-from apertura.pipeline.stale import stale_results
+from apertura.pipeline.stale import absent_lines, stale_results
 from apertura.pipeline.store import read_manifest
 
 _HEADINGS = ("flight", "of", "finished", "stale", "missing", "size")
@@ -60,6 +60,8 @@ def print_list(campaign: Campaign) -> None:
     console.print(
         f"{in_bytes(sum(sizes.values()))} in results" + (f", {wip} stages under way or left unfinished" if wip else "")
     )
+    for line in absent_lines(campaign):
+        console.print(line, soft_wrap=True, markup=False)
 
 
 def states(campaign: Campaign) -> dict[tuple[str, ...], dict[str, list[str]]]:
@@ -69,10 +71,22 @@ def states(campaign: Campaign) -> dict[tuple[str, ...], dict[str, list[str]]]:
     for name, result in results_of(campaign):
         there = (campaign.root / result.manifest).is_file()
         place = Path(result.manifest).parent.parts[1:]
-        if there or result.manifest in stale or not on_demand(result.manifest):
+        if there or result.manifest in stale or not on_demand(campaign, result.manifest):
             state = "stale" if result.manifest in stale else "finished" if there else "missing"
             found[place][state].append("export" if name == "fused" else name)
     return dict(found)
+
+
+def counted(found: Mapping[tuple[str, ...], Mapping[str, list[str]]]) -> str:
+    """Return how many results are in each state, of what `states` returns.
+
+    Examples
+    --------
+    >>> counted({(): {"finished": ["cube", "stac"], "stale": [], "missing": []}, ("f01",): {"missing": ["tracks"]}})
+    '2 results finished, 1 result missing'
+    """
+    counts = {state: sum(len(names.get(state, ())) for names in found.values()) for state in _COLOURS}
+    return ", ".join(f"{number_of(count, 'result')} {state}" for state, count in counts.items() if count)
 
 
 def _sizes(results: Path, places: set[tuple[str, ...]]) -> dict[tuple[str, ...], int]:

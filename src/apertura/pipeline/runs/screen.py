@@ -13,7 +13,7 @@ from apertura.common.progress import RUN
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.runs.journal import JobRecord, JournalReader, RunRecord, failures
 from apertura.pipeline.runs.outlook import Outlook, StepProgress
-from apertura.pipeline.runs.results import states
+from apertura.pipeline.runs.results import counted, states
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -232,10 +232,7 @@ def print_status(campaign: Campaign) -> None:
     if run.status != INTERRUPTED and (run.failed or run.status):
         print(*failures(campaign.root, run, campaign.result("logs", "snakemake.log")), sep="\n")
     if not held:
-        counts = Counter[str]()
-        for found in states(campaign).values():
-            counts.update({state: len(names) for state, names in found.items()})
-        print(", ".join(f"{count} results {state}" for state, count in counts.items() if count))
+        print(counted(states(campaign)))
 
 
 def _print_steps(campaign: Campaign, run: RunRecord) -> None:

@@ -1,7 +1,7 @@
 """Rule `echo`: what is measured of a pair's recordings and tracks: pulses, phase centres, clock and sidelink.
 
-The calibrated transfer functions follow from it and the recordings; they are written where `processing.keep` says so,
-and of a recorder that stores transfer functions itself.
+The calibrated transfer functions follow from it and the recordings. They are in it of a recorder that stores transfer
+functions itself; else rule `transfer` keeps them where `processing.keep` says so.
 """
 
 from pathlib import Path
@@ -12,6 +12,7 @@ import xarray as xr
 from apertura.common.provenance import merged
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import SampledWaveform
+from apertura.pipeline.digests import Lineage
 from apertura.pipeline.lineage import result_of
 from apertura.pipeline.opening.acquisition import open_acquisition
 from apertura.pipeline.opening.air import scene_air
@@ -48,11 +49,23 @@ def echo(campaign: Campaign, flight: str, pair: str) -> Path:
     relevant = {**lineage.result.settings, "calibration": calibration_spec(calibration)}
     folder = campaign.stage("echo", flight, pair)
     how: dict[str, Any] = {"modules": lineage.modules, "parents": parents, "settings": relevant, "inputs": inputs}
-    if isinstance(waveform, SampledWaveform) and "echo" not in campaign.settings.processing.keep:
+    if isinstance(waveform, SampledWaveform):
         save_stage(stamped(formed.dataset, "echo", **how), folder, lineage=lineage)
-        return folder
-    stage = stamped(formed.kept, "echo", **how)
+    else:
+        _write(formed, stamped(formed.hollow, "echo", **how), folder, lineage)
+    return folder
+
+
+def transfer(campaign: Campaign, flight: str, pair: str) -> Path:
+    """Write results/<flight>/<pair>/transfer.zarr, pulse by pulse those of echo.zarr."""
+    lineage = result_of(campaign, "transfer", flight, pair).begin(campaign.root)
+    formed, folder = PairEcho.opened(campaign, flight, pair), campaign.stage("transfer", flight, pair)
+    kept = formed.hollow[["time", "frequency", "transfer"]]
+    _write(formed, stamped(kept, "transfer", modules=lineage.modules, parents=[formed.dataset]), folder, lineage)
+    return folder
+
+
+def _write(formed: PairEcho, stage: xr.Dataset, folder: Path, lineage: Lineage) -> None:
     with writing(folder) as wip:
         write_blocks(wip, stage, "transfer", formed.blocks())
         finish(wip, folder, lineage=lineage, flags=formed.flags)
-    return folder

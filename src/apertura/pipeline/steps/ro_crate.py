@@ -62,7 +62,7 @@ class _Made(NamedTuple):
 def _results(campaign: Campaign) -> Iterator[_Made]:
     """Yield every result that the crate describes."""
     for name, where, result in places_of(campaign):
-        if name != "ro_crate" and not on_demand(result.manifest):
+        if name != "ro_crate" and not on_demand(campaign, result.manifest):
             path = campaign.root / result.manifest
             recorded, expected = read_manifest(path), "a manifest that states the sources of a result"
             with undamaged(path, expected=expected, remedy=f"Delete {path} and run the workflow again."):

@@ -190,9 +190,12 @@ class Chain:
         self._leaves: set[str] = set()
         self._waiting: list[str] = []
         self._rows: dict[str, Result] = {}
+        self._asked: list[str] = []
         try:
-            for _, result in results_of(Campaign.load(root)):
+            campaign = Campaign.load(root)
+            for _, result in results_of(campaign):
                 self._rows[result.manifest] = result
+            self._asked = [manifest for manifest in self._rows if not on_demand(campaign, manifest)]
             self._promised = True
         except CampaignError as error:  # what its manifests say can be compared all the same
             self._promised = False
@@ -201,7 +204,7 @@ class Chain:
 
     def promised(self) -> list[str]:
         """Return the manifests that a finished campaign has by its config."""
-        return [manifest for manifest in self._rows if not on_demand(manifest)]
+        return self._asked
 
     def walk(self, manifests: Iterable[str] = ()) -> None:
         """Compare some results, and all that they and the tags compared before were made from."""

@@ -53,8 +53,9 @@ def print_reproduced(path: Path, *, cores: int, keep: Path | None = None) -> int
     wanted = [one for one in known if (product.root / one).is_file()] if whole else [product.manifest]
     if not wanted:
         raise CampaignError("no results", product.root, "a campaign that was run", "Run it: `apertura run`.")
+    asked = [one for one in wanted if on_demand(campaign, one)]
     with _scratch(campaign, keep) as again:
-        status = run_workflow(again, cores, *(["all", *filter(on_demand, wanted)] if whole else wanted))
+        status = run_workflow(again, cores, *(["all", *asked] if whole else wanted))
         if status:
             return status
         lines = _found(product.root, again, wanted, known)
