@@ -319,7 +319,7 @@ _ROWS = (
         needed=inputs.of_samples,
         on_demand=True,
         demand=Demand(400, pulse_bytes=400, recorded_s=120),
-        cost=Cost(2.0, mb_s=0.001, last=True),
+        cost=Cost(0.3, mb_s=0.001, last=True),
     ),
     Rule(
         "calibrate",
