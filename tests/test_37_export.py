@@ -105,6 +105,7 @@ def test_every_raster_is_a_cog_in_the_strict_sense(tmp_path, name, shape):
         assert raster.overviews(1) == [factor for factor in (2, 4) if max(shape) > 256 * factor]
 
 
+@pytest.mark.quick("AVERAGE-*", "MODE-*")
 @pytest.mark.parametrize("band", [POWER, SLC, MASK, LOOKS, PHASE], ids=lambda band: f"{band.overviews}-{band.nodata}")
 def test_overviews_are_those_that_gdal_builds(tmp_path, band):
     """Beyond the blocks that pass through memory, too, and beside places that hold nothing."""

@@ -82,7 +82,7 @@ def test_before_the_first_run_the_scene_says_what_is_missing_and_what_makes_it(t
 
 
 def test_a_name_that_does_not_exist_is_answered_with_those_that_do(opened):
-    names = "expected one of raw, track, echo, profile, refined_track, terrain, image, cube."
+    names = "expected one of raw, track, echo, transfer, profile, refined_track, terrain, image, cube."
     assert names in complaint(lambda: opened.stage("ecko", *PAIR))
     assert "no flight 'f02'; expected one of f01." in complaint(lambda: opened.stage("echo", "f02", "uav1-uav2"))
     pairs = "no pair 'uav2-uav1'; expected one of uav1-uav1, uav1-uav2"

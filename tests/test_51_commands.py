@@ -157,6 +157,7 @@ def test_an_image_that_was_overtaken_is_not_finished_although_its_report_is_ther
     assert "not there yet: f01 uav1-uav2; apertura run" in " ".join(out.split())
 
 
+@pytest.mark.quick("samples-summary", "all-list", "samples-verify -q")
 @pytest.mark.parametrize("words", ["check", "summary", "list", "status", "score --no-paths", "verify -q", "run -n"])
 @pytest.mark.parametrize("lost", ["samples", "all"])
 def test_results_are_read_where_their_recordings_are_not(finished_tiny, tmp_path, typed, words, lost):
@@ -190,6 +191,7 @@ def test_a_summary_says_how_many_results_a_setting_has_overtaken(finished_tiny, 
     assert re.fullmatch(r"\d+ results are stale: apertura run", last)
 
 
+@pytest.mark.quick("True")
 @pytest.mark.parametrize("settled", [True, False])
 def test_a_reflector_is_given_in_the_zone_that_auto_stands_for(finished_tiny, tmp_path, settled):
     root = copy_writable(finished_tiny.root, tmp_path / "campaign")

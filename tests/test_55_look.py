@@ -72,6 +72,7 @@ def apart_db(image, exact):
     return 10 * np.log10(np.mean(np.abs(image - exact) ** 2) / np.mean(np.abs(exact) ** 2))
 
 
+@pytest.mark.quick("16")
 @pytest.mark.parametrize("pulses", [7, 16, 2048])
 def test_an_image_added_in_blocks_is_that_of_all_pulses_at_once(finished_tiny, tmp_path, monkeypatch, pulses):
     root = copy_writable(finished_tiny.root, tmp_path / "campaign")
@@ -214,6 +215,7 @@ def other_log(root):
     log.write_text(head + "".join(lines[1:]))
 
 
+@pytest.mark.quick("other_flight", "other_log")
 @pytest.mark.parametrize("change", [other_flight, shorter, other_samples, other_log])
 def test_a_recorder_that_is_started_again_under_the_same_name_is_shown_anew(tiny, change, capsys):
     look = Look(Campaign.load(tiny), follow=True)

@@ -8,7 +8,6 @@ from apertura.common.errors import CampaignError
 from apertura.common.paths import inside
 from apertura.formats.names import PHASE_HISTORIES, log_suffixes, recording_files
 from apertura.pipeline.config import FLIGHTS, SampledWaveform, Settings
-from apertura.pipeline.store import read_manifest
 
 _OF_RAW = ("track.manifest.json", "echo.manifest.json")
 """Manifests that name logs and phase histories among their sources."""
@@ -86,6 +85,8 @@ class RawFolder:
 
     def _made_from(self, flight: str, node: str) -> list[str]:
         """Return the files of a node that results say they were made from, where none is there: raw/ stayed behind."""
+        from apertura.pipeline.store import read_manifest  # loads arrays, which no config needs
+
         sources, folder = set[str](), f"raw/{flight}/"
         if any(self.flight_folder(flight).glob(f"{node}.*")):
             return []
