@@ -23,9 +23,6 @@ MOST_NODES = 128
 COUNTS = (*range(2, 9), *range(10, 65, 2), *range(68, MOST_NODES + 1, 4))
 """Numbers of nodes that are used."""
 
-NODES_DB = (-44, -50, -56, -62, -68, -74, -80, -86, -92, -98)
-"""dB, RMS errors of one interpolation that nodes are designed for."""
-
 _NOISE_DB = -20.0  # white noise in the design of weights, relative to the error they are designed for
 
 _GAUSS, _SHARE = np.polynomial.legendre.leggauss(160)
