@@ -237,8 +237,8 @@ def _words(root: Path, cores: int, arguments: Sequence[str]) -> list[str]:
 
 def _ended_by(status: int) -> str:
     """Return the signal that has ended a process, by its status or a shell's; empty: it ended itself, or by Ctrl-C."""
-    signalled = status < 0 or (status > SIGNALLED and status != INTERRUPTED)
-    return signal.Signals(abs(status) % SIGNALLED).name if signalled else ""
+    number = -status if status < 0 else status - SIGNALLED
+    return signal.Signals(number).name if status != INTERRUPTED and number in set(signal.Signals) else ""
 
 
 def _killed_for_memory() -> int:
