@@ -61,7 +61,7 @@ def test_every_module_that_a_step_calls_is_code_of_its_result(tiny):
 
 EVERY = frozenset(RESULTS)
 FOCUSED = {"refined_track", "image", "assessment", "speed_accuracy", "whole"}
-READ = FOCUSED | {"pictures", "raw", "track", "echo", "profile", "layers", "tracks"}
+READ = FOCUSED | {"pictures", "raw", "track", "echo", "transfer", "profile", "layers", "tracks"}
 
 
 CHANGES = [

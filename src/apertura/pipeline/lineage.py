@@ -23,7 +23,6 @@ from apertura.pipeline.config import KINDS
 from apertura.pipeline.digests import Result
 from apertura.pipeline.rule_inputs import JobPlace, Scope, SettingSpec, SourceSpec, is_sampled, received
 from apertura.pipeline.rules import EVERY, RESULTS, Rule
-from apertura.pipeline.store import read_manifest, sha256_present
 
 _READS = "apertura.formats.reading"
 """Calls the readers of rows: a result whose step imports it may read what was recorded."""
@@ -98,6 +97,8 @@ def reads_kept(campaign: Campaign, flight: str, pair: str) -> bool:
 
     They are where the recording is gone, and the stage is of the echo that is there.
     """
+    from apertura.pipeline.store import read_manifest, sha256_present  # loads arrays: a run, too, waits for them
+
     manifest, echo = (campaign.root / campaign.manifest(stage, flight, pair) for stage in ("transfer", "echo"))
     if campaign.promised_files(flight, pair.split("-")[1])[-1].is_file() or not manifest.is_file():
         return False
@@ -243,6 +244,8 @@ def _log_reader(campaign: Campaign, flight: str, node: str) -> str:
     readers = [_module(row.reader) for row in TRACKS.values() if path.suffix.lower() in row.suffixes]
     if path.is_file() or options.format in TRACKS or not readers or not manifest.is_file():
         return _module(TRACKS[log_format(path, options)].reader)
+    from apertura.pipeline.store import read_manifest  # loads arrays
+
     code = read_manifest(manifest)["code"]
     return next((one for one in readers if code_sha256(RESULTS["track"].module, one) == code), readers[0])
 
