@@ -209,6 +209,11 @@ def other_samples(root):
     data.write_bytes(bytes(100) + data.read_bytes()[100:])
 
 
+def other_last_samples(root):
+    data = root / "raw/f01/uav1.sigmf-data"
+    data.write_bytes(data.read_bytes()[:-100] + bytes(100))
+
+
 def other_log(root):
     (log,) = (root / "raw/f01").glob("uav1.track.*")
     head, *lines = log.read_text().splitlines(keepends=True)
@@ -216,7 +221,7 @@ def other_log(root):
 
 
 @pytest.mark.quick("other_flight", "other_log")
-@pytest.mark.parametrize("change", [other_flight, shorter, other_samples, other_log])
+@pytest.mark.parametrize("change", [other_flight, shorter, other_samples, other_last_samples, other_log])
 def test_a_recorder_that_is_started_again_under_the_same_name_is_shown_anew(tiny, change, capsys):
     look = Look(Campaign.load(tiny), follow=True)
     look._read()
@@ -231,6 +236,7 @@ def test_a_recorder_that_is_started_again_under_the_same_name_is_shown_anew(tiny
     assert "is dropped, and begun anew" in capsys.readouterr().out
     assert [pair.counts["added"] for pair in look.pairs] == [0, 0]  # both are sent by uav1
     assert look._map._entries == {}
+    assert not list((tiny / "results/look").rglob("*.png"))
     look._read()
     for pair in look.pairs:
         while pair.add_next(ended=True):

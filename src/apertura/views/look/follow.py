@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from functools import cache
+from pathlib import Path
 from types import FrameType
 from typing import Any
 
@@ -133,6 +134,7 @@ class Look:
             for number, pair in enumerate(self.pairs):
                 if node in (pair.tx, pair.rx):
                     self._map.drop(pair)
+                    self._picture(pair).unlink(missing_ok=True)
                     self.pairs[number] = pair.anew()
         return any(grown)
 
@@ -210,7 +212,7 @@ class Look:
         told |= {"share": shown.share, "error_db": error_db}
         told |= {"spacing_m": shown.grid.spacing_m, "setting": shown.setting}
         told["delay_s"] = pair.delay_s
-        path = self.campaign.result(LOOK, pair.flight, f"{pair.name}.png")
+        path = self._picture(pair)
         path.parent.mkdir(parents=True, exist_ok=True)
         self._draw(path, pair, told)
         self._map.add(pair, told)
@@ -222,7 +224,10 @@ class Look:
         told["image"] = f"{pair.flight}/{pair.name}.png"
         return told
 
-    def _draw(self, path: Any, pair: PairSoFar, told: Mapping[str, Any]) -> None:
+    def _picture(self, pair: PairSoFar) -> Path:
+        return self.campaign.result(LOOK, pair.flight, f"{pair.name}.png")
+
+    def _draw(self, path: Path, pair: PairSoFar, told: Mapping[str, Any]) -> None:
         shown = pair.shown
         if shown is None:
             raise TypeError("a pair without an image is not drawn")

@@ -1,6 +1,5 @@
 """What a node has recorded and logged so far: captures and lines that are whole, read once."""
 
-import os
 import pkgutil
 import time
 import zlib
@@ -24,7 +23,7 @@ from apertura.pipeline.opening.recordings import captures_of
 from apertura.pipeline.opening.transmitted import Transmitted
 
 _ABOUT_S = 60.0  # of the log about the pulses of a block: farther epochs do not move a spline
-_HEAD_BYTES = 4096  # of the samples, by which they are known to be those that were read
+_KNOWN_BYTES = 4096  # at either end of the samples that were read, by which they are known again
 _EPOCHS = 4  # that a log must be ahead of a pulse: those to come would move it by 0.27⁴ of its error at the end
 
 
@@ -65,7 +64,7 @@ class NodeSoFar:
         self._recording: Recording | None = None
         self._found: xr.Dataset | None = None  # captures found in samples that never stopped
         self._growing: Any = None
-        self._head, self._size = b"", 0  # of the samples
+        self._known = 0, b"", b""  # of the samples
         self._log_size, self._log_bytes, self._log_crc = -1, 0, 0  # of the file, of its whole lines
 
     def _begin_anew(self, path: Path, found: str) -> None:
@@ -117,8 +116,7 @@ class NodeSoFar:
                 return
             if recording is None or (self._recording and len(recording.captures.start) < len(self.time)):
                 return  # it has only begun, or its metadata are being written anew
-            with files[-1].open("rb") as samples:
-                self._head, self._size = samples.read(_HEAD_BYTES), samples.seek(0, os.SEEK_END)
+            self._known = _ends(files[-1], files[-1].stat().st_size)
             self._recording = recording
             recorded, self.frame = recording.captures.time, recording.captures.frame
         self.time = self._campaign.clock(self._flight, self.name).utc(recorded)
@@ -131,13 +129,11 @@ class NodeSoFar:
         known = self._recording.captures.time
         now = known[:0] if recording is None else recording.captures.time
         both = min(len(now), len(known))
-        with path.open("rb") as samples:
-            head, size = samples.read(_HEAD_BYTES), samples.seek(0, os.SEEK_END)
         if not np.array_equal(now[:both], known[:both]):
             return "holds captures of other times than before"
-        if size < self._size:
-            return f"holds {size} bytes where there were {self._size}"
-        return "" if head.startswith(self._head) else "does not begin with the samples that were read"
+        if (size := path.stat().st_size) < self._known[0]:
+            return f"holds {size} bytes where there were {self._known[0]}"
+        return "" if _ends(path, self._known[0]) == self._known else "does not hold the samples that were read"
 
     def _read_log(self) -> None:
         path = self._campaign.track_file(self._flight, self.name)
@@ -215,3 +211,11 @@ class NodeSoFar:
         settings = self._campaign.node(self._flight, self.name)
         wave_m = shortest_wave(self._sent.numerology.frequency_hz)
         return Acquisition(self.name, settings, self.track.isel(epoch=near), log, wave_m, **vars(captured))
+
+
+def _ends(path: Path, size: int) -> tuple[int, bytes, bytes]:
+    """Return a number of bytes of a file, and those at the begin and the end of that many."""
+    with path.open("rb") as stream:
+        head = stream.read(min(size, _KNOWN_BYTES))
+        stream.seek(max(0, size - _KNOWN_BYTES))
+        return size, head, stream.read(min(size, _KNOWN_BYTES))
