@@ -84,9 +84,3 @@ def test_missed_pulses_and_gaps_do_not_undersample_an_aperture():
     assert spread == pytest.approx(whole, rel=0.05)
     assert widest > 100 * whole
     assert "pulses_sparse" not in plan(aperture=left).flags
-
-
-def test_an_override_that_is_predicted_to_miss_is_flagged():
-    missed = plan(overrides={"engine_options": {"numba": {"oversampling": 2}}})
-    assert "dB, -60 dB asked: tiles that miss it are formed again" in missed.flags["prediction_misses"]
-    assert "prediction_misses" not in plan().flags

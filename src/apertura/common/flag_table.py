@@ -220,9 +220,6 @@ _OF_IMAGES = {
     "antenna_phase": Flag(
         "dB that a point loses, cm that it is off", "the phase of antenna patterns changes over the aperture",
         "lever_arms_m, to the phase centre; phase_deg of the pattern", "core/quality/budget.py"),
-    "prediction_misses": Flag(
-        "error predicted and accuracy asked, dB", "the plan is expected to miss the accuracy asked",
-        "engine and options asked for", "core/planning/planner.py"),
     "refinement_rejected": Flag(
         "dB of contrast gained on places not fitted; what is required",
         "places not fitted did not get sharper beyond doubt, or a track is a wavelength off: the logs are used",

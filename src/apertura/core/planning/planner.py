@@ -121,11 +121,15 @@ class SettingSearch:
         more = (blocks - 1) * self.tile_seconds
         return replace(setting, pulse_blocks=blocks, form_seconds=setting.form_seconds + more)
 
-    def decisions(self, chosen: Setting, verdict: str) -> Iterator[Decision]:
-        """Yield the choices that make up a setting, with their reasons; the verdict says whether it is exact enough."""
+    def decisions(self, chosen: Setting, expected_db: float, accuracy_db: float) -> Iterator[Decision]:
+        """Yield the choices that make up a setting, with their reasons, and whether it is exact enough."""
         requested = self._asked(chosen.engine)
         every = "engine and setting" if self.engine is None and not requested else "setting that was asked for"
-        yield Decision("engine", chosen.engine, f"cheapest of every {every}, to 5 %, {verdict}", chosen.error_db)
+        why = f"cheapest of every {every}, to 5 %, meets {accuracy_db:.0f} dB"
+        if expected_db > accuracy_db:
+            why = f"most exact of every {every}, predicted {expected_db:.1f} dB, {accuracy_db:.0f} dB asked: "
+            why += "tiles that miss it are formed again"
+        yield Decision("engine", chosen.engine, why, chosen.error_db)
         for name, reason in chosen.reasons.items():
             why = "asked for; " if name in requested else ""
             yield Decision(name, chosen.all_options[name], why + reason)
@@ -207,10 +211,6 @@ def make_plan(
     antennas, missed = decide_antennas(job.beams, job.illumination)
     chosen = search.fitted(chosen, presum)
     expected_db = power_sum_db(chosen.error_db, *([] if presumming.error_db is None else [presumming.error_db]))
-    verdict = f"meets {accuracy_db:.0f} dB"
-    if expected_db > accuracy_db:
-        verdict = f"predicted {expected_db:.1f} dB, {accuracy_db:.0f} dB asked: tiles that miss it are formed again"
-        flags["prediction_misses"] = verdict
     integrated = job.integration or Integration(None, len(job.aperture), "all", "every pulse counts for every pixel")
     memory, disk = bytes_needed(job, chosen, presum)
     blocks = block_decision(chosen, job, presum, requested="pulse_blocks" in requested)
@@ -218,7 +218,7 @@ def make_plan(
         setting=chosen,
         fallbacks=search.fallbacks(chosen),
         decisions=(
-            *search.decisions(chosen, verdict),
+            *search.decisions(chosen, expected_db, accuracy_db),
             Decision("integration", integrated.value, integrated.reason),
             presumming,
             blocks,
