@@ -73,6 +73,7 @@ TYPED = {
     "step refine": "step refine f01",
     "step tiles": "step tiles f01 uav1-uav2 1-of-2",
     "step tracks": "step tracks f01",
+    "step transfer": "step transfer f01 uav1-uav2",
     "step whole-chart": "step whole-chart --repeats 1",
     "study autofocus-picture": "study autofocus-picture none",
     "study chart": "study chart stability none",

@@ -84,6 +84,7 @@ def test_every_job_of_a_run_stays_within_what_it_asked_for_and_asked_for_no_more
         "calibrate",
         "terrain",
         "cphd",
+        "transfer",
         "interferogram",
         "speed_accuracy",
         "whole_chart",

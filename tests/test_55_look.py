@@ -291,12 +291,16 @@ def test_the_last_picture_is_the_fine_one(tiny):
 def test_files_that_are_not_there_yet_are_waited_for(tiny):
     for path in (tiny / "raw/f01").iterdir():
         path.unlink()
+    earlier = tiny / "results/look/map/map.json"
+    earlier.parent.mkdir(parents=True)
+    earlier.write_text("{}")
     look = Look(Campaign.load(tiny), follow=True, every_s=1.0)
     threading.Timer(2.0, look.finish.set).start()
     look.run()
     told = json.loads((tiny / "results/look/status.json").read_text())["pairs"]["f01/uav1-uav1"]
     assert "no such file" in told["waits"] or "track" in told["waits"]
     assert told["image"] is None
+    assert not earlier.exists()
 
 
 def test_an_image_of_hardly_any_aperture_is_shown_but_not_judged(tiny, monkeypatch):

@@ -141,6 +141,7 @@ class Look:
     def run(self) -> None:
         """Read, add and show until the recordings end, and then what the fine images still lack."""
         poll_s, shown_at, ended = self.every_s / _POLLS, time.monotonic(), False
+        self._map.begin()
         while not ended:
             polled = time.monotonic()
             grown = self._read()

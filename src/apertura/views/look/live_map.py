@@ -60,6 +60,10 @@ class LiveMap:
             "notes": notes,
         }
 
+    def begin(self) -> None:
+        """Remove the document of an earlier look: who asks for the map now waits for the first picture of this one."""
+        (self._folder / MAP).unlink(missing_ok=True)
+
     def add(self, pair: PairSoFar, told: Mapping[str, Any]) -> None:
         """Write the image so far of a pair, of which `told` is known."""
         shown, grid = pair.shown, pair.images[-1].grid
