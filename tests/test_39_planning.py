@@ -176,6 +176,12 @@ def test_an_override_that_misses_the_accuracy_is_kept_and_predicted():
 
 
 @compiled
+@pytest.mark.parametrize("accuracy_db", [-40.0, -60.0, -80.0, -90.0])
+def test_no_tile_is_formed_again_by_an_engine_that_compiles_itself_first_where_another_was_built(accuracy_db):
+    assert "numba" not in {setting.engine for setting in plan(accuracy_db, shape=(1024, 1024)).fallbacks}
+
+
+@compiled
 def test_every_setting_that_is_offered_may_be_asked_for():
     """Down to the coarsest: what the planner may choose an engine takes."""
     job = planning_job(shape=(4000, 4000))

@@ -223,6 +223,22 @@ def test_a_job_that_runs_over_what_was_expected_is_not_about_to_end(finished_tin
         assert Outlook(finished_tiny, cores=2).left(run, now_s, {})[1] == pytest.approx(left_s)
 
 
+def test_shares_of_tiles_tell_how_long_the_image_takes_that_gathers_them(finished_tiny):
+    done = JobRecord("tiles", ("tiles", "f01", "uav1-uav1", "1-of-2"), "", 0.0, 30.0)
+    assert Outlook(finished_tiny, cores=1).left(RunRecord(planned={"tiles": 1, "image": 1}, jobs={1: done}), 30.0, {})[
+        1
+    ]
+
+
+def test_nothing_is_told_while_tiles_of_an_image_are_formed_again(finished_tiny):
+    """Images took 60 s; one runs for 95, and none of the parts is done that its tiles are formed in again."""
+    done = JobRecord("image", ("image", "f01", "uav1-uav1"), "", 0.0, 60.0)
+    run = RunRecord(planned={"image": 2}, jobs={1: done, 2: replace(done, begun_s=60.0, ended_s=None)})
+    for parts, told in ((0, False), (1, False), (4, True)):
+        paced = {2: StepProgress("parts of tiles", parts, 7, 125.0, 155.0)}
+        assert (Outlook(finished_tiny, cores=2).left(run, 155.0, paced)[1] is not None) == told
+
+
 def test_the_first_tiles_of_an_image_do_not_tell_how_long_it_takes_where_others_have_ended(finished_tiny):
     """After 30 s one of 100 tiles is done, for tables come first: an image took 60 s, not 50 minutes."""
     done = JobRecord("image", ("image", "f01", "uav1-uav1"), "", 0.0, 60.0)

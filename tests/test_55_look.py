@@ -257,6 +257,24 @@ def test_a_recorder_started_again_while_a_picture_is_drawn_leaves_none_of_the_fl
     assert look.pairs[0].shown is None
 
 
+def test_a_file_that_is_away_for_a_moment_ends_no_look(tiny):
+    """As a recorder leaves it that removes and creates its files: between two reads, and before a block is read."""
+    data = tiny / "raw/f01/uav2.sigmf-data"
+    look, content = Look(Campaign.load(tiny), follow=True), data.read_bytes()
+    look._read()
+    data.unlink()
+    assert not look.pairs[1].add_next(ended=True) or look.pairs[1].counts["added"] == 0
+    assert "no such file" in look.pairs[1].why_dropped.lower()
+    look._read()
+    data.write_bytes(content[: len(content) // 2])
+    look._read()
+    assert look.pairs[1].taken == 0
+    look._read()
+    while look.pairs[1].add_next(ended=True):
+        pass
+    assert 0 < look.pairs[1].counts["added"] <= look.pairs[1].counts["recorded"]
+
+
 def test_metadata_that_are_half_written_anew_are_no_new_flight(tiny):
     meta = tiny / "raw/f01/uav1.sigmf-meta"
     document, node = json.loads(meta.read_text()), node_of(tiny, "uav1")

@@ -60,9 +60,9 @@ rule layers:
         header["layers"].log,
     benchmark:
         header["layers"].benchmark
+    priority: 1  # before images, which take all cores: what rasters take on this machine is then known early
     conda:
         "../../environment.yml"
-    priority: 1  # before images, which take all cores: what rasters take on this machine is then known early
     threads: header["layers"].threads
     resources:
         mem_mb=header["layers"].mem_mb,

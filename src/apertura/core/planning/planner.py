@@ -137,7 +137,8 @@ class SettingSearch:
     def _engines(self) -> list[str]:
         """Return the engines that can run here and fit the request; untimed ones only where they are named.
 
-        Seconds that were not measured are no reason to prefer an engine.
+        Seconds that were not measured are no reason to prefer an engine; nor are those of one that compiles itself
+        for ten seconds first, where the engine that it stands in for was built.
         """
         reads = {"profiles", "phase_history"} if self.job.recorded else {"profiles"}
         runnable = [name for name in ENGINES if load_engine(name).available() and load_engine(name).READS in reads]
@@ -157,7 +158,10 @@ class SettingSearch:
         if self.engine is not None:
             return [self.engine]
         stated = [name for name in runnable if self._asked(name)]
-        return stated or [name for name in runnable if getattr(load_engine(name), "TIMED", True)]
+        if stated:
+            return stated
+        timed = [name for name in runnable if getattr(load_engine(name), "TIMED", True)]
+        return [name for name in timed if getattr(load_engine(name), "STANDS_IN_FOR", None) not in timed]
 
 
 # ---- The planner

@@ -4,14 +4,15 @@ A job of rule r takes b + w seconds by the cost of its rule: its start and what 
 what was timed in this run to that, it is expected to take
 
     ρ_r (b + w)       where a job of its rule has ended, or tells how far it is;
-    ρ_p (b + w)       of rasters, where those of another rule have: they are alike;
+    ρ_p (b + w)       of rasters, or of sums of pulses over pixels, where those of another rule have: they are alike;
     ρ_b b + ρ_w w     elsewhere: ρ_b by jobs that are mostly start, ρ_w by the others.
 
 The last is only told of a job that is mostly start, w ≤ b, when such jobs of two rules were timed: starts are alike,
 but the first of a run wait for what all of them import. A sum over a run is told while no more than a fifth of it is of
 jobs of which that is not: where these take nothing it is 1.25 times the truth, where six times as much, half of it.
-Nothing is told of it before each rule that is to sum pulses over pixels was timed: engine and accuracy change that a
-thousandfold. A job that has run for longer than was expected is expected to run on for as long again as it is over.
+Nothing is told of it before one that sums pulses over pixels was timed: engine and accuracy change that a thousandfold;
+nor while one takes half as long again as expected: its tiles are formed again. Another job that does runs on for as
+long again as it is over.
 """
 
 import json
@@ -33,7 +34,7 @@ from apertura.pipeline.runs.journal import LAST_S, JobRecord, RunRecord
 
 _MOST_TIMED = 500
 _LEAST_S = 0.1
-_TELLS = 0.05  # of its work that a step has done before its pace counts for others
+_TELLS = 0.05  # of its work that a step has done, and two parts of it, before its pace is taken for others
 _SURE = 0.8
 
 
@@ -58,6 +59,11 @@ class StepProgress:
         return None
 
     @property
+    def tells(self) -> bool:
+        """Whether enough is done for a pace: what comes before the first part, tables, is in that of few."""
+        return self.done >= max(_TELLS * self.total, 2)
+
+    @property
     def left_s(self) -> float | None:
         """Seconds that the rest takes at the pace so far; None before there is one."""
         passed = self.at_s - self.since_s
@@ -72,8 +78,8 @@ class Measure:
     ----------
     of_rule
         Rule → how much longer than expected its jobs take, of those that were timed.
-    of_rasters
-        The same of any job of rasters; None where none was timed.
+    of_rasters, of_imaging
+        The same of any job of rasters, and of any that sums pulses over pixels; None where none was timed.
     of_start, of_work
         The same of the start of any job, and of what grows with its work; None where nothing was timed.
     starts
@@ -82,6 +88,7 @@ class Measure:
 
     of_rule: dict[str, float]
     of_rasters: float | None
+    of_imaging: float | None
     of_start: float | None
     of_work: float | None
     starts: bool
@@ -98,10 +105,12 @@ class Measure:
         starts = [ratio for rule, ratio in of_rule.items() if not any(grows[rule])]
         works = [ratio for rule, ratio in of_rule.items() if any(grows[rule])]
         rasters = [ratio for rule, ratio in of_rule.items() if _cost(rule).of_rasters]
+        imaging = [ratio for rule, ratio in of_rule.items() if _cost(rule).of_imaging]
         every = median_low(of_rule.values()) if timed else None
         return cls(
             of_rule,
             median(rasters) if rasters else None,
+            median(imaging) if imaging else None,
             median_low(starts) if starts else every,
             median_low(works) if works else every,
             len(starts) > 1,
@@ -111,8 +120,10 @@ class Measure:
         """Return what a job is expected to take, and whether that is to be told."""
         if rule in self.of_rule:
             return self.of_rule[rule] * (start_s + work_s), True
-        if self.of_rasters is not None and _cost(rule).of_rasters:
-            return self.of_rasters * (start_s + work_s), True
+        cost = _cost(rule)
+        alike = self.of_rasters if cost.of_rasters else self.of_imaging if cost.of_imaging else None
+        if alike is not None:
+            return alike * (start_s + work_s), True
         if self.of_start is None or self.of_work is None:
             return start_s + work_s, False
         return self.of_start * start_s + self.of_work * work_s, self.starts and work_s <= start_s
@@ -160,15 +171,21 @@ class Outlook:
         timed = [(job, max(job.seconds(), _LEAST_S)) for job in run.finished[-_MOST_TIMED:]]
         for number, left_s in paced.items():
             report = told[number]
-            if left_s is not None and report and report.done >= _TELLS * report.total:
+            if left_s is not None and report and report.tells:
                 timed.append((under_way[number], under_way[number].seconds(report.at_s) + left_s))
         measure = Measure.of([(job.rule, took, *self._expects(run, job.rule, job.step[1:])) for job, took in timed])
         left: dict[int, tuple[float, bool]] = {}
+        begun_again = False  # tiles that missed the accuracy: by a finer setting, in a time that nobody knows
         for number, job in under_way.items():
             whole, sure = measure.seconds(job.rule, *self._expects(run, job.rule, job.step[1:]))
             pace, report = paced.get(number), told.get(number)
-            early = job.rule in measure.of_rule and report and report.done < _TELLS * report.total
-            left[number] = (abs(whole - job.seconds(now_s)), sure) if pace is None or early else (pace, True)
+            early = job.rule in measure.of_rule and report and not report.tells
+            if pace is None or early:
+                over_s = job.seconds(now_s) - whole
+                left[number] = abs(over_s), sure
+                begun_again |= _cost(job.rule).of_imaging and over_s > whole / 2
+            else:
+                left[number] = pace, True
         waiting: dict[str, tuple[float, bool]] = {}
         for rule in run.waiting:
             each = [measure.seconds(rule, *self._expects(run, rule, where)) for where in self._places(rule)]
@@ -176,8 +193,9 @@ class Outlook:
         whole, sure_s = (self._sum(run, left, waiting, all_of_it=all_of_it) for all_of_it in (True, False))
         of_jobs = {number: seconds if sure else None for number, (seconds, sure) in left.items()}
         to_come = {*run.waiting, *(job.rule for job in under_way.values())}
-        guessed = any(_cost(rule).of_imaging and rule not in measure.of_rule for rule in to_come)
-        return of_jobs, whole if sure_s >= _SURE * whole and measure.of_rule and not guessed else None
+        guessed = measure.of_imaging is None and any(_cost(rule).of_imaging for rule in to_come)
+        known = measure.of_rule and sure_s >= _SURE * whole and not guessed and not begun_again
+        return of_jobs, whole if known else None
 
     def _sum(
         self,

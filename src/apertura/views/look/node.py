@@ -82,10 +82,10 @@ class NodeSoFar:
                 read()
             except NotFollowedError:
                 raise
-            except CampaignError as error:
+            except (CampaignError, OSError) as error:
                 if not self._follow:
                     raise
-                self.waits = str(error)  # a file that is not there yet, or has only begun
+                self.waits = str(error)  # a file that is not there yet, or not now, or has only begun
         grown = (len(self.time), self._log_size) != before
         self.grown_at = time.monotonic() if grown else self.grown_at
         return grown

@@ -153,7 +153,7 @@ class PairSoFar:
         """Add the pulses of some captures; return how many have a position and a transfer function."""
         try:
             block = self._block(tx_index, rx_index)
-        except CampaignError as error:
+        except (CampaignError, OSError) as error:  # also a file that has just been removed
             self.why_dropped = str(error)
             return 0
         if block is None:

@@ -26,6 +26,8 @@ from apertura.core.interpolation import kaiser_sinc
 
 instruction_set = compiled_for
 READS: Literal["profiles"] = "profiles"
+STANDS_IN_FOR = "native"
+"""Taken by itself only where that cannot run."""
 OVERSAMPLINGS = (2, 4, 6, 8, 12, 16, 24, 32)
 
 _SAMPLE_S = 3.1e-8  # per pulse and fine sample
