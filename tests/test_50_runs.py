@@ -236,7 +236,8 @@ def test_nothing_is_told_while_tiles_of_an_image_are_formed_again(finished_tiny)
     run = RunRecord(planned={"image": 2}, jobs={1: done, 2: replace(done, begun_s=60.0, ended_s=None)})
     for parts, told in ((0, False), (1, False), (4, True)):
         paced = {2: StepProgress("parts of tiles", parts, 7, 125.0, 155.0)}
-        assert (Outlook(finished_tiny, cores=2).left(run, 155.0, paced)[1] is not None) == told
+        of_jobs, whole = Outlook(finished_tiny, cores=2).left(run, 155.0, paced)
+        assert [one is not None for one in (of_jobs[2], whole)] == [told, told]
 
 
 def test_the_first_tiles_of_an_image_do_not_tell_how_long_it_takes_where_others_have_ended(finished_tiny):

@@ -182,8 +182,9 @@ class Outlook:
             early = job.rule in measure.of_rule and report and not report.tells
             if pace is None or early:
                 over_s = job.seconds(now_s) - whole
-                left[number] = abs(over_s), sure
-                begun_again |= _cost(job.rule).of_imaging and over_s > whole / 2
+                again = _cost(job.rule).of_imaging and over_s > whole / 2
+                left[number] = abs(over_s), sure and not again
+                begun_again |= again
             else:
                 left[number] = pace, True
         waiting: dict[str, tuple[float, bool]] = {}
