@@ -45,7 +45,7 @@ def stale_results(campaign: Campaign, *, paranoid: bool = False) -> dict[str, st
         path = inside(campaign.root, result.manifest, where=campaign.root)
         if not path.is_file():
             if any((path.parent / file).is_file() for file in products_of(RESULTS[name])):
-                stale[result.manifest] = "it is gone, and nobody knows what the files beside it were made from"
+                stale[result.manifest] = "its manifest is gone, which said what its files were made from"
             continue
         try:
             reasons = list(_reasons(campaign.root, result, read_manifest(path), paranoid=paranoid))
