@@ -176,9 +176,11 @@ def test_an_override_that_misses_the_accuracy_is_kept_and_predicted():
 
 
 @compiled
-@pytest.mark.parametrize("accuracy_db", [-40.0, -60.0, -80.0, -90.0])
-def test_no_tile_is_formed_again_by_an_engine_that_compiles_itself_first_where_another_was_built(accuracy_db):
-    assert "numba" not in {setting.engine for setting in plan(accuracy_db, shape=(1024, 1024)).fallbacks}
+def test_an_engine_that_compiles_itself_first_is_taken_by_name_alone_where_another_was_built():
+    """Ten seconds for the first of its tiles; the fallbacks of a plan are of these settings."""
+    job = planning_job()
+    assert "numba" not in {setting.engine for setting in SettingSearch(job).settings(300)}
+    assert {setting.engine for setting in SettingSearch(job, "numba").settings(300)} == {"numba"}
 
 
 @compiled

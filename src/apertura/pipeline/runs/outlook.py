@@ -11,8 +11,8 @@ The last is only told of a job that is mostly start, w ≤ b, when such jobs of 
 but the first of a run wait for what all of them import. A sum over a run is told while no more than a fifth of it is of
 jobs of which that is not: where these take nothing it is 1.25 times the truth, where six times as much, half of it.
 Nothing is told of it before one that sums pulses over pixels was timed: engine and accuracy change that a thousandfold;
-nor while one takes half as long again as expected: its tiles are formed again. Another job that does runs on for as
-long again as it is over.
+nor is one told that takes half as long again as expected: its tiles are formed again. Another job that does runs on for
+as long again as it is over.
 """
 
 import json
@@ -175,16 +175,14 @@ class Outlook:
                 timed.append((under_way[number], under_way[number].seconds(report.at_s) + left_s))
         measure = Measure.of([(job.rule, took, *self._expects(run, job.rule, job.step[1:])) for job, took in timed])
         left: dict[int, tuple[float, bool]] = {}
-        begun_again = False  # tiles that missed the accuracy: by a finer setting, in a time that nobody knows
         for number, job in under_way.items():
             whole, sure = measure.seconds(job.rule, *self._expects(run, job.rule, job.step[1:]))
             pace, report = paced.get(number), told.get(number)
             early = job.rule in measure.of_rule and report and not report.tells
             if pace is None or early:
                 over_s = job.seconds(now_s) - whole
-                again = _cost(job.rule).of_imaging and over_s > whole / 2
-                left[number] = abs(over_s), sure and not again
-                begun_again |= again
+                # Tiles that missed the accuracy are formed again by a finer setting: in a time that nobody knows.
+                left[number] = abs(over_s), sure and not (_cost(job.rule).of_imaging and over_s > whole / 2)
             else:
                 left[number] = pace, True
         waiting: dict[str, tuple[float, bool]] = {}
@@ -195,7 +193,7 @@ class Outlook:
         of_jobs = {number: seconds if sure else None for number, (seconds, sure) in left.items()}
         to_come = {*run.waiting, *(job.rule for job in under_way.values())}
         guessed = measure.of_imaging is None and any(_cost(rule).of_imaging for rule in to_come)
-        known = measure.of_rule and sure_s >= _SURE * whole and not guessed and not begun_again
+        known = measure.of_rule and sure_s >= _SURE * whole and not guessed
         return of_jobs, whole if known else None
 
     def _sum(
