@@ -114,7 +114,7 @@ def test_pulses_come_in_the_order_they_are_asked_for(drifting, tmp_path):
     whole = transfer.values
     some = np.array([7, 3, 3, 40])
     for key in (some, slice(None, None, 9), slice(60, 10, -7), 5, (some, slice(2, 9)), (slice(3), 4)):
-        np.testing.assert_array_equal(transfer[key].values, whole[key])
+        np.testing.assert_allclose(transfer[key].values, whole[key], rtol=2e-6, atol=1e-4)  # of 100: a DFT's last bit
     assert transfer[:0].values.shape == (0, whole.shape[1])
 
 
