@@ -43,9 +43,8 @@ def campaign_of(root, flights):
 
 def finish(root):
     """Put a file in the place of every result, with the manifest that its step would write."""
-    from apertura.pipeline.steps.code import code_of
-
     from apertura.common.atomic import write_json
+    from apertura.common.provenance import code_sha256
     from apertura.formats.export import exports_in
     from apertura.pipeline.campaign import Campaign
     from apertura.pipeline.digests import Sources
@@ -60,12 +59,12 @@ def finish(root):
         "export": [one.file for one in exports_in("pair")],
     }
     beside["export"], beside["fused"] = [*beside["export"], "image.json"], [*beside["fused"], "image.json"]
-    campaign, code = Campaign.load(root), cache(code_of)
+    campaign, code = Campaign.load(root), cache(code_sha256)
 
     class Made:
-        def __init__(self, name, result):
-            sources = Sources.of(root, result.sources).digests
-            self.record = lambda: {"sources": sources, "settings": result.settings_sha256, "code": code(name)}
+        def __init__(self, result):
+            sources, ran = Sources.of(root, result.sources).digests, code(*result.modules)
+            self.record = lambda: {"sources": sources, "settings": result.settings_sha256, "code": ran}
 
     for name, result in results_of(campaign):
         if "study" in result.manifest:
@@ -75,7 +74,7 @@ def finish(root):
         files = [manifest.parent / file for file in beside.get(name, [])]
         for file in files:
             write_json(file, {"stands for": file.name})
-        record_files(manifest, files, Made(name, result))
+        record_files(manifest, files, Made(result))
 
 
 def measured(name, *command, cwd):
@@ -103,10 +102,10 @@ def measure(root, flights):
     measured("snakemake -n", *snakemake, cwd=home)
     batch = f"all=1/{BATCH}"
     measured(f"snakemake -n --batch {batch}", *snakemake, "--batch", batch, cwd=home)
-    measured("apertura run -n, nothing made", apertura, "run", root, "-n", "--quiet", "rules", cwd=home)
+    measured("apertura run -n, nothing made", apertura, "run", root, "-n", "-q", cwd=home)
     measured("(placeholders for all results)", sys.executable, __file__, "--finish", root, cwd=home)
     measured("apertura check, all made", apertura, "check", root, cwd=home)
-    measured("apertura run -n, all made", apertura, "run", root, "-n", "--quiet", "rules", cwd=home)
+    measured("apertura run -n, all made", apertura, "run", root, "-n", "-q", cwd=home)
 
 
 def main():
