@@ -58,7 +58,7 @@ SHARED = ROOT.parent / "shared" / "data"
 
 def copy_writable(source: Path, target: Path) -> Path:
     """Copy a folder to one that may be changed, and return that."""
-    shutil.copytree(source, target, copy_function=shutil.copyfile)
+    shutil.copytree(str(source), str(target), copy_function=shutil.copyfile)
     for folder in [target, *(path for path in target.rglob("*") if path.is_dir())]:
         folder.chmod(0o755)
     return target

@@ -61,7 +61,7 @@ def by_rioxarray(path: Path) -> dict[str, Any]:
     """Return the same; the transform from the coordinates of the pixels' centres."""
     import rioxarray
 
-    with rioxarray.open_rasterio(path) as raster:
+    with rioxarray.open_rasterio(str(path)) as raster:
         west, east, north, south = (float(at) for axis in (raster.x, raster.y) for at in axis.values[[0, -1]])
         rows, columns = raster.shape[1:]
         right, down = (east - west) / (columns - 1), (south - north) / (rows - 1)

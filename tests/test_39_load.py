@@ -32,7 +32,7 @@ def test_pairs_are_those_of_the_flights_that_become_images(opened):
 
 def test_an_image_is_that_of_the_raster_on_the_same_grid(opened):
     image = opened.image(*PAIR)
-    with rasterio.open(opened.campaign.results / "f01" / "uav1-uav2" / "slc.tif") as raster:
+    with rasterio.open(str(opened.campaign.results / "f01" / "uav1-uav2" / "slc.tif")) as raster:
         np.testing.assert_array_equal(image.values, raster.read(1))
         assert (raster.transform.c, raster.transform.f) == (opened.scene.grid.west_m, opened.scene.grid.north_m)
         assert raster.transform.a == opened.scene.grid.spacing_m

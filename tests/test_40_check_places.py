@@ -2,7 +2,6 @@
 
 import re
 import shutil
-from collections import namedtuple
 
 import numpy as np
 import pytest
@@ -10,6 +9,7 @@ import rasterio
 from folders import edit_config, edit_track
 from rasterio.transform import from_origin
 
+from apertura.common.confined import ConfinedPath
 from apertura.core.geometry.geodesy import projected_from_ecef
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.check import as_line, problems, resources
@@ -18,7 +18,6 @@ from apertura.pipeline.check.scene import needles
 from apertura.pipeline.opening.reading import read_log
 from apertura.simulation.presets import DEMO_ORIGIN
 
-Usage = namedtuple("Usage", "total used free")
 TX, RX = "raw/f01/uav1.track.csv", "raw/f01/uav2.track.pos"
 
 
@@ -444,7 +443,7 @@ def test_free_memory_is_what_is_available_and_no_more_than_the_limit(tmp_path):
 def test_the_disk_must_hold_what_is_still_to_be_written(tiny, monkeypatch):
     swell(tiny, 400_000_000)  # samples stay where they are
     free = {"bytes": 400_000_000}
-    monkeypatch.setattr(shutil, "disk_usage", lambda _: Usage(0, 0, free["bytes"]))
+    monkeypatch.setattr(ConfinedPath, "free_bytes", lambda _: free["bytes"])
     assert reported(tiny) == []
     free["bytes"] = 1_000
     line = only(tiny)

@@ -48,7 +48,7 @@ def test_an_input_that_is_a_link_is_refused(tiny, tmp_path, file):
     path, elsewhere = tiny / file, tmp_path / "elsewhere"
     shutil.move(path, elsewhere)
     path.symlink_to(elsewhere)
-    with pytest.raises(CampaignError, match="leads through a symbolic link"):
+    with pytest.raises(CampaignError, match="a symbolic link"):
         require_files(Campaign.load(tiny))
 
 
@@ -62,7 +62,7 @@ def test_nothing_is_written_or_deleted_through_linked_results(tiny, tmp_path):
     (elsewhere / "f01/uav1/raw.zarr").mkdir(parents=True)
     (tiny / "results").symlink_to(elsewhere)
     campaign = Campaign.load(tiny)
-    with pytest.raises(CampaignError, match="leads through a symbolic link"):
+    with pytest.raises(CampaignError, match="a symbolic link"):
         ingest.ingest(campaign, "f01", "uav1")
     assert [path.name for path in elsewhere.rglob("*")] == ["f01", "uav1", "raw.zarr"]
     assert len(list(check_links(Examination(campaign)))) == 1

@@ -185,5 +185,8 @@ def test_a_preamble_outside_the_campaign_is_not_opened(tiny, name):
 
     edit_meta(tiny, "uav1", one_capture)
     message = complaint(lambda: ingest.ingest(Campaign.load(tiny), "f01", "uav1"))
-    assert "uav1.sigmf-meta: apertura:framing.preamble: path" in message
-    assert "inside the campaign folder" in message
+    if name == "link.npy":
+        assert "link.npy: a symbolic link" in message
+    else:
+        assert "uav1.sigmf-meta: apertura:framing.preamble: path" in message
+        assert "inside the campaign folder" in message

@@ -29,7 +29,7 @@ def place(east, north, up):
 
 
 def read_toy_history(paths, *, pair):
-    stored = np.load(paths[0])
+    stored = np.load(str(paths[0]))
     count = len(stored["time"])
     return xr.Dataset(
         {

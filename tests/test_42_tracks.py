@@ -179,7 +179,7 @@ def test_a_campaign_whose_tracks_are_left_alone_has_its_logs_as_they_are(finishe
         ):
             np.testing.assert_array_equal(read.time.values, logged.time.values)
             np.testing.assert_allclose(read.position.values, logged.position.values, atol=1e-4, rtol=0)
-    with Image.open(folder / "tracks.png") as picture:
+    with Image.open(str(folder / "tracks.png")) as picture:
         assert picture.text["Title"] == "tandem_demo · tracks of flight f01"
         assert "f01" in picture.text["APERTURA_SOURCES"]
 

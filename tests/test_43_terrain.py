@@ -104,7 +104,7 @@ def test_a_product_on_terrain_says_so_and_names_the_dem(hillside):
     digest = hashlib.sha256((hillside.root / "dem.tif").read_bytes()).hexdigest()
     apart = {"f01/uav1-uav2/slc.tif": None, "f01/fused/coherent_db.tif": "uav1-uav2", "f01/uav1-uav2/mask.tif": None}
     for name, stage in apart.items():
-        with rasterio.open(hillside.results / name) as raster:
+        with rasterio.open(str(hillside.results / name)) as raster:
             assert json.loads(raster.tags()["APERTURA_INPUTS"])["dem"] == digest
             runspec = json.loads(raster.tags()["APERTURA_RUNSPEC"])
             runspec = runspec[stage] if stage else runspec
@@ -117,7 +117,7 @@ def test_layers_lie_on_the_grid_and_hold_the_angles_of_the_slope(hillside):
     heights = open_stage(hillside.stage("terrain"), "terrain").height.values
     values = {}
     for name in ("incidence", "bistatic_angle", "mask"):
-        with rasterio.open(hillside.results / "f01" / "uav1-uav2" / f"{name}.tif") as raster:
+        with rasterio.open(str(hillside.results / "f01" / "uav1-uav2" / f"{name}.tif")) as raster:
             assert tuple(raster.transform)[:6] == grid.transform
             assert raster.crs.to_epsg() == 32632
             values[name] = raster.read(1)
@@ -182,7 +182,7 @@ def test_an_echo_that_is_open_is_not_read_again(hillside, tmp_path):
     """Its stage may even be gone: the pair is opened and planned from the arrays that are held."""
     campaign = Campaign.load(copy_writable(hillside.root, tmp_path / "campaign"))
     echo = PairEcho.opened(campaign, *PAIR).stage.load()
-    shutil.rmtree(campaign.stage("echo", *PAIR))
+    shutil.rmtree(str(campaign.stage("echo", *PAIR)))
     opened = open_pair(campaign, *PAIR, echo=echo)
     assert np.shares_memory(opened.history.transfer, echo.transfer.values)
     planned = plan_pair(campaign, opened, open_scene(campaign))
@@ -321,7 +321,7 @@ def test_a_platform_below_the_terrain_is_refused_with_its_pulse(hillside, tmp_pa
     planned = complaint(lambda: expected_plan(campaign, "f01", "uav1-uav1"))  # before anything ran
     assert "flight f01, pair uav1-uav1: at " in planned
     assert "transmitter is in or below the ground" in planned
-    shutil.copytree(hillside.results / "f01", root / "results" / "f01")
+    shutil.copytree(str(hillside.results / "f01"), str(root / "results" / "f01"))
     settle_ground(campaign)
     message = complaint(lambda: profile.profile(campaign, "f01", "uav1-uav1"))
     assert message.split(", worst")[0].split(": at ")[0] == planned.split(": at ")[0]

@@ -148,9 +148,9 @@ def test_a_clock_is_corrected_in_the_samples_only_where_it_matters(tmp_path, ppm
 
 def test_a_wrong_code_is_flagged_in_a_monostatic_image(tmp_path):
     campaign = flown(tmp_path)
-    codes = np.load(campaign.root / "raw" / "codes.npy")
+    codes = np.load(str(campaign.root / "raw" / "codes.npy"))
     assert "code_unconfirmed" not in echo_of(campaign, "uav1-uav1").attrs["flags"]
-    np.save(campaign.root / "raw" / "codes.npy", np.random.default_rng(3).permutation(codes))
+    np.save(str(campaign.root / "raw" / "codes.npy"), np.random.default_rng(3).permutation(codes))
     own, secondary = (echo_of(campaign, pair).attrs for pair in ("uav1-uav1", "uav1-uav2"))
     assert "code_unconfirmed" in own["flags"]
     assert own["code"]["carried"] is secondary["code"]["carried"] is False

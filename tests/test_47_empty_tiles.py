@@ -1,7 +1,5 @@
 """Tiles that no pulse sees: not stored, NaN in the cube and in the files of the image and of the sums."""
 
-import shutil
-
 import numpy as np
 import pytest
 import rasterio
@@ -19,7 +17,7 @@ def without_tiles(campaign, pair):
     """Write an image of a pair again, without some of its tiles."""
     folder = campaign.stage("image", "f01", pair)
     image = open_stage(folder, "image").load()
-    shutil.rmtree(folder)
+    folder.remove()
     missing = np.broadcast_to(np.complex64(complex(np.nan, np.nan)), image.image.shape)
     with writing(folder) as wip:
         create(wip, image.assign(image=(("y", "x"), missing)), {"image": (SIDE, SIDE)})
@@ -73,7 +71,7 @@ def test_a_sum_takes_what_a_pair_does_not_see_as_nothing(emptied):
 @pytest.mark.parametrize("name", ["uav1-uav2/slc.tif", "uav1-uav2/db.tif", "fused/coherent_power.tif"])
 def test_a_file_has_no_data_where_nothing_was_formed(emptied, name):
     campaign, _ = emptied
-    with rasterio.open(campaign.results / "f01" / name) as raster:
+    with rasterio.open(str(campaign.results / "f01" / name)) as raster:
         pixels, valid = raster.read(1), raster.dataset_mask() > 0
     assert np.isnan(pixels[:SIDE, :SIDE]).all()
     assert not valid[:SIDE, :SIDE].any()

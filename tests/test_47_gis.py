@@ -182,7 +182,7 @@ def test_qgis_paints_the_brightest_place_white_and_the_noise_floor_black(finishe
 def test_every_image_and_sum_says_what_its_values_mean(finished_tiny):
     said = {}
     for name in (name for name in RASTERS if name.endswith(".tif")):
-        with rasterio.open(finished_tiny.results / name) as raster:
+        with rasterio.open(str(finished_tiny.results / name)) as raster:
             radiometry = json.loads(raster.tags()["APERTURA_RADIOMETRY"])
             assert (raster.descriptions[0], raster.units[0]) == (radiometry["quantity"], radiometry["unit"])
         said[name.removeprefix("f01/")] = radiometry
@@ -206,9 +206,9 @@ def test_every_image_and_sum_says_what_its_values_mean(finished_tiny):
 
 def test_a_sum_times_its_factor_is_the_echo_again(finished_tiny):
     folder = finished_tiny.results / "f01"
-    with rasterio.open(folder / "fused" / "noncoherent_power.tif") as raster:
+    with rasterio.open(str(folder / "fused" / "noncoherent_power.tif")) as raster:
         mean, peaks = raster.read(1), json.loads(raster.tags()["APERTURA_RADIOMETRY"])["divided_by"]
-    powers = [rasterio.open(folder / pair / "power.tif").read(1) / peak**2 for pair, peak in peaks.items()]
+    powers = [rasterio.open(str(folder / pair / "power.tif")).read(1) / peak**2 for pair, peak in peaks.items()]
     np.testing.assert_allclose(mean, np.mean(powers, axis=0), rtol=1e-5)
 
 

@@ -6,6 +6,7 @@ import threading
 import urllib.error
 import urllib.request
 from contextlib import contextmanager
+from pathlib import Path
 
 import pytest
 import rasterio
@@ -76,7 +77,7 @@ def test_every_address_leads_to_the_file_that_was_looked_at(finished_tiny):
 def test_an_image_is_stretched_from_its_noise_floor_to_its_peak(finished_tiny):
     for image in document(finished_tiny)["images"]:
         layer = image["layers"][0]
-        with rasterio.open(finished_tiny.results / image["flight"] / image["image"] / layer["file"]) as raster:
+        with rasterio.open(str(finished_tiny.results / image["flight"] / image["image"] / layer["file"])) as raster:
             peak_db = float(raster.read(1).max())
         report = json.loads((finished_tiny.results / image["flight"] / image["image"] / "image.json").read_text())
         assert layer["kind"] == "image"
@@ -201,7 +202,7 @@ def test_a_map_that_is_not_as_it_was_written_is_one_message_at_the_start(finishe
 def test_a_map_that_names_other_files_than_products_does_not_reach_them(finished):
     found = document(finished)
     for layer, name in zip(found["images"][0]["layers"], ("scene.json", "../config/config.yaml"), strict=True):
-        layer["url"] = f"../{name}?sha256={sha256_file(finished.results / name)}"
+        layer["url"] = f"../{name}?sha256={sha256_file(Path(finished.results) / name)}"
     path = finished.results / "map" / "map.json"
     path.write_text(json.dumps(found))
     record_files(path.with_name("map.manifest.json"), [path])

@@ -32,7 +32,7 @@ RECORDED = [
 
 
 def tags_of(campaign, name):
-    with rasterio.open(campaign.results / name) as raster:
+    with rasterio.open(str(campaign.results / name)) as raster:
         return raster.tags()
 
 
@@ -49,7 +49,7 @@ def test_a_raster_is_a_valid_cog_on_the_campaigns_grid(finished_tiny, name):
     path = finished_tiny.results / name
     valid, errors, warnings = cog_validate(str(path), strict=True, quiet=True)
     assert valid, (errors, warnings)
-    with rasterio.open(path) as raster:
+    with rasterio.open(str(path)) as raster:
         np.testing.assert_allclose(tuple(raster.bounds), finished_tiny.settings.scene.bounds_m, atol=1e-3)
         assert raster.crs.to_epsg() == 32632
         assert raster.transform.a == -raster.transform.e == 0.1
@@ -137,17 +137,17 @@ def test_a_title_says_what_was_added_up(finished_tiny):
 
 def test_power_and_db_are_the_slc_squared(finished_tiny):
     folder = finished_tiny.results / "f01" / "uav1-uav1"
-    slc, power, db = (rasterio.open(folder / f"{name}.tif").read(1) for name in ("slc", "power", "db"))
+    slc, power, db = (rasterio.open(str(folder / f"{name}.tif")).read(1) for name in ("slc", "power", "db"))
     np.testing.assert_allclose(power, np.abs(slc) ** 2, rtol=1e-5)
     np.testing.assert_allclose(db, 20 * np.log10(np.abs(slc)), atol=1e-3)
 
 
 def test_the_cube_opens_with_xarray_and_holds_every_image(finished_tiny):
-    cube = xr.open_zarr(finished_tiny.results / "cube.zarr", consolidated=False, chunks=None)
+    cube = xr.open_zarr(str(finished_tiny.results / "cube.zarr"), consolidated=False, chunks=None)
     assert cube.image.dims == ("flight", "pair", "y", "x")
     assert cube.image.attrs["grid_mapping"] == "spatial_ref"
     assert "UTM zone 32N" in cube.spatial_ref.attrs["crs_wkt"]
-    slc = rasterio.open(finished_tiny.results / "f01" / "uav1-uav2" / "slc.tif").read(1)
+    slc = rasterio.open(str(finished_tiny.results / "f01" / "uav1-uav2" / "slc.tif")).read(1)
     np.testing.assert_array_equal(cube.image.values[0, cube.attrs["pairs"].index("uav1-uav2")], slc)
 
 
@@ -160,7 +160,7 @@ def test_coverage_lies_where_the_campaign_was_flown(finished_tiny):
     east, north = Transformer.from_crs("OGC:CRS84", "EPSG:32632", always_xy=True).transform(*np.transpose(ring))
     assert (east.min(), north.min()) == pytest.approx((xmin, ymin), abs=0.01)
     assert (east.max(), north.max()) == pytest.approx((xmax, ymax), abs=0.01)
-    echo = xr.open_zarr(finished_tiny.results / "f01" / PAIRS[1] / "echo.zarr", consolidated=False)
+    echo = xr.open_zarr(str(finished_tiny.results / "f01" / PAIRS[1] / "echo.zarr"), consolidated=False)
     for track, name in ((features[2], "tx_position"), (features[3], "rx_position")):
         longitude, latitude, height_m = np.transpose(track["geometry"]["coordinates"])
         ecef = Transformer.from_crs("EPSG:4979", "EPSG:4978").transform(latitude, longitude, height_m)
@@ -169,7 +169,9 @@ def test_coverage_lies_where_the_campaign_was_flown(finished_tiny):
 
 def test_a_layer_of_noise_lies_below_its_image(finished_tiny):
     folder = finished_tiny.results / "f01" / "uav1-uav1"
-    db, nesz, looks, mask = (rasterio.open(folder / f"{name}.tif").read(1) for name in ("db", "nesz", "looks", "mask"))
+    db, nesz, looks, mask = (
+        rasterio.open(str(folder / f"{name}.tif")).read(1) for name in ("db", "nesz", "looks", "mask")
+    )
     assert np.nanmax(nesz) < np.nanpercentile(db, 20)
     assert len(np.unique(looks)) == 1  # every pulse counts for every pixel
     assert not mask.any()

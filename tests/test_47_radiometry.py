@@ -127,7 +127,7 @@ def test_nothing_is_calibrated_of_a_radio_that_nobody_states(finished_tiny):
     folder = finished_tiny.result("f01", "uav1-uav1")
     assert not list(folder.glob("*0_db.tif"))
     assert not (folder / "radiometry.json").exists()
-    with rasterio.open(folder / "nesz.tif") as raster:
+    with rasterio.open(str(folder / "nesz.tif")) as raster:
         assert "relative" in raster.descriptions[0]
 
 
@@ -252,7 +252,7 @@ def test_mean_power_of_a_relative_image_is_that_of_its_echoes(finished_tiny, tmp
     for pair in PAIRS:
         layers(campaign, "f01", pair)
     folder = campaign.result("f01", "uav1-uav1")
-    pixels, squares = (rasterio.open(folder / f"{name}.tif").read(1) for name in ("power", "multilook_power"))
+    pixels, squares = (rasterio.open(str(folder / f"{name}.tif")).read(1) for name in ("power", "multilook_power"))
     assert squares[1, 2] == pytest.approx(pixels[4:8, 8:12].mean(), rel=1e-5)
     assert squares.shape == tuple(-(-size // 4) for size in pixels.shape)
     assert {link.state for link in verify(folder / "multilook_db.tif").links} == {"same"}

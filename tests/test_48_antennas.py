@@ -221,7 +221,7 @@ def test_a_scene_partly_outside_the_beam_is_flagged_with_its_share(beamed, turn_
         assert float(report["flags"]["beam_misses"].split()[0]) / 100 == pytest.approx(dark, abs=0.02)
         assert report["antennas"]["pulses_seeing"]["least"] == 0
         layers.layers(campaign, "f01", "uav1-uav1")
-        with rasterio.open(campaign.result("f01", "uav1-uav1", "mask.tif")) as mask:
+        with rasterio.open(str(campaign.result("f01", "uav1-uav1", "mask.tif"))) as mask:
             np.testing.assert_array_equal(np.isnan(pixels), mask.read(1) == OUTSIDE)
 
 

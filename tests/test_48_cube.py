@@ -45,7 +45,7 @@ def opened(campaign):
     """The cube as a stranger opens it; a warning is an error."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        return xr.open_zarr(campaign.stage("cube"))
+        return xr.open_zarr(str(campaign.stage("cube")))
 
 
 def test_images_are_selected_by_name(campaign, opened):

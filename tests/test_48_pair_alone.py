@@ -56,7 +56,7 @@ def test_the_cube_the_catalog_and_the_map_hold_the_pair_alone(alone):
     assert not SUMMED & {*cube.variables}
     assert cube.attrs["fusion"] == {}
     assert cube.phase_removed.isnull().all()
-    items = pystac.Catalog.from_file(alone.results / "stac" / CATALOG).get_items(recursive=True)
+    items = pystac.Catalog.from_file(str(alone.results / "stac" / CATALOG)).get_items(recursive=True)
     assert [item.id for item in items] == [f"f01-{PAIR}"]
     images = json.loads((alone.results / "map" / "map.json").read_text())["images"]
     assert [(one["flight"], one["image"]) for one in images] == [("f01", PAIR)]

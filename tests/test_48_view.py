@@ -16,7 +16,7 @@ def test_angles_of_the_view_are_those_of_the_layers_in_the_middle(finished_tiny,
     folder = finished_tiny.results / "f01" / pair
     view = json.loads((folder / "image.json").read_text())["view"]
     for name in ("incidence", "bistatic_angle"):
-        with rasterio.open(folder / f"{name}.tif") as raster:
+        with rasterio.open(str(folder / f"{name}.tif")) as raster:
             rows, columns = (slice(size // 2 - 1, size // 2 + 1) for size in raster.shape)
             middle = raster.read(1)[rows, columns].mean()
         assert view[f"{name}_deg"] == pytest.approx(middle, abs=0.1)

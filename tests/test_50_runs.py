@@ -10,6 +10,7 @@ import threading
 import time
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 
 import pytest
 from folders import ROOT, copy_writable
@@ -431,7 +432,7 @@ def test_clean_keeps_what_the_workflow_has_not_made_and_says_so(finished, capsys
 
 def test_clean_of_unfinished_work_keeps_every_result(finished, capsys):
     wip = finished.results / "f01/uav1-uav1/image.zarr.wip"
-    shutil.copytree(finished.results / "f01/uav1-uav1/image.zarr", wip)
+    shutil.copytree(str(finished.results / "f01/uav1-uav1/image.zarr"), str(wip))
     before = files(finished.results)
     clean(finished, unfinished_only=True, agreed=True)
     assert {name for name in before - files(finished.results) if ".wip/" not in name} == set()
@@ -466,7 +467,7 @@ def test_clean_follows_no_manifest_and_no_link_out_of_its_folder(finished, tmp_p
     outside = tmp_path / "outside"
     outside.mkdir()
     (outside / "secret").write_text("kept")
-    (finished.results / "out").symlink_to(outside)
+    Path(finished.results / "out").symlink_to(outside)
     (finished.results / "evil.manifest.json").write_text(json.dumps({"files": {name: "0"}}))
     clean(finished, unfinished_only=False, agreed=True)
     assert (finished.root / "config/config.yaml").is_file()

@@ -43,7 +43,7 @@ def test_a_reader_that_has_gone_is_one_message(finished_tiny):
     reading, writing = os.pipe()
     os.close(reading)
     with os.fdopen(writing, "w") as closed:
-        command = [APERTURA, "summary", finished_tiny.root]
+        command = [APERTURA, "summary", str(finished_tiny.root)]
         done = subprocess.run(command, stdout=closed, stderr=subprocess.PIPE, text=True, check=False)
     assert done.returncode == 2
     assert done.stderr == "error: output: Broken pipe (EPIPE). The reader of the output has gone.\n"
@@ -52,7 +52,7 @@ def test_a_reader_that_has_gone_is_one_message(finished_tiny):
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
 def test_a_full_disk_under_the_output_is_one_message(finished_tiny):
     with Path("/dev/full").open("w") as full:
-        command = [APERTURA, "summary", finished_tiny.root]
+        command = [APERTURA, "summary", str(finished_tiny.root)]
         done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
     assert done.returncode == 2
     assert done.stderr.startswith("error: output: No space left on device (ENOSPC)")

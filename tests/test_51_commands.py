@@ -26,7 +26,7 @@ def typed(monkeypatch, capsys):
 
     def run(*words, folder=None):
         if folder is not None:
-            monkeypatch.chdir(folder)
+            monkeypatch.chdir(str(folder))
         monkeypatch.setattr(sys, "argv", ["apertura", *map(str, words)])
         monkeypatch.setattr(processes, "_left", [])
         here = Path.cwd()

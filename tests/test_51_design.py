@@ -161,7 +161,7 @@ def test_what_was_predicted_is_measured_after_the_same_plan_was_sampled_and_proc
     from apertura.pipeline.steps.layers import layers
 
     layers(campaign, "f01", "uav1-uav1")
-    with rasterio.open(campaign.result("f01", "uav1-uav1", "nesz.tif")) as raster:
+    with rasterio.open(str(campaign.result("f01", "uav1-uav1", "nesz.tif"))) as raster:
         assert raster.read(1)[40, 40] == pytest.approx(planned["nesz"][40, 40], abs=1.0)
     (point,) = read_json(campaign.result("f01", "uav1-uav1", "radiometry.json"), expected="", remedy="")["points"][:1]
     assert point["rcs_dbsm"] == pytest.approx(0.0, abs=1.0)

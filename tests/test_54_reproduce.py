@@ -30,7 +30,7 @@ def again(finished_tiny, monkeypatch):
         asked.append((root, cores, targets))
         assert not (root / "results").exists()
         assert contents(root / "raw") == contents(finished_tiny.root / "raw")
-        shutil.copytree(finished_tiny.results, root / "results")
+        shutil.copytree(str(finished_tiny.results), str(root / "results"))
         return 0
 
     monkeypatch.setattr(RUN, copied)

@@ -3,26 +3,32 @@
 import fcntl
 import json
 import os
-import shutil
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
+from apertura.common.confined import ConfinedPath
+
 
 @contextmanager
 def replacement(path: Path) -> Iterator[Path]:
     """Yield where to write a file or folder; it becomes `path` when the body ends without an error.
 
-    The work folder, ``.<name>.wip``, may hold whatever else the body needs on disk. A second writer of the same path
-    waits: a kernel lock, which dies with its process, keeps it out. Leftovers of a killed writer are removed by the
-    next.
+    A second writer of the same path waits: a kernel lock, which dies with its process, keeps it out. Leftovers of a
+    killed writer are removed by the next.
 
     Parameters
     ----------
     path
         File, or folder that is absent or empty; folders above it are made.
+
+    Yields
+    ------
+    pathlib.Path
+        In a folder that was just made, under a name that nobody can know: ``.<name>.wip/<random>/<name>``. It may hold
+        whatever else the body needs on disk. The path holds in this process and its forks.
 
     Examples
     --------
@@ -33,13 +39,18 @@ def replacement(path: Path) -> Iterator[Path]:
     ...     [path.name for path in Path(folder).iterdir()]
     ['note.txt']
     """
-    work = path.with_name(f".{path.name}.wip")
-    temporary = work / path.name
-    with naming(path), _locked(work):
+    target = confined_target(path)
+    work = target.with_name(f".{target.name}.wip")
+    with _locked(work):
+        _clear(work)
+        private = work / uuid4().hex
         try:
-            _clear(work)
-            yield temporary
-            rename(temporary, path)
+            private.mkdir(mode=0o700)
+            with private.on_disk() as folder, _naming_target(folder, path):
+                yield folder / target.name
+            (private / target.name).synchronise()
+            (private / target.name).rename(target)
+            target.parent.synchronise_folder()
         finally:
             _clear(work)
 
@@ -84,15 +95,16 @@ def write_beside(path: Path, content: bytes) -> None:
     ...     (Path(folder) / "c" / "0").read_bytes()
     b'all of it'
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f"{path.name}.{uuid4().hex}.partial")
-    with naming(path):
+    target = confined_target(path)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    partial = target.with_name(f"{target.name}.{uuid4().hex}.partial")
+    with naming(target):
         try:
             with partial.open("wb") as stream:
                 stream.write(content)
                 stream.flush()
                 os.fsync(stream.fileno())
-            partial.replace(path)
+            partial.rename(target)
         except BaseException:
             partial.unlink(missing_ok=True)
             raise
@@ -100,28 +112,24 @@ def write_beside(path: Path, content: bytes) -> None:
 
 def rename(source: Path, target: Path) -> None:
     """Bring a file or folder to the disk and give it its name: after a power failure `target` is complete or absent."""
-    for path in (source, *source.rglob("*")):
-        _synchronise(path)
-    source.replace(target)
-    _synchronise(target.parent)
+    confined = ConfinedPath.of(source)
+    confined.synchronise()
+    confined.rename(target).parent.synchronise_folder()
 
 
-def date(paths: Iterable[Path], *, earliest_ns: int, latest_ns: int) -> None:
+def date(paths: Iterable[ConfinedPath], *, earliest_ns: int, latest_ns: int) -> None:
     """Bring the times of files between two, where they may be changed."""
     for path in paths:
         with suppress(OSError):
             found = path.stat()
             wanted_ns = min(max(found.st_mtime_ns, earliest_ns), latest_ns)
             if wanted_ns != found.st_mtime_ns:
-                os.utime(path, ns=(found.st_atime_ns, wanted_ns))
+                path.set_times(accessed_ns=found.st_atime_ns, modified_ns=wanted_ns)
 
 
 def remove(path: Path) -> None:
     """Remove a file, or a folder with its contents, if there is one; targets of links stay."""
-    if path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path)
-    else:
-        path.unlink(missing_ok=True)
+    ConfinedPath.of(path).remove()
 
 
 @contextmanager
@@ -143,25 +151,37 @@ def naming(path: Path) -> Iterator[None]:
         raise
 
 
-def _synchronise(path: Path) -> None:
-    if path.is_symlink():  # not written by us, nor is its target
-        return
-    descriptor = os.open(path, os.O_RDONLY)
-    with naming(path):
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
+def confined_target(path: Path) -> ConfinedPath:
+    """Return a path to be written as a confined one; folders above one that a caller gave whole are made."""
+    if not isinstance(path, ConfinedPath):
+        path.parent.mkdir(parents=True, exist_ok=True)
+    return ConfinedPath.of(path)
+
+
+def made_folder(path: Path) -> ConfinedPath:
+    """Return a folder that a caller gave whole as a confined path; it and folders above it are made."""
+    if not isinstance(path, ConfinedPath):
+        path.mkdir(parents=True, exist_ok=True)
+    return ConfinedPath.at(path)
 
 
 @contextmanager
-def _locked(work: Path) -> Iterator[None]:
+def _naming_target(folder: Path, path: Path) -> Iterator[None]:
+    """Name the target in an `OSError` of the body that names a file of the work folder, or none."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno is not None and (error.filename is None or str(error.filename).startswith(str(folder))):
+            error.filename = str(path)
+        raise
+
+
+@contextmanager
+def _locked(work: ConfinedPath) -> Iterator[None]:
     """Hold ``work/.lock``; on leaving, remove both."""
     name = work / ".lock"
-    work.parent.mkdir(parents=True, exist_ok=True)
     while True:
-        with suppress(FileExistsError):
-            work.mkdir()
+        work.mkdir(parents=True, exist_ok=True)
         try:
             lock = name.open("a")
         except FileNotFoundError:  # the writer before us has just removed the folder
@@ -173,23 +193,23 @@ def _locked(work: Path) -> Iterator[None]:
             try:
                 yield
             finally:
-                name.unlink()
+                name.unlink(missing_ok=True)
                 with suppress(OSError):  # the next writer has made its own lock, or is done already
                     work.rmdir()
             return
 
 
-def _is_at(descriptor: int, name: Path) -> bool:
+def _is_at(descriptor: int, name: ConfinedPath) -> bool:
     try:
         return os.path.samestat(os.fstat(descriptor), name.stat())
     except FileNotFoundError:
         return False
 
 
-def _clear(work: Path) -> None:
+def _clear(work: ConfinedPath) -> None:
     for path in work.iterdir():
         if path.name != ".lock":
-            remove(path)
+            path.remove()
 
 
 def _plain(value: object) -> object:

@@ -111,7 +111,7 @@ class CampaignError(ValueError):
 
     def __init__(self, found: str, where: object, expected: str, remedy: str) -> None:
         self.found = shown(found, _LONGEST["found"])
-        self.where = shown(where, _LONGEST["where"])
+        self.where = shown(getattr(where, "location", where), _LONGEST["where"])
         self.expected = shown(expected, _LONGEST["expected"])
         self.remedy = shown(remedy, _LONGEST["remedy"])
         super().__init__(f"{self.where}: {self.found}; expected {self.expected}. {self.remedy}")
@@ -176,5 +176,6 @@ def _error_number(error: BaseException) -> int | None:
 
 
 def _free(path: Path) -> str:
-    there = next(folder for folder in (path.absolute(), *path.absolute().parents) if folder.exists())
+    path = Path(path.absolute())
+    there = next(folder for folder in (path, *path.parents) if folder.exists())
     return f"{shutil.disk_usage(there).free / 1e6:.1f} MB free there"

@@ -1,49 +1,8 @@
-"""Untrusted names of files: resolved inside the folder only, through no link."""
+"""Paths of the campaign folder as shells take them, and of what is shipped."""
 
 from pathlib import Path
 
-from apertura.common.errors import CampaignError, quoted
-
-
-def inside(root: Path, name: str, *, where: object) -> Path:
-    """Return the path of a file that a campaign names, which lies in its folder.
-
-    Parameters
-    ----------
-    root
-        The folder.
-    name
-        Relative to it, with slashes.
-    where
-        What names the file, for the message.
-
-    Raises
-    ------
-    CampaignError
-        If the name is absolute, leads out of the folder or through a link, or holds a backslash or control characters.
-
-    Examples
-    --------
-    >>> inside(Path("campaign"), "raw/codes.npy", where="config.yaml").as_posix()
-    'campaign/raw/codes.npy'
-    """
-    parts = name.split("/")
-    way = [root.joinpath(*parts[: count + 1]) for count in range(len(parts))]
-    wrong = None
-    if not name.isprintable() or "\\" in name or not name.strip():
-        wrong = "is no plain name of a file"
-    elif name.startswith("/") or ".." in parts:
-        wrong = "leads out of the campaign folder"
-    elif any(path.is_symlink() for path in way):
-        wrong = "leads through a symbolic link"
-    if wrong:
-        raise CampaignError(
-            f"path {quoted(name)} {wrong}",
-            where,
-            "a relative path to a file inside the campaign folder",
-            "Copy the file into the folder and name it from there.",
-        )
-    return way[-1]
+from apertura.common.errors import CampaignError
 
 
 def check_shell_name(root: Path) -> None:

@@ -6,15 +6,18 @@ import os
 import re
 import signal
 import socket
+import struct
 import sys
+import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from types import FrameType
 from typing import IO
 
+from apertura.common.confined import ConfinedPath
 from apertura.common.errors import CampaignError, shown
 
 # ---- End of a command: signals, and the exit status for the run around it -------------------------------------------
@@ -23,7 +26,8 @@ INTERRUPTED = 130
 SIGNALLED = 128
 """Exit status of a process that a signal has ended, as shells count: this and the number of the signal."""
 STATUS_FILE = "APERTURA_STATUS_FILE"
-"""Environment variable: where steps leave the exit status that snakemake does not pass on."""
+"""Environment variable: where steps leave the exit status that snakemake does not pass on, as a reference of
+`ConfinedPath`."""
 
 ENDING = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 """Signals that end a run."""
@@ -43,8 +47,9 @@ class Interrupted(SystemExit):
 def leave_status(status: int) -> None:
     """Write the exit status of a step for the run that it belongs to, if any."""
     if STATUS_FILE in os.environ and status:
-        with suppress(OSError), Path(os.environ[STATUS_FILE]).open("a", encoding="utf-8") as file:  # on another node
-            file.write(f"{status}\n")
+        file = ConfinedPath.referenced(os.environ[STATUS_FILE])
+        with suppress(OSError, CampaignError), file.open("a", encoding="utf-8") as stream:  # on another node
+            stream.write(f"{status}\n")
 
 
 def die_with_parent(parent: int) -> None:
@@ -154,6 +159,66 @@ def as_typed(text: object) -> str:
     return str(text) if folder == os.sep else re.sub(rf"(?<![\w./-]){re.escape(folder)}{os.sep}", "", str(text))
 
 
+# ---- Confinement of Snakemake ---------------------------------------------------------------------------------------
+#
+# Snakemake, and the shells of its jobs, write and delete by whole names, in which the kernel follows links: records in
+# .snakemake, logs, benchmarks, outputs of failed jobs. Landlock (Linux 5.19 and newer, landlock(7)) keeps a process and
+# all that it starts from changing anything outside some folders, wherever a link leads.
+
+CONFINED = "APERTURA_CONFINED"
+"""Environment variable: the campaign folder to which Snakemake's changes are confined."""
+
+TEMPORARY = ("TMPDIR", "TMP", "TEMP", "TEMPDIR")
+"""Environment variables: where temporary files go; Snakemake sets all of them for its jobs."""
+
+_CREATE_RULESET, _ADD_RULE, _RESTRICT_SELF = 444, 445, 446  # system calls, the same on every architecture
+_VERSION, _PATH_BENEATH, _PR_SET_NO_NEW_PRIVS = 1, 1, 38
+_CHANGES = sum(1 << right for right in (1, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13))
+"""Rights of Landlock: write a file; remove and make folders and files of every kind; move between folders."""
+_TRUNCATE, _MOVES, _TRUNCATES = 1 << 14, 2, 3
+"""Right to truncate, and the versions of Landlock that know moves and truncation."""
+
+
+def confine_changes(root: Path) -> bool:
+    """Keep this process, and all that it starts, from changing files but for results and caches; return whether it is.
+
+    What stays writable: ``results`` and ``.snakemake`` of the campaign, the latter for temporary files, too; the user's
+    cache, the package's own compiled code, and devices. Recordings and config do not.
+
+    Parameters
+    ----------
+    root
+        The campaign folder.
+
+    Returns
+    -------
+    bool
+        False where the kernel has no Landlock, or too old a one: links are then found by the check before a run alone.
+    """
+    libc = ctypes.CDLL(None, use_errno=True)
+    version = libc.syscall(_CREATE_RULESET, None, ctypes.c_size_t(0), _VERSION)
+    if version < _MOVES:
+        return False
+    rights = _CHANGES | (_TRUNCATE if version >= _TRUNCATES else 0)
+    ruleset = libc.syscall(_CREATE_RULESET, struct.pack("=Q", rights), ctypes.c_size_t(8), 0)
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    folders = [cache, Path(__file__).parents[1], Path("/dev"), Path("/proc")]
+    with ExitStack() as stack:
+        for name in ("results", ".snakemake"):
+            folder = ConfinedPath.at(root) / name
+            folder.mkdir(exist_ok=True)
+            folders.append(stack.enter_context(folder.on_disk()))
+        os.environ[TEMPORARY[0]] = tempfile.tempdir = str(folder.absolute())
+        for folder in filter(Path.is_dir, folders):
+            opened = os.open(folder, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)
+            libc.syscall(_ADD_RULE, ruleset, _PATH_BENEATH, struct.pack("=Qi", rights, opened), 0)
+            os.close(opened)
+    libc.prctl(_PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0)
+    confined: bool = libc.syscall(_RESTRICT_SELF, ruleset, 0) == 0
+    os.close(ruleset)
+    return confined
+
+
 # ---- Lock of a campaign: one run at a time, released with its process -----------------------------------------------
 
 _LOCK = Path("results/.run.lock")
@@ -177,7 +242,7 @@ def hold(root: Path) -> IO[str]:
     ...
     apertura.common.errors.CampaignError: ...: another run holds this campaign: process ...; expected ...
     """
-    path = root / _LOCK
+    path = ConfinedPath.at(root) / _LOCK
     path.parent.mkdir(parents=True, exist_ok=True)
     lock = path.open("a+", encoding="utf-8")
     try:
@@ -208,7 +273,7 @@ def holder(root: Path) -> str | None:
     'process ... on ... since ... UTC'
     """
     try:
-        with (root / _LOCK).open(encoding="utf-8") as lock:
+        with (ConfinedPath.at(root) / _LOCK).open(encoding="utf-8") as lock:
             try:
                 fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
             except BlockingIOError:

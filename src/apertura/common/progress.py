@@ -7,6 +7,8 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from apertura.common.errors import CampaignError
+
 RUN = ".run"
 """Folder of the results: journal of a run, and a progress file for each running step."""
 
@@ -40,7 +42,7 @@ def reporting_to(file: Path) -> Iterator[None]:
         yield
     finally:
         _files.remove(file)
-        with suppress(OSError):
+        with suppress(OSError, CampaignError):
             file.unlink(missing_ok=True)
 
 
@@ -88,7 +90,7 @@ def _write(what: str, done: int, total: int, since_s: float) -> None:
     report = {"what": what, "done": done, "total": total, "since": since_s, "at": round(time.time(), 1)}
     for file in _files[-1:]:
         beside = file.with_suffix(".partial")
-        with suppress(OSError):
+        with suppress(OSError, CampaignError):
             file.parent.mkdir(parents=True, exist_ok=True)
             beside.write_text(json.dumps(report))
             beside.replace(file)

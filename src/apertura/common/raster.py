@@ -4,11 +4,13 @@ GDAL would otherwise choose a driver by content: a VRT or WMS document named .ti
 a file beside a raster changes its heights or its place.
 """
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from apertura.common.confined import on_disk
 from apertura.common.errors import CampaignError, shown
 
 ISOLATED = {
@@ -56,10 +58,7 @@ def opened_raster(path: Path, *, expected: str, remedy: str) -> Iterator[Any]:
     if not path.is_file():
         raise CampaignError("no such file", where=path, expected=expected, remedy=remedy)
     try:
-        name = str(path.resolve())  # absolute: no scheme and no /vsi… of GDAL
-        if name.startswith("/vsi"):
-            raise OSError("a path that GDAL takes for another file system")
-        with rasterio.Env(**ISOLATED), rasterio.open(name, driver="GTiff", sharing=False) as raster:
+        with on_disk(path) as file, rasterio.Env(**ISOLATED), _opened(str(file.absolute())) as raster:
             block, shape = raster.block_shapes[0], raster.shape
             if block[0] * block[1] > LARGEST_BLOCK or max(shape) > LARGEST_SIDE:
                 raise OSError(f"{shape[0]} × {shape[1]} posts in blocks of {block[0]} × {block[1]}")
@@ -68,5 +67,14 @@ def opened_raster(path: Path, *, expected: str, remedy: str) -> Iterator[Any]:
         raise
     except (rasterio.errors.RasterioError, OSError, ValueError, ArithmeticError, LookupError) as error:
         cause = f"{error}: {error.__cause__}" if error.__cause__ else str(error)
-        found = f"not readable as GeoTIFF ({shown(cause.replace(str(path.resolve()), path.name), 200)})"
+        cause = re.sub(rf"{re.escape(str(path.absolute()))}|/proc/self/fd/\d+", path.name, cause)
+        found = f"not readable as GeoTIFF ({shown(cause, 200)})"
         raise CampaignError(found, where=path, expected=expected, remedy=remedy) from error
+
+
+def _opened(name: str) -> Any:
+    import rasterio
+
+    if name.startswith("/vsi"):  # an absolute path has no scheme
+        raise OSError("a path that GDAL takes for another file system")
+    return rasterio.open(name, driver="GTiff", sharing=False)

@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -18,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.common.confined import ConfinedPath, on_disk
 from apertura.common.errors import shown
 
 SPARE_BYTES = 1 << 30
@@ -73,11 +75,12 @@ def read_isolated(
     sizes = [path.stat().st_size for path in paths]
     seconds = SECONDS + SECONDS_PER_BYTE * sum(sizes) if seconds is None else seconds
     memory_bytes = SPARE_BYTES + BYTES_PER_BYTE * max(sizes, default=0) if memory_bytes is None else memory_bytes
-    with TemporaryDirectory(prefix="apertura-") as name:
+    with TemporaryDirectory(prefix="apertura-") as name, ExitStack() as stack:
         folder = Path(name)
         # -P: a module that lies in the campaign folder is not what is imported
         command = [sys.executable, "-P", "-m", __name__, function, str(memory_bytes), str(int(seconds) + 1), name]
-        files = [str(path.absolute()) for path in paths]
+        files = [str(stack.enter_context(on_disk(path.absolute()))) for path in paths]
+        confined = [file for file, path in zip(files, paths, strict=True) if isinstance(path, ConfinedPath)]
         try:
             done = subprocess.run(
                 [*command, *files],
@@ -86,6 +89,7 @@ def read_isolated(
                 capture_output=True,
                 timeout=seconds,
                 env={**os.environ, **_THREADS},
+                pass_fds=[int(Path(file).name) for file in confined],
             )
             found = _ended(done.returncode, done.stderr)
         except subprocess.TimeoutExpired:

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.common.confined import on_disk
 from apertura.common.errors import CampaignError, quoted, shown
 
 _MAGIC = b"\x93NUMPY"
@@ -34,7 +35,8 @@ def read_npy(path: Path, *, kinds: str, most: int, expected: str, remedy: str) -
         with path.open("rb") as stream:
             if stream.read(len(_MAGIC)) != _MAGIC:
                 raise ValueError("not a .npy file")
-        mapped = np.load(path, mmap_mode="r", allow_pickle=False)
+        with on_disk(path) as file:
+            mapped = np.load(file, mmap_mode="r", allow_pickle=False)
         found = None
         if mapped.dtype.kind not in kinds or mapped.dtype.names or mapped.size > most:
             found = f"{quoted(mapped.dtype.str, 20)[1:-1]} of shape {mapped.shape}"

@@ -5,8 +5,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from apertura.common.confined import ConfinedPath
 from apertura.common.errors import CampaignError
-from apertura.common.paths import inside
 from apertura.pipeline.config import (
     CLOCKS,
     CONFIG,
@@ -56,10 +56,8 @@ class Campaign(RawFolder):
     @classmethod
     def load(cls, root: str | Path) -> "Campaign":
         """Read and validate `root`/config; raise CampaignError on the first file that is wrong."""
-        root = Path(root)
-        config, table, segments, clocks = (
-            inside(root, path.as_posix(), where=root) for path in (CONFIG, FLIGHTS, SEGMENTS, CLOCKS)
-        )
+        root = ConfinedPath.at(root)
+        config, table, segments, clocks = (root / path for path in (CONFIG, FLIGHTS, SEGMENTS, CLOCKS))
         settings = read_settings(config)
         flights = tuple(read_flights(table, nodes=settings.nodes))
         images = [f"{one.name}/{pair}" for one in flights if one.kind == "image" for pair in one.pairs]
@@ -122,44 +120,44 @@ class Campaign(RawFolder):
 
     @cached_property
     def values(self) -> dict[str, Any]:
-        """The settings as JSON values, without those that only state where to compute."""
-        return self.settings.model_dump(mode="json", exclude={"processing": {"scheduler"}})
+        """The settings as JSON values, without those that only state where to compute and where recordings lie."""
+        return self.settings.model_dump(mode="json", exclude={"raw_root": True, "processing": {"scheduler"}})
 
     @property
-    def results(self) -> Path:
+    def results(self) -> ConfinedPath:
         """The folder of everything the pipeline writes."""
         return self.root / "results"
 
-    def stage(self, stage: str, *where: str) -> Path:
+    def stage(self, stage: str, *where: str) -> ConfinedPath:
         """Return the folder of a stage: results/<where…>/<stage>.zarr.
 
         Examples
         --------
-        >>> Campaign(Path("c"), None, ()).stage("echo", "f01", "uav1-uav2").as_posix()
+        >>> Campaign(ConfinedPath.at("c"), None, ()).stage("echo", "f01", "uav1-uav2").as_posix()
         'c/results/f01/uav1-uav2/echo.zarr'
         """
         return self.result(*where, f"{stage}.zarr")
 
-    def result(self, *where: str) -> Path:
-        """Return results/<where…>; raise CampaignError if that leads through a link."""
-        return inside(self.root, "/".join(["results", *where]), where=self.root)
+    def result(self, *where: str) -> ConfinedPath:
+        """Return results/<where…>."""
+        return self.root.named("/".join(["results", *where]), where=self.root)
 
     def manifest(self, stage: str, *where: str) -> str:
         """Return the manifest of a stage relative to the campaign folder, as the workflow names it."""
         return "/".join(["results", *where, f"{stage}.manifest.json"])
 
-    def file(self, name: str, key: str) -> Path:
+    def file(self, name: str, key: str) -> ConfinedPath:
         """Return a file that `key` of the config names; raise CampaignError unless it lies in the campaign folder."""
-        return inside(self.root, name, where=f"{CONFIG}: {key}")
+        return self.root.named(name, where=f"{CONFIG}: {key}")
 
     @property
-    def sent_file(self) -> Path:
+    def sent_file(self) -> ConfinedPath:
         """The file of the transmitted signal: code symbols, or the samples of a pulse."""
         key = getattr(self.settings.waveform, "file_key", "")
         return self.file(getattr(self.settings.waveform, key, ""), f"waveform.{key}")
 
     @property
-    def calibration_file(self) -> Path | None:
+    def calibration_file(self) -> ConfinedPath | None:
         """The file of the constants that were measured at reflectors, where the config names one."""
         named = self.settings.processing.radiometric_calibration
         return self.file(named, "processing.radiometric_calibration") if named else None
@@ -168,7 +166,7 @@ class Campaign(RawFolder):
         """Return a path inside the campaign folder as the workflow names it."""
         return path.relative_to(self.root).as_posix()
 
-    def height_files(self) -> dict[str, Path]:
+    def height_files(self) -> dict[str, ConfinedPath]:
         """Return role → file of the DEM and of the grid of the geoid, where the config names them."""
         scene = self.settings.scene
         named = {"dem": scene.dem, "geoid": scene.geoid}
@@ -180,7 +178,7 @@ class Campaign(RawFolder):
         found = {point: (name, getattr(self.settings.nodes[name].antennas, point)) for point, name in nodes}
         return {point: (name, antenna) for point, (name, antenna) in found.items() if antenna is not None}
 
-    def pattern_files(self, pair: str) -> dict[str, Path]:
+    def pattern_files(self, pair: str) -> dict[str, ConfinedPath]:
         """Return key of the config → file of each sampled pattern of a pair's antennas."""
         named = {
             f"nodes.{node}.antennas.{point}.pattern": antenna.pattern

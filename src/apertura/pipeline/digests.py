@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from apertura.common.atomic import write_json
+from apertura.common.confined import ConfinedPath
 from apertura.common.errors import CampaignError
-from apertura.common.paths import inside
 from apertura.common.provenance import canonical_json, code_sha256, hashes_of_file, sha256_text
 
 _KEPT = Path("results/.hashes")
@@ -45,22 +45,23 @@ def digest_of(
     CampaignError
         If the file is not there, is reached through a link, or changes while it is read.
     """
-    path = inside(root, name, where=root)
+    root = ConfinedPath.at(root)
+    path = root.named(name, where=root)
     state = _state(path)
     algorithms = list(dict.fromkeys(["sha256", algorithm]))
     if state["size"] < _SMALL:
         return hashes_of_file(path, algorithms)[algorithm]
     kept = root / _KEPT / f"{name}.json"
     if not paranoid:
-        with suppress(OSError, ValueError, TypeError, KeyError):
-            known = json.loads(kept.read_text(encoding="utf-8"))
+        with suppress(OSError, ValueError, TypeError, KeyError, CampaignError):
+            known = json.loads(kept.read_bytes(_SMALL))
             if known["state"] == state:
                 return str(known[algorithm])
     digests = hashes_of_file(path, algorithms)
     if _state(path) != state:
         raise _changed(path)
     if max(state["mtime_ns"], state["ctime_ns"]) < time.time_ns() - _SETTLED_S * 1e9:
-        with suppress(OSError):  # a folder that cannot be written: the next one hashes again
+        with suppress(OSError, CampaignError):  # a folder that cannot be written: the next one hashes again
             write_json(kept, {"state": state, **digests})
     return digests[algorithm]
 
@@ -84,7 +85,8 @@ class Sources:
     @classmethod
     def of(cls, root: Path, names: Iterable[str]) -> "Sources":
         """Hash some files; raise CampaignError if one is not there."""
-        states = {name: _state(inside(root, name, where=root)) for name in sorted(set(names))}
+        root = ConfinedPath.at(root)
+        states = {name: _state(root.named(name, where=root)) for name in sorted(set(names))}
         return cls(root, {name: digest_of(root, name) for name in states}, states)
 
     def unchanged(self) -> dict[str, str]:

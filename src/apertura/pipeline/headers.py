@@ -60,7 +60,8 @@ class Header(RuleResources):
 
     def sources(self, wildcards: Any) -> list[str]:
         """Return what a job reads."""
-        return list(dict.fromkeys(source for result in self._results(wildcards) for source in result.sources))
+        named = dict.fromkeys(source for result in self._results(wildcards) for source in result.sources)
+        return [str((self.of.campaign.root / source).location) for source in named]
 
     def settings(self, wildcards: Any) -> dict[str, Any]:
         """Return what of the config matters to a job."""

@@ -4,10 +4,7 @@ A result is what one rule writes. Its manifest, written last, names its files an
 file, setting or code makes it stale, whatever the times of files say. All of it follows from `apertura.pipeline.rules`.
 """
 
-import os
-import shutil
 from collections.abc import Iterable, Iterator
-from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -270,17 +267,10 @@ def with_inputs(campaign: Campaign, target: Path, *, link: bool) -> Path:
     """
     sources = {source for _, result in results_of(campaign) for source in result.sources}
     named = [campaign.root / source for source in sources if source.partition("/")[0] not in {"results", *_INPUTS}]
-    for path in sorted({*named, *(path for folder in _INPUTS for path in (campaign.root / folder).rglob("*"))}):
-        if path.is_file() and not path.is_symlink():
+    inputs = ["config", *([] if campaign.settings.raw_root else ["raw"])]  # the config names raw_root there, too
+    for path in sorted({*named, *(path for folder in inputs for path in (campaign.root / folder).rglob("*"))}):
+        if path.is_file(follow_symlinks=False):
             here = path.relative_to(campaign.root)
             (target / here).parent.mkdir(parents=True, exist_ok=True)
-            _put(path, target / here, link=link and here.parts[0] == "raw")
+            path.copy_to(target / here, link=link and here.parts[0] == "raw")
     return target
-
-
-def _put(path: Path, target: Path, *, link: bool) -> None:
-    if link:
-        with suppress(OSError):  # another disk, or a file of somebody else's
-            os.link(path, target)
-            return
-    shutil.copy2(path, target)

@@ -4,8 +4,8 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+from apertura.common.confined import ConfinedPath
 from apertura.common.errors import CampaignError
-from apertura.common.paths import inside
 from apertura.formats.names import PHASE_HISTORIES, log_suffixes, recording_files
 from apertura.pipeline.config import FLIGHTS, SampledWaveform, Settings
 
@@ -25,10 +25,16 @@ class RawFolder:
         Its config.
     """
 
-    root: Path
+    root: ConfinedPath
     settings: Settings
 
-    def raw_files(self, flight: str, node: str) -> dict[str, Path]:
+    def __post_init__(self) -> None:
+        """Confine the paths of the folder, and of raw/ where the config states that it lies elsewhere."""
+        elsewhere = getattr(self.settings, "raw_root", None)
+        root = ConfinedPath.at(self.root)
+        object.__setattr__(self, "root", root.with_elsewhere({"raw": Path(elsewhere)}) if elsewhere else root)
+
+    def raw_files(self, flight: str, node: str) -> dict[str, ConfinedPath]:
         """Return role → file of everything recorded by `node` in `flight`, whether it is there or not."""
         if isinstance(self.settings.waveform, SampledWaveform):
             recorded = {path.suffix: path for path in self.promised_files(flight, node)}
@@ -38,15 +44,15 @@ class RawFolder:
         history = {f"history.{path.relative_to(folder).as_posix()}": path for path in files}
         return {**history, **({"track": self.track_file(flight, node)} if self.logged(flight, node) else {})}
 
-    def promised_files(self, flight: str, node: str) -> tuple[Path, ...]:
+    def promised_files(self, flight: str, node: str) -> tuple[ConfinedPath, ...]:
         """Return the files that `recording_files` does, whether they are there or not."""
         return tuple(self._recorded(flight, path.name) for path in recording_files(self.flight_folder(flight), node))
 
-    def recording_files(self, flight: str, node: str) -> tuple[Path, ...]:
+    def recording_files(self, flight: str, node: str) -> tuple[ConfinedPath, ...]:
         """Return the files of the recording of `node` in `flight`, in the order of their row of `RECORDERS`."""
         return tuple(self._raw_file(flight, node, path) for path in self.promised_files(flight, node))
 
-    def history_files(self, flight: str, node: str) -> list[Path]:
+    def history_files(self, flight: str, node: str) -> list[ConfinedPath]:
         """Return the files of a node's phase history, in the order of their names; of a folder all that it holds."""
         suffix = PHASE_HISTORIES[self.settings.waveform.format].suffix  # type: ignore[union-attr]
         folder = self.flight_folder(flight)
@@ -67,7 +73,7 @@ class RawFolder:
         """Return whether a flight log of a node lies there, or lay there when results were made."""
         return bool(self._logs(flight, node))
 
-    def track_file(self, flight: str, node: str) -> Path:
+    def track_file(self, flight: str, node: str) -> ConfinedPath:
         """Return the one raw/<flight>/<node>.track.* file."""
         logs = self._logs(flight, node)
         if len(logs) == 1:
@@ -90,20 +96,20 @@ class RawFolder:
         sources, folder = set[str](), f"raw/{flight}/"
         if any(self.flight_folder(flight).glob(f"{node}.*")):
             return []
-        for path in inside(self.root, f"results/{flight}", where=self.root).glob("*/*.manifest.json"):
+        for path in self.root.named(f"results/{flight}", where=self.root).glob("*/*.manifest.json"):
             if path.name in _OF_RAW:
                 with suppress(CampaignError):
                     sources |= read_manifest(path).get("sources", {}).keys()
         return sorted(name.removeprefix(folder) for name in sources if name.startswith(f"{folder}{node}."))
 
-    def flight_folder(self, flight: str) -> Path:
-        """Return raw/<flight>, which is no link: not even its names are read through one."""
-        return inside(self.root, f"raw/{flight}", where=self.root)
+    def flight_folder(self, flight: str) -> ConfinedPath:
+        """Return raw/<flight>."""
+        return self.root.named(f"raw/{flight}", where=self.root)
 
-    def _recorded(self, flight: str, name: str) -> Path:
-        return inside(self.root, f"raw/{flight}/{name}", where=self.root)
+    def _recorded(self, flight: str, name: str) -> ConfinedPath:
+        return self.root.named(f"raw/{flight}/{name}", where=self.root)
 
-    def _raw_file(self, flight: str, node: str, path: Path) -> Path:
+    def _raw_file(self, flight: str, node: str, path: ConfinedPath) -> ConfinedPath:
         """Return a file of a node, which must exist."""
         if not path.is_file():
             raise CampaignError(
@@ -115,7 +121,7 @@ class RawFolder:
         return path
 
 
-def size_of(path: Path) -> int:
+def size_of(path: ConfinedPath) -> int:
     """Return the bytes of a file; 0 where it is not there."""
     return path.stat().st_size if path.is_file() else 0
 
@@ -124,7 +130,7 @@ def _is_log(path: Path, node: str) -> bool:
     return path.name.startswith(f"{node}.track.")
 
 
-def _files(path: Path) -> list[Path]:
+def _files(path: ConfinedPath) -> list[ConfinedPath]:
     """Return a file itself, or those of a folder, including links, which are rejected later."""
-    inside_it = sorted(path.rglob("*")) if path.is_dir() and not path.is_symlink() else [path]
-    return [file for file in inside_it if file.is_symlink() or not file.is_dir()]
+    inside_it = list(path.rglob("*")) if path.is_dir() else [path]
+    return [file for file in inside_it if not file.is_dir(follow_symlinks=False)]

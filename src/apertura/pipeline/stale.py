@@ -5,12 +5,11 @@ import sys
 import time
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from itertools import count
-from pathlib import Path
 from typing import Any
 
 from apertura.common.atomic import date
+from apertura.common.confined import ConfinedPath
 from apertura.common.errors import CampaignError, shown
-from apertura.common.paths import inside
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.digests import Result, digest_of
 from apertura.pipeline.lineage import files_read, on_demand, places_of, products_of, results_of
@@ -42,7 +41,7 @@ def stale_results(campaign: Campaign, *, paranoid: bool = False) -> dict[str, st
     """
     stale: dict[str, str] = {}
     for name, result in results_of(campaign):
-        path = inside(campaign.root, result.manifest, where=campaign.root)
+        path = campaign.root.named(result.manifest, where=campaign.root)
         if not path.is_file():
             if any((path.parent / file).is_file() for file in products_of(RESULTS[name])):
                 stale[result.manifest] = "its manifest is gone, which said what its files were made from"
@@ -76,7 +75,9 @@ def wanted_files(campaign: Campaign) -> dict[str, str]:
 
 
 def absent_lines(campaign: Campaign) -> Iterator[str]:
-    """Yield a line where files of raw/ are not there, so that what was made from them is not compared with them."""
+    """Yield a line where raw/ lies elsewhere, and one where files of it are missing and not compared with results."""
+    if campaign.settings.raw_root:
+        yield f"recordings are read from {shown(campaign.settings.raw_root, 400)} (raw_root in the config)"
     if absent := absent_files(campaign):
         more = f" and {len(absent) - 1} more" if len(absent) > 1 else ""
         yield f"not there, so results are not compared with it: {shown(absent[0])}{more}"
@@ -107,7 +108,7 @@ def settle_times(campaign: Campaign, stale: Collection[str]) -> None:
     date(benchmarks, earliest_ns=newest_ns, latest_ns=now_ns)
 
 
-def _newest_ns(root: Path, names: Iterable[str]) -> int:
+def _newest_ns(root: ConfinedPath, names: Iterable[str]) -> int:
     return max((path.stat().st_mtime_ns for path in (root / name for name in names) if path.is_file()), default=0)
 
 
@@ -123,7 +124,7 @@ def make_again(campaign: Campaign, stale: Mapping[str, str], *, remove: bool) ->
         print("a dry run of snakemake alone does not count them: `apertura run CAMPAIGN -n` does", file=sys.stderr)
 
 
-def _kept(root: Path, manifest: str) -> Iterator[str]:
+def _kept(root: ConfinedPath, manifest: str) -> Iterator[str]:
     """Put files of a result that were edited since out of the workflow's way; yield their new names."""
     path = root / manifest
     try:
@@ -131,7 +132,7 @@ def _kept(root: Path, manifest: str) -> Iterator[str]:
     except CampaignError:  # nobody knows how they were
         return
     for name, digest in files.items():
-        file = inside(path.parent, name, where=path)
+        file = path.parent.named(name, where=path)
         if ".zarr/" in name or not file.is_file() or digest_of(root, file.relative_to(root).as_posix()) == digest:
             continue
         free = (file.with_stem(f"{file.stem}.edited{f'-{number}' if number else ''}") for number in count())
@@ -174,7 +175,7 @@ def damaged_results(campaign: Campaign) -> dict[str, str]:
     """Return manifest → what of a result is not as it was written, of those that are there; every byte is read."""
     damaged = {}
     for _, result in results_of(campaign):
-        path = inside(campaign.root, result.manifest, where=campaign.root)
+        path = campaign.root.named(result.manifest, where=campaign.root)
         if path.is_file():
             try:
                 files = damaged_files(path)
@@ -188,20 +189,20 @@ def damaged_results(campaign: Campaign) -> dict[str, str]:
     return damaged
 
 
-def _reasons(root: Path, result: Result, recorded: Mapping[str, Any], *, paranoid: bool) -> Iterator[str]:
+def _reasons(root: ConfinedPath, result: Result, recorded: Mapping[str, Any], *, paranoid: bool) -> Iterator[str]:
     if not states_origin(recorded):
         yield "it does not say what it was made from"
         return
     folder = (root / result.manifest).parent
 
     def file(name: str) -> str:  # arrays are looked into where they are opened
-        path = inside(folder, name, where=root / result.manifest)
+        path = folder.named(name, where=root / result.manifest)
         if not path.is_file():
             return ""
         return str(recorded["files"][name]) if ".zarr/" in name else digest_of(root, path.relative_to(root).as_posix())
 
     def source(name: str) -> str:
-        path = inside(root, name, where=root / result.manifest)
+        path = root.named(name, where=root / result.manifest)
         return digest_of(root, name, paranoid=paranoid) if path.is_file() else ""
 
     for difference in compare(recorded["files"], file):

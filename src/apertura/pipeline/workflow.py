@@ -14,11 +14,20 @@ from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import IO, Literal
 
-from apertura.common.atomic import remove
 from apertura.common.code_imports import PACKAGE
+from apertura.common.confined import ConfinedPath
 from apertura.common.errors import CampaignError, number_of
 from apertura.common.paths import check_shell_name, shipped
-from apertura.common.processes import INTERRUPTED, SIGNALLED, STATUS_FILE, die_with_parent, given, hold, isolate
+from apertura.common.processes import (
+    CONFINED,
+    INTERRUPTED,
+    SIGNALLED,
+    STATUS_FILE,
+    die_with_parent,
+    given,
+    hold,
+    isolate,
+)
 from apertura.common.progress import RUN
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.check import print_problems
@@ -50,6 +59,8 @@ _PROFILE = "SNAKEMAKE_PROFILE"
 """Environment variable: the profile where the command line names none."""
 _DRY_RUN = re.compile(r"-n|-np|--dry-?run")
 _SCATTER = "--set-scatter"
+_DEPLOYS = ("--sd", "--so", "--use-c", "--use-s", "--use-a", "--conda")
+"""Beginnings of options with which Snakemake installs software, wherever that is kept: its changes are not confined."""
 _UNTIL = ("--until", "-U")
 _TARGETS = ("all", "pages", "phase_history")
 """Rules of the workflow that only gather results of others."""
@@ -60,30 +71,35 @@ _LOG = "snakemake.log"
 class _Files:
     """What a run keeps of itself."""
 
-    journal: Path
-    status: Path
-    log: Path
+    journal: ConfinedPath
+    status: ConfinedPath
+    log: ConfinedPath
+    confined: str = ""
+    """Folder of the campaign to which Snakemake's changes are confined, if they are."""
 
     @classmethod
-    def of(cls, campaign: Campaign) -> "_Files":
+    def of(cls, campaign: Campaign, *, confined: bool) -> "_Files":
         """Return those of a run that forms results; what one before left is removed."""
         folder, log = campaign.result(RUN), campaign.result("logs", _LOG)
-        remove(folder)
+        folder.remove()
         folder.mkdir(parents=True)
         log.parent.mkdir(parents=True, exist_ok=True)
-        return cls(campaign.result(RUN, "journal.jsonl"), campaign.result(RUN, "status"), log)
+        own = campaign.result(RUN, "journal.jsonl"), campaign.result(RUN, "status"), log
+        return cls(*own, str(campaign.root) if confined else "")
 
     @classmethod
     def apart(cls, folder: str) -> "_Files":
         """Return those of a run that forms nothing."""
-        return cls(Path(folder, "journal.jsonl"), Path(folder, "status"), Path(folder, _LOG))
+        own = ConfinedPath.at(folder)
+        return cls(own / "journal.jsonl", own / "status", own / _LOG)
 
     @property
     def environment(self) -> dict[str, str]:
         """What snakemake and its steps are told; rules call `apertura`, which need not be on the caller's PATH."""
         isolate()
         path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ.get('PATH', os.defpath)}"
-        return {**os.environ, "PATH": path, STATUS_FILE: str(self.status), JOURNAL: str(self.journal)}
+        files = {STATUS_FILE: self.status.reference(), JOURNAL: self.journal.reference()}
+        return {**os.environ, "PATH": path, **files, **({CONFINED: self.confined} if self.confined else {})}
 
     def status_of(self, status: int) -> int:
         """Return snakemake's exit status, 2 where no step has ended with a defect, or 1 where a signal has ended it."""
@@ -143,7 +159,9 @@ def run_workflow(root: Path, cores: int, *arguments: str, paranoid: bool = False
         forced = ["--forcerun", *overtaken] if overtaken else []  # in time for a dry run; the workflow says why
         words = _words(root, cores, [*_without_inner_steps(campaign, options), *forced])
         if forms:
-            files, at_once = _Files.of(campaign), 0 if elsewhere else cores
+            deploys = any(argument.startswith(_DEPLOYS) for argument in arguments)
+            files = _Files.of(campaign, confined=not (elsewhere or deploys))
+            at_once = 0 if elsewhere else cores
             note(files.journal, "start", cores=at_once)
             screen = Screen(campaign, Outlook(campaign, at_once), quiet=show != "steps")
             return _formed(root, words, files, screen, warm, aloud=show == "snakemake")
@@ -190,7 +208,7 @@ def _formed(
                     print(said.read().decode("utf-8", "replace"), end="", file=sys.stderr, flush=True)
 
             if warm and warm.stdin:
-                Order(words, files.environment, str(files.log)).give(warm.stdin)
+                Order(words, files.environment, files.log.reference()).give(warm.stdin)
             ended = _watched(warm or _started([RECORDER, *words], files.environment, output=output), look)
             status = files.status_of(ended)
             look()

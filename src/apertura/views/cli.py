@@ -535,15 +535,15 @@ def init(
 
         print(*map(as_typed, write_campaign_config(read_flight_plan(path), folder)), sep="\n")
         return
+    from apertura.common.atomic import made_folder, write_text
     from apertura.pipeline.config.template import config_template, flights_template
 
-    folder = given(directory) / "config"
+    folder = made_folder(given(directory)) / "config"
     texts = {"config.yaml": config_template(kind), "flights.tsv": flights_template(kind)}
     for path, text in ((folder / name, text) for name, text in texts.items()):
         if path.exists():
             raise CampaignError("exists already", path, "a new folder", "Choose another folder; nothing was changed.")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text, encoding="utf-8")
+        write_text(path, text)
         print(as_typed(path))
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apertura.common.atomic import write_text
+from apertura.common.atomic import made_folder, write_text
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
 from apertura.core.geometry.geodesy import LOCAL
@@ -99,6 +99,7 @@ def print_design(path: Path, out: Path | None, *, optimise: str | None = None, t
         for flag, line in image.flags.items() if image.looks is not None else ():
             console.print(f"[yellow]{flag}[/yellow]: {name}: {line}", highlight=False)
     if out is not None:
+        out = made_folder(out)
         write_design(design, out, tried)
         write_text(out / PLAN, plan_text(plan))
         copy_named(plan, path.absolute().parent, out)

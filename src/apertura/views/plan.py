@@ -1,6 +1,5 @@
 """`apertura plan`: how each pair will be imaged, why, how exactly and at what cost, before anything runs."""
 
-import shutil
 from dataclasses import replace
 from math import isfinite
 from typing import TYPE_CHECKING
@@ -60,7 +59,7 @@ def print_plan(campaign: Campaign, *, threads: int = 1) -> None:
         f"in all about {seconds:.2g} s of imaging on {number_of(threads, 'thread')}, {decimal(disk)} on disk before "
         "compression"
     )
-    free = shutil.disk_usage(campaign.root).free
+    free = campaign.root.free_bytes()
     if disk > free and not campaign.results.is_dir():
         raise CampaignError(
             f"the results of all pairs need {decimal(disk)} on disk",

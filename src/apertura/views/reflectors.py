@@ -23,7 +23,7 @@ def write_constants(campaign: Campaign, to: Path | None = None) -> Path:
     """
     path = campaign.root / FILE if to is None else to
     used = campaign.calibration_file
-    if used is not None and path.resolve() == used.resolve():
+    if used is not None and path.resolve() == used.real():
         raise CampaignError(
             "is what processing.radiometric_calibration takes up",
             where=path,

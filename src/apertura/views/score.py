@@ -10,7 +10,6 @@ from rich.table import Table
 
 from apertura.common.documents import read_json, undamaged
 from apertura.common.errors import CampaignError
-from apertura.common.paths import inside
 from apertura.common.raster import opened_raster
 from apertura.core.quality.bright_points import BrightPoint, bright_point, brightest_near
 from apertura.core.quality.point_targets import cut_through, find_peak
@@ -58,7 +57,7 @@ def score(campaign: Campaign) -> list[Finding]:
     CampaignError
         If the campaign has no truth.json or no results.
     """
-    path = inside(campaign.root, "truth.json", where=campaign.root)
+    path = campaign.root.named("truth.json", where=campaign.root)
     expected, remedy = "true target places", "Only simulated campaigns have them."
     document = read_json(path, expected=expected, remedy=remedy)
     with undamaged(path, expected=expected, remedy=remedy):

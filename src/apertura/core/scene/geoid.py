@@ -13,6 +13,7 @@ from pyproj.exceptions import ProjError
 from pyproj.transformer import TransformerGroup
 
 from apertura.common.arrays import Floats
+from apertura.common.confined import on_disk
 from apertura.common.constants import VERTICAL_DATUMS
 from apertura.common.errors import CampaignError, quoted
 from apertura.common.raster import LARGEST_BLOCK, opened_raster
@@ -108,12 +109,13 @@ def _of_gtx(grid: Path, longitude: Floats, latitude: Floats) -> Floats:
 
     A bare name would be searched elsewhere.
     """
-    steps = f'+step +proj=vgridshift +grids="{grid.absolute()}" +multiplier=1'
-    try:
-        shift = Transformer.from_pipeline(f"+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad {steps}")
-    except ProjError as error:
-        raise CampaignError("not readable as a vertical grid", grid, _EXPECTED, "Get it again.") from error
-    return np.asarray(shift.transform(longitude, latitude, np.zeros_like(longitude))[2], np.float64)
+    with on_disk(grid.absolute().parent) as folder:  # PROJ tells the format by the name
+        steps = f'+step +proj=vgridshift +grids="{folder / grid.name}" +multiplier=1'
+        try:
+            shift = Transformer.from_pipeline(f"+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad {steps}")
+        except ProjError as error:
+            raise CampaignError("not readable as a vertical grid", grid, _EXPECTED, "Get it again.") from error
+        return np.asarray(shift.transform(longitude, latitude, np.zeros_like(longitude))[2], np.float64)
 
 
 def _of_tif(grid: Path, longitude: Floats, latitude: Floats) -> Floats:

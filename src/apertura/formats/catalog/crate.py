@@ -9,8 +9,8 @@ from urllib.parse import quote, unquote
 from rocrate.model.entity import Entity
 from rocrate.rocrate import ROCrate
 
+from apertura.common.confined import ConfinedPath
 from apertura.common.documents import DAMAGED, read_json, undamaged
-from apertura.common.paths import inside
 from apertura.common.provenance import canonical_json, sha256_text
 from apertura.formats.catalog import CRATE
 from apertura.formats.catalog.stac import media_type
@@ -393,7 +393,7 @@ def recorded_files(root: Path, *, inputs: bool = True) -> dict[str, CrateFile]:
     ...
     apertura.common.errors.CampaignError: nowhere/ro-crate-metadata.json: no such file; expected an RO-Crate ...
     """
-    crate = inside(root, CRATE, where=root)
+    crate = ConfinedPath.at(root).named(CRATE, where=root)
     document = read_json(crate, expected=_EXPECTED, remedy="Run the workflow first.", largest=LARGEST_CRATE)
     with undamaged(crate, expected=_EXPECTED, remedy=DAMAGED):
         files = [_recorded(entity, root, crate) for entity in document["@graph"] if "sha256" in entity]
@@ -405,5 +405,5 @@ def _recorded(entity: dict[str, Any], root: Path, crate: Path) -> tuple[str, Cra
     identifier, prefix = str(entity["@id"]), input_id("")
     outside = identifier.startswith(prefix)
     name = unquote(identifier.removeprefix(prefix))
-    path = inside(root.parent if outside else root, name, where=crate)
+    path = ConfinedPath.at(root.parent if outside else root).named(name, where=crate)
     return name, CrateFile(path, str(entity["sha256"])), outside

@@ -10,9 +10,9 @@ from urllib.parse import unquote, urlsplit
 
 import pystac
 
+from apertura.common.confined import ConfinedPath
 from apertura.common.documents import read_json
 from apertura.common.errors import CampaignError, shown
-from apertura.common.paths import inside
 from apertura.formats.catalog import CATALOG
 
 if TYPE_CHECKING:
@@ -71,7 +71,9 @@ def _problems(folder: Path, start: str) -> Iterator[str]:
             continue
         seen.add(name)
         try:
-            document = read_json(inside(folder, name, where=folder), expected="a STAC catalog", remedy="Make it again.")
+            document = read_json(
+                ConfinedPath.at(folder).named(name, where=folder), expected="a STAC catalog", remedy="Make it again."
+            )
         except CampaignError as error:
             yield f"{name}: {error.found}"
             continue

@@ -71,7 +71,7 @@ def write_mosaic(path: Path, rasters: Sequence[Path], *, title: str = "") -> Non
         for colour in kind["colours"]:
             ET.SubElement(table, "Entry", dict(zip(("c1", "c2", "c3", "c4"), map(str, colour), strict=True)))
     for raster in rasters:
-        band.append(_source(os.path.relpath(raster, path.parent), first, kind))
+        band.append(_source(os.path.relpath(str(raster), str(path.parent)), first, kind))
     ET.indent(root)
     write_text(path, ET.tostring(root, encoding="unicode") + "\n")
 

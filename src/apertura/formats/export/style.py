@@ -5,7 +5,8 @@ a scene that is mostly noise, and whiten the noise.
 """
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from math import ceil, floor, log10
 from pathlib import Path
 from xml.etree import ElementTree as ET  # only written, never parsed
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from rasterio.enums import Resampling
 
 from apertura.common.atomic import write_text
+from apertura.common.confined import on_disk
 from apertura.common.errors import ContractError
 from apertura.common.raster import ISOLATED
 from apertura.formats.export.layers import CLASSES, OUTSIDE
@@ -59,7 +61,7 @@ def write_db_style(path: Path, *_: object, **__: object) -> None:
     ...     [line.strip() for line in path.read_text().splitlines() if "Value>" in line]
     ['<minValue>-17.0</minValue>', '<maxValue>32.0</maxValue>']
     """
-    with rasterio.Env(**ISOLATED), rasterio.open(_beside(path)) as raster:
+    with _beside(path) as raster:
         about = json.loads(raster.tags().get(TAG, "{}"))
     top, below = about.get("peak_db"), about.get("noise_floor_re_peak_db")
     if top is None or below is None:
@@ -73,7 +75,7 @@ def write_linear_style(path: Path, *_: object, **__: object) -> None:
     Parameters as `write_db_style`. A style of their own also keeps QGIS from measuring the raster, and from
     writing what it measured into a mosaic or beside an image.
     """
-    with rasterio.Env(**ISOLATED), rasterio.open(_beside(path)) as raster:
+    with _beside(path) as raster:
         values = _few(raster)
     largest = float(np.nanmax(values)) if np.isfinite(values).any() else 0.0
     _write(path, _grey(0.0, float(f"{largest / 10 or 1.0:.3g}")))
@@ -98,7 +100,7 @@ def write_layer_style(path: Path, *_: object, **__: object) -> None:
 
     Parameters as `write_db_style`.
     """
-    with rasterio.Env(**ISOLATED), rasterio.open(_beside(path)) as raster:
+    with _beside(path) as raster:
         values, unit = _few(raster), raster.units[0]
     _write_ramp(path, *_round_ends(values[np.isfinite(values)]), unit)
 
@@ -108,7 +110,7 @@ def write_backscatter_style(path: Path, *_: object, **__: object) -> None:
 
     Parameters as `write_db_style`. Speckle reaches down to nothing and reflectors far up: neither sets the colours.
     """
-    with rasterio.Env(**ISOLATED), rasterio.open(_beside(path)) as raster:
+    with _beside(path) as raster:
         values, unit = _few(raster), raster.units[0]
     known = values[np.isfinite(values)]
     low, high = np.percentile(known, (2.0, 99.5)) if known.size else (-30.0, 0.0)
@@ -157,9 +159,12 @@ def _grey(low: float, high: float, *, unit: str = "") -> ET.Element:
     return renderer
 
 
-def _beside(path: Path) -> Path:
-    """Return the raster that a style is for."""
-    return next(file for file in map(path.with_suffix, (".tif", ".vrt")) if file.is_file())
+@contextmanager
+def _beside(path: Path) -> Iterator[rasterio.DatasetReader]:
+    """Open the raster that a style is for; a mosaic names its rasters relative to its folder."""
+    file = next(file for file in map(path.with_suffix, (".tif", ".vrt")) if file.is_file())
+    with on_disk(file.parent) as folder, rasterio.Env(**ISOLATED), rasterio.open(folder / file.name) as raster:
+        yield raster
 
 
 def _renderer(kind: str, **attributes: str) -> ET.Element:

@@ -186,7 +186,8 @@ def _mapped(path: Path, fields: dict[str, NDArray[Any]]) -> NDArray[Any]:
         or begin + int(np.prod([*shape, kind.itemsize], dtype=object)) > path.stat().st_size
     ):
         raise _error(f"{pulses} pulses of {count} samples from byte {begin} on, more than the file holds", path)
-    return np.memmap(path, kind, "r", begin, shape)
+    with path.open("rb") as stream:
+        return np.memmap(stream, kind, "r", begin, shape)
 
 
 def _check_pair(collect_type: str, pair: str, path: Path) -> None:

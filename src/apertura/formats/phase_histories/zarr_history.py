@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.common.confined import ConfinedPath
 from apertura.common.documents import CODECS, other_codec
 from apertura.common.errors import quoted
 from apertura.formats.isolated import BYTES_PER_BYTE, UnreadableError, read_isolated
@@ -35,7 +36,7 @@ def read_zarr_history(paths: Sequence[Path], *, pair: str) -> "xr.Dataset":
     if not folders:
         raise refused("a file, not a folder", paths[0], _EXPECTED)
     for folder in folders:
-        for path in (folder, *folder.rglob("*")):
+        for path in (folder, *ConfinedPath.of(folder).rglob("*")):
             if path.is_symlink():
                 raise refused("a symbolic link: what it leads to is not read", path, _EXPECTED)
     sizes = [path.stat().st_size for path in paths]
@@ -67,6 +68,7 @@ def read_fields(path: Path) -> dict[str, NDArray[Any]]:
     ValueError
         If one is missing, is not of the layout, or is kept in a way that may run code.
     """
+    path = ConfinedPath.at(path)
     group = _metadata(path)
     fields = {
         name: _array(path / name, name)
@@ -81,12 +83,13 @@ def read_fields(path: Path) -> dict[str, NDArray[Any]]:
 
 def _array(folder: Path, name: str) -> NDArray[Any]:
     import zarr
+    from zarr.storage import LocalStore
 
     other = other_codec(_metadata(folder))
     if other is not None:
         raise ValueError(f"{name} is kept by codec {quoted(other)}, and not by {', '.join(sorted(CODECS))}")
     # by itself: what a group repeats of its arrays' metadata has not been looked at
-    array = zarr.open_array(folder, mode="r", zarr_format=3)
+    array = zarr.open_array(LocalStore(ConfinedPath.at(folder), read_only=True), mode="r", zarr_format=3)
     check_array(name, array.shape, np.dtype(array.dtype))
     with np.errstate(over="ignore"):  # becomes infinite, and is refused as such
         return np.asarray(array[...], np.complex64) if name == "transfer" else np.asarray(array[...])

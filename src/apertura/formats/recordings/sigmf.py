@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, Field, TypeAdapter, ValidationError
 
 from apertura.common.atomic import naming
+from apertura.common.confined import ConfinedPath
 from apertura.common.documents import read_json
 from apertura.common.errors import CampaignError, quoted, shown
-from apertura.common.paths import inside
 from apertura.common.provenance import hashes_of_file
 from apertura.formats.recordings.recording import Captures, Recording
 from apertura.formats.recordings.sample_file import DATATYPES, SETTLING, Mixing, SampleFile, SampleLayout
@@ -254,7 +254,7 @@ def check_listed(meta_path: Path) -> None:
 
 def _collections(folder: Path) -> Iterator[tuple[Path, SigmfCollection]]:
     for found in sorted(folder.glob(f"*{_SUFFIX}")):
-        path = inside(folder, found.name, where=folder)
+        path = ConfinedPath.at(folder).named(found.name, where=folder)
         document = read_json(path, expected=_A_COLLECTION, remedy=_CORRECT_IT)
         collection = of_sigmf(TypeAdapter(SigmfCollection), document.get("collection"), path, "collection")
         listed = {stream.name for stream in collection.streams}

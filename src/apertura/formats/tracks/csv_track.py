@@ -80,11 +80,11 @@ def read_table(
     if path.stat().st_size > LARGEST_LOG:
         raise ValueError(f"{path.stat().st_size} bytes, at most {LARGEST_LOG} are read")
     _check_cells(path)
-    with warnings.catch_warnings():
+    with path.open("rb") as stream, warnings.catch_warnings():
         warnings.simplefilter("error", pd.errors.ParserWarning)  # cells beyond the heading would be dropped
         try:
             table = pd.read_csv(
-                path,
+                stream,
                 encoding="utf-8-sig",
                 skipinitialspace=True,
                 index_col=False,

@@ -9,8 +9,8 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, TextIO, TypeVar
 
+from apertura.common.confined import ConfinedPath
 from apertura.common.errors import CampaignError
-from apertura.common.paths import inside
 from apertura.common.processes import as_typed
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import (
@@ -36,6 +36,7 @@ Check = Callable[["Examination"], Iterable[CampaignError]]
 CHECKS: Mapping[str, str] = {
     "flights": "apertura.pipeline.check.files:check_flights",
     "files": "apertura.pipeline.check.files:check_files",
+    "raw_root": "apertura.pipeline.check.files:check_raw_root",
     "links": "apertura.pipeline.check.files:check_links",
     "modules": "apertura.pipeline.check.files:check_modules",
     "results": "apertura.pipeline.check.resources:check_writable",
@@ -175,25 +176,22 @@ def load(root: Path) -> tuple[Campaign | None, list[CampaignError]]:
     >>> load(Path("nowhere"))[0] is None
     True
     """
+    root = ConfinedPath.at(root)
     if not root.is_dir():
         remedy = "`apertura init` makes one."
         return None, [CampaignError("no such folder", where=root, expected="a campaign folder", remedy=remedy)]
     wrong: list[CampaignError] = []
-    settings = _tried(lambda: read_settings(_inside(root, CONFIG)), wrong)
+    settings = _tried(lambda: read_settings(root / CONFIG), wrong)
     nodes = settings.nodes if settings else _AnyNode()
-    flights = _tried(lambda: tuple(read_flights(_inside(root, FLIGHTS), nodes=nodes)), wrong)
+    flights = _tried(lambda: tuple(read_flights(root / FLIGHTS, nodes=nodes)), wrong)
     listed = _listed_flights(root / FLIGHTS) if flights is None else flights
-    segments = _tried(lambda: tuple(read_segments(_inside(root, SEGMENTS), flights=listed)), wrong) if listed else ()
-    clocks = _tried(lambda: tuple(read_clocks(_inside(root, CLOCKS), flights=listed)), wrong) if listed else ()
+    segments = _tried(lambda: tuple(read_segments(root / SEGMENTS, flights=listed)), wrong) if listed else ()
+    clocks = _tried(lambda: tuple(read_clocks(root / CLOCKS, flights=listed)), wrong) if listed else ()
     if settings is None or flights is None or segments is None or clocks is None:
         return None, wrong
     campaign = Campaign(root, settings, flights, segments, clocks)
     _tried(campaign.check_radio, wrong)
     return campaign, wrong
-
-
-def _inside(root: Path, path: Path) -> Path:
-    return inside(root, path.as_posix(), where=root)
 
 
 def _tried(read: Callable[[], T], wrong: list[CampaignError]) -> T | None:

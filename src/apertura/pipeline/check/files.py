@@ -8,9 +8,8 @@ from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from apertura.common.confined import ConfinedPath
 from apertura.common.errors import CampaignError, number_of
-from apertura.common.paths import inside
-from apertura.formats.names import recording_files
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import CONFIG, FLIGHTS, Flight, SampledWaveform
 from apertura.pipeline.stale import absent_files, wanted_files
@@ -45,7 +44,7 @@ def check_files(examined: "Examination") -> Iterator[CampaignError]:
     wanted = _wanted(campaign)
     for flight in campaign.flights:
         yield from _recorded(campaign, flight, wanted)
-    lookups: list[Callable[[], dict[str, Path]]] = [
+    lookups: list[Callable[[], dict[str, ConfinedPath]]] = [
         lambda: {f"scene.{role}": path for role, path in campaign.height_files().items()}
     ]
     lookups += [partial(campaign.pattern_files, pair) for flight in campaign.image_flights for pair in flight.pairs]
@@ -94,17 +93,17 @@ def _recorded(campaign: Campaign, flight: Flight, wanted: Callable[[str], str | 
         expected = f"the recording of node {node} in flight {flight.name}"
         remedy = f"Copy it there, or take {node} out of the nodes of {flight.name} in {FLIGHTS}."
         try:
-            promised = recording_files(campaign.flight_folder(flight.name), node)
+            promised = campaign.promised_files(flight.name, node)
         except CampaignError as problem:  # metadata that name files
             yield problem
             promised = ()
         for path in promised:
             try:
-                inside(campaign.root, campaign.relative(path), where=campaign.root)
+                there = path.is_file()
             except CampaignError as problem:  # a link
                 yield problem
                 continue
-            if path.is_file() or (made := wanted(campaign.relative(path))) is None:
+            if there or (made := wanted(campaign.relative(path))) is None:
                 yield from _readable(path, expected, remedy)
             elif made:
                 yield from _readable(path, f"{expected}, to make {made} again", f"{remedy} {_KEPT}")
@@ -112,7 +111,7 @@ def _recorded(campaign: Campaign, flight: Flight, wanted: Callable[[str], str | 
             yield from _looked_up(lambda node=node: [campaign.track_file(flight.name, node)])  # type: ignore[misc]
 
 
-def _looked_up(files: Callable[[], list[Path]]) -> Iterator[CampaignError]:
+def _looked_up(files: Callable[[], list[ConfinedPath]]) -> Iterator[CampaignError]:
     """Yield the error of looking for files, or what is wrong with those that are there."""
     try:
         paths = files()
@@ -123,27 +122,62 @@ def _looked_up(files: Callable[[], list[Path]]) -> Iterator[CampaignError]:
         yield from _readable(path, "what was recorded", "Copy it again.")
 
 
-def _readable(path: Path, expected: str, remedy: str) -> Iterator[CampaignError]:
-    if not path.is_file():
+def _readable(path: ConfinedPath, expected: str, remedy: str) -> Iterator[CampaignError]:
+    try:
+        state = path.stat() if path.is_file() else None
+    except CampaignError as problem:  # a link
+        yield problem
+        return
+    if state is None:
         yield CampaignError("no such file", where=path, expected=expected, remedy=remedy)
-    elif path.stat().st_mtime > time.time() + _AHEAD_S:
+    elif state.st_mtime > time.time() + _AHEAD_S:
         yield CampaignError(
-            f"dated {(path.stat().st_mtime - time.time()) / 3600:.1f} h in the future",
+            f"dated {(state.st_mtime - time.time()) / 3600:.1f} h in the future",
             where=path,
             expected="a time that has been, by this machine's clock",
             remedy=f"Set the clock, or run `touch {path}`: Snakemake takes no input from the future.",
         )
-    elif path.stat().st_size == 0:
+    elif state.st_size == 0:
         yield CampaignError("empty, 0 bytes", where=path, expected=expected, remedy="Copy it again.")
-    elif not os.access(path, os.R_OK):
+    elif not path.permits(os.R_OK):
         yield CampaignError("may not be read", where=path, expected=expected, remedy=f"Run `chmod u+r {path}`.")
+
+
+def check_raw_root(examined: "Examination") -> Iterator[CampaignError]:
+    """Yield a problem where the stated folder of recordings is not there, or raw/ holds files that are not read."""
+    campaign, stated = examined.campaign, examined.campaign.settings.raw_root
+    if not stated:
+        return
+    if not Path(stated).is_dir():
+        yield CampaignError(
+            f"{stated} is no folder",
+            where="raw_root",
+            expected="the folder that holds <flight>/<node>.*",
+            remedy="Mount or correct it, or copy the recordings to raw/ and leave raw_root out.",
+        )
+    own = ConfinedPath.at(Path(campaign.root)) / "raw"
+    if any(files for _, _, files in own.walk()):
+        yield CampaignError(
+            f"raw/ holds files, and raw_root is {stated}",
+            where="raw_root",
+            expected="recordings in one of the two",
+            remedy="Move the files there, or leave raw_root out.",
+        )
 
 
 def check_links(examined: "Examination") -> Iterator[CampaignError]:
     """Yield an error for each symbolic link that the results, or Snakemake's own records, hold or are."""
-    for folder in ("results", ".snakemake"):
-        top = examined.campaign.root / folder
-        yield from (_refused(path) for path in _links(top))
+    root = examined.campaign.root
+    for top in (root / "results", root / ".snakemake"):
+        below = () if top.is_symlink() else (folder / name for folder, _, names in top.walk() for name in names)
+        for path in (top, *below):
+            if path.is_symlink():
+                yield CampaignError(
+                    "a symbolic link",
+                    where=path,
+                    expected="a folder or a file: Snakemake would write and delete through a link",
+                    remedy="Remove it; to keep results elsewhere, put the whole campaign folder there.",
+                )
 
 
 def check_modules(examined: "Examination") -> Iterator[CampaignError]:
@@ -158,24 +192,7 @@ def check_modules(examined: "Examination") -> Iterator[CampaignError]:
         )
 
 
-def _links(top: Path) -> Iterator[Path]:
-    if top.is_symlink():
-        yield top
-        return
-    for folder, folders, files in os.walk(top):  # never into a linked folder
-        yield from (path for path in (Path(folder, name) for name in (*folders, *files)) if path.is_symlink())
-
-
-def _refused(path: Path) -> CampaignError:
-    return CampaignError(
-        "a symbolic link",
-        where=path,
-        expected="a folder or a file: nothing is written or deleted through a link",
-        remedy="Remove it; to keep results elsewhere, put the whole campaign folder there.",
-    )
-
-
-def drop_damaged_records(root: Path) -> int:
+def drop_damaged_records(root: ConfinedPath) -> int:
     """Remove the records of earlier runs that Snakemake could not read; return how many.
 
     Hashes say what is stale, not these records: without them, a report only lacks how long earlier jobs took.
@@ -189,9 +206,10 @@ def drop_damaged_records(root: Path) -> int:
     return len(damaged)
 
 
-def _is_damaged(path: Path) -> bool:
-    if not path.is_file() or path.name == "migration_underway":
-        return path.is_file()
+def _is_damaged(path: ConfinedPath) -> bool:
+    is_file = path.is_file(follow_symlinks=False)
+    if not is_file or path.name == "migration_underway":
+        return is_file
     try:
         return not isinstance(json.loads(path.read_bytes() or b"{}"), dict)
     except (ValueError, RecursionError):

@@ -1,7 +1,6 @@
 """Whether memory, disk and permissions suffice for what is certain to be needed."""
 
 import os
-import shutil
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
@@ -20,7 +19,7 @@ def check_writable(examined: Examination) -> Iterator[CampaignError]:
     """Yield a problem where neither the campaign folder nor its results may be written: a read-only disk, another's."""
     campaign = examined.campaign
     for folder in (campaign.root, campaign.results):
-        if folder.exists() and not (folder.is_dir() and os.access(folder, os.W_OK | os.X_OK)):
+        if folder.exists() and not (folder.is_dir() and folder.permits(os.W_OK | os.X_OK)):
             yield CampaignError(
                 "may not be written" if folder.is_dir() else "is no folder",
                 where=folder,
@@ -66,7 +65,7 @@ def check_disk(examined: Examination) -> Iterator[CampaignError]:
     campaign = examined.campaign
     needed = sum(disk_bytes(examined).values())
     folder = campaign.results if campaign.results.is_dir() else campaign.root
-    free = shutil.disk_usage(folder).free
+    free = folder.free_bytes()
     if needed > free:
         parts = ", ".join(f"{name} {size / 1e6:.0f} MB" for name, size in disk_bytes(examined).items() if size)
         yield CampaignError(

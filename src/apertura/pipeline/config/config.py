@@ -9,7 +9,7 @@ from apertura.common import documents
 from apertura.common.documents import read_yaml
 from apertura.pipeline.config.nodes import Node
 from apertura.pipeline.config.processing import Bench, Calibration, Interferometry, Processing, Scene
-from apertura.pipeline.config.section import Name, Section, Title
+from apertura.pipeline.config.section import Name, RawRoot, Section, Title
 from apertura.pipeline.config.waveform import PhaseHistoryWaveform, Waveform
 
 CONFIG = Path("config/config.yaml")
@@ -21,6 +21,11 @@ class Settings(Section):
 
     campaign: Title = Field(description="name of the campaign", examples=["my_campaign"])
     waveform: Waveform = Field(description="what was transmitted")
+    raw_root: RawRoot | None = Field(
+        None,
+        description="absolute path of a folder that is read in place of raw/, as on another disk; null: raw/ itself",
+        examples=["/data/recordings/my_campaign"],
+    )
     nodes: dict[Name, Node] = Field(min_length=1, description="one section per UAV, named as in flights.tsv")
     scene: Scene = Field(default_factory=Scene, description="the grid of every raster of the campaign")
     processing: Processing = Field(default_factory=Processing, description="how to compute")

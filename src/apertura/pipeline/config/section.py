@@ -64,6 +64,12 @@ def _title(text: str) -> str:
     return text
 
 
+def _absolute(path: str) -> str:
+    if not path.startswith("/") or not path.isprintable() or ".." in path.split("/"):
+        raise ValueError(f"{quoted(path)}: only the absolute path of a folder may be used, without '..'")
+    return path
+
+
 def plain_crs(crs: str) -> str:
     """Return a CRS that is 'auto', 'local' or authority and code; raise ValueError for any other text.
 
@@ -85,6 +91,9 @@ Name = Annotated[str, AfterValidator(_plain_name)]
 
 CrsName = Annotated[str, AfterValidator(plain_crs)]
 """A coordinate reference system by authority and code, two of them joined by ``+``, 'auto' or 'local'."""
+
+RawRoot = Annotated[str, AfterValidator(_absolute)]
+"""The path of a folder outside the campaign."""
 
 Title = Annotated[str, AfterValidator(_title)]
 """What people read: a line without what WKT, HTML or a terminal would take for their own."""

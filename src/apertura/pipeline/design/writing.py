@@ -1,6 +1,5 @@
 """A design as files: layers as GeoTIFFs on the later campaign's grid, tracks and footprints, the campaign's config."""
 
-import shutil
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,8 @@ from rasterio import Affine
 
 from apertura import __version__
 from apertura.common.arrays import Floats
-from apertura.common.atomic import write_json, write_text
+from apertura.common.atomic import made_folder, write_json, write_text
+from apertura.common.confined import ConfinedPath
 from apertura.common.errors import CampaignError
 from apertura.common.provenance import canonical_json
 from apertura.core.geometry.geodesy import LOCAL
@@ -45,7 +45,7 @@ def write_design(design: Design, folder: Path, tried: Sequence[Tried] = ()) -> l
     tried
         Plans that a search tried: those that no other beats are in design.json.
     """
-    grid, written = design.opened.scene.grid, list[Path]()
+    folder, grid, written = made_folder(folder), design.opened.scene.grid, list[Path]()
     place = {"transform": Affine(*grid.transform), "crs": grid.crs_wkt}
     tags = tags_of(design)
     images = {name: image.layers for name, image in design.images.items()}
@@ -133,6 +133,7 @@ def write_campaign_config(plan: FlightPlan, directory: Path) -> list[Path]:
     CampaignError
         If a config is there already; nothing is changed then.
     """
+    directory = made_folder(directory)
     paths = [directory / "config" / "config.yaml", directory / FLIGHTS]
     for path in paths:
         if path.exists():
@@ -159,9 +160,10 @@ def copy_named(plan: FlightPlan, root: Path, folder: Path) -> None:
         for part in value.values() if isinstance(value, dict) else value if isinstance(value, list | tuple) else ():
             yield from named(part)
 
+    root, folder = ConfinedPath.at(root), made_folder(folder)
     names = {Path(name) for name in named(plan.model_dump(mode="json", exclude_unset=True)) if name}
     for name in sorted(name for name in names if not name.is_absolute() and ".." not in name.parts):
         source, copy = root / name, folder / name
-        if source.is_file() and not source.is_symlink() and copy.resolve() != source.resolve():
+        if source.is_file() and copy.real() != source.real():
             copy.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(source, copy)
+            source.copy_to(copy)

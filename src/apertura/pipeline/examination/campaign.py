@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pyproj import CRS
 from pyproj.exceptions import ProjError
 
+from apertura.common.confined import ConfinedPath
 from apertura.common.errors import CampaignError
 from apertura.core.geometry.geodesy import LOCAL, geodetic_from_ecef
 from apertura.formats.names import PHASE_HISTORIES
@@ -158,7 +159,7 @@ class Examination:
 
     @cached_property
     def _tracks(self) -> tuple[dict[Key, "xr.Dataset"], list[CampaignError]]:
-        def files(flight: str, node: str) -> tuple[Path, ...]:
+        def files(flight: str, node: str) -> tuple[ConfinedPath, ...]:
             return (self.campaign.track_file(flight, node),)
 
         options = {name: node.log.options for name, node in self.campaign.settings.nodes.items()}
@@ -168,8 +169,8 @@ class Examination:
 
     def _each(
         self,
-        files: Callable[[str, str], tuple[Path, ...]],
-        open_files: Callable[[tuple[Path, ...], Key], T],
+        files: Callable[[str, str], tuple[ConfinedPath, ...]],
+        open_files: Callable[[tuple[ConfinedPath, ...], Key], T],
         needed: Callable[[Key], bool] = lambda _: True,
     ) -> tuple[dict[Key, T], list[CampaignError]]:
         """Open files that are there and not empty; the check 'files' names the others."""
@@ -178,9 +179,9 @@ class Examination:
         for flight, node in filter(needed, self.keys):
             try:
                 paths = files(flight, node)
+                if not all(map(size_of, paths)):
+                    continue
             except CampaignError:
-                continue
-            if not all(map(size_of, paths)):
                 continue
             try:
                 opened[flight, node] = open_files(paths, (flight, node))

@@ -9,7 +9,6 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from apertura.common.errors import CampaignError
-from apertura.common.paths import inside
 from apertura.core.echo.association import Association, associate
 from apertura.core.echo.captures import Read, Samples
 from apertura.core.echo.demodulate import Numerology
@@ -169,7 +168,7 @@ def open_acquisition(campaign: Campaign, flight: str, node: str, sent: Transmitt
     raw = raw.assign(time=("pulse", campaign.clock(flight, node).utc(raw.time.values)))
     files = Path("raw") / flight / node
     recording, log = (_read_from(stage, files) for stage in (raw, track))
-    path = inside(campaign.root, raw.attrs["samples"], where=campaign.stage("raw", flight, node))
+    path = campaign.root.named(raw.attrs["samples"], where=campaign.stage("raw", flight, node))
     captured = Captured.of(raw, path, files, recording, sent)
     _check_same(campaign, raw)
     wave_m = shortest_wave(sent.numerology.frequency_hz)

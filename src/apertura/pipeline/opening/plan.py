@@ -1,6 +1,5 @@
 """How each pair of a campaign will be imaged, and its error budget: from its echo, or from the flight logs."""
 
-import shutil
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -273,7 +272,7 @@ def plan_pair(campaign: Campaign, pair: OpenPair, scene: OpenScene, *, threads: 
         plan, decisions=(*plan.decisions, accuracy, air_decision(pair)), flags=Flags.merged(flags, plan.flags)
     )
     written = manifest_of(campaign.stage("image", pair.flight, pair.name)).is_file()
-    free_disk = None if written else shutil.disk_usage(campaign.root).free
+    free_disk = None if written else campaign.root.free_bytes()
     check_fits(plan, free_disk=free_disk, where=f"{pair.flight}/{pair.name}")
     return plan
 

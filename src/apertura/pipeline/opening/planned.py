@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.common.arrays import Floats
+from apertura.common.confined import ConfinedPath
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
 from apertura.core.geometry.geodesy import (
@@ -156,7 +157,7 @@ def open_plan(plan: FlightPlan, root: Path) -> OpenPlan:
         If a track leads into the ground or beyond the DEM, nodes come too close, or there is nothing to be imaged.
     """
     with errors_of_the_plan():
-        return _opened(plan, Campaign(root, plan.settings, plan.image_flights, planned=True))
+        return _opened(plan, Campaign(ConfinedPath.at(root), plan.settings, plan.image_flights, planned=True))
 
 
 @contextmanager

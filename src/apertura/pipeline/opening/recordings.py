@@ -5,7 +5,6 @@ from pathlib import Path
 import xarray as xr
 
 from apertura.common.errors import CampaignError
-from apertura.common.paths import inside
 from apertura.core.echo.trigger import PulseFraming, trigger_captures
 from apertura.formats.reading import open_recording
 from apertura.formats.recordings.recording import Recording
@@ -27,7 +26,7 @@ def preamble_files(recording: Recording, campaign: Campaign) -> tuple[Path, ...]
     if recording.framing is None:
         return ()
     name = recording.framing["preamble"]
-    return (inside(campaign.root, name, where=f"{recording.files[0]}: apertura:framing.preamble"),)
+    return (campaign.root.named(name, where=f"{recording.files[0]}: apertura:framing.preamble"),)
 
 
 def captures_of(recording: Recording, campaign: Campaign, *, node: str) -> xr.Dataset:

@@ -130,8 +130,9 @@ def write_campaign(
             write_config(root, settings.model_dump(mode="json", exclude_unset=True), lines)
             campaign = Campaign.load(root)
             if sent is not None:
-                campaign.sent_file.parent.mkdir(parents=True, exist_ok=True)
-                np.save(campaign.sent_file, np.asarray(sent, np.complex64))
+                sent_file = root / campaign.relative(campaign.sent_file)
+                sent_file.parent.mkdir(parents=True, exist_ok=True)
+                np.save(sent_file, np.asarray(sent, np.complex64))
             for name, flight in flights.items():
                 (root / "raw" / name).mkdir()
                 for node, recorded in flight.nodes.items():

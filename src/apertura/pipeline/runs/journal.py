@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from apertura.common.errors import shown
+from apertura.common.errors import CampaignError, shown
 
 JOURNAL = "APERTURA_JOURNAL"
 """Environment variable: where the journal of a run is written."""
@@ -171,7 +171,7 @@ class JournalReader:
 
     def news(self) -> RunRecord:
         """Return the run as it is told by now."""
-        with suppress(OSError), self.path.open("rb") as journal:
+        with suppress(FileNotFoundError), self.path.open("rb") as journal:
             journal.seek(self._read)
             data = journal.read(max(0, _LONGEST - self._read))
             self._read += len(data)
@@ -230,7 +230,7 @@ def _message(log: Path | None) -> str:
 
 def _tail(log: Path) -> list[str]:
     """Return the last lines of a log that hold something."""
-    with suppress(OSError), log.open("rb") as stream:
+    with suppress(OSError, CampaignError), log.open("rb") as stream:
         stream.seek(max(0, log.stat().st_size - _TAIL))
         return [line for line in stream.read().decode("utf-8", "replace").splitlines() if line.strip()]
     return []

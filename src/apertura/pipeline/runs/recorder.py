@@ -15,6 +15,8 @@ from snakemake_interface_logger_plugins.base import LogHandlerBase
 from snakemake_interface_logger_plugins.common import LogEvent
 from snakemake_interface_logger_plugins.registry import LoggerPluginRegistry
 
+from apertura.common.confined import ConfinedPath
+from apertura.common.processes import CONFINED, confine_changes
 from apertura.pipeline.runs.journal import JOURNAL, NAME, note, step_of
 
 
@@ -32,7 +34,7 @@ class LogHandler(LogHandlerBase):
         line = _line(getattr(record, "event", None), record.__dict__)
         if line is not None:
             event, told = line
-            note(Path(os.environ[JOURNAL]), event, **told)
+            note(ConfinedPath.referenced(os.environ[JOURNAL]), event, **told)
 
 
 def _line(event: LogEvent | None, said: dict[str, Any]) -> tuple[str, dict[str, Any]] | None:
@@ -57,6 +59,8 @@ def record() -> None:
     """Run snakemake with the arguments of this process."""
     LoggerPluginRegistry().register_plugin(f"snakemake_logger_plugin_{NAME}", sys.modules[__name__])
     sys.argv[0] = "snakemake"  # its messages begin with it
+    if CONFINED in os.environ:
+        confine_changes(Path(os.environ.pop(CONFINED)))
     main()
 
 

@@ -2,16 +2,14 @@
 
 import fcntl
 import json
-import os
 import sys
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 
-from apertura.common.atomic import remove
+from apertura.common.confined import ConfinedPath
 from apertura.common.errors import CampaignError, number_of, shown
-from apertura.common.paths import inside
 from apertura.common.processes import hold
 from apertura.common.progress import RUN
 from apertura.pipeline.campaign import Campaign
@@ -56,7 +54,7 @@ def print_list(campaign: Campaign) -> None:
         table.add_row(flight, (*of, f"flight{mark}")[0], *coloured, in_bytes(sizes[place]))
     console = Console(highlight=False)
     console.print(table)
-    wip = sum(1 for _, folders, _ in os.walk(campaign.results) for name in folders if name.endswith(".zarr.wip"))
+    wip = sum(name.endswith(".zarr.wip") for _, folders, _ in campaign.results.walk() for name in folders)
     console.print(
         f"{in_bytes(sum(sizes.values()))} in results" + (f", {wip} stages under way or left unfinished" if wip else "")
     )
@@ -89,13 +87,13 @@ def counted(found: Mapping[tuple[str, ...], Mapping[str, list[str]]]) -> str:
     return ", ".join(f"{number_of(count, 'result')} {state}" for state, count in counts.items() if count)
 
 
-def _sizes(results: Path, places: set[tuple[str, ...]]) -> dict[tuple[str, ...], int]:
+def _sizes(results: ConfinedPath, places: set[tuple[str, ...]]) -> dict[tuple[str, ...], int]:
     """Return how many bytes lie in each place; what lies in no other counts for the campaign."""
     sizes = dict.fromkeys({*places, ()}, 0)
-    for folder, _, names in os.walk(results):
-        parts = Path(folder).relative_to(results).parts
+    for folder, _, names in results.walk():
+        parts = folder.relative_to(results).parts
         place = next(parts[:depth] for depth in range(len(parts), -1, -1) if parts[:depth] in sizes)
-        sizes[place] += sum(Path(folder, name).lstat().st_size for name in names)
+        sizes[place] += sum((folder / name).lstat().st_size for name in names)
     return sizes
 
 
@@ -130,7 +128,7 @@ def clean(campaign: Campaign, *, unfinished_only: bool, agreed: bool) -> None:
         for path in files:
             path.unlink(missing_ok=True)
         if not unfinished_only:
-            remove(inside(campaign.root, ".snakemake", where=campaign.root))
+            (campaign.root / ".snakemake").remove()
         _drop_empty(campaign.results)
         print(f"removed {told}")
         kept = [] if unfinished_only else _files(campaign.results)
@@ -138,7 +136,7 @@ def clean(campaign: Campaign, *, unfinished_only: bool, agreed: bool) -> None:
             more = f" and {len(kept) - 1} more" if len(kept) > 1 else ""
             print(f"kept what it has not made: {shown(campaign.relative(kept[0]), 400)}{more}")
         elif not unfinished_only:
-            remove(campaign.results)  # with nothing in it but the lock
+            campaign.results.remove()  # with nothing in it but the lock
 
 
 def in_bytes(size: int) -> str:
@@ -157,11 +155,11 @@ def in_bytes(size: int) -> str:
     return f"{value:.1f} TB"
 
 
-def _refuse_writers(results: Path) -> None:
+def _refuse_writers(results: ConfinedPath) -> None:
     """Raise CampaignError if a step that has outlived its run still writes a stage."""
     for path in _files(results):
         if path.name.startswith(".") and path.name.endswith(_LOCK):
-            with path.open("a+") as lock:
+            with path.open("rb") as lock:
                 try:
                     fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 except BlockingIOError:
@@ -177,7 +175,7 @@ def _is_wanted(question: str, root: Path) -> bool:
     return typer.confirm(question)
 
 
-def _made(results: Path) -> Iterator[Path]:
+def _made(results: ConfinedPath) -> Iterator[ConfinedPath]:
     """Yield what the workflow has made: what manifests and locks of stages list, work in progress, logs."""
     yield from _unfinished(results)
     for path in _files(results):
@@ -187,34 +185,34 @@ def _made(results: Path) -> Iterator[Path]:
                 yield path
         elif path.name.startswith(".") and path.name.endswith(_LOCK):
             yield path
-            with suppress(ValueError, AttributeError, UnicodeDecodeError):
+            with suppress(ValueError, AttributeError, UnicodeDecodeError, CampaignError):
                 stage = path.with_name(path.name.removeprefix(".").removesuffix(".lock"))
                 yield from _listed(path, json.loads(path.read_text("utf-8") or "{}"), below=stage)
     for folder, suffix in _OWN.items():
         yield from (path for path in _files(results / folder) if path.name.endswith(suffix))
 
 
-def _listed(where: Path, names: dict[str, object], *, below: Path) -> Iterator[Path]:
+def _listed(where: ConfinedPath, names: dict[str, object], *, below: ConfinedPath) -> Iterator[ConfinedPath]:
     """Yield the files that are there of those that a manifest or a lock lists; none outside, none through a link."""
     for name in names:
         with suppress(CampaignError):
-            path = inside(below, name, where=where)
+            path = below.named(name, where=where)
             if path.is_file():
                 yield path
 
 
-def _unfinished(results: Path) -> Iterator[Path]:
+def _unfinished(results: ConfinedPath) -> Iterator[ConfinedPath]:
     for path in _files(results):
         if any(part.endswith(".zarr.wip") for part in path.relative_to(results).parts[:-1]):
             yield path
 
 
-def _files(top: Path) -> list[Path]:
-    """Return every file below a folder, sorted, without following links."""
-    return sorted(Path(folder, name) for folder, _, names in os.walk(top) for name in names if name != ".run.lock")
+def _files(top: ConfinedPath) -> list[ConfinedPath]:
+    """Return every file below a folder, links as such, sorted."""
+    return sorted(folder / name for folder, _, names in top.walk() for name in names if name != ".run.lock")
 
 
-def _drop_empty(top: Path) -> None:
-    for folder, _, _ in os.walk(top, topdown=False):
+def _drop_empty(top: ConfinedPath) -> None:
+    for folder, _, _ in reversed(list(top.walk())):
         with suppress(OSError):
-            Path(folder).rmdir()
+            folder.rmdir()

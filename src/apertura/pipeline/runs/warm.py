@@ -26,7 +26,9 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import IO, Any
 
-from apertura.common.processes import ALGEBRA_THREADS, ENDING, SIGNALLED, die_with_parent
+from apertura.common.confined import ConfinedPath
+from apertura.common.errors import CampaignError
+from apertura.common.processes import ALGEBRA_THREADS, ENDING, SIGNALLED, TEMPORARY, die_with_parent, leave_status
 from apertura.pipeline.rules import RULES
 
 NAME = "apertura.pipeline.runs.warm"
@@ -73,7 +75,7 @@ class Order:
     environment
         Variables beside those of this process.
     output
-        File that all output goes to.
+        File that all output goes to, as a reference of `ConfinedPath`.
     """
 
     arguments: Sequence[str]
@@ -114,7 +116,7 @@ def _begun(requests: socket.socket) -> BaseProcess:
         sys.exit(2)
     order = Order(**json.loads(said))
     os.environ.update(order.environment)
-    _redirect(order.output)
+    _redirect(ConfinedPath.referenced(order.output))
     snakemake = _fork(target=_child, args=(_snakemake, requests, order.arguments))
     snakemake.start()
     return snakemake
@@ -191,9 +193,9 @@ def _import() -> None:
     gc.freeze()  # what stands here is never looked at again: pages stay shared
 
 
-def _redirect(file: str) -> None:
+def _redirect(file: ConfinedPath) -> None:
     """Have standard output and error go to a file."""
-    output = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o666)
+    output = file.descriptor(os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
     for stream in (1, 2):
         os.dup2(output, stream)
     os.close(output)
@@ -291,11 +293,16 @@ def _step(asked: Mapping[str, Any], answer: socket.socket) -> None:
     with answer:
         if answer.recv(2) != b"go":
             sys.exit(SIGNALLED)
+    own = {name: os.environ[name] for name in TEMPORARY if name in os.environ}
     os.environ.clear()
-    os.environ.update(asked["environment"])
+    os.environ.update({name: value for name, value in asked["environment"].items() if name not in TEMPORARY} | own)
     tempfile.tempdir = None  # the environment says where
     os.chdir(asked["folder"])
-    _redirect(asked["log"])
+    try:
+        _redirect(ConfinedPath.at(asked["folder"]) / asked["log"])
+    except CampaignError as error:
+        leave_status(2)
+        sys.exit(f"error: {error}")
     sys.argv = ["apertura", *asked["words"]]
     pkgutil.resolve_name("apertura.__main__:main")()
 

@@ -8,7 +8,6 @@ import numpy as np
 
 from apertura.common.atomic import write_text
 from apertura.common.errors import CampaignError
-from apertura.common.paths import inside
 from apertura.core.geometry.geodesy import frame_from_map
 from apertura.core.scene.auto_grid import utm_crs
 from apertura.core.scene.grid import SceneGrid
@@ -97,7 +96,7 @@ def write_clock(
     campaign: Campaign, flight: str, node: str, *, offset_s: str, std_s: float, drift_ppm: float = 0.0
 ) -> Path:
     """Write the line of a node's clock into config/clocks.tsv; the others stay."""
-    path = inside(campaign.root, CLOCKS.as_posix(), where=campaign.root)
+    path = campaign.root.named(CLOCKS.as_posix(), where=campaign.root)
     others = [clock for clock in campaign.clocks if (clock.flight, clock.node) != (flight, node)]
     kept = [
         (one.flight, one.node, Decimal(one.offset_ns).scaleb(-9), one.drift_ppm, "" if one.std_s is None else one.std_s)

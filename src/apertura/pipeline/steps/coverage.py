@@ -1,5 +1,6 @@
 """Rule `coverage`: coverage of all flights and pairs of a campaign, as a picture and for a GIS."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ _DOTS = 480  # of the longer side of the scene
 _VERTICES = 400  # of a track
 
 
-def coverage(campaign: Campaign) -> list[Path]:
+def coverage(campaign: Campaign) -> Sequence[Path]:
     """Write results/coverage.png and results/coverage.geojson; return their paths."""
     lineage = result_of(campaign, "coverage").begin(campaign.root)
     scene = settled_scene(campaign)

@@ -1,6 +1,5 @@
 """Rules `image` and `tiles`: a focused image of one pair with its measured error, by one job or by many."""
 
-import shutil
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -10,6 +9,7 @@ import numpy as np
 import xarray as xr
 
 from apertura.common.atomic import write_json
+from apertura.common.confined import ConfinedPath
 from apertura.common.contracts import Window
 from apertura.common.errors import number_of
 from apertura.common.flags import Flags
@@ -77,7 +77,7 @@ def image(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Pa
         quality["flags"] = Flags.merged(*of_stages, plan.flags, quality["flags"], told.flags)
         finish(wip, folder, lineage=lineage, quality=quality, flags=quality["flags"])
     # Also those of another number of jobs, of a run that was killed: the workflow only knows of the present ones.
-    shutil.rmtree(_receipts(folder), ignore_errors=True)
+    _receipts(folder).remove()
     return folder
 
 
@@ -113,7 +113,7 @@ def tiles(campaign: Campaign, flight: str, pair: str, share: str, *, threads: in
     return receipt
 
 
-def _receipts(folder: Path) -> Path:
+def _receipts(folder: ConfinedPath) -> ConfinedPath:
     """Where the shares say that they are done, until their image is."""
     return folder.with_name("tiles")
 
@@ -122,7 +122,7 @@ def _receipts(folder: Path) -> Path:
 class _Work:
     """Common inputs of both rules: folder of the stage, reports that it quotes, formation."""
 
-    folder: Path
+    folder: ConfinedPath
     echo: xr.Dataset
     track: RefinedTrack
     pair: OpenPair

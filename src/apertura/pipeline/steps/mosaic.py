@@ -1,6 +1,6 @@
 """Rule `mosaic`: each product of all flights as one raster for a GIS, on the campaign's grid."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from apertura.common.errors import CampaignError
@@ -12,7 +12,7 @@ from apertura.pipeline.lineage import result_of
 from apertura.pipeline.store import read_manifest, record_files
 
 
-def mosaic(campaign: Campaign) -> list[Path]:
+def mosaic(campaign: Campaign) -> Sequence[Path]:
     """Write results/mosaic/<pair>/<product>.vrt and their styles; return their paths.
 
     Flights lie upon one another in the order of config/flights.tsv, the last uppermost.

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 from apertura.common.atomic import write_json, write_text
 from apertura.common.documents import read_json, undamaged
-from apertura.common.paths import inside, shipped
+from apertura.common.paths import shipped
 from apertura.common.provenance import lock_sha256, sha256_text, software
 from apertura.formats.catalog import CATALOG, CRATE
 from apertura.formats.catalog.crate import CrateJob, CrateRun, Listed, crate_document
@@ -18,7 +18,7 @@ from apertura.pipeline.rules import RESULTS, RULES
 from apertura.pipeline.store import read_manifest, record_files, remake
 
 
-def ro_crate(campaign: Campaign) -> list[Path]:
+def ro_crate(campaign: Campaign) -> Sequence[Path]:
     """Write results/ro-crate-metadata.json, and the workflow beside it; return their paths."""
     lineage = result_of(campaign, "ro_crate").begin(campaign.root)
     manifest, workflow = campaign.root / lineage.result.manifest, _workflow()
@@ -116,13 +116,13 @@ def _files(campaign: Campaign, one: _Made, known: Mapping[str, str]) -> list[Lis
     folder, where = manifest.rpartition("/")[0], campaign.root / one.result.manifest
     files = {f"{folder}/{name}" if folder else name: sha256 for name, sha256 in sorted(one.recorded["files"].items())}
     files[manifest] = known[one.result.manifest]
-    return [Listed(name, sha256, _size(inside(campaign.results, name, where=where))) for name, sha256 in files.items()]
+    return [Listed(name, sha256, _size(campaign.results.named(name, where=where))) for name, sha256 in files.items()]
 
 
 def _inputs(campaign: Campaign, known: Mapping[str, str]) -> list[Listed]:
     """Return the recordings, as they were when they were read, and the config, as it is."""
     names = sorted(name for name in known if not name.startswith("results/"))
-    return [Listed(name, known[name], _size(inside(campaign.root, name, where=campaign.root))) for name in names]
+    return [Listed(name, known[name], _size(campaign.root.named(name, where=campaign.root))) for name in names]
 
 
 def _size(path: Path) -> int | None:

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from apertura.common.atomic import write_json
 from apertura.common.documents import undamaged
 from apertura.common.errors import CampaignError
-from apertura.common.paths import inside
 from apertura.common.provenance import lock_sha256, software
 from apertura.formats.catalog import CATALOG
 from apertura.formats.catalog.stac import (
@@ -108,7 +107,7 @@ class _Described:
         """Return the files of a result with their hashes, as its manifest has them."""
         manifest = self.campaign.root / self.campaign.manifest(result, flight, name)
         hashes: Mapping[str, str] = read_manifest(manifest)["files"]
-        return {inside(manifest.parent, file, where=manifest): digest for file, digest in hashes.items()}
+        return {manifest.parent.named(file, where=manifest): digest for file, digest in hashes.items()}
 
     def _assets(self, files: Mapping[Path, str]) -> tuple[dict[str, Any], dict[str, str]]:
         """Return the assets of some files by their keys, and file → sha256 of what their rasters were made from."""

@@ -17,6 +17,7 @@ from zarr.errors import ZarrUserWarning
 from zarr.storage import LocalStore, MemoryStore
 
 from apertura.common.atomic import write_beside
+from apertura.common.confined import ConfinedPath
 from apertura.common.documents import other_codec
 from apertura.common.errors import CampaignError
 from apertura.pipeline.store.manifest import manifest_of
@@ -50,32 +51,23 @@ class StageStore(LocalStore):
         File of the folder → hash.
     """
 
-    def __init__(self, folder: Path, *, read_only: bool = False, sha256: Mapping[str, str] | None = None) -> None:
-        super().__init__(folder, read_only=read_only)
-        self._unchecked = dict(sha256 or {})
+    root: ConfinedPath
 
-    def _unlinked(self, key: str) -> str:
-        """Return a name in the folder; raise the error of damage if it leads through a link, which we never write."""
-        way = self.root
-        for part in key.split("/"):
-            way /= part
-            if way.is_symlink():
-                raise damaged(self.root, key)
-        return key
+    def __init__(self, folder: Path, *, read_only: bool = False, sha256: Mapping[str, str] | None = None) -> None:
+        super().__init__(ConfinedPath.of(folder), read_only=read_only)
+        self._unchecked = dict(sha256 or {})
 
     async def get(
         self, key: str, prototype: BufferPrototype | None = None, byte_range: ByteRequest | None = None
     ) -> Buffer | None:
         """Return a file of the folder; `CampaignError` if it is a chunk and not what was written."""
-        return self._checked(key, await super().get(self._unlinked(key), prototype, byte_range), byte_range)
+        return self._checked(key, await super().get(key, prototype, byte_range), byte_range)
 
     def get_sync(
         self, key: str, *, prototype: BufferPrototype | None = None, byte_range: ByteRequest | None = None
     ) -> Buffer | None:
         """As `get`."""
-        return self._checked(
-            key, super().get_sync(self._unlinked(key), prototype=prototype, byte_range=byte_range), byte_range
-        )
+        return self._checked(key, super().get_sync(key, prototype=prototype, byte_range=byte_range), byte_range)
 
     async def set(self, key: str, value: Buffer) -> None:
         """Write a file of the folder."""
@@ -85,6 +77,20 @@ class StageStore(LocalStore):
         """As `set`."""
         self._check_writable()
         write_beside(self.root / key, value.to_bytes())
+
+    async def set_if_not_exists(self, key: str, value: Buffer) -> None:
+        """Write a file that is not there; a file of a stage has one writer."""
+        if not await self.exists(key):
+            await self.set(key, value)
+
+    async def delete(self, key: str) -> None:
+        """Remove a file, or a folder with its contents."""
+        self._check_writable()
+        await asyncio.to_thread((self.root / key).remove)
+
+    async def delete_dir(self, prefix: str) -> None:
+        """As `delete`."""
+        await self.delete(prefix)
 
     def _checked(self, key: str, value: Buffer | None, byte_range: ByteRequest | None) -> Buffer | None:
         name = key.rpartition("/")[2]

@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any, Literal, Protocol
 
 from apertura.common.atomic import write_json
+from apertura.common.confined import ConfinedPath
 from apertura.common.documents import read_json, undamaged
 from apertura.common.errors import CampaignError
-from apertura.common.paths import inside
 from apertura.common.provenance import sha256_file
 
 
@@ -72,8 +72,6 @@ def read_manifest(manifest: Path) -> dict[str, Any]:
         If it is no manifest.
     """
     expected, remedy = "a manifest as the workflow wrote it", f"Delete {manifest} and run the workflow again."
-    if manifest.is_symlink():
-        raise CampaignError("a symbolic link", manifest, expected, remedy)
     document = read_json(manifest, expected=expected, remedy=remedy)
     with undamaged(manifest, expected=expected, remedy=remedy):
         for hashes in (document["files"], document.get("sources", {})):
@@ -190,7 +188,7 @@ def damaged_files(manifest: Path) -> list[str]:
     """Return the files of a result that are not as they were written, or not there; every byte is read."""
 
     def present(name: str) -> str:
-        return sha256_present(inside(manifest.parent, name, where=manifest))
+        return sha256_present(ConfinedPath.of(manifest).parent.named(name, where=manifest))
 
     return [difference.name for difference in compare(read_manifest(manifest)["files"], present)]
 

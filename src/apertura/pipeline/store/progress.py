@@ -10,7 +10,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
-from apertura.common.atomic import naming, remove, rename, write_beside
+from apertura.common.atomic import confined_target, naming, remove, rename, write_beside
+from apertura.common.confined import ConfinedPath
 from apertura.common.contracts import Window
 from apertura.common.provenance import canonical_json, sha256_tree
 from apertura.pipeline.store.manifest import ResultOrigin, manifest_of, write_manifest
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 
 
 @contextmanager
-def writing(folder: Path) -> Iterator[Path]:
+def writing(folder: Path) -> Iterator[ConfinedPath]:
     """Hold the right to write `folder` and yield where work in progress goes.
 
     A kernel lock that dies with its process keeps a second writer out: a step that outlived its snakemake finishes its
@@ -32,9 +33,10 @@ def writing(folder: Path) -> Iterator[Path]:
 
     Yields
     ------
-    pathlib.Path
+    apertura.common.confined.ConfinedPath
         ``<folder>.wip``; kept if the body fails, so that finished chunks are picked up again.
     """
+    folder = confined_target(folder)
     with _opened(folder) as (wip, lock):
         _take(lock, folder, wip)
         yield wip
@@ -43,7 +45,7 @@ def writing(folder: Path) -> Iterator[Path]:
 @contextmanager
 def sharing(
     folder: Path, stage: "xr.Dataset", name: str, windows: Sequence[Window]
-) -> Iterator[tuple[Path, list[Window]]]:
+) -> Iterator[tuple[ConfinedPath, list[Window]]]:
     """Join the jobs that write chunks of one stage at once, each its own; who finishes the stage waits for them.
 
     Parameters
@@ -57,6 +59,7 @@ def sharing(
         ``<folder>.wip``, and the windows that it does not hold yet: none if meanwhile others finished it, or began
         other work there.
     """
+    folder = confined_target(folder)
     with _opened(folder) as (wip, lock):
         fcntl.flock(lock, fcntl.LOCK_SH)
         if not (is_work_on(wip, stage) and is_intact(wip, skeleton_of(stage, name, windows))):
@@ -67,13 +70,13 @@ def sharing(
 
 
 @contextmanager
-def _opened(folder: Path) -> Iterator[tuple[Path, IO[str]]]:
+def _opened(folder: ConfinedPath) -> Iterator[tuple[ConfinedPath, IO[str]]]:
     folder.parent.mkdir(parents=True, exist_ok=True)
     with _lock_of(folder).open("a+") as lock:
         yield folder.with_name(f"{folder.name}.wip"), lock
 
 
-def _take(lock: IO[str], folder: Path, wip: Path) -> None:
+def _take(lock: IO[str], folder: ConfinedPath, wip: ConfinedPath) -> None:
     """Wait for every other writer; turn a finished folder that is undamaged into work in progress."""
     fcntl.flock(lock, fcntl.LOCK_EX)
     manifest_of(folder).unlink(missing_ok=True)
@@ -84,7 +87,7 @@ def _take(lock: IO[str], folder: Path, wip: Path) -> None:
             folder.rename(wip)
 
 
-def _lock_of(folder: Path) -> Path:
+def _lock_of(folder: ConfinedPath) -> ConfinedPath:
     """Return the lock file of a stage, which keeps the hashes of its files: snakemake removes manifests."""
     return folder.with_name(f".{folder.name}.lock")
 
@@ -101,6 +104,7 @@ def finish(wip: Path, folder: Path, *, lineage: ResultOrigin | None = None, **at
     **attributes
         Attributes of the stage that are known only now, such as what was measured on it.
     """
+    wip, folder = ConfinedPath.of(wip), ConfinedPath.of(folder)
     if attributes:
         from apertura.pipeline.store.chunks import update_attributes
 
@@ -144,7 +148,7 @@ def resume(wip: Path, stage: "xr.Dataset", name: str, windows: Sequence[Window])
     -----
     Work in progress is other work when its settings, inputs or code differ.
     """
-    files = skeleton_of(stage, name, windows)
+    wip, files = ConfinedPath.of(wip), skeleton_of(stage, name, windows)
     if is_work_on(wip, stage):
         chunks = {f"{name}/{_key(window, windows)}" for window in windows}
         for key in chunks.intersection(_attributes(wip).get(_REWRITTEN, [])):
@@ -189,13 +193,14 @@ def missing(wip: Path, name: str, windows: Sequence[Window]) -> list[Window]:
 
     A damaged chunk is removed, with a notice.
     """
+    wip = ConfinedPath.of(wip)
     array = open_array(wip, name, "r")
     return [window for window in windows if not _is_whole(wip / name / _key(window, windows), array, window)]
 
 
-def _is_whole(path: Path, array: Any, window: Window) -> bool:
-    if not path.is_file():
-        remove(path)
+def _is_whole(path: ConfinedPath, array: Any, window: Window) -> bool:
+    if not path.is_file(follow_symlinks=False):
+        path.remove()
         return False
     try:
         array[window]
@@ -222,7 +227,7 @@ def skeleton_of(stage: "xr.Dataset", name: str, windows: Sequence[Window]) -> di
     return skeleton(stage, {name: _chunk(windows)})
 
 
-def _begin(wip: Path, files: Mapping[str, bytes]) -> None:
+def _begin(wip: ConfinedPath, files: Mapping[str, bytes]) -> None:
     """Write metadata and coordinates; that of the stage, by which it is known, last. Resuming checks all of it."""
     remove(wip)
     for name, content in files.items():
@@ -233,20 +238,20 @@ def _begin(wip: Path, files: Mapping[str, bytes]) -> None:
     write_beside(wip / "zarr.json", files["zarr.json"])
 
 
-def is_intact(wip: Path, files: Mapping[str, bytes]) -> bool:
+def is_intact(wip: ConfinedPath, files: Mapping[str, bytes]) -> bool:
     """Return whether metadata and coordinates of work in progress are as it was begun, but for what was measured."""
     paths = ((wip / name, content) for name, content in files.items() if name != "zarr.json")
-    return all(path.is_file() and path.read_bytes() == content for path, content in paths)
+    return all(path.is_file(follow_symlinks=False) and path.read_bytes() == content for path, content in paths)
 
 
-def _repair(wip: Path, files: Mapping[str, bytes], chunks: Collection[str]) -> None:
+def _repair(wip: ConfinedPath, files: Mapping[str, bytes], chunks: Collection[str]) -> None:
     """Bring metadata and coordinates of work in progress back to how it was begun; remove what does not belong."""
-    for path in [path for path in wip.rglob("*") if not path.is_dir()]:
+    for path in [path for path in wip.rglob("*") if not path.is_dir(follow_symlinks=False)]:
         if (name := path.relative_to(wip).as_posix()) not in files and name not in chunks:
             path.unlink()
     for name, content in files.items():
         path = wip / name
-        if not path.is_file() or path.read_bytes() != content:
+        if not path.is_file(follow_symlinks=False) or path.read_bytes() != content:
             if name != "zarr.json":  # of a finished stage it also says what was measured
                 _notice(path, ValueError("not as it was written"), "it is written again")
             remove(path)
@@ -288,7 +293,7 @@ def create(
     """
     from apertura.pipeline.store.chunks import skeleton
 
-    _begin(wip, skeleton(stage, chunks, packed=packed, consolidated=consolidated))
+    _begin(ConfinedPath.of(wip), skeleton(stage, chunks, packed=packed, consolidated=consolidated))
 
 
 def open_array(folder: Path, name: str, mode: str = "r+") -> Any:

@@ -38,12 +38,12 @@ def save_stage(
     lineage
         Its sources, settings and code, for `apertura.pipeline.store.manifest.write_manifest`.
     """
-    from apertura.pipeline.store.chunks import encoding_of
+    from apertura.pipeline.store.chunks import StageStore, encoding_of
 
     with writing(folder) as wip, naming(folder):
         remove(wip)
         encoding = encoding_of(dataset, chunks or {})
-        dataset.to_zarr(wip, mode="w", consolidated=False, zarr_format=3, encoding=encoding)
+        dataset.to_zarr(StageStore(wip), mode="w", consolidated=False, zarr_format=3, encoding=encoding)
         finish(wip, folder, lineage=lineage)
 
 

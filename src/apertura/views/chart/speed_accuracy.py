@@ -68,7 +68,7 @@ class Part:
     beams: Beams | None = None
 
 
-def speed_accuracy(campaign: Campaign, flight: str, pair: str, *, seconds: float = 60.0) -> list[Path]:
+def speed_accuracy(campaign: Campaign, flight: str, pair: str, *, seconds: float = 60.0) -> Sequence[Path]:
     """Write results/study/speed_accuracy.csv, .png and .html.
 
     Parameters

@@ -5,7 +5,6 @@ import io
 import json
 import os
 import platform
-import shutil
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,6 +15,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from apertura.common.atomic import remove
+from apertura.common.confined import ConfinedPath
 from apertura.common.errors import CampaignError
 from apertura.common.tables import write_table
 from apertura.core.quality.budget import is_counted
@@ -147,7 +148,7 @@ class _Run:
     reports: list[dict[str, Any]]
 
 
-def whole_chart(campaign: Campaign, *, repeats: int = 3) -> list[Path]:
+def whole_chart(campaign: Campaign, *, repeats: int = 3) -> Sequence[Path]:
     """Write results/study/whole.csv and .png: total error against seconds from raw samples to GeoTIFFs.
 
     Parameters
@@ -172,7 +173,7 @@ def whole_chart(campaign: Campaign, *, repeats: int = 3) -> list[Path]:
                 runs[name].append(_carried(choices[name]))
             except CampaignError:
                 refused.append(name)
-    shutil.rmtree(work)
+    remove(work)
     rows = [_whole(name, some) for name, some in runs.items() if name not in refused]
     paths = [campaign.result(STUDY) / f"whole.{suffix}" for suffix in ("csv", "png")]
     write_table(paths[0], rows, digits=6)
@@ -192,12 +193,14 @@ def _applies(campaign: Campaign, name: str) -> bool:
 def _chosen(campaign: Campaign, work: Path, changes: dict[str, Any]) -> Campaign:
     """Return the campaign with changed settings, in another folder."""
     processing = type(campaign.settings.processing)(**{**campaign.settings.processing.model_dump(), **changes})
-    return replace(campaign, root=work, settings=campaign.settings.model_copy(update={"processing": processing}))
+    return replace(
+        campaign, root=ConfinedPath.at(work), settings=campaign.settings.model_copy(update={"processing": processing})
+    )
 
 
 def _carried(campaign: Campaign) -> _Run:
     """Carry a campaign through every step, in the order of the workflow's rules."""
-    shutil.rmtree(campaign.results, ignore_errors=True)
+    campaign.results.remove()
     flight, begin = campaign.image_flights[0], (process_time(), perf_counter())
     with contextlib.redirect_stdout(io.StringIO()):
         for other in campaign.flights:

@@ -1,6 +1,6 @@
 """Rule `bench`: a radar that stands still, measured: bench.json, bench.html and bench.png; and `apertura bench`."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,7 @@ _COLOURS = (BLUE, ORANGE, GREEN, RED, SKY)
 _HEAD = ("of", "quantity", "measured", "limit", "verdict")
 
 
-def bench(campaign: Campaign, flight: str) -> list[Path]:
+def bench(campaign: Campaign, flight: str) -> Sequence[Path]:
     """Measure a flight of kind bench; write its report, page and picture, and return their paths."""
     lineage = result_of(campaign, "bench", flight).begin(campaign.root)
     measured = measure_bench(campaign, flight)

@@ -1,5 +1,6 @@
 """Rule `pictures`: what the report shows of a pair, drawn from its stages."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -48,7 +49,7 @@ from apertura.views.report.image_drawings import (
 from apertura.views.report.sheet import thinned
 
 
-def pictures(campaign: Campaign, flight: str, pair: str) -> list[Path]:
+def pictures(campaign: Campaign, flight: str, pair: str) -> Sequence[Path]:
     """Write the pictures of one pair; return their paths."""
     lineage = result_of(campaign, "pictures", flight, pair).begin(campaign.root)
     shown = Shown(campaign, flight, pair)

@@ -1,8 +1,10 @@
 """Rule `page`: what the report says of a flight, as the results section of a paper would: one file that prints."""
 
+import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from apertura.common.atomic import replacement, write_text
@@ -164,7 +166,9 @@ def open_report(campaign: Campaign) -> Iterator[tuple[Path, Path]]:
     Its sources are hashed when it is written: snakemake settles the times of files before.
     """
     path = campaign.result(PAGE)
-    with replacement(path) as temporary:
-        yield temporary, shipped() / "workflow" / "report" / "report.css"
+    with TemporaryDirectory() as folder, replacement(path) as temporary:
+        page = Path(folder) / path.name  # of another process
+        yield page, shipped() / "workflow" / "report" / "report.css"
+        shutil.copyfile(page, temporary)
         lineage = result_of(campaign, "report").begin(campaign.root)
     record_files(campaign.root / lineage.result.manifest, [path], lineage)

@@ -1,5 +1,6 @@
 """Rule `pictures_fused`: what the report shows of the sums of a flight's pairs."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ _DOTS = 480  # of the longer side of a panel
 _MOST_PANELS = 2  # pairs beside their sums
 
 
-def pictures_fused(campaign: Campaign, flight: str) -> list[Path]:
+def pictures_fused(campaign: Campaign, flight: str) -> Sequence[Path]:
     """Write the sums of a flight beside its pairs, and cuts through the brightest target; return their paths."""
     lineage = result_of(campaign, "pictures_fused", flight).begin(campaign.root)
     written = [campaign.result(flight, FUSED, f"{name}.png") for name in SUM_PICTURES]

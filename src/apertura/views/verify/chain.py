@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from apertura import __version__
+from apertura.common.confined import ConfinedPath
 from apertura.common.errors import CampaignError, number_of, shown
-from apertura.common.paths import inside
 from apertura.common.provenance import lock_sha256, sha256_file, software
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import CONFIG
@@ -100,7 +100,7 @@ class Links:
         """Return the sha256 of a file, relative to the campaign folder; empty: not there; words: why it is not read."""
         if name not in self._digests:
             try:
-                self._digests[name] = sha256_present(inside(self.root, name, where=self.root))
+                self._digests[name] = sha256_present(ConfinedPath.at(self.root).named(name, where=self.root))
             except CampaignError as error:
                 self._digests[name] = error.found
         return self._digests[name]
@@ -129,14 +129,18 @@ class Links:
         """Compare all files of a stage's folder, chunks among them, with their hashes; as `compare`."""
         link = self.of(name)
         try:
-            folder = inside(self.root, name, where=by)
+            folder = ConfinedPath.at(self.root).named(name, where=by)
         except CampaignError as error:
             link.add("changed", error.found)
             return
         if not folder.is_dir():
             link.add("missing", f"recorded by {by}")
             return
-        there = {path.relative_to(folder).as_posix(): path for path in folder.rglob("*") if not path.is_dir()}
+        there = {
+            path.relative_to(folder).as_posix(): path
+            for path in folder.rglob("*")
+            if not path.is_dir(follow_symlinks=False)
+        }
 
         def present(file: str) -> str:
             path = there.get(file)
@@ -327,7 +331,7 @@ class Chain:
         for source in sources:
             folder, _, stage = source.rpartition("/")
             if stage == "image.manifest.json":
-                spec = _spec(inside(self.root, f"{folder}/image.zarr/zarr.json", where=link.name))
+                spec = _spec(ConfinedPath.at(self.root).named(f"{folder}/image.zarr/zarr.json", where=link.name))
                 image = folder.removeprefix("results/")  # of several, each has its own under its name
                 told = stated, stated.get(image), stated.get(image.rpartition("/")[2])
                 if spec is not None and not any(_holds(one, spec) for one in told):

@@ -15,7 +15,7 @@ from apertura.common.raster import opened_raster
 from apertura.formats.export.writing import blocks_of
 from apertura.pipeline.store import open_stage
 from apertura.views.verify.chain import shortened
-from apertura.views.verify.products import EXPECTED, REMEDY, SECTIONS, picture, sections_of, unlinked
+from apertura.views.verify.products import EXPECTED, REMEDY, SECTIONS, as_product, picture, sections_of
 
 Pixels = NDArray[Any]
 
@@ -135,7 +135,8 @@ def differences(first: Path, second: Path) -> dict[str, list[str]]:
     CampaignError
         If one is not there or not readable, or they are of two kinds.
     """
-    for path in map(unlinked, (first, second)):
+    first, second = as_product(first), as_product(second)
+    for path in (first, second):
         if not path.exists():
             raise CampaignError("no such file or folder", path, EXPECTED, "Correct the path.")
     if first.is_dir() != second.is_dir() or first.suffix != second.suffix:

@@ -1,7 +1,6 @@
 """Which product a path means, and what it says of itself: tags of a GeoTIFF or PNG, a stage, a report."""
 
 import json
-import os
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
@@ -9,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from apertura.common.confined import ConfinedPath
 from apertura.common.contracts import STAGES
 from apertura.common.documents import read_json, undamaged
 from apertura.common.errors import CampaignError, shown
@@ -36,7 +36,7 @@ class Product:
         The file, stage or manifest itself, wherever it lies; None: the whole campaign.
     """
 
-    root: Path
+    root: ConfinedPath
     manifest: str = ""
     file: Path | None = None
 
@@ -57,11 +57,14 @@ def find_product(path: Path, campaign: Path | None = None) -> Product:
         If it is not there, or belongs to no campaign.
     """
     if path.is_dir() and ((path / CONFIG).is_file() or (path / "results").is_dir()):
-        return Product(path)
-    results = next((folder for folder in unlinked(path).parents if folder.name == "results"), None)
+        return Product(ConfinedPath.at(path))
+    path = as_product(path)
+    results = next((folder for folder in path.parents if folder.name == "results"), None)
     if campaign is not None and not path.is_relative_to(campaign / "results") and path.is_file():
-        return Product(campaign, _listing(campaign / "results", path, sha256=sha256_file(path)), path)
-    product = Product(results.parent, _manifest(results, path), path) if results is not None else Product(path.parent)
+        listed = _listing(campaign / "results", path, sha256=sha256_file(path))
+        return Product(ConfinedPath.at(campaign), listed, path)
+    found = "" if results is None else _manifest(results, path)
+    product = Product(ConfinedPath.at(path.parent if results is None else results.parent), found, path)
     known = (product.root / product.manifest).is_file()
     if not path.exists() and not known:
         remedy = "Correct the path." if results is None else "Correct the path, or run the workflow (`apertura run`)."
@@ -74,13 +77,10 @@ def find_product(path: Path, campaign: Path | None = None) -> Product:
     return product
 
 
-def unlinked(path: Path) -> Path:
-    """Return a path; raise CampaignError if it leads through a link of the campaign that it lies in."""
-    results = next((folder for folder in path.parents if folder.name == "results"), None)
-    for part in (path, *path.parents):
-        if results is not None and part.is_relative_to(results) and part.is_symlink():
-            raise CampaignError("a symbolic link", part, "what the workflow wrote", "Name what it leads to.")
-    return path
+def as_product(path: Path) -> Path:
+    """Return a path that a user typed, confined to the campaign in whose results it lies, if any."""
+    root = next((folder.parent for folder in path.parents if folder.name == "results"), None)
+    return path if root is None else ConfinedPath.at(root) / path.relative_to(root)
 
 
 def _manifest(results: Path, path: Path) -> str:
@@ -104,11 +104,11 @@ def _listing(results: Path, path: Path, *, sha256: str = "") -> str:
     return ""
 
 
-def manifests(results: Path) -> Iterator[Path]:
+def manifests(results: Path) -> Iterator[ConfinedPath]:
     """Yield every manifest below a folder of results, in order of their names; links are not followed."""
-    for folder, folders, files in os.walk(results):
-        folders[:] = sorted(name for name in folders if ".zarr" not in name)
-        yield from (Path(folder, name) for name in sorted(files) if name.endswith(SUFFIX))
+    for folder, _, files in ConfinedPath.at(results).walk():
+        if not any(".zarr" in part for part in folder.relative_to(results).parts):
+            yield from (folder / name for name in files if name.endswith(SUFFIX))
 
 
 TAGGED = (".tif", ".png")
@@ -157,7 +157,7 @@ def picture(path: Path) -> Any:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")  # a picture of more pixels than any of ours, before it is unpacked
-            with Image.open(path, formats=["PNG"]) as opened:
+            with path.open("rb") as stream, Image.open(stream, formats=["PNG"]) as opened:
                 opened.load()  # texts may follow the pixels
                 return opened
     except MemoryError:

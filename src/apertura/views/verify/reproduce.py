@@ -5,8 +5,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from apertura.common.confined import ConfinedPath
 from apertura.common.errors import CampaignError, number_of, shown
-from apertura.common.paths import inside
 from apertura.common.processes import holder
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.lineage import on_demand, results_of, with_inputs
@@ -113,7 +113,7 @@ def compared(root: Path, again: Path, manifest: str) -> list[str]:
     there = _files(root, manifest), _files(again, manifest)
     for name in [*sorted({*there[0], *there[1]}), manifest]:
         folder = "" if name == manifest else f"{manifest.rpartition('/')[0]}/"
-        pair = [inside(where, f"{folder}{name}", where=manifest) for where in (root, again)]
+        pair = [ConfinedPath.at(where).named(f"{folder}{name}", where=manifest) for where in (root, again)]
         if not all(path.is_file() for path in pair):
             lines.append(f"missing  {folder}{name}: {'there' if pair[0].is_file() else 'made again'} alone")
         elif (at := first_difference(*pair)) is not None:

@@ -8,7 +8,6 @@ too, which no other header of all these reaches.
 
 import os
 import re
-import stat
 import sys
 import time
 import webbrowser
@@ -19,11 +18,11 @@ from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from io import BytesIO
 from pathlib import Path
-from typing import BinaryIO
+from typing import IO
 
+from apertura.common.confined import ConfinedPath
 from apertura.common.documents import read_json, undamaged
 from apertura.common.errors import CampaignError
-from apertura.common.paths import inside
 from apertura.common.processes import Interrupted
 from apertura.common.provenance import sha256_file
 from apertura.formats.export import LOOK, MAP, product_files
@@ -232,7 +231,7 @@ class MapServer(ThreadingHTTPServer):
         sha256_of: Callable[[str], str],
         port: int = 0,
     ) -> None:
-        self.folder, self.files, self.sha256_of = folder, files, sha256_of
+        self.folder, self.files, self.sha256_of = ConfinedPath.at(folder), files, sha256_of
         self.pages = {
             WINDOW: {name: content for name, content in page.items() if name in SHELL},
             LOOPBACK: {f"map/{name}": content for name, content in page.items() if name in FILES},
@@ -320,24 +319,20 @@ class _Handler(BaseHTTPRequestHandler):
                 return
             self._send(file, name)
 
-    def _opened(self, name: str) -> BinaryIO | None:
+    def _opened(self, name: str) -> IO[bytes] | None:
         """Return a file of the list; None if it is not there, or is reached through a link, or is no file."""
         with suppress(OSError, CampaignError):
-            path = inside(self.server.folder, name, where="request")
-            file = os.fdopen(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC), "rb")
-            if stat.S_ISREG(os.fstat(file.fileno()).st_mode):
-                return file
-            file.close()
+            return self.server.folder.named(name, where="request").open("rb")
         return None
 
-    def _is(self, file: BinaryIO, name: str, sha256: str | None) -> bool:
+    def _is(self, file: IO[bytes], name: str, sha256: str | None) -> bool:
         """Return whether an open file has the hash; products are replaced as a whole, so it is asked of its path."""
         with suppress(OSError, CampaignError):
             same = self.server.sha256_of(name) == sha256
             return same and os.path.samestat(os.fstat(file.fileno()), (self.server.folder / name).stat())
         return False
 
-    def _send(self, file: BinaryIO, name: str) -> None:
+    def _send(self, file: IO[bytes], name: str) -> None:
         size = file.seek(0, os.SEEK_END)
         try:
             part = asked_bytes(self.headers.get("Range"), size)

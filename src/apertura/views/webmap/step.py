@@ -10,7 +10,6 @@ import numpy as np
 from apertura.common.atomic import write_json
 from apertura.common.documents import read_json, undamaged
 from apertura.common.errors import CampaignError
-from apertura.common.paths import inside
 from apertura.common.raster import opened_raster
 from apertura.core.geometry.geodesy import LOCAL, frame_from_map, geodetic_from_ecef
 from apertura.core.scene.grid import SceneGrid
@@ -141,7 +140,7 @@ def stated_places(campaign: Campaign) -> list[Place]:
 
 def true_places(campaign: Campaign, crs: str, notes: list[str]) -> list[Place]:
     """Return the targets of a simulation, numbered as `apertura score` does; what cannot be read becomes a note."""
-    path = inside(campaign.root, "truth.json", where=campaign.root)
+    path = campaign.root.named("truth.json", where=campaign.root)
     if not path.is_file():
         return []
     try:

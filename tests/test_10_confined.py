@@ -1,0 +1,306 @@
+"""Paths of a campaign folder: what they read, write and delete lies below it, whatever links are there."""
+
+import ast
+import os
+import pickle
+import socket
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+from folders import copy_writable
+
+from apertura.common.atomic import remove, replacement, write_beside, write_json, write_text
+from apertura.common.confined import LARGEST_READ, ConfinedPath, on_disk
+from apertura.common.errors import CampaignError
+from apertura.common.processes import hold
+
+SOURCES = Path(__file__).parents[1] / "src" / "apertura"
+
+
+@pytest.fixture
+def root(tmp_path):
+    (tmp_path / "campaign" / "results" / "f01").mkdir(parents=True)
+    return ConfinedPath.at(tmp_path / "campaign")
+
+
+@pytest.fixture
+def outside(tmp_path):
+    """A folder of the user beside the campaign."""
+    (tmp_path / "outside" / "deep").mkdir(parents=True)
+    for name in ("a.json", "deep/b.log"):
+        (tmp_path / "outside" / name).write_text("kept")
+    return tmp_path / "outside"
+
+
+def state_of(folder):
+    """Return everything below a folder that a change would show in."""
+    return {
+        path.relative_to(folder).as_posix(): (
+            path.lstat()[:4],
+            path.lstat().st_mtime_ns,
+            path.is_file() and path.read_bytes(),
+        )
+        for path in (folder, *folder.rglob("*"))
+    }
+
+
+WAYS = {
+    "read": lambda path: path.read_bytes(),
+    "open": lambda path: path.open("rb").close(),
+    "write": lambda path: path.write_text("x"),
+    "append": lambda path: path.open("a").close(),
+    "stat": lambda path: path.stat(),
+    "is_file": lambda path: path.is_file(),
+    "exists": lambda path: path.exists(),
+    "mkdir": lambda path: (path / "new").mkdir(parents=True),
+    "list": lambda path: list(path.iterdir()),
+    "walk": lambda path: list(path.walk()),
+    "on_disk": lambda path: on_disk(path).__enter__(),
+    "json": lambda path: write_json(path / "x.json", {}),
+    "beside": lambda path: write_beside(path / "x", b""),
+    "remove below": lambda path: (path / "a.json").unlink(),
+    "remove all below": lambda path: remove(path / "deep"),
+    "rename from": lambda path: (path / "a.json").rename(path.parent / "stolen"),
+}
+
+
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("place", ["results/f01/link", "results/link/f01", "results"])
+def test_nothing_is_read_written_or_deleted_through_a_link(root, outside, way, place):
+    linked = Path(root) / (place.removesuffix("/f01") if place.startswith("results/link") else place)
+    if linked.is_dir():
+        (linked / "f01").rmdir()
+        linked.rmdir()
+    linked.symlink_to(outside)
+    before = state_of(outside)
+    with pytest.raises(CampaignError, match="symbolic link"):
+        WAYS[way](root / place)
+    assert state_of(outside) == before
+
+
+def test_of_a_link_that_is_removed_or_replaced_the_target_stays(root, outside):
+    before, link = state_of(outside), root / "results" / "link"
+    for change in (link.unlink, lambda: remove(link), lambda: write_text(link, "new")):
+        Path(link).unlink(missing_ok=True)
+        Path(link).symlink_to(outside / "a.json")
+        change()
+        assert not link.is_symlink()
+    assert link.read_text() == "new"
+    Path(root / "results" / "f01" / "link").symlink_to(outside)
+    remove(root / "results" / "f01")
+    assert not (root / "results" / "f01").exists()
+    assert state_of(outside) == before
+
+
+@pytest.mark.parametrize("work", [".note.json.wip", ".note.json.wip/.lock"])
+def test_a_work_folder_or_lock_that_is_a_link_is_refused_and_not_cleared(root, outside, work):
+    path = Path(root) / "results" / work
+    path.parent.mkdir(exist_ok=True)
+    path.symlink_to(outside if work.endswith("wip") else outside / "a.json")
+    before = state_of(outside)
+    with pytest.raises(CampaignError, match="a symbolic link"):
+        write_json(root / "results" / "note.json", {})
+    assert state_of(outside) == before
+
+
+def test_of_a_work_folder_that_holds_links_the_links_alone_are_cleared(root, outside):
+    work = Path(root) / "results" / ".note.json.wip"
+    work.mkdir()
+    (work / "of a killed writer").symlink_to(outside)
+    before = state_of(outside)
+    write_json(root / "results" / "note.json", {"a": 1})
+    assert (root / "results" / "note.json").read_text() == '{\n "a": 1\n}\n'
+    assert not work.exists()
+    assert state_of(outside) == before
+
+
+def test_a_folder_replaced_by_a_link_while_it_is_written_changes_nothing_outside(root, outside):
+    """The body writes by the descriptor of the folder that was made, wherever its name now leads."""
+    folder, before = Path(root) / "results" / "f01", state_of(outside)
+
+    def written():
+        with replacement(root / "results" / "f01" / "a.npy") as temporary:
+            folder.rename(folder.with_name("moved"))
+            folder.symlink_to(outside)
+            np.save(temporary, np.zeros(3))
+
+    with pytest.raises(CampaignError, match="symbolic link"):
+        written()
+    assert state_of(outside) == before
+
+
+@pytest.mark.parametrize("kind", ["named pipe", "socket", "device", "folder"])
+@pytest.mark.parametrize("mode", ["rb", "a", "w"])
+def test_what_is_no_plain_file_is_refused_at_once(root, kind, mode):
+    path = Path(root) / "results" / "x"
+    if kind == "named pipe":
+        os.mkfifo(path)
+    elif kind == "socket":
+        with socket.socket(socket.AF_UNIX) as made:
+            made.bind(str(path))
+    elif kind == "device":
+        path.symlink_to("/dev/zero")
+        kind = "symbolic link"
+    else:
+        path.mkdir()
+        kind = "Is a directory"
+    done = []
+
+    def opened():
+        with pytest.raises((CampaignError, IsADirectoryError), match=kind):
+            (root / "results" / "x").open(mode)
+        done.append(True)
+
+    thread = threading.Thread(target=opened, daemon=True)
+    thread.start()
+    thread.join(5)
+    assert done
+
+
+def test_a_hard_link_to_a_file_outside_is_read_but_not_written(root, outside):
+    path = Path(root) / "results" / ".run.lock"
+    path.hardlink_to(outside / "a.json")
+    assert (root / "results" / ".run.lock").read_text() == "kept"
+    with pytest.raises(CampaignError, match=r"2 names \(hard links\)"):
+        hold(root)
+    assert (outside / "a.json").read_text() == "kept"
+
+
+def test_a_sparse_file_of_any_size_is_refused_before_it_is_read(root):
+    with (root / "results" / "x").open("wb") as stream:
+        stream.truncate(1 << 40)
+    with pytest.raises(CampaignError, match=f"1099511627776 bytes; expected a file of at most {LARGEST_READ}"):
+        (root / "results" / "x").read_bytes()
+
+
+@pytest.mark.parametrize("name", ["../outside/a.json", "results/../../outside/a.json", "/etc/hostname"])
+def test_a_path_that_leads_out_of_the_folder_is_refused(root, outside, name):
+    with pytest.raises(CampaignError, match="leads out of the campaign folder"):
+        (root / name).read_text()
+
+
+def test_a_library_gets_a_name_that_leads_to_the_file_that_was_checked(root, outside):
+    (root / "results" / "x.npy").write_bytes(b"")
+    with pytest.raises(TypeError, match="use on_disk"):
+        np.load(root / "results" / "x.npy")
+    with on_disk(root / "results" / "x.npy") as name:
+        Path(root / "results" / "x.npy").unlink()
+        Path(root / "results" / "x.npy").symlink_to(outside / "a.json")
+        assert name.read_bytes() == b""
+
+
+def test_paths_derived_from_a_confined_one_are_confined_and_the_folder_may_be_a_link(root, tmp_path):
+    (tmp_path / "link").symlink_to(Path(root))
+    linked = ConfinedPath.at(tmp_path / "link")
+    path = linked / "results" / "f01"
+    derived = [
+        path,
+        path.parent,
+        path.parents[0],
+        path.with_name("f01"),
+        path.with_suffix(""),
+        linked.joinpath("results", "f01"),
+        next(linked.glob("results")),
+        next(linked.rglob("f01")),
+        pickle.loads(pickle.dumps(path)),
+        ConfinedPath.referenced(path.reference()),
+    ]
+    assert all(one.is_dir() and isinstance(one, ConfinedPath) for one in derived)
+    assert not isinstance(path.relative_to(linked), ConfinedPath)
+
+
+def test_a_folder_that_lies_elsewhere_takes_the_place_of_its_name(root, outside):
+    moved = root.with_elsewhere({"raw": outside})
+    assert (moved / "raw" / "a.json").read_text() == "kept"
+    assert str((moved / "raw" / "a.json").location) == str(outside / "a.json")
+    (outside / "deep" / "link").symlink_to(outside / "a.json")
+    with pytest.raises(CampaignError, match="a symbolic link"):
+        (moved / "raw" / "deep" / "link").read_text()
+
+
+# ---- No other door -------------------------------------------------------------------------------------------------
+
+_DOORS = {"common/confined.py", "common/atomic.py"}
+_CHANGES_BY_NAME = {
+    "os": {
+        *("open", "mkdir", "makedirs", "remove", "unlink", "rmdir", "removedirs", "rename", "renames", "replace"),
+        *("truncate", "utime", "chmod", "chown", "link", "symlink", "mkfifo", "mknod"),
+    },
+    "shutil": {"rmtree", "move", "copy", "copy2", "copyfile", "copytree", "copymode", "copystat"},
+}
+_ELSEWHERE = {
+    ("common/processes.py", "os.open"): "folders that Landlock is told of, opened without following by their names",
+    ("views/cli.py", "os.open"): "/dev/null",
+    ("views/report/step.py", "shutil.copyfile"): "from a temporary folder into a replacement",
+    ("pipeline/design/rehearsal.py", "shutil.copyfile"): "into a campaign folder that was just made",
+    ("pipeline/opening/writing.py", "shutil.copyfile"): "into a replacement of the whole campaign folder",
+}
+
+
+def test_no_other_code_of_the_product_changes_files_by_their_names():
+    found = set()
+    for path in SOURCES.rglob("*.py"):
+        file = path.relative_to(SOURCES).as_posix()
+        for call in (node for node in ast.walk(ast.parse(path.read_text("utf-8"))) if isinstance(node, ast.Call)):
+            of, name = getattr(getattr(call.func, "value", None), "id", ""), getattr(call.func, "attr", "")
+            if name in _CHANGES_BY_NAME.get(of, ()):
+                found.add((file, f"{of}.{name}"))
+            if getattr(call.func, "id", "") == "open":
+                found.add((file, "open"))
+    assert {one for one in found if one[0] not in _DOORS} == set(_ELSEWHERE)
+
+
+_WATCH = """
+import sys
+changed, root = [], sys.argv.pop(1)
+NAMES = {"os.remove", "os.rmdir", "os.mkdir", "os.rename", "os.truncate", "os.utime", "os.chmod", "os.link",
+         "os.symlink", "shutil.rmtree", "shutil.move", "shutil.copyfile"}
+def watch(event, arguments):
+    if event == "open":
+        name, mode, flags = arguments
+        writes = isinstance(flags, int) and flags & 0o1103
+    elif event in NAMES:
+        name, writes = arguments[-1] if event == "os.rename" else arguments[0], True
+    else:
+        return
+    if writes and isinstance(name, (str, bytes)) and str(name).startswith(root):
+        changed.append((event, str(name)))
+sys.addaudithook(watch)
+from apertura.__main__ import main
+try:
+    main()
+finally:
+    for event, name in changed:
+        print("BY NAME", event, name, file=sys.stderr)
+"""
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("list",),
+        ("check", "--products"),
+        ("step", "ingest", "f01", "uav1", "--campaign"),
+        ("step", "image", "f01", "uav1-uav2", "--campaign"),
+        ("step", "export", "f01", "uav1-uav2", "--campaign"),
+        ("step", "stac", "--campaign"),
+        ("look",),
+        ("clean", "--yes"),
+    ],
+    ids=lambda words: " ".join(words[:2]),
+)
+def test_a_command_opens_no_file_of_a_campaign_for_writing_by_its_whole_name(finished_tiny, tmp_path, words):
+    """Python reports every file that is opened or deleted to audit hooks, by the name that was given."""
+    root = copy_writable(finished_tiny.root, tmp_path / "campaign")
+    done = subprocess.run(
+        [sys.executable, "-c", _WATCH, str(root), *words, str(root)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert "BY NAME" not in done.stderr
+    assert done.returncode == 0, done.stderr
