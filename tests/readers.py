@@ -48,7 +48,7 @@ def ask_qgis(**asked: Any) -> dict[str, Any]:
 
 def by_rasterio(path: Path) -> dict[str, Any]:
     """Return CRS (WKT), transform, shape and no-data value."""
-    with rasterio.open(path) as raster:
+    with rasterio.open(str(path)) as raster:
         return {
             "wkt": raster.crs.to_wkt(),
             "transform": raster.transform[:6],

@@ -209,8 +209,8 @@ def confine_changes(root: Path) -> bool:
             folder.mkdir(exist_ok=True)
             folders.append(stack.enter_context(folder.on_disk()))
         os.environ[TEMPORARY[0]] = tempfile.tempdir = str(folder.absolute())
-        for folder in filter(Path.is_dir, folders):
-            opened = os.open(folder, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)
+        for writable in filter(Path.is_dir, folders):
+            opened = os.open(writable, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)
             libc.syscall(_ADD_RULE, ruleset, _PATH_BENEATH, struct.pack("=Qi", rights, opened), 0)
             os.close(opened)
     libc.prctl(_PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0)

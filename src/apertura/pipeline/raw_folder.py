@@ -131,6 +131,6 @@ def _is_log(path: Path, node: str) -> bool:
 
 
 def _files(path: ConfinedPath) -> list[ConfinedPath]:
-    """Return a file itself, or those of a folder, including links, which are rejected later."""
+    """Return a file itself, or those of a folder; raise CampaignError at a link."""
     inside_it = list(path.rglob("*")) if path.is_dir() else [path]
-    return [file for file in inside_it if not file.is_dir(follow_symlinks=False)]
+    return [file for file in inside_it if not file.is_dir()]

@@ -538,8 +538,8 @@ def init(
     from apertura.common.atomic import made_folder, write_text
     from apertura.pipeline.config.template import config_template, flights_template
 
-    folder = made_folder(given(directory)) / "config"
     texts = {"config.yaml": config_template(kind), "flights.tsv": flights_template(kind)}
+    folder = made_folder(given(directory)) / "config"
     for path, text in ((folder / name, text) for name, text in texts.items()):
         if path.exists():
             raise CampaignError("exists already", path, "a new folder", "Choose another folder; nothing was changed.")

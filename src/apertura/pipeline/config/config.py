@@ -24,7 +24,6 @@ class Settings(Section):
     raw_root: RawRoot | None = Field(
         None,
         description="absolute path of a folder that is read in place of raw/, as on another disk; null: raw/ itself",
-        examples=["/data/recordings/my_campaign"],
     )
     nodes: dict[Name, Node] = Field(min_length=1, description="one section per UAV, named as in flights.tsv")
     scene: Scene = Field(default_factory=Scene, description="the grid of every raster of the campaign")

@@ -116,7 +116,12 @@ def _choices(field: FieldInfo) -> str:
     listed = [word for word in words if word not in (field.description or "")]
     if listed and len(words) > 1:
         return f" ({' | '.join(words)})"
-    limits = [limit for kind in kinds for about in getattr(kind, "__metadata__", ()) for limit in about.metadata]
+    limits = [
+        limit
+        for kind in kinds
+        for about in getattr(kind, "__metadata__", ())
+        for limit in getattr(about, "metadata", ())
+    ]
     ends = [getattr(limit, end) for end in ("gt", "ge", "lt", "le") for limit in limits if hasattr(limit, end)]
     above = any(hasattr(limit, "gt") for limit in limits)
     return f" ({'above ' if above else ''}{ends[0]:g} to {ends[1]:g})" if len(ends) == 2 else ""

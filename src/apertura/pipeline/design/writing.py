@@ -125,7 +125,7 @@ def _covered(design: Design) -> Iterator[Covered]:
         yield Covered(pair.flight, pair.name, tracks, looks, imaged)
 
 
-def write_campaign_config(plan: FlightPlan, directory: Path) -> list[Path]:
+def write_campaign_config(plan: FlightPlan, directory: Path) -> Sequence[Path]:
     """Write the config of the campaign that a plan becomes, ready for its recordings.
 
     Raises
