@@ -1,18 +1,25 @@
 """Nothing leaves the campaign folder: neither by a name, nor through a link, nor by what a name does elsewhere."""
 
+import json
 import shutil
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import yaml
 from folders import copy_writable, require_files
 
 from apertura.common.errors import CampaignError
+from apertura.common.provenance import sha256_file
 from apertura.core.geometry.geodesy import local_crs
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.check import problems
 from apertura.pipeline.check.files import check_links
 from apertura.pipeline.config.config import validated
 from apertura.pipeline.examination.campaign import Examination
+from apertura.pipeline.headers import Headers
+from apertura.pipeline.lineage import results_of
 from apertura.pipeline.steps import ingest
 
 
@@ -118,3 +125,62 @@ def test_what_lies_outside_the_folder_is_not_opened_by_a_check(tiny):
     path.write_text(yaml.safe_dump(document))
     (line,) = map(str, problems(tiny))
     assert "waveform.codes: path '../codes.npy' leads out of the campaign folder" in line
+
+
+# Recordings that are kept elsewhere
+
+
+@pytest.fixture
+def elsewhere(tiny, tmp_path):
+    """The folder of the recordings of `tiny`, outside of it, as its config states."""
+    shutil.move(tiny / "raw", tmp_path / "archive")
+    edit(tiny, "raw_root", str(tmp_path / "archive"), load=False)
+    return tmp_path / "archive"
+
+
+def test_recordings_are_read_where_raw_root_says_and_keep_their_names(tiny, elsewhere):
+    assert problems(tiny, without=["disk", "memory"]) == []
+    campaign = Campaign.load(tiny)
+    ingest.ingest(campaign, "f01", "uav1")
+    recorded = json.loads((tiny / "results/f01/uav1/raw.manifest.json").read_text())["sources"]
+    assert recorded["raw/f01/uav1.sigmf-data"] == sha256_file(elsewhere / "f01/uav1.sigmf-data")
+    assert not (tiny / "raw").exists()
+    wildcards = SimpleNamespace(flight="f01", node="uav1")
+    listed = Headers(replace(campaign, root=Path()))["ingest"].sources(wildcards)
+    assert str(elsewhere / "f01/uav1.sigmf-data") in listed  # as Snakemake looks for it
+
+
+def test_where_recordings_lie_changes_no_result(tiny, tmp_path):
+    before = [result.settings_sha256 for _, result in results_of(Campaign.load(tiny))]
+    shutil.move(tiny / "raw", tmp_path / "archive")
+    moved = edit(tiny, "raw_root", str(tmp_path / "archive"))
+    assert [result.settings_sha256 for _, result in results_of(moved)] == before
+
+
+def test_a_missing_file_of_raw_root_is_named_where_it_should_be(tiny, elsewhere):
+    (elsewhere / "f01/uav2.sigmf-data").unlink()
+    found = [str(one) for one in problems(tiny, without=["disk", "memory"])]
+    assert [line for line in found if line.startswith(f"{elsewhere}/f01/uav2.sigmf-data: no such file")]
+
+
+def test_a_link_in_raw_root_is_refused_and_its_own_path_may_be_one(tiny, elsewhere, tmp_path):
+    (tmp_path / "link").symlink_to(elsewhere)
+    edit(tiny, "raw_root", str(tmp_path / "link"), load=False)
+    assert problems(tiny, without=["disk", "memory"]) == []
+    shutil.move(elsewhere / "codes.npy", tmp_path / "codes.npy")
+    (elsewhere / "codes.npy").symlink_to(tmp_path / "codes.npy")
+    assert any("codes.npy: a symbolic link" in str(one) for one in problems(tiny, without=["disk", "memory"]))
+
+
+@pytest.mark.parametrize(
+    ("stated", "found"), [("/nowhere", "no folder"), ("raw", "only the absolute path"), ("/a/../b", "without")]
+)
+def test_a_raw_root_that_is_no_folder_is_one_message(tiny, stated, found):
+    edit(tiny, "raw_root", stated, load=False)
+    assert any(found in str(one) and "raw_root" in str(one) for one in problems(tiny))
+
+
+def test_recordings_in_two_places_are_refused(tiny, tmp_path):
+    shutil.copytree(tiny / "raw", tmp_path / "archive")
+    edit(tiny, "raw_root", str(tmp_path / "archive"), load=False)
+    assert any("raw/ holds files" in str(one) for one in problems(tiny))

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import os
 import platform
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -15,6 +16,7 @@ from typing import Any, Protocol
 
 from apertura import __version__
 from apertura.common.code_imports import PACKAGE, built_from, import_closure, source_of, without_description
+from apertura.common.errors import CampaignError
 from apertura.common.paths import shipped
 
 # ---- Versions of the software and its lock file ---------------------------------------------------------------------
@@ -191,8 +193,15 @@ def sha256_text(text: str) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
+LARGEST_DOCUMENT = 1_000_000_000
+"""Bytes that a JSON document may have, to be hashed; an RO-Crate names every chunk, in about 300 bytes."""
+
+LARGEST_RESULT = 1 << 36
+"""Bytes that a file of the results may have, to be hashed: the largest stages are some GB, in chunks of some MB."""
+
+
 def sha256_file(path: Path) -> str:
-    """Return the sha256 of a file's bytes, hex.
+    """Return the sha256 of a file's bytes, hex; raise CampaignError where there are more than `LARGEST_RESULT`.
 
     Examples
     --------
@@ -200,7 +209,16 @@ def sha256_file(path: Path) -> str:
     64
     """
     with path.open("rb") as stream:
+        check_size(path, os.fstat(stream.fileno()).st_size)
         return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def check_size(path: Path, size: int) -> None:
+    """Raise CampaignError where a file of the results is larger than any of them: it may be sparse, and endless."""
+    largest = LARGEST_DOCUMENT if path.suffix == ".json" else LARGEST_RESULT
+    if size > largest:
+        expected = f"a file of the results, of at most {largest} bytes"
+        raise CampaignError(f"{size} bytes", path, expected, "Remove it and run the workflow again.")
 
 
 def hashes_of_file(path: Path, algorithms: Sequence[str]) -> dict[str, str]:

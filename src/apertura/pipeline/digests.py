@@ -16,7 +16,7 @@ from typing import Any, Literal
 from apertura.common.atomic import write_json
 from apertura.common.confined import ConfinedPath
 from apertura.common.errors import CampaignError
-from apertura.common.provenance import canonical_json, code_sha256, hashes_of_file, sha256_text
+from apertura.common.provenance import canonical_json, check_size, code_sha256, hashes_of_file, sha256_text
 
 _KEPT = Path("results/.hashes")
 _SMALL = 1 << 16  # bytes; hashed faster than its state is looked up
@@ -48,6 +48,8 @@ def digest_of(
     root = ConfinedPath.at(root)
     path = root.named(name, where=root)
     state = _state(path)
+    if name.startswith("results/"):
+        check_size(path, state["size"])
     algorithms = list(dict.fromkeys(["sha256", algorithm]))
     if state["size"] < _SMALL:
         return hashes_of_file(path, algorithms)[algorithm]

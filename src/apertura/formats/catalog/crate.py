@@ -11,7 +11,7 @@ from rocrate.rocrate import ROCrate
 
 from apertura.common.confined import ConfinedPath
 from apertura.common.documents import DAMAGED, read_json, undamaged
-from apertura.common.provenance import canonical_json, sha256_text
+from apertura.common.provenance import LARGEST_DOCUMENT, canonical_json, sha256_text
 from apertura.formats.catalog import CRATE
 from apertura.formats.catalog.stac import media_type
 
@@ -349,9 +349,6 @@ def _unique(entities: Iterable[dict[str, Any]]) -> Iterator[dict[str, Any]]:
 
 # ---- The files that a crate names, with the hashes that it states of them ------------------------------------------
 
-LARGEST_CRATE = 1_000_000_000
-"""Bytes; a file takes about 300, so three million files."""
-
 _EXPECTED = "an RO-Crate as the workflow writes it"
 
 
@@ -394,7 +391,7 @@ def recorded_files(root: Path, *, inputs: bool = True) -> dict[str, CrateFile]:
     apertura.common.errors.CampaignError: nowhere/ro-crate-metadata.json: no such file; expected an RO-Crate ...
     """
     crate = ConfinedPath.at(root).named(CRATE, where=root)
-    document = read_json(crate, expected=_EXPECTED, remedy="Run the workflow first.", largest=LARGEST_CRATE)
+    document = read_json(crate, expected=_EXPECTED, remedy="Run the workflow first.", largest=LARGEST_DOCUMENT)
     with undamaged(crate, expected=_EXPECTED, remedy=DAMAGED):
         files = [_recorded(entity, root, crate) for entity in document["@graph"] if "sha256" in entity]
     return {name: file for name, file, outside in files if inputs or not outside}
