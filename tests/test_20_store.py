@@ -381,3 +381,13 @@ def test_a_chunk_damaged_after_its_stage_was_opened_is_one_message_with_the_mani
     with pytest.raises(CampaignError, match=r"image/c/1/1: damaged.*Delete .*image\.manifest\.json and run") as caught:
         opened.image.load()
     assert str(caught.value).count(str(tmp_path)) == 2
+
+
+def test_a_chunk_that_is_gone_after_its_stage_was_opened_is_no_empty_one(tmp_path):
+    """zarr fills a chunk that is not there with the fill value, as of pixels that were never formed: NaN."""
+    finished_image(tmp_path / "image.zarr")
+    opened = open_stage(tmp_path / "image.zarr", "image")
+    (tmp_path / "image.zarr" / "image" / "c" / "1" / "1").unlink()
+    assert opened.image[0, 0].item() == 1
+    with pytest.raises(CampaignError, match=r"image/c/1/1: damaged.*Delete .*image\.manifest\.json and run"):
+        opened.image.load()

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from folders import complaint, edit_meta
 
+from apertura.formats.recordings.sigmf import open_sigmf
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import read_segments
 from apertura.pipeline.opening.transmitted import read_codes, read_framing
@@ -162,6 +163,8 @@ def described(meta, **changes):
         ("capture", {"core:datetime": "99999-01-01T00:00:00Z"}, "is no time"),
         ("capture", {"core:datetime": "2300-01-01T00:00:00Z"}, "is not between 1980 and 2199"),
         ("capture", {"core:datetime": "1600-01-01T00:00:00Z"}, "is not between 1980 and 2199"),
+        ("global", {"core:offset": 1}, "capture 0: core:sample_start 0; expected no sample before core:offset 1"),
+        ("global", {"core:extensions": [{"name": "packed", "version": "1", "optional": False}]}, "requires 'packed'"),
         ("capture", {"core:datetime": "nowZ"}, "is no time"),
         ("capture", {"core:datetime": "NaTZ"}, "is no time"),
         ("capture", {"core:datetime": "2025-02-30T00:00:00Z"}, "core:datetime: "),
@@ -173,6 +176,23 @@ def test_metadata_that_no_recorder_writes_are_refused_by_key(tiny, place, change
     assert "uav1.sigmf-meta: " in message
     assert expected in message
     assert len(message) < 600
+
+
+def test_the_samples_of_a_recording_that_was_split_count_from_its_offset(tiny):
+    """SigMF: core:offset is the index of the file's first sample, and core:sample_start counts as it does."""
+
+    def split(meta):
+        meta["global"] |= {"core:offset": 1000, "core:extensions": [{"name": "antenna", "optional": False}]}
+        for capture in meta["captures"]:
+            capture["core:sample_start"] += 1000
+
+    files = [tiny / "raw" / "f01" / f"uav1.sigmf-{kind}" for kind in ("meta", "data")]
+    whole = open_sigmf(*files)
+    edit_meta(tiny, "uav1", split)
+    part = open_sigmf(*files)
+    np.testing.assert_array_equal(part.captures.start, whole.captures.start)
+    start = part.captures.start[1:2]
+    np.testing.assert_array_equal(part.samples.captures(start, 8), whole.samples.captures(start, 8))
 
 
 @pytest.mark.parametrize("name", ["/etc/passwd", "../preamble.npy", "raw/../../x.npy", "link.npy"])

@@ -63,6 +63,17 @@ class SigmfFraming(BaseModel):
     guard_samples: Count
 
 
+class Extension(BaseModel):
+    """An extension of SigMF that metadata use."""
+
+    name: Annotated[str, Field(max_length=200)]
+    optional: bool = True
+
+
+DESCRIPTIVE = frozenset({"antenna", "apertura", "capture_details", "signal", "spatial", "traceability", "volatile"})
+"""Extensions that describe a recording and change no sample or time; one that is required and unknown is refused."""
+
+
 class Global(BaseModel):
     """The global object."""
 
@@ -76,6 +87,8 @@ class Global(BaseModel):
     if_hz: Frequency | None = Field(None, alias="apertura:if_hz")
     dataset: FileName | None = Field(None, alias="core:dataset")
     trailing_bytes: Count = Field(0, alias="core:trailing_bytes")
+    offset: Count = Field(0, alias="core:offset")
+    extensions: list[Extension] = Field(default_factory=list, alias="core:extensions", max_length=100)
 
 
 class Capture(BaseModel):
@@ -121,7 +134,7 @@ def read_meta(path: Path) -> tuple[Global, StatedCaptures]:
     """
     with _opened(path) as stream:
         header = _read_global(stream, path)
-        captures = _read_captures(ijson.items(_from_start(stream), "captures.item", use_float=True), path)
+        captures = _read_captures(ijson.items(_from_start(stream), "captures.item", use_float=True), path, header)
         deque(ijson.basic_parse(_from_start(stream)), maxlen=0)  # what follows is JSON, too
     return header, captures
 
@@ -149,7 +162,21 @@ def _opened(path: Path) -> Iterator[BinaryIO]:
 
 def _read_global(stream: BinaryIO, path: Path) -> Global:
     document = next(ijson.items(_from_start(stream), "global", use_float=True), None)
-    return of_sigmf(TypeAdapter(Global), document, path, "global")
+    return _global(document, path)
+
+
+def _global(document: object, path: Path) -> Global:
+    """Return the global object checked; raise CampaignError where it requires an extension that is not known here."""
+    header = of_sigmf(TypeAdapter(Global), document, path, "global")
+    required = [one.name for one in header.extensions if not one.optional and one.name not in DESCRIPTIVE]
+    if required:
+        raise CampaignError(
+            f"core:extensions requires {quoted(required[0])}",
+            path,
+            f"no extension beyond {', '.join(sorted(DESCRIPTIVE))}: it may change how samples are read",
+            "Convert the recording to plain SigMF; where the extension only describes, set its `optional` to true.",
+        )
+    return header
 
 
 def _from_start(stream: BinaryIO) -> BinaryIO:
@@ -159,7 +186,8 @@ def _from_start(stream: BinaryIO) -> BinaryIO:
     return stream
 
 
-def _read_captures(documents: Iterator[object], path: Path) -> StatedCaptures:
+def _read_captures(documents: Iterator[object], path: Path, whole: Global) -> StatedCaptures:
+    """Return the captures; their first samples count from the begin of the file (core:offset is taken off)."""
     parts: list[StatedCaptures] = []
     while some := list(islice(documents, _AT_ONCE)):
         captures = of_sigmf(_SOME_CAPTURES, some, path, "captures", first=_AT_ONCE * len(parts))
@@ -174,6 +202,15 @@ def _read_captures(documents: Iterator[object], path: Path) -> StatedCaptures:
             np.array([getattr(capture, name) for capture in captures], np.int64)
             for name in ("start", "header_bytes", "frame")
         )
+        before = np.flatnonzero(start < whole.offset)
+        if before.size:
+            raise CampaignError(
+                f"capture {_AT_ONCE * len(parts) + before[0]}: core:sample_start {start[before[0]]}",
+                path,
+                f"no sample before core:offset {whole.offset}, the index of the file's first",
+                "The recording was split: correct core:sample_start, or leave core:offset out where they count from 0.",
+            )
+        start -= whole.offset
         parts.append(StatedCaptures(start, time, np.array(stated), header, frame))
     if not parts:
         raise CampaignError("not valid SigMF: captures: none", path, _EXPECTED, _REMEDY)
@@ -528,7 +565,7 @@ class GrowingSigmf:
         if self._header is None:
             return
         if documents:
-            read = _read_captures(iter(documents), path)
+            read = _read_captures(iter(documents), path, self._header)
             self._captures = read if self._captures is None else self._captures.followed_by(read)
         behind = appended[: mark + len(text[:at].encode())]
         self._read_to, self._known = self._read_to + len(behind), (self._known + behind)[-_KNOWN_BYTES:]
@@ -554,7 +591,7 @@ class GrowingSigmf:
                 "global first, in a recording that grows",
                 "Look at it when it has ended.",
             )
-        self._header = of_sigmf(TypeAdapter(Global), header, path, "global")
+        self._header = _global(header, path)
         return at + 1  # behind the bracket
 
 

@@ -55,7 +55,7 @@ class StageStore(LocalStore):
 
     def __init__(self, folder: Path, *, read_only: bool = False, sha256: Mapping[str, str] | None = None) -> None:
         super().__init__(ConfinedPath.of(folder), read_only=read_only)
-        self._unchecked = dict(sha256 or {})
+        self._unchecked = {key: digest for key, digest in (sha256 or {}).items() if _METADATA not in key}
 
     async def get(
         self, key: str, prototype: BufferPrototype | None = None, byte_range: ByteRequest | None = None
@@ -97,6 +97,8 @@ class StageStore(LocalStore):
         if name.startswith(".z"):  # of version 2, which is not ours, and whose filters may be a pickle
             return None
         if name == _METADATA and value is not None and other_codec(_json(value)) is not None:
+            raise damaged(self.root, key)
+        if value is None and key in self._unchecked:  # zarr would take a chunk that is gone for one that is empty
             raise damaged(self.root, key)
         if value is None or byte_range is not None or name == _METADATA:
             return value
