@@ -9,7 +9,7 @@ import pytest
 
 from apertura.core.combination import choose_fusion
 from apertura.core.quality.agreement import Agreement, agreement, agreement_of_ground
-from apertura.core.quality.bright_points import bright_points, has_point, near
+from apertura.core.quality.bright_points import BrightPoint, bright_points, has_point, near
 
 PAIRS = tuple(f"a-{name}" for name in "abcdef")
 RANK = dict.fromkeys(PAIRS, (0.0,))
@@ -219,3 +219,34 @@ def test_ground_of_another_scene_is_not_coherent():
         some = generator.normal(size=(2, 2, SIDE, SIDE))
         images = [np.fft.ifft2(np.fft.fft2(one[0] + 1j * one[1]) * inside((0.2, 0.1))) for one in some]
         assert agreement_of_ground((images[0], images[1]), [WHOLE], **WHERE) is None
+
+
+def scattered(generator, count, side_m, shift_m):
+    """Points of two images, each shifted from the first to the second by an amount of its own, metres."""
+    here = generator.uniform(0, side_m, (count, 2))
+    first, second = ([BrightPoint(y / SPACING_M, x / SPACING_M, 1.0) for x, y in at] for at in (here, here + shift_m))
+    return first, second
+
+
+@pytest.mark.parametrize("apart_m", [0.0, 0.3, 0.6, 1.0, 1.5])
+def test_points_that_are_shifted_by_different_amounts_are_compared_and_never_told_less(apart_m):
+    """An error of height shifts points by angle: those of one side one way, those of the other another."""
+    generator = np.random.default_rng(3)
+    direction = generator.uniform(0.5, 1.5, (5, 2)) * [1.0, 0.3]
+    image = np.ones((400, 400), np.complex64)
+    found = agreement((image, image), scattered(generator, 5, 12.0, apart_m * direction), **WHERE)
+    assert found is not None
+    assert found.points >= 3
+    assert found.shifted is (apart_m > 0)
+
+
+def test_points_of_different_scenes_are_not_taken_for_shifted_ones():
+    """By chance alone: at most a few of a thousand draws."""
+    generator, image = np.random.default_rng(4), np.ones((400, 400), np.complex64)
+    same = 0
+    for _ in range(1000):
+        first, _ = scattered(generator, generator.integers(3, 9), 12.0, np.zeros(2))
+        second, _ = scattered(generator, generator.integers(3, 9), 12.0, np.zeros(2))
+        found = agreement((image, image), (first, second), **WHERE)
+        same += found is not None and found.spread
+    assert same <= 3

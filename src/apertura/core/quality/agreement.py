@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
+from math import comb
 from typing import Literal
 
 import numpy as np
@@ -34,6 +35,8 @@ _MOST_PATCHES = 16  # of ground that are compared: the brightest
 _LEAST_LOOKS = 12
 """Independent samples: with fewer the coherence of one flank of a response would count (eq. 6 of interferometry)."""
 _BY_CHANCE = 0.001  # probability at which images with nothing in common are taken for coherent
+_WIDER = (2.0, 4.0, 8.0)  # resolution cells: gates within which points that shift by different amounts are matched
+_FEWEST_SPREAD = 3  # points: of two, a match of both within a wide gate may be chance
 _FAR = 4.0  # deviations of a point from the median of all, beyond which it is another one
 _MARGIN = 1.4  # on the bound of phase and place by looks: what ground scatters beyond it (eq. 8 of interferometry)
 
@@ -64,6 +67,8 @@ class Agreement:
     coherence
         Length of the mean phasor of points: 1 where all have the same phase, 1/√points by chance; of patches the
         coherence of their common band.
+    spread
+        Whether points are shifted by amounts that differ by more than a resolution cell.
     """
 
     by: Literal["bright points", "looks"]
@@ -78,6 +83,7 @@ class Agreement:
     phase_rad: float
     phase_std_rad: float
     coherence: float
+    spread: bool = False
 
     @property
     def evidence(self) -> str:
@@ -92,7 +98,7 @@ class Agreement:
     @property
     def shifted(self) -> bool:
         """Whether the images show different places, by more than the uncertainty of their points."""
-        return self.shift_units > SHIFTED + 3 * self.shift_std_units or self.cycle_off
+        return self.spread or self.shift_units > SHIFTED + 3 * self.shift_std_units or self.cycle_off
 
     @property
     def cycle_off(self) -> bool:
@@ -173,10 +179,8 @@ def agreement(
     (0.0, 1.571, True)
     """
     lists = [[(point.column * spacing_m, -point.row * spacing_m, point.amplitude) for point in some] for some in points]
-    reach = max(REACH_M, 12 * cell_m)
-    _, matched = common_shift(lists[0], lists[1], reach=reach, gate=cell_m)
-    enough = len(matched) >= max(1 if alone else 2, min(map(len, points)) / 2)
-    if not enough and not (matched := _brightest_of_both(lists, cell_m)):
+    matched, spread = _common_points(lists, cell_m, alone=alone)
+    if not matched:
         return None
     shifts = np.array([np.subtract(lists[1][j][:2], lists[0][i][:2]) for i, j in matched])
     values = np.array([_between(images, points[0][i], points[1][j]) for i, j in matched])
@@ -206,7 +210,46 @@ def agreement(
         phase_rad=float(np.angle(phasor)),
         phase_std_rad=float(scatter / np.sqrt((1 / turn).sum())),
         coherence=float(abs(phasor)),
+        spread=spread,
     )
+
+
+def _common_points(
+    lists: Sequence[Sequence[tuple[float, float, float]]], cell_m: float, *, alone: bool
+) -> tuple[list[tuple[int, int]], bool]:
+    """Return the points that two images have in common, and whether they lie apart by shifts that differ.
+
+    Within one cell of a common shift half of the points of either image are evidence; so is the brightest of both in
+    one cell. Heights, courses and drifts shift points by different amounts: within wider gates points are the same
+    where chance does not bring about as many matches.
+    """
+    reach, fewest = max(REACH_M, 12 * cell_m), min(map(len, lists))
+    _, matched = common_shift(lists[0], lists[1], reach=reach, gate=cell_m)
+    if len(matched) >= max(1 if alone else 2, fewest / 2):
+        return matched, False
+    for gate in _WIDER if fewest >= _FEWEST_SPREAD else ():
+        _, wider = common_shift(lists[0], lists[1], reach=reach, gate=gate * cell_m)
+        if len(wider) >= fewest / 2 and _chance(lists, len(wider), reach, gate * cell_m) < _BY_CHANCE:
+            return wider, True
+    return _brightest_of_both(lists, cell_m), False
+
+
+def _chance(lists: Sequence[Sequence[tuple[float, float, float]]], matches: int, reach: float, gate: float) -> float:
+    """Return a bound on the probability that so many points match under some shift though images share none.
+
+    Shifts within reach that differ by a gate are tried; under each, a point finds another within the gate with the
+    probability p that the points of the denser image cover of the area that its points lie in (binomial distribution).
+    """
+    fewer, more = sorted(lists, key=len)
+    place = np.array([point[:2] for point in more])
+    width, height = np.ptp(place, axis=0) + 2 * gate
+    covered = min(1.0, len(more) * np.pi * gate**2 / (width * height))
+    trials = len(fewer) * len(more)  # each pair of points gives a shift, under which it matches itself
+    at_least = sum(
+        comb(len(fewer) - 1, count) * covered**count * (1 - covered) ** (len(fewer) - 1 - count)
+        for count in range(matches - 1, len(fewer))
+    )
+    return float(min(trials, (reach / gate) ** 2 * np.pi) * at_least)
 
 
 def _brightest_of_both(lists: Sequence[Sequence[tuple[float, float, float]]], cell_m: float) -> list[tuple[int, int]]:

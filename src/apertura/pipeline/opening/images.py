@@ -214,7 +214,9 @@ def agreement_report(found: Agreement | None) -> dict[str, float | str] | None:
     """Return an agreement as JSON values."""
     if found is None:
         return None
-    return {name: value if isinstance(value, str) else float(f"{value:.4g}") for name, value in asdict(found).items()}
+    return {
+        name: value if isinstance(value, str | bool) else float(f"{value:.4g}") for name, value in asdict(found).items()
+    }
 
 
 # ---- What images say of themselves, and how those of a flight agree, as steps wrote it ------------------------------

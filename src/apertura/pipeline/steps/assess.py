@@ -267,6 +267,8 @@ _LOOKS_WRONG = frozenset({"defocused", "loss_unexpected", "echo_elsewhere", "pai
 
 _TIED = "as many pairs say the opposite, and their images do not show which is wrong"
 
+_SPREAD = ", by amounts that differ from point to point by more than a resolution cell"
+
 _EXPLAINED_SIGMAS = 3.0
 """Standard deviations of the phase that errors of the logs make between pairs, beyond which it has another cause."""
 
@@ -427,7 +429,8 @@ def _disagreement(chosen: CoherentSum, pair: str, blind: Sequence[str]) -> dict[
             "pairs_apart": (
                 f"{where} of {pair} lie {100 * one.shift_m:.1f} ± {100 * one.shift_std_m:.1f} cm from where {agreeing} "
                 f"{'has' if len(chosen.agreeing) == 1 else 'have'} them, {100 * one.shift_east_m:+.1f} cm east and "
-                f"{100 * one.shift_north_m:+.1f} cm north: positions, lever arms, path offsets or heights are wrong"
+                f"{100 * one.shift_north_m:+.1f} cm north{_SPREAD * one.spread}: positions, lever arms, path offsets "
+                "or heights are wrong"
             ),
             **({_PHASE: _phase_line(one, where, pair, chosen.reference)} if one.out_of_phase else {}),
         }
