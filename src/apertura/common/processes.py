@@ -179,7 +179,7 @@ _TRUNCATE, _MOVES, _TRUNCATES = 1 << 14, 2, 3
 """Right to truncate, and the versions of Landlock that know moves and truncation."""
 
 
-def confine_changes(root: Path) -> bool:
+def confine_changes(root: Path, *others: Path) -> bool:
     """Keep this process, and all that it starts, from changing files but for results and caches; return whether it is.
 
     What stays writable: ``results`` and ``.snakemake`` of the campaign, the latter for temporary files, too; the user's
@@ -189,6 +189,8 @@ def confine_changes(root: Path) -> bool:
     ----------
     root
         The campaign folder.
+    *others
+        Further folders whose files may be changed.
 
     Returns
     -------
@@ -202,7 +204,7 @@ def confine_changes(root: Path) -> bool:
     rights = _CHANGES | (_TRUNCATE if version >= _TRUNCATES else 0)
     ruleset = libc.syscall(_CREATE_RULESET, struct.pack("=Q", rights), ctypes.c_size_t(8), 0)
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    folders = [cache, Path(__file__).parents[1], Path("/dev"), Path("/proc")]
+    folders = [*others, cache, Path(__file__).parents[1], Path("/dev"), Path("/proc")]
     with ExitStack() as stack:
         for name in ("results", ".snakemake"):
             folder = ConfinedPath.at(root) / name

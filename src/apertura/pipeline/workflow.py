@@ -88,10 +88,10 @@ class _Files:
         return cls(*own, str(campaign.root) if confined else "")
 
     @classmethod
-    def apart(cls, folder: str) -> "_Files":
+    def apart(cls, folder: str, *, confined: Path | None) -> "_Files":
         """Return those of a run that forms nothing."""
         own = ConfinedPath.at(folder)
-        return cls(own / "journal.jsonl", own / "status", own / _LOG)
+        return cls(own / "journal.jsonl", own / "status", own / _LOG, str(confined or ""))
 
     @property
     def environment(self) -> dict[str, str]:
@@ -166,8 +166,8 @@ def run_workflow(root: Path, cores: int, *arguments: str, paranoid: bool = False
             screen = Screen(campaign, Outlook(campaign, at_once), quiet=show != "steps")
             return _formed(root, words, files, screen, warm, aloud=show == "snakemake")
     with tempfile.TemporaryDirectory() as scratch:
-        files = _Files.apart(scratch)
         dry = any(map(_DRY_RUN.fullmatch, arguments))
+        files = _Files.apart(scratch, confined=root if dry and not elsewhere else None)
         if show == "errors" or (dry and show == "steps"):
             return _looked_at(root, words, files, told=dry)
         return files.status_of(_watched(_started([RECORDER, *words], files.environment)))

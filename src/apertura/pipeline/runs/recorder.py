@@ -60,7 +60,8 @@ def record() -> None:
     LoggerPluginRegistry().register_plugin(f"snakemake_logger_plugin_{NAME}", sys.modules[__name__])
     sys.argv[0] = "snakemake"  # its messages begin with it
     if CONFINED in os.environ:
-        confine_changes(Path(os.environ.pop(CONFINED)))
+        journal = ConfinedPath.referenced(os.environ[JOURNAL])
+        confine_changes(Path(os.environ.pop(CONFINED)), journal.parent.real())
     main()
 
 
