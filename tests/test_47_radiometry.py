@@ -86,7 +86,7 @@ def test_the_noise_of_a_calibrated_image_is_that_of_the_noise_figure(flown, pair
     noise = said(flown, pair)["noise"]
     assert abs(noise["noise_figure_measured_db"] - 6) < 3 * noise["std_db"] < 1.0
     assert (noise["sidelink"] is None) is (pair == "uav1-uav1")
-    with rasterio.open(flown.result("f01", pair, "nesz.tif")) as raster:
+    with rasterio.open(str(flown.result("f01", pair, "nesz.tif"))) as raster:
         assert raster.descriptions == ("noise-equivalent sigma0",)
         assert -70 < np.nanmedian(raster.read(1)) < -50
 
@@ -111,12 +111,12 @@ def test_a_receiver_stated_wrong_by_six_decibels_is_told_by_its_noise(flown, tmp
 
 @pytest.mark.slow
 def test_sigma0_says_what_it_is_and_times_its_cell_is_the_image(flown):
-    with rasterio.open(flown.result("f01", "uav1-uav1", "sigma0_db.tif")) as raster:
+    with rasterio.open(str(flown.result("f01", "uav1-uav1", "sigma0_db.tif"))) as raster:
         means, sigma0_db = json.loads(raster.tags()["APERTURA_RADIOMETRY"]), raster.read(1)
         assert raster.units == ("dB",)
     assert means["standard_name"] == "surface_backwards_scattering_coefficient_of_radar_wave"
     assert means["calibration_std_db"] == 0.5
-    with rasterio.open(flown.result("f01", "uav1-uav1", "db.tif")) as raster:
+    with rasterio.open(str(flown.result("f01", "uav1-uav1", "db.tif"))) as raster:
         ratio_db = sigma0_db - raster.read(1)
     assert np.nanmax(ratio_db) - np.nanmin(ratio_db) < 10  # spreading and beams over six metres, and no speckle
     assert flown.result("f01", "uav1-uav1", "sigma0_db.qml").is_file()
@@ -191,7 +191,7 @@ def test_mean_power_is_that_of_echoes_where_no_coefficient_is_asked_for(flown, t
     layers(campaign, "f01", "uav1-uav1")
     folder = campaign.result("f01", "uav1-uav1")
     assert not list(folder.glob("*sigma0*"))
-    with rasterio.open(folder / "multilook_power.tif") as raster:
+    with rasterio.open(str(folder / "multilook_power.tif")) as raster:
         assert (raster.shape, raster.descriptions[0][:15]) == ((1, 1), "mean echo power")
 
 
@@ -218,11 +218,11 @@ def test_mean_power_lies_on_a_coarser_grid_and_says_what_it_is(flown, tmp_path):
         campaign = Campaign.load(root)
         folder = campaign.result("f01", "uav1-uav1")
         assert products <= {path.name for path in layers(campaign, "f01", "uav1-uav1")}
-        with rasterio.open(folder / "multilook_sigma0_power.tif") as raster:
+        with rasterio.open(str(folder / "multilook_sigma0_power.tif")) as raster:
             assert (raster.res, raster.shape) == ((pytest.approx(0.3), pytest.approx(0.3)), (20, 20))
             mean, said = raster.read(1), json.loads(raster.tags()["APERTURA_RADIOMETRY"])
             assert raster.descriptions[0].startswith("mean sigma0, radar cross-section per area of ground of 6 x 6 pix")
-        with rasterio.open(folder / "multilook_sigma0_db.tif") as raster:
+        with rasterio.open(str(folder / "multilook_sigma0_db.tif")) as raster:
             decibels = raster.read(1)
             assert raster.units == ("dB",)
         assert (said["speckle_filter"], said["noise"]) == ("Lee", "subtracted" if subtract else "in it")
@@ -231,9 +231,9 @@ def test_mean_power_lies_on_a_coarser_grid_and_says_what_it_is(flown, tmp_path):
         np.testing.assert_allclose(decibels[positive], 10 * np.log10(mean[positive]), atol=1e-3)
         assert np.isnan(decibels[~positive]).all()
         means[subtract] = mean
-    with rasterio.open(folder / "sigma0_db.tif") as raster:
+    with rasterio.open(str(folder / "sigma0_db.tif")) as raster:
         sigma0 = 10 ** (raster.read(1) / 10)
-    with rasterio.open(folder / "nesz.tif") as raster:
+    with rasterio.open(str(folder / "nesz.tif")) as raster:
         noise = (10 ** (raster.read(1).astype(np.float64) / 10)).reshape(20, 6, 20, 6).mean(axis=(1, 3))
     dim = means[False] < np.median(means[False])  # of bright ones float32 does not tell it
     np.testing.assert_allclose((means[False] - means[True])[dim], noise[dim], rtol=0.01)
@@ -265,7 +265,7 @@ def test_mean_power_of_sums_is_told_without_the_noise_of_their_pairs(finished_ti
     results = Campaign.load(root).results / "f01"
 
     def read(name):
-        with rasterio.open(results / name) as raster:
+        with rasterio.open(str(results / name)) as raster:
             return raster.read(1).astype(np.float64), json.loads(raster.tags()["APERTURA_RADIOMETRY"]), raster.tags()
 
     noise = {"coherent": 0.0, "noncoherent": 0.0}
@@ -308,8 +308,8 @@ def test_mean_power_is_mosaicked_and_in_the_catalog_at_its_own_place(finished_ti
     stac(campaign)
     webmap(campaign)
     folder, about = campaign.results, json.loads((campaign.results / "stac/images/f01/uav1-uav1.json").read_text())
-    with rasterio.open(folder / "f01/uav1-uav1/multilook_db.tif") as raster:
-        assert rasterio.open(folder / "mosaic/uav1-uav1/multilook_db.vrt").transform == raster.transform
+    with rasterio.open(str(folder / "f01/uav1-uav1/multilook_db.tif")) as raster:
+        assert rasterio.open(str(folder / "mosaic/uav1-uav1/multilook_db.vrt")).transform == raster.transform
         asset = about["assets"]["multilook_db"]
         assert (asset["proj:shape"], asset["proj:transform"]) == ([*raster.shape], [*raster.transform][:6])
     assert "proj:shape" not in about["assets"]["db"]
@@ -326,7 +326,7 @@ def test_no_sigma0_is_told_where_the_mask_says_why(flown, tmp_path):
     away = (x - east) * np.cos(np.radians(40)) - (y - north) * np.sin(np.radians(40))  # from the track
     ridge = 620.0 + np.maximum(0, 1.5 - 4 * np.abs(away))
     place = {"crs": "EPSG:32632", "transform": rasterio.transform.from_origin(west, top, 0.1, 0.1)}
-    with rasterio.open(root / "dem.tif", "w", "GTiff", 200, 200, 1, dtype="float64", **place) as raster:
+    with rasterio.open(str(root / "dem.tif"), "w", "GTiff", 200, 200, 1, dtype="float64", **place) as raster:
         raster.write(ridge, 1)
     state(root, "processing", radiometry=["sigma0", "beta0"], multilook={"spacing_m": 0.2})
     state(root, "scene", dem="dem.tif", dem_datum="ellipsoid")
@@ -334,12 +334,12 @@ def test_no_sigma0_is_told_where_the_mask_says_why(flown, tmp_path):
     layers(campaign, "f01", "uav1-uav1")
     folder = campaign.result("f01", "uav1-uav1")
     names = ("mask", "sigma0_db", "beta0_db", "multilook_sigma0_power")
-    mask, sigma0, beta0, squares = (rasterio.open(folder / f"{name}.tif").read(1) for name in names)
+    mask, sigma0, beta0, squares = (rasterio.open(str(folder / f"{name}.tif")).read(1) for name in names)
     assert min((mask == 1).sum(), (mask == 2).sum(), (mask == 0).sum()) > 100
     assert np.isnan(sigma0[mask != 0]).all()
     assert np.isnan(beta0[mask != 0]).all()
     assert np.isfinite(beta0[mask == 0]).all()
     assert np.isfinite(sigma0[mask == 0]).mean() > 0.95  # but for slopes that are nearly laid over
-    nesz = rasterio.open(folder / "nesz.tif").read(1)  # of the facet, as σ⁰ is
+    nesz = rasterio.open(str(folder / "nesz.tif")).read(1)  # of the facet, as σ⁰ is
     assert np.array_equal(np.isfinite(nesz)[mask == 0], np.isfinite(sigma0)[mask == 0])
     assert np.isnan(squares[(np.isnan(sigma0).reshape(30, 4, 30, 4).sum(axis=(1, 3)) > 8)]).all()

@@ -173,7 +173,7 @@ def test_a_flight_of_one_pair_has_no_sum(opened):
 
 def test_metadata_are_consolidated_and_hashed_with_the_rest(campaign):
     folder = campaign.stage("cube")
-    held = zarr.open_group(folder, mode="r", use_consolidated=True)
+    held = zarr.open_group(str(folder), mode="r", use_consolidated=True)
     assert {"image", "flight", "time"} <= set(held.metadata.consolidated_metadata.metadata)
     assert damaged_files(manifest_of(folder)) == []
 
