@@ -189,7 +189,7 @@ def measured(alone: list[Campaign], empty: Campaign, flight: str, pair: str, des
     normal = None if flat else surface(grid, opened.terrain, whole)[1]
     with np.errstate(invalid="ignore"):
         nesz = 10 * np.log10(noise * calibration.pixel_noise(whole) / calibration.power(whole, "sigma0", normal))
-    with rasterio.open(campaign.result(flight, pair, "mask.tif")) as raster:
+    with rasterio.open(str(campaign.result(flight, pair, "mask.tif"))) as raster:
         seen = raster.read(1) == 0
     rows, half = [], grid.shape[0] * grid.spacing_m / 2
     for target, pixels in zip(points(opened, half), images, strict=True):
@@ -230,7 +230,7 @@ def compare(name: str, folder: Path, draws: int):
         clutter = [Clutter((-half - 2, -half - 2, half + 2, half + 2), 10.0, 40.0)]
         campaign = processed(rehearse(design.opened, clutter, folder / "right"))
         for two, own in design.interferograms.items():
-            with rasterio.open(campaign.result("interferometry", two, "coherence.tif")) as raster:
+            with rasterio.open(str(campaign.result("interferometry", two, "coherence.tif"))) as raster:
                 values = raster.read(1)
             inner = tuple(slice(size // 5, -size // 5) for size in values.shape)
             both = float(np.median(own["coherence"][inner])), float(np.nanmedian(values[inner]))

@@ -165,7 +165,7 @@ class RecordingWriter:
         with (self.to / self.data.name).open("ab") as stream:
             shutil.copyfileobj(self.source, stream)
         beside = self.to / f".{self.meta.name}"
-        shutil.copy2(self.meta, beside)
+        shutil.copy2(str(self.meta), beside)
         beside.replace(self.to / self.meta.name)
 
 

@@ -1,6 +1,7 @@
 """A pair's echo as CPHD: what the standard's own checker says of it, and the image that it gives when it comes back."""
 
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -40,7 +41,7 @@ def reimported(campaign, flight, pair, target):
     file, scene = cphd.cphd(campaign, flight, pair), yaml.safe_load((campaign.root / "config/config.yaml").read_text())
     (target / "config").mkdir(parents=True)
     (target / "raw" / flight).mkdir(parents=True)
-    shutil.copyfile(file, target / "raw" / flight / f"{rx}.cphd")
+    shutil.copyfile(str(file), target / "raw" / flight / f"{rx}.cphd")
     config = {
         "campaign": "again",
         "waveform": {"kind": "phase_history", "format": "cphd"},
@@ -89,7 +90,7 @@ def gotcha(shared, tmp_path_factory):
 @pytest.mark.slow
 def test_gotcha_through_cphd_gives_the_same_image_to_80_db(gotcha, tmp_path):
     again = reimported(gotcha, "pass1", "radar-radar", tmp_path / "again")
-    assert failures(gotcha.result("pass1", "radar-radar", "phase_history.cphd")) == {}
+    assert failures(Path(gotcha.result("pass1", "radar-radar", "phase_history.cphd"))) == {}
     one, other = (image_of(each, "pass1", "radar-radar") for each in (gotcha, again))
     assert difference_db(one, other) < -80
     echoes = [PairEcho.opened(each, "pass1", "radar-radar").stage for each in (gotcha, again)]
@@ -120,7 +121,7 @@ def fine_tiny(_tiny, tmp_path_factory):
 @pytest.mark.parametrize("pair", ["uav1-uav1", "uav1-uav2"])
 def test_a_simulated_pair_through_cphd_gives_the_same_image_to_80_db(fine_tiny, tmp_path, pair):
     again = reimported(fine_tiny, "f01", pair, tmp_path / "again")
-    assert failures(fine_tiny.result("f01", pair, "phase_history.cphd")) == {}
+    assert failures(Path(fine_tiny.result("f01", pair, "phase_history.cphd"))) == {}
     assert difference_db(image_of(fine_tiny, "f01", pair), image_of(again, "f01", pair)) < -80
     one, other = (PairEcho.opened(each, "f01", pair).stage for each in (fine_tiny, again))
     for name in ("time", "tx_position", "rx_position", "path_limit"):

@@ -236,7 +236,13 @@ def test_a_lazy_image_is_judged_when_asked_and_by_all_of_it():
     told = ap.judge(abs(lazy)[:9, :9])
     assert (told.verdict, dict(told.flags)) == ("focused", {})
     assert told.focus["points"][0]["x_m"] == pytest.approx(TARGET[0, 0], abs=0.03)
-    assert [line["cause"] for line in told.budget] == ["positions", "heights", "calibration", "arithmetic"]
+    assert [line["cause"] for line in told.budget] == [
+        "positions",
+        "heights",
+        "calibration",
+        "atmosphere",
+        "arithmetic",
+    ]
     with pytest.raises(CampaignError, match="not computed"):
         ap.judge(lazy.compute())
     with pytest.raises(CampaignError, match="several images"):
@@ -324,3 +330,26 @@ def test_what_the_arithmetic_could_not_form_is_not_called_focused():
     """Profiles that begin a thousandth of the way out: no pixel lies in them."""
     image = ap.backproject(replace(PROFILES, start_m=PROFILES.start_m / 1e3), TARGET_GRID, judge=True)
     assert image.attrs["verdict"] == "cannot tell"
+
+
+def test_an_image_is_of_the_track_that_was_given_whatever_becomes_of_its_array():
+    """It is lazy: what is computed later must not follow an array that the caller goes on using."""
+    track = APERTURE.tx_m.copy()
+    first, second = (
+        ap.backproject(replace(HISTORY, aperture=ap.Aperture(track, track)), TARGET_GRID, judge=False) for _ in range(2)
+    )
+    expected = first.values
+    track += 1.0
+    np.testing.assert_array_equal(second.values, expected)
+
+
+def test_the_budget_of_arrays_states_what_air_would_do_where_vacuum_is_assumed():
+    """N = 290 makes every path longer by 290 parts in a million: of a range R the image lies 290e-6 R farther."""
+    budget = json.loads(ap.backproject(HISTORY, TARGET_GRID, judge=False).attrs["budget"])
+    line = next(one for one in budget if one["cause"] == "atmosphere")
+    slant_m = np.linalg.norm(APERTURE.tx_m.mean(axis=0) - TARGET)
+    ground_m = np.linalg.norm((APERTURE.tx_m.mean(axis=0) - TARGET)[0, :2])
+    assert "N = 290" in line["stated"]
+    assert line["shift_m"] == pytest.approx(290e-6 * slant_m * slant_m / ground_m, rel=0.1)
+    stated = ap.backproject(HISTORY, TARGET_GRID, judge=False, atmosphere=285.0).attrs["budget"]
+    assert "20 N units" in stated

@@ -22,7 +22,7 @@ from apertura.pipeline.lineage import on_demand, places_of, result_of, results_o
 from apertura.pipeline.rules import RESULTS
 from apertura.pipeline.steps.ro_crate import ro_crate
 from apertura.pipeline.steps.stac import stac
-from apertura.pipeline.store import read_manifest
+from apertura.pipeline.store import open_stage, read_manifest
 from apertura.views.verify.crate import changed_files
 
 ROOT = Path(__file__).parents[1]
@@ -86,7 +86,7 @@ def test_an_item_tells_time_and_band_of_what_was_recorded(finished_tiny):
     waveform = finished_tiny.settings.waveform
     band_hz = waveform.subcarriers * waveform.subcarrier_spacing_hz
     assert item.properties["sar:bandwidth"] == pytest.approx(band_hz / 1e9)
-    middle_hz = waveform.carrier_hz + (band_hz - waveform.subcarrier_spacing_hz) / 2
+    middle_hz = waveform.carrier_hz + band_hz / 2  # subcarrier N/2, to which profiles are referenced
     assert item.properties["sar:center_frequency"] == pytest.approx(middle_hz / 1e9)
 
 
@@ -248,3 +248,13 @@ def test_the_how_to_does_what_it_says(finished, monkeypatch, capsys):
         exec(compile(code, "catalog.md", "exec"), names)
         said, expected = capsys.readouterr().out, printed.partition("    ...\n")[0]
         assert said.startswith(expected)
+
+
+def test_a_frequency_is_the_same_number_in_every_product(finished_tiny):
+    item = pystac.Item.from_file(str(finished_tiny.results / "stac/images/f01/uav1-uav2.json"))
+    report = json.loads((finished_tiny.result("f01", "uav1-uav2", "image.json")).read_text())
+    cube = open_stage(finished_tiny.stage("cube"), "cube")
+    stated = float(cube.centre_frequency.sel(flight="f01", pair="uav1-uav2"))
+    profile = open_stage(finished_tiny.stage("profile", "f01", "uav1-uav2"), "profile")
+    assert item.properties["sar:center_frequency"] == round(stated / 1e9, 9)
+    assert report["view"]["centre_hz"] == stated == profile.attrs["centre_frequency_hz"]

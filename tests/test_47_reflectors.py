@@ -135,7 +135,7 @@ def later(measured, tmp_path_factory):
     )
     spec = plan("later", targets, {"f01": (-2.0, 1.5, 1.5)})
     root = unknown_radio(simulate(tmp_path_factory.mktemp("later") / "campaign", spec, seed=5))
-    shutil.copy(write_constants(measured), root / "calibration.json")
+    shutil.copy(str(write_constants(measured)), root / "calibration.json")
     state(root, "processing", radiometric_calibration="calibration.json")
     campaign = run_steps(root, exports=False)
     export_flight(campaign, "f01")
@@ -322,7 +322,7 @@ def test_a_phase_history_is_calibrated_by_its_own_images(measured, tmp_path):
     (tmp_path / "config/flights.tsv").write_text("flight\tkind\ttransmitter\tnodes\nf01\timage\tuav1\tuav1\n")
     written = cphd.cphd(measured, "f01", "uav1-uav1")
     (tmp_path / "raw/f01").mkdir(parents=True)
-    shutil.copy(written, tmp_path / "raw/f01/uav1.cphd")
+    shutil.copy(str(written), tmp_path / "raw/f01/uav1.cphd")
     campaign = run_steps(tmp_path, exports=False)
     layers.layers(campaign, "f01", "uav1-uav1")
     found = read_constants(write_constants(campaign)).pairs["uav1-uav1"]

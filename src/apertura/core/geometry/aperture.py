@@ -138,6 +138,11 @@ class Aperture:
         """Return the number of pulses."""
         return len(self.tx_m)
 
+    def copied(self) -> "Aperture":
+        """Return the aperture with arrays of its own; one array where one node does both."""
+        tx_m = self.tx_m.copy()
+        return Aperture(tx_m, tx_m if self.rx_m is self.tx_m else self.rx_m.copy())
+
     def __getitem__(self, pulses: slice | NDArray[np.bool_] | NDArray[np.int64]) -> "Aperture":
         """Return the aperture of some pulses; slices are views."""
         return Aperture(self.tx_m[pulses], self.rx_m[pulses])

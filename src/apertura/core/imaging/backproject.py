@@ -172,6 +172,7 @@ def backproject(  # noqa: PLR0913 - each choice is a keyword, so that an editor 
         expected="choices of ImagingChoices",
     )
     inputs = inputs_of(profiles, choices.window)
+    inputs = replace(inputs, aperture=inputs.aperture.copied())  # the image is lazy, and the caller's arrays may change
     ground = ground_of(terrain, grid)
     _check_kinds(inputs, beams, certified_pixels)
     if atmosphere is not None:

@@ -14,6 +14,7 @@ from apertura.common.atomic import write_json
 from apertura.common.documents import undamaged
 from apertura.common.errors import CampaignError
 from apertura.common.provenance import lock_sha256, software
+from apertura.core.echo.compression import centre_frequency
 from apertura.formats.catalog import CATALOG
 from apertura.formats.catalog.stac import (
     AcquisitionTime,
@@ -167,8 +168,8 @@ class _Described:
         times, frequency = echo.time.values.astype(np.int64), echo.frequency.values
         span_hz = float(frequency[-1] - frequency[0])
         bandwidth_hz = span_hz * frequency.size / max(frequency.size - 1, 1)
-        centre_hz = float(frequency[0] + frequency[-1]) / 2
-        return AcquisitionTime(instant(int(times.min())), instant(int(times.max())), centre_hz, bandwidth_hz)
+        ends = instant(int(times.min())), instant(int(times.max()))
+        return AcquisitionTime(*ends, centre_frequency(frequency), bandwidth_hz)
 
 
 def _resolution(brightest: Mapping[str, Any]) -> dict[str, float]:
