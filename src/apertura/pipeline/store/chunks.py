@@ -49,12 +49,22 @@ class StageStore(LocalStore):
         As `zarr.storage.LocalStore` takes them.
     sha256
         File of the folder → hash.
+    finished_later
+        Leave it to `finish` to bring all files to the disk at once: what is there after a kill is begun anew.
     """
 
     root: ConfinedPath
 
-    def __init__(self, folder: Path, *, read_only: bool = False, sha256: Mapping[str, str] | None = None) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        *,
+        read_only: bool = False,
+        sha256: Mapping[str, str] | None = None,
+        finished_later: bool = False,
+    ) -> None:
         super().__init__(ConfinedPath.of(folder), read_only=read_only)
+        self._finished_later = finished_later
         self._unchecked = {key: digest for key, digest in (sha256 or {}).items() if _METADATA not in key}
 
     async def get(
@@ -76,7 +86,12 @@ class StageStore(LocalStore):
     def set_sync(self, key: str, value: Buffer) -> None:
         """As `set`."""
         self._check_writable()
-        write_beside(self.root / key, value.to_bytes())
+        path = self.root / key
+        if self._finished_later:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(value.to_bytes())
+        else:
+            write_beside(path, value.to_bytes())
 
     async def set_if_not_exists(self, key: str, value: Buffer) -> None:
         """Write a file that is not there; a file of a stage has one writer."""

@@ -43,7 +43,9 @@ def save_stage(
     with writing(folder) as wip, naming(folder):
         remove(wip)
         encoding = encoding_of(dataset, chunks or {})
-        dataset.to_zarr(StageStore(wip), mode="w", consolidated=False, zarr_format=3, encoding=encoding)
+        dataset.to_zarr(
+            StageStore(wip, finished_later=True), mode="w", consolidated=False, zarr_format=3, encoding=encoding
+        )
         finish(wip, folder, lineage=lineage)
 
 
