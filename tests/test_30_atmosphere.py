@@ -220,6 +220,7 @@ VACUUM = {
     "core/imaging/resolution.py": _SIZE,
     "core/imaging/reflectors.py": "wavelength of a cross-section: 0.003 dB",
     "core/imaging/job.py": f"{_DEFAULT}; {_SIZE}",
+    "core/imaging/judgement.py": "whether a wave speed is that in vacuum, so that the budget states what air would do",
     "core/echo/compression.py": _DEFAULT,
     "core/echo/calibration.py": _ELECTRICAL,
     "core/echo/dechirp.py": _ELECTRICAL,
