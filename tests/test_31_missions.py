@@ -73,6 +73,9 @@ WRONG = {
     "f.kml": ("<kml><LineString><coordinates>9,48,1 9,49,1</coordinates></LineString></kml>", "clampToGround"),
     "g.csv": ("latitude_deg\n48\n", "no column longitude_deg"),
     "h.gpx": ("", "suffix '.gpx'"),
+    "i.plan": (plan(item(16, 10**400, 9.9, 50), item(16, 48.4, 9.9, 50)), "no mission"),
+    "j.plan": (plan(item(16, 48.4, 9.9, 50)).replace('"command": 16', '"command": 1e400'), "no mission"),
+    "k.kml": ("<LineString>" * 80_000, "no LineString that is closed"),
 }
 
 

@@ -13,7 +13,7 @@ from apertura.core.geometry.aperture import Aperture
 from apertura.core.imaging.resolution import Resolution
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import Plane
-from apertura.pipeline.config.flight_plan import FlightPlan
+from apertura.pipeline.config.flight_plan import FlightPlan, read_flight_plan
 from apertura.pipeline.design import designed
 from apertura.pipeline.design.judgement import helpful_changes, judge, search, tried_report
 from apertura.pipeline.opening.planned import open_plan
@@ -305,3 +305,17 @@ def test_a_bad_plan_is_refused_by_one_message(case):
     assert words in str(caught.value)
     assert "config.yaml" not in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["dike.plan", "dike.kml"])
+def test_a_mission_in_place_of_a_plan_is_one_message_that_says_where_it_belongs(tmp_path, name):
+    (tmp_path / name).write_text('{"mission": {}}')
+    with pytest.raises(CampaignError, match=rf"{name}: a mission, not a flight plan.*kind: mission, file: {name}"):
+        read_flight_plan(tmp_path / name)
+
+
+def test_an_unknown_key_called_as_an_alternative_of_another_is_named(tmp_path):
+    """`mission` is also a kind of track."""
+    (tmp_path / "plan.yaml").write_text("mission: dike.plan\n")
+    with pytest.raises(CampaignError, match="mission: unknown key"):
+        read_flight_plan(tmp_path / "plan.yaml")

@@ -323,9 +323,12 @@ def _complaints(error: ValidationError, schema: dict[str, Any]) -> str:
 def _complaint(item: dict[str, Any], schema: dict[str, Any]) -> tuple[str, str]:
     """Return a key and its error; names of alternative types are no keys."""
     tags = _collected(schema, lambda part: part.get("discriminator", {}).get("mapping", {}))
-    location = [str(part) for part in item["loc"] if not (re.match(_TYPE, str(part)) or part in tags)]
+    parts, unknown = [*map(str, item["loc"])], item["type"] in {"extra_forbidden", "unexpected_keyword_argument"}
+    own = parts[-1:] if unknown else []  # a key, also where it is called as one of the alternatives
+    way = parts[:-1] if unknown else parts
+    location = [part for part in way if not (re.match(_TYPE, part) or part in tags)] + own
     key = ".".join(location) or "the whole file"
-    if item["type"] in {"extra_forbidden", "unexpected_keyword_argument"}:
+    if unknown:
         known = sorted(_collected(schema, _properties) - {location[-1]})  # it may be a key of another section
         near = difflib.get_close_matches(location[-1], known, n=1, cutoff=0.5)
         return key, "unknown key" + (f" (did you mean '{near[0]}'?)" if near else "")

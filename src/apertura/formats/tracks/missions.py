@@ -73,7 +73,7 @@ def read_mission(path: Path) -> Mission:
         raise CampaignError("no such file", path, expected, "Copy it beside the plan.")
     try:
         mission = reader(path)
-    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError, ArithmeticError) as error:
         if isinstance(error, CampaignError):
             raise
         raise CampaignError(f"no mission ({quoted(str(error), 120)})", path, expected, _REMEDY) from error
@@ -141,20 +141,26 @@ def _waypoints(path: Path) -> Mission:
 
 def _kml(path: Path) -> Mission:
     text = read_text(path, expected="KML", remedy=_REMEDY, largest=LARGEST_MISSION)
-    # By its text: a parser of XML would expand entities of strangers.
-    line = re.search(r"<LineString[^>]*>(.*?)</LineString>", text, re.DOTALL)
-    if line is None:
-        raise ValueError("no LineString")
-    listed = re.search(r"<coordinates>(.*?)</coordinates>", line[1], re.DOTALL)
-    if listed is None:
-        raise ValueError("a LineString without coordinates")
-    mode = re.search(r"<altitudeMode>\s*(\w+)\s*</altitudeMode>", line[1])
+    # By its text: a parser of XML would expand entities of strangers, and an expression may look at all of it again for
+    # every element that is not closed.
+    line = _element(text, "LineString")
+    listed = _element(line, "coordinates")
+    mode = re.search(r"<altitudeMode>\s*(\w+)\s*</altitudeMode>", line)
     references: Mapping[str, Reference] = {"absolute": "sea", "relativeToGround": "ground"}
     named = mode[1] if mode else "clampToGround"
     if named not in references:
         raise ValueError(f"altitudeMode {named}: a flight has heights, absolute or relativeToGround")
-    place = np.array([[float(one) for one in triple.split(",")] for triple in listed[1].split()], float)
+    place = np.array([[float(one) for one in triple.split(",")] for triple in listed.split()], float)
     return Mission(place[:, [1, 0, 2]], references[named], np.full(len(place), np.nan))
+
+
+def _element(text: str, name: str) -> str:
+    """Return the content of the first element of a name."""
+    begin = text.find(f"<{name}")
+    inner, end = text.find(">", begin) + 1, text.find(f"</{name}>", begin)
+    if begin < 0 or not 0 < inner <= end:
+        raise ValueError(f"no {name} that is closed")
+    return text[inner:end]
 
 
 def _csv(path: Path) -> Mission:

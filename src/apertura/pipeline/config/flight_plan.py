@@ -7,6 +7,7 @@ from pydantic import Field, model_validator
 
 from apertura.common import documents
 from apertura.common.documents import read_yaml
+from apertura.common.errors import CampaignError
 from apertura.pipeline.config.config import Settings
 from apertura.pipeline.config.flights import Flight
 from apertura.pipeline.config.section import Name, Section
@@ -276,5 +277,12 @@ def read_flight_plan(path: Path) -> FlightPlan:
         If it is not there, is no YAML, or with every key that is wrong and the nearest valid one.
     """
     remedy = "docs/howto/design.md shows one."
+    if path.suffix.lower() in {".plan", ".waypoints", ".kml"}:
+        raise CampaignError(
+            "a mission, not a flight plan",
+            where=path,
+            expected="a plan in YAML, which also states radar, nodes and scene",
+            remedy=f"Name the mission in its tracks, {{kind: mission, file: {path.name}}}: {remedy}",
+        )
     document = read_yaml(path, expected="a flight plan in YAML", remedy=remedy)
     return documents.validated(FlightPlan, document, where=path, expected="keys of a flight plan, docs/howto/design.md")
