@@ -169,7 +169,7 @@ WINDOWS = [(slice(r, r + 32), slice(c, min(c + 32, 48))) for r in (0, 32) for c 
 def test_finished_tiles_are_kept_and_other_work_is_thrown_away(tmp_path):
     with writing(tmp_path / "image.zarr") as wip:
         assert resume(wip, empty_image(), "image", WINDOWS) == WINDOWS
-        zarr.open_array(wip / "image", mode="r+")[WINDOWS[1]] = 0
+        zarr.open_array(Path(wip) / "image", mode="r+")[WINDOWS[1]] = 0
     with writing(tmp_path / "image.zarr") as wip:
         assert resume(wip, empty_image(), "image", WINDOWS) == [WINDOWS[0], *WINDOWS[2:]]
         assert resume(wip, empty_image(code="1"), "image", WINDOWS) == WINDOWS
@@ -184,7 +184,7 @@ def test_jobs_share_the_work_and_who_finishes_waits_for_them(tmp_path):
 
     finisher = threading.Thread(target=finish_it)
     with sharing(folder, empty_image(), "image", WINDOWS) as (wip, first):
-        zarr.open_array(wip / "image", mode="r+")[WINDOWS[0]] = 1
+        zarr.open_array(Path(wip) / "image", mode="r+")[WINDOWS[0]] = 1
         with sharing(folder, empty_image(), "image", WINDOWS) as (_, second):
             finisher.start()
             assert not alone.wait(0.3)
@@ -209,7 +209,7 @@ def test_other_work_that_came_between_is_not_written_into(tmp_path, monkeypatch)
 def finished_image(folder):
     with writing(folder) as wip:
         resume(wip, empty_image(), "image", WINDOWS)
-        zarr.open_array(wip / "image", mode="r+")[:] = 1
+        zarr.open_array(Path(wip) / "image", mode="r+")[:] = 1
         finish(wip, folder)
 
 
@@ -230,7 +230,7 @@ def test_a_damaged_stage_is_computed_again(tmp_path):
 def test_a_partial_chunk_of_a_killed_writer_does_not_stay(tmp_path):
     with writing(tmp_path / "image.zarr") as wip:
         resume(wip, empty_image(), "image", WINDOWS)
-        zarr.open_array(wip / "image", mode="r+")[:] = 1
+        zarr.open_array(Path(wip) / "image", mode="r+")[:] = 1
         (wip / "image" / "c" / "0" / "0.123.partial").write_bytes(b"half")
         finish(wip, tmp_path / "image.zarr")
     files = json.loads(manifest_of(tmp_path / "image.zarr").read_text())["files"]

@@ -6,7 +6,7 @@ a scene that is mostly noise, and whiten the noise.
 
 import json
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from math import ceil, floor, log10
 from pathlib import Path
 from xml.etree import ElementTree as ET  # only written, never parsed
@@ -161,9 +161,10 @@ def _grey(low: float, high: float, *, unit: str = "") -> ET.Element:
 
 @contextmanager
 def _beside(path: Path) -> Iterator[rasterio.DatasetReader]:
-    """Open the raster that a style is for; a mosaic names its rasters relative to its folder."""
+    """Open the raster that a style is for, of a mosaic by its whole name: its rasters are named relative to that."""
     file = next(file for file in map(path.with_suffix, (".tif", ".vrt")) if file.is_file())
-    with on_disk(file.parent) as folder, rasterio.Env(**ISOLATED), rasterio.open(folder / file.name) as raster:
+    named = nullcontext(Path(file.absolute())) if file.suffix == ".vrt" else on_disk(file)
+    with named as name, rasterio.Env(**ISOLATED), rasterio.open(name) as raster:
         yield raster
 
 
