@@ -204,6 +204,8 @@ def confine_changes(root: Path, *others: Path) -> bool:
     rights = _CHANGES | (_TRUNCATE if version >= _TRUNCATES else 0)
     ruleset = libc.syscall(_CREATE_RULESET, struct.pack("=Q", rights), ctypes.c_size_t(8), 0)
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    with suppress(OSError):  # of a new account it is not there yet, and Snakemake would make it
+        cache.mkdir(parents=True, exist_ok=True)
     folders = [*others, cache, Path(__file__).parents[1], Path("/dev"), Path("/proc")]
     with ExitStack() as stack:
         for name in ("results", ".snakemake"):
