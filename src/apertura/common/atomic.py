@@ -48,9 +48,7 @@ def replacement(path: Path) -> Iterator[Path]:
             private.mkdir(mode=0o700)
             with private.on_disk() as folder, _naming_target(folder, path):
                 yield folder / target.name
-            (private / target.name).synchronise()
-            (private / target.name).rename(target)
-            target.parent.synchronise_folder()
+            rename(private / target.name, target)
         finally:
             _clear(work)
 
