@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from apertura.common.flag_table import FLAGS
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.imaging.focus_check import focus_flags
 from apertura.core.quality.agreement import agreement
@@ -24,7 +25,15 @@ from apertura.core.quality.budget import (
     position_lines,
     strictest_accuracy_db,
 )
-from apertura.core.quality.focus import compare_parts, judge, judge_parts, point_focus
+from apertura.core.quality.focus import (
+    GEOMETRY_CONTRADICTED,
+    PointFocus,
+    compare_parts,
+    focus_with_flags,
+    judge,
+    judge_parts,
+    point_focus,
+)
 from apertura.core.quality.path_errors import Effect, PointPaths
 
 PULSES, WAVELENGTH_M = 600, 0.214
@@ -92,6 +101,30 @@ def test_one_point_among_sidelobes_does_not_decide():
     blurred = point_focus(np.exp(2j * moving_average_noise(generator, 200, 20)))
     assert judge([(1.0, sharp), (0.9, sharp), (0.3, blurred)]).verdict == "focused"
     assert judge([(1.0, blurred), (0.9, blurred), (0.3, sharp)]).verdict == "defocused"
+
+
+@pytest.mark.parametrize(
+    ("losses_db", "verdict"),
+    [((-0.3, -0.5), "focused"), ((-0.6, -6.0), "cannot tell"), ((-4.0, -4.2), "defocused"), ((-1.0,), "cannot tell")],
+)
+def test_a_loss_whose_interval_reaches_one_decibel_is_no_verdict(losses_db, verdict):
+    assert judge([(1.0, PointFocus(loss_db, 0.01, 1, 30.0)) for loss_db in losses_db]).verdict == verdict
+
+
+@pytest.mark.parametrize("flag", sorted(GEOMETRY_CONTRADICTED))
+def test_an_image_whose_geometry_a_flag_contradicts_is_not_called_focused(flag):
+    focus = {"verdict": "focused", "why": "3 bright points lost 0.02 dB", "loss_db": -0.02}
+    assert flag in FLAGS
+    assert focus_with_flags(focus, ["hover", flag])["verdict"] == "cannot tell"
+    assert focus_with_flags(focus, ["hover", flag])["why"].endswith(f"contradicted by {flag}")
+    assert focus_with_flags(focus | {"verdict": "defocused"}, [flag])["verdict"] == "defocused"
+    assert focus_with_flags(focus, ["hover", "track_gap"]) == focus
+
+
+@pytest.mark.parametrize(("error_db", "verdict"), [(-10.0, "cannot tell"), (-40.0, "focused"), (None, "focused")])
+def test_an_image_with_a_large_numerical_error_is_not_called_focused(error_db, verdict):
+    focus = {"verdict": "focused", "why": "3 bright points lost 0.02 dB"}
+    assert focus_with_flags(focus, ["accuracy_missed"], error_db=error_db)["verdict"] == verdict
 
 
 @pytest.mark.parametrize("std_cm", [0.5, 1.0, 2.0, 4.0])

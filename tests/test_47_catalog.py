@@ -20,6 +20,7 @@ from apertura.formats.catalog.validation import stac_problems
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.lineage import on_demand, places_of, result_of, results_of
 from apertura.pipeline.rules import RESULTS
+from apertura.pipeline.steps import assess, cube, export
 from apertura.pipeline.steps.ro_crate import ro_crate
 from apertura.pipeline.steps.stac import stac
 from apertura.pipeline.store import open_stage, read_manifest
@@ -258,3 +259,29 @@ def test_a_frequency_is_the_same_number_in_every_product(finished_tiny):
     profile = open_stage(finished_tiny.stage("profile", "f01", "uav1-uav2"), "profile")
     assert item.properties["sar:center_frequency"] == round(stated / 1e9, 9)
     assert report["view"]["centre_hz"] == stated == profile.attrs["centre_frequency_hz"]
+
+
+@pytest.mark.slow
+def test_a_verdict_is_the_same_word_in_every_product(finished, monkeypatch):
+    """A wrong code of a sharp pair: neither its image nor the sum that holds it is called focused anywhere."""
+    line = [("uav1-uav2", "wrong_code", "another code")]
+    monkeypatch.setattr("apertura.pipeline.steps.assess.wrong_codes", lambda _: line)
+    campaign = Campaign.load(finished)
+    assess.assess(campaign, "f01")
+    cube.cube(campaign)
+    for name, raster, item, verdict in (
+        ("uav1-uav1", "db.tif", "f01-uav1-uav1", "focused"),
+        ("uav1-uav2", "db.tif", "f01-uav1-uav2", "cannot tell"),
+        ("fused", "coherent_db.tif", "f01-coherent", "cannot tell"),
+    ):
+        export.export(campaign, "f01", name)
+        stac(campaign)
+        report = json.loads(campaign.result("f01", name, "image.json").read_text())
+        items = pystac.Catalog.from_file(str(finished / "results/stac" / CATALOG)).get_items(recursive=True)
+        with rasterio.open(str(campaign.result("f01", name, raster))) as opened:
+            tags = json.loads(opened.tags()["APERTURA_FOCUS"])
+        assert report["focus"]["verdict"] == tags["verdict"] == verdict
+        assert next(one for one in items if one.id == item).properties["apertura:verdict"] == verdict
+        if name != "fused":
+            stated = open_stage(campaign.stage("cube"), "cube").verdict.sel(flight="f01", pair=name)
+            assert str(stated.values) == verdict

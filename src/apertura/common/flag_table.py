@@ -236,8 +236,11 @@ _OF_IMAGES = {
         "cm of path, and standard deviation", "after refinement pairs show points a constant path apart",
         "nodes.<n>.path_offset_m of the pair's receiver, lever arms", "methods/autofocus/refine.py"),
     "prior_inconsistent": Flag(
-        "motions against the errors stated", "motions found are much larger or smaller than stated",
+        "motions against the errors stated", "track errors found are much larger than stated",
         "position_std_m, position_correlation_s; lever arms, heights, times", "methods/autofocus/evidence.py"),
+    "prior_too_wide": Flag(
+        "motions against the errors stated", "track errors found are much smaller than stated; no error of the image",
+        "position_std_m, position_correlation_s", "methods/autofocus/evidence.py"),
     "cycle_slip_suspected": Flag(
         "parts of the track, how far off", "parts of the refined track may be a wavelength off",
         "position_std_m; more bright points", "methods/autofocus/evidence.py"),

@@ -31,6 +31,7 @@ from apertura.core.planning.plan import memory_limit
 from apertura.core.planning.planner import make_plan
 from apertura.core.quality.budget import MOST_ACCURACY_DB
 from apertura.core.quality.error_check import CONFIDENCE, ErrorBound, error_bound
+from apertura.core.quality.focus import focus_with_flags
 from apertura.core.scene.angles import surface
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import FlatGround, GroundModels, Terrain, ground_of
@@ -197,10 +198,10 @@ def backproject(  # noqa: PLR0913 - each choice is a keyword, so that an editor 
         if error.bound_db > accuracy_db:
             sure = f"up to {error.bound_db:.1f} dB ({CONFIDENCE:.0%} sure)"
             flags["accuracy_missed"] = f"{sure}, {accuracy_db:g} dB asked"
-    told = _judged(formation, judge, error_db=attributes.get("numerical_error_db"))
-    missed = "accuracy_missed" in flags and attributes["numerical_error_db"] > _BLIND_DB
-    if told.verdict == "focused" and missed:
-        told = replace(told, verdict="cannot tell", why=f"the image itself errs: {flags['accuracy_missed']}")
+    error_db = attributes.get("numerical_error_db")
+    told = _judged(formation, judge, error_db=error_db)
+    flags = Flags.merged(flags, plan.flags, told.flags)
+    focus = focus_with_flags({"verdict": told.verdict, "why": told.why}, flags, error_db=error_db)
     attributes |= {
         "units": "1",
         "wave_speed_m_s": inputs.wave_speed_m_s,
@@ -209,9 +210,9 @@ def backproject(  # noqa: PLR0913 - each choice is a keyword, so that an editor 
         "setting": formation.plan.setting.line,
         "predicted_error_db": round(formation.plan.predicted_error_db, 2),
         "models": json.dumps(formation.plan.reasons, ensure_ascii=False),
-        "flags": json.dumps(Flags.merged(flags, plan.flags, told.flags), ensure_ascii=False),
-        "verdict": told.verdict,
-        "verdict_why": told.why,
+        "flags": json.dumps(flags, ensure_ascii=False),
+        "verdict": focus["verdict"],
+        "verdict_why": focus["why"],
         "budget": json.dumps(told.budget, ensure_ascii=False),
     }
     lazy = formation.image
@@ -246,9 +247,6 @@ def _check_kinds(inputs: PhaseHistory | Profiles, beams: Any, certified_pixels: 
 
 _SUM = 1e-3
 """Of 1, by which the sum of weights may be off: a hundredth of a decibel."""
-
-_BLIND_DB = -20.0
-"""dB below the peak of the numerical error above which, where less was asked, points may be its own: not focused."""
 
 _AT_ONCE_S = 10.0
 """Seconds that the plan may take for an image that is formed to be judged, where the caller does not say."""

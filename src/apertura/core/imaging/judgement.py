@@ -25,6 +25,7 @@ from apertura.core.quality.budget import (
     offset_line,
     position_lines,
 )
+from apertura.core.quality.focus import focus_with_flags
 from apertura.core.quality.path_errors import PointPaths
 
 if TYPE_CHECKING:
@@ -79,6 +80,7 @@ def judgement(formation: Formation, target: Any, lines: Sequence[BudgetLine]) ->
         focus = {key: value for key, value in focus.items() if key not in {"loss_db", "std_db", "elsewhere", "points"}}
         focus |= {"verdict": "cannot tell", "why": f"no aperture: {still}", "points": []}
     flags = Flags.merged(antenna_flags(lines), {} if still else focus_flags(focus, spoilt))
+    focus = focus_with_flags(focus, flags)
     return Judgement(focus["verdict"], focus["why"], flags, [line.report for line in lines], focus)
 
 

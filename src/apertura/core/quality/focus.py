@@ -1,8 +1,8 @@
 """Focus of an image, measured without truth: by contributions of pulses and by subapertures."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -131,6 +131,37 @@ LEAST_PEAK_SHARE = 0.35
 DEFOCUSED_DB = -1.0
 """dB, loss of a peak beyond which an image is called defocused."""
 
+Verdict = Literal["focused", "defocused", "cannot tell"]
+
+MOST_ERROR_DB = -20.0
+"""dB, numerical error against the peak above which, where less was requested, bright points may be artefacts."""
+
+GEOMETRY_CONTRADICTED = frozenset(
+    {
+        "association_ambiguous",
+        "association_suspect",
+        "attitude_suspect",
+        "code_unconfirmed",
+        "cycle_slip_suspected",
+        "echo_elsewhere",
+        "flights_apart",
+        "loss_unexpected",
+        "pair_unconfirmed",
+        "pairs_apart",
+        "pairs_out_of_phase",
+        "paths_differ",
+        "phase_unmeasured",
+        "platform_below_scene",
+        "prior_inconsistent",
+        "reference_point",
+        "refinement_rejected",
+        "time_tags_apart",
+        "wrong_code",
+    }
+)
+"""Flags that contradict the geometry, the clocks or the code that an image was formed with: no image that carries one
+is called focused."""
+
 _TREND = 5  # degree of the polynomial that models patterns, range and aspect in the log-amplitude
 _PADDING = 8  # of the spectrum of blocks, whose maximum removes a linear phase
 _SIGMAS = 5.0  # by which a drift must exceed a cell to be called defocused
@@ -243,7 +274,7 @@ class Focus:
         One line: reason for the verdict.
     """
 
-    verdict: Literal["focused", "defocused", "cannot tell"]
+    verdict: Verdict
     loss_db: float
     std_db: float
     points: int
@@ -274,11 +305,55 @@ def judge(points: Sequence[tuple[float, PointFocus | None]]) -> Focus:
     loss = weighted_median(losses, weights)
     spread = 1.4826 * weighted_median(np.abs(losses - loss), weights)
     std = float(np.hypot(spread, np.median(stds)) / np.sqrt(len(measured)))
-    bad = loss < DEFOCUSED_DB - 2 * std
+    verdict = verdict_of_loss(loss, std)
     line = f"{number_of(len(measured), 'bright point')} lost {abs(loss):.2f} ± {std:.2f} dB of the peak to phase errors"
-    if not bad and loss < DEFOCUSED_DB:
-        line += f", not more than {-DEFOCUSED_DB:g} dB by two standard deviations"
-    return Focus("defocused" if bad else "focused", loss, std, len(measured), line)
+    if verdict == "cannot tell":
+        line += f": within two standard deviations, the loss may or may not exceed {-DEFOCUSED_DB:g} dB"
+    return Focus(verdict, loss, std, len(measured), line)
+
+
+def verdict_of_loss(loss_db: float, std_db: float) -> Verdict:
+    """Return the verdict that a loss of the peak and its standard deviation allow, at two standard deviations.
+
+    Examples
+    --------
+    >>> verdict_of_loss(-0.2, 0.1), verdict_of_loss(-2.0, 0.1), verdict_of_loss(-4.48, 2.85)
+    ('focused', 'defocused', 'cannot tell')
+    """
+    if loss_db < DEFOCUSED_DB - 2 * std_db:
+        return "defocused"
+    return "focused" if loss_db > DEFOCUSED_DB + 2 * std_db else "cannot tell"
+
+
+def focus_with_flags(
+    focus: Mapping[str, Any], flags: Iterable[str], *, error_db: float | None = None
+) -> dict[str, Any]:
+    """Return the section `focus` of image.json with a verdict that no flag of the image contradicts.
+
+    Parameters
+    ----------
+    focus
+        With `verdict` and `why`, of the bright points alone.
+    flags
+        Names of the flags that the image carries.
+    error_db
+        Numerical error of the image against its peak, dB; None: not measured.
+
+    Notes
+    -----
+    Source: docs/theory/focus.md, "Verdict".
+
+    Examples
+    --------
+    >>> focus_with_flags({"verdict": "focused", "why": "3 bright points lost 0.02 dB"}, ["wrong_code"])["verdict"]
+    'cannot tell'
+    """
+    against = sorted(GEOMETRY_CONTRADICTED.intersection(flags))
+    if "accuracy_missed" in flags and error_db is not None and error_db > MOST_ERROR_DB:
+        against.append("accuracy_missed")
+    if focus["verdict"] != "focused" or not against:
+        return dict(focus)
+    return {**focus, "verdict": "cannot tell", "why": f"{focus['why']}; contradicted by {', '.join(against)}"}
 
 
 def judge_parts(parts: SubApertures, *, cell_m: float) -> Focus:

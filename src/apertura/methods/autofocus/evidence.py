@@ -223,7 +223,7 @@ class Evidence:
         count = len(self.settled)
         if not count:
             return ""
-        power = float((self.settled**2).mean())
+        power = self._motion_power
         low, high = chi2.ppf([_BY_CHANCE, 1 - _BY_CHANCE], count) / count
         if low / _SLACK < power < high * _SLACK:
             return ""
@@ -234,11 +234,16 @@ class Evidence:
         )
 
     @property
+    def _motion_power(self) -> float:
+        """Mean square of the motions that the image determines, in variances that the log states."""
+        return float((self.settled**2).mean())
+
+    @property
     def flags(self) -> dict[str, str]:
         """Edges crossed."""
         flags = {} if self.accepted or not self.promising else {"refinement_rejected": self.why}
         if self.inconsistent:
-            flags["prior_inconsistent"] = self.inconsistent
+            flags["prior_too_wide" if self._motion_power < 1 else "prior_inconsistent"] = self.inconsistent
         if self.slip:
             flags["cycle_slip_suspected"] = self.slip
         return flags

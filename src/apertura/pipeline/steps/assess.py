@@ -414,7 +414,9 @@ def _regained(focus: Mapping[str, Any], gain_db: float) -> bool:
 
 def _rank(focus: Mapping[str, Any]) -> tuple[int, float]:
     """Return the rank of a pair's focus, the best first."""
-    return ["focused", "defocused", "cannot tell"].index(focus["verdict"]), -focus.get("loss_db", 0.0)
+    uncertain = "cannot tell" if "loss_db" in focus else "not measured"
+    verdict = uncertain if focus["verdict"] == "cannot tell" else focus["verdict"]
+    return ["focused", "cannot tell", "defocused", "not measured"].index(verdict), -focus.get("loss_db", 0.0)
 
 
 def _disagreement(chosen: CoherentSum, pair: str, blind: Sequence[str]) -> dict[str, str]:

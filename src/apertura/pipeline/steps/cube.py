@@ -14,6 +14,7 @@ from apertura.common.contracts import MEASURED, QUOTED, RASTERS, SUMMED, Window
 from apertura.common.documents import undamaged
 from apertura.common.flags import Flags
 from apertura.core.combination import clutter_reduction_db, coherent_sum, magnitude_sum, noncoherent_sum
+from apertura.core.quality.focus import focus_with_flags
 from apertura.core.quality.measures import BlockRaster, held, image_statistics
 from apertura.core.scene.grid import SceneGrid
 from apertura.methods.interferometry.coherence import chance, coherence, common_band, window_px
@@ -92,6 +93,7 @@ def _quoted(image: xr.Dataset, assessed: Mapping[str, Any]) -> dict[str, float |
     """Return the quality of an image and its assessment: name of a row of `QUOTED` → value or None."""
     quality = image.attrs["quality"]
     view, focus, pulses = quality["view"], quality["focus"], quality.get("pulses", {})  # a phase history has none
+    flags = {*image.attrs["flags"], *assessed["flags"]}
     return {
         "heading": view["heading_deg"],
         "look_direction": view["look_deg"],
@@ -109,8 +111,8 @@ def _quoted(image: xr.Dataset, assessed: Mapping[str, Any]) -> dict[str, float |
         "pulses_used": pulses.get("used"),
         "pulses_dropped": pulses.get("dropped"),
         "peak": quality["brightest"]["amplitude"],
-        "verdict": focus["verdict"],
-        "flags": ",".join(sorted({*image.attrs["flags"], *assessed["flags"]})),
+        "verdict": focus_with_flags(focus, flags, error_db=quality["numerical_error_db"])["verdict"],
+        "flags": ",".join(sorted(flags)),
     }
 
 

@@ -20,7 +20,7 @@ from apertura.common.provenance import Provenance, canonical_json, chained_sha25
 from apertura.common.raster import opened_raster
 from apertura.core.combination import InPhase, in_phase
 from apertura.core.quality.budget import NO_EFFECT, BudgetLine
-from apertura.core.quality.focus import DEFOCUSED_DB
+from apertura.core.quality.focus import DEFOCUSED_DB, focus_with_flags, verdict_of_loss
 from apertura.core.quality.measures import Amplitude, BlockRaster, held, image_statistics
 from apertura.core.quality.point_targets import CUT_REACH_M, cuts_report, find_peak
 from apertura.core.scene.grid import SceneGrid
@@ -60,6 +60,7 @@ def export_pair(campaign: Campaign, flight: str, pair: str) -> list[Path]:
     }
     if campaign.calibrated:
         report |= _calibrated(campaign, flight, pair, report)
+    report["focus"] = focus_with_flags(quality["focus"], report["flags"], error_db=report["numerical_error_db"])
     origin = _with_code(Provenance.of(lineage.modules, [image]), assessed)
     folder = campaign.result(flight, pair)
     written = write_exports(
@@ -102,24 +103,23 @@ def export_fused(campaign: Campaign, flight: str) -> list[Path]:
     windows = list(grid.tiles(campaign.settings.processing.tile_px))
     measured, isolated = _in_phase(images, assessed, sums["noncoherent"], grid, windows)
     at_points = measured if isolated else None
+    added = assessed["fusion"]["phases_rad"]
+    of_pairs = {
+        pair: Flags.merged(image.attrs["flags"], assessed["pairs"][pair]["flags"]) for pair, image in images.items()
+    }
+    of_sum = Flags.merged(
+        _flags_of_choice(assessed["fusion"]), _incoherent(at_points), cube.attrs["flags"].get(flight, {})
+    )
+    against = {*of_sum, *(flag for pair in added for flag in of_pairs[pair])}  # of pairs left out, none
+    worst = _worst(images, assessed["fusion"])
     report = {
-        **_worst(images, assessed["fusion"]),
-        "focus": _focus(images, at_points, [*assessed["fusion"]["phases_rad"]]),
+        **worst,
+        "focus": focus_with_flags(_focus(images, at_points, [*added]), against, error_db=worst["numerical_error_db"]),
         **_measures(grid, windows, sums, images, assessed),
         "fusion": assessed["fusion"],
         "coherence": _coherence(measured, assessed) | {"isolated": isolated},
         "agreement": cube.attrs["agreement"]["flights"].get(flight),
-        "flags": Flags.merged(
-            _flags(
-                {
-                    pair: Flags.merged(image.attrs["flags"], assessed["pairs"][pair]["flags"])
-                    for pair, image in images.items()
-                },
-                assessed["fusion"],
-            ),
-            _incoherent(at_points),
-            cube.attrs["flags"].get(flight, {}),
-        ),
+        "flags": Flags.merged(_flags_of_pairs(of_pairs), of_sum),
     }
     name, coherently = f"{campaign.settings.campaign} · flight {flight}", assessed["fusion"]["phases_rad"]
     titles = {
@@ -323,9 +323,8 @@ def _focus(images: Mapping[str, xr.Dataset], measured: InPhase | None, added: Se
     of_images = -20 * float(np.log10(np.mean([10 ** (-one["loss_db"] / 20) for one in told])))
     loss_db = of_images + measured.loss_db
     std_db = float(np.hypot(np.mean([one["std_db"] for one in told]), measured.loss_std_db))
-    bad = loss_db < DEFOCUSED_DB - 2 * std_db
     return {
-        "verdict": "defocused" if bad else "focused",
+        "verdict": verdict_of_loss(loss_db, std_db),
         "loss_db": round(loss_db, 3),
         "std_db": round(std_db, 3),
         "why": (
@@ -358,18 +357,25 @@ def _incoherent(measured: InPhase | None) -> dict[str, str]:
     return {"sum_incoherent": line}
 
 
-def _flags(of_pairs: Mapping[str, Mapping[str, str]], fusion: Mapping[str, Any]) -> Flags:
-    """Return the flags of all pairs, each line with its pairs unless all carry it, and those of the choice of pairs."""
+def _flags_of_pairs(of_pairs: Mapping[str, Mapping[str, str]]) -> Flags:
+    """Merge the flags of all pairs, each line with its pairs unless all carry it."""
     raised: dict[str, dict[str, list[str]]] = {}
     for pair, flags in of_pairs.items():
         for flag, line in flags.items():
             raised.setdefault(flag, {}).setdefault(line, []).append(pair)
-    flags = {
-        flag: "; ".join(
-            line if len(pairs) == len(of_pairs) else f"{' and '.join(pairs)}: {line}" for line, pairs in lines.items()
-        )
-        for flag, lines in raised.items()
-    }
+    return Flags(
+        {
+            flag: "; ".join(
+                line if len(pairs) == len(of_pairs) else f"{' and '.join(pairs)}: {line}"
+                for line, pairs in lines.items()
+            )
+            for flag, lines in raised.items()
+        }
+    )
+
+
+def _flags_of_choice(fusion: Mapping[str, Any]) -> Flags:
+    """List the flags of the choice of pairs of a coherent sum: pairs left out, and phases not measured."""
     alone = "; ".join(f"{pair} is not in the coherent sum: {why}" for pair, why in fusion["left_out"].items())
     if ties := " or ".join(" and ".join(tie) for tie in fusion["ties"]):
         alone += f"; a tie: {ties} would make as large a sum, and the better focused one was taken"
@@ -382,7 +388,7 @@ def _flags(of_pairs: Mapping[str, Mapping[str, str]], fusion: Mapping[str, Any])
             + f"; wrong by a quarter of a turn the peak would be {lost[0]:.0f} dB lower, by half a turn "
             + (f"{lost[1]:.0f} dB" if known != unknown else "gone, and each target shown twice beside its place")
         )
-    return Flags.merged(flags, chosen)
+    return Flags(chosen)
 
 
 def _worst(images: Mapping[str, xr.Dataset], fusion: Mapping[str, Any]) -> dict[str, Any]:
