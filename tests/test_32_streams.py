@@ -136,8 +136,43 @@ def test_saturation_is_that_of_all_blocks_together():
     """Extremes that only a later block reaches replace those of the earlier ones."""
     saturation = Saturation()
     for values in ([1, 5, 5, -3], [7, 7, 7, -3], [7, 0, 0, -9]):
-        saturation.count({"radar": np.array(values, np.int16)})
+        saturation.count({"radar": np.array(values, np.int16).reshape(1, 2, 2)})
     assert saturation.shares["radar"] == pytest.approx((4 + 1 - 2) / 12)
+
+
+def symbols(generator, captures):
+    """Noise with the envelope of OFDM symbols, 12 dB of crest factor, as (capture, sample, 2) counts."""
+    return generator.normal(0, 1500, (captures, 2048, 2))
+
+
+def limited(iq, share):
+    """Limit each component to a share of its largest value."""
+    return iq.clip(-share * np.abs(iq).max(), share * np.abs(iq).max())
+
+
+@pytest.mark.parametrize(("share", "flagged"), [(1 / 8, True), (1 / 4, True), (1 / 2, False)])
+def test_captures_that_the_receiver_limited_are_counted(share, flagged):
+    """At half of the peak, 2.6 deviations of a component, limiting costs less than 0.1 dB."""
+    generator, saturation = np.random.default_rng(1), Saturation()
+    iq = symbols(generator, 200)
+    iq[::5] = limited(iq[::5], share)
+    for block in np.split(iq.astype(np.int16), 10):
+        saturation.count({"radar": block})
+    line = saturation.flags.get("captures_limited", "")
+    assert line.startswith("40 of 200 captures of channel radar: crest factor") if flagged else line == ""
+
+
+def test_captures_that_are_weak_or_hold_a_tone_are_not_limited():
+    """Fading lowers the peak alone; a strong tone lowers the crest factor alone; lost pulses leave noise."""
+    generator, saturation = np.random.default_rng(2), Saturation()
+    faded = symbols(generator, 200) * np.geomspace(1, 0.01, 200)[:, None, None]
+    turn = 0.3 * np.arange(2048)
+    tone = symbols(generator, 20) + 20000 * np.stack([np.cos(turn), np.sin(turn)], -1)
+    pulse = symbols(generator, 40) * 0.01
+    pulse[:30, 100:140] += 9000
+    for name, iq in (("faded", faded), ("tone", np.concatenate([faded, tone])), ("pulses", pulse)):
+        saturation.count({name: iq.astype(np.float32)})
+    assert "captures_limited" not in saturation.flags
 
 
 def test_a_long_flight_takes_no_more_memory_than_a_short_one(monkeypatch):

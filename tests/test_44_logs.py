@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from folders import complaint, edit_config, edit_track, small_simulation
+from folders import complaint, edit_config, edit_data, edit_track, small_simulation
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
 from apertura.core.geometry.aperture import Aperture
@@ -223,6 +223,21 @@ def test_an_offset_between_the_nodes_tags_does_not_turn_the_bistatic_phase(tmp_p
         phases.append(np.angle((data.transfer.values * np.exp(2j * np.pi * turns)).sum()))
     assert data.attrs["time_tags"]["offset_s"] == pytest.approx(offset_s, abs=1e-5)
     assert abs(np.angle(np.exp(1j * (phases[1] - phases[0])))) < 0.05
+
+
+@pytest.mark.parametrize("node", ["a", "b"])
+def test_captures_that_repeat_earlier_ones_are_left_out(tmp_path, node):
+    """Eight captures hold the samples of the eight before them: those are of other positions, and make a ghost."""
+    campaign = small_campaign(tmp_path)
+
+    def repeat(samples):
+        captures = samples.reshape(40, -1)
+        captures[20:28] = captures[12:20]
+
+    edit_data(Path(str(campaign.root)), node, repeat)
+    attrs = echo_of(campaign, f"a-{node}").attrs
+    assert attrs["pulses"] == {"used": 32, "dropped": 8, "reasons": {"captures_repeated": 8}}
+    assert attrs["flags"]["captures_repeated"] == f"8 of 40 captures of {node}, the first is number 20"
 
 
 def test_a_single_wrong_tag_is_left_out(tmp_path):

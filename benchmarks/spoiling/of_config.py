@@ -90,6 +90,21 @@ def _above_a_geoid(folder: Folder) -> None:
     section("scene", height_datum="egm96", geoid="raw/egm96_15.gtx")(folder)
 
 
+def _arms_in_enu(folder: Folder) -> None:
+    """State the lever arms of the transmitter east, north and up instead of forward, right and down."""
+    first, last = folder.log(TX).enu_m[[0, -1]]
+    yaw = np.arctan2(*(last - first)[:2])
+    # forward = (sin yaw, cos yaw, 0), right = (cos yaw, −sin yaw, 0), down = (0, 0, −1) in east, north, up
+    axes = np.array([[np.sin(yaw), np.cos(yaw), 0], [np.cos(yaw), -np.sin(yaw), 0], [0, 0, -1]])
+
+    def change(document: Document) -> None:
+        stated = document["nodes"][TX]["lever_arms_m"]
+        for point, arm in list(stated.items()):
+            stated[point] = (np.array(arm) @ axes).tolist()
+
+    folder.edit_config(change)
+
+
 def _no_attitude_no_arms(document: Document) -> None:
     document["nodes"][TX] |= {"attitude": "none", "lever_arms_m": {}}
 
@@ -113,6 +128,7 @@ MISTAKES = {
     "height_2m": Mistake("ground 2 m too high", section("scene", height_m=lambda m: m + 2), "height"),
     "height_0m5": Mistake("ground 0.5 m too high", section("scene", height_m=lambda m: m + 0.5), "height"),
     "height_below_0m5": Mistake("ground 0.5 m too low", section("scene", height_m=lambda m: m - 0.5), "height"),
+    "height_below_1m": Mistake("ground 1 m too low", section("scene", height_m=lambda m: m - 1.0), "height"),
     "height_egm96": Mistake("ellipsoidal height taken for one above EGM96", _above_a_geoid, "height"),
     "arm_z_1m2": Mistake("lever arms 1.2 m too low", arms(plus=(0, 0, 1.2)), "arm"),
     "arm_y_sign": Mistake("y of the lever arms with the wrong sign", arms(1, -1, 1), "arm"),
@@ -122,6 +138,7 @@ MISTAKES = {
         d["nodes"][TX]["lever_arms_m"].update({p: [a[1], a[0], a[2]]})
         for p, a in list(d["nodes"][TX]["lever_arms_m"].items())
     ]), "arm"),
+    "arms_in_enu": Mistake("lever arms east-north-up along the mean course", _arms_in_enu, "arm"),
     "arms_in_cm": Mistake("lever arms in centimetres", arms(100, 100, 100), "arm"),
     "arms_forgotten": Mistake("no lever arms", config(lambda d: d["nodes"][TX].update(lever_arms_m={})), "arm"),
     "sidelink_arm_forgotten": Mistake("no lever arm of the sidelink", arms(0, 0, 0, points=("sidelink",)), "arm"),

@@ -249,6 +249,7 @@ MISTAKES = {
     "yaw_sign": Mistake("yaw counter-clockwise", logs(turned(2, np.negative), TX), "attitude"),
     "yaw_90": Mistake("yaw from east", logs(turned(2, lambda yaw: yaw + 90), TX), "attitude"),
     "yaw_magnetic": Mistake("yaw from magnetic north, 4° off", logs(turned(2, lambda yaw: yaw + 4), TX)),
+    "yaw_magnetic_15": Mistake("yaw 15° off", logs(turned(2, lambda yaw: yaw + 15), TX), "attitude"),
     "yaw_180": Mistake("yaw backwards", logs(turned(2, lambda yaw: yaw + 180), TX), "attitude"),
     "roll_sign": Mistake("roll with the wrong sign", logs(turned(0, np.negative), TX)),
     "pitch_sign": Mistake("pitch with the wrong sign", logs(turned(1, np.negative), TX)),

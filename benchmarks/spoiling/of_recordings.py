@@ -112,6 +112,23 @@ def _clipped(values: Complex) -> Complex:
     return np.clip(louder.real, -8191, 8191) + 1j * np.clip(louder.imag, -8191, 8191)
 
 
+def _limited(values: Complex) -> Complex:
+    """Limit each fifth capture to an eighth of the largest I or Q."""
+    limit = np.abs(values.view(np.float64)).max() / 8
+    values[::5] = np.clip(values[::5].real, -limit, limit) + 1j * np.clip(values[::5].imag, -limit, limit)
+    return values
+
+
+def _repeated(captures: Captures) -> Captures:
+    """Replace captures 80 to 119 by the 40 before them."""
+    captures[80:120] = captures[40:80]
+    return captures
+
+
+def _drifting(turns: float) -> Callable[[Complex], Complex]:
+    return lambda values: values * np.exp(2j * np.pi * turns * np.linspace(0, 1, len(values)))[:, None, None]
+
+
 def _swap_recordings(folder: Folder) -> None:
     raw = folder.root / "raw" / "f01"
     for suffix in (".sigmf-meta", ".sigmf-data"):
@@ -177,6 +194,17 @@ MISTAKES = {
     "rx_carrier_50khz": Mistake("receiver's oscillator 50 kHz off", samples(_offset_carrier(5e4), RX), control=True),
     "tx_saturated": Mistake("radar of the transmitter clips", samples(_clipped, TX)),
     "rx_saturated": Mistake("radar of the receiver clips", samples(_clipped, RX, channels=RADAR)),
+    "tx_limited": Mistake("a fifth of the transmitter's captures limited to an eighth", samples(_limited, TX)),
+    "rx_limited": Mistake("a fifth of the receiver's limited to an eighth", samples(_limited, RX, channels=RADAR)),
+    "tx_repeated": Mistake("40 captures repeat the 40 before", lambda f: f.edit_captures(TX, _repeated)),
+    "rx_repeated": Mistake("40 of the receiver repeat the 40 before", lambda f: f.edit_captures(RX, _repeated)),
+    **{
+        f"rx_radar_drift_{turns}": Mistake(
+            f"radar of the receiver drifts by {turns} turns against its sidelink",
+            samples(_drifting(turns), RX, channels=RADAR),
+        )
+        for turns in (1, 2, 3)
+    },
     "tx_tone": Mistake("a strong tone in the transmitter's radar", samples(_tone, TX)),
     "tx_iq_swapped": Mistake("I and Q of the transmitter swapped", samples(lambda s: 1j * s.conj(), TX)),
     "iq_swapped": Mistake("I and Q of all swapped", samples(lambda s: 1j * s.conj(), TX, RX)),

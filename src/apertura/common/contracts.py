@@ -142,6 +142,7 @@ STAGES: Mapping[str, Stage] = {
             "start": Variable(("pulse",), "int64", "1", "first sample of the capture in the recorder's file"),
             "time": Variable(("pulse",), "datetime64[ns]", "", "UTC time tag of the capture, node's own clock"),
             "frame": Variable(("pulse",), "int64", "1", "frame number sent in the payload, -1 without"),
+            "repeats": Variable(("pulse",), "bool", "1", "whether the capture repeats an earlier one bit for bit"),
         },
         {
             "node": "node name",

@@ -107,6 +107,14 @@ _OF_RECORDINGS = {
         "s and m of path between reception and reference point, at worst",
         "CPHD: positions and times of pulses contradict each other", "the file's writer; whether the image is sharp",
         "formats/phase_histories/cphd.py"),
+    "captures_repeated": Flag(
+        "captures left out, of how many; the number of the first",
+        "captures repeat earlier ones bit for bit: the recorder wrote old samples again; ghosts without this",
+        "buffers of the recorder; the copy of the recording", "pipeline/opening/echo.py"),
+    "captures_limited": Flag(
+        "captures, of how many; their crest factor and that of the others, dB",
+        "part of the captures is limited below the converter's end stops: echoes are weaker there, and distorted",
+        "limiter, gain control and gain of the receiver", "core/echo/captures.py"),
     "saturated_radar": Flag(
         "share of the samples", "samples at the end stops of the converter", "gain", "core/echo/captures.py"),
     "saturated_sidelink": Flag(

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.common.arrays import Complexes, Floats
+from apertura.common.flags import Flags
 from apertura.core.echo.demodulate import Numerology
 from apertura.core.interpolation import kaiser_beta, kaiser_sinc
 
@@ -52,13 +53,25 @@ def spread(count: int, *, groups: int, each: int) -> list[Pulses]:
     return [np.arange(int(middle - each / 2), int(middle - each / 2) + each) for middle in middles]
 
 
+_CREST_SAMPLES = 256
+"""Samples of a capture by which its crest factor is measured: noise alone has one below 3 in 2 of 10⁶ captures."""
+
+_LIMITED_CREST = 3.0
+"""Peak power over mean power of a limited capture at most; noise and OFDM symbols have 6 to 10, a square wave has 1."""
+
+_LIMITED_SHARE = 0.5
+"""Of the peak power and of the crest factor that captures without a limit have: a limited one has less of both."""
+
+
 class Saturation:
-    """Samples at a converter's end stops, counted block by block.
+    """Samples at a converter's end stops, and captures limited below them, counted block by block.
 
     Notes
     -----
     A converter that clips accumulates samples at its end stops, whatever its number of bits; without clipping the
-    extreme values occur once or twice.
+    extreme values occur once or twice. A limiter in front of it lowers the peak of a capture and its crest factor,
+    max|s|²/mean|s|², alike: a weak capture has a lower peak and keeps its crest factor, a strong tone the other way
+    round. Captures are compared with the 90th percentile of all.
 
     Examples
     --------
@@ -76,6 +89,7 @@ class Saturation:
     def __init__(self) -> None:
         self._extremes: dict[str, list[_Extreme]] = {}
         self._samples: dict[str, int] = {}
+        self._powers: dict[str, list[Floats]] = {}
 
     def count(self, iq: Mapping[str, Samples]) -> None:
         """Count some captures, channel → (capture, sample, 2)."""
@@ -84,6 +98,11 @@ class Saturation:
             extremes = self._extremes.setdefault(name, [_Extreme(+1), _Extreme(-1)])
             for extreme, value in zip(extremes, (samples.max().item(), samples.min().item()), strict=True):
                 extreme.count(samples, value)
+            every = max(1, samples.shape[1] // _CREST_SAMPLES)
+            some = samples[:, ::every].astype(np.float64)
+            power = (some**2).sum(axis=-1)
+            if power.shape[1] >= _CREST_SAMPLES:
+                self._powers.setdefault(name, []).append(np.stack([power.max(axis=1), power.mean(axis=1)]))
 
     @property
     def shares(self) -> dict[str, float]:
@@ -94,13 +113,32 @@ class Saturation:
         }
 
     @property
-    def flags(self) -> dict[str, str]:
-        """A flag for each channel whose converter clipped."""
-        return {
+    def flags(self) -> Flags:
+        """Flags of channels whose converter clipped, and of captures limited before it."""
+        clipped = {
             f"saturated_{name}": f"{share:.2%} of the samples of channel {name} sit at the converter's end stops"
             for name, share in self.shares.items()
             if share > SATURATED_SHARE
         }
+        limited = [self._limited(name, *np.concatenate(powers, axis=1)) for name, powers in self._powers.items()]
+        return Flags.merged(clipped, *limited)
+
+    @staticmethod
+    def _limited(channel: str, peak: Floats, mean: Floats) -> Flags:
+        """Raise a flag where captures have a lower peak and a lower crest factor than the others."""
+        crest = peak / np.maximum(mean, np.finfo(float).tiny)
+        usual_peak, usual_crest = (float(np.percentile(values, 90)) for values in (peak, crest))
+        limited = (
+            (peak < _LIMITED_SHARE * usual_peak) & (crest < _LIMITED_SHARE * usual_crest) & (crest < _LIMITED_CREST)
+        )
+        if not limited.any():
+            return Flags()
+        found_db, usual_db = (10 * float(np.log10(value)) for value in (np.median(crest[limited]), usual_crest))
+        line = (
+            f"{int(limited.sum())} of {len(peak)} captures of channel {channel}: crest factor {found_db:.1f} dB, "
+            f"{usual_db:.1f} dB of the others"
+        )
+        return Flags({"captures_limited": line})
 
 
 class _Extreme:

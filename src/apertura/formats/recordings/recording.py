@@ -1,5 +1,6 @@
 """What every recorder's files become: samples to be read, captures in UTC, and what was sent before each symbol."""
 
+import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +15,7 @@ from apertura.common.provenance import hashes_of_file
 from apertura.formats.recordings.sample_file import SampleFile
 
 _AT_ONCE = 4096
-_ALIVE = 16  # samples of which one that is not zero spares the others a look
+_FIRST = 16  # samples of a capture that show that it is not empty, and that it repeats no other
 
 
 def _sha512(path: Path) -> str:
@@ -98,7 +99,7 @@ class Recording:
         CampaignError
             If a capture holds only zeros, or the file ends before the last.
         """
-        self._check_alive(captures)
+        repeats = self._repeats(captures)
         layout, segments = self.samples.layout.kept()
         return xr.Dataset(
             {
@@ -106,6 +107,7 @@ class Recording:
                 "start": ("pulse", captures.start),
                 "time": ("pulse", captures.time),
                 "frame": ("pulse", captures.frame),
+                "repeats": ("pulse", repeats),
             },
             attrs={
                 **layout,
@@ -118,13 +120,24 @@ class Recording:
             },
         )
 
-    def _check_alive(self, captures: Captures) -> None:
-        """Raise CampaignError if a capture holds only zeros; of those that begin otherwise no more is read."""
-        start, few = captures.start, min(_ALIVE, captures.length)
-        dead: list[NDArray[np.bool_]] = []
+    def _repeats(self, captures: Captures) -> NDArray[np.bool_]:
+        """Find captures that repeat an earlier one bit for bit, which noise never does; (capture,) bool.
+
+        Captures that begin like no other one are not read further.
+
+        Raises
+        ------
+        CampaignError
+            If a capture holds only zeros.
+        """
+        start, few = captures.start, min(_FIRST, captures.length)
+        dead, alike = list[NDArray[np.bool_]](), dict[bytes, list[int]]()
         for first in range(0, len(start), _AT_ONCE):
             some = start[first : first + _AT_ONCE]
-            silent = np.asarray(~self.samples.captures(some, few).any(axis=(1, 3)))
+            beginnings = self.samples.captures(some, few)
+            for number, beginning in enumerate(beginnings, first):
+                alike.setdefault(beginning.tobytes(), []).append(number)
+            silent = np.asarray(~beginnings.any(axis=(1, 3)))
             for capture in np.flatnonzero(silent.any(axis=1)):
                 silent[capture] = ~self.samples.captures(some[capture : capture + 1], captures.length).any(
                     axis=(0, 1, 3)
@@ -138,3 +151,12 @@ class Recording:
                     "samples",
                     "The receiver or the copy failed; record or copy again, or remove those captures.",
                 )
+        repeats = np.zeros(len(start), bool)
+        for numbers in alike.values():
+            known = set[bytes]()
+            for number in numbers if len(numbers) > 1 else ():
+                samples = self.samples.captures(start[number : number + 1], captures.length).tobytes()
+                digest = hashlib.blake2b(samples, digest_size=16).digest()
+                repeats[number] = digest in known
+                known.add(digest)
+        return repeats

@@ -226,7 +226,8 @@ def pair_echo(
     Pulses of a hover are left out unless `hovers`, as `apertura.pipeline.opening.positions.place` does.
     """
     pulses = common_pulses(tx, rx, prf_hz=sent.waveform.prf_hz)
-    paired = np.flatnonzero(~pulses.outlier)
+    repeats = rx.raw.repeats.values[pulses.rx_index]
+    paired = np.flatnonzero(~pulses.outlier & ~repeats)
     positions = place(tx, rx, tx.raw.time.values[pulses.tx_index[paired]], hovers=hovers)
     paired = paired[positions.good]
     at = tx.raw.time.values[pulses.tx_index[paired]]
@@ -251,7 +252,7 @@ def pair_echo(
             **_axes((tx, rx), at),
             **_sidelink_vector((tx, rx), at),
         },
-        attrs=_attributes((tx, rx), pulses, positions, measured, at=at, calibration=calibration)
+        attrs=_attributes((tx, rx), pulses, positions, measured, repeats, at=at, calibration=calibration)
         | {"stated_offset_m": offset_m, **stated_air(flown)},
     )
     saturation = Saturation()
@@ -263,6 +264,7 @@ def _attributes(
     pulses: Association,
     positions: PulsePositions,
     measured: Transfer,
+    repeats: NDArray[np.bool_],
     *,
     at: Times,
     calibration: dict[str, Any] | None,
@@ -276,9 +278,14 @@ def _attributes(
         "positions": positions.report,
         "time_tags": _time_tags(nodes[0], pulses),
         "flags": Flags.merged(
-            pulses.flags, positions.flags, measured.flags, missing, calibration["flags"] if calibration else {}
+            pulses.flags,
+            _repeated(nodes[1], pulses, repeats),
+            positions.flags,
+            measured.flags,
+            missing,
+            calibration["flags"] if calibration else {},
         ),
-        "pulses": _counted(len(nodes[0].raw.time), pulses, positions, measured),
+        "pulses": _counted(len(nodes[0].raw.time), pulses, repeats, positions, measured),
     }
     if calibration:
         attrs["calibration"] = {name: calibration[name] for name in ("flight", "offset_m", "std_m")}
@@ -354,12 +361,24 @@ def _time_tags(tx: Acquisition, pulses: Association) -> dict[str, Any]:
     }
 
 
-def _counted(sent: int, pulses: Association, positions: PulsePositions, measured: Transfer) -> dict[str, Any]:
+def _repeated(rx: Acquisition, pulses: Association, repeats: NDArray[np.bool_]) -> Flags:
+    """Raise a flag where captures of the receiver repeat earlier ones bit for bit; they are left out."""
+    if not repeats.any():
+        return Flags()
+    first = int(pulses.rx_index[int(repeats.argmax())])
+    line = f"{int(repeats.sum())} of {len(repeats)} captures of {rx.name}, the first is number {first}"
+    return Flags({"captures_repeated": line})
+
+
+def _counted(
+    sent: int, pulses: Association, repeats: NDArray[np.bool_], positions: PulsePositions, measured: Transfer
+) -> dict[str, Any]:
     """Return how many of the pulses sent are used, how many not, and why."""
     used = int(measured.kept.sum())
     reasons = {
         "unpaired": pulses.tx_dropped,
         "time_tag_outlier": int(pulses.outlier.sum()),
+        "captures_repeated": int((repeats & ~pulses.outlier).sum()),
         **positions.reasons,
         "sidelink_lost": int((~measured.kept).sum()),
     }
