@@ -122,7 +122,7 @@ def finished_sample(shared, all_steps, tmp_path_factory):
     from folders import copy_writable, state
 
     campaign = copy_writable(shared / "campaign-sample", tmp_path_factory.mktemp("sample") / "campaign")
-    state(campaign, "scene", atmosphere="vacuum")  # which the model that made it flies in
+    state(campaign, "scene", atmosphere={"refractivity_n": 0.0})  # which the model that made it flies in
     return all_steps("sample", campaign)
 
 

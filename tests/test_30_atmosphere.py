@@ -83,7 +83,8 @@ def test_what_the_weather_may_be_covers_ten_kelvin_twenty_hectopascals_and_any_h
     measured = Atmosphere.of_weather(celsius, hpa, humidity, ground_m=300.0)
     assert measured.refractivity_n == air.refractivity_n
     assert 1 < measured.std_n < air.std_n / 3
-    assert Atmosphere.vacuum().std_n == 0
+    assert Atmosphere.stated(0.0, ground_m=0.0).std_n == 0  # simulated in vacuum
+    assert Atmosphere.vacuum().std_n == 300  # in place of air
     assert wave_speed(0.0) == SPEED_OF_LIGHT_M_S  # to the bit
 
 

@@ -344,12 +344,12 @@ def test_an_image_is_of_the_track_that_was_given_whatever_becomes_of_its_array()
 
 
 def test_the_budget_of_arrays_states_what_air_would_do_where_vacuum_is_assumed():
-    """N = 290 makes every path longer by 290 parts in a million: of a range R the image lies 290e-6 R farther."""
+    """N = 300 makes every path longer by 300 parts in a million: of a range R the image lies 300e-6 R farther."""
     budget = json.loads(ap.backproject(HISTORY, TARGET_GRID, judge=False).attrs["budget"])
     line = next(one for one in budget if one["cause"] == "atmosphere")
     slant_m = np.linalg.norm(APERTURE.tx_m.mean(axis=0) - TARGET)
     ground_m = np.linalg.norm((APERTURE.tx_m.mean(axis=0) - TARGET)[0, :2])
-    assert "N = 290" in line["stated"]
-    assert line["shift_m"] == pytest.approx(290e-6 * slant_m * slant_m / ground_m, rel=0.1)
+    assert "N = 300" in line["stated"]
+    assert line["shift_m"] == pytest.approx(300e-6 * slant_m * slant_m / ground_m, rel=0.1)
     stated = ap.backproject(HISTORY, TARGET_GRID, judge=False, atmosphere=285.0).attrs["budget"]
     assert "20 N units" in stated

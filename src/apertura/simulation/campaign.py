@@ -81,7 +81,7 @@ def _stated_air(specification: CampaignSpecification) -> dict[str, Any]:
     if specification.atmosphere == "standard":
         return {}
     vacuum = specification.atmosphere == "vacuum"
-    return {"atmosphere": "vacuum" if vacuum else {"refractivity_n": specification.atmosphere}}
+    return {"atmosphere": {"refractivity_n": 0.0 if vacuum else specification.atmosphere}}
 
 
 def _write_segments(root: Path, specification: CampaignSpecification) -> None:

@@ -131,7 +131,7 @@ def _config(flight: FmcwFlight, waveform: Mapping[str, Any]) -> dict[str, Any]:
             "spacing_m": flight.spacing_m,
             "height_m": flight.origin[2],
             "height_datum": "ellipsoid",
-            "atmosphere": "vacuum",  # as `beats` flies
+            "atmosphere": {"refractivity_n": 0.0},  # as `beats` flies
         },
     }
 

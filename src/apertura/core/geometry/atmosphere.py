@@ -17,6 +17,9 @@ SCALE_HEIGHT_M = 7350.0
 STANDARD_HUMIDITY_PERCENT = 50.0
 """Relative humidity taken where nobody states it; the standard atmosphere has none."""
 
+USUAL_N = 300.0
+"""N units of air at the ground, which recordings of a flight are of wherever vacuum is assumed."""
+
 _STANDARD_K, _STANDARD_HPA, _LAPSE_K_M, _BAROMETRIC = 288.15, 1013.25, 6.5e-3, 5.2559  # ISO 2533, below 11 km
 _HIGHEST_M = 11_000.0  # where its lapse ends
 _UNKNOWN = 10.0, 20.0, 100 / np.sqrt(12)  # K, hPa, % (any humidity alike): weather against the standard atmosphere
@@ -115,8 +118,11 @@ class Atmosphere:
 
     @classmethod
     def vacuum(cls) -> "Atmosphere":
-        """Return no air: waves fly at the speed of light in vacuum."""
-        return cls(0.0, 0.0, "vacuum, as asked for")
+        """Return vacuum in place of air that nobody measured: an approximation, off by all of the air's refractivity.
+
+        `stated(0.0)` is exact: recordings simulated in vacuum, or corrected for the air.
+        """
+        return cls(0.0, 0.0, f"vacuum, in place of air of about N = {USUAL_N:.0f}", USUAL_N)
 
     @classmethod
     def standard(cls, ground_m: float) -> "Atmosphere":
@@ -144,7 +150,8 @@ class Atmosphere:
                 expected=f"N units, (n - 1)·10⁶: {_LEAST_N:g} to {_MOST_N:g}, or 0 for vacuum",
                 remedy="Of an index n give (n - 1)·10⁶.",
             )
-        return cls(refractivity_n, ground_m, f"N = {refractivity_n:g} at the ground, as stated", _STATED_N)
+        std_n = _STATED_N if refractivity_n else 0.0  # 0: simulated in vacuum, which nobody measured
+        return cls(refractivity_n, ground_m, f"N = {refractivity_n:g} at the ground, as stated", std_n)
 
     def at_n(self, height_m: Any) -> Floats:
         """Return N at heights (m), of their shape."""
@@ -188,7 +195,7 @@ class Atmosphere:
         of_pulses = (legs * length_m).sum(axis=0) / np.maximum(length_m.sum(axis=0), 1e-9)
         mean = float(of_pulses.mean())
         falls = abs(self.refractivity_n - mean)
-        scaled = self.std_n * mean / self.refractivity_n if self.refractivity_n else 0.0
+        scaled = self.std_n * (mean / self.refractivity_n if self.refractivity_n else 1.0)
         left_m = length_m.sum(axis=0) * 1e-6 * (of_pulses - mean)
         return FlightAir(
             mean,

@@ -12,6 +12,7 @@ from apertura.common.arrays import is_number
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
 from apertura.common.flags import Flags
+from apertura.core.geometry.atmosphere import USUAL_N
 from apertura.core.imaging.focus_check import focus_flags, focus_report
 from apertura.core.imaging.formation import Formation
 from apertura.core.imaging.view import ground_axes
@@ -189,14 +190,14 @@ def budget_by_hand(
     ]
 
 
-_SEA_LEVEL_N, _OTHER_N = 290.0, 20.0
-"""N units of air at sea level, and by which the air of a day differs from a standard atmosphere."""
+_OTHER_N = 20.0
+"""N units by which the air of a day differs from a standard atmosphere."""
 
 
 def _air_line(paths: PointPaths, wave_speed_m_s: float) -> BudgetLine:
     """Return the effect of air where the wave speed is that in vacuum, else of other air than was stated."""
     in_vacuum = math.isclose(wave_speed_m_s, SPEED_OF_LIGHT_M_S, rel_tol=1e-9)
-    units = _SEA_LEVEL_N if in_vacuum else _OTHER_N
+    units = USUAL_N if in_vacuum else _OTHER_N
     path_m = sum(np.linalg.norm(leg - paths.point_m, axis=1) for leg in paths.aperture.legs)
     words = f"air of N = {units:.0f}, where vacuum is assumed," if in_vacuum else f"{units:.0f} N units"
     return BudgetLine("atmosphere", None, paths.of_offset(1e-6 * units * path_m, common=True), unit=words)

@@ -295,7 +295,8 @@ class Scene(Section):
         "auto",
         description="air that the waves fly through: auto, standard atmosphere at the ground's height with 50 % "
         "humidity; {temperature_c: x, pressure_hpa: y, relative_humidity: z} measured at the ground; "
-        "{refractivity_n: 290} there; vacuum; it thins with height",
+        "{refractivity_n: 290} there, 0 for recordings simulated in vacuum; vacuum, an approximation whose error is "
+        "in the budget; air thins with height",
     )
     reference_points: tuple[KnownPoint, ...] = Field(
         (),

@@ -85,7 +85,8 @@ def in_air(campaign: Campaign, history: xr.Dataset) -> xr.Dataset:
         asked = "point" if given == "point" else "measured"
     air = scene_air(campaign, history.tx_position.values)
     if asked == "corrected":
-        air = replace(air, atmosphere=replace(Atmosphere.vacuum(), source="none: taken out of the files, as stated"))
+        corrected = replace(Atmosphere.stated(0.0, ground_m=0.0), source="none: taken out of the files, as stated")
+        air = replace(air, atmosphere=corrected)
     flown = air.over(aperture_of(history))
     if asked == "point":
         history = history.assign(reference_delay=history.reference_delay * (1 + 1e-6 * flown.refractivity_n))

@@ -13,6 +13,7 @@ from apertura.common.flags import Flags
 from apertura.core.antenna.beam import Beams
 from apertura.core.backprojection.job import Integration, Job
 from apertura.core.echo.compression import centre_frequency
+from apertura.core.geometry.atmosphere import USUAL_N
 from apertura.core.imaging.job import decide_integration, imaging_job
 from apertura.core.imaging.range_profiles import GUARD_SAMPLES, RangeWindow
 from apertura.core.planning.decisions import decide_accuracy
@@ -43,7 +44,6 @@ from apertura.pipeline.store import manifest_of
 # ---- Error budget of a pair, from config, logs and echo -------------------------------------------------------------
 
 _MS, _CM, _PPM = 1e-3, 1e-2, 1e-6
-_USUAL_N = 300.0  # of air at the ground: what vacuum is told by
 _SHOWN_CELLS = 0.01  # of a range cell: a shift below it is lost in any peak of 20 dB (docs/theory/focus.md, eq. 6)
 
 
@@ -189,7 +189,7 @@ def air_decision(pair: OpenPair) -> Decision:
     cell_m = pair.wave_speed_m_s / float(np.ptp(pair.frequency_hz)) / 2
     moved_m, left_m, other = float(air["vacuum_would_move_m"]), float(air["one_constant_leaves_m"]), "vacuum"
     if not air["refractivity_n"]:
-        moved_m, other = 1e-6 * _USUAL_N * float(air["range_m"]), f"air of N = {_USUAL_N:.0f}"
+        moved_m, other = 1e-6 * USUAL_N * float(air["range_m"]), f"air of N = {USUAL_N:.0f}"
     shows = "" if moved_m > _SHOWN_CELLS * cell_m else ", which does not show"
     why = (
         f"{air['source']}; mean along the paths from {air['antennas_m']:.0f} m; {other} would move the image by "
