@@ -15,6 +15,7 @@ from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.check import problems
 from apertura.pipeline.digests import Sources, digest_of
 from apertura.pipeline.lineage import modules_of, on_demand, results_of
+from apertura.pipeline.opening.scene import expected_scene
 from apertura.pipeline.resources import Resources
 from apertura.pipeline.rules import RESULTS
 from apertura.pipeline.stale import (
@@ -26,8 +27,10 @@ from apertura.pipeline.stale import (
     stale_lines,
     stale_results,
     wanted_files,
+    without_outdated,
 )
-from apertura.pipeline.steps import echo
+from apertura.pipeline.steps import echo, ingest, scene
+from apertura.views.plan import first_flight, print_plan
 from apertura.views.summary import print_summary
 
 LOG = "raw/f01/uav2.track.pos"
@@ -334,3 +337,26 @@ def test_what_is_kept_overtakes_no_other_result_whether_it_is_asked_for_or_no_lo
     campaign = state(finished, "processing", keep=[])
     assert names(stale_results(campaign)) == {"ro_crate"}
     assert (finished / kept).is_file()
+
+
+def planned_spacing_m(campaign):
+    return expected_scene(without_outdated(campaign), lambda: first_flight(campaign)).grid.spacing_m
+
+
+def test_a_plan_follows_the_config_and_not_results_that_are_out_of_date(tiny, capsys):
+    """A finished grid with an automatic CRS: after an edit of the spacing the plan is of the new one, and says so."""
+    campaign = state(tiny, "scene", crs="auto")
+    for node in ("uav1", "uav2"):
+        ingest.ingest(campaign, "f01", node)
+    for pair in ("uav1-uav1", "uav1-uav2"):
+        echo.echo(campaign, "f01", pair)
+    scene.scene(campaign)
+    assert planned_spacing_m(campaign) == 0.1
+    print_plan(campaign)
+    assert "out of date" not in capsys.readouterr().out
+    edited = state(tiny, "scene", spacing_m=0.2)
+    assert planned_spacing_m(edited) == 0.2
+    print_plan(edited)
+    printed = capsys.readouterr().out
+    assert "1 result out of date (results/scene.manifest.json): planned from the config" in printed
+    assert "pixels of 0.2 m" in " ".join(printed.split())

@@ -39,6 +39,8 @@ class Campaign(RawFolder):
         Lines of the tables beside the config.
     planned
         Whether it is a flight plan: nothing was recorded, and what is sent may not be there yet.
+    outdated
+        Manifests of results that are out of date: what is planned from the config does not read them.
 
     Examples
     --------
@@ -52,6 +54,7 @@ class Campaign(RawFolder):
     segments: tuple[Segment, ...] = ()
     clocks: tuple[ClockRow, ...] = ()
     planned: bool = False
+    outdated: frozenset[str] = frozenset()
 
     @classmethod
     def load(cls, root: str | Path) -> "Campaign":
@@ -145,6 +148,11 @@ class Campaign(RawFolder):
     def manifest(self, stage: str, *where: str) -> str:
         """Return the manifest of a stage relative to the campaign folder, as the workflow names it."""
         return "/".join(["results", *where, f"{stage}.manifest.json"])
+
+    def is_current(self, result: ConfinedPath) -> bool:
+        """Return whether a stage or document is finished and not `outdated`."""
+        manifest = result.with_name(f"{result.stem}.manifest.json")
+        return manifest.is_file() and self.relative(manifest) not in self.outdated
 
     def file(self, name: str, key: str) -> ConfinedPath:
         """Return a file that `key` of the config names; raise CampaignError unless it lies in the campaign folder."""

@@ -4,12 +4,13 @@ import re
 import sys
 import time
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from itertools import count
 from typing import Any
 
 from apertura.common.atomic import date
 from apertura.common.confined import ConfinedPath
-from apertura.common.errors import CampaignError, shown
+from apertura.common.errors import CampaignError, number_of, shown
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.digests import Result, digest_of
 from apertura.pipeline.lineage import files_read, on_demand, places_of, products_of, results_of
@@ -53,6 +54,18 @@ def stale_results(campaign: Campaign, *, paranoid: bool = False) -> dict[str, st
         if reasons or not stale.keys().isdisjoint(result.sources):
             stale[result.manifest] = "; ".join(reasons)
     return stale
+
+
+def without_outdated(campaign: Campaign) -> Campaign:
+    """Return a campaign whose plans are taken from its config and files: results that are out of date are not read."""
+    return replace(campaign, outdated=frozenset(stale_results(campaign)))
+
+
+def outdated_lines(campaign: Campaign) -> Iterator[str]:
+    """Yield a line on the results that `without_outdated` has taken out of account."""
+    if campaign.outdated:
+        count = number_of(len(campaign.outdated), "result")
+        yield f"{count} out of date ({min(campaign.outdated)}): planned from the config; `apertura run` updates them"
 
 
 def absent_files(campaign: Campaign) -> list[str]:

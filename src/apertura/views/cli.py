@@ -383,8 +383,10 @@ def score(
     """Compare where point targets are found with where they were put, and print the products' paths."""
     opened = _opened(campaign)
     from apertura.views.score import print_findings
+    from apertura.views.summary import print_stale
 
     print_findings(opened, paths=paths)
+    print_stale(opened)
 
 
 @app.command()
@@ -514,8 +516,11 @@ def map_page(
     """Show a campaign as a map in a browser: served to this machine alone, until Ctrl-C."""
     opened = _opened(campaign)
     opened.check_images()
+    from apertura.views.summary import print_stale
     from apertura.views.webmap.server import served, served_look
 
+    if not look_:
+        print_stale(opened)
     (served_look if look_ else served)(opened, port=port).show(in_browser=open_)
 
 

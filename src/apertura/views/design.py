@@ -32,6 +32,7 @@ from apertura.pipeline.design.layers import UNITS, PlannedImage, planned_image
 from apertura.pipeline.design.writing import PICTURE_TAGS, copy_named, plan_text, write_design
 from apertura.pipeline.opening.pair import open_pair
 from apertura.pipeline.opening.scene import expected_scene
+from apertura.pipeline.stale import outdated_lines, without_outdated
 from apertura.views.image_report import read_report
 from apertura.views.plan import first_flight
 from apertura.views.report.page import Block, Heading, Paragraph, Picture, Table, page
@@ -366,12 +367,14 @@ def print_comparison(path: Path, folder: Path, *, threads: int = 1) -> None:
     """Print planned and flown side by side: by the logs of the campaign, and by its images where there are any."""
     from rich.console import Console
 
-    plan, campaign = read_flight_plan(path), Campaign.load(folder)
+    plan, campaign = read_flight_plan(path), without_outdated(Campaign.load(folder))
     campaign.check_images()
     rows = comparison_rows(plan, path.absolute().parent, campaign, threads=threads)
     head = ("image", "quantity", "planned", "flown, by the logs", "measured in the image")
     console = Console(width=max(120, Console().width))
     console.print(_table("planned and flown", head, rows))
+    for line in outdated_lines(campaign):
+        console.print(line, highlight=False)
     for line in _other_radar(plan, campaign):
         console.print(f"[yellow]another radar[/yellow]: {line}", highlight=False)
 
@@ -453,7 +456,7 @@ def _measured(campaign: Campaign, flight: str, pair: str) -> Mapping[str, float]
     """Return what a finished image says of itself; nothing before."""
     from apertura.common.raster import opened_raster
 
-    if not (campaign.result(flight, pair, "image.json")).is_file():
+    if not campaign.is_current(campaign.result(flight, pair, "export")):
         return {}
     report = read_report(campaign, flight, pair)
     found: dict[str, float] = {}

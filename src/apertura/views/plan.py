@@ -13,6 +13,7 @@ from apertura.pipeline.opening.autofocus import expected_track
 from apertura.pipeline.opening.pair import open_pair
 from apertura.pipeline.opening.plan import budget_of, plan_pair
 from apertura.pipeline.opening.scene import Flown, expected_scene
+from apertura.pipeline.stale import outdated_lines, without_outdated
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -37,6 +38,9 @@ def print_plan(campaign: Campaign, *, threads: int = 1) -> None:
     from rich.filesize import decimal
 
     console = Console(width=max(140, Console().width))
+    campaign = without_outdated(campaign)
+    for line in outdated_lines(campaign):
+        console.print(line, highlight=False)
     seconds, disk = 0.0, 0
     scene = expected_scene(campaign, lambda: first_flight(campaign))
     for flight in campaign.image_flights:

@@ -23,7 +23,7 @@ from apertura.pipeline.opening.acquisition import Acquisition
 from apertura.pipeline.opening.pair import OpenPair
 from apertura.pipeline.opening.plan import paths_to, positions_loss_db
 from apertura.pipeline.opening.scene import OpenScene
-from apertura.pipeline.store import manifest_of, open_stage
+from apertura.pipeline.store import open_stage
 
 # ---- Decision whether and how the tracks of a flight are refined ----------------------------------------------------
 
@@ -229,7 +229,7 @@ def expected_track(
 
     Before step `refine` ran, the pairs are those of the logs, whatever was decided.
     """
-    if manifest_of(campaign.stage("refined_track", pairs[0].flight)).is_file():
+    if campaign.is_current(campaign.stage("refined_track", pairs[0].flight)):
         track = open_refined(campaign, pairs[0].flight)
         return [track.pair(pair) for pair in pairs], track.decisions
     return list(pairs), autofocus_of(campaign, pairs, scene)

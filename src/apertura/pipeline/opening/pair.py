@@ -36,7 +36,6 @@ from apertura.pipeline.opening.positions import inside_segments, keep_segments, 
 from apertura.pipeline.opening.reading import read_history
 from apertura.pipeline.opening.scene import Flown, OpenScene
 from apertura.pipeline.opening.transmitted import transmitted
-from apertura.pipeline.store import manifest_of
 
 # ---- Antennas of a pair: from the config to the beams that weigh pulses ---------------------------------------------
 
@@ -335,7 +334,7 @@ def open_pair(
     From the logs in any case where the tags of pulses that both nodes `recorded` are given.
     """
     waveform = campaign.settings.waveform
-    if echo is None and recorded is None and manifest_of(campaign.stage("echo", flight, pair)).is_file():
+    if echo is None and recorded is None and campaign.is_current(campaign.stage("echo", flight, pair)):
         echo = PairEcho.opened(campaign, flight, pair).stage
     if echo is None:
         if isinstance(waveform, SampledWaveform):

@@ -39,7 +39,6 @@ from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import CONFIG, Node, SampledWaveform
 from apertura.pipeline.opening.pair import OpenPair, scene_illumination
 from apertura.pipeline.opening.scene import OpenScene
-from apertura.pipeline.store import manifest_of
 
 # ---- Error budget of a pair, from config, logs and echo -------------------------------------------------------------
 
@@ -271,7 +270,7 @@ def plan_pair(campaign: Campaign, pair: OpenPair, scene: OpenScene, *, threads: 
     plan = replace(
         plan, decisions=(*plan.decisions, accuracy, air_decision(pair)), flags=Flags.merged(flags, plan.flags)
     )
-    written = manifest_of(campaign.stage("image", pair.flight, pair.name)).is_file()
+    written = campaign.is_current(campaign.stage("image", pair.flight, pair.name))
     free_disk = None if written else campaign.root.free_bytes()
     check_fits(plan, free_disk=free_disk, where=f"{pair.flight}/{pair.name}")
     return plan

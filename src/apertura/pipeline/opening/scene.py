@@ -24,7 +24,7 @@ from apertura.core.scene.terrain import FlatGround, GridHeights, Terrain
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import Scene
 from apertura.pipeline.config.section import plain_crs
-from apertura.pipeline.store import manifest_of, open_array, open_document, open_stage, remake
+from apertura.pipeline.store import open_array, open_document, open_stage, remake
 
 # ---- Ground of the config: flat at a height, or a DEM ---------------------------------------------------------------
 
@@ -251,10 +251,8 @@ def expected_scene(campaign: Campaign, flown: Callable[[], Flown]) -> OpenScene:
     `flown` gives the apertures of the first image flight; needed only where something is `auto`.
     """
     requested = campaign.settings.scene
-    if (
-        "auto" in {requested.crs, requested.bounds_m, requested.spacing_m}
-        and manifest_of(campaign.result("scene.json")).is_file()
-    ):
+    settles = "auto" in {requested.crs, requested.bounds_m, requested.spacing_m}
+    if settles and campaign.is_current(campaign.result("scene.json")):
         scene = settled_scene(campaign)
     else:
         grid, ground, chosen = settled(campaign, flown)
@@ -262,7 +260,7 @@ def expected_scene(campaign: Campaign, flown: Callable[[], Flown]) -> OpenScene:
         scene = OpenScene(grid, level, level, (), ground.inputs, chosen)
     if requested.dem is None:
         return scene
-    if manifest_of(campaign.stage("terrain")).is_file():
+    if campaign.is_current(campaign.result("scene.json")) and campaign.is_current(campaign.stage("terrain")):
         return open_scene(campaign)
     dem = ConfiguredGround.of(requested, campaign.height_files(), crs=scene.grid.crs).dem
     return replace(scene, terrain=UncheckedDem(dem, scene.grid)) if dem else scene
