@@ -63,8 +63,7 @@ def test_gps_time_around_leap_seconds_is_utc(gps, utc):
 @pytest.mark.parametrize("fraction", [0, 1, 999_999_999])
 def test_the_leap_second_itself_has_no_utc(fraction):
     within = np.datetime64("2017-01-01T00:00:17", "ns") + np.timedelta64(fraction, "ns")
-    with pytest.raises(ValueError, match="within a leap second"):
-        utc_from_gps(np.array([within]))
+    assert np.isnat(utc_from_gps(np.array([within]))).all()
 
 
 @pytest.mark.parametrize("time", ["1980-01-05T23:59:59", "NaT"])

@@ -136,6 +136,116 @@ def test_heights_above_a_geoid_take_an_offset_and_ellipsoidal_ones_none(tmp_path
     assert "heights are ellipsoidal; expected what config.yaml says, nodes.a.log.height_offset_m" in message
 
 
+def restarted(first, second, **written):
+    """Return a log of two parts, 20 epochs each, under a header each; keys of both are systems, kinds or datums."""
+    parts = []
+    for part, keys in ((slice(0, 20), first), (slice(20, 40), second)):
+        system = keys.get("system", "UTC")
+        times = TIMES[part] + np.timedelta64({"GPST": 18, "UTC": 0, "JST": 9 * 3600}[system], "s")
+        values, names = {"llh": (PLACES, LLH), "ecef": (ECEF, XYZ)}[keys.get("kind", "llh")]
+        parts.append(logs.solution(times, values[part], names, system=system, **written))
+    return "".join(parts)
+
+
+@pytest.mark.parametrize(
+    ("first", "second"),
+    [
+        ({"system": "GPST"}, {"system": "UTC"}),
+        ({"system": "UTC"}, {"system": "GPST"}),
+        ({"system": "JST"}, {"kind": "ecef"}),
+        ({"kind": "ecef"}, {"system": "GPST"}),
+    ],
+)
+def test_solutions_are_read_under_the_header_before_them(tmp_path, first, second):
+    """As rtkrcv writes after a restart, and as `cat` joins files."""
+    track = read(tmp_path, restarted(first, second))
+    np.testing.assert_array_equal(track.time.values, TIMES)
+    np.testing.assert_allclose(track.position.values, ECEF, atol=1e-5, rtol=0)
+
+
+def test_columns_and_form_of_times_may_change_with_a_header(tmp_path):
+    """Weeks and seconds under the second header, its standard deviations in another order, and none in the first."""
+    columns = np.hstack([PLACES[20:], np.tile([0.02, 0.01, 0.05], (20, 1))])
+    second = logs.solution(TIMES[20:], columns, f"{LLH} sde(m) sdn(m) sdu(m)")
+    for time in TIMES[20:]:
+        week, rest = divmod((time - np.datetime64("1980-01-06", "ns")).astype(int), 7 * 86400 * 10**9)
+        stamp = np.datetime_as_string(time, "ms").replace("-", "/").replace("T", " ")
+        second = second.replace(stamp, f"{week} {rest / 1e9:.3f}")
+    track = read(tmp_path, logs.solution(TIMES[:20], PLACES[:20], LLH) + second)
+    np.testing.assert_array_equal(track.time.values, TIMES)
+    assert np.isnan(track.position_std.values[:20]).all()
+    np.testing.assert_array_equal(track.position_std.values[20:], np.tile([0.01, 0.02, 0.05], (20, 1)))
+
+
+def test_a_remark_among_solutions_is_no_header(tmp_path):
+    lines = written("llh").splitlines()
+    track = read(tmp_path, "\n".join([*lines[:9], "% battery low", *lines[9:]]) + "\n")
+    np.testing.assert_array_equal(track.time.values, TIMES)
+    half = "\n".join([*lines[:9], "% ref pos : 48 9 600", *lines[9:]]) + "\n"
+    assert "no header line after line 9 with latitude(deg)" in complaint(lambda: read(tmp_path, half))
+
+
+@pytest.mark.parametrize("datum", ["Tokyo", "NAD83", "ED50"])
+@pytest.mark.parametrize("kind", ["llh", "ecef", "enu"])
+def test_a_datum_other_than_wgs_84_is_refused(tmp_path, datum, kind):
+    name = {"llh": "lat/lon/height", "ecef": "x/y/z-ecef", "enu": "e/n/u-baseline"}[kind]
+    head, rest = written(kind).split("\n", 1)
+    assert "WGS84" in head
+    text = f"% ({name}={datum}{'/ellipsoidal' if kind == 'llh' else ''},Q=1:fix)\n{rest}"
+    message = complaint(lambda: read(tmp_path, text))
+    assert f"line 1: positions in datum '{datum}'; expected WGS84" in message
+    assert read(tmp_path, text.replace(datum, "ITRF2014")).sizes["epoch"] == 40
+
+
+def test_a_header_that_states_two_time_systems_is_refused(tmp_path):
+    text = logs.solution(TIMES, PLACES, LLH, system="GPST", head=["% obs start : 2025/05/14 23:59:57.0 UTC (week2366)"])
+    assert "times are GPST by the heading of the columns and UTC by line 2, '% obs start" in complaint(
+        lambda: read(tmp_path, text)
+    )
+    assert read(tmp_path, text.replace(".0 UTC", ".0 GPST")).sizes["epoch"] == 40
+
+
+@pytest.mark.parametrize("spelling", ["-1.#IND", "1.#QNAN", "1.#INF", "-nan(ind)", "nan(snan)", "-nan", "1.#J", "inf"])
+def test_a_standard_deviation_that_c_prints_as_no_number_is_unknown(tmp_path, spelling):
+    columns = np.hstack([PLACES, np.full((40, 3), 0.01)])
+    text = logs.solution(TIMES, columns, f"{LLH} sdn(m) sde(m) sdu(m)").replace(" 0.010000000", f" {spelling}", 1)
+    track = read(tmp_path, text)
+    assert not np.isfinite(track.position_std.values[0, 0])
+    np.testing.assert_array_equal(track.position_std.values[1:], 0.01)
+    np.testing.assert_allclose(track.position.values, ECEF, atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("system", ["UTC", "JST"])
+def test_epochs_within_a_leap_second_are_left_out_and_counted(tmp_path, system):
+    text = logs.solution(TIMES, PLACES, LLH)
+    for second in ("00", "01"):  # the whole flight, less its last epochs, in the year of a leap second
+        text = text.replace(f"2025/05/15 00:00:{second}", f"2016/12/31 23:59:6{second[1]}")
+    text = text.replace("2025/05/14", "2016/12/31").replace("23:59:61", "23:59:60")
+    if system == "JST":
+        text = text.replace("UTC", "JST").replace("2016/12/31 23:59", "2017/01/01 08:59")
+    track = read(tmp_path, text)
+    assert track.dropped == {"within a leap second": 10}
+    assert track.sizes["epoch"] == 30
+    assert str(track.time.values[-1]) == "2016-12-31T23:59:59.900000000"
+    assert "no leap seconds" in complaint(lambda: read(tmp_path, text.replace(system, "GPST")))
+
+
+def test_a_solution_that_was_filtered_backward_is_turned_round(tmp_path):
+    lines = logs.solution(TIMES, PLACES, LLH).splitlines()
+    heading = [line for line in lines if line.startswith("%")]
+    track = read(tmp_path, "\n".join([*heading, *lines[: len(heading) - 1 : -1]]) + "\n")
+    np.testing.assert_array_equal(track.time.values, TIMES)
+    np.testing.assert_allclose(track.position.values, ECEF, atol=1e-5, rtol=0)
+    assert "times descend" in track.remarks[0]
+
+
+@pytest.mark.parametrize(("weeks", "later"), [(1024, 1024), (2048, 2048), (0, 0)])
+def test_dates_of_a_week_number_that_rolled_over_are_remarked(tmp_path, weeks, later):
+    track = read(tmp_path, logs.solution(TIMES - np.timedelta64(7 * weeks, "D"), PLACES, LLH))
+    remark = f"{later} weeks later, on 2025-05-14: correct the times of the log"
+    assert [remark in one for one in track.attrs.get("remarks", [])] == [True] * bool(weeks)
+
+
 def test_a_header_and_a_config_that_disagree_on_time_are_refused(tmp_path):
     text = logs.solution(TIMES, PLACES, LLH, system="GPST")
     assert "times are GPST; expected what config.yaml says" in complaint(

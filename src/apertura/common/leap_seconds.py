@@ -92,12 +92,13 @@ def utc_from_gps(time_gps: Times) -> Times:
     Returns
     -------
     ndarray
-        Of the same shape, datetime64[ns]. After `KNOWN_UNTIL` no further leap second is assumed; with a notice.
+        Of the same shape, datetime64[ns]; NaT within a leap second: 23:59:60 is a time of UTC that no datetime64 is.
+        After `KNOWN_UNTIL` no further leap second is assumed; with a notice.
 
     Raises
     ------
     ValueError
-        If a time is before 1980-01-06, or within a leap second: 23:59:60 is a time of UTC that no datetime64 is.
+        If a time is before 1980-01-06.
 
     Examples
     --------
@@ -108,11 +109,8 @@ def utc_from_gps(time_gps: Times) -> Times:
     _check(time_gps)
     ahead = np.asarray(np.searchsorted(_SINCE_GPS, time_gps, side="right"), np.int64)
     # n − 1 s after UTC's midnight GPS time meets the n-th leap second; for a second it has not passed
-    within = np.flatnonzero((ahead > 0) & (time_gps - _SINCE_GPS[ahead - 1] < _SECOND))
-    if within.size:
-        wrong = np.ravel(time_gps)[within[0]]
-        raise ValueError(f"GPS time {wrong} is within a leap second of UTC (23:59:60), which has no date")
-    return np.asarray(time_gps - ahead * _SECOND)
+    within = (ahead > 0) & (time_gps - _SINCE_GPS[ahead - 1] < _SECOND)
+    return np.where(within, np.datetime64("NaT", "ns"), time_gps - ahead * _SECOND)
 
 
 def gps_from_weeks(week: NDArray[np.int64], milliseconds: NDArray[np.int64]) -> Times:

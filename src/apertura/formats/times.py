@@ -48,6 +48,23 @@ def utc_times(texts: Sequence[str]) -> NDArray[np.datetime64]:
     return np.array(plain, "datetime64[ns]")
 
 
+LEAP_SECOND = "within a leap second"
+"""Reason why an epoch is left out: UTC counts 23:59:60, which no datetime64 is."""
+
+_LEAP_SECOND = re.compile(r"[T ]\d\d:[25]9:60(?!\d)", re.ASCII)  # minute of any zone, whole or half hours
+
+
+def in_leap_second(texts: Sequence[str]) -> NDArray[np.bool_]:
+    """Return which times written as ISO 8601 are within a leap second.
+
+    Examples
+    --------
+    >>> in_leap_second(["2016-12-31T23:59:59.9", "2016-12-31T23:59:60.1"]).tolist()
+    [False, True]
+    """
+    return np.array([_LEAP_SECOND.search(text) is not None for text in texts], bool)
+
+
 def coarsened(times: NDArray[np.datetime64]) -> NDArray[np.datetime64]:
     """Return times in the coarsest of milli-, micro- and nanoseconds that holds them exactly, to be written.
 

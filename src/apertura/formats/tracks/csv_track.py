@@ -23,6 +23,9 @@ LARGEST_LOG = 500_000_000
 """Bytes of a flight log or a table: a day at 50 Hz."""
 
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(nan|inf)", re.ASCII | re.IGNORECASE)
+_NOT_FINITE = re.compile(r"([+-]?)(?:nan\(\w*\)|(inf)inity|1\.#(inf)\d*|1\.#\w+)", re.ASCII | re.IGNORECASE)
+"""NaN and infinity as printf of C libraries writes them: nan(ind), infinity, 1.#INF, -1.#IND, 1.#QNAN, and 1.#J, which
+is either, rounded."""
 
 
 def number(text: str) -> float:
@@ -30,9 +33,12 @@ def number(text: str) -> float:
 
     Examples
     --------
-    >>> number("-1.5e3"), number("nan")
-    (-1500.0, nan)
+    >>> number("-1.5e3"), number("nan"), number("-1.#IND"), number("1.#INF00")
+    (-1500.0, nan, nan, inf)
     """
+    other = _NOT_FINITE.fullmatch(text)
+    if other:
+        return float(f"{other[1]}{other[2] or other[3] or 'nan'}")
     if not _NUMBER.fullmatch(text):
         raise ValueError(f"{quoted(text, 40)} is no number")
     return float(text)
@@ -124,9 +130,10 @@ def numbers(columns: pd.DataFrame) -> NDArray[np.float64]:
         if columns[name].dtype.kind in "fiu":
             continue
         cells = columns[name].dropna().astype(str).str.strip()
-        wrong = cells[~cells.map(lambda cell: bool(_NUMBER.fullmatch(cell)))]
+        wrong = cells[~cells.map(lambda cell: bool(_NUMBER.fullmatch(cell) or _NOT_FINITE.fullmatch(cell)))]
         if len(wrong):
             raise ValueError(f"could not convert string to a number in column {name}: {quoted(wrong.iloc[0], 40)}")
+        columns = columns.assign(**{str(name): cells.map(number).reindex(columns.index)})
     return columns.to_numpy(np.float64, na_value=np.nan)
 
 

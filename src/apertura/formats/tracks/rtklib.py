@@ -1,10 +1,11 @@
 """RTKLIB solutions (.pos): read in any of its formats, by GPS time, UTC or Japan's time; written in the usual one."""
 
 import re
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
 from itertools import accumulate
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -14,7 +15,7 @@ from apertura.common.documents import read_text
 from apertura.common.errors import CampaignError, quoted
 from apertura.common.leap_seconds import GPS_EPOCH, gps_from_utc, utc_from_gps
 from apertura.core.geometry.geodesy import ecef_from_geodetic, ned_axes
-from apertura.formats.times import coarsened, utc_times
+from apertura.formats.times import LEAP_SECOND, coarsened, in_leap_second, utc_times
 from apertura.formats.tracks.csv_track import LARGEST_LOG, number
 from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions
 from apertura.formats.tracks.track import FIXES, contradicted, make_track, unstated
@@ -33,12 +34,26 @@ _CELLS = re.compile(r"\s*[,;]\s*|\s+")
 _LAST_WEEK, _WEEK_S = 11_000, 604_800
 _JST_AHEAD = np.timedelta64(9, "h")
 _SAME_BASE_M, _WORST_M = 0.01, 1e9
+_DATUM = re.compile(
+    r"(?:lat/lon/height|x/y/z-ecef|e/n/u-baseline|out-datum|datum)\s*[=:]\s*([^/,)\s]+)(?:/(\w+))?", re.I
+)
+"""Datum of positions and, behind a slash, of heights, as a comment of the header states them."""
+
+_GEOCENTRIC = re.compile(r"(?:WGS|ITRF|IGS|IGB)[-_ ]?\d*", re.I)
+"""Datums that agree with WGS 84 within centimetres; 0 is what `out-datum` calls WGS 84."""
+
+_INTERVAL = re.compile(
+    r"(?:obs|sol|inp) (?:start|end)\b.*?\b(GPST|UTC|JST)\b|out-timesys\s*[=:]\s*(gpst|utc|jst)\b", re.I
+)
+"""Time system that a comment of the header states, besides the heading."""
+
+_STATES = re.compile(rf"ref pos\s*:|{_DATUM.pattern}|{_INTERVAL.pattern}", re.I)
 _EXPECTED = "an RTKLIB solution whose header names its columns and says GPST, UTC or JST"
 _REMEDY = "Export the solution with these output settings."
 
 
 class _Header(NamedTuple):
-    """Fields of the lines before the first solution."""
+    """Fields of the comment lines before some solutions."""
 
     system: str
     position: str
@@ -49,17 +64,18 @@ class _Header(NamedTuple):
 
 
 def read_rtklib_pos(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -> xr.Dataset:
-    """Return the `track` stage of an RTKLIB solution.
+    """Return the `track` stage of an RTKLIB solution, or of several in one file, each under its own header.
 
-    Its header states whether times are GPST, UTC or JST (as calendar dates or week and seconds), and whether positions
+    A header states whether times are GPST, UTC or JST (as calendar dates or week and seconds), and whether positions
     are latitude, longitude (decimal degrees, or degrees, minutes and seconds) and height, ECEF, or a baseline to east,
     north and up of ``ref pos`` or options.base. Columns Q and standard deviations, where named, are kept; those of ECEF
-    are turned to north, east and up with their covariances. Lines with Q = 0 hold no solution and are counted.
+    are turned to north, east and up with their covariances. Lines with Q = 0 hold no solution and are counted, as are
+    epochs within a leap second.
 
     Raises
     ------
     CampaignError
-        If the header does not name the columns, heights are above a geoid and options.height_offset_m is not
+        If a header does not name the columns, states two time systems or another datum than WGS 84, heights are above a geoid and options.height_offset_m is not
         given, a baseline has no base, or a line cannot be read.
 
     Notes
@@ -68,49 +84,144 @@ def read_rtklib_pos(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) 
     """
     text = read_text(path, expected=_EXPECTED, remedy=_REMEDY, largest=LARGEST_LOG // 2)
     lines = text.splitlines()
-    header = _header([line for line in lines if line.startswith("%")], path)
-    _check_stated(header, options, node=node, where=path)
     cut = bool(lines) and text[-1] not in "\r\n" and lines[-1][:1] not in {"", "%"}
-    times, values, stated = _rows(lines[: len(lines) - cut], header, path)
-    quality = stated[:, 0] if "Q" in header.cell_of else np.full(len(times), np.nan)
-    solved = quality != 0
-    unsolved = int((~solved).sum())
-    time = _utc(_times(times, path)[solved], header.system, path)
-    position, ecef = _position(values[solved], header, options, node=node, where=path)
+    parts = [
+        _solutions(header, rows, options, node=node, where=path)
+        for header, rows in _parts(lines[: len(lines) - cut], path)
+    ]
+    ecef = any(part.ecef for part in parts)
+    dropped = Counter({"line cut off": int(cut)})
+    for part in parts:
+        dropped.update(part.dropped)
     return make_track(
-        time,
-        position,
+        np.concatenate([part.time for part in parts]),
+        np.concatenate(
+            [ecef_from_geodetic(*part.position.T) if ecef and not part.ecef else part.position for part in parts]
+        ),
         frame="ecef" if ecef else "geodetic",
-        fix=_fix(quality[solved], path) if "Q" in header.cell_of else None,
-        position_std_m=_std(stated[solved, 1:], position),
-        dropped={why: count for why, count in (("Q = 0", unsolved), ("line cut off", int(cut))) if count},
+        fix=_joined([part.fix for part in parts], np.zeros, parts),
+        position_std_m=_joined([part.std for part in parts], lambda count: np.full((count, 3), np.nan), parts),
+        dropped={why: count for why, count in dropped.items() if count},
         node=node,
         where=path,
     )
 
 
-def _header(lines: list[str], path: Path) -> _Header:
-    split = ((line, _CELLS.split(line.strip("% \t"))) for line in lines)
-    found = (
-        (line, names, kind)
-        for line, names in split
-        for kind, columns in _POSITIONS.items()
-        if set(columns) <= set(names)
+class _Solutions(NamedTuple):
+    """Solutions under one header."""
+
+    time: NDArray[np.datetime64]
+    position: NDArray[np.float64]
+    ecef: bool
+    fix: NDArray[np.int8] | None
+    std: NDArray[np.float64] | None
+    dropped: dict[str, int]
+
+
+def _joined(values: list[Any], unknown: Callable[[int], NDArray[Any]], parts: Sequence[_Solutions]) -> Any:
+    """Return what the headers name of all solutions, or `unknown` of those under another; None where no header does."""
+    if all(value is None for value in values):
+        return None
+    there = next(value.dtype for value in values if value is not None)
+    return np.concatenate(
+        [
+            unknown(len(part.time)).astype(there) if value is None else value
+            for value, part in zip(values, parts, strict=True)
+        ]
     )
-    _, names, kind = next(found, ("", [""], ""))
-    if not kind:
-        raise _error(f"no header line with {', '.join(_POSITIONS['geodetic'])}, x-ecef(m) … or e-baseline(m) …", path)
+
+
+def _parts(lines: list[str], path: Path) -> Iterator[tuple[_Header, list[tuple[int, str]]]]:
+    """Yield each header of a file and the numbered lines of solutions under it; RTKLIB writes one after every restart.
+
+    Comments among solutions that state nothing of a header end no part.
+    """
+    comments, rows, header, first = list[str](), list[tuple[int, str]](), None, 1
+    for line, text in [*enumerate(lines, 1), (len(lines) + 1, "")]:
+        if text.startswith("%"):
+            first = first if comments else line
+            comments.append(text)
+        elif text.strip() or line > len(lines):
+            if comments and (header is None or any(_STATES.search(one) or _kind(one) for one in comments)):
+                if header is not None:
+                    yield header, rows
+                header, rows = _header(comments, path, first), []
+            comments = []
+            rows += [(line, text)] if text.strip() else []
+    yield header or _header([], path, 1), rows
+
+
+def _solutions(
+    header: _Header, rows: list[tuple[int, str]], options: LogOptions, *, node: str, where: Path
+) -> _Solutions:
+    _check_stated(header, options, node=node, where=where)
+    times, values, stated = _rows(rows, header, where)
+    quality = stated[:, 0] if "Q" in header.cell_of else np.full(len(times), np.nan)
+    time = _utc(_times(times, where), header.system, where)
+    solved, leap = quality != 0, np.isnat(time)
+    kept = solved & ~leap
+    position, ecef = _position(values[kept], header, options, node=node, where=where)
+    return _Solutions(
+        time[kept],
+        position,
+        ecef,
+        _fix(quality[kept], where) if "Q" in header.cell_of else None,
+        _std(stated[kept, 1:], position),
+        {"Q = 0": int((~solved).sum()), LEAP_SECOND: int((leap & solved).sum())},
+    )
+
+
+def _kind(line: str) -> str:
+    """Return the key of `_POSITIONS` whose columns a comment line names; empty if it is no heading."""
+    names = set(_CELLS.split(line.strip("% \t")))
+    return next((kind for kind, columns in _POSITIONS.items() if set(columns) <= names), "")
+
+
+def _header(lines: list[str], path: Path, first: int) -> _Header:
+    """Return the fields of comment lines, the first of which is line `first` of the file."""
+    heading = next((line for line in lines if _kind(line)), "")
+    if not heading:
+        where = f" after line {first - 1}" if first > 1 else ""
+        columns = f"{', '.join(_POSITIONS['geodetic'])}, x-ecef(m) … or e-baseline(m) …"
+        raise _error(f"no header line{where} with {columns}", path)
+    kind, names = _kind(heading), _CELLS.split(heading.strip("% \t"))
     if names[0] not in {"GPST", "UTC", "JST"}:
         raise _error(f"time system {quoted(names[0])}", path)
     doubled = [name for name in names if names.count(name) > 1]
     if doubled:
         raise _error(f"column {quoted(doubled[0], 40)} a second time", path)
+    heights = _stated_besides(lines, names[0], path, first)
     widths = [2, *(3 if name.endswith("(d'\")") else 1 for name in names[1:])]
     ends = list(accumulate(widths))
-    heights = next((word for line in lines for word in ("geodetic", "ellipsoidal") if f"/{word}" in line), "")
     base = next((line.partition(":")[2] for line in lines if re.match(r"%\s*ref pos\s*:", line)), "")
     cell_of = {name: end - width for name, end, width in zip(names, ends, widths, strict=True)}
     return _Header(names[0], kind, cell_of, ends[-1], heights, _CELLS.split(base.strip()) if base.strip() else [])
+
+
+def _stated_besides(lines: list[str], system: str, path: Path, first: int) -> str:
+    """Return the datum of heights in the comments of a header; raise CampaignError of what cannot be as they state."""
+    heights = ""
+    for line, text in enumerate(lines, first):
+        interval, datum = _INTERVAL.search(text), _DATUM.search(text)
+        stated = (interval[1] or interval[2]).upper() if interval else system
+        if stated != system:
+            raise CampaignError(
+                f"times are {system} by the heading of the columns and {stated} by line {line}, "
+                f"{quoted(text.strip(), 80)}",
+                path,
+                "one time system",
+                f"Export the solution again. If the heading is right, remove line {line}.",
+            )
+        if datum and datum[1] != "0" and not _GEOCENTRIC.fullmatch(datum[1]):
+            raise CampaignError(
+                f"line {line}: positions in datum {quoted(datum[1], 40)}",
+                path,
+                "WGS84, or a realisation of ITRF",
+                "Export the solution with out-datum=wgs84, or transform it.",
+            )
+        if datum and (datum[2] or "").lower() in {"geodetic", "ellipsoidal"}:
+            heights = datum[2].lower()
+    return heights
 
 
 def _check_stated(header: _Header, options: LogOptions, *, node: str, where: Path) -> None:
@@ -132,7 +243,7 @@ def _check_stated(header: _Header, options: LogOptions, *, node: str, where: Pat
 
 
 def _rows(
-    lines: list[str], header: _Header, path: Path
+    lines: list[tuple[int, str]], header: _Header, path: Path
 ) -> tuple[list[str | np.datetime64], NDArray[np.float64], NDArray[np.float64]]:
     """Return of each solution its time, a date as text; its position as logged; Q and standard deviations, or NaN."""
     sexagesimal = header.position == "sexagesimal"
@@ -141,9 +252,7 @@ def _rows(
     whole = [header.cell_of[name] for name in named] if set(named) <= set(header.cell_of) else []
     wanted = [header.cell_of.get("Q"), *whole]
     times, positions, stated = [], [], []
-    for line, text in enumerate(lines, 1):
-        if not text.strip() or text[0] == "%":
-            continue
+    for line, text in lines:
         cells = _CELLS.split(text.strip())
         if len(cells) != header.cells:
             raise _error(f"line {line} has {len(cells)} columns, the header names {header.cells}", path)
@@ -180,12 +289,14 @@ def _time(first: str, second: str) -> str | np.datetime64:
 
 
 def _times(stated: list[str | np.datetime64], path: Path) -> NDArray[np.datetime64]:
-    dates = [place for place, time in enumerate(stated) if isinstance(time, str)]
+    """Return times in the system of the log; NaT within a leap second."""
+    dates = np.array([isinstance(time, str) for time in stated], bool)
+    dates[dates] = ~in_leap_second([time for time in stated if isinstance(time, str)])
     times = np.array(
         [np.datetime64("NaT", "ns") if isinstance(time, str) else time for time in stated], "datetime64[ns]"
     )
     try:
-        times[dates] = utc_times([time for time in stated if isinstance(time, str)])
+        times[dates] = utc_times([str(stated[place]) for place in np.flatnonzero(dates)])
     except ValueError as error:
         raise _error(str(error), path) from error
     return times
@@ -194,6 +305,8 @@ def _times(stated: list[str | np.datetime64], path: Path) -> NDArray[np.datetime
 def _utc(time: NDArray[np.datetime64], system: str, path: Path) -> NDArray[np.datetime64]:
     if system != "GPST":
         return time - _JST_AHEAD if system == "JST" else time
+    if np.isnat(time).any():
+        raise _error("second 60 in GPS time, which has no leap seconds", path)
     try:
         return utc_from_gps(time)
     except ValueError as error:
@@ -240,7 +353,8 @@ def _std(stated: NDArray[np.float64], ecef: NDArray[np.float64]) -> NDArray[np.f
         return None
     if stated.shape[1] == len(_STD):
         return stated
-    clipped = stated.clip(-_WORST_M, _WORST_M)  # whose squares are numbers; a track refuses what is as large
+    known = np.where(np.isinf(stated), np.nan, stated)
+    clipped = known.clip(-_WORST_M, _WORST_M)  # whose squares are numbers; a track refuses what is as large
     xx, yy, zz, xy, yz, zx = (np.sign(clipped) * clipped**2).T
     covariance = np.stack([xx, xy, zx, xy, yy, yz, zx, yz, zz], -1).reshape(-1, 3, 3)
     axes = ned_axes(ecef)

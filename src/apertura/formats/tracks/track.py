@@ -11,6 +11,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from apertura.common.errors import CampaignError, number_of, quoted, shown
+from apertura.common.leap_seconds import KNOWN_UNTIL
 from apertura.core.geometry.geodesy import ecef_from_geodetic
 from apertura.formats.times import outside, utc_times
 from apertura.formats.tracks.log_options import LogOptions
@@ -23,6 +24,9 @@ LOWEST_M, HIGHEST_M = -1000.0, 100_000.0
 
 FARTHEST_M = 1e5
 """From the origin of a local frame."""
+
+_ROLLOVER = np.timedelta64(1024 * 7, "D")
+"""Period of the week number that GPS satellites send."""
 
 _LOG = logging.getLogger(__name__)
 _EARTH_M = 6.37e6
@@ -48,7 +52,8 @@ def make_track(
     Parameters
     ----------
     time_utc
-        (epoch,) datetime64[ns], UTC, strictly increasing.
+        (epoch,) datetime64[ns], UTC, strictly increasing; or strictly decreasing, as of a filter that ran backward:
+        the epochs are then reversed, with a remark.
     position
         (epoch, 3) float64 in `frame`.
     frame
@@ -57,7 +62,8 @@ def make_track(
     attitude_deg
         (epoch, 3) float64: roll, pitch, yaw in degrees, yaw clockwise from north; NaN or None where not logged.
     position_std_m
-        (epoch, 3) float64: standard deviations to north, east and up, metres, NaN where not logged; None: nowhere.
+        (epoch, 3) float64: standard deviations to north, east and up, metres, NaN or infinite where not known; None:
+        nowhere.
     fix
         (epoch,) int8: kind of solution, a value of `FIXES`, 0 where not logged; None: nowhere.
     dropped
@@ -83,8 +89,18 @@ def make_track(
     if len(time_utc) < 2:
         without = f" ({', '.join(f'{count} left out: {why}' for why, count in left_out.items())})" if left_out else ""
         raise CampaignError(f"{len(time_utc)} epochs{without}", where, "at least two", "Export the whole log.")
+    remarks = []
+    if (np.diff(time_utc) < np.timedelta64(0, "ns")).all():
+        remarks.append("times descend, as of a filter that ran backward: the epochs are read in reverse")
+        time_utc, position = time_utc[::-1], position[::-1]
+        attitude_deg, position_std_m, fix = (
+            None if one is None else one[::-1] for one in (attitude_deg, position_std_m, fix)
+        )
     _check_times(time_utc, where)
+    remarks += _rolled_over(time_utc)
     _check_positions(position, frame, where)
+    if position_std_m is not None:
+        position_std_m = np.where(np.isinf(position_std_m), np.nan, position_std_m)
     _check_stated(attitude_deg, position_std_m, fix, where)
     attitude = np.full_like(position, np.nan) if attitude_deg is None else np.radians(attitude_deg)
     quality = {
@@ -99,10 +115,13 @@ def make_track(
         "attitude": (("epoch", "axis"), attitude),
     }
     # Plain arrays: xarray would import dask and scipy to check whether they are theirs.
-    return xr.Dataset(
+    track = xr.Dataset(
         {name: xr.Variable(dims, values, fastpath=True) for name, (dims, values) in variables.items()},
         attrs={"node": node, "frame": "local" if frame == "local" else "ecef", "dropped": left_out},
     )
+    for remark in remarks:
+        track = remarked(track, remark, where)
+    return track
 
 
 def remarked(track: xr.Dataset, remark: str, where: Path) -> xr.Dataset:
@@ -119,6 +138,18 @@ def remarked(track: xr.Dataset, remark: str, where: Path) -> xr.Dataset:
     """
     _LOG.warning("%s: %s", shown(where, 300), shown(remark, 500))
     return track.assign_attrs(remarks=[*track.attrs.get("remarks", ()), remark])
+
+
+def _rolled_over(time_utc: NDArray[np.datetime64]) -> list[str]:
+    """Return a remark where times are so old that a receiver may have counted GPS weeks modulo 1024."""
+    periods = (KNOWN_UNTIL - time_utc[-1]) // _ROLLOVER
+    if periods < 1:
+        return []
+    meant = (time_utc[0] + periods * _ROLLOVER).astype("datetime64[D]")
+    return [
+        f"the log begins on {time_utc[0].astype('datetime64[D]')}; if its receiver counts GPS weeks modulo 1024, the "
+        f"flight was {periods * 1024} weeks later, on {meant}: correct the times of the log"
+    ]
 
 
 def _check_positions(position: NDArray[np.float64], frame: str, where: Path) -> None:
