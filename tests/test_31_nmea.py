@@ -15,7 +15,6 @@ from apertura.formats.tracks.log_options import LogOptions
 from tests.attack import logs
 
 TIMES, PLACES = logs.circle()
-DROPPED = "sentences broken off or with a wrong checksum"
 
 
 def read(tmp_path, text, name="a.track.nmea", **options):
@@ -120,9 +119,34 @@ def test_a_sentence_whose_checksum_is_wrong_or_missing_is_no_epoch(tmp_path):
     at = [place for place, line in enumerate(lines) if "GGA" in line]
     lines[at[3]] = lines[at[3]].replace("N,00957", "N,00956")
     lines[at[5]] = lines[at[5]].partition("*")[0]
+    lines[at[7]] = lines[at[7]][:40]
+    lines[at[8]] = lines[at[8]][:-1]
     track = read(tmp_path, "\n".join(lines) + "\n")
-    assert track.dropped == {DROPPED: 2}
-    np.testing.assert_array_equal(track.time.values, np.delete(TIMES, [3, 5]))
+    assert track.dropped == {
+        "sentences with a wrong checksum": 1,
+        "sentences without a checksum, which others have": 1,
+        "sentences broken off": 2,
+    }
+    np.testing.assert_array_equal(track.time.values, np.delete(TIMES, [3, 5, 7, 8]))
+
+
+@pytest.mark.parametrize("end", ["\r\n", "\n", " \r\n"])
+def test_a_log_without_any_checksum_is_read_with_a_remark(tmp_path, end):
+    """A sentence that is cut off is still none, at the end of the log even where its last digits alone are lost."""
+    lines = [line.partition("*")[0] for line in logs.nmea(TIMES, PLACES).splitlines()]
+    at = next(place for place, line in enumerate(lines) if "GGA,235957.30" in line)
+    lines[at] = lines[at][:40]
+    track = read(tmp_path, end.join(lines) + end)
+    assert track.dropped == {"sentences broken off": 1}
+    np.testing.assert_array_equal(track.time.values, np.delete(TIMES, 3))
+    np.testing.assert_allclose(
+        track.position.values, ecef_from_geodetic(*np.delete(PLACES, 3, 0).T), atol=2e-5, rtol=0
+    )
+    np.testing.assert_array_equal(track.position_std.values, np.tile([0.01, 0.02, 0.03], (39, 1)))
+    assert "none of 87 sentences has a checksum" in track.remarks[0]
+    cut = read(tmp_path, end.join(lines[:-1])[:-1])
+    assert cut.dropped == {"sentences broken off": 2}
+    np.testing.assert_array_equal(cut.time.values, np.delete(TIMES, [3, 39]))
 
 
 def test_a_sentence_within_a_leap_second_is_no_epoch(tmp_path):

@@ -12,12 +12,15 @@ import xarray as xr
 from pynmea2 import NMEASentence, ParseError
 
 from apertura.common.errors import CampaignError, quoted
-from apertura.formats.times import utc_times
+from apertura.formats.times import LEAP_SECOND, utc_times
 from apertura.formats.tracks.csv_track import LARGEST_LOG, number
 from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions
 from apertura.formats.tracks.track import FIXES, contradicted, make_track, remarked, start_time, unstated
 
-_BODY = re.compile(rb"([A-Z]{2}[A-Z0-9]{3},[^*]{1,250})(?:\*([0-9A-Fa-f]{2}))?")
+_BODY = re.compile(rb"([A-Z]{2}[A-Z0-9]{3},[^*]{1,250})(\*[0-9A-Fa-f]{0,2})?")
+_SEALED = re.compile(rb"\$..(?:GGA|RMC|ZDA|GST),[^*$\r\n]{1,250}\*[0-9A-Fa-f]{2}")
+_COMMAS = {"GGA": 14, "RMC": 9, "ZDA": 4, "GST": 8}
+"""Of a whole sentence, up to the last field that is read."""
 _STAMP = re.compile(rb"[\s\[(\"']*\d[-\d\s:.,;/TZ+\])\"']*")
 _DATED = {"RMC", "ZDA"}
 _WANTED = re.compile(r"[^P].(?:GGA|RMC|ZDA|GST),")
@@ -39,17 +42,20 @@ class _Fix(NamedTuple):
 
 @dataclass
 class _Log:
-    """Values of the sentences of a log, from which the track is made."""
+    """Values of the sentences of a log, from which the track is made; `sealed`: there are checksums in it."""
 
     path: Path
     node: str
     options: LogOptions
+    data: bytes
+    sealed: bool
     now_ns: int | None = None
     fixes: dict[int, _Fix] = field(default_factory=dict)
     order: list[int] = field(default_factory=list)
     std: dict[int, tuple[float, float, float]] = field(default_factory=dict)
     dropped: Counter[str] = field(default_factory=Counter)
     stamped: int = 0
+    unsealed: int = 0
 
 
 def read_nmea(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -> xr.Dataset:
@@ -58,7 +64,8 @@ def read_nmea(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -> xr.
     Positions, their kind and the geoid separation are those of GGA: ellipsoidal height is altitude plus separation. GGA
     has a time of day; its date is that of the RMC (valid) or ZDA before it, or options.start_utc's where there is none,
     and goes on over midnight; where both are, they must be of one day. GST states standard deviations. Of one epoch by
-    several talkers GN's is taken.
+    several talkers GN's is taken. A log without any checksum is read as it is, with a remark; in others sentences with
+    a wrong checksum, without one and broken off are counted apart.
 
     Raises
     ------
@@ -74,8 +81,10 @@ def read_nmea(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -> xr.
         raise contradicted("time_system", "times of NMEA are UTC", node=node, where=path)
     if path.stat().st_size > LARGEST_LOG // 2:
         raise CampaignError(f"{path.stat().st_size} bytes", path, f"at most {LARGEST_LOG // 2}", "Shorten the log.")
-    log = _Log(path, node, options)
-    looked_through = _sentences(_Log(path, node, options))  # as far as the first date: epochs before it have it, too
+    data = path.read_bytes()
+    sealed = _SEALED.search(data) is not None
+    log = _Log(path, node, options, data, sealed)
+    looked_through = _sentences(_Log(path, node, options, data, sealed))  # as far as the first date: epochs before it have it, too
     dates = (_dated(sentence) for sentence in looked_through if sentence.sentence_type in _DATED)
     log.now_ns = next((date for date in dates if date is not None), None)
     first_ns = log.now_ns
@@ -96,22 +105,36 @@ def _check_day(first_ns: int, log: _Log) -> None:
 
 def _sentences(log: _Log) -> Iterator[Any]:
     """Yield the sentences that are wanted and whole; those that are broken are counted."""
-    for line in log.path.read_bytes().splitlines():
+    lines = log.data.splitlines()
+    ended = not log.data or log.data[-1:] in b"\r\n"
+    for number, line in enumerate(lines, 1):
         stamp, *pieces = line.split(b"$")
         for place, piece in enumerate(pieces):
             match = _BODY.match(piece)
             if match:
                 log.stamped += place == 0 and bool(_STAMP.fullmatch(stamp))
-                yield from _whole(match[1].decode("latin-1"), match[2], log)
+                last = place + 1 == len(pieces) and (number < len(lines) or ended)
+                yield from _whole(match[1].decode("latin-1"), match[2], log, ended=last)
 
 
-def _whole(text: str, checksum: bytes | None, log: _Log) -> Iterator[Any]:
-    """Yield a sentence that is wanted and whole."""
-    if not checksum or int(checksum, 16) != NMEASentence.checksum(text):
-        log.dropped["sentences broken off or with a wrong checksum"] += 1
-    elif _WANTED.match(text):
+def _whole(text: str, checksum: bytes | None, log: _Log, *, ended: bool) -> Iterator[Any]:
+    """Yield a sentence that is wanted and whole; `ended`: a line end follows it."""
+    unsealed = checksum is None and ended and text.count(",") >= _COMMAS.get(text[2:5], 1)
+    if unsealed and not log.sealed:
+        checksum, text = b"", text.rstrip()
+    elif unsealed:
+        log.dropped["sentences without a checksum, which others have"] += 1
+        return
+    elif checksum is None or len(checksum) < 3:
+        log.dropped["sentences broken off"] += 1
+        return
+    elif int(checksum[1:], 16) != NMEASentence.checksum(text):
+        log.dropped["sentences with a wrong checksum"] += 1
+        return
+    if _WANTED.match(text):
+        log.unsealed += not checksum
         try:
-            yield NMEASentence.parse(f"${text}*{checksum.decode()}", check=True)
+            yield NMEASentence.parse(f"${text}{checksum.decode()}", check=bool(checksum))
         except ParseError as error:
             raise _error(f"sentence {quoted(text, 100)}", log.path) from error
 
@@ -156,7 +179,7 @@ def _take(sentence: Any, log: _Log) -> None:
         if of_day is None or (kind == "GGA" and fix is None):
             return
         if of_day >= _DAY_NS or sentence.data[0][4:6] == "60":
-            log.dropped["within a leap second"] += kind == "GGA"
+            log.dropped[LEAP_SECOND] += kind == "GGA"
             return
         log.now_ns = now = _nearest(of_day, log)
         if fix is not None:
@@ -241,9 +264,12 @@ def _track(log: _Log) -> xr.Dataset:
         node=log.node,
         where=log.path,
     )
-    if not log.stamped:
-        return track
-    return remarked(track, f"{log.stamped} lines begin with a host's stamp, which is not used", log.path)
+    if log.stamped:
+        track = remarked(track, f"{log.stamped} lines begin with a host's stamp, which is not used", log.path)
+    if log.unsealed:
+        found = f"none of {log.unsealed} sentences has a checksum: damaged digits are not noticed"
+        track = remarked(track, found, log.path)
+    return track
 
 
 def _error(found: str, path: Path) -> CampaignError:

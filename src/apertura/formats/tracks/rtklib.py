@@ -75,8 +75,8 @@ def read_rtklib_pos(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) 
     Raises
     ------
     CampaignError
-        If a header does not name the columns, states two time systems or another datum than WGS 84, heights are above a geoid and options.height_offset_m is not
-        given, a baseline has no base, or a line cannot be read.
+        If a header does not name the columns, states two time systems or another datum than WGS 84, heights are
+        above a geoid and options.height_offset_m is not given, a baseline has no base, or a line cannot be read.
 
     Notes
     -----
