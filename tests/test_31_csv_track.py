@@ -24,7 +24,8 @@ def read(tmp_path, heading, *columns, **options):
 
 def test_columns_of_other_names_are_mapped(tmp_path):
     mapped = {"time_utc": "t", "latitude_deg": "lat", "longitude_deg": "lon", "height_m": "alt", "quality": "q"}
-    track = read(tmp_path, "t,alt,lat,lon,q", TIMES, PLACES[:, 2], *PLACES[:, :2].T, np.full(40, 2), columns=mapped)
+    columns = TIMES, PLACES[:, 2], *PLACES[:, :2].T, np.full(40, 2)
+    track = read(tmp_path, "t,alt,lat,lon,q", *columns, columns=mapped, quality="rtklib")
     np.testing.assert_allclose(track.position.values, ECEF, atol=1e-6, rtol=0)
     np.testing.assert_array_equal(track.time.values, TIMES)
     assert set(track.fix.values) == {2}
@@ -145,3 +146,124 @@ def test_a_line_with_more_cells_than_the_heading_is_named(tmp_path):
         ).sizes["epoch"]
         == 40
     )
+
+
+def test_numbers_of_another_unit_take_a_factor(tmp_path):
+    """As ulog2csv writes them: µs, 1e-7 degrees, millimetres."""
+    elapsed = (TIMES - np.datetime64("1970-01-01", "ns")).astype("timedelta64[us]").astype(int)
+    whole = np.rint(PLACES / [1e-7, 1e-7, 1e-3]).astype(int)
+    scales = {"time_s": 1e-6, "latitude_deg": 1e-7, "longitude_deg": 1e-7, "height_m": 1e-3}
+    track = read(tmp_path, f"time_s,{GEODETIC}", elapsed, *whole.T, scales=scales, start_utc="1970-01-01")
+    assert (np.abs(track.time.values - TIMES) <= np.timedelta64(500, "ns")).all()
+    np.testing.assert_allclose(track.position.values, ecef_from_geodetic(*(whole * [1e-7, 1e-7, 1e-3]).T), atol=1e-6)
+    message = complaint(lambda: read(tmp_path, f"time_s,{GEODETIC}", elapsed, *whole.T, scales={"lat": 1.0}))
+    assert "nodes.a.log.scales: column 'lat'; expected one of time_utc" in message
+
+
+@pytest.mark.parametrize("numbers", [[1], [5], [4, 5], [1, 2, 5], [2, 9]])
+def test_numbers_of_kinds_of_solution_ask_for_their_numbering(tmp_path, numbers):
+    """4 is a fixed solution in GGA and DGPS in RTKLIB; 1 is a single one in GGA and fixed in RTKLIB."""
+    columns = TIMES, *PLACES.T, np.resize(numbers, 40)
+    message = complaint(lambda: read(tmp_path, f"time_utc,{GEODETIC},quality", *columns))
+    assert f"kinds of solution {', '.join(map(str, numbers))} in column 'quality'" in message
+    assert "nodes.a.log.quality in config.yaml. Add it: rtklib (1 fix, 2 float, 5 single) or gga (4 fix" in message
+
+
+@pytest.mark.parametrize(
+    ("numbering", "kinds"), [("gga", [0, 5, 4, 5, 1, 2, 3]), ("rtklib", [0, 1, 2, 3, 4, 5, 6])], ids=["gga", "rtklib"]
+)
+def test_kinds_of_solution_are_read_by_the_numbering_that_the_config_states(tmp_path, numbering, kinds):
+    numbers = ["", 1, 2, 3, 4, 5, 9 if numbering == "gga" else 6]
+    columns = TIMES[:7], *PLACES[:7].T, numbers
+    track = read(tmp_path, f"time_utc,{GEODETIC},quality", *columns, quality=numbering)
+    assert track.fix.values.tolist() == kinds
+
+
+def test_epochs_that_gga_calls_not_measured_are_left_out(tmp_path):
+    columns = TIMES, *PLACES.T, [4] * 36 + [0, 6, 7, 8]
+    track = read(tmp_path, f"time_utc,{GEODETIC},quality", *columns, quality="gga")
+    assert track.dropped == {
+        "no fix (quality 0)": 1,
+        "dead reckoning (quality 6)": 1,
+        "typed in (quality 7)": 1,
+        "simulated (quality 8)": 1,
+    }
+    assert set(track.fix.values) == {1}
+
+
+def rows_of(times=TIMES, places=PLACES):
+    return [f"{time},{north},{east},{up}" for time, (north, east, up) in zip(times, places, strict=True)]
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        [f"time_utc,{GEODETIC}", *rows_of()[:20], f"time_utc,{GEODETIC}", *rows_of()[20:]],
+        ["# flown by nobody, 5 m/s", f"time_utc,{GEODETIC}", *rows_of()[:9], "# pause", *rows_of()[9:]],
+        [f"# time_utc,{GEODETIC}", *rows_of()],
+        [" Time_UTC , Latitude_deg,LONGITUDE_DEG , height_m ", *rows_of()],
+    ],
+    ids=["joined", "comments", "heading is a comment", "capitals"],
+)
+def test_headings_and_comments_as_programs_write_them(tmp_path, lines):
+    track = read(tmp_path, lines[0], lines[1:])
+    np.testing.assert_array_equal(track.time.values, TIMES)
+    np.testing.assert_allclose(track.position.values, ECEF, atol=1e-6, rtol=0)
+
+
+def test_a_second_heading_of_other_columns_is_refused(tmp_path):
+    lines = [*rows_of()[:20], "longitude_deg,latitude_deg,time_utc,height_m", *rows_of()[20:]]
+    message = complaint(lambda: read(tmp_path, f"time_utc,{GEODETIC}", lines))
+    assert "line 22 is another heading than the first: files were joined" in message
+
+
+@pytest.mark.parametrize(
+    ("encoding", "name", "expected"),
+    [
+        ("utf-16", "höhe", 'text in UTF-16, as "Unicode text" of Excel; save the file as UTF-8'),
+        ("latin-1", "höhe", "byte 0xf6 in line 1 is not UTF-8; save the file as UTF-8"),
+        ("cp1252", "µ", "byte 0xb5 in line 1 is not UTF-8; save the file as UTF-8"),
+    ],
+)
+def test_text_that_is_not_utf_8_is_refused_with_what_to_do(tmp_path, encoding, name, expected):
+    path = tmp_path / "a.track.csv"
+    path.write_bytes("\n".join([f"time_utc,{GEODETIC},{name}", *(f"{row},1" for row in rows_of())]).encode(encoding))
+    message = complaint(lambda: read_track(path, node="a"))
+    assert expected in message
+    assert "codec" not in message
+
+
+@pytest.mark.parametrize(
+    "text", ["14.05.2025 09:29:58", "14-May-2025 09:29:58", "29:58.0", "2025-05-14 25:00:00", "5/14/25"]
+)
+@pytest.mark.parametrize("name", ["time_utc", "time"])
+def test_a_time_that_is_not_in_iso_8601_is_named_with_its_column(tmp_path, name, text):
+    columns = [*TIMES[:20], text, *TIMES[21:]], *PLACES.T
+    message = complaint(lambda: read(tmp_path, f"{name},{GEODETIC}", *columns, time_system="utc"))
+    assert f"column {name}: '{text}' is no time in ISO 8601 such as 2025-05-14T09:30:00.5Z" in message
+
+
+def test_a_decimal_comma_of_seconds_is_one_of_iso_8601(tmp_path):
+    texts = [f'"{str(time)[:23].replace(".", ",")}Z"' for time in TIMES]
+    np.testing.assert_array_equal(read(tmp_path, f"time_utc,{GEODETIC}", texts, *PLACES.T).time.values, TIMES)
+
+
+def test_epochs_within_a_leap_second_are_left_out_and_counted(tmp_path):
+    start = np.datetime64("2016-12-31T23:59:57", "ns")
+    texts = [str(time) for time in start + np.arange(30) * np.timedelta64(100, "ms")]
+    texts += [f"2016-12-31T23:59:60.{tenth}" for tenth in range(10)]
+    track = read(tmp_path, f"time_utc,{GEODETIC}", texts, *PLACES.T)
+    assert track.dropped == {"within a leap second": 10}
+    assert str(track.time.values[-1]) == "2016-12-31T23:59:59.900000000"
+    gps = start + np.timedelta64(17, "s") + np.arange(40) * np.timedelta64(100, "ms")
+    track = read(tmp_path, f"time,{GEODETIC}", gps, *PLACES.T, time_system="gpst")
+    assert track.dropped == {"within a leap second": 10}
+    assert str(track.time.values[-1]) == "2016-12-31T23:59:59.900000000"
+
+
+@pytest.mark.parametrize("spelling", ["1.#INF", "-nan(ind)", "-1.#IND", "1.#J"])
+def test_a_standard_deviation_that_c_prints_as_no_number_is_unknown(tmp_path, spelling):
+    columns = TIMES, *PLACES.T, *[[spelling, *[0.01] * 39]] * 3
+    track = read(tmp_path, f"time_utc,{GEODETIC},std_north_m,std_east_m,std_up_m", *columns)
+    assert np.isnan(track.position_std.values[0]).all()
+    np.testing.assert_array_equal(track.position_std.values[1:], 0.01)

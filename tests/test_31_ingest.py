@@ -18,6 +18,7 @@ from apertura.formats.names import RECORDERS, TRACKS, LogFormat
 from apertura.formats.reading import open_recording, read_phase_history, read_track
 from apertura.formats.recordings.recording import Captures, Recording
 from apertura.formats.recordings.sample_file import SampleFile
+from apertura.formats.tracks.log_options import LogOptions
 from apertura.formats.tracks.track import make_track
 from apertura.pipeline.campaign import Campaign
 
@@ -72,7 +73,7 @@ CSV = "time_utc,latitude_deg,longitude_deg,height_m,quality,std_north_m,std_east
 def csv_log(path, *cells):
     rows = [f"2025-05-14T09:30:1{n}Z,48,9,600,{cell}" for n, cell in enumerate(cells)]
     path.write_text(CSV + "\n".join(rows) + "\n")
-    return check(read_track(path, node="a"), "track")
+    return check(read_track(path, node="a", options=LogOptions(quality="rtklib")), "track")
 
 
 def test_a_csv_log_says_how_good_it_is(tmp_path):

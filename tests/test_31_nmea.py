@@ -139,9 +139,7 @@ def test_a_log_without_any_checksum_is_read_with_a_remark(tmp_path, end):
     track = read(tmp_path, end.join(lines) + end)
     assert track.dropped == {"sentences broken off": 1}
     np.testing.assert_array_equal(track.time.values, np.delete(TIMES, 3))
-    np.testing.assert_allclose(
-        track.position.values, ecef_from_geodetic(*np.delete(PLACES, 3, 0).T), atol=2e-5, rtol=0
-    )
+    np.testing.assert_allclose(track.position.values, ecef_from_geodetic(*np.delete(PLACES, 3, 0).T), atol=2e-5, rtol=0)
     np.testing.assert_array_equal(track.position_std.values, np.tile([0.01, 0.02, 0.03], (39, 1)))
     assert "none of 87 sentences has a checksum" in track.remarks[0]
     cut = read(tmp_path, end.join(lines[:-1])[:-1])

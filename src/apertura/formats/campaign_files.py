@@ -147,7 +147,8 @@ def write_csv_log(
     local
         Whether positions are metres to east, north and up in axes of the campaign's own.
     further
-        Column → (epoch,): more of them; whole numbers as such, others to 10 µm, and empty cells where one is NaN.
+        Column → (epoch,): more of them; whole numbers and words as such, others to 10 µm, and empty cells where one is
+        NaN.
     """
     axes = ("east_m", "north_m", "up_m") if local else ("latitude_deg", "longitude_deg", "height_m")
     columns = ["time_utc", *axes]
@@ -165,7 +166,7 @@ def write_csv_log(
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def _cell(value: float, digits: int) -> str:
-    if isinstance(value, int):
+def _cell(value: float | str, digits: int) -> str:
+    if isinstance(value, int | str):
         return str(value)
     return "" if math.isnan(value) else f"{value:.{digits}f}"

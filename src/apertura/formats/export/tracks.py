@@ -21,6 +21,7 @@ from apertura.formats.campaign_files import write_csv_log
 from apertura.formats.export.map_layout import DPI
 from apertura.formats.times import coarsened
 from apertura.formats.tracks.rtklib import write_rtklib_pos
+from apertura.formats.tracks.track import FIXES
 
 _AXES = ("east", "north", "up")
 _NED_OF_ENU = [1, 0, 2]
@@ -171,7 +172,8 @@ def write_csv(path: Path, log: RefinedLog) -> None:
         f"std_{axis}_m": std_m[:, _AXES.index(axis)] for axis in ("north", "east", "up")
     }
     if log.fix.any():
-        further["quality"] = log.fix
+        kinds = {number: name for name, number in FIXES.items()}
+        further["quality"] = np.array([kinds.get(number, "") for number in log.fix.tolist()])
     further |= {f"correction_{axis}_m": column for axis, column in zip(_AXES, correction_m.T, strict=True)}
     further["refined"] = log.refined.astype(np.int8)
     with replacement(path) as temporary:

@@ -1,11 +1,13 @@
 """Tables of comma-separated values, checked column by column, and flight logs in them, by names of ours or mapped."""
 
 import csv
+import io
 import re
 import warnings
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, TextIO
 
 import numpy as np
 import pandas as pd
@@ -14,8 +16,17 @@ from numpy.typing import NDArray
 
 from apertura.common.errors import CampaignError, quoted
 from apertura.common.leap_seconds import GPS_EPOCH, utc_from_gps
+from apertura.formats.times import LEAP_SECOND, in_leap_second
 from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions
-from apertura.formats.tracks.track import FIXES, contradicted, make_track, start_time, unstated
+from apertura.formats.tracks.track import (
+    FIXES,
+    GGA_KINDS,
+    GGA_NOT_MEASURED,
+    contradicted,
+    make_track,
+    start_time,
+    unstated,
+)
 
 # ---- Untrusted tables of comma-separated numbers, columns by name ---------------------------------------------------
 
@@ -71,7 +82,9 @@ def read_table(
     Parameters
     ----------
     path
-        UTF-8, with or without byte-order mark; the first line names the columns.
+        UTF-8, with or without byte-order mark; the first line names the columns, in capitals or not. Lines that begin
+        with # are comments; the last of them before the first row may be the heading. A heading that is repeated, as
+        where files were joined, is left out.
     required, optional
         Names of columns that must be there, or may, but once.
     texts
@@ -80,21 +93,28 @@ def read_table(
     Raises
     ------
     ValueError
-        If it is no table, its cells stand between semicolons, it lacks a column or has one twice, or a line has more or
-        fewer cells than the heading.
+        If it is no table, its cells stand between semicolons or tabs, it lacks a column or has one twice, another
+        heading stands in it, or a line has more or fewer cells than the heading.
     """
     if path.stat().st_size > LARGEST_LOG:
         raise ValueError(f"{path.stat().st_size} bytes, at most {LARGEST_LOG} are read")
-    _check_cells(path)
-    with path.open("rb") as stream, warnings.catch_warnings():
+    known = list(dict.fromkeys([*required, *optional, *texts]))
+    try:
+        heading, others = _checked_cells(path, known)
+    except UnicodeDecodeError as error:
+        raise ValueError(_not_utf8(path)) from error
+    names = _named(heading, known)
+    with path.open(encoding="utf-8-sig", newline="") as stream, warnings.catch_warnings():
         warnings.simplefilter("error", pd.errors.ParserWarning)  # cells beyond the heading would be dropped
+        plain = len(others) == 1
         try:
             table = pd.read_csv(
-                stream,
-                encoding="utf-8-sig",
+                stream if plain else _without(stream, others),
+                header=0 if plain else None,
+                names=names,
                 skipinitialspace=True,
                 index_col=False,
-                dtype=dict.fromkeys(texts, str),
+                dtype=dict.fromkeys([name for name in texts if name in names], str),
                 low_memory=False,
             )
         except pd.errors.ParserWarning as error:
@@ -102,26 +122,81 @@ def read_table(
     missing = [name for name in required if name not in table.columns]
     if missing:
         raise ValueError(f"no column {missing[0]} among {quoted(list(table.columns), 300)}")
-    doubled = [name for name in (*required, *optional) if f"{name}.1" in table.columns]
-    if doubled:
-        raise ValueError(f"column {doubled[0]} a second time")
     return table
 
 
-def _check_cells(path: Path) -> None:
-    """Raise ValueError where a line has fewer cells than the heading, a piece is gone, maybe of a number; or more."""
+def _named(heading: Sequence[str], known: Sequence[str]) -> list[str]:
+    """Return the names of columns: those that are known, in capitals or not, as they are known; each once."""
+    plain = [cell.strip().casefold() for cell in heading]
+    names = [cell.strip() for cell in heading]
+    for name in known:
+        places = [place for place, cell in enumerate(names) if cell == name]
+        places = places or [place for place, cell in enumerate(plain) if cell == name.casefold()]
+        if len(places) > 1:
+            raise ValueError(f"column {name} a second time")
+        if places:
+            names[places[0]] = name
+    return [f"{name}.{place}" if name in names[:place] else name for place, name in enumerate(names)]
+
+
+def _not_utf8(path: Path) -> str:
+    """Return where a file is not UTF-8 text."""
+    with path.open("rb") as stream:
+        if stream.read(2) in {b"\xff\xfe", b"\xfe\xff"}:
+            return 'text in UTF-16, as "Unicode text" of Excel; save the file as UTF-8'
+        stream.seek(0)
+        for line, data in enumerate(stream, 1):
+            try:
+                data.decode("utf-8-sig")
+            except UnicodeDecodeError as error:
+                return f"byte {data[error.start]:#04x} in line {line} is not UTF-8; save the file as UTF-8"
+    return "not UTF-8; save the file as UTF-8"
+
+
+def _checked_cells(path: Path, known: Sequence[str]) -> tuple[list[str], set[int]]:
+    """Return the heading, and the numbers of rows that hold no values: comments, and the heading as often as it comes.
+
+    Raises
+    ------
+    ValueError
+        If a line has fewer cells than the heading, so that a piece is gone, maybe of a number; or more.
+    """
     with path.open(encoding="utf-8-sig", newline="") as stream:
         rows = csv.reader(stream, skipinitialspace=True)
+        heading, others, commented = list[str](), set[int](), list[str]()
+        names = {name.casefold() for name in known}
         try:
-            heading = next((row for row in rows if row), [])
-            if len(heading) == 1 and ";" in heading[0]:
-                raise ValueError(f"line {rows.line_num} has its cells between semicolons, not commas")
-            # one cell that is empty is a comma that ends the line
-            odd = next((row for row in rows if row and len(row) - (row[-1] == "") != len(heading) != len(row)), None)
+            for place, row in enumerate(rows):
+                if row and row[0].startswith("#"):
+                    others.add(place)
+                    commented = [row[0].lstrip("# "), *row[1:]]
+                elif row and not heading:
+                    is_comment = bool(names & {cell.strip().casefold() for cell in commented})
+                    heading = commented if is_comment else row
+                    others |= set() if is_comment else {place}
+                    for mark, name in ((";", "semicolons"), ("\t", "tabs")):
+                        if len(heading) == 1 and mark in heading[0]:
+                            raise ValueError(f"line {rows.line_num} has its cells between {name}, not commas")
+                    titles = {cell.strip().casefold() for cell in heading} & names
+                elif row == heading:
+                    others.add(place)
+                elif row and row[0].strip().casefold() in titles:
+                    raise ValueError(f"line {rows.line_num} is another heading than the first: files were joined")
+                elif row and len(row) - (row[-1] == "") != len(heading) != len(row):  # a comma may end the line
+                    raise ValueError(f"line {rows.line_num} has {len(row)} cells, the heading {len(heading)}")
         except csv.Error as error:
             raise ValueError(f"line {rows.line_num}: {error}") from error
-    if odd is not None:
-        raise ValueError(f"line {rows.line_num} has {len(odd)} cells, the heading {len(heading)}")
+    return heading, others
+
+
+def _without(stream: TextIO, others: set[int]) -> TextIO:
+    """Return a table without some of its rows."""
+    kept = io.StringIO(newline="")
+    csv.writer(kept).writerows(
+        row for number, row in enumerate(csv.reader(stream, skipinitialspace=True)) if number not in others
+    )
+    kept.seek(0)
+    return kept
 
 
 def numbers(columns: pd.DataFrame) -> NDArray[np.float64]:
@@ -147,7 +222,8 @@ _POSITIONS: dict[Literal["geodetic", "ecef", "local"], list[str]] = {
 }
 _ATTITUDE = ["roll_deg", "pitch_deg", "yaw_deg"]
 _STD = ["std_north_m", "std_east_m", "std_up_m"]
-_OURS = (*_TIMES, *(name for names in _POSITIONS.values() for name in names), *_ATTITUDE, *_STD, "quality")
+_QUALITY = "quality"
+_OURS = (*_TIMES, *(name for names in _POSITIONS.values() for name in names), *_ATTITUDE, *_STD, _QUALITY)
 _ZONE = r"(?:Z|[+-]\d\d:?\d\d)$"
 _LONGEST_S = 4e9
 
@@ -170,7 +246,11 @@ def read_csv_track(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -
     - the first that is whole of latitude_deg, longitude_deg, height_m (WGS 84, ellipsoidal, after height_offset_m);
       x_m, y_m, z_m (ECEF); east_m, north_m, up_m (axes of the campaign's own);
     - where known roll_deg, pitch_deg, yaw_deg; std_north_m, std_east_m, std_up_m (standard deviations); quality (kind
-      of solution: a name or number of `FIXES`). Empty cells of these are epochs without such a value.
+      of solution: a name of `FIXES`, or a number as options.quality says). Empty cells of these are epochs without such
+      a value.
+
+    Numbers are multiplied by options.scales. Epochs within a leap second are left out and counted, as are those that
+    are not measured by their quality in GGA.
 
     Raises
     ------
@@ -178,46 +258,77 @@ def read_csv_track(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -
         If a column is missing or a cell is not a number or a time, or the epoch of times is not stated.
     """
     log = _Log(path, node, options)
+    dropped = Counter[str]()
     try:
         table = _table(log)
+        if cut_off(path):
+            table, dropped["line cut off"] = table.iloc[:-1], 1
+        for why, wrong in _left_out(table, log).items():
+            dropped[why] += int(wrong.sum())
+            table = table[~wrong.reindex(table.index)]
         frame = _frame(table, log)
-        position = numbers(table[_POSITIONS[frame]])
+        position = _scaled(table, _POSITIONS[frame], log)
         attitude, std = (
-            numbers(table[names]) if set(names) <= set(table.columns) else None for names in (_ATTITUDE, _STD)
+            _scaled(table, names, log) if set(names) <= set(table.columns) else None for names in (_ATTITUDE, _STD)
         )
-        fix = _fix(table["quality"]) if "quality" in table else None
+        fix = _fix(table[_QUALITY], log) if _QUALITY in table else None
         time = _time(table, log)
+        kept = ~np.isnat(time) if options.time_system == "gpst" else np.ones(len(time), bool)
+        dropped[LEAP_SECOND] += int((~kept).sum())
     except CampaignError:
         raise
     except (ValueError, ArithmeticError) as error:
         raise _error(str(error).partition("\n")[0], log, "Correct the log or export it again.") from error
     if frame == "geodetic":
         position = position + np.array([0.0, 0.0, options.height_offset_m or 0.0])
-    last = slice(None, -1) if cut_off(path) else slice(None)
+    attitude, std, fix = (None if one is None else one[kept] for one in (attitude, std, fix))
     return make_track(
-        time[last],
-        position[last],
+        time[kept],
+        position[kept],
         frame=frame,
-        attitude_deg=None if attitude is None else attitude[last],
-        position_std_m=None if std is None else std[last],
-        fix=None if fix is None else fix[last],
-        dropped={"line cut off": 1} if last.stop else None,
+        attitude_deg=attitude,
+        position_std_m=std,
+        fix=fix,
+        dropped={why: count for why, count in dropped.items() if count},
         node=node,
         where=path,
     )
 
 
+def _left_out(table: pd.DataFrame, log: _Log) -> dict[str, "pd.Series[bool]"]:
+    """Return why rows are no epochs → which rows."""
+    reasons = {}
+    if _QUALITY in table and log.options.quality == "gga":
+        stated = _words(table[_QUALITY])
+        for number, why in GGA_NOT_MEASURED.items():
+            if number:
+                reasons[f"{why} (quality {number})"] = stated == number
+    for name in ("time_utc", "time"):
+        if name in table:
+            texts = table[name].fillna("").astype(str)
+            reasons[LEAP_SECOND] = pd.Series(in_leap_second(texts.tolist()), table.index)
+    return reasons
+
+
+def _scaled(table: pd.DataFrame, names: list[str], log: _Log) -> NDArray[np.float64]:
+    """Return columns as (row, column) float64, multiplied by the factors of the config."""
+    return numbers(table[names]) * [log.options.scales.get(name, 1.0) for name in names]
+
+
 def _table(log: _Log) -> pd.DataFrame:
     """Return the table under names of ours; ValueError where names are missing or ambiguous."""
     mapped = dict(log.options.columns)
-    unknown = [name for name in mapped if name not in _OURS]
-    if unknown:
-        raise CampaignError(
-            f"column {quoted(unknown[0])}",
-            f"config.yaml: nodes.{log.node}.log.columns",
-            f"one of {', '.join(_OURS)}",
-            "Columns of ours stand left, those of the log right.",
-        )
+    for key, table_of in (("columns", mapped), ("scales", log.options.scales)):
+        unknown = [name for name in table_of if name not in _OURS]
+        if unknown:
+            raise CampaignError(
+                f"column {quoted(unknown[0])}",
+                f"config.yaml: nodes.{log.node}.log.{key}",
+                f"one of {', '.join(_OURS)}",
+                "Columns of apertura stand left, those of the log right."
+                if key == "columns"
+                else "Columns of apertura stand left, their factors right.",
+            )
     theirs = [mapped.get(name, name) for name in _OURS]
     texts = [mapped.get(name, name) for name in ("time_utc", "time", "quality")]
     table = read_table(log.path, list(mapped.values()), optional=theirs, texts=texts)
@@ -234,7 +345,7 @@ def _error(found: str, log: _Log, remedy: str) -> CampaignError:
     expected = (
         "columns time_utc (ISO 8601), or time or time_s, latitude_deg, longitude_deg, height_m, or x_m, y_m, z_m, or "
         f"east_m, north_m, up_m; optionally {', '.join(_ATTITUDE)}, {', '.join(_STD)}, quality ({', '.join(FIXES)}, "
-        f"or their numbers 1 to 6); or their names in nodes.{log.node}.log.columns"
+        f"or numbers as nodes.{log.node}.log.quality says); or their names in nodes.{log.node}.log.columns"
     )
     return CampaignError(found, log.path, expected, remedy)
 
@@ -264,7 +375,7 @@ def _time(table: pd.DataFrame, log: _Log) -> NDArray[np.datetime64]:
         raise ValueError("columns time and time_s")
     name, system = stated[0], log.options.time_system
     if name == "time_s":
-        return _counted(numbers(table[["time_s"]])[:, 0], log)
+        return _counted(_scaled(table, ["time_s"], log)[:, 0], log)
     zoned = table[name].dropna().str.strip().str.contains(_ZONE)
     if name == "time" and not zoned.all():
         if system is None or zoned.any():
@@ -278,8 +389,15 @@ def _time(table: pd.DataFrame, log: _Log) -> NDArray[np.datetime64]:
 
 
 def _iso(cells: "pd.Series[str]") -> NDArray[np.datetime64]:
-    time = pd.to_datetime(cells, utc=True, format="ISO8601").dt.tz_localize(None).dt.as_unit("ns")
-    return np.asarray(time.to_numpy())
+    """Return times in ISO 8601, whose seconds may have a decimal comma; ValueError names the first that is none."""
+    texts = cells.str.strip().str.replace(",", ".", regex=False)
+    time = pd.to_datetime(texts, utc=True, format="ISO8601", errors="coerce")
+    wrong = cells[time.isna() & cells.notna()]
+    if len(wrong):
+        raise ValueError(
+            f"column {cells.name}: {quoted(wrong.iloc[0], 40)} is no time in ISO 8601 such as 2025-05-14T09:30:00.5Z"
+        )
+    return np.asarray(time.dt.tz_localize(None).dt.as_unit("ns").to_numpy())
 
 
 def _counted(seconds: NDArray[np.float64], log: _Log) -> NDArray[np.datetime64]:
@@ -293,11 +411,25 @@ def _counted(seconds: NDArray[np.float64], log: _Log) -> NDArray[np.datetime64]:
     return start_time(log.options, found, node=log.node, where=log.path) + elapsed
 
 
-def _fix(quality: "pd.Series[str]") -> NDArray[np.int8]:
+def _fix(quality: "pd.Series[str]", log: _Log) -> NDArray[np.int8]:
     """Return RTKLIB's numbers of kinds of solution that are named or numbered; 0 where a cell is empty."""
-    numbers = {**FIXES, "": 0, **{str(number): number for number in (0, *FIXES.values())}}
-    words = quality.map(lambda cell: "" if pd.isna(cell) else str(cell).strip().lower().removesuffix(".0"))
-    unknown = words[~words.isin(numbers)]
+    words = _words(quality)
+    kinds = {**FIXES, "": 0}
+    if log.options.quality == "gga":
+        kinds |= {number: FIXES[kind] for number, kind in GGA_KINDS.items()}
+    else:
+        kinds |= {str(number): number for number in (0, *FIXES.values())}
+    counted = sorted({word for word in words if word.isdigit() and word != "0"})
+    if counted and log.options.quality is None:
+        column = log.options.columns.get(_QUALITY, _QUALITY)
+        found = f"kinds of solution {', '.join(counted)} in column {quoted(column)}"
+        numbering = ": rtklib (1 fix, 2 float, 5 single) or gga (4 fix, 5 float, 1 single)"
+        raise unstated("quality", found, node=log.node, where=log.path, remedy=numbering)
+    unknown = words[~words.isin(kinds)]
     if len(unknown):
         raise ValueError(f"quality {quoted(unknown.iloc[0])}")
-    return np.array([numbers[word] for word in words], np.int8)
+    return np.array([kinds[word] for word in words], np.int8)
+
+
+def _words(quality: "pd.Series[str]") -> "pd.Series[str]":
+    return quality.map(lambda cell: "" if pd.isna(cell) else str(cell).strip().lower().removesuffix(".0"))

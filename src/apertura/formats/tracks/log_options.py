@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 TimeSystem = Literal["utc", "gpst"]
+QualityNumbers = Literal["rtklib", "gga"]
 
 
 @dataclass(frozen=True)
@@ -22,6 +23,11 @@ class LogOptions:
         ISO 8601, UTC; None: stated by the log, else the log is rejected.
     columns
         Name of a column of ours → name in the log, for CSV.
+    scales
+        Name of a column of ours → factor that its numbers are multiplied by, for CSV; missing ones are 1.
+    quality
+        How kinds of solution are numbered in a CSV log: as RTKLIB's Q (1 fix, 2 float, 5 single) or as in GGA of NMEA
+        (4 fix, 5 float, 1 single); None: they are names, or the log is rejected.
     base
         WGS 84 latitude (deg), longitude (deg) and ellipsoidal height (m) of the point that baselines begin at.
     body
@@ -35,6 +41,8 @@ class LogOptions:
     time_system: TimeSystem | None = None
     start_utc: str | None = None
     columns: Mapping[str, str] = field(default_factory=dict)
+    scales: Mapping[str, float] = field(default_factory=dict)
+    quality: QualityNumbers | None = None
     base: tuple[float, float, float] | None = None
     body: str | None = None
     height_offset_m: float | None = None

@@ -15,7 +15,16 @@ from apertura.common.errors import CampaignError, quoted
 from apertura.formats.times import LEAP_SECOND, utc_times
 from apertura.formats.tracks.csv_track import LARGEST_LOG, number
 from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions
-from apertura.formats.tracks.track import FIXES, contradicted, make_track, remarked, start_time, unstated
+from apertura.formats.tracks.track import (
+    FIXES,
+    GGA_KINDS,
+    GGA_NOT_MEASURED,
+    contradicted,
+    make_track,
+    remarked,
+    start_time,
+    unstated,
+)
 
 _BODY = re.compile(rb"([A-Z]{2}[A-Z0-9]{3},[^*]{1,250})(\*[0-9A-Fa-f]{0,2})?")
 _SEALED = re.compile(rb"\$..(?:GGA|RMC|ZDA|GST),[^*$\r\n]{1,250}\*[0-9A-Fa-f]{2}")
@@ -26,8 +35,6 @@ _DATED = {"RMC", "ZDA"}
 _WANTED = re.compile(r"[^P].(?:GGA|RMC|ZDA|GST),")
 _TIME = re.compile(r"([01]\d|2[0-3])([0-5]\d)([0-5]\d|60)(?:\.(\d{1,9})\d*)?", re.ASCII)
 _DAY_NS, _SECOND_NS = 86_400_000_000_000, 1_000_000_000
-_KINDS = {"1": "single", "2": "dgps", "3": "single", "4": "fix", "5": "float", "9": "sbas"}
-_NOT_MEASURED = {"": "no fix", "0": "no fix", "6": "dead reckoning", "7": "typed in", "8": "simulated"}
 _REMEDY = "Log GGA with RMC or ZDA, as the receiver sends them."
 
 
@@ -84,7 +91,9 @@ def read_nmea(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -> xr.
     data = path.read_bytes()
     sealed = _SEALED.search(data) is not None
     log = _Log(path, node, options, data, sealed)
-    looked_through = _sentences(_Log(path, node, options, data, sealed))  # as far as the first date: epochs before it have it, too
+    looked_through = _sentences(
+        _Log(path, node, options, data, sealed)
+    )  # as far as the first date: epochs before it have it, too
     dates = (_dated(sentence) for sentence in looked_through if sentence.sentence_type in _DATED)
     log.now_ns = next((date for date in dates if date is not None), None)
     first_ns = log.now_ns
@@ -107,13 +116,13 @@ def _sentences(log: _Log) -> Iterator[Any]:
     """Yield the sentences that are wanted and whole; those that are broken are counted."""
     lines = log.data.splitlines()
     ended = not log.data or log.data[-1:] in b"\r\n"
-    for number, line in enumerate(lines, 1):
+    for row, line in enumerate(lines, 1):
         stamp, *pieces = line.split(b"$")
         for place, piece in enumerate(pieces):
             match = _BODY.match(piece)
             if match:
                 log.stamped += place == 0 and bool(_STAMP.fullmatch(stamp))
-                last = place + 1 == len(pieces) and (number < len(lines) or ended)
+                last = place + 1 == len(pieces) and (row < len(lines) or ended)
                 yield from _whole(match[1].decode("latin-1"), match[2], log, ended=last)
 
 
@@ -206,17 +215,17 @@ def _fix(sentence: Any, log: _Log) -> _Fix | None:
     """Return the position of a GGA, or None and count it where it is no measured position."""
     data = sentence.data
     quality = data[5]
-    reason = _NOT_MEASURED.get(quality)
+    reason = GGA_NOT_MEASURED.get(quality)
     if reason is None and not all((data[1], data[2], data[3], data[4], data[8])):
         reason = "without a position"
     if reason is not None:
         log.dropped[reason] += 1
         return None
-    if quality not in _KINDS or data[9] != "M" or data[2] not in "NS" or data[4] not in "EW":
+    if quality not in GGA_KINDS or data[9] != "M" or data[2] not in "NS" or data[4] not in "EW":
         raise ValueError("a quality, unit or hemisphere that NMEA has not")
     separation = number(data[10]) if data[10] and data[11] == "M" else np.nan
     geodetic = sentence.latitude, sentence.longitude, number(data[8])
-    return _Fix(sentence.talker, geodetic, separation, FIXES[_KINDS[quality]])
+    return _Fix(sentence.talker, geodetic, separation, FIXES[GGA_KINDS[quality]])
 
 
 def _keep(now: int, fix: _Fix, log: _Log) -> None:

@@ -19,6 +19,12 @@ from apertura.formats.tracks.log_options import LogOptions
 FIXES = {"fix": 1, "float": 2, "sbas": 3, "dgps": 4, "single": 5, "ppp": 6}
 """Kinds of solution by RTKLIB's numbers, Q."""
 
+GGA_KINDS = {"1": "single", "2": "dgps", "3": "single", "4": "fix", "5": "float", "9": "sbas"}
+"""Quality of NMEA's GGA → kind of solution, a key of `FIXES`; 9 as NovAtel writes it."""
+
+GGA_NOT_MEASURED = {"": "no fix", "0": "no fix", "6": "dead reckoning", "7": "typed in", "8": "simulated"}
+"""Quality of NMEA's GGA → why an epoch is no measured position."""
+
 LOWEST_M, HIGHEST_M = -1000.0, 100_000.0
 """Heights above the ellipsoid that an aircraft or a balloon logs."""
 

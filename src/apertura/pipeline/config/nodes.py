@@ -34,6 +34,14 @@ class Log(Section):
     columns: dict[Cell, Cell] = Field(
         default_factory=dict, description="column that apertura reads → its name in a CSV log"
     )
+    scales: dict[Cell, Annotated[float, Field(gt=0, le=1e12)]] = Field(
+        default_factory=dict, description="column that apertura reads → factor of its numbers in a CSV log: 1e-7, 0.001"
+    )
+    quality: Literal["rtklib", "gga"] | None = Field(
+        None,
+        description="how a CSV log numbers kinds of solution: rtklib (1 fix, 2 float, 5 single) or gga (4 fix, 5 "
+        "float, 1 single); null: it names them",
+    )
     base: tuple[Latitude, Longitude, float] | None = Field(
         None, description="where baselines begin: latitude, longitude (deg), ellipsoidal height (m), WGS 84"
     )

@@ -8,7 +8,7 @@ from typing import Any, get_args
 
 from apertura.common.documents import validated
 from apertura.common.errors import CampaignError
-from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions, TimeSystem
+from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions, QualityNumbers, TimeSystem
 from apertura.pipeline.config import CLOCKS, CONFIG, read_settings
 from apertura.pipeline.config.nodes import Log
 
@@ -17,8 +17,11 @@ NODE = "<node>"
 
 _KEY = re.compile(r"\bnodes\.\S+?\.log\.(\w+)")
 _OPTIONS = {one.name for one in fields(LogOptions)}
+_TABLES = {"columns", "scales"}
 _TYPED = {
     "columns": "columns.NAME='COLUMN OF THE LOG'",
+    "scales": "scales.NAME=FACTOR",
+    "quality": f"quality={'|'.join(get_args(QualityNumbers))}",
     "base": "base=LATITUDE,LONGITUDE,HEIGHT",
     "time_system": f"time_system={'|'.join(get_args(TimeSystem))}",
     "start_utc": "start_utc=YYYY-MM-DDTHH:MM:SS",
@@ -65,7 +68,8 @@ def surroundings(path: Path, settings: Sequence[str]) -> Surroundings:
     path
         The file, absolute.
     settings
-        KEY=VALUE, keys of `LogOptions`; a column is columns.NAME, a base three numbers with commas.
+        KEY=VALUE, keys of `LogOptions`; a column is columns.NAME, its factor scales.NAME, a base three numbers with
+        commas.
 
     Raises
     ------
@@ -101,11 +105,11 @@ def _parsed(settings: Sequence[str]) -> dict[str, Any]:
     parsed: dict[str, Any] = {}
     for setting in settings:
         key, equals, value = setting.partition("=")
-        column = key.removeprefix("columns.")
-        if not equals or not ({key} & _OPTIONS or column != key):
+        table, dot, column = key.partition(".")
+        if not equals or table not in (_TABLES if dot else _OPTIONS):
             raise CampaignError(setting, "--set", _EXPECTED, "Correct it.")
-        if column != key:
-            parsed.setdefault("columns", {})[column] = value
+        if dot:
+            parsed.setdefault(table, {})[column] = value
         else:
             parsed[key] = value.split(",") if key == "base" else value
     return parsed
