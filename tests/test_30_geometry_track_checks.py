@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from apertura.core.geometry.geodesy import ecef_from_geodetic
 from apertura.core.geometry.phase_centres import position_spline
 from apertura.core.geometry.track_checks import (
     check_track,
@@ -12,6 +13,7 @@ from apertura.core.geometry.track_checks import (
     find_steps,
     hovering,
     misfits,
+    rounded_position_m,
     rounded_time_m,
     scatter_m,
 )
@@ -170,6 +172,40 @@ def test_times_rounded_against_the_motion_are_found_with_what_they_cost(grain_s,
     size_m = rounded_time_m(np.round(true_s / grain_s) * grain_s, place)
     assert size_m == pytest.approx(0.23 if found else 0.0, abs=0.01)
     assert ("track_times" in checked(np.round(true_s / grain_s) * grain_s, place).faults) is found
+
+
+RADIUS_M = 6_371_000 * np.pi / 180
+
+
+@pytest.mark.parametrize(
+    ("grain_deg", "expected_m"),
+    [
+        (1e-4 / 60, 0.0644),  # four decimals of a minute: 0.185 m and 0.124 m, over √12
+        (1e-5 / 60, 0.00535),  # 1.9 cm of latitude; 1.2 cm of longitude count as fine
+        (1e-4, 3.87),  # six digits of a spreadsheet
+        (1e-9, 0.0),
+    ],
+)
+@pytest.mark.parametrize("kind", ["circle", "legs", "straight"])
+@pytest.mark.parametrize("speed", [0.1, 1.0])
+def test_positions_rounded_to_a_grid_are_found_with_what_they_err_by(grain_deg, expected_m, kind, speed):
+    time_s, place = logged(kind, epochs=600, noise_m=0.003, seed=2)
+    turned = speed * place @ np.array([[0.8, 0.6, 0], [-0.6, 0.8, 0], [0, 0, 1]])  # along no axis of the grid
+    latitude, longitude = 48 + turned[:, 0] / RADIUS_M, 9 + turned[:, 1] / RADIUS_M / np.cos(np.radians(48))
+    rounded = [np.round(angle / grain_deg) * grain_deg for angle in (latitude, longitude)]
+    ecef = ecef_from_geodetic(*rounded, 600 + turned[:, 2])
+    found = rounded_position_m(time_s, ecef, least_m=X_BAND_M)
+    few = grain_deg == 1e-4 and speed * np.ptp(place[:, :2], axis=0).min() < 100  # too few values for a grid
+    assert few or found == pytest.approx(expected_m, rel=0.01)
+    faults = checked(time_s, ecef).faults
+    assert few or ("track_positions" in faults) is (expected_m > 0)
+
+
+def test_positions_of_uniform_motion_are_no_grid():
+    """5 m/s at 10 Hz moves by 0.5 m from epoch to epoch."""
+    time_s, place = logged("straight", epochs=300)
+    assert rounded_position_m(time_s, place, least_m=X_BAND_M) == 0.0
+    assert rounded_position_m(time_s, place + [4e6, 1e6, 4e6], least_m=X_BAND_M) == 0.0
 
 
 def test_the_error_of_the_spline_between_epochs_is_estimated_from_the_epochs():

@@ -112,6 +112,74 @@ def test_one_of_several_receivers_is_chosen_by_number(tmp_path):
 
 
 @pytest.mark.usefixtures("reader")
+@pytest.mark.parametrize("suffix", KINDS)
+def test_several_receivers_are_listed_with_their_solutions(tmp_path, suffix):
+    rows = [
+        (name, {**row, "Status": 3} if name == "GPS" and row["I"] == 0 else row)
+        for name, row in dataflash_rows(receivers=(0, 1))
+    ]
+    track = read(tmp_path, rows, suffix=suffix)
+    found = "the log holds 0 (single 60) and 1 (fix 60); 0 is read: set nodes.a.log.body to choose"
+    assert track.attrs["remarks"] == [found]
+    assert "remarks" not in read(tmp_path, rows, suffix=suffix, options=LogOptions(body="1")).attrs
+
+
+RNG = np.random.default_rng(12)
+
+
+@pytest.mark.usefixtures("reader")
+@pytest.mark.parametrize(
+    "foreign",
+    [RNG.bytes(200), bytes(4096), RNG.bytes(60) + b"\xa3\x95\x07" + RNG.bytes(60), b"\xa3\x95" * 30],
+    ids=["200 bytes", "zeros", "a message of no kind", "beginnings of messages"],
+)
+@pytest.mark.parametrize("inside", [0, 20])
+def test_epochs_behind_foreign_bytes_are_read_and_the_bytes_are_counted(tmp_path, foreign, inside):
+    data = dataflash(dataflash_rows())
+    at = data.index(b"\xa3\x95\x82", len(data) // 2) + inside  # within the first GPS message of the second half
+    path = tmp_path / "a.track.bin"
+    path.write_bytes(data[:at] + foreign + data[at:])
+    track = read_track(path, node="a")
+    assert 58 <= track.sizes["epoch"] <= 60
+    assert np.isin(track.time.values, utc_of(flight()[0])).all()
+    assert track.time.values[-1] == utc_of(flight()[0])[-1]
+    assert apart_m(track).max() < 0.02
+    lost, of = _counts(track)
+    assert of == len(data) + len(foreign)
+    assert len(foreign) <= lost <= len(foreign) + 200
+
+
+def _counts(track):
+    """Return how many bytes of how many are no messages."""
+    lost, of = track.attrs["damage"].split(" bytes")[0].split(" of ")
+    return int(lost), int(of)
+
+
+@pytest.mark.usefixtures("reader")
+@pytest.mark.parametrize("tail", [b"", bytes(700), b"\xff" * 64, "cut"], ids=["none", "zeros", "ones", "cut"])
+def test_the_end_of_a_log_is_no_damage(tmp_path, tail):
+    data = dataflash(dataflash_rows())
+    path = tmp_path / "a.track.bin"
+    path.write_bytes(data[:-9] if tail == "cut" else data + tail)
+    track = read_track(path, node="a")
+    assert "damage" not in track.attrs
+    assert track.sizes["epoch"] == 60
+
+
+@pytest.mark.usefixtures("reader")
+def test_lines_of_a_text_log_that_are_no_messages_are_counted(tmp_path):
+    lines = dataflash_text(dataflash_rows()).split(b"\n")
+    at = next(place for place, line in enumerate(lines) if line.startswith(b"GPS, ") and place > 200)
+    lines[at] = lines[at][:30]
+    path = tmp_path / "a.track.log"
+    path.write_bytes(b"\n".join([*lines[:100], b"@@@@@,,", *lines[100:]]))
+    track = read_track(path, node="a")
+    assert track.attrs["damage"].startswith("2 of ")
+    assert "lines are no messages, in 2 places, from line 101 on" in track.attrs["damage"]
+    assert track.sizes["epoch"] == 59
+
+
+@pytest.mark.usefixtures("reader")
 def test_messages_of_a_second_receiver_in_older_logs_are_its_own(tmp_path):
     own = "TimeUS,Status,GMS,GWk,NSats,HDop,Lat,Lng,Alt,Spd,GCrs,VZ,Yaw,U"
     forms = dict.fromkeys(("GPS", "GPS2"), ("QBIHBcLLeffffB", own))

@@ -124,7 +124,86 @@ def test_one_of_several_receivers_is_chosen_by_name(tmp_path):
 
 
 @pytest.mark.usefixtures("reader")
+def test_several_receivers_are_listed_with_their_solutions(tmp_path):
+    single, fixed = ulog_receiver(fix_type=np.full(60, 3)), ulog_receiver(fix_type=np.r_[np.full(59, 6), 2])
+    topics = (SENSOR, 0, single), (SENSOR, 1, fixed)
+    track = read(tmp_path, *topics)
+    assert track.attrs["remarks"] == [
+        "the log holds sensor_gps:0 (single 60) and sensor_gps:1 (fix 59, no fix 1); sensor_gps:0 is read: set "
+        "nodes.a.log.body to choose"
+    ]
+    chosen = read(tmp_path, *topics, options=LogOptions(body="sensor_gps:1"))
+    assert "remarks" not in chosen.attrs
+    assert chosen.sizes["epoch"] == 59
+
+
+RNG = np.random.default_rng(11)
+SYNC = struct.pack("<HB", 8, ord("S")) + bytes([0x2F, 0x73, 0x13, 0x20, 0x25, 0x0C, 0xBB, 0x12])
+
+
+@pytest.mark.usefixtures("reader")
+@pytest.mark.parametrize(
+    ("foreign", "inside"),
+    [
+        (RNG.bytes(200), 0),
+        (RNG.bytes(700) + SYNC, 0),
+        (RNG.bytes(200), 20),  # within a message
+        (bytes(4096), 0),
+        (b"\xff" * 512, 31),
+        (b"\xff\xff" + RNG.bytes(100), 0),  # a size beyond the file, where pyulog ends
+    ],
+    ids=["200 bytes", "before a sync", "within a message", "zeros", "ones", "a size beyond the file"],
+)
+def test_epochs_behind_foreign_bytes_are_read_and_the_bytes_are_counted(tmp_path, foreign, inside):
+    data = ulog((GPS, 0, ulog_receiver(epochs=98)))
+    size = len(_last_message(data))
+    at = len(data) - 58 * size + inside  # behind epoch 40
+    path = tmp_path / "a.track.ulg"
+    path.write_bytes(data[:at] + foreign + data[at:])
+    track = read_track(path, node="a")
+    lost = 98 - track.sizes["epoch"]
+    assert 1 <= lost <= 2
+    assert np.isin(track.time.values, utc_of(flight(98)[0])).all()
+    assert track.time.values[-1] == utc_of(flight(98)[0])[-1]
+    assert apart_m(track).max() < 0.02
+    stated = len(foreign) + lost * size - len(SYNC) * foreign.endswith(SYNC)
+    assert track.attrs["damage"] == track.attrs["remarks"][0]
+    assert track.attrs["damage"].startswith(f"{stated} of {len(data) + len(foreign)} bytes are no messages")
+
+
+def _last_message(data):
+    """Return the last message of a log of one topic."""
+    fields = ulog_receiver()
+    size = 2 + sum(
+        {"uint64_t": 8, "double": 8, "int32_t": 4, "float": 4, "uint8_t": 1}[kind] for kind, _ in fields.values()
+    )
+    return data[-size - 3 :]
+
+
+@pytest.mark.usefixtures("reader")
+@pytest.mark.parametrize("tail", [b"", bytes(700), b"\xff" * 64, "cut"], ids=["none", "zeros", "ones", "cut"])
+def test_the_end_of_a_log_is_no_damage(tmp_path, tail):
+    data = ulog((GPS, 0, ulog_receiver()), (ATTITUDE, 0, ulog_attitude()))
+    path = tmp_path / "a.track.ulg"
+    path.write_bytes(data[:-9] if tail == "cut" else data + tail)
+    track = read_track(path, node="a")
+    assert "damage" not in track.attrs
+    assert track.sizes["epoch"] == 60
+
+
+@pytest.mark.usefixtures("reader")
+def test_dropouts_of_the_logger_are_reported(tmp_path):
+    path = tmp_path / "a.track.ulg"
+    data = ulog((GPS, 0, ulog_receiver()))
+    at = len(data) - 10 * len(_last_message(data))
+    path.write_bytes(data[:at] + struct.pack("<HBH", 2, ord("O"), 1500) + data[at:])
+    track = read_track(path, node="a")
+    assert track.attrs["remarks"] == ["1 dropouts of the logger, 1.5 s in all: messages are lost there"]
+    assert track.sizes["epoch"] == 60
+
+
 @pytest.mark.parametrize("old", [True, False])
+@pytest.mark.usefixtures("reader")
 def test_heights_above_sea_level_are_refused_or_made_ellipsoidal(tmp_path, old):
     name = "alt" if old else "altitude_msl_m"
     copied = {f"{name}_ellipsoid" if old else "altitude_ellipsoid_m": ulog_receiver(old=old)[name][1]}

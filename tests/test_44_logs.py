@@ -10,7 +10,7 @@ from folders import complaint, edit_config, edit_data, edit_track, small_simulat
 from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.geodesy import ecef_from_geodetic
-from apertura.formats.tracks.track import make_track
+from apertura.formats.tracks.track import damaged, make_track
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import Node
 from apertura.pipeline.opening.echo import PairEcho
@@ -194,7 +194,30 @@ def test_a_log_with_rounded_times_is_flagged_with_how_far_that_moves_its_positio
     assert not flagged or "positions err by 0.29 m along the flight" in flags["track_times"]
 
 
-@pytest.mark.quick("-0.004")
+def logged_flags(position, *, damage=""):
+    """Return the flags of pulses between the epochs of a node's log, 10 Hz, at 1.2 GHz."""
+    times = np.datetime64("2025-05-14T09:30", "ns") + np.arange(len(position)) * np.timedelta64(100, "ms")
+    where = Path("a.track.ulg")
+    track = damaged(make_track(times, position, frame="local", node="a", where=where), damage, where)
+    log = NodeLog("a", Node(), track, str(where), C / 1.2e9)
+    return place(log, log, times[20:-20] + np.timedelta64(50, "ms")).flags
+
+
+def test_a_log_on_a_coarse_grid_is_flagged_with_how_far_its_positions_err():
+    time_s = np.arange(400) * 0.1
+    flown = np.stack([5 * time_s, 3 * np.sin(time_s), 5 + np.sin(0.7 * time_s)], -1)
+    assert logged_flags(flown) == {}
+    flags = logged_flags(np.round(flown / [0.2, 0.1, 0.01]) * [0.2, 0.1, 0.01])
+    assert "a: positions of the log are written so coarsely that they err by 0.065 m" in flags["track_positions"]
+
+
+def test_a_damaged_log_is_flagged():
+    time_s = np.arange(400) * 0.1
+    flown = np.stack([5 * time_s, 3 * np.sin(time_s), 5 + np.sin(0.7 * time_s)], -1)
+    found = "259 of 6873 bytes are no messages, from byte 2602 on; epochs there are lost"
+    assert logged_flags(flown, damage=found) == {"track_log_damaged": f"a: {found}"}
+
+
 @pytest.mark.quick("-0.004")
 @pytest.mark.parametrize("offset_s", [0.0, 1e-3, -4e-3])
 def test_an_offset_between_the_nodes_tags_does_not_turn_the_bistatic_phase(tmp_path, offset_s):

@@ -76,6 +76,9 @@ _OF_RECORDINGS = {
     "track_epochs_dropped": Flag(
         "epochs left out, by reason", "epochs without a fix, damaged or doubled",
         "the log, if track_gap comes with it; else nothing", "pipeline/opening/positions.py"),
+    "track_log_damaged": Flag(
+        "bytes or lines of the log that are no messages", "the log is damaged: epochs are lost, or may be wrong",
+        "the medium, or the copy of the log", "pipeline/opening/positions.py"),
     "track_gap": Flag(
         "pulses dropped, longest gap", "the spline does not bridge the log's gap", "the log's rate and losses",
         "pipeline/opening/positions.py"),
@@ -89,6 +92,9 @@ _OF_RECORDINGS = {
     "track_frozen": Flag(
         "pulses dropped, epochs, the worst", "epochs repeat the position before them",
         "rate of the receiver against that of the log", "pipeline/opening/positions.py"),
+    "track_positions": Flag(
+        "m that positions err by", "rounded coordinates of the log displace positions",
+        "decimals of the log's coordinates: 8 of degrees, 6 of minutes (NMEA)", "pipeline/opening/positions.py"),
     "track_times": Flag(
         "m along the flight that positions err by", "rounded times of the log displace positions along the flight",
         "decimals of the log's times", "pipeline/opening/positions.py"),

@@ -1,4 +1,4 @@
-"""Checks of a flight log's epochs: spikes, steps, frozen positions, rounded times and gaps."""
+"""Checks of a flight log's epochs: spikes, steps, frozen positions, rounded times and positions, and gaps."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.common.arrays import Floats
+from apertura.core.geometry.geodesy import geodetic_from_ecef
 from apertura.core.geometry.phase_centres import position_spline
 
 # ---- Spikes and steps
@@ -192,7 +193,7 @@ def _step(time_s: Floats, misfit_m: Floats, before: int, scatter: float) -> Faul
     return Fault(before, before + 1, size) if size > max(_SIGMA * scatter, 3 * FINEST_GRAIN_M, rough, flown) else None
 
 
-# ---- Frozen positions and rounded times
+# ---- Frozen positions, rounded times and rounded positions
 
 
 def find_frozen(time_s: Floats, position_m: Floats) -> NDArray[np.bool_]:
@@ -263,6 +264,73 @@ def rounded_time_m(time_s: Floats, position_m: Floats) -> float:
 def _multiples(time_s: Floats, grain_s: float) -> bool:
     steps = np.diff(time_s) / grain_s
     return bool((np.abs(steps - np.round(steps)) < 1e-4).all())
+
+
+def rounded_position_m(time_s: Floats, position_m: Floats, *, least_m: float) -> float:
+    """Return the RMS error of positions by coarsely written coordinates, metres; 0 without.
+
+    Parameters
+    ----------
+    time_s
+        (epoch,) float64, seconds, ascending.
+    position_m
+        (epoch, 3) float64, metres: ECEF, or any Cartesian frame within 1000 km of its origin.
+    least_m
+        Errors below are not looked for.
+
+    Notes
+    -----
+    A coordinate rounded to a grain g errs by g/√12. The grain is the greatest common divisor of the differences of all
+    values of a coordinate: of the frame's axes, and on Earth of latitude, longitude and height. It is accepted where
+    positions scatter by at least a tenth of it; grains up to 1.5 cm are those of logs that resolve centimetres, and
+    count as none. Source: docs/theory/tracks.md, "Rounded positions".
+
+    Examples
+    --------
+    >>> time_s = np.arange(200) * 0.1
+    >>> flown = np.stack([8 * np.sin(time_s), 8 * np.cos(time_s), 600 + time_s], -1)
+    >>> error_m = rounded_position_m(time_s, (flown / 0.18).round() * 0.18, least_m=0.01)
+    >>> round(error_m, 2), rounded_position_m(time_s, flown, least_m=0.01)  # 0.18 m·√(3/12)
+    (0.09, 0.0)
+    """
+    frames = [position_m]
+    if np.linalg.norm(position_m[0]) > _ON_EARTH_M:
+        geodetic = geodetic_from_ecef(position_m)
+        across = np.cos(np.radians(geodetic[0, 0]))
+        frames.append(geodetic * [_DEGREE_M, _DEGREE_M * across, 1.0])
+    squared = [0.0]
+    for frame in frames:
+        scatter = np.sqrt(np.mean(misfits(time_s, frame - frame[0]) ** 2, axis=0))
+        grains = [_grain(axis - axis[0], max(least_m, _COARSE_M)) for axis in frame.T]
+        squared.append(
+            sum(grain**2 / 12 for grain, rough in zip(grains, scatter, strict=True) if rough > _ROUGH * grain)
+        )
+    error_m = float(np.sqrt(max(squared)))
+    return error_m if error_m > least_m else 0.0
+
+
+_ON_EARTH_M = 1e6
+_DEGREE_M = 111_195.0  # of latitude
+_ROUGH = 0.1  # of a grain: what positions scatter by at least that are rounded to it
+_SAME_M = 1e-5
+_COARSE_M = 1.5e-2  # receivers that resolve centimetres write 1e-7 degrees, 1.1 cm
+_FEWEST_VALUES, _MOST_VALUES = 8, 500
+
+
+def _grain(values_m: Floats, least_m: float) -> float:
+    """Return the greatest common divisor of the differences of values, metres; 0 where it is less than `least_m`."""
+    steps = np.diff(np.unique(values_m))
+    steps = np.unique(steps[steps > _SAME_M])[:_MOST_VALUES]
+    if len(np.unique(values_m)) < _FEWEST_VALUES or not steps.size:
+        return 0.0
+    grain = float(steps[0])
+    for step in steps.tolist():
+        rest = step % grain
+        while min(rest, grain - rest) > _SAME_M:  # Euclid's algorithm
+            grain, rest = rest, grain % rest
+            if grain < least_m:
+                return 0.0
+    return grain if grain >= least_m else 0.0
 
 
 # ---- Valid epochs and gaps
@@ -361,6 +429,9 @@ def check_track(
     rounded_m = rounded_time_m(time_s, place)
     if rounded_m > tolerated_m:
         faults["track_times"] = [(float(time_s[0]), rounded_m)]
+    coarse_m = rounded_position_m(time_s, position_m, least_m=tolerated_m)
+    if coarse_m > tolerated_m:
+        faults["track_positions"] = [(float(time_s[0]), coarse_m)]
     return CheckedTrack(
         cause == "",
         (*_holes(time_s, place, cause, tolerated_m, longest_gap_s), *steps),

@@ -13,9 +13,10 @@ from apertura.common.errors import CampaignError, quoted
 from apertura.common.leap_seconds import gps_from_weeks, utc_from_gps
 from apertura.formats.isolated import UnreadableError, read_isolated
 from apertura.formats.tracks.autopilot import Attitude, Epochs, autopilot_track
-from apertura.formats.tracks.dataflash_fields import COLUMNS, NEEDED
+from apertura.formats.tracks.damage import damage_of
+from apertura.formats.tracks.dataflash_fields import COLUMNS, DAMAGE, NEEDED
 from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions
-from apertura.formats.tracks.track import FIXES
+from apertura.formats.tracks.track import FIXES, damaged, receivers_remark, remarked
 
 Fields = Mapping[str, NDArray[Any]]
 
@@ -94,7 +95,7 @@ def track_of(fields: Fields, *, node: str, options: LogOptions, where: Path) -> 
         time_utc = _utc(rows["GWk"], rows["GMS"])
     except ValueError as error:
         raise _error(str(error), where) from error
-    fix = np.array([_KINDS.get(int(kind) if np.isfinite(kind) else 0, 0) for kind in rows["Status"]], np.int8)
+    fix = _fix(rows["Status"])
     epochs = Epochs(
         boot_s=rows["TimeUS"] * 1e-6,
         time_utc=time_utc,
@@ -108,7 +109,17 @@ def track_of(fields: Fields, *, node: str, options: LogOptions, where: Path) -> 
     delay_s = delay_s if 0 < delay_s < 1 else _DELAY_S
     track = autopilot_track(epochs, _attitude(fields), delay_s=delay_s, options=options, node=node, where=where)
     track.attrs["source"] = f"GPS {chosen} of {', '.join(map(str, known))}"
+    for unit, name in DAMAGE.items():
+        if name in fields:
+            track = damaged(track, damage_of(fields[name], unit), where)
+    if len(known) > 1 and options.body is None:
+        kinds = {str(number): _fix(fields["GPS/Status"][fields["GPS/I"] == number]) for number in known}
+        track = remarked(track, receivers_remark(kinds, str(chosen), node), where)
     return track
+
+
+def _fix(status: Floats) -> NDArray[np.int8]:
+    return np.array([_KINDS.get(int(kind) if np.isfinite(kind) else 0, 0) for kind in status], np.int8)
 
 
 def _receiver(fields: Fields, options: LogOptions, node: str, where: Path) -> tuple[int, list[int]]:

@@ -1,11 +1,15 @@
 """Positions, attitude and parameters in an ArduPilot DataFlash log, binary or text; run by `read_isolated`."""
 
 import math
+import tempfile
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from apertura.formats.tracks.damage import Span, foreign_bytes, without
 
 COLUMNS = {
     "GPS": ("TimeUS", "I", "Status", "GMS", "GWk", "Lat", "Lng", "Alt", "Spd", "GCrs", "VZ"),
@@ -19,10 +23,15 @@ NEEDED = tuple(name for name in COLUMNS["GPS"] if name != "I")
 
 _SECOND = {"GPS2": "GPS", "GPA2": "GPA"}  # the second receiver, before it became I = 1 of the same message
 _BINARY = b"\xa3\x95"
+_FMT, _FMT_BYTES = 128, 89
+DAMAGE = {"bytes": "damage/bytes", "lines": "damage/lines"}
+"""Spans of bytes, or of lines of a text, that are no messages, then (0, how many there are in all)."""
 
 
 def read_fields(path: Path) -> dict[str, NDArray[Any]]:
     """Return ``message/column`` → float64 values of every message, and ``PARM/name`` → its last value.
+
+    What is no message is left out (`DAMAGE`), and reading resumes behind it.
 
     Parameters
     ----------
@@ -36,11 +45,30 @@ def read_fields(path: Path) -> dict[str, NDArray[Any]]:
     """
     from pymavlink.DFReader import DFReader_binary, DFReader_text
 
-    with path.open("rb") as stream:
-        begins = stream.read(8192)
-    if not begins.startswith(_BINARY) and b"FMT," not in begins:
+    data = path.read_bytes()
+    is_binary = data.startswith(_BINARY)
+    if not is_binary and b"FMT," not in data[:8192]:
         raise ValueError("no FMT message at its beginning")
-    log = DFReader_binary(str(path)) if begins.startswith(_BINARY) else DFReader_text(str(path))
+    with ExitStack() as stack:
+        name = str(path)
+        if is_binary:
+            spans, ended = _foreign(data)
+            if spans:  # the reader ends at a type that it does not know, and takes no bytes but a file's
+                file = stack.enter_context(tempfile.NamedTemporaryFile())
+                file.write(without(data[:ended], spans))
+                file.flush()
+                name = file.name
+            unit, size = "bytes", len(data)
+            log = DFReader_binary(name)
+        else:
+            spans, size = _wrong_lines(data)
+            unit = "lines"
+            log = DFReader_text(name)
+        arrays = _columns(log)
+    return {**arrays, DAMAGE[unit]: np.array([*spans, (0, size)], np.int64)}
+
+
+def _columns(log: Any) -> dict[str, NDArray[Any]]:
     rows: dict[str, list[list[float]]] = {kind: [] for kind in COLUMNS}
     parameters: dict[str, float] = {}
     while (message := log.recv_match(type=[*COLUMNS, *_SECOND, "PARM"], strict=True)) is not None:
@@ -52,6 +80,33 @@ def read_fields(path: Path) -> dict[str, NDArray[Any]]:
     arrays = {kind: np.array(rows[kind], np.float64).reshape(-1, len(names)) for kind, names in COLUMNS.items()}
     named = {f"{kind}/{name}": arrays[kind][:, n] for kind, names in COLUMNS.items() for n, name in enumerate(names)}
     return {**named, **{f"PARM/{name}": np.array([value]) for name, value in parameters.items()}}
+
+
+def _foreign(data: bytes) -> tuple[list[Span], int]:
+    """Return the spans of a binary log that are no messages, and where the last message ends."""
+    lengths = {_FMT: _FMT_BYTES}
+
+    def message_bytes(at: int) -> int:
+        return lengths.get(data[at + 2], 0) if data[at : at + 2] == _BINARY and at + 2 < len(data) else 0
+
+    def note(at: int) -> None:
+        if data[at + 2] == _FMT:
+            lengths[data[at + 3]] = data[at + 4]
+
+    return foreign_bytes(data, 0, len(data), message_bytes, note=note)
+
+
+def _wrong_lines(data: bytes) -> tuple[list[Span], int]:
+    """Return the lines of a text log, from 1, that are no messages: of no kind, or of too few columns."""
+    columns, wrong = {"FMT": 5}, list[Span]()
+    lines = data[data.find(b"FMT,") :].splitlines()
+    for number, line in enumerate(lines, 1 + data[: data.find(b"FMT,")].count(b"\n")):
+        cells = [cell.strip() for cell in line.decode("utf-8", errors="replace").split(",")]
+        if cells[0] == "FMT" and len(cells) > 4:
+            columns[cells[3]] = len(cells[4])
+        if line.strip() and number < len(lines) and len(cells) - 1 < columns.get(cells[0], 1 << 16):
+            wrong.append((number, number + 1))
+    return wrong, len(lines)
 
 
 def _row(message: Any, kind: str) -> list[float]:

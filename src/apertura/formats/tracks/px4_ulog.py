@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from apertura.common.errors import CampaignError, quoted
 from apertura.formats.isolated import UnreadableError, read_isolated
 from apertura.formats.tracks.autopilot import Attitude, Epochs, autopilot_track, clock_of
+from apertura.formats.tracks.damage import damage_of
 from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions
-from apertura.formats.tracks.track import FIXES
-from apertura.formats.tracks.ulog_fields import ATTITUDE, DELAY, FUSED, RECEIVERS
+from apertura.formats.tracks.track import FIXES, damaged, receivers_remark, remarked
+from apertura.formats.tracks.ulog_fields import ATTITUDE, CORRUPT, DAMAGE, DELAY, DROPOUTS, FUSED, RECEIVERS
 
 Fields = Mapping[str, NDArray[Any]]
 
@@ -99,7 +100,33 @@ def track_of(fields: Fields, *, node: str, options: LogOptions, where: Path) -> 
         delay_s = 0.0  # the estimator's positions are of the moment that it writes
     track = autopilot_track(epochs, _attitude(fields), delay_s=delay_s, options=options, node=node, where=where)
     track.attrs["source"] = source
+    return _with_remarks(track, fields, source, options, node, where)
+
+
+def _with_remarks(
+    track: xr.Dataset, fields: Fields, source: str, options: LogOptions, node: str, where: Path
+) -> xr.Dataset:
+    """Return a track with remarks on damage, dropouts of the logger and other receivers of the log."""
+    damage = damage_of(fields[DAMAGE]) if DAMAGE in fields else ""
+    if not damage and CORRUPT in fields and fields[CORRUPT].any():
+        damage = "some messages do not fit the formats that the log states; epochs may be lost"
+    track = damaged(track, damage, where)
+    dropouts = fields.get(DROPOUTS, np.zeros(0, np.int64))
+    if dropouts.size:
+        found = f"{dropouts.size} dropouts of the logger, {dropouts.sum() / 1e3:.1f} s in all: messages are lost there"
+        track = remarked(track, found, where)
+    receivers = [name for name in _sources(fields) if not name.startswith(FUSED)]
+    several = len({name for name in receivers if name.startswith(source.partition(":")[0])}) > 1
+    if several and options.body is None:
+        kinds = {name: _fix(fields, name) for name in receivers}
+        track = remarked(track, receivers_remark(kinds, source, node), where)
     return track
+
+
+def _fix(fields: Fields, source: str) -> NDArray[np.int8]:
+    """Return the kind of solution of each message of a receiver; 0 without a position in three dimensions."""
+    stated = fields.get(f"{source}/fix_type", np.zeros(0, np.uint8))
+    return np.array([_KINDS.get(int(kind), 0) for kind in stated], np.int8)
 
 
 def _sources(fields: Fields) -> list[str]:
@@ -129,7 +156,7 @@ def _epochs(fields: Fields, source: str, options: LogOptions, node: str, where: 
     if latitude is None or longitude is None:
         raise _error(f"no latitude and longitude in {source}", where)
     of = {name: fields.get(f"{source}/{name}") for name in ("fix_type", "eph", "epv")}
-    fix = None if of["fix_type"] is None else np.array([_KINDS.get(int(kind), 0) for kind in of["fix_type"]], np.int8)
+    fix = None if of["fix_type"] is None else _fix(fields, source)
     lacking = [name for name in _ALWAYS if f"{source}/{name}" not in fields and not source.startswith(FUSED)]
     if lacking:
         raise _error(f"no {', '.join(lacking)} in {source}", where)

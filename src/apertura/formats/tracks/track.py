@@ -146,6 +146,47 @@ def remarked(track: xr.Dataset, remark: str, where: Path) -> xr.Dataset:
     return track.assign_attrs(remarks=[*track.attrs.get("remarks", ()), remark])
 
 
+def damaged(track: xr.Dataset, found: str, where: Path) -> xr.Dataset:
+    """Return a track whose log is damaged, with that as a remark and in `damage`, which images of it are flagged by.
+
+    Parameters
+    ----------
+    track
+        Of `make_track`.
+    found
+        One line; '' where nothing is damaged.
+    where
+        The log.
+    """
+    return remarked(track, found, where).assign_attrs(damage=found) if found else track
+
+
+def receivers_remark(kinds: Mapping[str, NDArray[np.int8]], taken: str, node: str) -> str:
+    """Return the remark on a log of several receivers, of which the config chooses none.
+
+    Parameters
+    ----------
+    kinds
+        Receiver → (epoch,) kinds of solution, values of `FIXES` or 0.
+    taken
+        The one that is read.
+    node
+        Whose log.
+
+    Examples
+    --------
+    >>> receivers_remark({"0": np.array([5, 5]), "1": np.array([1, 0])}, "0", "uav1")
+    'the log holds 0 (single 2) and 1 (fix 1, no fix 1); 0 is read: set nodes.uav1.log.body to choose'
+    """
+    names = {number: name for name, number in FIXES.items()} | {0: "no fix"}
+    listed = []
+    for receiver, fix in kinds.items():
+        counted = {name: int((fix == number).sum()) for number, name in names.items()}
+        stated = ", ".join(f"{name} {count}" for name, count in counted.items() if count)
+        listed.append(f"{receiver} ({stated or 'no epochs'})")
+    return f"the log holds {' and '.join(listed)}; {taken} is read: set nodes.{node}.log.body to choose"
+
+
 def _rolled_over(time_utc: NDArray[np.datetime64]) -> list[str]:
     """Return a remark where times are so old that a receiver may have counted GPS weeks modulo 1024."""
     periods = (KNOWN_UNTIL - time_utc[-1]) // _ROLLOVER

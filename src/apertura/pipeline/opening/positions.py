@@ -194,10 +194,17 @@ def _flags(node: NodeLog, at: Times, barred: dict[str, NDArray[np.bool_]]) -> di
     if node.track.attrs["dropped"]:
         counted = ", ".join(f"{count} {why}" for why, count in node.track.attrs["dropped"].items())
         lines["track_epochs_dropped"] = f"{node.name}: epochs of the log left out: {counted}"
+    if node.track.attrs.get("damage"):
+        lines["track_log_damaged"] = f"{node.name}: {node.track.attrs['damage']}"
     if "track_times" in checked.faults:
         lines["track_times"] = (
             f"{node.name}: times of the log are written so coarsely that positions err by "
             f"{checked.faults['track_times'][0][1]:.2f} m along the flight"
+        )
+    if "track_positions" in checked.faults:
+        lines["track_positions"] = (
+            f"{node.name}: positions of the log are written so coarsely that they err by "
+            f"{checked.faults['track_positions'][0][1]:.3f} m"
         )
     if node.yaw_fault is not None:
         lines["attitude_suspect"] = f"{node.name}: {node.yaw_fault.line}"
