@@ -78,7 +78,10 @@ def test_rows_said_twice_and_rows_without_satellites_are_no_epochs(tmp_path):
 @pytest.mark.parametrize(
     ("change", "expected"),
     [
-        (lambda lines: lines[:5] + [lines[5].replace("23:59:57", "noon")] + lines[6:], "'2025-05-14 noon' is no time"),
+        (
+            lambda lines: lines[:5] + [lines[5].replace("23:59:57", "noon")] + lines[6:],
+            "'2025-05-14 noon' is no date",
+        ),
         (lambda lines: [*lines[:5], lines[6], lines[5], *lines[7:]], "does not increase"),
         (lambda lines: [lines[0].replace("seaLevel", "takeoff"), *lines[1:]], "no column altitude_above_seaLevel"),
         (lambda lines: [lines[0].replace("latitude,", "lat,"), *lines[1:]], "no column latitude"),
@@ -93,6 +96,49 @@ def test_an_export_that_cannot_be_read_is_one_message(tmp_path, change, expected
     message = complaint(lambda: read(tmp_path, text))
     assert "a.track.csv: " in message
     assert expected in message
+
+
+def dated(form, times=TIMES):
+    """Return an export whose dates have another format."""
+    text = logs.airdata(times, PLACES)
+    for time in times.astype("datetime64[s]").tolist():
+        text = text.replace(str(time), form(time), 1) if str(time) in text else text
+    return text
+
+
+FORMATS = {
+    "5/14/2025 11:59:57 PM": lambda t: f"{t.month}/{t.day}/{t.year} {t.strftime('%I:%M:%S %p').lstrip('0')}",
+    "14/5/2025 23:59:57": lambda t: f"{t.day}/{t.month}/{t.year} {t:%H:%M:%S}",
+    "14.05.2025 23:59:57": lambda t: f"{t:%d.%m.%Y %H:%M:%S}",
+    "2025/05/14 11:59:57PM": lambda t: f"{t:%Y/%m/%d %I:%M:%S%p}",
+}
+
+
+@pytest.mark.parametrize("form", FORMATS.values(), ids=FORMATS)
+@pytest.mark.parametrize("back_days", [0, 9], ids=["14 May", "5 May"])
+def test_dates_are_read_in_every_format_that_an_account_can_be_set_to(tmp_path, form, back_days):
+    """The flight passes midnight, so that the day changes: 5/5 to 5/6, or 6/5, tells which number it is."""
+    times = TIMES - np.timedelta64(back_days, "D")
+    track = read(tmp_path, dated(form, times))
+    assert (np.abs(track.time.values - times) <= np.timedelta64(50, "ms")).all()
+
+
+def test_a_date_of_two_meanings_names_the_setting(tmp_path):
+    times = TIMES - np.timedelta64(10 * 86400 + 3600, "s")  # 4 May, 22:59
+    message = complaint(lambda: read(tmp_path, dated(FORMATS["5/14/2025 11:59:57 PM"], times)))
+    assert "column datetime(utc): '5/4/2025 10:59:57 PM' may be month/day or day/month" in message
+    assert "Set the date format of the AirData account to YYYY-MM-DD and 24 hours" in message
+    german = read(tmp_path, dated(FORMATS["14.05.2025 23:59:57"], times))
+    assert (np.abs(german.time.values - times) <= np.timedelta64(50, "ms")).all()
+
+
+def test_minutes_are_enough_where_they_are_seen_to_change(tmp_path):
+    """As a spreadsheet saves the export: 5/14/2025 23:59."""
+    track = read(tmp_path, dated(lambda t: f"{t.month}/{t.day}/{t.year} {t:%H:%M}"))
+    assert (np.abs(track.time.values - TIMES) <= np.timedelta64(50, "ms")).all()
+    assert "datetime(utc) holds whole minutes" in track.remarks[0]
+    early = dated(lambda t: f"{t.month}/{t.day}/{t.year} {t:%H:%M}", TIMES - np.timedelta64(30, "s"))
+    assert "one a minute, so that no minute is seen to change" in complaint(lambda: read(tmp_path, early))
 
 
 @pytest.fixture(scope="module")

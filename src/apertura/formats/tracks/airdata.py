@@ -1,5 +1,7 @@
 """Flight logs of DJI drones as AirData exports them (CSV): whole seconds of UTC beside a clock of milliseconds."""
 
+import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -8,7 +10,7 @@ import pandas as pd
 import xarray as xr
 from numpy.typing import NDArray
 
-from apertura.common.errors import CampaignError
+from apertura.common.errors import CampaignError, quoted
 from apertura.formats.times import utc_times
 from apertura.formats.tracks.csv_track import cut_off, numbers, read_table
 from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions
@@ -21,8 +23,9 @@ _HEIGHTS = {"altitude_above_seaLevel(meters)": 1.0, "altitude_above_seaLevel(fee
 _SATELLITES = "satellites"
 _FEWEST = 4  # without them a position is dead reckoning
 
-_APART_S = 1.5
-"""By what seconds and clock step apart where the clock stood still: a whole second is late by 1 s at most."""
+_APART = 1.5
+"""Units of UTC by which it and the clock step apart where the clock stood still: a whole second is late by 1 s at
+most."""
 
 _TOLERANCE_S = 0.1
 """Seconds, accuracy of a part's clock zero, and how far an epoch may lie outside its second: AirData's
@@ -30,6 +33,14 @@ interval."""
 
 _ROUNDING_S = 1e-6
 
+_DATE = re.compile(
+    r"(?P<first>\d{1,4})(?P<mark>[-/.])(?P<second>\d{1,2})(?P=mark)(?P<third>\d{1,4})[ T]+"
+    r"(?P<hour>\d{1,2}):(?P<minute>\d\d)(?::(?P<seconds>\d\d))?(?: ?(?P<half>[AaPp][Mm]))?",
+    re.ASCII,
+)
+"""Dates by the settings of an AirData account: the year first or last, month and day in either order."""
+
+_SETTING = "Set the date format of the AirData account to YYYY-MM-DD and 24 hours, and export the flight again."
 _EXPECTED = f"AirData's CSV: {_CLOCK}, {_UTC}, {', '.join(_PLACE)}, altitude_above_seaLevel, {', '.join(_ATTITUDE)}"
 
 
@@ -40,15 +51,18 @@ class _Clock(NamedTuple):
     resolved: NDArray[np.bool_]
     misfit_s: float
     parts: int
+    unit: str
 
 
 def read_airdata(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -> xr.Dataset:
     """Return the `track` stage of a DJI flight as AirData exports it, at 10 Hz.
 
-    datetime(utc) holds whole seconds, which are taken as cut off: UTC is the clock time(millisecond) plus the offset
-    with which no epoch leaves its second. The clock stands still while motors are off, so every part between has an
-    offset of its own; parts too short to determine it are left out. Misfits are reported (remarks). Heights are above
-    mean sea level: options.height_offset_m is needed. The log does not state how a position was solved (RTK or not).
+    datetime(utc) holds whole seconds, or minutes where a spreadsheet saved the export, which are taken as cut off: UTC
+    is the clock time(millisecond) plus the offset with which no epoch leaves its second. Dates may have any format that
+    an account can be set to, as long as the rows determine which number is the day. The clock stands still while motors
+    are off, so every part between has an offset of its own; parts too short to determine it are left out. Misfits are
+    reported (remarks). Heights are above mean sea level: options.height_offset_m is needed. The log does not state how a
+    position was solved (RTK or not).
 
     Raises
     ------
@@ -70,9 +84,12 @@ def read_airdata(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -> 
             raise ValueError("no column altitude_above_seaLevel, in metres or feet")
         cut = cut_off(path)
         table, dropped = _measured(table.iloc[: len(table) - cut])
-        clock = _utc(numbers(table[[_CLOCK]])[:, 0] / 1000, utc_times(table[_UTC].fillna("").str.strip().tolist()))
+        time, unit = _dates(table[_UTC].fillna("").str.strip().tolist())
+        clock = _utc(numbers(table[[_CLOCK]])[:, 0] / 1000, time, unit)
         logged = numbers(table[[*_PLACE, height]])
         attitude = numbers(table[_ATTITUDE])[clock.resolved] if set(_ATTITUDE) <= set(table) else None
+    except _DateError as error:
+        raise CampaignError(f"column {_UTC}: {error}", path, "dates such as 2025-05-14 09:29:58", _SETTING) from error
     except (ValueError, ArithmeticError) as error:
         found = str(error).partition("\n")[0]
         raise CampaignError(found, path, _EXPECTED, "Export the flight from AirData again.") from error
@@ -86,7 +103,9 @@ def read_airdata(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -> 
         node=node,
         where=path,
     )
-    remark = f"{_UTC} holds whole seconds, {clock.misfit_s:.2f} s off the clock of milliseconds in {clock.parts} parts"
+    remark = (
+        f"{_UTC} holds whole {clock.unit}s, {clock.misfit_s:.2f} s off the clock of milliseconds in {clock.parts} parts"
+    )
     return remarked(track, remark, path)
 
 
@@ -100,27 +119,74 @@ def _measured(table: pd.DataFrame) -> tuple[pd.DataFrame, dict[str, int]]:
     return table[~(doubled | blind)], {why: int(rows.sum()) for why, rows in counts.items()}
 
 
-def _utc(clock_s: NDArray[np.float64], second: NDArray[np.datetime64]) -> _Clock:
-    """Return UTC of epochs from a clock and from seconds of UTC that are cut off; ValueError if they do not agree."""
+class _DateError(ValueError):
+    """Dates that cannot be read, or not in one way alone."""
+
+
+def _dates(texts: Sequence[str]) -> tuple[NDArray[np.datetime64], str]:
+    """Return times of UTC, and the unit that they are cut off to: second or minute."""
+    unique = list(dict.fromkeys(texts))
+    matches = [_DATE.fullmatch(text) for text in unique]
+    wrong = next((text for text, match in zip(unique, matches, strict=True) if match is None), None)
+    if wrong is not None:
+        raise _DateError(f"{quoted(wrong, 40)} is no date and time")
+    found = [match for match in matches if match]
+    order = _order([match.group("first", "mark", "second", "third") for match in found], unique)
+    times = {}
+    for text, match in zip(unique, found, strict=True):
+        year, month, day = (int(match[part]) for part in order)
+        hour = int(match["hour"])
+        if match["half"]:
+            if not 1 <= hour <= 12:
+                raise _DateError(f"{quoted(text, 40)} is no date and time")
+            hour = hour % 12 + 12 * (match["half"].lower() == "pm")
+        try:
+            iso = f"{year:04d}-{month:02d}-{day:02d}T{hour:02d}:{match['minute']}:{match['seconds'] or '00'}"
+            times[text] = utc_times([iso])[0]
+        except ValueError as error:
+            raise _DateError(f"{quoted(text, 40)} is no date and time") from error
+    unit = "second" if any(match["seconds"] for match in found) else "minute"
+    return np.array([times[text] for text in texts], "datetime64[ns]"), unit
+
+
+def _order(dates: Sequence[tuple[str, ...]], texts: Sequence[str]) -> tuple[str, str, str]:
+    """Return which parts of dates are year, month and day."""
+    if not dates or all(len(first) == 4 for first, *_ in dates):
+        return "first", "second", "third"
+    month_first, day_first = ("third", "first", "second"), ("third", "second", "first")
+    numbers_of = [(int(first), int(second)) for first, _, second, _ in dates]
+    firsts, seconds = (set(column) for column in zip(*numbers_of, strict=True))
+    if max(seconds) > 12 or (len(seconds) > 1 and len(firsts) == 1):  # days alone pass 12, or change within a flight
+        return month_first
+    if max(firsts) > 12 or (len(firsts) > 1 and len(seconds) == 1) or dates[0][1] == ".":
+        return day_first
+    if firsts == seconds and len(firsts) == 1:
+        return month_first
+    raise _DateError(f"{quoted(texts[0], 40)} may be month/day or day/month")
+
+
+def _utc(clock_s: NDArray[np.float64], second: NDArray[np.datetime64], unit: str) -> _Clock:
+    """Return UTC of epochs from a clock and from UTC that is cut off; ValueError if they do not agree."""
+    unit_s = {"second": 1.0, "minute": 60.0}[unit]
     if not np.isfinite(clock_s).all() or not (np.diff(clock_s) > 0).all():
         raise ValueError(f"column {_CLOCK} does not increase")
     if not len(clock_s):
         raise ValueError("no epochs")
     zero = second[0]
     second_s = (second - zero) / np.timedelta64(1, "s")
-    apart = np.abs(np.diff(second_s) - np.diff(clock_s)) > _APART_S
+    apart = np.abs(np.diff(second_s) - np.diff(clock_s)) > _APART * unit_s
     part = np.concatenate([[0], np.cumsum(apart)])
     offset, resolved, misfit = np.zeros(len(second_s)), np.zeros(len(second_s), bool), 0.0
     for number in range(part[-1] + 1):
         rows = part == number
-        low, high = (second_s - clock_s)[rows].max(), (second_s - clock_s)[rows].min() + 1
+        low, high = (second_s - clock_s)[rows].max(), (second_s - clock_s)[rows].min() + unit_s
         offset[rows] = (low + high) / 2
         resolved[rows] = high - low <= 2 * _TOLERANCE_S + _ROUNDING_S
         misfit = max(misfit, (low - high) / 2 if resolved[rows].any() else 0.0)
     if misfit > _TOLERANCE_S or not resolved.any():
         found = (
-            f"{misfit:.2f} s apart" if misfit > _TOLERANCE_S else "one a second, so that no second is seen to change"
+            f"{misfit:.2f} s apart" if misfit > _TOLERANCE_S else f"one a {unit}, so that no {unit} is seen to change"
         )
         raise ValueError(f"columns {_CLOCK} and {_UTC}: {found}")
     elapsed = np.round((clock_s + offset) * 1e9).astype("timedelta64[ns]")
-    return _Clock(zero + elapsed, resolved, misfit, int(part[-1]) + 1)
+    return _Clock(zero + elapsed, resolved, misfit, int(part[-1]) + 1, unit)
