@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rasterio
+from folders import complaint
 from pyproj import CRS, Transformer
 from rasterio.transform import from_origin
 from scenes import UTM_GRID
@@ -14,9 +15,9 @@ from scenes import UTM_GRID
 import apertura as ap
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
-from apertura.core.geometry.geodesy import frame_from_map
+from apertura.core.geometry.geodesy import frame_from_map, geodetic_from_ecef, projected_from_ecef
 from apertura.core.scene import geoid
-from apertura.core.scene.dem import NAMES_FILES, open_dem
+from apertura.core.scene.dem import NAMES_FILES, open_dem, steepest_step
 from apertura.core.scene.grid import SceneGrid
 
 
@@ -186,6 +187,71 @@ def test_a_height_that_no_land_has_is_counted_where_it_counts(tmp_path, wild):
     assert f"most often {wild:g} m" in str(caught.value)
     local = open_dem(write_dem(path, heights, corner, crs=None), "local", datum="carried")
     assert np.isfinite(local.heights(SceneGrid("local", 500020.0, 5400060.0, 0.5, (70, 90)))).all()
+
+
+@pytest.mark.parametrize("crs", ["EPSG:31467", "EPSG:31287", "EPSG:25832", "EPSG:32632"])
+@pytest.mark.parametrize("dem_crs", ["EPSG:31467", "EPSG:32632", "EPSG:4326"])
+def test_heights_of_a_scene_count_from_wgs_84_whatever_its_crs(tmp_path, crs, dem_crs):
+    """Bessel's ellipsoid lies 47 m below WGS 84 there; a DEM at 620 m above WGS 84 and flat ground at 620 m are one."""
+    x, y = Transformer.from_crs("EPSG:4326", crs, always_xy=True).transform(9.955, 48.42)
+    grid = SceneGrid(crs, x, y, 1.0, (8, 8))
+    west, north = Transformer.from_crs("EPSG:4326", dem_crs, always_xy=True).transform(9.954, 48.421)
+    post = 1e-5 if dem_crs == "EPSG:4326" else 2.0
+    path = write_dem(tmp_path / "dem.tif", np.full((200, 200), 620.0), from_origin(west, north, post, post), dem_crs)
+    for heights in (np.full((8, 8), 620.0), open_dem(path, grid, datum="ellipsoid").heights(grid)):
+        geodetic = geodetic_from_ecef(grid.positions(heights))
+        np.testing.assert_allclose(geodetic[..., 2], 620.0, atol=1e-3)
+        np.testing.assert_allclose(geodetic[0, 0, :2], [48.42, 9.955], atol=2e-5)
+    east, north, up = projected_from_ecef(crs, grid.positions(np.full((8, 8), 620.0))[4, 3])
+    np.testing.assert_allclose([east - x, north - y, up], [3.5, -4.5, 620.0], atol=3e-3)
+
+
+@pytest.mark.parametrize("fill", [0, -1, 1, 255, 999])
+@pytest.mark.parametrize("side", [1, 2, 12])
+def test_a_void_filled_with_a_constant_is_refused_where_it_counts(tmp_path, fill, side):
+    """In hilly land near 400 m; the same block beside the scene does no harm."""
+    heights = 400 + np.random.default_rng(5).normal(0, 3, (60, 60)).astype(np.float32)
+    heights[2 : 2 + side, 50 - side : 50] = fill
+    path, corner = tmp_path / "dem.tif", from_origin(500000, 5400100, 2, 2)
+    sound = open_dem(write_dem(path, heights, corner), UTM_GRID.crs, datum="ellipsoid").heights(UTM_GRID)
+    assert np.abs(sound - 400).max() < 20
+    heights[30 : 30 + side, 20 : 20 + side] = fill
+    terrain = open_dem(write_dem(path, heights, corner), UTM_GRID.crs, datum="ellipsoid")
+    message = complaint(lambda: terrain.heights(UTM_GRID))
+    count = "1 post" if side == 1 else f"{side**2} posts"
+    assert f"{count} from row 30, column 20 on are exactly {fill}, and all posts beside at least" in message
+    assert f"Declare {fill} as nodata of those posts and fill them with a GIS" in message
+
+
+@pytest.mark.parametrize("kind", ["sea cliff", "coast", "lake", "declared"])
+def test_land_that_has_a_height_of_fill_values_is_no_void(tmp_path, kind):
+    heights = 400 + np.random.default_rng(5).normal(0, 3, (60, 60))
+    if kind == "sea cliff":
+        heights[:, 25:] = 0
+    elif kind == "coast":
+        heights[:] = np.maximum(0, np.linspace(-20, 60, 60))[None]
+    elif kind == "lake":
+        heights = np.maximum(np.hypot(*np.mgrid[-30:30, -30:30]) * 3 - 30, 0) - 1
+    else:
+        heights[30:33, 20:23] = -9999
+    path, nodata = tmp_path / "dem.tif", {"nodata": -9999} if kind == "declared" else {}
+    write_dem(path, heights.astype(np.float32), from_origin(500000, 5400100, 2, 2), **nodata)
+    found = open_dem(path, UTM_GRID.crs, datum="ellipsoid").heights(UTM_GRID)
+    assert np.isnan(found).any() == (kind == "declared")
+
+
+@pytest.mark.parametrize(
+    ("drop_m", "over_m", "found"), [(400, 2, True), (130, 2, True), (80, 2, False), (110, 40, False), (400, 40, True)]
+)
+def test_a_step_of_the_ground_is_found_where_it_is_steeper_than_79_degrees(tmp_path, drop_m, over_m, found):
+    east = np.arange(60) * 2.0
+    heights = 600 - drop_m * np.clip((east - 30) / over_m, 0, 1) + np.zeros((60, 1))
+    path = write_dem(tmp_path / "dem.tif", heights.astype(np.float32), from_origin(500000, 5400100, 2, 2))
+    step = steepest_step(open_dem(path, UTM_GRID.crs, datum="ellipsoid"), UTM_GRID)
+    assert (step is not None) is found
+    if step is not None:
+        assert step.height_m == pytest.approx(drop_m * min(1, 20 / over_m), rel=0.1)
+        assert 500020 < step.x_m < 500065
 
 
 def test_a_file_that_is_no_dem_is_refused(tmp_path):

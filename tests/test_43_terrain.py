@@ -9,6 +9,7 @@ from functools import partial
 import numpy as np
 import pytest
 import rasterio
+import xarray as xr
 import yaml
 from folders import complaint, copy_writable, require_files, run_steps, settle_ground
 from rasterio.transform import from_origin
@@ -17,11 +18,12 @@ from apertura.core.backprojection.engines import load_engine
 from apertura.core.geometry.geodesy import projected_from_ecef
 from apertura.core.imaging.range_profiles import profiles_of
 from apertura.core.scene.grid import SceneGrid
+from apertura.core.scene.terrain import FlatGround
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.opening.echo import PairEcho
 from apertura.pipeline.opening.pair import open_pair
 from apertura.pipeline.opening.plan import job_of, plan_pair
-from apertura.pipeline.opening.scene import ConfiguredGround, expected_scene, open_scene, settled_scene
+from apertura.pipeline.opening.scene import ConfiguredGround, OpenScene, expected_scene, open_scene, settled_scene
 from apertura.pipeline.steps import profile, scene
 from apertura.pipeline.store import open_stage
 from apertura.simulation import ImageGrid, preset, simulate
@@ -92,6 +94,17 @@ def test_flat_ground_puts_them_elsewhere(hillside, tmp_path):
     findings = score(run_steps(root))
     off = [finding.error_m for finding in findings if finding.target and finding.image == "uav1-uav1"]
     assert min(off) > 0.1
+
+
+def test_a_step_of_the_dem_flags_images_of_the_scene():
+    grid, level = SceneGrid("local", 0.0, 8.0, 0.5, (16, 16)), FlatGround(0.0)
+    step = {"height_m": 618.4, "over_m": 20.0, "x_m": 500041.0, "y_m": 5400040.0}
+    for found, flagged in ((step, True), (None, False)):
+        stage = xr.Dataset(attrs={"terrain": {"dem": "dem.tif", "steepest_step": found}})
+        flags = OpenScene(grid, level, level, (stage,), {}, {}).flags
+        line = "the DEM has a step of 618 m over 20 m at x 500041.0, y 5400040.0"
+        assert flags == ({"terrain_step": line} if flagged else {})
+    assert OpenScene(grid, level, level, (), {}, {}).flags == {}
 
 
 @pytest.mark.slow

@@ -200,6 +200,9 @@ _OF_IMAGES = {
     "platform_below_scene": Flag(
         "m below the lowest ground of the scene", "an antenna is lower than all of the DEM beside it",
         "unit and datum of scene.dem", "core/scene/clearance.py"),
+    "terrain_step": Flag(
+        "m of height, over m on the ground, its place", "a step of the DEM is steeper than 79 degrees",
+        "voids filled with a constant, seams of the DEM; nothing, if it is a cliff", "pipeline/opening/scene.py"),
     "outside_swath": Flag(
         "share of the scene, integration angle",
         "no pulse passes part of the scene inside the integration angle: no data",

@@ -13,6 +13,7 @@ from apertura.common.errors import CampaignError
 
 ECEF = "EPSG:4978"
 GEODETIC = "EPSG:4979"
+_PLANE = "EPSG:4326"
 
 LOCAL = "local"
 """CRS of a frame without a place on Earth: x east, y north, z up, metres."""
@@ -69,7 +70,7 @@ def ecef_from_projected(crs: str, x: Positions, y: Positions, height_m: Position
     x, y
         (...,) float64, metres, first easting then northing whatever the order the CRS declares.
     height_m
-        (...,) float64, metres above the ellipsoid.
+        (...,) float64, metres above the ellipsoid of WGS 84, whichever ellipsoid `crs` is on.
 
     Raises
     ------
@@ -81,8 +82,11 @@ def ecef_from_projected(crs: str, x: Positions, y: Positions, height_m: Position
     >>> ecef_from_projected("EPSG:32632", *map(np.array, (500000.0, 0.0, 0.0))).round(2) + 0.0
     array([6299611.55,  997760.45,       0.  ])
     """
-    transformer = _transformer(crs, ECEF)
-    position = np.stack(transformer.transform(x, y, height_m), axis=-1)
+    if is_on_wgs84(crs):
+        position = np.stack(_transformer(crs, ECEF).transform(x, y, height_m), axis=-1)
+    else:  # heights of such a system's own ellipsoid are tens of metres off
+        longitude, latitude = _transformer(crs, _PLANE).transform(x, y)
+        position = ecef_from_geodetic(latitude, longitude, height_m)
     if not np.isfinite(position).all():
         raise CampaignError(
             f"positions in {crs} that have no place on Earth",
@@ -94,9 +98,26 @@ def ecef_from_projected(crs: str, x: Positions, y: Positions, height_m: Position
 
 
 def projected_from_ecef(crs: str, position: Positions) -> Positions:
-    """Return (..., 3) float64 easting, northing, ellipsoidal height (m) in `crs` of ECEF positions (m)."""
-    transformer = _transformer(ECEF, crs)
-    return np.stack(transformer.transform(*np.moveaxis(position, -1, 0)), axis=-1)
+    """Return (..., 3) float64 easting and northing (m) in `crs`, height (m) above WGS 84, of ECEF positions (m)."""
+    if is_on_wgs84(crs):
+        return np.stack(_transformer(ECEF, crs).transform(*np.moveaxis(position, -1, 0)), axis=-1)
+    latitude, longitude, height_m = np.moveaxis(geodetic_from_ecef(position), -1, 0)
+    return np.stack([*_transformer(_PLANE, crs).transform(longitude, latitude), height_m], axis=-1)
+
+
+@lru_cache(maxsize=64)
+def is_on_wgs84(crs: str) -> bool:
+    """Return whether the ellipsoid of a CRS is that of WGS 84, or GRS 80, which is 0.1 mm less high.
+
+    Examples
+    --------
+    >>> is_on_wgs84("EPSG:25832"), is_on_wgs84("EPSG:31467")  # ETRS89; DHDN, on Bessel's ellipsoid
+    (True, False)
+    """
+    ellipsoid = CRS(crs).ellipsoid
+    return ellipsoid is None or (
+        abs(ellipsoid.semi_major_metre - 6_378_137) < 0.1 and abs(ellipsoid.inverse_flattening - 298.2572) < 1e-3
+    )
 
 
 def frame_from_map(crs: str, x: ArrayLike, y: ArrayLike, height_m: ArrayLike) -> Positions:
@@ -109,7 +130,7 @@ def frame_from_map(crs: str, x: ArrayLike, y: ArrayLike, height_m: ArrayLike) ->
     x, y
         (...,) float64, metres, easting and northing.
     height_m
-        (...,) float64, metres above the ellipsoid, or z of the local frame.
+        (...,) float64, metres above the ellipsoid of WGS 84, or z of the local frame.
 
     Raises
     ------
@@ -143,6 +164,8 @@ def _transformer(source: str, target: str) -> Transformer:
     """Return PROJ's transformer between two systems, cached: it takes milliseconds to create."""
     if GEODETIC in (source, target):
         return Transformer.from_crs(source, target)
+    if _PLANE in (source, target):
+        return Transformer.from_crs(source, target, always_xy=True, allow_ballpark=False)
     here, there = (system if system == ECEF else CRS(system).to_3d() for system in (source, target))
     return Transformer.from_crs(here, there, always_xy=True, allow_ballpark=False)
 

@@ -4,6 +4,7 @@ import re
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,9 +12,9 @@ from pyproj import CRS, Transformer
 from pyproj.exceptions import ProjError
 
 from apertura.common.arrays import Floats
-from apertura.common.errors import CampaignError, quoted, shown
+from apertura.common.errors import CampaignError, number_of, quoted, shown
 from apertura.common.raster import opened_raster
-from apertura.core.geometry.geodesy import LOCAL
+from apertura.core.geometry.geodesy import GEODETIC, LOCAL, is_on_wgs84
 from apertura.core.scene.geoid import declared_datum, geoid_file, grid_names, undulation
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import Terrain, bilinear
@@ -32,6 +33,17 @@ LOWEST_M, HIGHEST_M = -500.0, 9000.0
 MOST_POSTS = 100_000_000
 """Posts of a DEM in memory at once, at most: 0.8 GB of float64."""
 
+FILLS = (0.0, -1.0, 1.0, 255.0, -99.0, 99.0, 999.0, -100.0, -499.0)
+"""Values that programs put where a raster has no height, among those that land may have."""
+
+STEEPEST = 5.0
+"""Rise over run of the steepest ground that raises no question: 79 degrees, over `STEP_M` or a post."""
+
+STEP_M = 20.0
+"""Metres on the ground over which a step is measured: 100 m of height."""
+
+_FILL_MARGIN = 16  # posts about those of a scene that are read to see whether a block of them is a void
+_MOST_STEPS = 4_000_000
 _TILE_PX = 512
 _SAME_RASTER = "the raster that was opened before"
 
@@ -87,7 +99,8 @@ class Dem(Terrain):
         Raises
         ------
         CampaignError
-            If a post that counts has a height that no land on Earth has: a void undeclared, or another unit.
+            If a post that counts has a height that no land on Earth has, or is one of a block that has one of `FILLS`
+            and steep walls all round: a void undeclared, or another unit.
         """
         side = max(1, int(LATTICE_M / grid.spacing_m))
         rows, columns = (np.arange(size) + first for size, first in zip(grid.shape, grid.first, strict=True))
@@ -135,14 +148,14 @@ class Dem(Terrain):
         return np.asarray(a * x + b * y + c - 0.5), np.asarray(d * x + e * y + f - 0.5)
 
     def _shift(self, crs: str, place: Floats) -> Floats:
-        """Return the shift from heights of the DEM to heights above the ellipsoid of `crs`, metres."""
+        """Return the shift from heights of the DEM to those of a grid in `crs`, above WGS 84, metres."""
         if crs == LOCAL:
             return np.zeros(place.shape[:-1])
         longitude, latitude = _transformer(crs, CRS(self.geodetic).to_2d()).transform(place[..., 0], place[..., 1])
         shift = np.zeros_like(longitude) if self.geoid is None else undulation(self.geoid, longitude, latitude)
-        return np.asarray(
-            _transformer(CRS(self.geodetic), CRS(crs).to_3d()).transform(longitude, latitude, shift)[2], np.float64
-        )
+        target = CRS(crs).to_3d() if is_on_wgs84(crs) else CRS(GEODETIC)
+        raised = _transformer(CRS(self.geodetic), target).transform(longitude, latitude, shift)
+        return np.asarray(raised[2], np.float64)
 
     def _sample(self, row: Floats, column: Floats) -> Floats:
         """Return the raster's heights (m, above its datum) between posts; NaN outside it."""
@@ -167,10 +180,11 @@ class Dem(Terrain):
             )
         with opened_raster(self.path, expected=_SAME_RASTER, remedy="Copy the DEM again.") as raster:
             window = Window(first[1], first[0], counts[1], counts[0])
-            posts = raster.read(1, window=window, masked=True)
-            posts = posts.astype(np.float64).filled(np.nan) * raster.scales[0] + raster.offsets[0]
+            stored, posts = _heights(raster, window)
+            place = (at[0] - first[0], at[1] - first[1])
+            if self.horizontal and np.isin(stored, FILLS).any():
+                self._check_fills(raster, first, counts, place)
         posts *= self.metres_per_unit
-        place = (at[0] - first[0], at[1] - first[1])
         impossible = (posts < LOWEST_M) | (posts > HIGHEST_M)
         if (
             self.horizontal
@@ -180,6 +194,47 @@ class Dem(Terrain):
             raise self._impossible_heights(posts, impossible, first)
         sampled[inside] = bilinear(posts[None], *place)[0]
         return sampled
+
+    def _check_fills(self, raster: Any, first: list[int], counts: list[int], place: tuple[Floats, Floats]) -> None:
+        """Raise CampaignError where a height depends on a block of posts of one value with steep walls all round.
+
+        Posts about those that are asked for are read, too: only a block that ends within them is known to be one.
+        """
+        from rasterio.windows import Window
+        from scipy.ndimage import binary_dilation, label
+
+        begin = [max(0, one - _FILL_MARGIN) for one in first]
+        end = [min(size, one + n + _FILL_MARGIN) for one, n, size in zip(first, counts, self.shape, strict=True)]
+        stored, heights = _heights(raster, Window(begin[1], begin[0], end[1] - begin[1], end[0] - begin[0]))
+        heights *= self.metres_per_unit
+        wall_m = max(STEEPEST * STEP_M, STEEPEST * self._post_m)
+        for value in FILLS:
+            blocks, count = label(stored == value)
+            for number in range(1, count + 1):
+                block = blocks == number
+                around = binary_dilation(block) & ~block
+                edges = (block[0].any(), block[-1].any(), block[:, 0].any(), block[:, -1].any())
+                walls = np.abs(heights[around] - heights[block][0])
+                if any(edges) or not walls.size or not np.nanmin(walls, initial=np.inf) > wall_m:
+                    continue
+                seen = block[tuple(slice(a - b, a - b + n) for a, b, n in zip(first, begin, counts, strict=True))]
+                if np.isnan(bilinear(np.where(seen, np.nan, 0.0)[None], *place)).any():
+                    row, column = (int(axis[0]) + one for axis, one in zip(np.nonzero(block), begin, strict=True))
+                    raise CampaignError(
+                        f"{number_of(int(block.sum()), 'post')} from row {row}, column {column} on are exactly "
+                        f"{value:g}, and all posts beside at least {np.nanmin(walls):.0f} m off: a void filled with "
+                        f"{value:g}",
+                        where=self.path,
+                        expected="heights of the ground, and voids declared as nodata",
+                        remedy=f"Declare {value:g} as nodata of those posts and fill them with a GIS.",
+                    )
+
+    @property
+    def _post_m(self) -> float:
+        """Distance of posts, metres, the wider way."""
+        a, b, _, d, e, _ = self.pixel_from_map
+        unit_m = 111_195.0 if CRS(self.horizontal).is_geographic else 1.0
+        return unit_m / max(min(np.hypot(a, d), np.hypot(b, e)), 1e-12)
 
     def _impossible_heights(self, posts: Floats, impossible: NDArray[np.bool_], start: list[int]) -> CampaignError:
         values, counts = np.unique(posts[impossible], return_counts=True)
@@ -248,6 +303,47 @@ def height_range(terrain: Terrain, grid: SceneGrid, *, where: Path) -> tuple[flo
             remedy="Fill the voids (NaN or nodata) of the DEM with a GIS, or make scene.bounds_m smaller.",
         )
     return low, high
+
+
+def _heights(raster: Any, window: Any) -> tuple[Floats, Floats]:
+    """Return values of a window as stored, NaN in voids, and as heights of the raster's unit."""
+    stored = raster.read(1, window=window, masked=True).astype(np.float64).filled(np.nan)
+    return stored, stored * raster.scales[0] + raster.offsets[0]
+
+
+class Step(NamedTuple):
+    """The steepest step of a scene's ground: metres of height over metres on the ground, and where it is."""
+
+    height_m: float
+    over_m: float
+    x_m: float
+    y_m: float
+
+
+def steepest_step(terrain: Terrain, grid: SceneGrid) -> Step | None:
+    """Return the highest step of the ground that is steeper than `STEEPEST` over `STEP_M`; None where there is none.
+
+    Cliffs are seldom so steep; a void that is filled with a constant is, and blocks of another datum or source.
+
+    Parameters
+    ----------
+    terrain, grid
+        The ground, and the whole grid.
+    """
+    most = int(np.ceil(np.sqrt(grid.shape[0] * grid.shape[1] / _MOST_STEPS)))
+    every = max(1, round(STEP_M / 4 / grid.spacing_m), most)
+    rows, columns = (np.arange(every // 2, size, every) for size in grid.shape)
+    heights = terrain.heights_at(grid, rows[:, None], columns[None, :])
+    ahead = max(1, round(STEP_M / (every * grid.spacing_m)))
+    over_m, steps = ahead * every * grid.spacing_m, list[Step]()
+    for drops in (heights[ahead:] - heights[:-ahead], heights[:, ahead:] - heights[:, :-ahead]):
+        if drops.size:
+            drop = np.nan_to_num(np.abs(drops))
+            row, column = np.unravel_index(int(drop.argmax()), drop.shape)
+            x_m, y_m = (float(one) for one in grid.map_at(rows[row], columns[column]))
+            steps.append(Step(float(drop[row, column]), over_m, x_m, y_m))
+    highest = max(steps, default=None)
+    return highest if highest is not None and highest.height_m > STEEPEST * over_m else None
 
 
 @lru_cache(maxsize=64)
@@ -331,7 +427,9 @@ def _dem(path: Path, crs: str, *, datum: str, geoid: Path | None) -> Dem:
     metres = _metres_per_unit(path, system, unit)
     horizontal = system.sub_crs_list[0] if system.is_compound else system.to_2d()
     earth = counted_from in {"egm96", "egm2008"}
-    geodetic = CRS("EPSG:4979") if earth or horizontal.geodetic_crs is None else horizontal.geodetic_crs.to_3d()
+    stated = datum == "ellipsoid" and not is_on_wgs84(horizontal.to_wkt())
+    wgs84 = earth or stated or horizontal.geodetic_crs is None
+    geodetic = CRS(GEODETIC) if wgs84 else horizontal.geodetic_crs.to_3d()
     undulations = (
         None
         if counted_from == "ellipsoid"

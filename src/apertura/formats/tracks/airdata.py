@@ -61,8 +61,8 @@ def read_airdata(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -> 
     is the clock time(millisecond) plus the offset with which no epoch leaves its second. Dates may have any format that
     an account can be set to, as long as the rows determine which number is the day. The clock stands still while motors
     are off, so every part between has an offset of its own; parts too short to determine it are left out. Misfits are
-    reported (remarks). Heights are above mean sea level: options.height_offset_m is needed. The log does not state how a
-    position was solved (RTK or not).
+    reported (remarks). Heights are above mean sea level: options.height_offset_m is needed. The log does not state how
+    a position was solved (RTK or not).
 
     Raises
     ------

@@ -268,7 +268,9 @@ def plan_pair(campaign: Campaign, pair: OpenPair, scene: OpenScene, *, threads: 
     accuracy = accuracy_of(campaign, pair, scene)
     plan = plan_job(campaign, job_of(campaign, pair, scene, threads=threads), accuracy_db=float(accuracy.value))
     plan = replace(
-        plan, decisions=(*plan.decisions, accuracy, air_decision(pair)), flags=Flags.merged(flags, plan.flags)
+        plan,
+        decisions=(*plan.decisions, accuracy, air_decision(pair)),
+        flags=Flags.merged(flags, scene.flags, plan.flags),
     )
     written = campaign.is_current(campaign.stage("image", pair.flight, pair.name))
     free_disk = None if written else campaign.root.free_bytes()

@@ -199,6 +199,17 @@ class OpenScene:
         """Terrain for image.json; empty for flat ground."""
         return {"terrain": self.parents[0].attrs["terrain"]} if self.parents else {}
 
+    @property
+    def flags(self) -> dict[str, str]:
+        """Flags of the terrain for images: name → what was measured, in one line."""
+        step = self.report.get("terrain", {}).get("steepest_step")
+        if step is None:
+            return {}
+        return {
+            "terrain_step": f"the DEM has a step of {step['height_m']:.0f} m over {step['over_m']:.0f} m at "
+            f"x {step['x_m']:.1f}, y {step['y_m']:.1f}"
+        }
+
 
 def settled_scene(campaign: Campaign) -> OpenScene:
     """Return the scene of results/scene.json on level ground; `open_scene` also opens the ground itself.

@@ -9,7 +9,7 @@ import xarray as xr
 
 from apertura.common.errors import CampaignError, number_of
 from apertura.core.geometry.aperture import Aperture
-from apertura.core.scene.dem import height_range
+from apertura.core.scene.dem import height_range, steepest_step
 from apertura.core.scene.terrain import GridHeights
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.digests import Lineage
@@ -75,12 +75,15 @@ def terrain(campaign: Campaign) -> Path:
         heights = open_array(wip, "height")
         for window in missing:
             heights[window] = ground.dem.heights(grid[window])
-        lowest_m, highest_m = height_range(GridHeights(grid, heights), grid, where=ground.dem.path)
+        written = GridHeights(grid, heights)
+        lowest_m, highest_m = height_range(written, grid, where=ground.dem.path)
+        step = steepest_step(written, grid)
         report = {
             "dem": ground.dem.path.name,
             "geoid": ground.dem.geoid.name if ground.dem.geoid else None,
             "lowest_m": lowest_m,
             "highest_m": highest_m,
+            "steepest_step": None if step is None else step._asdict(),
             "datum": campaign.settings.scene.dem_datum,
         }
         finish(wip, folder, lineage=lineage, terrain=report)
