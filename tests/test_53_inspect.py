@@ -12,13 +12,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import pyulog
+import rasterio
 import scipy.io
 import xarray as xr
 import yaml
 from folders import SHARED, copy_writable
 from matplotlib import image
+from rasterio import Affine
 
 from apertura.core.echo.dechirp import FrequencySweep
+from apertura.formats.export.cog import write_power, write_slc
 from apertura.formats.reading import read_track
 from apertura.formats.tracks.track import make_track
 from apertura.pipeline.examination.facts import log_facts
@@ -232,6 +235,52 @@ def test_a_campaign_of_phase_history_is_reported_by_the_clock_that_was_aligned(s
     (root / "config/clocks.tsv").unlink()
     assert "apertura align" in look(raw / f"{node}.out").missing[0]
     assert look(root).parts[0].facts["captures_inside_log_share"] < 0.9
+
+
+PRODUCT = {"transform": Affine(1, 0, 500000, 0, -1, 5400000), "crs": "EPSG:32632"}
+
+
+def test_a_product_of_apertura_is_no_elevation_model(tmp_path):
+    tags = {
+        "APERTURA_VERSION": "1.0",
+        "APERTURA_CODE_SHA256": "0123456789abcdef",
+        "APERTURA_ERROR_DB": "-61.25",
+        "APERTURA_FLAGS": '{"track_gap": "uav1: a gap"}',
+        "APERTURA_FOCUS": '{"verdict": "focused"}',
+    }
+    write_power(tmp_path / "power.tif", np.ones((8, 9), "c8"), tags=tags, title="f01 uav1-uav2, power", **PRODUCT)
+    write_slc(tmp_path / "slc.tif", np.ones((8, 9), "c8"), tags=tags, title="f01 uav1-uav2", **PRODUCT)
+    for name, values in (("power.tif", "linear (1)"), ("slc.tif", "carrier kept (1)")):
+        report = look(tmp_path / name)
+        assert report.kind == "product of apertura"
+        assert (report.problem, report.missing) == (None, ())
+        assert report.facts["values"].endswith(values)
+        assert report.facts["title"].startswith("f01 uav1-uav2")
+        assert report.facts["flags"] == "track_gap"
+        assert report.facts["focus"] == "focused"
+        assert report.facts["numerical_error"] == "-61.25 dB"
+        assert report.facts["pixels"] == "8 × 9"
+        assert not any(name.startswith("height") for name in report.facts)
+
+
+@pytest.mark.parametrize(
+    ("unit", "crs", "scale", "fact", "value"),
+    [
+        ("", "EPSG:32632", 1.0, "height_m", [600.0, 650.0]),
+        ("metre", "EPSG:32632", 0.5, "height_m", [300.0, 325.0]),
+        ("ft", "EPSG:32632", 1.0, "height", "600.00 to 650.00 ft"),
+        ("", "EPSG:26910+6360", 1.0, "height", "600.00 to 650.00 US survey foot"),
+    ],
+)
+def test_heights_are_reported_in_the_unit_of_the_raster(tmp_path, unit, crs, scale, fact, value):
+    kind = {"width": 51, "height": 4, "count": 1, "dtype": "int16", "transform": PRODUCT["transform"], "crs": crs}
+    with rasterio.open(tmp_path / "dem.tif", "w", "GTiff", **kind) as raster:
+        raster.write(np.tile(np.arange(600, 651, dtype=np.int16), (4, 1)), 1)
+        raster.scales, raster.units = (scale,), (unit,)
+    report = look(tmp_path / "dem.tif")
+    assert report.kind == "elevation model"
+    assert report.facts[fact] == value
+    assert {"height", "height_m"} & set(report.facts) == {fact}
 
 
 def test_an_axis_without_a_stated_deviation_is_not_known(tmp_path):

@@ -27,6 +27,12 @@ if TYPE_CHECKING:
     import xarray as xr
     from rasterio import DatasetReader
 
+PRODUCT_TAG = "APERTURA_VERSION"
+"""Tag of every raster that apertura writes."""
+
+METRES = frozenset({"", "m", "metre", "meter", "metres", "meters"})
+"""Units of heights that are metres, or not stated."""
+
 WAVE_M = 0.25
 """Wavelength that errors between epochs of a log by itself are compared with: L-band."""
 
@@ -301,10 +307,15 @@ def history_facts(echo: "xr.Dataset") -> HistoryFacts:
 
 @dataclass(frozen=True, eq=False)
 class DemFacts:
-    """What a raster of heights holds.
+    """What a raster of heights, or a product of apertura, holds.
 
     Attributes
     ----------
+    tags
+        Of the file; `PRODUCT_TAG` is among them where it is a product of apertura.
+    description, values_unit
+        Of the first band; empty where the file does not state them. Of heights in a compound CRS the unit is that of
+        its vertical axis.
     posts
         Rows and columns.
     crs
@@ -318,10 +329,13 @@ class DemFacts:
     bands, dtype
         How many, and the type of the first.
     heights
-        (row, column) float32: of at most 512 posts along a side, NaN where there is none; None where the raster is
-        larger than can be used.
+        (row, column) float32 in `values_unit`, scale and offset applied: of at most 512 posts along a side, NaN where
+        there is none; None where the raster is larger than can be used, or of complex numbers.
     """
 
+    tags: Mapping[str, str]
+    description: str
+    values_unit: str
     posts: tuple[int, int]
     crs: str
     unit: str
@@ -345,6 +359,9 @@ def dem_facts(path: Path) -> DemFacts:
     with opened_raster(path, expected="a GeoTIFF of heights", remedy="Convert it.") as raster:
         bounds, crs = raster.bounds, raster.crs
         return DemFacts(
+            tags={str(name): str(value) for name, value in raster.tags().items()},
+            description=str(raster.descriptions[0] or ""),
+            values_unit=_values_unit(raster),
             posts=(raster.height, raster.width),
             crs=str(crs or ""),
             unit=str(crs.linear_units) if crs and crs.is_projected else "deg",
@@ -356,11 +373,23 @@ def dem_facts(path: Path) -> DemFacts:
         )
 
 
+def _values_unit(raster: "DatasetReader") -> str:
+    """Return the unit of the first band: of the vertical axis of a compound CRS, else as the band states it."""
+    from pyproj import CRS
+    from pyproj.exceptions import ProjError
+
+    try:
+        axes = CRS.from_user_input(raster.crs).axis_info if raster.crs else []
+    except ProjError:
+        axes = []
+    return str(axes[2].unit_name if len(axes) == 3 else raster.units[0] or "")
+
+
 def _heights(raster: "DatasetReader") -> NDArray[np.float32] | None:
     from apertura.core.scene.dem import MOST_POSTS
 
-    if raster.height * raster.width > MOST_POSTS:
+    if raster.height * raster.width > MOST_POSTS or raster.dtypes[0].startswith("complex"):
         return None
     shape = tuple(min(side, _ACROSS) for side in raster.shape)
-    read = raster.read(1, out_shape=shape, masked=True).astype(np.float32)
-    return np.asarray(np.ma.filled(read, np.nan), np.float32)
+    read = raster.read(1, out_shape=shape, masked=True).astype(np.float64)
+    return np.asarray(np.ma.filled(read, np.nan) * raster.scales[0] + raster.offsets[0], np.float32)

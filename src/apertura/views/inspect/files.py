@@ -1,5 +1,6 @@
 """Reports of one file: a flight log, a recording, phase history, a DEM, an array."""
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -14,6 +15,9 @@ from apertura.formats.names import PHASE_HISTORIES, log_format, log_suffixes
 from apertura.formats.npy import read_npy
 from apertura.formats.reading import open_recording, read_phase_history, read_track
 from apertura.pipeline.examination.facts import (
+    METRES,
+    PRODUCT_TAG,
+    DemFacts,
     HistoryFacts,
     LogFacts,
     RecordingFacts,
@@ -322,7 +326,7 @@ def _history_lacks(facts: HistoryFacts, kind: str, beside: Surroundings) -> list
 
 
 def dem_report(path: Path) -> Report:
-    """Return the report of a raster of heights.
+    """Return the report of a raster of heights, or of a product of apertura.
 
     Raises
     ------
@@ -331,8 +335,10 @@ def dem_report(path: Path) -> Report:
     """
     facts = dem_facts(path)
     left, bottom, right, top = facts.bounds
-    rows: dict[str, Any] = {
-        "posts": f"{facts.posts[0]} × {facts.posts[1]}",
+    is_product = PRODUCT_TAG in facts.tags
+    rows: dict[str, Any] = _product_rows(facts) if is_product else {}
+    rows |= {
+        "pixels" if is_product else "posts": f"{facts.posts[0]} × {facts.posts[1]}",
         "crs": shown(facts.crs or "none", 200),
         "x": f"{left:.9g} to {right:.9g}",
         "y": f"{bottom:.9g} to {top:.9g}",
@@ -340,10 +346,16 @@ def dem_report(path: Path) -> Report:
         "bands": facts.bands,
         "type": facts.dtype,
     }
+    if is_product:
+        return Report(path, "product of apertura", "", rows)
     heights = facts.heights
     if heights is not None:
         known = heights[np.isfinite(heights)]
-        rows["height_m"] = [float(known.min()), float(known.max())] if known.size else None
+        ends = [float(known.min()), float(known.max())] if known.size else None
+        if facts.values_unit.lower() in METRES:
+            rows["height_m"] = ends
+        else:
+            rows["height"] = None if ends is None else f"{ends[0]:.2f} to {ends[1]:.2f} {shown(facts.values_unit, 40)}"
         rows["posts_without_height_share"] = 1 - known.size / max(heights.size, 1)
     try:
         open_dem(path, "a scene on Earth")
@@ -352,8 +364,36 @@ def dem_report(path: Path) -> Report:
         lacks = (f"{problem.found}; expected {problem.expected}: set scene.dem_datum if that is what it lacks",)
     from apertura.views.inspect.pictures import draw_heights
 
-    picture = None if heights is None else (lambda: draw_heights(heights, facts.bounds, path.name))
+    picture = (
+        None
+        if heights is None
+        else (lambda: draw_heights(heights, facts.bounds, path.name, unit=facts.values_unit or "m"))
+    )
     return Report(path, "elevation model", "", rows, lacks, picture=picture)
+
+
+def _product_rows(facts: DemFacts) -> dict[str, Any]:
+    """Return what a product of apertura is, by its tags."""
+    tags = facts.tags
+    rows = {
+        "title": tags.get("TIFFTAG_IMAGEDESCRIPTION", ""),
+        "values": f"{facts.description} ({facts.values_unit or 'no unit'})",
+        "flags": ", ".join(_tag(tags, "APERTURA_FLAGS", dict)) or "none",
+        "focus": str(_tag(tags, "APERTURA_FOCUS", dict).get("verdict", "")),
+        "numerical_error": f"{tags['APERTURA_ERROR_DB']} dB" if "APERTURA_ERROR_DB" in tags else "",
+        "version": tags[PRODUCT_TAG],
+        "code": tags.get("APERTURA_CODE_SHA256", "")[:12],
+    }
+    return {name: shown(value, 200) for name, value in rows.items() if value}
+
+
+def _tag(tags: Mapping[str, str], name: str, kind: type) -> Any:
+    """Return what a tag holds as JSON, or an empty value where it is not of that kind."""
+    try:
+        value = json.loads(tags.get(name, "null"))
+    except ValueError:
+        value = None
+    return value if isinstance(value, kind) else kind()
 
 
 def array_report(path: Path) -> Report:

@@ -159,15 +159,15 @@ def _antennas(plan: "Axes", echo: "xr.Dataset") -> None:
     plan.legend(loc="best", fontsize="small")
 
 
-def draw_heights(heights: NDArray[np.float32], extent: tuple[float, ...], name: str) -> Figure:
-    """Return heights of a raster as a map; `extent` is left, bottom, right, top in its CRS."""
+def draw_heights(heights: NDArray[np.float32], extent: tuple[float, ...], name: str, *, unit: str) -> Figure:
+    """Return heights (in `unit`) of a raster as a map; `extent` is left, bottom, right, top in its CRS."""
     figure = _figure(name, (7, 6))
     axes = figure.subplots()
     left, bottom, right, top = extent
     drawn = axes.imshow(
         heights, extent=(left, right, bottom, top), cmap="terrain", aspect="auto", interpolation="nearest"
     )
-    figure.colorbar(drawn, ax=axes, label="height, as the raster counts it, m")
+    figure.colorbar(drawn, ax=axes, label=f"height, as the raster counts it, {unit}")
     _named(axes, "x of its CRS", "y of its CRS")
     return figure
 

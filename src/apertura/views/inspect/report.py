@@ -26,7 +26,8 @@ class Report:
     path
         The file or folder.
     kind
-        flight log, recording, phase history, elevation model, array, campaign folder, folder or unknown.
+        flight log, recording, phase history, elevation model, product of apertura, array, campaign folder, folder or
+        unknown.
     format
         A key of the table of its readers; empty where there is one alone.
     facts
