@@ -65,6 +65,33 @@ def beats_from(sweep, late_s, start_s):
 STARTS_S = 0.05 + 0.040004 * np.arange(8)
 
 
+@pytest.mark.parametrize("count", [5, 900, 3000])
+@pytest.mark.parametrize("stated", ["times", "prf", "none"])
+@pytest.mark.parametrize("form", ["beat_npy", "beat_mat"])
+def test_an_array_with_a_sweep_in_each_column_is_refused(tmp_path, form, stated, count):
+    """Of 882 samples: fewer sweeps than samples, as many and more."""
+    beat = np.random.default_rng(1).normal(size=(count, 882)).astype(np.float32)
+    time = BEGAN + np.arange(count) * np.timedelta64(40, "ms")
+    changes = {"prf_hz": 25.0} if stated != "times" else {}
+    path = tmp_path / f"a.{form[5:]}"
+
+    def save(array):
+        if form == "beat_npy":
+            np.save(path, array)
+            files = [path]
+            if stated == "times":
+                np.save(tmp_path / "a.time.npy", time)
+                files.append(tmp_path / "a.time.npy")
+            return files
+        savemat(path, {"beat": array, **({"time": time.astype(np.int64) / 1e9} if stated == "times" else {})})
+        return [path]
+
+    assert echo(form, *save(beat), **changes).sizes["pulse"] == count
+    message = complaint(lambda: echo(form, *save(beat.T), **changes))
+    assert f"882 × {count} samples, with a sweep in each column; expected a sweep in each row" in message
+    assert "Save the transpose" in message
+
+
 def test_arrays_and_matlab_hold_the_same_sweeps(tmp_path):
     beat = beats(STARTS_S).astype("f4")
     time = BEGAN + np.round(STARTS_S * 1e9).astype("timedelta64[ns]")

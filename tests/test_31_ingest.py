@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.io import savemat
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.contracts import check
@@ -196,6 +197,87 @@ def test_gotcha_delays_are_referred_to_the_scene_centre(shared):
     distance = np.linalg.norm(echo.tx_position.values, axis=1)
     np.testing.assert_allclose(echo.reference_delay.values * SPEED_OF_LIGHT_M_S / 2, distance, atol=2e-3)
     assert echo.attrs["frame"] == "local"
+
+
+def gotcha(folder, *, version=7, **changes):
+    """Write a file of AFRL's structure, of 8 frequencies and 5 pulses, by MATLAB's version 7 or 7.3."""
+    generator, pulses = np.random.default_rng(6), np.arange(5.0)
+    fields = {
+        "fp": generator.normal(size=(8, 5)) + 1j * generator.normal(size=(8, 5)),
+        "freq": 9.3e9 + 1e6 * np.arange(8.0),
+        "x": 7000 + pulses,
+        "y": 10 * pulses,
+        "z": np.full(5, 7000.0),
+        "r0": 9900 + pulses,
+        "af": {"r_correct": 0.2 + 0.01 * pulses, "ph_correct": 0.5 * pulses},
+    } | changes
+    path = folder / "a.mat"
+    if version == 7:
+        savemat(path, {"data": {name: values for name, values in fields.items() if values is not None}})
+        return path, fields
+    import h5py
+
+    def write(group, named):
+        for name, values in named.items():
+            if isinstance(values, dict):
+                write(group.create_group(name), values)
+                continue
+            array = np.atleast_2d(values).T
+            if array.dtype.kind == "c":
+                array = np.rec.fromarrays([array.real, array.imag], names="real,imag")
+            group[name] = array
+
+    with h5py.File(path, "w", userblock_size=512) as file:
+        write(file.create_group("data"), fields)
+    return path, fields
+
+
+@pytest.mark.usefixtures("reader")
+def test_matlab_files_of_version_7_3_are_those_of_version_7(tmp_path):
+    echoes = [read_phase_history("afrl_mat", [gotcha(tmp_path, version=one)[0]], pair="a-a") for one in (7, 7.3)]
+    for name in ("transfer", "frequency", "reference_delay", "tx_position"):
+        np.testing.assert_array_equal(echoes[0][name].values, echoes[1][name].values)
+    assert echoes[0].attrs["remarks"] == echoes[1].attrs["remarks"]
+
+
+@pytest.mark.usefixtures("reader")
+def test_corrections_of_passes_are_applied_where_the_config_says_so(tmp_path):
+    path, fields = gotcha(tmp_path)
+    raw = read_phase_history("afrl_mat", [path], pair="a-a")
+    assert "corrections of 0.20 to 0.24 m of r0, and of phases, which are not applied" in raw.attrs["remarks"][0]
+    moved = read_phase_history("afrl_mat", [path], pair="a-a", described={"corrections": "stored"})
+    assert "remarks" not in moved.attrs
+    turned = raw.transfer.values * np.exp(1j * fields["af"]["ph_correct"])[:, None]
+    np.testing.assert_allclose(moved.transfer.values, turned, rtol=1e-5)
+    further = (moved.reference_delay - raw.reference_delay).values * SPEED_OF_LIGHT_M_S / 2
+    np.testing.assert_allclose(further, fields["af"]["r_correct"], atol=1e-6)
+    bare, _ = gotcha(tmp_path, af=None)
+    assert "remarks" not in read_phase_history("afrl_mat", [bare], pair="a-a").attrs
+    with pytest.raises(CampaignError, match=r"no field data\.af\.r_correct.*Set waveform\.corrections to none"):
+        read_phase_history("afrl_mat", [bare], pair="a-a", described={"corrections": "stored"})
+
+
+def test_corrections_that_gotcha_stores_keep_its_trihedrals_sharp(shared):
+    """By the signs above: the other ones lose 18 dB and more."""
+    files = sorted((shared / "gotcha_afrl").glob("*.mat"))
+    east, north = np.meshgrid(np.arange(-16.6, -14.6, 0.1), np.arange(20.0, 23.0, 0.1))
+    peaks = []
+    for corrections in ("none", "stored"):
+        echo = read_phase_history("afrl_mat", files, pair="a-a", described={"corrections": corrections})
+        antenna, half = echo.tx_position.values, echo.reference_delay.values * SPEED_OF_LIGHT_M_S / 2
+        frequency, image = echo.frequency.values[::4], 0
+        for place, reference_m, samples in zip(antenna, half, echo.transfer.values[:, ::4], strict=True):
+            path_m = np.sqrt((place[0] - east) ** 2 + (place[1] - north) ** 2 + place[2] ** 2) - reference_m
+            image = image + np.exp(4j * np.pi / SPEED_OF_LIGHT_M_S * path_m[..., None] * frequency) @ samples
+        peaks.append(20 * np.log10(np.abs(image).max()))
+    assert abs(peaks[1] - peaks[0]) < 0.5
+
+
+@pytest.mark.usefixtures("reader")
+def test_frequencies_in_ghz_are_refused(tmp_path):
+    path, _ = gotcha(tmp_path, freq=9.3 + 1e-3 * np.arange(8.0))
+    with pytest.raises(CampaignError, match=r"frequencies of 9\.3 to 9\.307: in another unit than Hz\?"):
+        read_phase_history("afrl_mat", [path], pair="a-a")
 
 
 @pytest.mark.parametrize(

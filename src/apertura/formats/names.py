@@ -89,7 +89,9 @@ class HistoryFormat(NamedTuple):
 
 
 PHASE_HISTORIES: Mapping[str, HistoryFormat] = {
-    "afrl_mat": HistoryFormat(".mat", "apertura.formats.phase_histories.afrl:read_afrl_mat", frame="local"),
+    "afrl_mat": HistoryFormat(
+        ".mat", "apertura.formats.phase_histories.afrl:read_afrl_mat", described=True, frame="local"
+    ),
     "pulson": HistoryFormat(".out", "apertura.formats.phase_histories.pulson:read_pulson"),
     "cphd": HistoryFormat(".cphd", "apertura.formats.phase_histories.cphd:read_cphd", described=True),
     "hdf5": HistoryFormat(".h5", "apertura.formats.phase_histories.hdf5_history:read_hdf5_history"),

@@ -3,8 +3,10 @@
 It enters at `echo`: there are no raw samples, no clock and no code to remove.
 """
 
-from collections.abc import Sequence
+import logging
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -12,30 +14,40 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
-from apertura.common.errors import CampaignError
+from apertura.common.errors import CampaignError, shown
 from apertura.formats.isolated import UnreadableError, read_isolated
 from apertura.formats.phase_histories import phase_history
+from apertura.formats.phase_histories.mat_fields import CORRECTIONS
 from apertura.formats.phase_histories.phase_history import LARGEST, History, largest_by_row, refused
 
 _EXPECTED = "a Gotcha .mat file with data.fp (frequency, pulse), freq, x, y, z, r0, all finite"
 
-_LARGEST = {"fp": LARGEST, "freq": 1e12, "x": 1e7, "y": 1e7, "z": 1e7, "r0": 1e7}
-"""Largest values of fields: samples, Hz, m."""
+_LARGEST = {"fp": LARGEST, "freq": 1e12, "x": 1e7, "y": 1e7, "z": 1e7, "r0": 1e7, "r_correct": 1e4, "ph_correct": 1e4}
+"""Largest values of fields: samples, Hz, m, rad."""
+
+_LOG = logging.getLogger(__name__)
 
 _EPOCH = np.datetime64("1970-01-01", "ns")
 
 
-def read_afrl_mat(paths: Sequence[Path], *, pair: str) -> xr.Dataset:
+def read_afrl_mat(
+    paths: Sequence[Path], *, pair: str, described: Mapping[str, Any] = MappingProxyType({})
+) -> xr.Dataset:
     """Return the `echo` stage of a pass whose .mat files are joined in the order of their names.
 
     Each holds fp (subcarrier, pulse), freq (Hz), x, y, z and r0 (m). Monostatic: both phase centres are the antenna.
     Samples are referred to a delay of 2 r0/c. The data carry no clock: `time` counts pulses from the epoch at 1 s.
     Frame 'local': metres from the scene centre.
 
+    Files may hold corrections of their passes, data.af: r_correct (m) is to be added to r0, ph_correct (rad) to the
+    phase of samples. They are applied where `described`, section `waveform`, has corrections: stored; else `remarks`
+    state them. They move targets by decimetres, and bring passes together.
+
     Raises
     ------
     CampaignError
-        If a file lacks a field, holds NaN, or frequencies differ between files or are not equally spaced.
+        If a file lacks a field, holds NaN, or frequencies differ between files or are not equally spaced; or if
+        corrections that are to be applied are not stored.
 
     Notes
     -----
@@ -47,10 +59,12 @@ def read_afrl_mat(paths: Sequence[Path], *, pair: str) -> xr.Dataset:
         passes = read_isolated("apertura.formats.phase_histories.mat_fields:read_fields", paths)
     except UnreadableError as error:
         raise _error(f"not readable ({error})", error.path) from error
-    return joined(paths, passes, pair=pair)
+    return joined(paths, passes, pair=pair, corrected=described.get("corrections") == "stored")
 
 
-def joined(paths: Sequence[Path], passes: Sequence[dict[str, NDArray[Any]]], *, pair: str) -> xr.Dataset:
+def joined(
+    paths: Sequence[Path], passes: Sequence[dict[str, NDArray[Any]]], *, pair: str, corrected: bool = False
+) -> xr.Dataset:
     """Return the `echo` stage of what `apertura.formats.phase_histories.mat_fields` read of each file.
 
     Parameters
@@ -58,9 +72,12 @@ def joined(paths: Sequence[Path], passes: Sequence[dict[str, NDArray[Any]]], *, 
     paths
         Files in order, for messages.
     passes
-        Per file fp (subcarrier, pulse) complex64; freq (subcarrier,) Hz; x, y, z, r0 (pulse,) m.
+        Per file fp (subcarrier, pulse) complex64; freq (subcarrier,) Hz; x, y, z, r0 (pulse,) m; with or without those
+        of `CORRECTIONS`, (pulse,).
     pair
         Transmitter-receiver.
+    corrected
+        Whether these are applied.
 
     Raises
     ------
@@ -70,6 +87,18 @@ def joined(paths: Sequence[Path], passes: Sequence[dict[str, NDArray[Any]]], *, 
     histories, pulse = [], 0
     for path, fields in zip(paths, passes, strict=True):
         _check(fields, path)
+        transfer, r0 = fields["fp"].T, fields["r0"]
+        if corrected:
+            lacking = [name for name in CORRECTIONS if name not in fields]
+            if lacking:
+                raise CampaignError(
+                    f"no field data.af.{lacking[0]}",
+                    path,
+                    "stored corrections, as waveform.corrections says",
+                    "Set waveform.corrections to none.",
+                )
+            transfer = transfer * np.exp(1j * fields["ph_correct"])[:, None].astype(np.complex64)
+            r0 = r0 + fields["r_correct"]
         antenna = np.stack([fields["x"], fields["y"], fields["z"]], -1)
         pulses = np.arange(pulse, pulse + len(antenna))
         pulse += len(antenna)
@@ -79,21 +108,32 @@ def joined(paths: Sequence[Path], passes: Sequence[dict[str, NDArray[Any]]], *, 
                 _EPOCH + pulses * np.timedelta64(1, "s"),
                 antenna,
                 antenna.copy(),
-                fields["fp"].T,
+                transfer,
                 fields["freq"],
-                reference_delay=2 * fields["r0"] / SPEED_OF_LIGHT_M_S,
+                reference_delay=2 * r0 / SPEED_OF_LIGHT_M_S,
                 path_limit=np.full(len(antenna), np.inf),
                 used=np.ones(len(antenna), bool),
                 frame="local",
                 reference="point",
             )
         )
-    return phase_history.joined(histories, pair=pair, expected=_EXPECTED)
+    echo = phase_history.joined(histories, pair=pair, expected=_EXPECTED)
+    stored = [fields["r_correct"] for fields in passes if "r_correct" in fields]
+    if corrected or not stored:
+        return echo
+    moved = np.concatenate(stored)
+    remark = (
+        f"data.af holds corrections of {moved.min():.2f} to {moved.max():.2f} m of r0, and of phases, which are not "
+        "applied: waveform.corrections: stored applies them"
+    )
+    _LOG.warning("%s: %s", shown(paths[0], 300), remark)
+    return echo.assign_attrs(remarks=[remark])
 
 
 def _check(fields: dict[str, NDArray[Any]], path: Path) -> None:
     size = fields["x"].size
-    if fields["fp"].shape != (fields["freq"].size, size) or any(fields[name].size != size for name in ("y", "z", "r0")):
+    pulsed = [name for name in ("y", "z", "r0", *CORRECTIONS) if name in fields]
+    if fields["fp"].shape != (fields["freq"].size, size) or any(fields[name].size != size for name in pulsed):
         raise _error(
             f"fp is {fields['fp'].shape} for {fields['freq'].size} frequencies, {size} pulses (y "
             f"{fields['y'].size}, z {fields['z'].size}, r0 {fields['r0'].size})",

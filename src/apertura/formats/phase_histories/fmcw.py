@@ -32,6 +32,9 @@ _FARTHEST_S = 2.0**33
 _LEAST_STEP = 0.9
 """Of a sweep, what at least is between the beginnings of two; float64 seconds since 1970 are good to 0.2 us."""
 
+_MOST_INTERVALS = 1.05
+"""Of the interval between sweeps, how many samples a row may hold."""
+
 _EXPECTED = "beat signals (sweep, sample), real or complex as waveform.iq says, all finite"
 _REMEDY = "Correct the file, or waveform in the config."
 
@@ -142,7 +145,7 @@ def joined_sweeps(read: Sequence[Sweeps], *, pair: str, described: Mapping[str, 
     sweep, dropped = sweep_of(described), dict[str, int]()
     times, transfers = list[Times](), list[NDArray[np.complex64]]()
     for one in read:
-        _check(one, sweep)
+        _check(one, sweep, described)
         began = _regular(one, described, alone=len(read) == 1) if one.time is None else one.time
         if len(began) != len(one.beat):
             raise _error(f"{len(began)} times for {len(one.beat)} sweeps", one.path)
@@ -180,8 +183,15 @@ def joined_sweeps(read: Sequence[Sweeps], *, pair: str, described: Mapping[str, 
     )
 
 
-def _check(one: Sweeps, sweep: FrequencySweep) -> None:
+def _check(one: Sweeps, sweep: FrequencySweep, described: Mapping[str, Any]) -> None:
     beat = one.beat
+    if beat.ndim == 2 and _is_by_columns(one, sweep, described):
+        raise CampaignError(
+            f"{beat.shape[0]} × {beat.shape[1]} samples, with a sweep in each column",
+            one.path,
+            f"a sweep in each row: (sweep, sample), at least {sweep.sweep_samples} samples",
+            "Save the transpose; or correct waveform.sweep_s, waveform.sample_rate_hz and waveform.prf_hz.",
+        )
     if beat.ndim != 2 or beat.dtype.kind not in "fiuc" or beat.shape[1] < sweep.sweep_samples or not len(beat):
         raise _error(f"{beat.dtype} of shape {beat.shape}: a sweep has {sweep.sweep_samples} samples", one.path)
     if (beat.dtype.kind == "c") != (sweep.iq != "real"):
@@ -192,6 +202,20 @@ def _check(one: Sweeps, sweep: FrequencySweep) -> None:
         raise _error(
             f"sweep {int(bad[0])} holds what is no number, or beyond {_LARGEST:g} ({bad.size} in all)", one.path
         )
+
+
+def _is_by_columns(one: Sweeps, sweep: FrequencySweep, described: Mapping[str, Any]) -> bool:
+    """Return whether columns of an array are sweeps: by its times, its sides, and the interval between sweeps."""
+    rows, columns = one.beat.shape
+    if one.time is not None and rows != columns and len(one.time) in {rows, columns}:
+        return len(one.time) == columns
+    exact = {sweep.sweep_samples}
+    if described.get("prf_hz"):
+        exact.add(round(sweep.sample_rate_hz / described["prf_hz"]))
+    if (rows in exact) != (columns in exact):
+        return rows in exact
+    too_long = columns < sweep.sweep_samples or (described.get("prf_hz") and columns > _MOST_INTERVALS * max(exact))
+    return bool(too_long) and rows >= sweep.sweep_samples
 
 
 def _regular(one: Sweeps, described: Mapping[str, Any], *, alone: bool) -> Times:

@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.formats.phase_histories.mat_fields import read_variables
+
 
 def read_beat_fields(path: Path) -> dict[str, NDArray[Any]]:
     """Return beat (sweep, sample), and time where there is one.
@@ -14,20 +16,18 @@ def read_beat_fields(path: Path) -> dict[str, NDArray[Any]]:
     Parameters
     ----------
     path
-        MATLAB file, version 4 to 7.
+        MATLAB file, version 4 to 7.3.
 
     Raises
     ------
     ValueError
         If there is no such variable.
     """
-    from scipy.io import loadmat
-
-    document = loadmat(path, variable_names=["beat", "time"])
-    if "beat" not in document:
+    variables = read_variables(path, ["beat", "time"])
+    if "beat" not in variables:
         raise ValueError("no variable called beat")
-    fields = {name: np.asarray(document[name]) for name in ("beat", "time") if name in document}
-    return {name: values.ravel() if name == "time" else values for name, values in fields.items()}
+    fields = {name: np.asarray(values) for name, values in variables.items()}
+    return {name: np.atleast_1d(values) if name == "time" else np.atleast_2d(values) for name, values in fields.items()}
 
 
 def read_wav(path: Path) -> dict[str, NDArray[Any]]:

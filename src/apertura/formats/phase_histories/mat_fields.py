@@ -1,5 +1,7 @@
-"""Fields of the structure `data` in a MATLAB file; run by `read_isolated`, and importing no more than that takes."""
+"""Variables of MATLAB files, of versions 4 to 7.3; run by `read_isolated`, and importing no more than that takes."""
 
+import warnings
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -8,26 +10,93 @@ from numpy.typing import NDArray
 
 _FIELDS = ("fp", "freq", "x", "y", "z", "r0")
 
+CORRECTIONS = ("r_correct", "ph_correct")
+"""Fields of data.af: corrections of r0 (m) and of the phase (rad) of each pulse, which the data set does not apply."""
+
+_HDF5 = b"\x89HDF\r\n\x1a\n"
+_USER_BLOCK = 512
+
 
 def read_fields(path: Path) -> dict[str, NDArray[Any]]:
-    """Return fp (subcarrier, pulse) complex64 and freq, x, y, z, r0 float64 of one dimension.
+    """Return fp (subcarrier, pulse) complex64; freq, x, y, z, r0 and those of `CORRECTIONS` that are there, float64.
 
     Parameters
     ----------
     path
-        MATLAB file, version 4 to 7.
+        MATLAB file, version 4 to 7.3.
 
     Raises
     ------
     ValueError
         If a field is missing or is not an array of numbers.
     """
-    from scipy.io import loadmat
-
-    document = loadmat(path, squeeze_me=True, struct_as_record=False, variable_names=["data"])
-    if "data" not in document:
+    variables = read_variables(path, ["data"])
+    if not isinstance(variables.get("data"), Mapping):
         raise ValueError("no structure called data")
-    return {name: _numbers(name, getattr(document["data"], name, None)) for name in _FIELDS}
+    data = variables["data"]
+    stored = data.get("af")
+    corrections = {name: stored[name] for name in CORRECTIONS if isinstance(stored, Mapping) and name in stored}
+    named = {name: data.get(name) for name in _FIELDS}
+    return {name: _numbers(name, value) for name, value in (named | corrections).items()}
+
+
+def read_variables(path: Path, names: list[str]) -> dict[str, Any]:
+    """Return variables of a MATLAB file: an array for each, or a mapping of field → value for a structure.
+
+    Parameters
+    ----------
+    path
+        The file.
+    names
+        Variables that are wanted; missing ones are left out.
+
+    Raises
+    ------
+    ValueError
+        If the file is damaged, or a part of it is kept in another file.
+    """
+    with path.open("rb") as stream:
+        stream.seek(_USER_BLOCK)
+        is_hdf5 = stream.read(len(_HDF5)) == _HDF5  # as `save -v7.3` writes
+    if is_hdf5:
+        import h5py
+
+        with h5py.File(path, "r") as file:
+            return {name: _of_hdf5(file, name) for name in names if name in file}
+    from scipy.io import loadmat
+    from scipy.io.matlab import MatReadWarning
+
+    with warnings.catch_warnings():
+        warnings.simplefilter(
+            "error", MatReadWarning
+        )  # a variable that is damaged or doubled is no more than a warning
+        try:
+            document = loadmat(path, struct_as_record=False, squeeze_me=True, variable_names=names)
+        except MatReadWarning as warning:
+            raise ValueError(f"a damaged or doubled variable ({warning})") from warning
+    return {name: _plain(document[name]) for name in names if name in document}
+
+
+def _plain(value: Any) -> Any:
+    names = getattr(value, "_fieldnames", None)
+    return value if names is None else {name: _plain(getattr(value, name)) for name in names}
+
+
+def _of_hdf5(group: Any, name: str) -> Any:
+    """Return a variable of a file of version 7.3, whose arrays have the order of their axes reversed."""
+    import h5py
+
+    link = group.get(name, getlink=True)
+    value = group[name] if isinstance(link, h5py.HardLink) else None
+    if isinstance(value, h5py.Group):
+        return {field: _of_hdf5(value, field) for field in value}
+    # what lies in another file is not the campaign's: a link, external storage or a virtual array could name any
+    if not isinstance(value, h5py.Dataset) or value.external or value.is_virtual:
+        raise ValueError(f"{name} is no array in this file itself")
+    array = np.asarray(value[()]).T
+    if array.dtype.names is not None and set(array.dtype.names) == {"real", "imag"}:
+        array = array["real"] + 1j * array["imag"]
+    return np.squeeze(array)
 
 
 def _numbers(name: str, value: object) -> NDArray[Any]:

@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 LARGEST = 1e30
 """Largest sample: its square still adds up in float32."""
 
+LOWEST_HZ = 1e6
+"""No radar images at less: frequencies below are in MHz or GHz."""
+
 _BLOCK_BYTES = 8 << 20
 _EARTH_M = (6.3e6, 1e8)
 """How far from the Earth's centre an antenna may be: below any ground, beyond any orbit that images."""
@@ -214,6 +217,9 @@ def _check_times(histories: Sequence[History], expected: str) -> None:
 def _even(history: History, expected: str) -> Floats:
     """Return equal steps through the frequencies, which files may round to float32."""
     frequency = history.frequency
+    if frequency.size and 0 < frequency[-1] < LOWEST_HZ:
+        found = f"frequencies of {frequency[0]:g} to {frequency[-1]:g}: in another unit than Hz?"
+        raise CampaignError(found, history.path, f"Hz, above {LOWEST_HZ:g}", "Write frequencies in Hz.")
     even = np.linspace(frequency[0], frequency[-1], frequency.size)
     step = even[1] - even[0] if even.size > 1 else 0.0
     if not (step > 0 and frequency[0] > 0 and np.abs(even - frequency).max() <= 1e-2 * step):

@@ -237,6 +237,9 @@ class PhaseHistoryWaveform(Section):
         "made them took it out; auto: point for afrl_mat and cphd, else measured",
     )
     channel: str | None = Field(None, description="of a CPHD file with several channels the one to image")
+    corrections: Literal["none", "stored"] = Field(
+        "none", description="of afrl_mat files that hold corrections of their passes (data.af): stored applies them"
+    )
 
     @field_validator("format")
     @classmethod
@@ -244,9 +247,11 @@ class PhaseHistoryWaveform(Section):
         return _known(name, "phase_history")
 
     @model_validator(mode="after")
-    def _channels_are_of_cphd(self) -> Self:
+    def _keys_are_of_their_format(self) -> Self:
         if self.channel is not None and self.format != "cphd":
             raise ValueError(f"channel={self.channel!r} is of format cphd, and not of {self.format}")
+        if self.corrections != "none" and self.format != "afrl_mat":
+            raise ValueError(f"corrections={self.corrections!r} is of format afrl_mat, and not of {self.format}")
         return self
 
 

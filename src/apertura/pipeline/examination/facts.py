@@ -269,6 +269,8 @@ class HistoryFacts:
         Reason → pulses that the reader left out.
     flags
         That the reader raised.
+    remarks
+        What a person should know of how it was read.
     """
 
     times: TimeFacts
@@ -281,6 +283,7 @@ class HistoryFacts:
     bounds: Mapping[str, Mapping[str, Range]]
     dropped: Mapping[str, int]
     flags: Mapping[str, str]
+    remarks: tuple[str, ...]
 
 
 def history_facts(echo: "xr.Dataset") -> HistoryFacts:
@@ -302,6 +305,7 @@ def history_facts(echo: "xr.Dataset") -> HistoryFacts:
         bounds={leg: bounds_of(at, str(frame)) for leg, at in (("tx", tx), ("rx", rx))} if placed else {},
         dropped={why: int(count) for why, count in echo.attrs.get("dropped", {}).items()},
         flags=dict(echo.attrs.get("flags", {})),
+        remarks=tuple(echo.attrs.get("remarks", ())),
     )
 
 

@@ -311,7 +311,8 @@ def _history_rows(facts: HistoryFacts) -> dict[str, Any]:
     if facts.frame is not None:
         rows |= {"frame": facts.frame, "bistatic": facts.bistatic}
         rows |= {f"{leg}_bounds": dict(bounds) for leg, bounds in facts.bounds.items()}
-    return rows | {"left_out": dict(facts.dropped), "flags": dict(facts.flags)}
+    rows |= {"left_out": dict(facts.dropped), "flags": dict(facts.flags)}
+    return rows | ({"remarks": list(facts.remarks)} if facts.remarks else {})
 
 
 def _history_lacks(facts: HistoryFacts, kind: str, beside: Surroundings) -> list[str]:
