@@ -16,12 +16,14 @@ from apertura.formats.names import recording_files
 from apertura.formats.reading import open_recording
 from apertura.formats.recordings.sample_file import EDGE, SETTLING, Mixing, SampleFile, SampleLayout
 from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.check.files import check_files
 from apertura.pipeline.check.recordings import check_recordings
 from apertura.pipeline.examination.campaign import Examination
 from apertura.pipeline.opening.echo import PairEcho
 from apertura.pipeline.steps import echo, ingest
 from apertura.pipeline.store import open_stage
 from apertura.simulation.campaign import write_campaign
+from apertura.views.inspect.look import look
 
 RATE_HZ, DFT = 64e6, 256
 NODES = {"a": 1, "b": 2}
@@ -200,6 +202,44 @@ def test_a_recording_that_ran_through_is_mixed_the_same_however_it_is_read(tmp_p
     np.testing.assert_array_equal(file.channel(1)[40:50], file.read(40, 50)[:, 1])
 
 
+@pytest.mark.parametrize("taken_for", ["i16_le", "i16_be", "u16_le", "i32_le", "i8"])
+@pytest.mark.parametrize(("kind", "right"), [("<f4", "f32_le"), (">f4", "f32_be"), ("<f8", "f64_le")])
+@pytest.mark.parametrize("unit", [1.0, 1e-6])
+def test_floats_that_are_taken_for_counts_are_refused(campaign, taken_for, kind, right, unit):
+    """Captures are as many samples as the file holds by the datatype that is stated."""
+    numbers = (counts_of(campaign, "a") * unit).astype(kind)
+    per_sample = np.dtype(kind).itemsize * 8 // int("".join(filter(str.isdigit, taken_for)))
+
+    def count(meta):
+        for capture in meta["captures"]:
+            capture["core:sample_start"] *= per_sample
+
+    rewrite(campaign, "a", numbers, f"c{taken_for}")
+    edit_meta(campaign, "a", count)
+    message = complaint(lambda: open_recording(recording_files(campaign / "raw/f01", "a")))
+    found = f"core:datatype c{taken_for}, and a.sigmf-data holds finite floating-point numbers; expected c{right}"
+    assert found in message
+    assert f"Set core:datatype to c{right}" in message
+
+
+@pytest.mark.parametrize("kind", ["noise", "full scale", "sine", "constant", "zeros", "clipped"])
+@pytest.mark.parametrize("bits", [8, 16, 32])
+def test_counts_are_no_floats(tmp_path, kind, bits):
+    generator, top, turns = np.random.default_rng(3), 2 ** (bits - 1) - 1, np.arange(40_000) * 0.01
+    values = {
+        "noise": generator.normal(0, top / 100, turns.size),
+        "full scale": generator.uniform(-top, top, turns.size),
+        "sine": top * 0.9 * np.sin(turns),
+        "constant": np.full(turns.size, top * 0.49),
+        "zeros": np.zeros(turns.size),
+        "clipped": np.clip(generator.normal(0, top, turns.size), -top, top),
+    }[kind]
+    path = tmp_path / "iq"
+    path.write_bytes(values.astype(f"<i{bits // 8}").tobytes())
+    layout = SampleLayout(f"ci{bits}_le" if bits > 8 else "ci8")
+    assert SampleFile(path, 1, layout).floats_among_counts(0) is None
+
+
 @pytest.mark.parametrize("wrong", [np.nan, np.inf, 1e30])
 def test_a_float_that_is_no_sample_is_named(campaign, wrong):
     numbers = counts_of(campaign, "a").astype("<f4")
@@ -286,6 +326,18 @@ def test_a_collection_says_which_recording_is_a_nodes(campaign, plain):
     collection(campaign, a="rx_0", b="rx_1")
     for pair, transfer in transfers(campaign).items():
         np.testing.assert_array_equal(transfer, plain[pair])
+
+
+def test_an_archive_is_to_be_unpacked(campaign):
+    folder = campaign / "raw/f01"
+    for suffix in ("meta", "data"):
+        (folder / f"a.sigmf-{suffix}").unlink()
+    (folder / "a.sigmf").write_bytes(b"a tar archive")
+    message = complaint(lambda: recording_files(folder, "a"))
+    assert "a.sigmf: a SigMF archive; expected .sigmf-meta and .sigmf-data. Unpack it: tar -xf a.sigmf" in message
+    assert "Unpack it: tar -xf a.sigmf" in look(folder / "a.sigmf").problem.remedy
+    problems = [str(problem) for problem in check_files(Examination(Campaign.load(campaign)))]
+    assert any("Unpack it" in problem for problem in problems)
 
 
 def test_metadata_that_a_collection_hashed_otherwise_are_refused(campaign):

@@ -134,6 +134,10 @@ _DATATYPE = re.compile(r"([cr])(?:([iu]8)|([iu](?:16|32)|f(?:16|32|64))_([lb])e)
 DATATYPES = "ci16_le: c or r (complex, real); i8, u8, or i16, u16, i32, u32, f16, f32, f64 with _le or _be"
 """What datatypes are read, for messages."""
 
+_EXAMINED_BYTES = 1 << 16
+_FEWEST, _DISTINCT, _TINIEST, _USUAL = 256, 32, 1e-12, 0.999  # numbers, values of them, their size, its share
+_HALF = 0.45
+
 _LARGEST = np.float64(1e15)  # of a float: sums of squares stay in float32
 
 
@@ -233,6 +237,15 @@ Spans = Sequence[tuple[int, int]]
 """First sample, and that behind the last."""
 
 
+def _are_samples(numbers: NDArray[np.floating[Any]]) -> bool:
+    """Return whether floats may be samples of a recorder: finite, of several values and of usual size, or 0."""
+    with np.errstate(invalid="ignore"):  # a NaN that signals
+        magnitude = np.abs(numbers[numbers != 0].astype(np.float64))
+    if magnitude.size < _FEWEST or not np.isfinite(magnitude).all() or np.unique(magnitude).size <= _DISTINCT:
+        return False
+    return bool(np.mean((magnitude > _TINIEST) & (magnitude < 1 / _TINIEST)) > _USUAL)
+
+
 @dataclass(frozen=True)
 class SampleFile:
     """I and Q of a recording, channels interleaved per sample.
@@ -288,6 +301,32 @@ class SampleFile:
         begun, ended = max(0, first - SETTLING), min(len(self), last + SETTLING)
         real = self._read([(begun, max(last, ended))]).reshape(1, -1, self.channels)
         return mixing.baseband(real, begun)[0, first - begun : last - begun]
+
+    def floats_among_counts(self, first: int) -> str | None:
+        """Return the datatype, such as f32_le, of floats that the layout takes for integers; None if it does not.
+
+        The bytes of counts are no floats: small negative ones are NaN, others beyond any sample. Those of floats are
+        finite and within a few powers of ten throughout.
+
+        Parameters
+        ----------
+        first
+            Sample from which on some are read.
+        """
+        if self.layout.stored.kind == "f":
+            return None
+        place, size = next(self._pieces(first, len(self)), (0, 0))
+        with naming(self.path), self.path.open("rb") as stream:
+            stream.seek(place)
+            data = stream.read(min(size, _EXAMINED_BYTES))
+        data = data[: len(data) // 8 * 8]
+        usual = [kind for kind in ("<f4", ">f4", "<f8", ">f8") if _are_samples(np.frombuffer(data, kind))]
+        if not usual:
+            return None
+        # every second half of doubles of few digits is zero, and the other half a float: then they are doubles
+        halved = np.mean(np.frombuffer(data, "<u4") == 0) > _HALF
+        kind = np.dtype(next((one for one in usual if one.endswith("8") == bool(halved)), usual[0]))
+        return f"f{8 * kind.itemsize}_{'b' if kind.str.startswith('>') else 'l'}e"
 
     def captures(self, start: NDArray[np.int64], length: int) -> Samples:
         """Return some captures, each of `length` samples from its `start` on, (pulse, sample, channel, 2).

@@ -257,9 +257,13 @@ def find_sigmf(folder: Path, node: str) -> tuple[Path, Path]:
     Raises
     ------
     CampaignError
-        If a collection is none, gives the node a stream that it does not list, or two collections give it one.
+        If a collection is none, gives the node a stream that it does not list, or two collections give it one; or if
+        an archive lies there instead.
     """
     meta = folder / f"{node}.sigmf-meta"
+    archive = folder / f"{node}{ARCHIVE}"
+    if not meta.is_file() and archive.is_file():
+        raise archived(archive)
     if not meta.is_file():
         given = [(path, one.nodes[node]) for path, one in _collections(folder) if node in one.nodes]
         if len(given) > 1:
@@ -271,6 +275,23 @@ def find_sigmf(folder: Path, node: str) -> tuple[Path, Path]:
         dataset = read_global(meta).dataset
         samples = samples if dataset is None else folder / dataset
     return meta, samples
+
+
+ARCHIVE = ".sigmf"
+"""Suffix of a tar archive of metadata and samples."""
+
+
+def archived(path: Path) -> CampaignError:
+    """Return the error of a recording that lies in an archive.
+
+    Examples
+    --------
+    >>> print(archived(Path("uav2.sigmf")))
+    uav2.sigmf: a SigMF archive; expected .sigmf-meta and .sigmf-data. Unpack it: tar -xf uav2.sigmf.
+    """
+    return CampaignError(
+        "a SigMF archive", path, ".sigmf-meta and .sigmf-data", f"Unpack it: tar -xf {shown(path.name, 100)}."
+    )
 
 
 def check_listed(meta_path: Path) -> None:
@@ -311,7 +332,8 @@ def open_sigmf(meta_path: Path, data_path: Path) -> Recording:
     Raises
     ------
     CampaignError
-        If the metadata are not SigMF, the data are truncated, or a capture lies past their end.
+        If the metadata are not SigMF, the data are truncated, a capture lies past their end, or the first samples are
+        floating-point numbers where core:datatype states counts.
 
     Notes
     -----
@@ -328,6 +350,15 @@ def open_sigmf(meta_path: Path, data_path: Path) -> Recording:
         )
     channels, layout = _channels(header, meta_path), _layout(header, captures, meta_path)
     samples = _samples(SampleFile(data_path, len(channels), layout), captures, meta_path)
+    floats = samples.floats_among_counts(int(captures.start[0]))
+    if floats is not None:
+        right = f"{header.datatype[0]}{floats}"
+        raise CampaignError(
+            f"core:datatype {header.datatype}, and {data_path.name} holds finite floating-point numbers",
+            meta_path,
+            right,
+            f"Set core:datatype to {right}.",
+        )
     return Recording(
         samples=samples,
         channels=channels,

@@ -222,6 +222,10 @@ def _unknown(path: Path) -> Report:
     recorders = sorted({suffix for row in RECORDERS for suffix in row})
     histories = sorted({row.suffix for row in PHASE_HISTORIES.values()})
     logs = sorted(f".{suffix}" for suffix in log_suffixes())
+    from apertura.formats.recordings.sigmf import ARCHIVE, archived
+
+    if path.suffix == ARCHIVE:
+        return Report(path, "unknown", "", {**_size(path), "begins_with": quoted(head)}, problem=archived(path))
     problem = CampaignError(
         f"no format that is known by a name in {quoted(path.suffix)}",
         path,
