@@ -14,6 +14,19 @@ from apertura.pipeline.config import read_segments
 from apertura.pipeline.opening.transmitted import read_codes, read_framing
 from apertura.pipeline.steps import ingest
 
+# The campaign folder
+
+
+def test_a_folder_whose_name_is_not_utf_8_is_refused_at_once(tiny):
+    named = os.fsdecode(os.fsencode(tiny.parent) + b"/S\xfcd")
+    tiny.rename(named)
+    for root in (named, f"{named}/."):
+        message = complaint(lambda root=root: Campaign.load(root))
+        assert "a name that is not UTF-8 text; expected the folder and those above it named in UTF-8" in message
+        assert "LC_ALL=C.UTF-8" in message
+        assert message.isprintable()
+
+
 # Tables of the config
 
 
@@ -31,6 +44,22 @@ def test_a_table_of_windows_is_read_as_one_of_unix(tiny):
     flights = Campaign.load(tiny).flights
     path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes().replace(b"\n", b"\r\n"))
     assert Campaign.load(tiny).flights == flights
+
+
+@pytest.mark.parametrize("line", ["# f02\timage\tuav1\tuav1", "#f02", "\t\t\t", "   ", "\t\t\t\t\t\t", ""])
+@pytest.mark.parametrize("first", [True, False])
+def test_comments_and_blank_lines_of_a_table_are_no_rows(tiny, line, first):
+    for name in ("flights.tsv", "segments.tsv"):
+        path = tiny / "config" / name
+        if name == "segments.tsv":
+            times = "2025-05-14T09:30:00\t2025-05-14T09:40:00"
+            path.write_text(f"flight\tpair\tstart\tend\nf01\tuav1-uav1\t{times}\n")
+        whole = Campaign.load(tiny)
+        lines = path.read_text().splitlines()
+        lines.insert(0 if first else 1, line)
+        path.write_text("\n".join([*lines, line]) + "\n")
+        again = Campaign.load(tiny)
+        assert (again.flights, again.segments) == (whole.flights, whole.segments)
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """A campaign folder as one value: settings, flights and paths."""
 
+import os
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -27,6 +28,20 @@ from apertura.pipeline.config import (
     read_settings,
 )
 from apertura.pipeline.raw_folder import RawFolder
+
+
+def _check_name(root: Path) -> None:
+    """Raise CampaignError where the name of a folder is no UTF-8 text, which tags, JSON and GDAL's names must be."""
+    name = os.path.abspath(root)  # noqa: PTH100  (follows no link)
+    try:
+        name.encode()
+    except UnicodeEncodeError:
+        raise CampaignError(
+            "a name that is not UTF-8 text",
+            root.name or root,
+            "the folder and those above it named in UTF-8",
+            "Rename it (convmv -f latin1 -t utf8), or set a UTF-8 locale: LC_ALL=C.UTF-8.",
+        ) from None
 
 
 @dataclass(frozen=True)
@@ -59,6 +74,7 @@ class Campaign(RawFolder):
     @classmethod
     def load(cls, root: str | Path) -> "Campaign":
         """Read and validate `root`/config; raise CampaignError on the first file that is wrong."""
+        _check_name(Path(root))
         root = ConfinedPath.at(root)
         config, table, segments, clocks = (root / path for path in (CONFIG, FLIGHTS, SEGMENTS, CLOCKS))
         settings = read_settings(config)

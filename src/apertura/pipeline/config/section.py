@@ -111,7 +111,7 @@ def table_rows(path: Path, columns: Sequence[str], *, remedy: str) -> Iterator[t
     Parameters
     ----------
     path
-        Of the table.
+        Of the table; lines that begin with # and lines of blanks and tabs are no rows.
     columns
         The heading.
     remedy
@@ -129,6 +129,8 @@ def table_rows(path: Path, columns: Sequence[str], *, remedy: str) -> Iterator[t
     try:
         for row in rows:
             cells = [cell.strip() for cell in row]
+            if not any(cells) or cells[0].startswith("#"):
+                continue
             if heading is None:
                 heading = cells
                 if cells != list(columns):
@@ -136,7 +138,7 @@ def table_rows(path: Path, columns: Sequence[str], *, remedy: str) -> Iterator[t
             elif len(cells) > len(columns):
                 found = f"{len(cells)} cells, the last {quoted(cells[-1])}"
                 raise CampaignError(found, f"{path}: line {rows.line_num}", listed, "Correct the line.")
-            elif row:
+            else:
                 yield f"{path}: line {rows.line_num}", dict(zip(columns, cells + [""] * len(columns), strict=False))
     except csv.Error as error:
         raise CampaignError(
