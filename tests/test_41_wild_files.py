@@ -10,6 +10,7 @@ from folders import complaint, edit_meta
 
 from apertura.formats.recordings.sigmf import open_sigmf
 from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.check import problems
 from apertura.pipeline.config import read_segments
 from apertura.pipeline.opening.transmitted import read_codes, read_framing
 from apertura.pipeline.steps import ingest
@@ -24,6 +25,7 @@ def test_a_folder_whose_name_is_not_utf_8_is_refused_at_once(tiny):
         message = complaint(lambda root=root: Campaign.load(root))
         assert "a name that is not UTF-8 text; expected the folder and those above it named in UTF-8" in message
         assert "LC_ALL=C.UTF-8" in message
+        assert [str(problem) for problem in problems(root)] == [message]
         assert message.isprintable()
 
 

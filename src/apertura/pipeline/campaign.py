@@ -30,8 +30,16 @@ from apertura.pipeline.config import (
 from apertura.pipeline.raw_folder import RawFolder
 
 
-def _check_name(root: Path) -> None:
-    """Raise CampaignError where the name of a folder is no UTF-8 text, which tags, JSON and GDAL's names must be."""
+def check_name(root: Path) -> None:
+    """Raise CampaignError where the name of a folder, or of one above it, is not UTF-8 text.
+
+    Tags, JSON and GDAL's names are UTF-8: steps would end in an encoding error.
+
+    Parameters
+    ----------
+    root
+        The campaign folder.
+    """
     name = os.path.abspath(root)  # noqa: PTH100  (follows no link)
     try:
         name.encode()
@@ -74,7 +82,7 @@ class Campaign(RawFolder):
     @classmethod
     def load(cls, root: str | Path) -> "Campaign":
         """Read and validate `root`/config; raise CampaignError on the first file that is wrong."""
-        _check_name(Path(root))
+        check_name(Path(root))
         root = ConfinedPath.at(root)
         config, table, segments, clocks = (root / path for path in (CONFIG, FLIGHTS, SEGMENTS, CLOCKS))
         settings = read_settings(config)

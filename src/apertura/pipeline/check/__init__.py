@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, TextIO, TypeVar
 from apertura.common.confined import ConfinedPath
 from apertura.common.errors import CampaignError
 from apertura.common.processes import as_typed
-from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.campaign import Campaign, check_name
 from apertura.pipeline.config import (
     CLOCKS,
     CONFIG,
@@ -176,6 +176,10 @@ def load(root: Path) -> tuple[Campaign | None, list[CampaignError]]:
     >>> load(Path("nowhere"))[0] is None
     True
     """
+    try:
+        check_name(root)
+    except CampaignError as problem:
+        return None, [problem]
     root = ConfinedPath.at(root)
     if not root.is_dir():
         remedy = "`apertura init` makes one."
