@@ -6,14 +6,19 @@ import struct
 
 import numpy as np
 import pytest
+from autopilot_logs import dataflash, dataflash_rows, ulog, ulog_receiver
 from folders import complaint, edit_meta
 
+from apertura.core.geometry.geodesy import ecef_from_geodetic
+from apertura.formats.reading import read_track
 from apertura.formats.recordings.sigmf import open_sigmf
+from apertura.formats.tracks.log_options import LogOptions
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.check import problems
 from apertura.pipeline.config import read_segments
 from apertura.pipeline.opening.transmitted import read_codes, read_framing
 from apertura.pipeline.steps import ingest
+from tests.attack import logs
 
 # The campaign folder
 
@@ -241,3 +246,125 @@ def test_a_preamble_outside_the_campaign_is_not_opened(tiny, name):
     else:
         assert "uav1.sigmf-meta: apertura:framing.preamble: path" in message
         assert "inside the campaign folder" in message
+
+
+# Files of other programs: ten of each class, each read rightly or refused in one message
+
+TIMES, PLACES = logs.circle()
+ECEF = ecef_from_geodetic(*PLACES.T)
+LATER = TIMES + np.timedelta64(1, "h")
+CSV = "time_utc,latitude_deg,longitude_deg,height_m"
+PLAIN = [f"{time}Z,{a:.9f},{b:.9f},{h:.6f}" for time, (a, b, h) in zip(TIMES, PLACES, strict=True)]
+LLH = "latitude(deg) longitude(deg) height(m)"
+
+
+def gns(time, geodetic):
+    """Return GNS, which some receivers send in place of GGA."""
+    body = logs.gga(time, geodetic)[1:].partition("*")[0].split(",")
+    return logs.sealed(",".join(["GNGNS", *body[1:6], "RR", *body[7:10], body[11], "", ""]))
+
+
+def csv_log(*lines, heading=CSV):
+    return "a.track.csv", "\n".join([heading, *lines]) + "\n"
+
+
+def west(longitude):
+    """Return a log of the flight 20 degrees further west, and what it must become."""
+    return PLACES * [1, 0, 1] + [0, longitude, 0]
+
+
+LOGS = {
+    "rtklib: longitudes from 0 to 360": (
+        "a.track.pos", logs.solution(TIMES, west(350.05), LLH), {}, ecef_from_geodetic(*west(-9.95).T),
+    ),
+    "rtklib: status records, .stat of the same run": (
+        "a.track.pos", "$POS,2366,293418.000,1,4177000.0,733000.0,4747000.0,0.01,0.01,0.01\n" * 9, {},
+        "no header line with latitude(deg)",
+    ),
+    "rtklib: heights of a geoid, its separation in a column of its own": (
+        "a.track.pos", logs.solution(TIMES, PLACES, LLH).replace("/ellipsoidal", "/geodetic"), {},
+        "nodes.a.log.height_offset_m",
+    ),
+    "nmea: BeiDou talkers, GGA and ZDA, below the ellipsoid": (
+        "a.track.txt",
+        "".join(
+            f"{logs.zda(time)}\r\n{logs.gga(time, place - [0, 0, 650], talker='GB', separation='-31.2')}\r\n"
+            for time, place in zip(TIMES, PLACES, strict=True)
+        ),
+        {}, ecef_from_geodetic(*(PLACES - [0, 0, 650]).T),
+    ),
+    "nmea: GNS without GGA": (
+        "a.track.nmea", "".join(f"{logs.rmc(t)}\n{gns(t, p)}\n" for t, p in zip(TIMES, PLACES, strict=True)), {},
+        "no GGA, but 40 GNS; expected an NMEA 0183 log with GGA. Log GGA",
+    ),
+    "csv: index column of pandas, all cells quoted": (
+        *csv_log(
+            *(",".join(f'"{cell}"' for cell in [number, *row.split(",")]) for number, row in enumerate(PLAIN)),
+            heading='"",' + ",".join(f'"{name}"' for name in CSV.split(",")),
+        ),
+        {}, ECEF,
+    ),
+    "csv: times of PostgreSQL, zone +00": (
+        *csv_log(*(row.replace("T", " ").replace("Z,", "+00,") for row in PLAIN), heading=CSV.replace("_utc", "")),
+        {}, ECEF,
+    ),
+    "csv: hemispheres behind degrees": (
+        *csv_log(*(row.replace(",9.9", "E,9.9") for row in PLAIN)), {}, "in column latitude_deg: '48.4",
+    ),
+    "csv: seconds of GPS week alone": (
+        *csv_log(*(f"{293418 + n}{row[30:]}" for n, row in enumerate(PLAIN)), heading=CSV.replace("utc", "s")), {},
+        "nodes.a.log.start_utc",
+    ),
+    "px4: two logs joined by cat": (
+        "a.track.ulg", ulog(("sensor_gps", 0, ulog_receiver())) * 2, {},
+        "another log begins at byte 3821: separate logs that were joined",
+    ),
+    "px4: encrypted": ("a.track.ulg", b"ULogEnc\x01" + bytes(4000), {}, "not readable (Invalid file format"),
+    "ardupilot: a page of zeros before the first message": (
+        "a.track.bin", bytes(512) + dataflash(dataflash_rows()), {}, 60,
+    ),
+    "ardupilot: telemetry, .tlog": (
+        "a.track.bin", b"\xfe\x09\x00\x01\x01\x00" * 900, {}, "without 'FMT' in its first 8192 bytes",
+    ),
+    "airdata: saved by a German spreadsheet": (
+        "a.track.csv", logs.airdata(TIMES, PLACES).replace(",", ";").replace(".", ","), {"height_offset_m": 48.0},
+        "cells between semicolons",
+    ),
+    "airdata: two flights in one file": (
+        "a.track.csv", logs.airdata(TIMES, PLACES) + logs.airdata(LATER, PLACES).partition("\n")[2],
+        {"height_offset_m": 48.0}, "column time(millisecond) does not increase",
+    ),
+    "optitrack: a take cut at its beginning, in millimetres": (
+        "a.track.csv",
+        logs.capture(
+            20 + np.arange(12) / 360,
+            {name: pose * np.r_[np.ones(4), np.full(3, 1e3)] for name, pose in logs.poses().items()},
+            unit="Millimeters",
+        ),
+        {"start_utc": "2025-05-14", "body": "Radar"}, 12,
+    ),
+    "optitrack: markers alone": (
+        "a.track.csv", logs.capture(np.arange(12) / 360, {}), {"start_utc": "2025-05-14"}, "no rigid body",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.usefixtures("reader")
+@pytest.mark.parametrize("case", LOGS)
+def test_logs_of_other_programs_are_read_or_refused_in_one_message(tmp_path, case):
+    name, content, options, expected = LOGS[case]
+    path = tmp_path / name
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+
+    def read():
+        return read_track(path, node="a", options=LogOptions(**options))
+
+    if isinstance(expected, str):
+        message = complaint(read)
+        assert expected in message
+        assert message.isprintable()
+        assert len(message) < 800
+    elif isinstance(expected, int):
+        assert read().sizes["epoch"] == expected
+    else:
+        np.testing.assert_allclose(read().position.values, expected, atol=2e-5, rtol=0)

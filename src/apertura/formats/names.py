@@ -147,8 +147,12 @@ def log_format(path: Path, options: LogOptions = AS_IT_SAYS) -> str:
         known = {name: row for name, row in known.items() if row.heading in begins}
     if options.format is None and known:
         return next(iter(known))
+    headings = [repr(row.heading) for row in TRACKS.values() if suffix in row.suffixes]
+    found = f"a flight log of kind {path.suffix!r}"
+    if headings:
+        found += f" without {' or '.join(headings)} in its first {_HEADING_BYTES} bytes"
     raise CampaignError(
-        f"a flight log of kind {path.suffix!r}" if options.format is None else f"format {quoted(options.format)}",
+        found if options.format is None else f"format {quoted(options.format)}",
         where=path,
         expected=f"<node>.track.<{'|'.join(log_suffixes())}>; formats {', '.join(TRACKS)}",
         remedy="Convert the log, or write a reader for it.",

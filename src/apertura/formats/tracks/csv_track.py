@@ -224,7 +224,7 @@ _ATTITUDE = ["roll_deg", "pitch_deg", "yaw_deg"]
 _STD = ["std_north_m", "std_east_m", "std_up_m"]
 _QUALITY = "quality"
 _OURS = (*_TIMES, *(name for names in _POSITIONS.values() for name in names), *_ATTITUDE, *_STD, _QUALITY)
-_ZONE = r"(?:Z|[+-]\d\d:?\d\d)$"
+_ZONE = r":[^:]*(?:Z|[+-]\d\d(?::?\d\d)?)$"
 _LONGEST_S = 4e9
 
 

@@ -46,8 +46,9 @@ def read_fields(path: Path) -> dict[str, NDArray[Any]]:
     from pymavlink.DFReader import DFReader_binary, DFReader_text
 
     data = path.read_bytes()
-    is_binary = data.startswith(_BINARY)
-    if not is_binary and b"FMT," not in data[:8192]:
+    is_text = b"FMT," in data[:8192]
+    is_binary = not is_text and _BINARY in data[:8192]
+    if not is_binary and not is_text:
         raise ValueError("no FMT message at its beginning")
     with ExitStack() as stack:
         name = str(path)

@@ -28,6 +28,9 @@ from apertura.formats.tracks.track import (
 
 _BODY = re.compile(rb"([A-Z]{2}[A-Z0-9]{3},[^*]{1,250})(\*[0-9A-Fa-f]{0,2})?")
 _SEALED = re.compile(rb"\$..(?:GGA|RMC|ZDA|GST),[^*$\r\n]{1,250}\*[0-9A-Fa-f]{2}")
+_PLACES = ("GNS", "GLL")
+"""Sentences with a position that are not read: GLL has no height, GNS no kind of solution for all systems together."""
+
 _COMMAS = {"GGA": 14, "RMC": 9, "ZDA": 4, "GST": 8}
 """Of a whole sentence, up to the last field that is read."""
 _STAMP = re.compile(rb"[\s\[(\"']*\d[-\d\s:.,;/TZ+\])\"']*")
@@ -63,6 +66,7 @@ class _Log:
     dropped: Counter[str] = field(default_factory=Counter)
     stamped: int = 0
     unsealed: int = 0
+    others: Counter[str] = field(default_factory=Counter)
 
 
 def read_nmea(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -> xr.Dataset:
@@ -140,7 +144,9 @@ def _whole(text: str, checksum: bytes | None, log: _Log, *, ended: bool) -> Iter
     elif int(checksum[1:], 16) != NMEASentence.checksum(text):
         log.dropped["sentences with a wrong checksum"] += 1
         return
-    if _WANTED.match(text):
+    if not _WANTED.match(text):
+        log.others[text[2:5]] += 1
+    else:
         log.unsealed += not checksum
         try:
             yield NMEASentence.parse(f"${text}{checksum.decode()}", check=bool(checksum))
@@ -250,6 +256,9 @@ def _keep(now: int, fix: _Fix, log: _Log) -> None:
 
 def _track(log: _Log) -> xr.Dataset:
     fixes = [log.fixes[now] for now in log.order]
+    elsewhere = [f"{log.others[kind]} {kind}" for kind in _PLACES if log.others[kind]]
+    if not fixes and not log.dropped and elsewhere:
+        raise _error(f"no GGA, but {' and '.join(elsewhere)}", log.path)
     geodetic = np.array([fix.geodetic for fix in fixes]).reshape(-1, 3)
     separation = np.array([fix.separation for fix in fixes])
     stated = np.isfinite(separation)

@@ -26,6 +26,7 @@ _BYTES = {
     **dict.fromkeys(("int32_t", "uint32_t", "float"), 4),
     **dict.fromkeys(("int64_t", "uint64_t", "double"), 8),
 }
+_MAGIC = b"ULog\x01\x12\x35"
 _HEADER, _MESSAGE = 16, 3
 _FLAGS_BYTES = 40
 _DEEPEST = 8
@@ -51,6 +52,9 @@ def read_fields(path: Path) -> dict[str, NDArray[Any]]:
     from pyulog import ULog
 
     data = path.read_bytes()
+    second = data.find(_MAGIC, 1)
+    if second > 0:  # whose subscriptions would replace those of the first, and their messages with them
+        raise ValueError(f"another log begins at byte {second}: separate logs that were joined")
     spans, unread = _foreign(data)
     # where every byte is a message the parser reads the file by itself, data that were appended included
     left_out = sorted([*spans, *unread])
