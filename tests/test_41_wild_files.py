@@ -3,14 +3,24 @@
 import io
 import os
 import struct
+from dataclasses import asdict
 
 import numpy as np
 import pytest
+import rasterio
 from autopilot_logs import dataflash, dataflash_rows, ulog, ulog_receiver
 from folders import complaint, edit_meta
+from pyproj import Transformer
+from rasterio import Affine
+from rasterio.transform import from_origin
+from scipy.io import savemat, wavfile
 
+from apertura.core.echo.dechirp import FrequencySweep, transfer_of
 from apertura.core.geometry.geodesy import ecef_from_geodetic
-from apertura.formats.reading import read_track
+from apertura.core.scene.dem import height_range, open_dem
+from apertura.core.scene.grid import SceneGrid
+from apertura.formats.phase_histories.pulson import MESSAGE, SAMPLE_RATE_HZ
+from apertura.formats.reading import read_phase_history, read_track
 from apertura.formats.recordings.sigmf import open_sigmf
 from apertura.formats.tracks.log_options import LogOptions
 from apertura.pipeline.campaign import Campaign
@@ -368,3 +378,258 @@ def test_logs_of_other_programs_are_read_or_refused_in_one_message(tmp_path, cas
         assert read().sizes["epoch"] == expected
     else:
         np.testing.assert_allclose(read().position.values, expected, atol=2e-5, rtol=0)
+
+
+SWEEP = FrequencySweep(2.26e9, 330e6, 2e-3, 44_100.0)
+FMCW = {
+    **asdict(SWEEP), "kind": "fmcw", "prf_hz": 100.0, "start_utc": "2025-05-14T09:30",
+    "trigger": {"sync_channel": 1, "beat_channel": 2, "edge": "rising", "threshold": 0.3},
+}  # fmt: skip
+BEATS = np.random.default_rng(8).normal(size=(9, SWEEP.sweep_samples))
+
+
+def scans():
+    """Return three scans of a PulsON radar of 350 samples, and a fourth."""
+    messages = np.zeros(4, MESSAGE)
+    messages["type"], messages["source"], messages["step_bins"], messages["kind"] = 0xF201, 1, 32, 1
+    messages["start_ps"], messages["stop_ps"] = 10_000, 10_000 + round(350 / SAMPLE_RATE_HZ * 1e12)
+    messages["total"], messages["messages"], messages["antenna"] = 350, 1, 2
+    messages["id"], messages["time_ms"] = np.arange(4), 1000 + 20 * np.arange(4)
+    messages["scan"] = np.random.default_rng(2).normal(0, 1e4, (4, 350)).round()
+    return bytes(32) + messages.tobytes()
+
+
+def saved(array, **more):
+    """Return the bytes of a .npy file."""
+    stream = io.BytesIO()
+    np.save(stream, array, **more)
+    return stream.getvalue()
+
+
+def matlab(version="5", **fields):
+    stream = io.BytesIO()
+    savemat(stream, fields, format=version)
+    return stream.getvalue()
+
+
+def sound(dtype, channels=2, rate=44_100):
+    """Return a recording of a sound card: nine sweeps, sync in channel 1."""
+    samples = np.zeros((4000, channels))
+    for number in range(9):
+        first = 50 + 441 * number
+        samples[first : first + SWEEP.sweep_samples, 0] = 0.9
+        samples[first : first + SWEEP.sweep_samples, -1] = BEATS[number] / 10
+    top = {"i2": 2**15 - 1, "i4": 2**31 - 1, "f4": 1.0, "u1": 127}[dtype]
+    stream = io.BytesIO()
+    wavfile.write(stream, rate, (samples * top + 128 * (dtype == "u1")).astype(dtype))
+    return stream.getvalue()
+
+
+def of_24_bits(wav):
+    """Return the .wav file of 32 bits with 24, in the extensible form that recorders write."""
+    numbers = np.frombuffer(wav[44:], "<i4").view(np.uint8).reshape(-1, 4)[:, 1:].tobytes()
+    form = (
+        struct.pack("<HHIIHHHHI", 0xFFFE, 2, 44_100, 44_100 * 6, 6, 24, 22, 24, 3)
+        + b"\x01\x00"
+        + bytes.fromhex("000000001000800000aa00389b71")
+    )
+    chunks = b"fmt " + struct.pack("<I", len(form)) + form + b"data" + struct.pack("<I", len(numbers)) + numbers
+    return b"RIFF" + struct.pack("<I", 4 + len(chunks)) + b"WAVE" + chunks
+
+
+def gotcha(**changes):
+    """Return AFRL's structure of 8 frequencies and 5 pulses, as MATLAB saves it."""
+    pulses = np.arange(5.0)
+    fields = {
+        "fp": np.exp(1j * np.arange(40.0)).reshape(8, 5), "freq": 9.3e9 + 1e6 * np.arange(8.0),
+        "x": 7000 + pulses, "y": 10 * pulses, "z": np.full(5, 7000.0), "r0": 9900 + pulses,
+    }  # fmt: skip
+    return matlab(data=fields | changes)
+
+
+RECORDINGS = {
+    "npy: columns first in memory (Fortran)": ("beat_npy", "npy", saved(np.asfortranarray(BEATS)), 9),
+    "npy: big-endian doubles": ("beat_npy", "npy", saved(BEATS.astype(">f8")), 9),
+    "npy: a list of sweeps (pickled objects)": (
+        "beat_npy", "npy", saved(np.array([*BEATS, [1]], object), allow_pickle=True), "not readable",
+    ),
+    "npy: frames × receivers × samples": ("beat_npy", "npy", saved(BEATS[:, None]), "of shape (9, 1, 88)"),
+    "npy: complex samples where waveform.iq is real": (
+        "beat_npy", "npy", saved(BEATS.astype(complex)), "complex128 samples where waveform.iq is real",
+    ),
+    "mat: version 4": ("beat_mat", "mat", matlab("4", beat=BEATS), 9),
+    "mat: times as days of MATLAB": (
+        "beat_mat", "mat", matlab(beat=BEATS, time=739_751.4 + np.arange(9) * 0.01 / 86400),
+        "times as days of MATLAB (datenum); expected seconds since 1970",
+    ),
+    "mat: a table in place of the structure": ("afrl_mat", "mat", matlab(data=BEATS), "no structure called data"),
+    "mat: phase history in single precision, positions whole": (
+        "afrl_mat", "mat", gotcha(fp=np.ones((8, 5), np.complex64), x=np.arange(7000, 7005, dtype=np.int16)), 5,
+    ),
+    "mat: frequencies that descend": (
+        "afrl_mat", "mat", gotcha(freq=9.4e9 - 1e6 * np.arange(8.0)), "frequencies that do not rise in equal steps",
+    ),
+    "wav: 24 bits, extensible header": ("beat_wav", "wav", of_24_bits(sound("i4")), 9),
+    "wav: floats": ("beat_wav", "wav", sound("f4"), 9),
+    "wav: eight bits": ("beat_wav", "wav", sound("u1"), 9),
+    "wav: one channel": ("beat_wav", "wav", sound("i2", channels=1), "1 channels"),
+    "wav: another sample rate": ("beat_wav", "wav", sound("i2", rate=48_000), "48000 samples/s"),
+    "wav: an .mp3 that was renamed": ("beat_wav", "wav", b"ID3\x04" + bytes(900), "not readable"),
+    "cphd: a SICD image in NITF": ("cphd", "cphd", b"NITF02.10" + b" " * 4000, "not readable"),
+    "cphd: version 0.3": (
+        "cphd", "cphd", b"CPHD/0.3\nXML_DATA_SIZE := 3000\nXML_BYTE_OFFSET := 100\n\f\n" + bytes(4000), "CPHD/0.3",
+    ),
+    "pulson: log of the radar's own program, text": (
+        "pulson", "out", b"Timestamp, Config, NodeId, ScanStartPs\n" * 90, "without a message MRM_SCAN_INFO",
+    ),
+    "pulson: ends within a message": ("pulson", "out", scans()[:-500], 3),
+}  # fmt: skip
+
+
+@pytest.mark.usefixtures("reader")
+@pytest.mark.parametrize("case", RECORDINGS)
+def test_recordings_of_other_programs_are_read_or_refused_in_one_message(tmp_path, case):
+    kind, suffix, content, expected = RECORDINGS[case]
+    path = tmp_path / f"a.{suffix}"
+    path.write_bytes(content)
+
+    def read():
+        return read_phase_history(kind, [path], pair="a-a", described=FMCW if kind.startswith("beat") else {})
+
+    if isinstance(expected, str):
+        message = complaint(read)
+        assert expected in message
+        assert message.isprintable()
+        assert len(message) < 800
+        return
+    echo = read()
+    assert echo.sizes["pulse"] == expected
+    if kind.startswith("beat"):
+        late_s = np.full(9, 0.5 / SWEEP.sample_rate_hz) if kind == "beat_wav" else None  # sync rises between samples
+        right = transfer_of(BEATS, SWEEP, late_s=late_s)
+        scale = np.vdot(echo.transfer.values, right) / np.vdot(echo.transfer.values, echo.transfer.values)
+        apart = np.abs(scale * echo.transfer.values - right).max() / np.abs(right).max()
+        assert apart < (0.1 if "eight bits" in case else 1e-3)
+
+
+RASTER = {"count": 1, "dtype": "float32", "crs": "EPSG:32632", "transform": from_origin(500000, 5400100, 2, 2)}
+GROUND = 600 + np.add.outer(0.2 * np.arange(60), 0.3 * np.arange(60))  # by rows and columns of 2 m
+GRID = SceneGrid("EPSG:32632", 500030.0, 5400070.0, 1.0, (30, 30))
+
+
+def raster(path, heights=GROUND, *, write=None, **profile):
+    """Write a GeoTIFF of heights."""
+    kind = RASTER | {"height": heights.shape[-2], "width": heights.shape[-1]} | profile
+    with rasterio.open(path, "w", "GTiff", **kind) as file:
+        for band in range(1, kind["count"] + 1):
+            file.write(np.asarray(heights if heights.ndim == 2 else heights[band - 1]).astype(kind["dtype"]), band)
+        if write is not None:
+            write(file)
+
+
+def turned():
+    """Return heights on posts of 1 m that are turned by 30°, and their transform."""
+    place = (
+        Affine.translation(500045, 5400055)
+        @ Affine.rotation(-30)
+        @ Affine.scale(1, -1)
+        @ Affine.translation(-100, -100)
+    )
+    columns, rows = np.meshgrid(np.arange(200) + 0.5, np.arange(200) + 0.5)
+    x, y = place @ (columns, rows)
+    return 600 + 0.1 * (5400099 - y) + 0.15 * (x - 500001), place
+
+
+def in_web_mercator():
+    to_map = Transformer.from_crs("EPSG:3857", "EPSG:32632", always_xy=True)
+    west, north = Transformer.from_crs("EPSG:32632", "EPSG:3857", always_xy=True).transform(500000, 5400100)
+    x, y = to_map.transform(*np.meshgrid(west + 3 * np.arange(70) + 1.5, north - 3 * np.arange(70) - 1.5))
+    return 600 + 0.1 * (5400099 - y) + 0.15 * (x - 500001), from_origin(west, north, 3, 3)
+
+
+def masked(file):
+    file.write_mask(np.pad(np.zeros((4, 4), bool), ((20, 36), (20, 36)), constant_values=True))
+
+
+def coloured(file):
+    file.write_colormap(1, {value: (value, 0, 0) for value in range(256)})
+
+
+DEMS = {
+    "differences of floats (predictor 3) in DEFLATE, heights about 0": (
+        lambda path: raster(path, GROUND - 600, dtype="float32", predictor=3, compress="deflate"),
+        -600.0,
+    ),
+    "BigTIFF, tiled, ZSTD": (
+        lambda path: raster(path, BIGTIFF="YES", tiled=True, blockxsize=16, blockysize=16, compress="zstd"),
+        0.0,
+    ),
+    "int16 of decimetres less 500 m": (
+        lambda path: raster(
+            path,
+            np.rint(10 * (GROUND - 500)),
+            dtype="int16",
+            write=lambda file: (setattr(file, "scales", (0.1,)), setattr(file, "offsets", (500.0,))),
+        ),
+        0.0,
+    ),
+    "turned by 30 degrees": (lambda path: raster(path, turned()[0], transform=turned()[1]), 0.0),
+    "Web Mercator": (
+        lambda path: raster(path, in_web_mercator()[0], transform=in_web_mercator()[1], crs="EPSG:3857"),
+        0.0,
+    ),
+    "another UTM zone": (
+        lambda path: raster(path, crs="EPSG:32633", transform=from_origin(60000, 5420000, 2, 2)),
+        "% of the scene lies outside",
+    ),
+    "a mask within the file": (lambda path: raster(path, write=masked), "no height at"),
+    "no data that is NaN by name alone": (
+        lambda path: raster(
+            path, np.where(np.pad(np.ones((3, 3)), ((20, 37), (20, 37))) > 0, np.nan, GROUND), nodata=np.nan
+        ),
+        "no height at",
+    ),
+    "shaded relief in colours": (
+        lambda path: raster(path, np.stack([GROUND % 255] * 3), count=3, dtype="uint8", photometric="RGB"),
+        "colours (red, green, blue), not heights",
+    ),
+    "land cover with a palette": (
+        lambda path: raster(path, GROUND % 9, dtype="uint8", write=coloured),
+        "colours (palette), not heights",
+    ),
+    "complex image": (lambda path: raster(path, dtype="complex64"), "heights of type complex64"),
+    "kilometres": (
+        lambda path: raster(path, GROUND / 1000, write=lambda file: setattr(file, "units", ("km",))),
+        "heights in km",
+    ),
+    "JPEG2000 that was renamed": (
+        lambda path: path.write_bytes(b"\0\0\0\x0cjP  \r\n\x87\n" + bytes(900)),
+        "not readable as GeoTIFF",
+    ),
+    "ground control points alone": (
+        lambda path: raster(path, crs=None, transform=Affine.identity()),
+        "no CRS on Earth",
+    ),
+}
+
+
+@pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+@pytest.mark.parametrize("case", DEMS)
+def test_elevation_models_of_other_programs_are_read_or_refused_in_one_message(tmp_path, case):
+    write, expected = DEMS[case]
+    path = tmp_path / "dem.tif"
+    write(path)
+
+    def read():
+        terrain = open_dem(path, GRID, datum="ellipsoid")
+        height_range(terrain, GRID, where=path)
+        return terrain.heights(GRID)
+
+    if isinstance(expected, str):
+        message = complaint(read)
+        assert expected in message
+        assert message.isprintable()
+        assert len(message) < 800
+    else:
+        right = 600 + 0.1 * (5400099 - GRID.y_m)[:, None] + 0.15 * (GRID.x_m - 500001) + expected
+        np.testing.assert_allclose(read(), right, atol=0.06)

@@ -361,6 +361,7 @@ def _transformer(source: str | CRS, target: str | CRS) -> Transformer:
 
 # ---- Opening a DEM file
 
+_COLOURS = {"red", "green", "blue", "palette", "hue", "saturation", "lightness", "cyan", "magenta", "yellow"}
 _EXPECTED = "the DEM of scene.dem, a GeoTIFF of heights"
 NAMES_FILES = re.compile(r'\+proj=|grids=|init=|"PROJ4"|PARAMETERFILE\["[^"]*","[^"]*[/\\:~]', re.IGNORECASE)
 """Parts of a CRS (WKT) that make PROJ open files other than the grids in its own folders."""
@@ -447,12 +448,16 @@ def _header(path: Path) -> tuple[tuple[float, ...], tuple[int, int], str, CRS | 
             raster.transform,
             raster.dtypes[0],
         )
+        colours = [one.name for one in raster.colorinterp if one.name in _COLOURS]
         try:
             system = CRS.from_user_input(raster.crs) if raster.crs else None
             if system and NAMES_FILES.search(system.to_wkt()):
                 raise _wrong(path, "a CRS that names a file", "a CRS that is complete in itself, or names a known grid")
         except ProjError as error:
             raise _wrong(path, f"a CRS that PROJ does not read ({shown(error)})", "a CRS that PROJ reads") from error
+    if colours:
+        found = f"colours ({', '.join(colours)}), not heights"
+        raise _wrong(path, found, "a band of heights, which a shaded relief or a map has not")
     if min(shape) < 2:
         raise _wrong(path, f"{shape[0]} × {shape[1]} posts", "at least 2 × 2")
     if not np.issubdtype(np.dtype(kind), np.integer) and not np.issubdtype(np.dtype(kind), np.floating):

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 PULSE_FIELDS = ("TxTime", "TxPos", "RcvTime", "RcvPos", "SRPPos", "FX1", "FX2", "TOA1", "TOA2", "SC0", "SCSS")
 """Of each pulse, what an image needs."""
 
+_LONGEST_KIND = 64
 PATH_LIMIT = "APERTURA_PATH_LIMIT"
 """Parameter of each pulse that our own files add: `path_limit` of stage echo, m."""
 
@@ -45,6 +46,12 @@ def read_fields(path: Path) -> dict[str, NDArray[Any]]:
     from lxml import etree
 
     with path.open("rb") as stream:
+        first = stream.readline(_LONGEST_KIND).decode("ascii", errors="replace").strip()
+        if not first.startswith("CPHD/"):
+            raise ValueError(f"it begins with {first[:20]!r}, not with CPHD/ and a version")
+        if not first.startswith("CPHD/1."):
+            raise ValueError(f"version {first!r}, and neither 1.0.1 nor 1.1.0")
+        stream.seek(0)
         kind, header = skcphd.read_file_header(stream)
         stream.seek(0)
         with skcphd.Reader(stream) as reader:

@@ -29,6 +29,9 @@ _LARGEST = 1e15
 _FARTHEST_S = 2.0**33
 """Since 1970, what nanoseconds can count."""
 
+_DATENUM = 723_181, 803_534
+"""1980 and 2200 as MATLAB counts days."""
+
 _LEAST_STEP = 0.9
 """Of a sweep, what at least is between the beginnings of two; float64 seconds since 1970 are good to 0.2 us."""
 
@@ -246,6 +249,9 @@ def _times(stored: NDArray[Any], path: Path) -> Times:
         with np.errstate(invalid="ignore", over="ignore"):  # what is no number becomes no time, and is refused as such
             seconds = stored.astype(np.float64)
             seconds = np.where(np.abs(seconds) < _FARTHEST_S, seconds, np.nan)
+            if _are_datenum(seconds):
+                found = "times as days of MATLAB (datenum)"
+                raise CampaignError(found, path, "seconds since 1970", "Write 86400 * (time - 719529).")
             whole = np.floor(seconds)
             # apart, because float64 holds nanoseconds of one second but not of all since 1970
             rest = np.round((seconds - whole) * 1e9).astype("timedelta64[ns]")
@@ -255,6 +261,11 @@ def _times(stored: NDArray[Any], path: Path) -> Times:
     if wrong.size:
         raise _error(f"time {int(wrong[0])} is none between 1970 and 2199", path)
     return stored.astype("datetime64[ns]")
+
+
+def _are_datenum(time: NDArray[np.float64]) -> bool:
+    """Return whether times are days since the year 0, of 1980 to 2199; as seconds they were of January 1970."""
+    return bool(time.size and (time > _DATENUM[0]).all() and (time < _DATENUM[1]).all() and np.ptp(time) < 1)
 
 
 def _error(found: str, path: Path, expected: str = _EXPECTED) -> CampaignError:
