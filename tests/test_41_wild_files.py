@@ -1,6 +1,8 @@
 """Files of a campaign that no person would write: each is one message where a traceback, or nothing, used to be."""
 
+import hashlib
 import io
+import json
 import os
 import struct
 from dataclasses import asdict
@@ -633,3 +635,59 @@ def test_elevation_models_of_other_programs_are_read_or_refused_in_one_message(t
     else:
         right = 600 + 0.1 * (5400099 - GRID.y_m)[:, None] + 0.15 * (GRID.x_m - 500001) + expected
         np.testing.assert_allclose(read(), right, atol=0.06)
+
+
+def described_by(meta, changes):
+    """Change metadata by ``part.key`` → value, where part is global or the number of a capture."""
+    for name, value in changes.items():
+        part, _, key = name.partition(".")
+        (meta["global"] if part == "global" else meta["captures"][int(part)])[key] = value
+    return meta
+
+
+COUNTS = np.arange(128, dtype="<i2")
+NOTES = '[{"core:sample_start": 0, "core:label": "\\u0000"}]'
+SIGMF = {
+    "byte-order mark and blanks between all": ({}, lambda text: ("\ufeff" + text.replace(",", " ,\r\n\t")).encode(), 4),
+    "keys of other programs, geolocation, annotations": (
+        {"global.core:geolocation": {"type": "Point", "coordinates": [9.9, 48.4]}, "global.gnuradio:block": [1, {}]},
+        lambda text: text.replace('"captures"', f'"annotations": {NOTES}, "captures"').encode(), 4,
+    ),
+    "core:sha512 in capitals": (
+        {"global.core:sha512": hashlib.sha512(COUNTS.tobytes()).hexdigest().upper()}, str.encode, 4,
+    ),
+    "time tags with an offset": (
+        {"1.core:datetime": "2025-05-14T11:30:01+02:00"}, str.encode, "captures.1.core:datetime: ",
+    ),
+    "metadata in UTF-16": ({}, lambda text: text.encode("utf-16"), "not valid SigMF: no JSON"),
+    "metadata cut off": ({}, lambda text: text[:-40].encode(), "not valid SigMF: no JSON"),
+    "captures that are not sorted": ({"2.core:sample_start": 8}, str.encode, "capture 1 holds -8 samples"),
+    "real samples without an intermediate frequency": (
+        {"global.core:datatype": "ri16_le"}, str.encode, "core:datatype ri16_le without apertura:if_hz",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", SIGMF)
+def test_sigmf_of_other_programs_is_read_or_refused_in_one_message(tmp_path, case):
+    """Four captures of 16 samples."""
+    changes, text_of, expected = SIGMF[case]
+    captures = [
+        {"core:sample_start": 16 * n, "core:datetime": f"2025-05-14T09:30:0{n}Z", "core:frequency": 1.2e9}
+        for n in range(4)
+    ]
+    known = {"core:datatype": "ci16_le", "core:version": "1.2.0", "core:sample_rate": 1e6}
+    meta, data = tmp_path / "a.sigmf-meta", tmp_path / "a.sigmf-data"
+    meta.write_bytes(text_of(json.dumps(described_by({"global": known, "captures": captures}, changes))))
+    data.write_bytes(COUNTS.tobytes())
+    if isinstance(expected, str):
+        message = complaint(lambda: open_sigmf(meta, data))
+        assert expected in message
+        assert message.isprintable()
+        assert len(message) < 800
+        return
+    recording = open_sigmf(meta, data)
+    recording.check_hash()
+    assert len(recording.captures.start) == expected
+    iq = recording.samples.captures(recording.captures.start, 16)
+    np.testing.assert_array_equal(iq.ravel(), COUNTS)
