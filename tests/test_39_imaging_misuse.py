@@ -353,3 +353,14 @@ def test_the_budget_of_arrays_states_what_air_would_do_where_vacuum_is_assumed()
     assert line["shift_m"] == pytest.approx(300e-6 * slant_m * slant_m / ground_m, rel=0.1)
     stated = ap.backproject(HISTORY, TARGET_GRID, judge=False, atmosphere=285.0).attrs["budget"]
     assert "20 N units" in stated
+
+
+@pytest.mark.parametrize(("accuracy_db", "replaced"), [(-60.0, False), (-100.0, True)])
+def test_a_requested_engine_that_is_too_coarse_is_replaced_and_that_is_flagged(accuracy_db, replaced):
+    image = ap.backproject(HISTORY, TARGET_GRID, engine="native", accuracy_db=accuracy_db, judge=False)
+    flags = json.loads(image.attrs["flags"])
+    assert ("engine_replaced" in flags) == replaced
+    if replaced:
+        assert flags["engine_replaced"] == "the image by reference: native, as requested, misses -100 dB"
+    left_to_the_planner = ap.backproject(HISTORY, TARGET_GRID, accuracy_db=accuracy_db, judge=False)
+    assert "engine_replaced" not in json.loads(left_to_the_planner.attrs["flags"])

@@ -318,6 +318,10 @@ _OF_IMAGES = {
         "is wrong alike",
         "nodes.<n>.receiver: gain_db, full_scale_dbm or full_scale_v, full_scale_counts, noise_figure_db",
         "pipeline/opening/radiometry.py"),
+    "engine_replaced": Flag(
+        "tiles, engine requested and engine used, accuracy",
+        "the requested engine misses the requested accuracy: another one formed the image, or some of its tiles",
+        "processing.engine auto, or a coarser processing.accuracy_db", "core/planning/plan.py"),
     "accuracy_missed": Flag(
         "bound of the error, accuracy asked, dB", "at 95 %, the error may exceed the accuracy asked",
         "processing.accuracy_db, processing.engine", "core/imaging/certify.py, core/imaging/backproject.py"),

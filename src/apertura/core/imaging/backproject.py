@@ -195,6 +195,7 @@ def backproject(  # noqa: PLR0913 - each choice is a keyword, so that an editor 
             "numerical_error_estimate_db": round(error.estimate_db, 2),
             "certified_pixels": certified_pixels,
         }
+        flags = Flags.merged(flags, plan.replaced_by(formation.plan.setting, "the image"))
         if error.bound_db > accuracy_db:
             sure = f"up to {error.bound_db:.1f} dB ({CONFIDENCE:.0%} sure)"
             flags["accuracy_missed"] = f"{sure}, {accuracy_db:g} dB asked"

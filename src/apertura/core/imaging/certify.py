@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.common.contracts import Window
+from apertura.common.flags import Flags
 from apertura.core.backprojection.tiles import compute_tiles
 from apertura.core.imaging.formation import Formation
 from apertura.core.quality.error_check import CONFIDENCE, Brightness, Certificate, random_pixels
@@ -48,7 +49,7 @@ def certified(
     """
     count = min(max(RANDOM_PIXELS, len(formation.windows)), _MOST_TILES)
     drawn, certificate = random_pixels(formation.windows, count, np.random.default_rng(0)), None
-    settings, redone = iter(formation.plan.fallbacks), []
+    settings, redone, flags = iter(formation.plan.fallbacks), [], Flags()
     while True:
         brightness, setting = Brightness.of(target, formation.windows), next(settings, None)
         # Random pixels do not depend on the image, bright ones do: of the first image pulses are read once for both.
@@ -68,15 +69,18 @@ def certified(
         rewriting([*uncertified, *worse])
         for tiles in (uncertified, worse):
             compute_tiles(image, tiles, target, threads=threads, scheduler=scheduler)
+        flags = Flags.merged(flags, formation.plan.replaced_by(setting, f"{len(worse) + len(uncertified)} tiles"))
         redone.append({"tiles": len(worse) + len(uncertified), "with": f"{setting.line}, every pulse"})
     line = f"numerical error up to {error.bound_db:.1f} dB ({CONFIDENCE:.0%} sure), {accuracy_db:.1f} dB asked"
+    if error.bound_db > accuracy_db:
+        flags["accuracy_missed"] = line
     return {
         "numerical_error_db": round(error.bound_db, 2),
         "numerical_error_confidence": CONFIDENCE,
         "numerical_error_estimate_db": round(error.estimate_db, 2),
         "certified_pixels": count + BRIGHT_PIXELS,
         "redone": redone,
-        "flags": {"accuracy_missed": line} if error.bound_db > accuracy_db else {},
+        "flags": flags,
     }
 
 

@@ -12,6 +12,7 @@ from rich.filesize import decimal
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
+from apertura.common.flags import Flags
 from apertura.core.antenna.beam import Beams
 from apertura.core.antenna.illumination import Illumination
 from apertura.core.backprojection.engines.engine import Setting
@@ -247,6 +248,8 @@ class Plan:
         The ground that is imaged on: as it is, a plane through it, or level.
     beams, integration, illumination
         Of the job.
+    fixed_engine
+        Whether the engine of `setting` was requested.
     """
 
     setting: Setting
@@ -264,6 +267,7 @@ class Plan:
     beams: Beams | None = field(default=None, repr=False)
     integration: Integration | None = field(default=None, repr=False)
     illumination: Illumination | None = field(default=None, repr=False)
+    fixed_engine: bool = False
 
     @property
     def engine(self) -> str:
@@ -309,6 +313,13 @@ class Plan:
             presum=None,
             middle_m=None,
         )
+
+    def replaced_by(self, setting: Setting, what: str) -> Flags:
+        """Raise a flag where a requested engine is replaced for `what`, the image or some of its tiles."""
+        if not self.fixed_engine or setting.engine == self.engine:
+            return Flags()
+        line = f"{what} by {setting.engine}: {self.engine}, as requested, misses {self.accuracy_db:.0f} dB"
+        return Flags({"engine_replaced": line})
 
     def inputs(self, profiles: Profiles) -> Profiles:
         """Return the profiles for the plan's setting, presummed if planned: the image's sum over pulses is the same."""

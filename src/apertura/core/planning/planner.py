@@ -241,6 +241,7 @@ def make_plan(
         beams=job.beams,
         integration=integrated,
         illumination=job.illumination,
+        fixed_engine="engine" in requested,
     )
 
 
