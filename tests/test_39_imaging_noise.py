@@ -59,6 +59,16 @@ def test_pulses_that_are_missing_let_no_echo_into_the_noise(share):
     assert 10 * np.log10(deaf.power / noise) > 2
 
 
+@pytest.mark.parametrize(("every", "sparse"), [(1, False), (2, True)])
+def test_where_pulses_are_sparse_the_deviation_holds_what_echoes_leak_into_the_noise(every, sparse):
+    """Twice the scene's Doppler leaves too little of the band: echoes beside the scene raise what is measured."""
+    noise, whole = 1e-2, profiles(1e-2)
+    some = replace(whole, samples=whole.samples[::every], start_m=whole.start_m[::every], aperture=FLOWN[::every])
+    found = noise_power(some, PLACES)
+    assert (found.std_db > 0.6) == sparse
+    assert abs(10 * np.log10(found.power / noise)) < max(0.35, 2 * found.std_db)
+
+
 def test_the_deviation_told_is_that_of_many_recordings():
     """Also where 64 places lie in a few resolution cells and are hardly more than one."""
     drawn = [profiles(1.0, echo=0.0, seed=seed, pulses=128) for seed in range(24)]
