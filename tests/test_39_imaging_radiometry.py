@@ -293,3 +293,22 @@ def test_a_block_of_ground_that_no_beam_reaches_has_no_calibration_and_stops_not
     power = found.power((slice(0, 20), slice(0, 600)), "sigma0")
     assert np.isfinite(power[10, 20])
     assert np.isnan(power[:, 512:]).all()
+
+
+def test_sigma0_of_level_ground_near_nadir_is_not_told():
+    """Below the track the area of a cell by sin θ has no meaning: 3 dB off within 5° of it, NaN now."""
+    track = straight_track(96, length_m=14.0)
+    aperture = Aperture(track + [0.0, 0.0, 12.0], track + [0.0, 0.0, 12.0])
+    grid = SceneGrid("local", -3.0, float(track[0, 1]) + 12.0, 0.25, (96, 24))
+    found = calibrated(aperture, grid=grid)
+    rows, column = slice(0, 96), slice(12, 13)
+    power = found.power((rows, column), "sigma0")[:, 0]
+    aside_m = np.abs(grid.positions_at(np.arange(96), np.full(96, 12), np.zeros(96))[:, 1] - track[0, 1])
+    incidence_deg = np.degrees(np.arctan2(aside_m, track[0, 2] + 12.0))
+    assert np.isnan(power[incidence_deg < 4.5]).all()
+    assert np.isfinite(power[incidence_deg > 7.0]).all()
+    assert np.isfinite(found.rcs_power((rows, column))).all()
+    turn = np.linspace(0, 2 * np.pi, 256, endpoint=False)
+    circle = np.stack([20 * np.cos(turn), 20 * np.sin(turn), np.full(256, 20.0)], -1)
+    seen = calibrated(Aperture(circle, circle), grid=SceneGrid("local", -3.0, 3.0, 0.25, (24, 24)))
+    assert np.isfinite(seen.power((slice(0, 24), slice(0, 24)), "sigma0")).all()

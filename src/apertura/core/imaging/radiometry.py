@@ -211,6 +211,8 @@ class Calibration:
     directions
         (node row, node column, 3, 3) float64, unit vectors: up, normal of the slant plane, towards the bisector of
         both antennas.
+    across
+        (node row, node column) float64, sine of the incidence across the track: 0 at nadir.
 
     Notes
     -----
@@ -229,6 +231,7 @@ class Calibration:
     area_m2: Floats
     noise: Floats
     directions: Floats
+    across: Floats
 
     @classmethod
     def of(
@@ -277,6 +280,7 @@ class Calibration:
             area,
             noise,
             np.zeros((*lattice.shape, 3, 3)),
+            np.ones(lattice.shape),
         )
         fill(lattice, found._fill, grid, terrain, aperture, beams, threads=threads)
         return found
@@ -301,6 +305,7 @@ class Calibration:
             self.gain[block] = 2 * np.log(amplitude).reshape(shape)
             self.area_m2[block] = np.log(self.cell_m2 * level).reshape(shape)
             self.noise[block] = np.log((weight**2).sum(axis=0) * share / self.count).reshape(shape)
+        self.across[block] = _across(gradient, share_of, up).reshape(shape)
         self.directions[block] = np.stack([up, slant, towards], axis=1).reshape(*shape, 3, 3)
 
     def _parts(self, pulses: slice, points: Floats) -> tuple[Floats, Floats]:
@@ -356,12 +361,15 @@ class Calibration:
         Returns
         -------
         ndarray
-            (row, column) float64, NaN where no pulse sees the pixel; with normals also where the ground is so near to
-            layover that its area is hardly known, beyond it, or faces away (gamma0).
+            (row, column) float64, NaN where no pulse sees the pixel, and for sigma0 of level ground within 5.7° of nadir;
+            with normals where the ground is so near to layover that its area is hardly known, beyond it, or faces
+            away (gamma0).
         """
         level = self.rcs_power(window) * self.cell(window)
         if quantity == "sigma0" and (normal is None or isinstance(self.terrain, FlatGround)):
-            return level
+            if not (self.across < _STEEPEST).any():
+                return level
+            return np.where(self.lattice.between(self.across, window) < _STEEPEST, np.nan, level)
         up, slant, towards = np.moveaxis(self.lattice.between(self.directions, window), -2, 0)
         slant, towards = _unit(slant), _unit(towards)
         normal = up if normal is None else normal
@@ -435,6 +443,21 @@ def _directions(gradient: Floats, parts: Floats, up: Floats) -> tuple[Floats, Fl
     slant = np.cross(mean, np.linalg.eigh(spread)[1][..., -1])
     slant *= np.where((slant * up).sum(-1, keepdims=True) < 0, -1.0, 1.0)
     return _unit(slant), _unit(-mean)
+
+
+def _across(gradient: Floats, parts: Floats, up: Floats) -> Floats:
+    """Return the sine of the incidence across the direction in which the gradient moves along the track, (point,).
+
+    Half of the rms of the level gradient's component across the main axis of its own spread over the pulses: R sin θ
+    aside a straight track, and of the same order at the middle of a circle.
+    """
+    size = np.abs(parts)
+    weight = size / np.maximum(size.sum(axis=0), 1e-300)
+    level = gradient - (gradient * up).sum(-1, keepdims=True) * up
+    apart = level - np.einsum("pk,pkc->kc", weight, level)
+    spread = np.einsum("pk,pkc,pkd->kcd", weight, apart, apart)
+    aside = np.cross(up, np.linalg.eigh(spread)[1][..., -1])
+    return np.asarray(np.sqrt(np.einsum("pk,pk->k", weight, (level * aside).sum(-1) ** 2)) / 2)
 
 
 def _unit(vectors: Floats) -> Floats:
