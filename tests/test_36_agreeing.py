@@ -163,6 +163,8 @@ def test_a_pair_that_shares_nothing_is_added_and_named_unmeasured_unless_it_hide
     assert told.agreeing == ("a", "b")
     assert told.phases_rad == {"a": 0.0, "b": 0.0, "c": 0.0}
     assert set(told.unmeasured) == {"c"}
+    coarse = choose_fusion(rank, between, coarse="pixels of 0.2 m do not resolve cells of 0.1 m", align=False)
+    assert coarse.unmeasured == {"c": "pixels of 0.2 m do not resolve cells of 0.1 m"}
     vague = choose_fusion(rank, between | {("a", "c"): difference(2.0, std_rad=0.7)}, align=False)
     assert "not certain enough" in vague.unmeasured["c"]
     hidden = choose_fusion(rank, between, hidden={("a", "c")}, align=False)

@@ -2,11 +2,13 @@
 
 import json
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from folders import SHARED, copy_writable, edit_config, edit_track, run_steps
 
+from apertura.core.scene.grid import SceneGrid
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.opening.diagnosis import Hypothesis, Trial, explanation
 from apertura.pipeline.opening.images import assessment_of
@@ -85,7 +87,7 @@ def test_the_sign_of_a_lever_arm_is_seen_and_named(tmp_path):
     campaign = sample(tmp_path, lambda root: edit_config(root, flip_right_arm))
     reports = reports_of(campaign)
     for pair in PAIRS:
-        assert reports[pair]["focus"]["loss_db"] > -0.1
+        assert reports[pair]["focus"]["loss_db"] > -0.3
         assert reports[pair]["focus"]["verdict"] == "cannot tell"
         assert "contradicted by pairs_apart, pairs_out_of_phase" in reports[pair]["focus"]["why"]
         assert {"pairs_apart", "pairs_out_of_phase"} <= set(reports[pair]["flags"])
@@ -251,6 +253,16 @@ def papers_flight(tmp_path_factory):
     root = tmp_path_factory.mktemp("uav") / "campaign"
     simulate(root, preset("paper-uav"), seed=1)
     return run_steps(root)
+
+
+@pytest.mark.parametrize(
+    ("spacing_m", "reason"), [(0.1, ""), (0.11, "pixels of 0.11 m do not resolve cells of 0.0997 m")]
+)
+def test_pixels_hardly_wider_than_a_cell_are_compared_and_wider_ones_are_named_as_the_reason(spacing_m, reason):
+    """A cell of 9.97 cm against pixels of 10 cm is no loss: the band is sampled twice a cycle up to 1.13 cells."""
+    shown = {pair: SimpleNamespace(cell_m=0.0997) for pair in PAIRS}
+    grid = SceneGrid("local", 0.0, 10.0, spacing_m, (100, 100))
+    assert assess._too_coarse(shown, grid).partition(":")[0] == reason
 
 
 @pytest.mark.slow

@@ -215,7 +215,8 @@ _OF_IMAGES = {
         "m that the antennas moved", "the antennas hardly moved as the scene sees it: no image",
         "kind bench in flights.tsv; the flight log; config/segments.tsv", "core/planning/plan.py"),
     "spacing_coarse": Flag(
-        "spacing, finest resolution cell", "pixels are wider than the finest resolution cell", "scene.spacing_m",
+        "spacing, finest resolution cell", "pixels are wider than the finest resolution cell by over 5 %",
+        "scene.spacing_m",
         "core/planning/plan.py"),
     "pulses_sparse": Flag(
         "spread of phase rates, cycles per pulse; share that folds, its dB",
@@ -289,8 +290,9 @@ _OF_IMAGES = {
         "the flags of that pair; processing.fusion.align_phase", "pipeline/steps/export.py"),
     "phase_unmeasured": Flag(
         "the pair, why, dB that a wrong phase costs",
-        "no image tells the phase of a pair in the coherent sum: if wrong, targets split",
-        "a reflector in the scene; a calibration flight", "pipeline/steps/export.py"),
+        "the phase offset of a pair in the coherent sum is not observable: if wrong, targets split",
+        "what the line names: a finer scene.spacing_m, else a reflector in the scene or a calibration flight",
+        "pipeline/steps/export.py"),
     "sum_incoherent": Flag(
         "share of power in phase at bright points, dB lost",
         "pairs of the coherent sum are not in phase: its peaks are weaker than theirs",

@@ -178,6 +178,7 @@ def choose_fusion(
     between: Mapping[tuple[str, str], Agreement | None],
     *,
     hidden: Collection[tuple[str, str]] = (),
+    coarse: str = "",
     align: bool,
 ) -> CoherentSum:
     """Return which pairs add coherently: the largest set that agrees in phase and place.
@@ -191,6 +192,8 @@ def choose_fusion(
     hidden
         Two pairs of which the second shows none of the bright points of the first, as it should: added it would be
         noise.
+    coarse
+        Why no two images could be compared, where their pixels are too wide for that.
     align
         Whether a constant phase is removed: members may then have any.
 
@@ -229,7 +232,7 @@ def choose_fusion(
         else:
             phases[pair], guess = 0.0, best.against(pair, vague, reference)
             unmeasured[pair] = (
-                f"it shares nothing with {_named(agreeing)} that tells a phase"
+                coarse or f"it shares nothing with {_named(agreeing)} that tells a phase"
                 if guess is None
                 else f"{_phase_line(guess, reference)} is not certain enough"
             )

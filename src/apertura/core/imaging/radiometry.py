@@ -361,9 +361,9 @@ class Calibration:
         Returns
         -------
         ndarray
-            (row, column) float64, NaN where no pulse sees the pixel, and for sigma0 of level ground within 5.7° of nadir;
-            with normals where the ground is so near to layover that its area is hardly known, beyond it, or faces
-            away (gamma0).
+            (row, column) float64, NaN where no pulse sees the pixel, and for sigma0 of level ground within 5.7° of
+            nadir; with normals where the ground is so near to layover that its area is hardly known, beyond it, or
+            faces away (gamma0).
         """
         level = self.rcs_power(window) * self.cell(window)
         if quantity == "sigma0" and (normal is None or isinstance(self.terrain, FlatGround)):

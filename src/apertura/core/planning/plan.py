@@ -20,6 +20,7 @@ from apertura.core.backprojection.inputs import Profiles
 from apertura.core.backprojection.job import Integration, Job
 from apertura.core.backprojection.presum import Presum, presummed
 from apertura.core.geometry.aperture import Aperture
+from apertura.core.quality.agreement import WIDEST_PIXEL
 from apertura.core.scene.terrain import Terrain
 
 # ---- Limits of imaging
@@ -52,7 +53,7 @@ def check_geometry(job: Job) -> dict[str, str]:
         )
     weigh = None if job.sector is None else job.sector.over(aperture)
     cell_m = aperture.resolution_cell_m(ground_m, band_hz=job.band_hz, weigh=weigh)
-    if job.spacing_m > cell_m:
+    if job.spacing_m > WIDEST_PIXEL * cell_m:
         flags["spacing_coarse"] = (
             f"spacing {job.spacing_m:g} m, finest resolution cell {cell_m:.3g} m: targets fall between"
         )

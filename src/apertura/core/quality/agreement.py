@@ -18,6 +18,9 @@ from apertura.core.quality.point_targets import PATCH_PX, BandLimitedPatch
 REACH_M = 4.0
 """Metres, largest shift between two images that is searched, or a dozen cells: more would match other points."""
 
+WIDEST_PIXEL = 1.05
+"""Pixel spacing in finest resolution cells at most: pixels of 1.13 cells of a flat band sample it critically."""
+
 SHIFTED = 0.18
 """Shift of two images in units of eq. 6, a tenth of the resolution cell, above which, and beyond their uncertainty,
 they show different places."""

@@ -12,7 +12,7 @@ from apertura.common.contracts import Window
 from apertura.common.documents import undamaged
 from apertura.common.errors import CampaignError
 from apertura.common.provenance import sha256_file
-from apertura.core.quality.agreement import Agreement, agreement, agreement_of_ground
+from apertura.core.quality.agreement import WIDEST_PIXEL, Agreement, agreement, agreement_of_ground
 from apertura.core.quality.bright_points import SPECKLE, BrightPoint, bright_points, has_point, near
 from apertura.core.quality.measures import BlockRaster
 from apertura.core.quality.point_targets import BandLimitedPatch, carrier_at
@@ -201,7 +201,7 @@ def agreement_of(
 
 def comparable(first: ComparedImage, second: ComparedImage, grid: SceneGrid) -> bool:
     """Return whether the pixels of two images are fine enough to compare the places of points."""
-    return grid.spacing_m <= min(first.cell_m, second.cell_m)
+    return grid.spacing_m <= WIDEST_PIXEL * min(first.cell_m, second.cell_m)
 
 
 def shows_points_of(first: ComparedImage, second: ComparedImage, grid: SceneGrid) -> bool:

@@ -296,10 +296,11 @@ def assess(campaign: Campaign, flight: str) -> Path:
     rank = {pair: _rank(one["focus"]) for pair, one in quality.items()}
     track = open_refined(campaign, flight)
     refined = track.correction is not None
-    as_formed = choose_fusion(rank, between, hidden=hidden, align=False)
+    coarse = _too_coarse(shown, grid)
+    as_formed = choose_fusion(rank, between, hidden=hidden, coarse=coarse, align=False)
     # A path that is constant for a pair is invisible to the refinement of tracks: its phase is removed here.
     align = refined or campaign.settings.processing.fusion.align_phase
-    fusion = choose_fusion(rank, between, hidden=hidden, align=True) if align else as_formed
+    fusion = choose_fusion(rank, between, hidden=hidden, coarse=coarse, align=True) if align else as_formed
     explained_rad = track.stage.attrs["report"].get("pair_phase_std_rad", {}) if refined else None
     flags = _flags(pairs, as_formed, hidden, explained_rad=explained_rad)
     for pair, name, line in wrong_codes({pair: one.get("code", {}) for pair, one in quality.items()}):
@@ -323,6 +324,14 @@ def assess(campaign: Campaign, flight: str) -> Path:
     path = campaign.result(flight, "assessment.json")
     save_document(path, report, lineage)
     return path
+
+
+def _too_coarse(shown: Mapping[str, ComparedImage], grid: SceneGrid) -> str:
+    """Return why no two images can be compared where pixels are wider than their cells; empty where they can."""
+    if any(comparable(one, two, grid) for one, two in combinations(shown.values(), 2)):
+        return ""
+    cell_m = min((image.cell_m for image in shown.values()), default=np.inf)
+    return f"pixels of {grid.spacing_m:g} m do not resolve cells of {cell_m:.3g} m: make scene.spacing_m finer"
 
 
 def _hides(first: ComparedImage, second: ComparedImage, grid: SceneGrid) -> bool:
