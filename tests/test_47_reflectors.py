@@ -342,9 +342,26 @@ def test_constants_of_another_radar_are_refused(later, tmp_path):
     message = complaint(lambda: calibrated_pair(Campaign.load(root), pair, scene))
     assert "centre_hz is 1.4048e+09 and was 1.3e+09" in message
     change_file(root, lambda document: document["pairs"].pop("uav1-uav1"))
-    assert "no constant of uav1-uav1, but of uav1-uav2" in complaint(
-        lambda: calibrated_pair(Campaign.load(root), pair, scene)
-    )
+    assert calibrated_pair(Campaign.load(root), pair, scene) is None
+
+
+@pytest.mark.slow
+def test_a_pair_without_a_constant_is_flagged_and_the_other_one_calibrated(later, tmp_path):
+    """A trihedral serves the monostatic pair alone: the run goes on, the bistatic pair holds no σ⁰ and says why."""
+    root = copy_writable(later.root, tmp_path / "campaign")
+    change_file(root, lambda document: document["pairs"].pop("uav1-uav2"))
+    campaign = Campaign.load(root)
+    for pair in ("uav1-uav1", "uav1-uav2"):
+        layers.layers(campaign, "f01", pair)
+        export.export(campaign, "f01", pair)
+    told = {
+        pair: json.loads(campaign.result("f01", pair, "image.json").read_text()) for pair in campaign.images["f01"][:2]
+    }
+    assert "pair_uncalibrated" not in told["uav1-uav1"]["flags"]
+    assert told["uav1-uav2"]["flags"]["pair_uncalibrated"].startswith("calibration.json has no constant of uav1-uav2")
+    for pair, some in (("uav1-uav1", True), ("uav1-uav2", False)):
+        with rasterio.open(str(campaign.result("f01", pair, "sigma0_db.tif"))) as raster:
+            assert np.isfinite(raster.read(1, masked=True).filled(np.nan)).any() == some
 
 
 # ---- Without recordings ---------------------------------------------------------------------------------------------
@@ -417,9 +434,11 @@ def test_a_file_of_constants_is_checked_before_anything_runs(tiny):
     state(tiny, "processing", radiometric_calibration="calibration.json")
     (line,) = map(as_line, problems(tiny))
     assert "calibration.json: no such file" in line
-    (tiny / "calibration.json").write_text(some_constants("uav1-uav1").model_dump_json())
+    (tiny / "calibration.json").write_text(some_constants("uav3-uav3").model_dump_json())
     (line,) = map(as_line, problems(tiny))
-    assert "no constant of uav1-uav2, but of uav1-uav1" in line
+    assert "no constant of uav1-uav1, uav1-uav2, but of uav3-uav3" in line
+    (tiny / "calibration.json").write_text(some_constants("uav1-uav1").model_dump_json())
+    assert problems(tiny) == []
     change_file(tiny, lambda document: document.update(schema_version=2))
     (line,) = map(as_line, problems(tiny))
     assert "schema_version" in line

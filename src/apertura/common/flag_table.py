@@ -303,6 +303,9 @@ _OF_IMAGES = {
     "pair_unconfirmed": Flag(
         "bright points in common", "a pair shows none of the bright points of another",
         "SNR of its echo; names of its channels", "pipeline/steps/assess.py"),
+    "pair_uncalibrated": Flag(
+        "file of constants, pair", "no constant of the pair is known: backscattering coefficients hold no value",
+        "a reflector that serves the pair; transmit_power_dbm and receivers of its nodes", "pipeline/steps/layers.py"),
     "constant_drifts": Flag(
         "dB or rad between flights or calibrations, standard deviation",
         "constant or phase changed by over three standard deviations",

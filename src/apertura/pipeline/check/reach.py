@@ -1,6 +1,6 @@
 """Whether nodes, scene and reflector lie where waves reach, and the antennas have patterns."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -297,14 +297,13 @@ def check_patterns(examined: Examination) -> Iterator[CampaignError]:
             yield problem
 
 
-def check_constants(examined: Examination) -> Iterator[CampaignError]:
-    """Yield a file of measured constants that is none, or lacks a pair."""
+def check_constants(examined: Examination) -> Iterable[CampaignError]:
+    """Raise for a file of measured constants that is none, or holds no pair of the campaign."""
     campaign = examined.campaign
     path = campaign.calibration_file
     if path is None or not path.is_file() or path.stat().st_size == 0:
-        return
-    from apertura.pipeline.opening.constants import lacking, read_constants
+        return ()
+    from apertura.pipeline.opening.constants import check_pairs, read_constants
 
-    known = read_constants(path).pairs
-    pairs = dict.fromkeys(pair for flight in campaign.image_flights for pair in flight.pairs)
-    yield from (lacking(pair, known, path) for pair in pairs if pair not in known)
+    check_pairs(read_constants(path), campaign, path)
+    return ()

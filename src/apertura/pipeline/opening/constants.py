@@ -147,19 +147,23 @@ def read_constants(path: Path) -> Constants:
 
 
 def constant_of(campaign: Campaign, opened: OpenPair) -> tuple[PairConstant, str] | None:
-    """Return the measured constant of an open pair and where it comes from; None where the config names no file.
+    """Return the measured constant of an open pair and where it comes from.
+
+    None where the config names no file, or where that holds constants of other pairs of the campaign alone: a
+    reflector that serves monostatic pairs calibrates no bistatic one.
 
     Raises
     ------
     CampaignError
-        If the file lacks the pair, or was measured with another radar.
+        If the file holds no pair of the campaign, or was measured with another radar.
     """
     path = campaign.calibration_file
     if path is None:
         return None
     constants = read_constants(path)
+    check_pairs(constants, campaign, path)
     if opened.name not in constants.pairs:
-        raise lacking(opened.name, constants.pairs, path)
+        return None
     found = constants.pairs[opened.name]
     other = found.radar.differs(Radar.of(campaign, opened))
     if other is not None:
@@ -172,7 +176,9 @@ def constant_of(campaign: Campaign, opened: OpenPair) -> tuple[PairConstant, str
     return found, constants.measured
 
 
-def lacking(pair: str, known: Mapping[str, Any], path: Path) -> CampaignError:
-    """Return the error of a file without a pair."""
-    expected = "a constant of every pair that is imaged"
-    return CampaignError(f"no constant of {pair}, but of {', '.join(known)}", path, expected, _REMEDY)
+def check_pairs(constants: Constants, campaign: Campaign, path: Path) -> None:
+    """Raise CampaignError where a file of constants holds none of a campaign's pairs."""
+    pairs = list(dict.fromkeys(pair for flight in campaign.image_flights for pair in flight.pairs))
+    if constants.pairs.keys().isdisjoint(pairs):
+        found = f"no constant of {', '.join(pairs)}, but of {', '.join(constants.pairs)}"
+        raise CampaignError(found, path, "a constant of one of the pairs that are imaged", _REMEDY)

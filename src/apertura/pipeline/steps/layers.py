@@ -58,7 +58,7 @@ def layers(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> l
     measured_noise = noise_power(profiles, places_m, time_s=opened.time_s, beams=beams)
     noise = measured_noise.power
     asked, multilook = campaign.settings.processing.radiometry, campaign.settings.processing.multilook
-    measured = calibrated is not None or multilook is not None
+    measured = campaign.calibrated or multilook is not None
     image = open_stage(campaign.stage("image", flight, pair), "image") if measured else None
     origin = Provenance.of(
         lineage.modules,
@@ -89,14 +89,16 @@ def layers(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> l
     write("layers", layer_rasters(scene, looks, noise, calibrated, threads=threads), absolute)
     if image is not None:
         powers, means = dict[str, GroundPower](), dict[str, Mapping[str, Any]]()
-        if calibrated is not None:
+        if campaign.calibrated:
             mask = folder / product("mask", "write_mask").file
-            powers = {name: GroundPower(scene, image, calibrated, mask, name) for name in asked}
+            known = calibrated is not None
+            powers = {name: GroundPower(scene, image, calibrated, mask, name, known) for name in asked}
             means = {name: means_of(name) for name in asked}
             images = ((name, one.amplitude) for name, one in powers.items())
             write("radiometry", {name: LazyLayer(scene.grid, np.complex64, of, threads) for name, of in images}, means)
             written.append(folder / CROSS_SECTIONS)
-            write_json(written[-1], _report(scene, image, calibrated, measured_noise) | {"polarisation": label})
+            report = _report(scene, image, calibrated, measured_noise) if calibrated else _no_constant(campaign, pair)
+            write_json(written[-1], report | {"polarisation": label})
         if multilook is not None:
             per_weight = noise / integration_of(campaign, opened, scene).count ** 2
             averaged = {f"multilook_{name}": (power, means[name]) for name, power in powers.items()}
@@ -123,6 +125,8 @@ class GroundPower:
     calibrated, mask, quantity
         Of a calibrated pair: what its power is divided by, and the file in which other values than 0 are places whose
         power is not that of their ground alone. None: power as it is.
+    is_known
+        Whether the power is known; False: of a pair without a constant in a campaign that is calibrated.
     """
 
     scene: OpenScene
@@ -130,11 +134,12 @@ class GroundPower:
     calibrated: CalibratedPair | None = None
     mask: Path | None = None
     quantity: Quantity = "sigma0"
+    is_known: bool = True
 
     def per_one(self, window: Window) -> NDArray[np.float64]:
         """Return the mean power of a window, (row, column), of ground that is 1; NaN where it is not told."""
         if self.calibrated is None:
-            return np.ones([part.stop - part.start for part in window])
+            return np.full([part.stop - part.start for part in window], 1.0 if self.is_known else np.nan)
         scene, flat = self.scene, isinstance(self.scene.terrain, FlatGround)
         normal = None if flat and self.quantity == "sigma0" else surface(scene.grid, scene.terrain, window)[1]
         power = self.calibrated.calibration.power(window, self.quantity, normal)
@@ -195,6 +200,21 @@ def _report(scene: OpenScene, image: xr.Dataset, calibrated: CalibratedPair, noi
         "link": calibrated.link and asdict(calibrated.link),
         "noise": {"pulse": noise.power if np.isfinite(noise.power) else None, **noise_said},
         "points": calibrated.points(found, scene, noise.power),
+    }
+
+
+def _no_constant(campaign: Campaign, pair: str) -> dict[str, Any]:
+    """Return radiometry.json of a pair without a constant in a campaign that is calibrated."""
+    line = f"{campaign.calibration_file and campaign.calibration_file.name} has no constant of {pair}"
+    return {
+        "calibrated_by": None,
+        "constant_db": None,
+        "std_db": None,
+        "pointing_std_db": 0.0,
+        "flags": Flags({"pair_uncalibrated": f"{line}: its backscattering coefficients hold no value"}),
+        "link": None,
+        "noise": {"pulse": None, "noise_figure_db": None, "noise_figure_measured_db": None, "std_db": None},
+        "points": [],
     }
 
 
