@@ -72,6 +72,8 @@ def test_cross_sections_of_a_simulated_flight_are_those_of_its_targets(flown, pa
     assert [one.rcs_put_dbsm for one in found] == pytest.approx([-10, 0, 10])
     for one in found:
         assert abs(one.rcs_dbsm - one.rcs_put_dbsm) < max(0.3, one.rcs_std_db)
+    listed = said(flown, pair, "image.json")["cross_sections"]["points_listed"]
+    assert listed == {"most": 50, "below_brightest_db": -12.0, "above_surroundings_db": 12.2}
     brightest = said(flown, pair, "image.json")["cross_sections"]["points"][0]
     assert brightest["rcs_dbsm"] == pytest.approx(10, abs=0.3)
     *_, pointing, amplitude = said(flown, pair, "image.json")["budget"]

@@ -14,7 +14,7 @@ from apertura.core.echo.compression import centre_frequency
 from apertura.core.imaging.noise import PulseNoise, noise_places, sidelink_noise
 from apertura.core.imaging.radiometry import Calibration, Link, Turn, cell_constant, pointing_std_db
 from apertura.core.imaging.reflectors import DRIFT_SIGMAS
-from apertura.core.quality.bright_points import BrightPoint
+from apertura.core.quality.bright_points import DEEPEST_DB, SPECKLE, BrightPoint
 from apertura.core.quality.budget import ATTITUDE_STD_DEG
 from apertura.core.quality.measures import BlockRaster
 from apertura.pipeline.campaign import Campaign
@@ -32,6 +32,13 @@ LEAST_CONTRAST = 10.0
 _UNSTATED_STD_DB, _FIGURE_STD_DB = 1.0, 0.5  # of a radio whose amplitude_std_db nobody states; of a noise figure
 _SIDELINK_STD_DB = 0.3  # of the noise that a sidelink adds, by its mean SNR
 _MOST_POINTS = 50  # whose cross-section is stated, the brightest
+
+POINTS_LISTED = {
+    "most": _MOST_POINTS,
+    "below_brightest_db": DEEPEST_DB,
+    "above_surroundings_db": round(-10 * float(np.log10(SPECKLE)), 1),
+}
+"""Limits of the list of points in radiometry.json: a weaker target has no cross-section there."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -35,7 +35,7 @@ from apertura.pipeline.lineage import result_of
 from apertura.pipeline.opening.echo import PairEcho
 from apertura.pipeline.opening.pair import open_pair, pattern_digests
 from apertura.pipeline.opening.plan import integration_of, weighing
-from apertura.pipeline.opening.radiometry import CalibratedPair, calibrated_pair, points_of
+from apertura.pipeline.opening.radiometry import POINTS_LISTED, CalibratedPair, calibrated_pair, points_of
 from apertura.pipeline.opening.scene import OpenScene, open_scene
 from apertura.pipeline.steps.multilook import LazyLayer, coarse, multilook_of, said_of, side_of
 from apertura.pipeline.steps.stamping import tags_of
@@ -200,6 +200,7 @@ def _report(scene: OpenScene, image: xr.Dataset, calibrated: CalibratedPair, noi
         "link": calibrated.link and asdict(calibrated.link),
         "noise": {"pulse": noise.power if np.isfinite(noise.power) else None, **noise_said},
         "points": calibrated.points(found, scene, noise.power),
+        "points_listed": POINTS_LISTED,
     }
 
 
@@ -215,6 +216,7 @@ def _no_constant(campaign: Campaign, pair: str) -> dict[str, Any]:
         "link": None,
         "noise": {"pulse": None, "noise_figure_db": None, "noise_figure_measured_db": None, "std_db": None},
         "points": [],
+        "points_listed": POINTS_LISTED,
     }
 
 
