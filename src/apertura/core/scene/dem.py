@@ -234,7 +234,7 @@ class Dem(Terrain):
         """Distance of posts, metres, the wider way."""
         a, b, _, d, e, _ = self.pixel_from_map
         unit_m = 111_195.0 if CRS(self.horizontal).is_geographic else 1.0
-        return unit_m / max(min(np.hypot(a, d), np.hypot(b, e)), 1e-12)
+        return unit_m / max(float(min(np.hypot(a, d), np.hypot(b, e))), 1e-12)
 
     def _impossible_heights(self, posts: Floats, impossible: NDArray[np.bool_], start: list[int]) -> CampaignError:
         values, counts = np.unique(posts[impossible], return_counts=True)
@@ -429,8 +429,8 @@ def _dem(path: Path, crs: str, *, datum: str, geoid: Path | None) -> Dem:
     horizontal = system.sub_crs_list[0] if system.is_compound else system.to_2d()
     earth = counted_from in {"egm96", "egm2008"}
     stated = datum == "ellipsoid" and not is_on_wgs84(horizontal.to_wkt())
-    wgs84 = earth or stated or horizontal.geodetic_crs is None
-    geodetic = CRS(GEODETIC) if wgs84 else horizontal.geodetic_crs.to_3d()
+    own = None if earth or stated else horizontal.geodetic_crs
+    geodetic = CRS(GEODETIC) if own is None else own.to_3d()
     undulations = (
         None
         if counted_from == "ellipsoid"

@@ -211,14 +211,14 @@ def _is_by_columns(one: Sweeps, sweep: FrequencySweep, described: Mapping[str, A
     """Return whether columns of an array are sweeps: by its times, its sides, and the interval between sweeps."""
     rows, columns = one.beat.shape
     if one.time is not None and rows != columns and len(one.time) in {rows, columns}:
-        return len(one.time) == columns
+        return bool(len(one.time) == columns)
     exact = {sweep.sweep_samples}
     if described.get("prf_hz"):
         exact.add(round(sweep.sample_rate_hz / described["prf_hz"]))
     if (rows in exact) != (columns in exact):
-        return rows in exact
+        return bool(rows in exact)
     too_long = columns < sweep.sweep_samples or (described.get("prf_hz") and columns > _MOST_INTERVALS * max(exact))
-    return bool(too_long) and rows >= sweep.sweep_samples
+    return bool(too_long and rows >= sweep.sweep_samples)
 
 
 def _regular(one: Sweeps, described: Mapping[str, Any], *, alone: bool) -> Times:

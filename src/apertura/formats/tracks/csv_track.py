@@ -281,7 +281,8 @@ def read_csv_track(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -
         raise _error(str(error).partition("\n")[0], log, "Correct the log or export it again.") from error
     if frame == "geodetic":
         position = position + np.array([0.0, 0.0, options.height_offset_m or 0.0])
-    attitude, std, fix = (None if one is None else one[kept] for one in (attitude, std, fix))
+    attitude, std = (None if one is None else one[kept] for one in (attitude, std))
+    fix = None if fix is None else fix[kept]
     return make_track(
         time[kept],
         position[kept],

@@ -17,7 +17,7 @@ Span = tuple[int, int]
 
 
 def foreign_bytes(
-    data: Sequence[int], first: int, end: int, message_bytes: Callable[[int], int], *, note: Callable[[int], None]
+    data: bytes, first: int, end: int, message_bytes: Callable[[int], int], *, note: Callable[[int], None]
 ) -> tuple[list[Span], int]:
     """Return the spans of a log that are no messages, and where the last message ends.
 

@@ -96,12 +96,11 @@ def make_track(
         without = f" ({', '.join(f'{count} left out: {why}' for why, count in left_out.items())})" if left_out else ""
         raise CampaignError(f"{len(time_utc)} epochs{without}", where, "at least two", "Export the whole log.")
     remarks = []
-    if (np.diff(time_utc) < np.timedelta64(0, "ns")).all():
+    if len(time_utc) > 2 and (np.diff(time_utc) < np.timedelta64(0, "ns")).all():
         remarks.append("times descend, as of a filter that ran backward: the epochs are read in reverse")
         time_utc, position = time_utc[::-1], position[::-1]
-        attitude_deg, position_std_m, fix = (
-            None if one is None else one[::-1] for one in (attitude_deg, position_std_m, fix)
-        )
+        attitude_deg, position_std_m = (None if one is None else one[::-1] for one in (attitude_deg, position_std_m))
+        fix = None if fix is None else fix[::-1]
     _check_times(time_utc, where)
     remarks += _rolled_over(time_utc)
     _check_positions(position, frame, where)
