@@ -433,6 +433,28 @@ def raw_messages(name):
 
 
 @pytest.mark.usefixtures("reader")
+def test_a_real_log_is_whole(flown):
+    assert "damage" not in flown.attrs
+    assert "remarks" not in flown.attrs
+
+
+def test_foreign_bytes_anywhere_in_a_real_log_are_found(tmp_path):
+    """At 40 places: its other epochs stay as they are."""
+    if not REAL.is_file():
+        pytest.skip(f"{REAL} is not here")
+    data, generator = REAL.read_bytes(), np.random.default_rng(4)
+    whole, path = read_fields(REAL)[f"{GPS}:0/timestamp"], tmp_path / "a.ulg"
+    for at in generator.integers(60_000, len(data) - 4000, 40):
+        path.write_bytes(data[:at] + generator.bytes(200) + data[at:])
+        fields = read_fields(path)
+        spans = fields["damage"]
+        assert any(first <= at <= last for first, last in spans[:-1])
+        assert 200 <= np.diff(spans[:-1], axis=1).sum() < 3000
+        kept = fields[f"{GPS}:0/timestamp"]
+        assert np.isin(kept, whole).all()
+        assert kept.size >= whole.size - 6
+
+
 def test_epochs_span_bounds_and_rate_of_a_real_flight_are_those_of_its_messages(flown):
     """px4_real_flight, a PX4 1.9 multicopter over Zurich; fields are unpacked here by their offsets in the message."""
     names, payloads = raw_messages(GPS)

@@ -3,6 +3,7 @@
 import io
 import itertools
 import struct
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,6 @@ _HEADER, _MESSAGE = 16, 3
 _FLAGS_BYTES = 40
 _DEEPEST = 8
 _LONGEST = 10_000
-_UNKNOWN = 1 << 16
 
 
 def read_fields(path: Path) -> dict[str, NDArray[Any]]:
@@ -78,48 +78,84 @@ def read_fields(path: Path) -> dict[str, NDArray[Any]]:
     }
 
 
-def _foreign(data: bytes) -> tuple[list[Span], list[Span]]:
-    """Return the spans of a ULog that are no messages, and what its sections end with: data may have been appended."""
-    sizes, formats = dict[int, tuple[int, int]](), dict[str, list[tuple[str, int, str]]]()
+def _keyed(data: bytes, at: int, size: int) -> bool:
+    """Return whether a payload begins with the length of a key, and the key."""
+    return 0 < data[at] < size and data[at + 1 : at + 1 + data[at]].isascii()
 
-    def message_bytes(at: int) -> int:
-        if at + _MESSAGE + 2 > len(data):
-            return 0
-        size, kind = data[at] | data[at + 1] << 8, chr(data[at + 2])
-        first, second = data[at + 3], data[at + 4]
-        least, most = sizes.get(first | second << 8, (0, _UNKNOWN)) if kind == "D" else (0, 0)
-        good = {
-            "D": least + 2 <= size <= most + 2,
-            "L": size > 9 and 0x30 <= first <= 0x37,  # a level, "0" to "7"
-            "S": size == 8,
-            "O": size == 2,
-            "I": 1 < first + 1 < size,  # the length of a key, and the key
-            "P": 1 < first + 1 < size,
-            "M": 1 < second + 2 < size,
-            "Q": 1 < second + 2 < size,
-        }.get(kind, kind.isascii() and kind.isupper() and 0 < size <= _LONGEST)
-        if kind not in "LSOIPMQFAB" and most in {
-            0,
-            _UNKNOWN,
-        }:  # of no known size: judged by what follows
-            following = data[at + _MESSAGE + size + 2 : at + 2 * _MESSAGE + size]
-            good = good and (not following or following.isupper())
-        return size + _MESSAGE if good else 0
 
-    def note(at: int) -> None:
-        kind, text = data[at + 2], data[at + _MESSAGE : at + message_bytes(at)]
+def _levelled(data: bytes, at: int, size: int) -> bool:
+    """Return whether a payload may be a logged text: its level, "0" to "7", its time, the text."""
+    return size > 9 and 0x30 <= data[at] <= 0x37
+
+
+_PLAUSIBLE: Mapping[str, Callable[[bytes, int, int], bool]] = {
+    "B": lambda _, at, size: at == _HEADER + _MESSAGE and size >= _FLAGS_BYTES,
+    "F": lambda data, at, size: size > 2 and b":" in data[at : at + size] and data[at : at + size].isascii(),
+    "I": _keyed,
+    "P": _keyed,
+    "M": lambda data, at, size: _keyed(data, at + 1, size - 1),
+    "Q": lambda data, at, size: _keyed(data, at + 1, size - 1),
+    "A": lambda data, at, size: size > 3 and data[at + 3 : at + size].isascii(),
+    "R": lambda _, __, size: size == 2,
+    "L": _levelled,
+    "C": _levelled,
+    "S": lambda _, __, size: size == 8,
+    "O": lambda _, __, size: size == 2,
+}
+"""Kind of a message, but for data → whether a payload of so many bytes at an offset may be one."""
+
+
+class _Messages:
+    """The messages of a ULog, as far as it has been walked through."""
+
+    def __init__(self, data: bytes) -> None:
+        self._data = data
+        self._formats: dict[str, list[tuple[str, int, str]]] = {}
+        self._sizes: dict[int, tuple[int, int]] = {}
+
+    def note(self, at: int) -> None:
+        """Take up the format or the topic that a message describes."""
+        kind, text = self._data[at + 2], self._data[at + _MESSAGE : at + self.size(at)]
         if kind == ord("F"):
             name, _, described = text.decode("latin-1").partition(":")
-            formats[name] = [_field(one) for one in described.split(";") if one]
-        elif kind == ord("A") and len(text) > 3:
-            size = _sizes(text[3:].decode("latin-1"), formats)
+            self._formats[name] = [_field(one) for one in described.split(";") if one]
+        elif kind == ord("A"):
+            size = _sizes(text[3:].decode("latin-1"), self._formats)
             if size is not None:
-                sizes[text[1] | text[2] << 8] = size
+                self._sizes[text[1] | text[2] << 8] = size
 
-    edges = [_HEADER, *_appended(data), len(data)]
+    def size(self, at: int) -> int:
+        """Return the length of a message, header included; of a kind or topic that is not known by what follows it."""
+        size = self._known(at)
+        if size or at + _MESSAGE + 2 > len(self._data):
+            return size
+        kind, size = self._data[at + 2], (self._data[at] | self._data[at + 1] << 8) + _MESSAGE
+        is_topic = kind == ord("D") and self._topic(at) not in self._sizes
+        unknown = is_topic or (0x41 <= kind <= 0x5A and kind != ord("D") and chr(kind) not in _PLAUSIBLE)
+        followed = at + size >= len(self._data) or self._known(at + size) > 0
+        return size if unknown and _MESSAGE < size <= _LONGEST and followed else 0
+
+    def _known(self, at: int) -> int:
+        """Return the length of a message that is as its kind must be; 0 if it is none."""
+        if at + _MESSAGE + 2 > len(self._data):
+            return 0
+        size, kind = self._data[at] | self._data[at + 1] << 8, chr(self._data[at + 2])
+        if kind == "D":
+            least, most = self._sizes.get(self._topic(at), (1, 0))
+            return size + _MESSAGE if least <= size - 2 <= most else 0
+        plausible = _PLAUSIBLE.get(kind)
+        return size + _MESSAGE if plausible is not None and plausible(self._data, at + _MESSAGE, size) else 0
+
+    def _topic(self, at: int) -> int:
+        return self._data[at + _MESSAGE] | self._data[at + _MESSAGE + 1] << 8
+
+
+def _foreign(data: bytes) -> tuple[list[Span], list[Span]]:
+    """Return the spans of a ULog that are no messages, and what its sections end with: data may have been appended."""
+    messages, edges = _Messages(data), [_HEADER, *_appended(data), len(data)]
     spans, unread = list[Span](), list[Span]()
     for first, end in itertools.pairwise(edges):
-        found, ended = foreign_bytes(data, first, end, message_bytes, note=note)
+        found, ended = foreign_bytes(data, first, end, messages.size, note=messages.note)
         spans += found
         unread += [(ended, end)] if ended < end else []
     return spans, unread
