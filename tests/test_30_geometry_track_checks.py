@@ -201,6 +201,15 @@ def test_positions_rounded_to_a_grid_are_found_with_what_they_err_by(grain_deg, 
     assert few or ("track_positions" in faults) is (expected_m > 0)
 
 
+def test_degrees_in_single_precision_are_a_grid():
+    """4·10⁻⁶ degrees of latitude, 0.42 m, and 10⁻⁶ of longitude, 0.07 m, from 48° north and 9° east on."""
+    time_s, place = logged("circle", epochs=600, noise_m=0.003, seed=2)
+    latitude, longitude = 48.4 + place[:, 0] / RADIUS_M, 9.9 + place[:, 1] / RADIUS_M / np.cos(np.radians(48.4))
+    single = [angle.astype(np.float32).astype(np.float64) for angle in (latitude, longitude)]
+    error_m = rounded_position_m(time_s, ecef_from_geodetic(*single, 600 + place[:, 2]), least_m=X_BAND_M)
+    assert error_m == pytest.approx(np.hypot(0.424, 0.0704) / np.sqrt(12), rel=0.02)
+
+
 def test_positions_of_uniform_motion_are_no_grid():
     """5 m/s at 10 Hz moves by 0.5 m from epoch to epoch."""
     time_s, place = logged("straight", epochs=300)

@@ -47,6 +47,19 @@ def test_one_date_in_the_middle_dates_the_whole_log(tmp_path):
         np.testing.assert_array_equal(track.time.values, TIMES)
 
 
+@pytest.mark.parametrize("wrong", [1, 3, 10])
+def test_a_date_that_is_late_after_midnight_is_that_of_the_next_day(tmp_path, wrong):
+    """RMC of some receivers has the day before for a moment: epochs from then on would be a day earlier."""
+    lines, late = logs.nmea(TIMES, PLACES, every=1).splitlines(), 0
+    for place, line in enumerate(lines):
+        if "RMC,000" in line and late < wrong:
+            lines[place] = logs.sealed(line[1:].partition("*")[0].replace(",150525,", ",140525,"))
+            late += 1
+    track = read(tmp_path, "\n".join(lines) + "\n")
+    np.testing.assert_array_equal(track.time.values, TIMES)
+    assert track.remarks[0].startswith(f"{wrong} dates after midnight are those of the day before")
+
+
 def test_a_receiver_that_is_not_sure_has_no_date(tmp_path):
     text = logs.rmc(TIMES[0] + np.timedelta64(400, "D"), status="V") + "\n" + logs.nmea(TIMES, PLACES, every=0)
     assert "no RMC or ZDA with a date; expected key nodes.a.log.start_utc" in complaint(lambda: read(tmp_path, text))

@@ -37,6 +37,7 @@ _STAMP = re.compile(rb"[\s\[(\"']*\d[-\d\s:.,;/TZ+\])\"']*")
 _DATED = {"RMC", "ZDA"}
 _WANTED = re.compile(r"[^P].(?:GGA|RMC|ZDA|GST),")
 _TIME = re.compile(r"([01]\d|2[0-3])([0-5]\d)([0-5]\d|60)(?:\.(\d{1,9})\d*)?", re.ASCII)
+_LATE_NS = 60_000_000_000
 _DAY_NS, _SECOND_NS = 86_400_000_000_000, 1_000_000_000
 _REMEDY = "Log GGA with RMC or ZDA, as the receiver sends them."
 
@@ -66,6 +67,7 @@ class _Log:
     dropped: Counter[str] = field(default_factory=Counter)
     stamped: int = 0
     unsealed: int = 0
+    late_dates: int = 0
     others: Counter[str] = field(default_factory=Counter)
 
 
@@ -186,7 +188,11 @@ def _take(sentence: Any, log: _Log) -> None:
     """Add the values of a sentence to the log."""
     kind = sentence.sentence_type
     if kind in _DATED:
-        log.now_ns = _dated(sentence) or log.now_ns
+        date = _dated(sentence)
+        if date is not None and log.order and log.now_ns and abs(date + _DAY_NS - log.now_ns) < _LATE_NS:
+            log.late_dates += 1  # some receivers write the day before for a moment after midnight
+            date += _DAY_NS
+        log.now_ns = date or log.now_ns
         return
     try:
         of_day = _time_of_day(sentence.data[0])
@@ -284,6 +290,9 @@ def _track(log: _Log) -> xr.Dataset:
     )
     if log.stamped:
         track = remarked(track, f"{log.stamped} lines begin with a host's stamp, which is not used", log.path)
+    if log.late_dates:
+        found = f"{log.late_dates} dates after midnight are those of the day before, and are taken for the next"
+        track = remarked(track, found, log.path)
     if log.unsealed:
         found = f"none of {log.unsealed} sentences has a checksum: damaged digits are not noticed"
         track = remarked(track, found, log.path)
