@@ -15,7 +15,7 @@ from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import FlatGround, Plane
 from apertura.pipeline.config.flight_plan import FlightPlan, read_flight_plan
 from apertura.pipeline.design import designed
-from apertura.pipeline.design.judgement import helpful_changes, judge, search, tried_report
+from apertura.pipeline.design.judgement import helpful_changes, judge, refinement_line, search, tried_report
 from apertura.pipeline.opening.planned import open_plan
 
 HERE = Path()
@@ -202,9 +202,61 @@ def test_coherence_of_two_heights_is_the_common_share_of_windowed_spectra():
 def test_positions_known_worse_cost_more_and_the_cause_is_named():
     plan = plan_of(require={"loss_db": 0.5})
     plan["nodes"]["uav1"]["position_std_m"] = 0.02
+    plan["processing"]["autofocus"] = "off"
     (verdict,) = judge(designed(FlightPlan.model_validate(plan), HERE))
     assert not verdict.met
     assert verdict.cause.startswith("positions: 2 2 2 cm")
+
+
+def design_of(std_m, autofocus, **node):
+    plan = plan_of(require={"loss_db": 1.0})
+    plan["nodes"]["uav1"] |= {"position_std_m": std_m, **node}
+    plan["processing"]["autofocus"] = autofocus
+    return designed(FlightPlan.model_validate(plan), HERE)
+
+
+@pytest.mark.parametrize(("autofocus", "met"), [("auto", True), ("on", True), ("off", False)])
+def test_loss_is_judged_with_refinement_where_the_plan_requests_it_and_both_losses_are_stated(autofocus, met):
+    """At L-band 2 cm cost 2 to 5 dB as logged, 0.3 dB after refinement (docs/theory/autofocus.md, "Measured")."""
+    design = design_of(0.02, autofocus)
+    (verdict,) = judge(design)
+    assert verdict.met == met
+    layers = design.images["f01/uav1-uav1"].layers
+    assert 2 < np.median(layers["loss"]) < 6
+    assert np.median(layers["loss_refined"]) == pytest.approx(0.3, abs=0.1)
+    assert verdict.found == pytest.approx(np.max(layers["loss_refined" if met else "loss"]), abs=0.05)
+
+
+def test_a_refinement_needs_points_whose_cross_section_follows_from_the_radar_equation():
+    design = design_of(0.02, "on")
+    layers = design.images["f01/uav1-uav1"].layers
+    pulse_db = np.percentile(layers["point_snr"] - 10 * np.log10(layers["looks"]), 5)
+    assert refinement_line(design, "f01").endswith(f"3 bright points in the scene, 10 dB above the noise of one pulse: "
+                                                   f"at least {10 - pulse_db:.0f} dBsm")  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("std_m", "node", "obstacle"),
+    [
+        (0.06, {}, "position errors of 6 cm exceed 4.4 cm"),
+        (0.02, {"position_correlation_s": 0.2}, "a correlation time of 0.2 s, less than 0.5 s"),
+    ],
+)
+def test_a_refinement_beyond_its_measured_limits_does_not_count(std_m, node, obstacle):
+    design = design_of(std_m, "on", **node)
+    (verdict,) = judge(design)
+    assert not verdict.met
+    assert obstacle in refinement_line(design, "f01")
+    assert np.isnan(design.images["f01/uav1-uav1"].layers["loss_refined"]).all()
+
+
+def test_a_coarse_grid_is_refused_for_sparse_pulses_as_the_grid_itself():
+    """Corners of 2 × 2 pixels spread the Doppler half as far as those of 20 × 20: what a search keeps can be flown."""
+    plan = plan_of()
+    plan["waveform"]["prf_hz"] = 8.0
+    for coarse in (None, 2):
+        with pytest.raises(CampaignError, match="or more, the spread of Doppler over the scene, instead of 8 Hz"):
+            designed(FlightPlan.model_validate(plan), HERE, coarse=coarse)
 
 
 @pytest.mark.slow

@@ -13,7 +13,7 @@ from folders import run_steps
 from apertura.common.documents import read_json
 from apertura.core.quality.point_targets import cut_through, find_peak
 from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.config.flight_plan import FlightPlan
+from apertura.pipeline.config.flight_plan import FlightPlan, read_flight_plan
 from apertura.pipeline.design import designed
 from apertura.pipeline.design.rehearsal import rehearse
 from apertura.pipeline.opening.scene import open_scene
@@ -88,6 +88,14 @@ def typed(monkeypatch, capsys, *words):
     return ended.value.code or 0, said.out, said.err
 
 
+def test_time_in_the_air_has_take_off_transit_and_landing(folder):
+    """30 m of climb and of descent at 2 m/s, and the 15.6 m back home at 1 m/s, beside the mission's own 15.6 s."""
+    design = designed(read_flight_plan(folder / "plan.yaml"), folder)
+    back_m = np.radians(WAYPOINTS[1][1] - WAYPOINTS[0][1]) * 6.378e6 * np.cos(np.radians(WAYPOINTS[0][0]))
+    assert design.recording.transfer_s["f01"] == pytest.approx(2 * 30 / 2 + back_m, rel=0.01)
+    assert design.recording.flight_s["f01"] == pytest.approx(2 * 30 / 2 + 2 * back_m, rel=0.01)
+
+
 @pytest.mark.slow
 def test_a_mission_becomes_a_report_layers_and_the_campaign_s_config(folder, monkeypatch, capsys):
     status, out, err = typed(monkeypatch, capsys, "design", folder / "plan.yaml", folder / "out")
@@ -97,7 +105,8 @@ def test_a_mission_becomes_a_report_layers_and_the_campaign_s_config(folder, mon
     assert any("uav1" in line and "100.0" in line for line in out.splitlines())  # seen, %
     page = (folder / "out" / "design.html").read_text()
     assert page.count("data:image/png") == 2
-    assert "All that is required is met." in page
+    assert "GO: all of 1 requirement met" in page
+    assert out.startswith("GO: all of 1 requirement met\n")
     with rasterio.open(folder / "out/f01/uav1-uav1/nesz.tif") as raster:
         assert raster.shape == (80, 80)
         assert raster.tags()["APERTURA_PLANNED"] == "true"

@@ -1,4 +1,4 @@
-"""`apertura design` and `apertura compare`: what a planned flight will give, and what it gave."""
+"""Commands `apertura design` and `apertura compare`: expected images of a planned flight, against those flown."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from apertura.common.atomic import made_folder, write_text
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
-from apertura.common.errors import CampaignError
+from apertura.common.errors import CampaignError, number_of
 from apertura.core.geometry.geodesy import LOCAL
 from apertura.core.quality.budget import expected
 from apertura.formats.export.layers import OUTSIDE
@@ -20,11 +20,13 @@ from apertura.pipeline.design import as_plan
 from apertura.pipeline.design.computed import Design, designed
 from apertura.pipeline.design.judgement import (
     AXES,
+    SHARE,
     Change,
     Tried,
     Verdict,
     helpful_changes,
     judge,
+    refinement_line,
     search,
     tried_report,
 )
@@ -43,10 +45,15 @@ if TYPE_CHECKING:
 
 PAGE, PLAN, PANELS, PARETO = "design.html", "plan.yaml", "layers.png", "pareto.png"
 _SHOWN = ("resolution", "nesz", "point_snr", "incidence", "loss", "mask")
-_TITLES = {"resolution": "coarsest resolution", "nesz": "NESZ", "point_snr": "SNR of a point", "loss": "loss of focus"}
+_TITLES = {
+    "resolution": "coarsest resolution",
+    "nesz": "NESZ",
+    "point_snr": "SNR of a point",
+    "loss": "focus loss, tracks as logged",
+}
 _DOTS = 400  # of the longer side of a panel
 _MOST_CHANGES, _MOST_PLANS = 5, 12
-_JUDGED = ("requirement", "asked", "given", "met", "image", "first cause")
+_JUDGED = ("requirement", "required", "planned", "met", "image", "largest contribution")
 _LISTED = {
     "resolution": "coarsest, m",
     "resolution_fine": "finest, m",
@@ -57,12 +64,14 @@ _LISTED = {
     "snr": "SNR, dB",
     "point_snr": "point's SNR, dB",
     "ambiguity": "folded",
-    "loss": "loss, dB",
+    "loss": "loss as logged, dB",
+    "loss_refined": "loss refined, dB",
 }
 """Layer → head of its column; those that no image has are left out."""
 
 _LEAST = {"looks", "snr", "point_snr"}
-_CAPTION = "what images will be: the middle of what is seen, and what 95 % have"
+_SMALLEST = 1e-3  # of a share, printed as 0 below
+_CAPTION = "Planned images: median over the visible scene, and the value that 95 % of it reach"
 
 
 def print_design(path: Path, out: Path | None, *, optimise: str | None = None, threads: int = 1) -> bool:
@@ -87,13 +96,14 @@ def print_design(path: Path, out: Path | None, *, optimise: str | None = None, t
     if optimise is not None:
         plan, tried = search(plan, root, [word for word in optimise.split(",") if word], threads=threads)
         moved = ", ".join(f"{key}: {getattr(plan.moved, key):.3g}" for key in AXES.values())
-        console.print(f"best of {len(tried)} plans tried: moved: {{{moved}}}", highlight=False)
+        console.print(f"Best of {len(tried)} plans that can be flown: moved: {{{moved}}}", highlight=False)
     design = designed(plan, root, threads=threads)
     verdicts = judge(design)
     changes = helpful_changes(plan, root, verdicts, threads=threads)
-    console.print(_table(_CAPTION, *value_table(design, "\n")))
+    console.print(headline(verdicts, changes), highlight=False)
+    console.print(_table(_CAPTION, *value_table(design)))
     if verdicts:
-        console.print(_table("what is required", _JUDGED, [verdict_row(one) for one in verdicts]))
+        console.print(_table("Requirements", _JUDGED, [verdict_row(one) for one in verdicts]))
     for line in (*interferogram_lines(design), *recording_lines(design), *change_lines(changes)):
         console.print(line, highlight=False)
     for name, image in design.images.items():
@@ -117,8 +127,8 @@ def _table(title: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> "P
     from rich.table import Table
 
     table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
-    for heading in head:
-        table.add_column(heading, overflow="fold")
+    for at, heading in enumerate(head):
+        table.add_column(heading.replace(", ", "\n"), overflow="fold", no_wrap=not at)
     for row in rows:
         table.add_row(*row)
     return table
@@ -127,7 +137,27 @@ def _table(title: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> "P
 # ---- Words ----------------------------------------------------------------------------------------------------------
 
 
-def value_table(design: Design, between: str = " / ") -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+def headline(verdicts: Sequence[Verdict], changes: Sequence[Change]) -> str:
+    """Return go or no-go, with the requirements missed and the change that helps most.
+
+    Examples
+    --------
+    >>> headline([Verdict("loss_db", 1.0, 0.3, "f01/a-a", "positions")], [])
+    'GO: all of 1 requirement met'
+    >>> headline([Verdict("loss_db", 1.0, 4.4, "f01/a-a", "positions")], [])
+    'NO-GO: loss_db 4.4 (required 1)'
+    """
+    if not verdicts:
+        return "No verdict: the plan states no requirement (section require)"
+    missed = [one for one in verdicts if not one.met]
+    if not missed:
+        return f"GO: all of {number_of(len(verdicts), 'requirement')} met"
+    found = ", ".join(f"{one.requirement} {_value(one.found)} (required {_value(one.asked)})" for one in missed)
+    helps = f"; most helpful change: {changes[0].words}" if changes else ""
+    return f"NO-GO: {found}{helps}"
+
+
+def value_table(design: Design) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
     """Return head and rows of images, pairs and sums: median of what is seen, what 95 % have, share that is seen."""
     images = design.images.values()
     listed = [name for name in _LISTED if any(np.isfinite(one.layers.get(name, np.nan)).any() for one in images)]
@@ -139,9 +169,9 @@ def value_table(design: Design, between: str = " / ") -> tuple[tuple[str, ...], 
             values = image.layers[name][seen] if name in image.layers else np.empty(0)
             values = values[np.isfinite(values)]
             worst = np.percentile(values, 5 if name in _LEAST else 95) if values.size else np.nan
-            cells.append(between.join(map(_digits, (np.median(values), worst))) if values.size else "")
+            cells.append("\n".join(map(_digits, (np.median(values), worst))) if values.size else "")
         rows.append((image.name, *cells, f"{100 * seen.mean():.1f}"))
-    return ("image", *(_LISTED[name] for name in listed), "seen, %"), rows
+    return ("image", *(_LISTED[name] for name in listed), "visible, %"), rows
 
 
 def _value(value: float | None) -> str:
@@ -149,15 +179,15 @@ def _value(value: float | None) -> str:
 
 
 def _digits(value: float) -> str:
-    return f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"
+    return f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}" if abs(value) >= _SMALLEST else "0"
 
 
 def interferogram_lines(design: Design) -> Iterator[str]:
     """Yield coherence and height of ambiguity in the middle of each interferogram."""
     for name, layers in design.interferograms.items():
         units = {layer: "" if UNITS[layer][0] == "1" else f" {UNITS[layer][0]}" for layer in layers}
-        told = [f"{layer} {np.nanmedian(values):.3g}{units[layer]}" for layer, values in layers.items()]
-        yield f"{name}: {', '.join(told)}"
+        medians = [f"{layer} {np.nanmedian(values):.3g}{units[layer]}" for layer, values in layers.items()]
+        yield f"Interferogram {name}: {', '.join(medians)}"
 
 
 def verdict_row(verdict: Verdict) -> tuple[str, ...]:
@@ -171,7 +201,10 @@ def recording_lines(design: Design) -> Iterator[str]:
     recording, opened = design.recording, design.opened
     low, high = (float(edge(opened.pairs[0].frequency_hz)) for edge in (np.min, np.max))
     wave_cm = 200 * SPEED_OF_LIGHT_M_S / (low + high)
-    yield f"band {low / 1e9:.4f} to {high / 1e9:.4f} GHz, {(high - low) / 1e6:.1f} MHz; {wave_cm:.2f} cm in its middle"
+    yield (
+        f"Band {low / 1e9:.4f} to {high / 1e9:.4f} GHz, {(high - low) / 1e6:.1f} MHz wide; wavelength {wave_cm:.2f} cm "
+        "at its centre"
+    )
     for flight, lasting_s in recording.flight_s.items():
         rates = recording.node_bytes_s[flight]
         each = ", ".join(f"{node} {rate / 1e6:.3g} MB/s" for node, rate in rates.items())
@@ -180,26 +213,50 @@ def recording_lines(design: Design) -> Iterator[str]:
         imaged_s = sum(end - begin for begin, end in flown.imaged_s)
         image = track.image if isinstance(track, MissionTrack) else None
         waypoints = f", waypoints {image[0]} to {image[1]}" if image else ""
+        transfer_s = recording.transfer_s[flight]
+        parts = (
+            f"with {transfer_s:.0f} s of take-off, transit and landing at {planned.climb_m_s:g} m/s"
+            if transfer_s
+            else "without take-off and landing: the plan states no home"
+        )
         yield (
-            f"{flight}: imaged along {flown.imaged_m:.1f} m in {imaged_s:.1f} s{waypoints}; {lasting_s:.0f} s in the "
-            f"air, {recording.pulses[flight]} pulses; {each}"
+            f"Flight {flight}: imaged along {flown.imaged_m:.1f} m in {imaged_s:.1f} s{waypoints}; {lasting_s:.0f} s "
+            f"in the air, {parts}; {recording.pulses[flight]} pulses; {each}"
+        )
+        refinement = design.refinements[flight]
+        yield (
+            f"Flight {flight}: focus loss {_loss(design, flight, 'loss')} with the tracks as logged, "
+            f"{_loss(design, flight, 'loss_refined')} after refinement; autofocus {refinement.decision.value} "
+            f"({refinement.decision.reason}); {refinement_line(design, flight)}"
         )
     dopplers = {one.name: one.doppler_hz for one in design.images.values() if one.looks is not None}
     prf = float(getattr(opened.plan.waveform, "prf_hz", None) or 0.0)
-    folds = "; more than the pulses: echoes fold by their angle, ambiguity.tif says where and how much" * (
-        max(dopplers.values()) > prf
-    )
-    told = ", ".join(f"{name} {hz:.0f}" for name, hz in dopplers.items())
-    yield f"Doppler over the scene, Hz: {told}; {prf:g} pulses per second{folds}"
+    folds = "; above the pulse rate: echoes fold, ambiguity.tif holds their share" * (max(dopplers.values()) > prf)
+    each = ", ".join(f"{name} {hz:.0f}" for name, hz in dopplers.items())
+    yield f"Doppler spread over the scene, Hz: {each}; pulse rate {prf:g} Hz{folds}"
     pulses = float(np.median([np.nanmedian(one.layers["looks"]) for one in design.judged]))
     yield (
-        f"a pixel of {opened.scene.grid.spacing_m:g} m is made of {pulses:.0f} pulses: scene.spacing_m says what angle "
-        "of the aperture it carries, and finer pixels resolve finer where more is flown"
+        f"A pixel of {opened.scene.grid.spacing_m:g} m integrates {pulses:.0f} pulses; a smaller scene.spacing_m "
+        "integrates more, where more is flown"
     )
     yield (
-        f"recorded {recording.recorded_bytes / 1e9:.3g} GB; processing about {recording.processing_s / 3600:.2g} h, "
+        f"Recorded data {recording.recorded_bytes / 1e9:.3g} GB; processing about {_lasting(recording.processing_s)}, "
         f"{recording.memory_bytes / 1e9:.2g} GB of memory"
     )
+
+
+def _loss(design: Design, flight: str, layer: str) -> str:
+    """Return a loss of the image of a flight that requirements are of, as 95 % of the visible scene has it."""
+    image = next(one for one in design.judged if one.name.startswith(f"{flight}/"))
+    values = image.layers[layer][image.layers["mask"] == 0]
+    return f"{np.percentile(values, SHARE):.2f} dB" if values.size and np.isfinite(values).all() else "not known"
+
+
+def _lasting(seconds: float) -> str:
+    for unit, size in (("h", 3600), ("min", 60)):
+        if seconds >= size:
+            return f"{seconds / size:.2g} {unit}"
+    return f"{seconds:.0f} s"
 
 
 def _given(change: Change) -> str:
@@ -209,25 +266,24 @@ def _given(change: Change) -> str:
 def change_lines(changes: Sequence[Change]) -> Iterator[str]:
     """Yield the single changes that help most."""
     for place, change in enumerate(changes[:_MOST_CHANGES], 1):
-        then = ", all met" if change.meets else ""
-        then += f", but then not met: {', '.join(change.breaks)}" if change.breaks else ""
-        yield f"{place}. {change.words}: {change.gain_db:.2g} dB nearer{then} ({_given(change)})"
+        then = ", all requirements met" if change.meets else ""
+        then += f", but no longer met: {', '.join(change.breaks)}" if change.breaks else ""
+        yield f"{place}. {change.words}: {change.gain_db:.2g} dB closer{then} ({_given(change)})"
 
 
 def _blocks(
     design: Design, verdicts: Sequence[Verdict], changes: Sequence[Change], tried: Sequence[Tried], out: Path
 ) -> Iterator[Block]:
     plan = design.opened.plan
-    yield Heading(1, f"{plan.campaign}: what the flight will give")
+    yield Heading(1, f"{plan.campaign}: flight plan")
+    yield Paragraph(f"{headline(verdicts, changes)}.")
     if verdicts:
-        unmet = [one.requirement for one in verdicts if not one.met]
-        outcome = f"Not met: {', '.join(unmet)}." if unmet else "All that is required is met."
-        yield Paragraph(f"{outcome} Requirements hold where 95 % of what is seen has them.")
-        yield Table("What is required.", _JUDGED, [verdict_row(one) for one in verdicts])
+        caption = "Requirements; each must hold for 95 % of the visible scene."
+        yield Table(caption, _JUDGED, [verdict_row(one) for one in verdicts])
     if changes:
         yield Table(
-            "Single changes, the one that helps most first.",
-            ("change", "nearer", "then all met", "then"),
+            "Single changes, most helpful first.",
+            ("change", "closer by", "all met", "result"),
             [
                 (
                     change.words,
@@ -238,15 +294,15 @@ def _blocks(
                 for change in changes[:_MOST_CHANGES]
             ],
         )
-    yield Picture((out / "coverage.png").read_bytes(), "Tracks and what they see.")
-    yield Picture((out / PANELS).read_bytes(), f"Layers of {design.judged[0].name}; white: not seen.")
+    yield Picture((out / "coverage.png").read_bytes(), "Tracks and visible areas.")
+    yield Picture((out / PANELS).read_bytes(), f"Layers of {design.judged[0].name}; white: not visible.")
     if tried:
-        yield Picture((out / PARETO).read_bytes(), "Plans that the search tried, and those that no other beats.")
+        yield Picture((out / PARETO).read_bytes(), "Plans tried by the search, and the Pareto-optimal ones.")
         plans = tried_report(tried)[:_MOST_PLANS]
         head = (*(f"moved.{key}" for key in plans[0]["moved"]), *plans[0]["found"])
         rows = [[_value(value) for value in (*one["moved"].values(), *one["found"].values())] for one in plans]
-        yield Table("Plans that no other beats, the one taken first; design.json holds all.", head, rows)
-    yield Table(f"{_CAPTION.capitalize()}.", *value_table(design))
+        yield Table("Pareto-optimal plans, the chosen one first; design.json holds all.", head, rows)
+    yield Table(f"{_CAPTION}.", *value_table(design))
     yield Paragraph(" ".join(f"{line}." for line in (*interferogram_lines(design), *recording_lines(design))))
     for image in design.images.values():
         if image.budget:
@@ -263,7 +319,7 @@ def _blocks(
         (flag, name, line) for name, one in design.images.items() if one.looks for flag, line in one.flags.items()
     ]
     if raised:
-        yield Table("Limits crossed.", ("flag", "image", "found"), raised)
+        yield Table("Flags raised.", ("flag", "image", "measured"), raised)
 
 
 # ---- Pictures -------------------------------------------------------------------------------------------------------

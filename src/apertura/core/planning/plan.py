@@ -59,7 +59,7 @@ def check_geometry(job: Job) -> dict[str, str]:
         )
     if missing := no_aperture(aperture, ground_m, wavelength_m=2 * SPEED_OF_LIGHT_M_S / sum(job.band_hz)):
         flags["no_aperture"] = missing
-    if sparse := _sparse(job):
+    if sparse := undersampling(job):
         flags["pulses_sparse"] = sparse
     beyond = _share_beyond(aperture, job.points_m, job.path_limit_m)
     if beyond:
@@ -106,7 +106,7 @@ FOLDED_DB = 1.0
 """dB by which echoes that fold brighten the scene on average, above which they show between its targets."""
 
 
-def _sparse(job: Job) -> str | None:
+def undersampling(job: Job) -> str | None:
     """Return one line where the aperture is undersampled so far that its ambiguities show, else None.
 
     Notes

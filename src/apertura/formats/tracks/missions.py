@@ -76,7 +76,8 @@ def read_mission(path: Path) -> Mission:
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, ArithmeticError) as error:
         if isinstance(error, CampaignError):
             raise
-        raise CampaignError(f"no mission ({quoted(str(error), 120)})", path, expected, _REMEDY) from error
+        why = f"no key {error}" if isinstance(error, KeyError) else str(error)
+        raise CampaignError(f"unreadable mission: {quoted(why, 200)}", path, expected, _REMEDY) from error
     latitude, longitude, height = mission.place.T
     good = (np.abs(latitude) <= 90) & (np.abs(longitude) <= 360) & (np.abs(height) < 1e5)
     if not 2 <= len(mission.place) <= _MOST_WAYPOINTS or not good.all():
@@ -107,8 +108,10 @@ def _of_commands(rows: list[tuple[int, int, list[float]]], speed: float, home: t
             places.append(parameters[4:7])
             references.append(_FRAMES[frame])
             speeds.append(speed)
-    if len(set(references)) > 1:
-        raise ValueError(f"heights count from {' and '.join(sorted(set(references)))} in one mission")
+    for number, reference in enumerate(references, 1):
+        if reference != references[0]:
+            counted = f"heights count from {references[0]} up to waypoint {number - 1}, from {reference} at waypoint"
+            raise ValueError(f"{counted} {number}; give all waypoints one altitude frame")
     return Mission(np.array(places, float).reshape(-1, 3), (references or ["home"])[0], np.array(speeds, float), home)
 
 

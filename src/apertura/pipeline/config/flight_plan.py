@@ -139,6 +139,9 @@ class PlannedFlight(Section):
     )
     formation: Formation | None = Field(None, description="where nodes without a track fly; null: every node has one")
     separation_m: float = Field(2.0, ge=0, description="least distance between any two nodes, m")
+    climb_m_s: Positive = Field(
+        2.0, description="vertical speed of take-off and landing, m/s; counts in flight_s of a mission with a home"
+    )
     wobble: Wobble | None = Field(None, description="by wind; null: none")
     log_rate_hz: Positive = Field(10.0, description="epochs of the flight logs per second, Hz")
     solution: Literal["fix", "float", "single"] = Field(

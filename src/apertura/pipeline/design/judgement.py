@@ -11,6 +11,7 @@ import numpy as np
 from apertura.common.errors import CampaignError
 from apertura.core.quality.budget import RECEIVER_STD_M
 from apertura.formats.export.layers import LAYOVER, OUTSIDE, SHADOW
+from apertura.methods.autofocus.expected import LEAST_POINTS, LEAST_SNR_DB
 from apertura.pipeline.config import OfdmWaveform
 from apertura.pipeline.config.flight_plan import BesideTrack, FlightPlan, LineTrack
 from apertura.pipeline.design.computed import Design, designed
@@ -106,6 +107,11 @@ def report_of(design: Design) -> dict[str, Any]:
     return {
         "judgement": [verdict.report for verdict in judge(design)],
         "recording": asdict(design.recording),
+        "refinement": {
+            flight: {"decision": f"{one.decision.value}: {one.decision.reason}", "applied": one.applied}
+            | {"expected": refinement_line(design, flight)}
+            for flight, one in design.refinements.items()
+        },
         "budget": {name: [line.report for line in image.budget] for name, image in design.images.items()},
         "flags": {name: dict(image.flags) for name, image in design.images.items()},
         "doppler_hz": {name: image.doppler_hz for name, image in design.images.items() if image.looks is not None},
@@ -118,7 +124,9 @@ _Found = tuple[str, float, str, str]
 def _of_images(design: Design) -> Iterator[_Found]:
     for image in design.judged:
         seen = image.layers["mask"] == 0
-        for name, (layer, side) in _LAYERS.items():
+        applied = design.refinements[image.name.split("/")[0]].applied
+        for name, (logged, side) in _LAYERS.items():
+            layer = "loss_refined" if logged == "loss" and applied else logged
             if layer in image.layers:
                 values = image.layers[layer][seen]
                 values = values[~np.isnan(values)]
@@ -139,7 +147,8 @@ def _of_interferograms(design: Design) -> Iterator[_Found]:
 def _of_recording(design: Design) -> Iterator[_Found]:
     recording = design.recording
     flight, lasting_s = max(recording.flight_s.items(), key=lambda item: item[1])
-    yield "flight_s", lasting_s, flight, "length of the tracks over their speed"
+    before = " with take-off, transit and landing" if recording.transfer_s[flight] else ""
+    yield "flight_s", lasting_s, flight, f"length of the tracks over their speed{before}"
     pulses = sum(recording.pulses.values())
     yield "recorded_gb", recording.recorded_bytes / 1e9, "all", f"{pulses} pulses of all flights, by each node"
 
@@ -159,6 +168,30 @@ def _cause(name: str, design: Design, image: PlannedImage, seen: np.ndarray, val
         return f"Doppler spreads {spread_hz:.0f} Hz over the scene, by speed, range and beams"
     looks = float(np.median(image.layers["looks"][seen]))
     return f"noise of {looks:.0f} pulses at the far side, by power, gains and range"
+
+
+def refinement_line(design: Design, flight: str) -> str:
+    """Return whether the tracks of a flight will be refined by its images, and what that needs of the scene."""
+    refinement = design.refinements[flight]
+    if refinement.obstacles:
+        return f"refinement is not expected to succeed: {', '.join(refinement.obstacles)}"
+    what = "tracks refined" if refinement.applied else "tracks as logged; processing.autofocus: on refines them"
+    return f"{what}, which needs {LEAST_POINTS} bright points in the scene, {_least_point(design, flight)}"
+
+
+def _least_point(design: Design, flight: str) -> str:
+    """Return the cross-section from which a point is bright enough for a refinement, in all pairs of a flight."""
+    each = f"{LEAST_SNR_DB:g} dB above the noise of one pulse"
+    rcs_dbsm, excess_db = design.opened.plan.expect.rcs_dbsm, list[float]()
+    for image in design.images.values():
+        if image.looks is not None and image.name.startswith(f"{flight}/") and "point_snr" in image.layers:
+            seen = image.layers["mask"] == 0
+            pulse_db = (image.layers["point_snr"] - 10 * np.log10(np.maximum(image.layers["looks"], 1)))[seen]
+            pulse_db = pulse_db[np.isfinite(pulse_db)]
+            excess_db.append(float(np.percentile(pulse_db, 100 - SHARE)) if pulse_db.size else np.nan)
+    if rcs_dbsm is None or not excess_db or not np.isfinite(excess_db).all():
+        return each
+    return f"{each}: at least {rcs_dbsm + LEAST_SNR_DB - min(excess_db):.0f} dBsm"
 
 
 def _coarsest(image: PlannedImage) -> str:
@@ -276,6 +309,8 @@ def _candidates(plan: FlightPlan) -> Iterator[tuple[str, _Changing]]:
         yield "twice the pulse rate (waveform.prf_hz)", partial(_radar, prf_hz=2 * prf_hz)
     if isinstance(plan.waveform, OfdmWaveform):
         yield "twice the bandwidth (waveform.subcarriers)", partial(_radar, subcarriers=2 * plan.waveform.subcarriers)
+    if plan.processing.autofocus != "on":
+        yield "refine the tracks by the images (processing.autofocus: on)", _refined
     yield "3 dB more power (transmit_power_dbm)", _louder
     yield "positions known twice as well (position_std_m)", _surer
 
@@ -322,6 +357,10 @@ def _tracks(plan: FlightPlan, change: Callable[[Any], dict[str, Any]]) -> Flight
 def _radar(plan: FlightPlan, **changes: Any) -> FlightPlan:
     waveform = type(plan.waveform).model_validate(plan.waveform.model_dump() | changes)
     return plan.model_copy(update={"waveform": waveform})
+
+
+def _refined(plan: FlightPlan) -> FlightPlan:
+    return plan.model_copy(update={"processing": plan.processing.model_copy(update={"autofocus": "on"})})
 
 
 def _louder(plan: FlightPlan) -> FlightPlan:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,9 +16,9 @@ from apertura.core.backprojection.job import Integration, Job, Signal
 from apertura.core.echo.compression import centre_frequency
 from apertura.core.imaging.radiometry import point_weights
 from apertura.core.imaging.resolution import Resolution
-from apertura.core.planning.plan import check_geometry
-from apertura.core.quality.budget import BudgetLine, expected
-from apertura.core.quality.path_errors import MOST_PULSES
+from apertura.core.planning.plan import Decision, check_geometry
+from apertura.core.quality.budget import BudgetLine, expected, summed
+from apertura.core.quality.path_errors import MOST_PULSES, Effect
 from apertura.core.scene.looks import BLOCK_PX, Looks
 from apertura.core.scene.terrain import bilinear
 from apertura.formats.export.layers import OUTSIDE
@@ -50,11 +51,36 @@ UNITS: Mapping[str, tuple[str, str]] = {
     "point_snr": ("dB", "point of expect.rcs_dbsm over noise"),
     "ambiguity": ("1", "share of the scene's echo that folds onto the place"),
     "path_margin": ("m", "total path left before the prefix or the recording ends"),
-    "loss": ("dB", "expected loss of a point's peak by all causes of the error budget"),
+    "loss": ("dB", "expected loss of a point's peak by all causes of the error budget, with the tracks as logged"),
+    "loss_refined": ("dB", "the same after step refine; NaN where a measured limit of the refinement is exceeded"),
     "coherence": ("1", "of still ground between two images: common spectrum and noise"),
     "height_ambiguity": ("m", "height that turns the phase between two images once"),
 }
 """Layer → unit and meaning."""
+
+
+@dataclass(frozen=True)
+class PlannedRefinement:
+    """Refinement of a flight's tracks, before the flight.
+
+    Attributes
+    ----------
+    decision
+        On or off by the plan's `processing.autofocus`, and why.
+    remainder_db
+        Loss by position errors that it is expected to leave, 0 or less; NaN where an obstacle prevents it.
+    obstacles
+        Measured limits that the flight exceeds.
+    """
+
+    decision: Decision
+    remainder_db: float
+    obstacles: tuple[str, ...]
+
+    @property
+    def applied(self) -> bool:
+        """Whether images are judged with refined tracks: requested by the plan, and within the measured limits."""
+        return self.decision.value == "on" and not self.obstacles
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,6 +121,7 @@ def planned_image(
     *,
     sigma0_db: float | None,
     rcs_dbsm: float | None,
+    refinement: PlannedRefinement | None = None,
     threads: int = 1,
 ) -> PlannedImage:
     """Return what the image of a pair will be.
@@ -105,13 +132,13 @@ def planned_image(
         Settings, the pair as it will fly, or as its logs say that it flew; grid and ground.
     sigma0_db, rcs_dbsm
         Of the ground and of a point, to be seen above the noise; None: not asked.
+    refinement
+        Of the flight's tracks before the flight; None: the pair is as it will be imaged.
     threads
         Tiles computed at once.
     """
     grid = scene.grid
-    integration = integration_of(campaign, pair, scene)
-    beams = Beams.within(integration.sector, pair.beams)
-    job = _job(campaign, pair, scene, beams, integration)
+    job, integration, beams = planned_job(campaign, pair, scene)
     flags = Flags.merged(check_geometry(job), decide_antennas(job.beams, job.illumination)[1], integration.flags)
     calibrated = calibrated_pair(campaign, pair, scene, weights=(beams, integration.count), threads=threads)
     noise = _noise(calibrated)
@@ -127,12 +154,15 @@ def planned_image(
         layers["snr"] = (sigma0_db - layers["nesz"]).astype(np.float32)
     if rcs_dbsm is not None:
         layers["point_snr"] = _point_snr(calibrated, noise, rcs_dbsm, grid.shape)
-    layers |= _coarse_layers(campaign, pair, scene, beams)
+    seen = _seen_from(pair, beams, scene.middle_m)
+    refined = seen if refinement is None else _refined(campaign, seen, scene, refinement)
+    layers |= _coarse_layers(campaign, pair, scene, beams, None if refinement is None else refined.left)
     outside = layers["mask"] == OUTSIDE
     layers["mask"] = np.where((layers["path_margin"] < 0) | outside, OUTSIDE, layers["mask"]).astype(np.uint8)
     spread, _ = pair.aperture.phase_rates(job.points_m, wavelength_m=pair.wave_speed_m_s / job.band_hz[1])
     rate_hz = 1 / float(np.median(np.diff(pair.time_s)))
-    budget = tuple(budget_of(campaign, _seen_from(pair, beams, scene.middle_m), scene))
+    applied = refinement is not None and refinement.applied
+    budget = tuple(budget_of(campaign, refined if applied else seen, scene))
     return PlannedImage(f"{pair.flight}/{pair.name}", layers, resolution, budget, flags, looks, spread * rate_hz)
 
 
@@ -166,7 +196,12 @@ def summed_image(flight: str, images: list[PlannedImage]) -> PlannedImage:
                 mean = inverse.sum(axis=0) / count
                 mean = np.where(mean > 0, mean / (count if coherent else 1), np.nan)
                 layers[name] = (sign * 10 * np.log10(mean)).astype(np.float32)
-    for name, worst in (("ambiguity", np.max), ("path_margin", np.min), ("loss", np.max)):
+    for name, worst in (
+        ("ambiguity", np.max),
+        ("path_margin", np.min),
+        ("loss", np.max),
+        ("loss_refined", np.max),
+    ):
         layers[name] = worst([image.layers[name] for image in images], axis=0)
     flags = Flags.merged(*(image.flags for image in images))
     return PlannedImage(f"{flight}/sum", layers, resolution, (), flags, None, float("nan"))
@@ -208,11 +243,13 @@ def resolution_layers(resolution: Resolution, shape: tuple[int, int]) -> dict[st
     return {"resolution": coarse, "resolution_fine": fine, "orientation": azimuth}
 
 
-def _job(campaign: Campaign, pair: OpenPair, scene: OpenScene, beams: Beams | None, integration: Integration) -> Job:
-    """Return what the limits of imaging are checked on: the planner's job without its signal."""
+def planned_job(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> tuple[Job, Integration, Beams | None]:
+    """Return what the limits of imaging are checked on: the planner's job without its signal; and its weights."""
+    integration = integration_of(campaign, pair, scene)
+    beams = Beams.within(integration.sector, pair.beams)
     grid, frequency_hz = scene.grid, pair.frequency_hz
     centre_hz, count = centre_frequency(frequency_hz), len(frequency_hz)
-    return Job(
+    job = Job(
         aperture=pair.aperture,
         ground_m=grid.sample_points(AMBIGUITY_NODES, scene.level.height_m),
         shape=grid.shape,
@@ -226,6 +263,13 @@ def _job(campaign: Campaign, pair: OpenPair, scene: OpenScene, beams: Beams | No
         integration=integration,
         illumination=scene_illumination(campaign, pair.name, beams, scene, pair.aperture),
     )
+    return job, integration, beams
+
+
+def _refined(campaign: Campaign, pair: OpenPair, scene: OpenScene, refinement: PlannedRefinement) -> OpenPair:
+    """Return a pair with the loss that a refinement leaves, and the shifts of the logs, which no refinement sees."""
+    logged = summed(line.effect for line in budget_of(campaign, pair, scene) if line.cause == "positions")
+    return replace(pair, left=replace(logged, loss_db=refinement.remainder_db, loss_std_db=0.0))
 
 
 def _noise(calibrated: CalibratedPair | None) -> float:
@@ -245,13 +289,16 @@ def _point_snr(calibrated: CalibratedPair | None, noise: float, rcs_dbsm: float,
         return (rcs_dbsm + 10 * np.log10(ratio)).astype(np.float32)
 
 
-def _coarse_layers(campaign: Campaign, pair: OpenPair, scene: OpenScene, beams: Beams | None) -> dict[str, Layer]:
-    """Return loss by expected errors, echoes that fold, and path left before the recording ends; bilinear."""
+def _coarse_layers(
+    campaign: Campaign, pair: OpenPair, scene: OpenScene, beams: Beams | None, left: Effect | None
+) -> dict[str, Layer]:
+    """Return losses by expected errors, echoes that fold, and path left before the recording ends; bilinear."""
     wavelength_m = pair.wave_speed_m_s / float(pair.frequency_hz[-1])
 
-    def loss_db(points: Floats) -> Floats:
+    def loss_db(points: Floats, after: Effect | None = None) -> Floats:
+        seen = [replace(_seen_from(pair, beams, point), left=after or pair.left) for point in points]
         found = [
-            expected(budget_of(campaign, _seen_from(pair, beams, point), scene, place_m=point)) for point in points
+            expected(budget_of(campaign, one, scene, place_m=point)) for one, point in zip(seen, points, strict=True)
         ]
         return -np.array([effect.loss_db for effect in found])
 
@@ -263,6 +310,7 @@ def _coarse_layers(campaign: Campaign, pair: OpenPair, scene: OpenScene, beams: 
 
     counts = {
         "loss": (LOSS_NODES, loss_db),
+        "loss_refined": (LOSS_NODES, partial(loss_db, after=left)),
         "ambiguity": (AMBIGUITY_NODES, folded),
         "path_margin": (AMBIGUITY_NODES, left_m),
     }

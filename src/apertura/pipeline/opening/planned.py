@@ -1,5 +1,6 @@
 """A flight plan, opened: where nodes will be at each pulse, the pairs they make, the grid and the ground."""
 
+import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -78,11 +79,17 @@ class Course:
         (epoch, 3) float64: easting, northing, height above the ellipsoid (z in a local frame), metres.
     imaged_s
         Begin and end of what makes the image.
+    home_m
+        (3,) float64, as `place_m`: take-off and landing point of a mission; None where the plan has none.
+    transit_m_s
+        Horizontal speed between home and the track.
     """
 
     time_s: Floats
     place_m: Floats
     imaged_s: tuple[tuple[float, float], ...]
+    home_m: Floats | None = None
+    transit_m_s: float = math.inf
 
     def imaged_legs_m(self) -> list[Floats]:
         """Return places evenly spread over each leg that makes the image, (point, 3) float64 metres."""
@@ -98,6 +105,15 @@ class Course:
     def length_s(self) -> float:
         """From the first pulse to the end of what is flown."""
         return float(self.time_s[-1]) - LEAD_S
+
+    def transfer_s(self, climb_m_s: float) -> float:
+        """Return the time of take-off, transit from and to home, and landing, seconds; 0 where no home is known."""
+        if self.home_m is None:
+            return 0.0
+        ends = [[np.interp(at, self.time_s, axis) for axis in self.place_m.T] for at in (0.0, self.length_s)]
+        away_m = np.array(ends) - self.home_m
+        horizontal_s = np.linalg.norm(away_m[:, :2], axis=1).sum() / self.transit_m_s
+        return float(horizontal_s + np.abs(away_m[:, 2]).sum() / climb_m_s)
 
 
 @dataclass(frozen=True, eq=False)
@@ -389,8 +405,8 @@ def _mission(
     flat = map_from_frame(ground.crs, ecef_from_geodetic(latitude, longitude, np.zeros(len(height))))[:, :2]
     home = mission.home_deg or (float(latitude[0]), float(longitude[0]))
     base: Floats
+    at = map_from_frame(ground.crs, ecef_from_geodetic(*(np.array(one) for one in (*home, 0.0))))
     if mission.reference == "home":
-        at = map_from_frame(ground.crs, ecef_from_geodetic(*(np.array(one) for one in (*home, 0.0))))
         base = np.full(len(flat), ground.height_at(float(at[0]), float(at[1])))
     elif mission.reference == "ground":
         base = np.array([ground.height_at(float(x), float(y)) for x, y in flat])
@@ -411,6 +427,9 @@ def _mission(
         raise CampaignError(f"image: [{first}, {last}]", where, f"waypoints 1 to {len(place)}", "Correct it.")
     imaged = ((float(time_s[first - 1]), float(time_s[last - 1])),)
     course = _sampled(time_s, place, imaged, flight.log_rate_hz, where)
+    if mission.reference == "home" and mission.home_deg is not None:
+        landed_m = np.array([at[0], at[1], base[0]])
+        course = replace(course, home_m=landed_m, transit_m_s=float(np.median(speed[1:])))
     if len(place) == 2:
         return course
     rounded = gaussian_filter1d(course.place_m - place[0], _CORNER_S * flight.log_rate_hz, axis=0, mode="nearest")

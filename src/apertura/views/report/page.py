@@ -23,6 +23,8 @@ tr { break-inside: avoid; }
 th { text-align: left; border-bottom: 0.4mm solid #333; padding: 0.8mm 1.5mm; }
 td { vertical-align: top; border-bottom: 0.1mm solid #bbb; padding: 0.8mm 1.5mm; overflow-wrap: anywhere; }
 td:first-child { min-width: 22mm; }
+td.number { white-space: nowrap; }
+.wide { overflow-x: auto; }
 @media print { body { margin: 0; padding: 0; max-width: none; } h2 { break-before: auto; } }
 """
 _POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
@@ -65,9 +67,18 @@ class Table:
     def html(self) -> str:
         """As HTML, escaped."""
         head = "".join(f"<th>{escape(cell)}</th>" for cell in self.head)
-        rows = "".join(f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>\n" for row in self.rows)
+        rows = "".join(f"<tr>{''.join(map(_cell, row))}</tr>\n" for row in self.rows)
         caption = f"<caption>{escape(self.caption)}</caption>"
-        return f"<table>{caption}<thead><tr>{head}</tr></thead>\n<tbody>{rows}</tbody></table>"
+        table = f"<table>{caption}<thead><tr>{head}</tr></thead>\n<tbody>{rows}</tbody></table>"
+        return f'<div class="wide">{table}</div>'
+
+
+_NUMBERS = re.compile(r"[-−+±\d.,e\s/%]+")  # a cell of numbers alone, which break between lines only where told
+
+
+def _cell(text: str) -> str:
+    kind = ' class="number"' if _NUMBERS.fullmatch(text) else ""
+    return f"<td{kind}>{escape(text).replace(chr(10), '<br>')}</td>"
 
 
 @dataclass(frozen=True)
