@@ -163,6 +163,8 @@ def test_what_was_predicted_is_measured_after_the_same_plan_was_sampled_and_proc
     assert (status, err) == (0, "")
     assert "measured in the image" in out
     assert "another radar" not in out
+    (width,) = (line.split() for line in out.splitlines() if "resolution_fine" in line)
+    assert float(width[-1]) == pytest.approx(float(width[-2]), rel=0.1)  # of the only target, against the logs
     document["waveform"]["carrier_hz"] = 1.2e9
     (tmp_path / "plan.yaml").write_text(yaml.safe_dump(document))
     _, out, _ = typed(monkeypatch, capsys, "compare", tmp_path / "plan.yaml", tmp_path / "flown")

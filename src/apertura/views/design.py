@@ -32,6 +32,7 @@ from apertura.pipeline.design.judgement import (
 )
 from apertura.pipeline.design.layers import UNITS, PlannedImage, planned_image
 from apertura.pipeline.design.writing import PICTURE_TAGS, copy_named, plan_text, write_design
+from apertura.pipeline.opening.autofocus import open_refined
 from apertura.pipeline.opening.pair import open_pair
 from apertura.pipeline.opening.scene import expected_scene
 from apertura.pipeline.stale import outdated_lines, without_outdated
@@ -426,9 +427,9 @@ def print_comparison(path: Path, folder: Path, *, threads: int = 1) -> None:
     plan, campaign = read_flight_plan(path), without_outdated(Campaign.load(folder))
     campaign.check_images()
     rows = comparison_rows(plan, path.absolute().parent, campaign, threads=threads)
-    head = ("image", "quantity", "planned", "flown, by the logs", "measured in the image")
+    head = ("image", "quantity", "planned", "flown (from the logs)", "measured in the image")
     console = Console(width=max(120, Console().width))
-    console.print(_table("planned and flown", head, rows))
+    console.print(_table("Planned and flown; measured resolution: widths of the brightest point", head, rows))
     for line in outdated_lines(campaign):
         console.print(line, highlight=False)
     for line in _other_radar(plan, campaign):
@@ -469,8 +470,16 @@ def comparison_rows(plan: FlightPlan, root: Path, campaign: Campaign, *, threads
             if planned is None:
                 continue
             opened = open_pair(campaign, flight.name, pair)
-            asked = {"sigma0_db": plan.expect.sigma0_db, "rcs_dbsm": plan.expect.rcs_dbsm}
-            flown = planned_image(campaign, opened, scene, **asked, threads=threads)
+            if campaign.is_current(campaign.stage("refined_track", flight.name)):
+                opened = open_refined(campaign, flight.name).pair(opened)
+            flown = planned_image(
+                campaign,
+                opened,
+                scene,
+                sigma0_db=plan.expect.sigma0_db,
+                rcs_dbsm=plan.expect.rcs_dbsm,
+                threads=threads,
+            )
             measured = _measured(campaign, flight.name, pair)
             planned_pair = next(one for one in design.opened.pairs if (one.flight, one.name) == (flight.name, pair))
             numbers = [_numbers(planned), _numbers(flown)]
@@ -516,6 +525,11 @@ def _measured(campaign: Campaign, flight: str, pair: str) -> Mapping[str, float]
         return {}
     report = read_report(campaign, flight, pair)
     found: dict[str, float] = {}
+    brightest = report.get("brightest") or {}
+    axes = ("ground_range_width_m", "cross_range_width_m")
+    widths = [float(brightest[axis]) for axis in axes if brightest.get(axis) is not None]
+    if report["focus"].get("verdict") == "focused" and len(widths) == len(axes):
+        found |= {"resolution, m": max(widths), "resolution_fine, m": min(widths)}
     if report["focus"].get("loss_db") is not None:
         found["loss, dB"] = -float(report["focus"]["loss_db"])
     for name in ("looks", "incidence", "bistatic_angle", "nesz"):

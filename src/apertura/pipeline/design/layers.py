@@ -308,7 +308,7 @@ def _coarse_layers(
     def left_m(points: Floats) -> Floats:
         return np.asarray(pair.path_limit_m - pair.aperture[pair.aperture.sample(MOST_PULSES)].path(points).min(axis=0))
 
-    counts = {
+    counts: dict[str, tuple[int, Callable[[Floats], Floats]]] = {
         "loss": (LOSS_NODES, loss_db),
         "loss_refined": (LOSS_NODES, partial(loss_db, after=left)),
         "ambiguity": (AMBIGUITY_NODES, folded),
