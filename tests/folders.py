@@ -98,14 +98,13 @@ STAND_ON_ALL = frozenset({"mosaic", "map", "stac", "ro_crate"})
 
 
 def export_flight(campaign: Campaign, flight: str) -> None:
-    """Write what the images of a flight are for others: rasters, and tracks where samples were recorded."""
+    """Write what the images of a flight are for others: rasters and tracks."""
     for pair in campaign.flight(flight).pairs:
         layers.layers(campaign, flight, pair, threads=2)
         export.export(campaign, flight, pair)
     if FUSED in campaign.flight(flight).images:
         export.export_fused(campaign, flight)
-    if isinstance(campaign.settings.waveform, SampledWaveform):
-        tracks.tracks(campaign, flight)
+    tracks.tracks(campaign, flight)
 
 
 def run_steps(root: Path, *, exports: bool = True) -> Campaign:

@@ -4,6 +4,7 @@ import shutil
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import sarkit.verification
 import yaml
@@ -18,7 +19,7 @@ from apertura.pipeline.check import problems
 from apertura.pipeline.lineage import on_demand, results_of
 from apertura.pipeline.opening.echo import PairEcho
 from apertura.pipeline.stale import stale_results
-from apertura.pipeline.steps import cphd, echo
+from apertura.pipeline.steps import cphd, echo, tracks
 from apertura.pipeline.store import open_stage
 
 AT = np.array([48.0, 11.0, 600.0])
@@ -85,6 +86,16 @@ def gotcha(shared, tmp_path_factory):
     settle_ground(campaign)
     make_images(campaign, "pass1")
     return campaign
+
+
+@pytest.mark.slow
+def test_positions_that_travel_with_the_samples_are_written_as_tracks_pulse_by_pulse(gotcha):
+    written = {path.name for path in tracks.tracks(gotcha, "pass1")}
+    assert written == {"radar.csv", "tracks.png"}  # a local frame has no .pos
+    with gotcha.result("pass1", "tracks", "radar.csv").open("rb") as file:
+        read = pd.read_csv(file)
+    echo = open_stage(gotcha.stage("echo", "pass1", "radar-radar"), "echo")
+    np.testing.assert_allclose(read[["east_m", "north_m", "up_m"]], echo.tx_position.values, atol=1e-4, rtol=0)
 
 
 @pytest.mark.slow

@@ -11,8 +11,10 @@ from folders import complaint, edit_config, run_steps
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.geometry.geodesy import ecef_from_projected, geodetic_from_ecef
 from apertura.formats.names import PHASE_HISTORIES, HistoryFormat
+from apertura.formats.tracks.csv_track import read_csv_track
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.check import problems
+from apertura.pipeline.steps import tracks
 from apertura.pipeline.store import open_stage
 from apertura.views.look.follow import Look
 
@@ -104,6 +106,19 @@ def test_a_target_is_where_it_stands_by_the_log_and_its_clock(campaign):
     echo = open_stage(Campaign.load(campaign).stage("echo", "f01", "uav1-uav1"), "echo")
     assert echo.attrs["time_tags"]["std_s"] == 1e-3
     assert echo.attrs["frame"] == "ecef"
+
+
+def test_refined_tracks_of_a_phase_history_are_written_for_its_log(campaign):
+    keep_time(campaign)
+    edit_config(campaign, lambda document: document.update(processing={"autofocus": "off"}))
+    opened = run_steps(campaign, exports=False)
+    written = {path.name for path in tracks.tracks(opened, "f01")}
+    assert written == {"uav1.csv", "uav1.pos", "tracks.png"}
+    read, log = (read_csv_track(path, node="uav1") for path in (
+        campaign / "results/f01/tracks/uav1.csv", campaign / "raw/f01/uav1.track.csv"
+    ))  # fmt: skip
+    np.testing.assert_array_equal(read.time.values, log.time.values)
+    np.testing.assert_allclose(read.position.values, log.position.values, atol=1e-4, rtol=0)
 
 
 @pytest.mark.slow

@@ -111,6 +111,7 @@ WRONG_RUNS = {
     "--set-scatter tiles=0": "tiles=N, N >= 1",
     "--set-scat=tiles=0": "tiles=N, N >= 1",
     "--until imag": "ingest, bench, echo",
+    "cphd": "cphd: a step that runs only where its result is requested",
     "results/f01/uav2-uav2/echo.manifest.json": "one of fused, tracks, uav1, uav1-uav1, uav1-uav2, uav2",
     "results/f01/uav9/track.manifest.json": "f01 has no uav9",
     "results/f09/uav1-uav1/echo.manifest.json": "no flight 'f09'",
@@ -124,6 +125,13 @@ def test_what_snakemake_would_ignore_or_make_of_no_flight_is_refused(typed, tiny
     assert err.count("\n") == 1
     assert WRONG_RUNS[words] in err
     assert not (tiny / "results").exists()
+
+
+@pytest.mark.slow
+def test_a_step_named_as_a_target_is_the_last_step(typed, tiny):
+    status, out, err = typed("run", tiny, "echo", "-n")
+    assert (status, err) == (0, "")
+    assert out.endswith("2 echo\n")
 
 
 @pytest.mark.slow

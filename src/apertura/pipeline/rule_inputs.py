@@ -171,6 +171,16 @@ def echoes_that_bound_the_scene(place: JobPlace) -> Iterable[str]:
     return [campaign.manifest("echo", first.name, pair) for pair in first.pairs] if by_flight else []
 
 
+def unstaged_positions(place: JobPlace) -> Iterable[str]:
+    """Return what positions of a phase history come from, which has no stage `track`: flight logs, else echoes."""
+    campaign = place.campaign
+    if is_sampled(campaign):
+        return []
+    nodes = [(flight, node) for flight, node in place.below(Scope.NODE)]
+    logs = [campaign.relative(campaign.track_file(*at)) for at in nodes if campaign.logged(*at)]
+    return logs or [campaign.manifest("echo", *pair) for pair in place.pairs]
+
+
 def heights(place: JobPlace) -> Iterable[str]:
     """Return the files of the DEM and of the geoid."""
     return map(place.campaign.relative, place.campaign.height_files().values())
@@ -242,6 +252,14 @@ def log_settings(place: JobPlace) -> Mapping[str, Any]:
     """Return how a node's log is read."""
     stated = place.campaign.values["nodes"][place.where[1]]["log"]
     return {name: value for name, value in stated.items() if name not in {"longest_gap_s", "smoothing_m"}}
+
+
+def unstaged_log_settings(place: JobPlace) -> Mapping[str, Any]:
+    """Return how the logs of a flight are read, where no stage `track` holds them."""
+    if is_sampled(place.campaign):
+        return {}
+    nodes = {at[1]: at for at in place.below(Scope.NODE) if place.campaign.logged(*at)}
+    return {"log": {node: log_settings(JobPlace(place.campaign, Scope.NODE, at)) for node, at in nodes.items()}}
 
 
 def stated_errors(place: JobPlace) -> Mapping[str, Any]:

@@ -136,7 +136,7 @@ def run_workflow(root: Path, cores: int, *arguments: str, paranoid: bool = False
         If the campaign is not fit to run, or another run holds it.
     """
     elsewhere = _runs_elsewhere(arguments)
-    options = code_from_outside(root, arguments)
+    options = _steps_as_until(code_from_outside(root, arguments))
     _check_values(options)
     if _PROFILE in os.environ:
         os.environ[_PROFILE] = _whole(root, _PROFILE, os.environ[_PROFILE])
@@ -324,6 +324,34 @@ def _values(options: Sequence[str], *names: str) -> Iterator[int]:
             option = word
         elif option in names or (len(option) > len("--set-") and any(name.startswith(option) for name in names)):
             yield at
+
+
+def _steps_as_until(options: Sequence[str]) -> list[str]:
+    """Return options with steps named as targets turned into last steps, as Snakemake takes no rule with wildcards.
+
+    Examples
+    --------
+    >>> _steps_as_until(["tracks", "-n"]), _steps_as_until(["-n", "--until", "echo"])
+    (['--until', 'tracks', '-n'], ['-n', '--until', 'echo'])
+    """
+    leading = next((at for at, word in enumerate(options) if word.startswith("-")), len(options))
+    steps = [word for word in options[:leading] if word in RULES and RULES[word].of.wildcards]
+    for step in steps:
+        if RULES[step].on_demand:
+            raise CampaignError(
+                f"{step}: a step that runs only where its result is requested",
+                "apertura run",
+                f"a target of {', '.join(_TARGETS)}, or a file of the results",
+                "Name the file, or the target that gathers it.",
+            )
+    others = [word for word in options[:leading] if word not in steps]
+    rest = list(options[leading:])
+    if not steps:
+        return [*others, *rest]
+    if _UNTIL[0] in rest:
+        at = rest.index(_UNTIL[0]) + 1
+        return [*others, *rest[:at], *steps, *rest[at:]]
+    return [*others, _UNTIL[0], *steps, *rest]
 
 
 def _check_values(options: Sequence[str]) -> None:

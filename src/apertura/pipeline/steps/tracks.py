@@ -13,6 +13,8 @@ from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import Node
 from apertura.pipeline.lineage import result_of
 from apertura.pipeline.opening.autofocus import RefinedTrack, open_refined
+from apertura.pipeline.opening.reading import read_log
+from apertura.pipeline.rule_inputs import is_sampled
 from apertura.pipeline.steps.stamping import tags_of
 from apertura.pipeline.store import open_stage, record_files
 
@@ -20,14 +22,15 @@ from apertura.pipeline.store import open_stage, record_files
 def tracks(campaign: Campaign, flight: str) -> list[Path]:
     """Write results/<flight>/tracks: of each node .csv and, on Earth, .pos, and tracks.png; return their paths.
 
+    Positions that travel with the samples of a phase history are written as phase centres, an epoch per pulse.
     Where the refinement was not accepted, moved no track or was not tried, the files hold the logs as they are.
     """
     lineage = result_of(campaign, "tracks", flight).begin(campaign.root)
     found = open_refined(campaign, flight)
-    stages = {node: open_stage(campaign.stage("track", flight, node), "track") for node in found.stage.attrs["nodes"]}
+    positions = {node: _positions(campaign, flight, node) for node in found.stage.attrs["nodes"]}
     outcome, folder = outcome_of(found), (campaign.root / lineage.result.manifest).parent
     folder.mkdir(parents=True, exist_ok=True)
-    logs = [refined_log(found, node, stage, campaign.node(flight, node)) for node, stage in stages.items()]
+    logs = [refined_log(found, node, track, campaign.node(flight, node)) for node, track in positions.items()]
     written = []
     for log in logs:
         table, solution = (folder / f"{log.node}.{suffix}" for suffix in ("csv", "pos"))
@@ -37,11 +40,35 @@ def tracks(campaign: Campaign, flight: str) -> list[Path]:
             write_pos(solution, log, outcome=outcome, version=__version__)
             written.append(solution)
     picture = folder / "tracks.png"
-    tags = tags_of(Provenance.of(lineage.modules, [found.stage, *stages.values()]), lineage)
+    if is_sampled(campaign):
+        provenance = Provenance.of(lineage.modules, [found.stage, *positions.values()])
+    else:
+        provenance = Provenance.of(lineage.modules, [found.stage], inputs=lineage.sources.digests)
+    tags = tags_of(provenance, lineage)
     title = f"{campaign.settings.campaign} · tracks of flight {flight}"
     write_picture(picture, logs, title=title, outcome=outcome, tags=tags)
     record_files(campaign.root / lineage.result.manifest, [*written, picture], lineage)
     return [*written, picture]
+
+
+def _positions(campaign: Campaign, flight: str, node: str) -> xr.Dataset:
+    """Return the positions of a node as stage `track` holds them: as logged, else of its antenna at the pulses."""
+    if is_sampled(campaign):
+        track: xr.Dataset = open_stage(campaign.stage("track", flight, node), "track")
+        return track
+    if campaign.logged(flight, node):
+        return read_log(campaign, flight, node)
+    pair = next(pair for pair in campaign.flight(flight).pairs if node in pair.split("-"))
+    echo, leg = open_stage(campaign.stage("echo", flight, pair), "echo"), "tx" if pair.startswith(f"{node}-") else "rx"
+    place_m = echo[f"{leg}_position"].values
+    return xr.Dataset(  # its times may be of no calendar, as where a recorder states none
+        {
+            "time": ("epoch", echo.time.values),
+            "position": (("epoch", "axis"), place_m),
+            "attitude": (("epoch", "axis"), np.full(place_m.shape, np.nan)),
+        },
+        attrs={"node": node, "frame": echo.attrs["frame"]},
+    )
 
 
 def outcome_of(found: RefinedTrack) -> str:
