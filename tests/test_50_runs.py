@@ -6,6 +6,7 @@ import os
 import re
 import shutil
 import subprocess
+import tempfile
 import threading
 import time
 from dataclasses import replace
@@ -17,11 +18,11 @@ from folders import ROOT, copy_writable
 from rich.console import Console
 
 from apertura.common.errors import CampaignError
-from apertura.common.processes import hold, holder
+from apertura.common.processes import hold, holder, keep_caches_writable
 from apertura.common.progress import progress_path
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.resources import Resources
-from apertura.pipeline.runs.journal import JobRecord, JournalReader, RunRecord, failures, note
+from apertura.pipeline.runs.journal import JobRecord, JournalReader, RunRecord, a_step_was_killed, failures, note
 from apertura.pipeline.runs.outlook import Outlook, StepProgress
 from apertura.pipeline.runs.results import clean, print_list, states
 from apertura.pipeline.runs.screen import Bar, Screen, bars, print_status, table
@@ -393,8 +394,49 @@ def test_steps_that_fail_alike_say_it_once_with_every_log(tmp_path):
 
 
 def test_a_defect_and_a_killed_step_are_told_apart(tmp_path):
-    assert "a defect of ours" in failed(tmp_path, "Traceback (most recent call last):\nZeroDivisionError: by zero\n")
-    assert "was it killed" in failed(tmp_path, "10 of 20 tiles to form\n")
+    assert "internal error, please report it" in failed(
+        tmp_path, "Traceback (most recent call last):\nZeroDivisionError: by zero\n"
+    )
+    assert "it was killed, perhaps for lack of memory" in failed(tmp_path, "10 of 20 tiles to form\n")
+
+
+@pytest.mark.parametrize(("said", "killed"), [("10 of 20 tiles to form\n", True), ("error: codes.npy: gone\n", False)])
+def test_a_killed_step_is_known_by_its_log(tmp_path, said, killed):
+    (tmp_path / "0.log").write_text(said)
+    assert (
+        a_step_was_killed(tmp_path, RunRecord(jobs={0: JobRecord("image", "image f01", "0.log", 0, failed=True)}))
+        == killed
+    )
+
+
+def test_an_executor_without_its_plugin_is_one_message_with_what_to_install(tmp_path):
+    (tmp_path / "a.log").write_text(
+        "usage: [-h]\nsnakemake: error: argument --executor/-e: invalid choice: 'slurm' (choose from 'local')\n"
+    )
+    message, _ = failures(tmp_path, RunRecord(), tmp_path / "a.log")
+    assert message.startswith("error: executor 'slurm' is not installed. Install it beside apertura: ")
+    assert message.endswith("pip install snakemake-executor-plugin-slurm")
+
+
+def test_without_a_writable_home_caches_lie_in_the_temporary_folder(tmp_path, monkeypatch):
+    (tmp_path / "home").write_text("a file: nothing can be made below it, by root neither")
+    monkeypatch.setattr(os, "environ", {"HOME": str(tmp_path / "home")})
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    keep_caches_writable()
+    cache = Path(os.environ["XDG_CACHE_HOME"])
+    assert (cache.parent, cache.stat().st_mode & 0o777) == (tmp_path, 0o700)
+    assert os.environ["MPLCONFIGDIR"] == f"{cache}/matplotlib"
+    cache.rename(tmp_path / "other")
+    cache.symlink_to(tmp_path / "other")  # as another user may have left it
+    del os.environ["XDG_CACHE_HOME"]
+    keep_caches_writable()
+    assert Path(os.environ["XDG_CACHE_HOME"]) != cache
+
+
+def test_with_a_writable_home_caches_stay_where_they_are(tmp_path, monkeypatch):
+    monkeypatch.setattr(os, "environ", {"HOME": str(tmp_path / "new" / "home")})
+    keep_caches_writable()
+    assert os.environ.keys() == {"HOME"}
 
 
 def test_what_the_workflow_says_is_told_where_no_step_failed(tmp_path):

@@ -322,6 +322,17 @@ def test_steps_are_forks_that_end_with_the_run_whatever_is_killed_outright(tiny,
 
 
 @pytest.mark.slow
+def test_a_step_that_is_killed_ends_the_run_with_status_1(tiny):
+    larger(tiny)
+    run = apertura("run", tiny, "--cores", 2, *TO_IMAGES)
+    wait_for_tiles(tiny, run, count=2)
+    os.kill(list(below(run.pid))[-1], signal.SIGSEGV)
+    code, output = finished(run, timeout=60)
+    assert (code, output.count("error:")) == (1, 1)
+    assert "a step exited without a message" in output
+
+
+@pytest.mark.slow
 def test_a_run_from_any_folder_tells_each_step_and_ends_with_what_its_images_say(tiny, tmp_path):
     code, output = finished(apertura("run", tiny, "-n"))
     assert code == 0

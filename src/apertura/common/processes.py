@@ -6,6 +6,7 @@ import os
 import re
 import signal
 import socket
+import stat
 import struct
 import sys
 import tempfile
@@ -125,6 +126,49 @@ def isolate() -> None:
         if name in os.environ:
             os.environ[name] = os.pathsep.join(filter(_is_absolute, os.environ[name].split(os.pathsep)))
     sys.path[:] = filter(_is_absolute, sys.path)
+    keep_caches_writable()
+
+
+_CACHE, _MATPLOTLIB = "XDG_CACHE_HOME", "MPLCONFIGDIR"
+
+
+def keep_caches_writable() -> None:
+    """Point the caches of libraries at a folder of this user in the temporary folder where the home is read-only.
+
+    Snakemake ends without its cache; matplotlib warns, and scans all fonts in every process.
+    """
+    cache, config = (_user_folder(*one) for one in ((_CACHE, ".cache"), ("XDG_CONFIG_HOME", ".config")))
+    if not _is_writable(cache):
+        os.environ[_CACHE] = str(_private_folder())
+    if _MATPLOTLIB not in os.environ and not (config and _is_writable(config / "matplotlib")):
+        os.environ[_MATPLOTLIB] = str(Path(os.environ.get(_CACHE) or cache or _private_folder()) / "matplotlib")
+
+
+def _user_folder(variable: str, name: str) -> Path | None:
+    """Return a folder of the XDG base directory specification; None where the user has no home."""
+    if stated := os.environ.get(variable):
+        return Path(stated)
+    try:
+        return Path.home() / name
+    except RuntimeError:
+        return None
+
+
+def _is_writable(folder: Path | None) -> bool:
+    """Return whether a folder can be written to, or made."""
+    while folder is not None and not folder.exists() and folder != folder.parent:
+        folder = folder.parent
+    return folder is not None and folder.is_dir() and os.access(folder, os.W_OK | os.X_OK)
+
+
+def _private_folder() -> Path:
+    """Return this user's folder below the temporary folder; a new one where the usual name is not this user's."""
+    folder = Path(tempfile.gettempdir()) / f"apertura-cache-{os.getuid()}"
+    with suppress(FileExistsError):
+        folder.mkdir(mode=0o700)
+    found = folder.lstat()
+    private = stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & 0o022
+    return folder if private else Path(tempfile.mkdtemp(prefix=f"{folder.name}-"))
 
 
 def _is_absolute(path: str) -> bool:
@@ -203,7 +247,7 @@ def confine_changes(root: Path, *others: Path) -> bool:
         return False
     rights = _CHANGES | (_TRUNCATE if version >= _TRUNCATES else 0)
     ruleset = libc.syscall(_CREATE_RULESET, struct.pack("=Q", rights), ctypes.c_size_t(8), 0)
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    cache = _user_folder(_CACHE, ".cache") or _private_folder()
     with suppress(OSError):  # of a new account it is not there yet, and Snakemake would make it
         cache.mkdir(parents=True, exist_ok=True)
     folders = [*others, cache, Path(__file__).parents[1], Path("/dev"), Path("/proc")]

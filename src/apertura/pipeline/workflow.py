@@ -34,7 +34,7 @@ from apertura.pipeline.check import print_problems
 from apertura.pipeline.config.section import RESERVED_NAMES
 from apertura.pipeline.lineage import on_demand, results_of
 from apertura.pipeline.rules import RULES
-from apertura.pipeline.runs.journal import JOURNAL, NAME, RECORDER, JournalReader, failures, note
+from apertura.pipeline.runs.journal import JOURNAL, NAME, RECORDER, JournalReader, a_step_was_killed, failures, note
 from apertura.pipeline.runs.outlook import Outlook
 from apertura.pipeline.runs.screen import NOTHING, Screen, listed
 from apertura.pipeline.runs.warm import AT_ONCE, Order
@@ -212,6 +212,8 @@ def _formed(
             ended = _watched(warm or _started([RECORDER, *words], files.environment, output=output), look)
             status = files.status_of(ended)
             look()
+            if status == 2 and a_step_was_killed(root, reader.run):
+                status = 1
     finally:
         note(files.journal, "end", status=status)
     killed = _killed_for_memory() - killed

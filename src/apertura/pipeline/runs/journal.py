@@ -205,17 +205,41 @@ def failures(root: Path, run: RunRecord, log: Path) -> Iterator[str]:
     log
         Of snakemake.
     """
-    told: dict[str, list[str]] = {}
+    messages: dict[str, list[str]] = {}
     for job in run.failed:
-        told.setdefault(_message(root / job.log if job.log else None), []).append(job.log)
-    if not told:
-        told = {shown(" ".join(message.split()), 2000): [] for message in run.said or _tail(log)[-1:]}
-    for message, logs in told.items():
+        messages.setdefault(_message(root / job.log if job.log else None), []).append(job.log)
+    if not messages:
+        last = [_installable(line) for line in _tail(log)[-1:]]
+        messages = {shown(" ".join(message.split()), 2000): [] for message in run.said or last}
+    for message, logs in messages.items():
         yield f"error: {message.removeprefix(_SAID)}"
         for name in filter(None, logs):
             yield f"  log of the step: {shown(root / name, 400)}"
     if log.is_relative_to(root):  # that of a dry run is not kept
         yield f"  log of snakemake: {shown(log, 400)}"
+
+
+def a_step_was_killed(root: Path, run: RunRecord) -> bool:
+    """Return whether a failed step of a run has left no message in its log."""
+    return any(_message(root / job.log) == _KILLED for job in run.failed if job.log)
+
+
+_KILLED = "a step exited without a message: it was killed, perhaps for lack of memory, or its machine went down"
+_NO_EXECUTOR = re.compile(r"argument --executor/-e: invalid choice: '([\w-]+)'")
+
+
+def _installable(line: str) -> str:
+    """Return an error of snakemake's command line, or what to install for the executor that it does not have.
+
+    Examples
+    --------
+    >>> _installable("snakemake: error: argument --executor/-e: invalid choice: 'slurm' (choose from 'local')")
+    "executor 'slurm' is not installed. Install it beside apertura: pip install snakemake-executor-plugin-slurm"
+    """
+    if not (named := _NO_EXECUTOR.search(line)):
+        return line
+    plugin = f"snakemake-executor-plugin-{named[1]}"
+    return f"executor {named[1]!r} is not installed. Install it beside apertura: pip install {plugin}"
 
 
 def _message(log: Path | None) -> str:
@@ -224,8 +248,8 @@ def _message(log: Path | None) -> str:
         if line.startswith(_SAID):
             return shown(line, 2000)
     if any(line.startswith("Traceback") for line in lines):
-        return f"a defect of ours, please report it with the log: {shown(lines[-1], 2000)}"
-    return "a step ended without a word: was it killed, or did its machine end?"
+        return f"internal error, please report it with the log: {shown(lines[-1], 2000)}"
+    return _KILLED
 
 
 def _tail(log: Path) -> list[str]:
