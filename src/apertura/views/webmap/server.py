@@ -145,31 +145,27 @@ FILES = ("index.html", "app.js", "app.css")
 BUILT = Path(__file__).parent / "page"
 """Where `webmap/build.mjs` writes: no part of the sources, but of the package that is installed."""
 
-_NOT_BUILT = """<!doctype html>
-<html lang="en">
-<meta charset="utf-8">
-<title>No map</title>
-<p>This apertura was installed without its map: no <code>npm</code> was there to build it.
-<p>Install Node.js 20 or newer, type <code>make webmap</code> in apertura's sources, then
-<code>apertura map</code> again.
-"""
-
 
 def page_files(built: Path = BUILT) -> Mapping[str, bytes]:
-    """Return name → content of `SHELL` and `FILES`; without a bundle, a `shell.html` that says how to get one.
+    """Return name → content of `SHELL` and `FILES`.
 
     Parameters
     ----------
     built
         Where the bundle is.
 
-    Examples
-    --------
-    >>> list(page_files(Path("nowhere")))
-    ['shell.html']
+    Raises
+    ------
+    CampaignError
+        If this installation has no bundle.
     """
     if not is_built(built):
-        return {SHELL[0]: _NOT_BUILT.encode()}
+        raise CampaignError(
+            "this installation has no map page: pip install does not build it",
+            "apertura map",
+            f"the page that make webmap builds with Node.js 20 or newer, in {built}",
+            "In apertura's sources, run make setup; or make webmap, then pip install . again.",
+        )
     return {name: (built / name).read_bytes() for name in (*SHELL, *FILES)}
 
 
@@ -291,6 +287,10 @@ class _Handler(BaseHTTPRequestHandler):
             self._say(HTTPStatus.FORBIDDEN, "this server has another name")
             return
         self.host = host
+        if self.headers.get("Content-Length", "0").strip() != "0" or "Transfer-Encoding" in self.headers:
+            self.close_connection = True  # a body is not read, and must not be taken for the next request
+            self._say(HTTPStatus.BAD_REQUEST, "a request without a body")
+            return
         opened = self.path in {"/", "/map/"} or self.headers.get("Sec-Fetch-Dest") == "document"
         if opened and host == LOOPBACK:  # by a reader, and not as the frame
             self._say(HTTPStatus.FOUND, "the map", Location=self.server.url)
