@@ -275,6 +275,20 @@ def test_a_file_that_is_away_for_a_moment_ends_no_look(tiny):
     assert 0 < look.pairs[1].counts["added"] <= look.pairs[1].counts["recorded"]
 
 
+def test_a_log_that_becomes_a_named_pipe_is_reported_once(tiny, capsys):
+    look = Look(Campaign.load(tiny), follow=True)
+    look._read()
+    capsys.readouterr()
+    log = tiny / "raw/f01/uav1.track.csv"
+    log.unlink()
+    os.mkfifo(log)
+    look._read()
+    look._read()
+    (line,) = capsys.readouterr().out.splitlines()
+    assert "uav1 is not read at present: " in line
+    assert "uav1.track.csv: a named pipe" in line
+
+
 def test_metadata_that_are_half_written_anew_are_no_new_flight(tiny):
     meta = tiny / "raw/f01/uav1.sigmf-meta"
     document, node = json.loads(meta.read_text()), node_of(tiny, "uav1")

@@ -74,6 +74,7 @@ class Look:
         self.decimated, self.busy_s = 1, 0.0
         self._map = LiveMap(campaign, LOOK, every_s=every_s)
         self._delay_s = np.inf  # of the picture before
+        self._reported = set[str]()  # errors of files, printed once each
         waveform = campaign.settings.waveform
         self.nodes: dict[tuple[str, str], NodeSoFar] = {}
         self.pairs: list[PairSoFar] = []
@@ -127,6 +128,10 @@ class Look:
         """Read what has come; begin anew the pairs of nodes whose files did. Return whether anything has come."""
         grown = [node.read() for node in self.nodes.values()]
         for node in self.nodes.values():
+            # While nothing was read, the lines of the pairs say what they wait for.
+            if node.waits and self.follow and node.has_read and node.waits not in self._reported:
+                self._reported.add(node.waits)
+                print(f"{datetime.now(UTC):%H:%M:%S}  {node.name} is not read at present: {node.waits}", flush=True)
             if not node.begun_anew:
                 continue
             print(f"{datetime.now(UTC):%H:%M:%S}  {node.begun_anew}", flush=True)

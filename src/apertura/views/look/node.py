@@ -173,6 +173,11 @@ class NodeSoFar:
         return cast("np.datetime64", epochs[-1 if ended else max(0, len(epochs) - 1 - _EPOCHS)])
 
     @property
+    def has_read(self) -> bool:
+        """Whether captures and epochs of the log have been read."""
+        return bool(len(self.time)) and self.track is not None
+
+    @property
     def complete(self) -> bool:
         """Whether the recording says that it has ended, and the log reaches as far."""
         return bool(self.ended and len(self.time) and self.known_until(ended=True) >= self.time[-1])

@@ -46,7 +46,7 @@ class PairSoFar:
     scene
         First block → grid, and its ground.
     echo
-        Of a recorder that stores transfer functions; then there are no
+        Of a recorder that stores transfer functions; tx, rx and sent are then None.
     tx, rx, sent
         Its nodes, and what was transmitted.
     threads
@@ -182,7 +182,7 @@ class PairSoFar:
         rx = tx if self.rx is self.tx else self.rx.acquisition(rx_index[inside])
         hovers = bool(campaign.segments_of(self.flight, self.name))
         if not place(tx, rx, tx.raw.time.values, hovers=hovers).good.any():
-            self.why_dropped = "hover: the antennas stood"
+            self.why_dropped = "hover: platform stationary"
             return None
         air = scene_air(campaign, tx.track.position.values)
         offset = calibrated(campaign, self.flight, self.name)
