@@ -130,6 +130,19 @@ REFUSED = {
     "atmosphere an index": (lambda: HISTORY, {"atmosphere": [1.0003]}, "atmosphere"),
     "calibration a word": (lambda: HISTORY, {"calibration": "auto"}, "calibration"),
     "calibration negative": (lambda: HISTORY, {"calibration": -1.0}, "calibration"),
+    "track in half precision": (flown(APERTURE.tx_m.astype(np.float16)), {}, "float16, whose numbers near 20 m"),
+    "track with a mask": (
+        lambda: ap.Aperture(np.ma.masked_equal(APERTURE.tx_m, APERTURE.tx_m[5, 0]), APERTURE.rx_m),
+        {},
+        "1 masked values",
+    ),
+    "no subcarriers": (
+        lambda: ap.PhaseHistory(ECHO[:, :0], FREQUENCY[:0], np.ones(0), np.zeros(96), APERTURE),
+        {},
+        "no subcarrier",
+    ),
+    "pixels a truth": (lambda: HISTORY, {"certified_pixels": True}, "certified_pixels"),
+    "pixels without end": (lambda: HISTORY, {"certified_pixels": 10**12}, "0 to 1000000"),
     "pixels negative": (lambda: HISTORY, {"certified_pixels": -1}, "certified_pixels"),
     "pixels a word": (lambda: HISTORY, {"certified_pixels": "all"}, "certified_pixels"),
     "judge a word": (lambda: HISTORY, {"judge": "later"}, "judge"),
@@ -288,6 +301,9 @@ def judged(**stated):
         (lambda: ap.simulate(None), "simulate: directory"),
         (lambda: ap.simulate("never_made", targets=[]), "simulate: targets"),
         (lambda: ap.simulate("never_made", seed=-1), "simulate: seed"),
+        (lambda: ap.simulate([1]), "simulate: directory"),
+        (lambda: ap.simulate("a\0b"), "a path with a null byte"),
+        (lambda: ap.open_campaign("a\0b"), "a path with a null byte"),
         (lambda: ap.backproject(HISTORY, TARGET_GRID, atmosphere=True), "expected auto, vacuum"),
         (lambda: ap.backproject(HISTORY, TARGET_GRID, terrain=True), "expected a height in metres"),
         (lambda: ap.backproject(HISTORY, TARGET_GRID, terrain=ap.FlatGround("a")), "FlatGround: height_m"),
@@ -317,6 +333,34 @@ def test_other_doors_refuse_what_is_of_another_kind(call, told):
 
 def test_one_height_is_flat_ground_for_every_door():
     assert np.array_equal(ap.range_compress(HISTORY, TARGET_GRID, 0.0).samples, PROFILES.samples)
+
+
+@pytest.mark.parametrize(
+    "as_given",
+    [
+        pytest.param(np.matrix, id="matrix"),
+        pytest.param(np.ma.masked_array, id="masked nowhere"),
+        pytest.param(lambda values: values.astype(values.dtype.newbyteorder(">")), id="other byte order"),
+        pytest.param(
+            lambda values: values.astype(np.clongdouble if values.dtype.kind == "c" else np.longdouble), id="extended"
+        ),
+    ],
+)
+def test_arrays_of_every_kind_give_the_image_of_plain_ones(as_given):
+    given = replace(HISTORY, transfer=as_given(ECHO), aperture=ap.Aperture(*map(as_given, APERTURE.legs)))
+    images = [ap.backproject(one, TARGET_GRID, judge=False).values for one in (given, HISTORY)]
+    np.testing.assert_allclose(images[0], images[1], atol=1e-5)
+
+
+def test_numbers_of_few_bits_are_sizes_of_a_grid():
+    few = replace(TARGET_GRID, shape=tuple(map(np.uint8, TARGET_GRID.shape)))
+    images = [ap.backproject(HISTORY, grid, judge=False).values for grid in (few, TARGET_GRID)]
+    np.testing.assert_array_equal(*images)
+
+
+def test_an_image_of_one_pixel_is_judged():
+    one = ap.SceneGrid("local", -0.05, 0.05, 0.1, (1, 1))
+    assert ap.backproject(HISTORY, one, judge=True).attrs["verdict"] == "cannot tell"
 
 
 def test_arrays_of_xarray_and_dask_are_arrays():

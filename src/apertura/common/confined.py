@@ -196,6 +196,10 @@ class ConfinedPath(PosixPath):
     def _way(self) -> tuple[Path, tuple[str, ...]]:
         """Return a trusted folder, and the components from there."""
         count = len(self._top.parts)
+        if "\0" in str(self):
+            raise CampaignError(
+                "a path with a null byte", where=self, expected="the name of a file", remedy="Correct it."
+            )
         parts = self.parts[count:]
         if self.parts[:count] != self._top.parts or ".." in parts or "/" in parts:
             raise self._refused("leads out of the campaign folder")

@@ -120,6 +120,9 @@ class PhaseHistory:
         vectors = {"reference_delay_s": (pulses,), "frequency_hz": (subcarriers,), "weight": (subcarriers,)}
         said = "transfer (pulse, subcarrier), reference_delay_s (pulse,), frequency_hz and weight (subcarrier,)"
         _check_shapes(self, {"transfer": (pulses, subcarriers), **vectors}, f"{said}, as many pulses of the aperture")
+        if subcarriers == 0:
+            expected = "two or more subcarriers, whose width resolves range"
+            raise CampaignError("no subcarrier", "PhaseHistory: transfer", expected, "Give the samples of a band.")
 
     def __len__(self) -> int:
         """Return the number of pulses."""

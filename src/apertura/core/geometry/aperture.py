@@ -1,6 +1,6 @@
 """The synthetic aperture of a pair: phase centres at each pulse, total paths, phase rates and resolution."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -19,8 +19,9 @@ _STRETCHES = 64  # of the aperture, in which phase rates are compared
 _STEPS_IN_A_ROW = 63  # of which the median is taken, so that missed pulses do not count
 
 
-_FLOAT32_M = 2.0**13
-"""Metres beyond which float32 rounds by half a millimetre or more: a hundredth of a cycle at L-band there and back."""
+_COARSEST_M = 2.0**-10
+"""Metres between neighbouring numbers above which a track is refused: half of it is a hundredth of a cycle at L-band
+there and back."""
 
 
 def distance(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -87,7 +88,26 @@ def as_array(value: Any, kind: type, where: str) -> Any:
             expected=f"an array of {'complex numbers' if kind is np.complex64 else 'real numbers'}",
             remedy="Keep the phase of samples: give I + jQ." if kind is np.complex64 and of else "Give a numpy array.",
         )
-    return found if found is value else found.astype(kind)
+    if np.ma.is_masked(value):
+        raise CampaignError(
+            f"{np.ma.count_masked(value)} masked values",
+            where=where,
+            expected="a value everywhere: a mask is not looked at",
+            remedy="Leave out the pulses with masked values, or fill them.",
+        )
+    return _native(found, kind) if isinstance(found, np.ndarray) or not found.dtype.isnative else found
+
+
+_KEPT: Mapping[type, tuple[type, ...]] = {
+    np.float64: (np.float32, np.float64),
+    np.complex64: (np.complex64, np.complex128),
+}
+
+
+def _native(found: Any, kind: type) -> NDArray[Any]:
+    """Return a plain array in the byte order of this machine, of a precision that engines know."""
+    plain = np.asarray(found)
+    return plain if plain.dtype.isnative and plain.dtype.type in _KEPT[kind] else plain.astype(kind)
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,11 +137,15 @@ class Aperture:
 
     def __post_init__(self) -> None:
         for name in ("tx_m", "rx_m"):
-            found = as_array(getattr(self, name), np.float64, f"Aperture: {name}")
+            given = getattr(self, name)
+            found = as_array(given, np.float64, f"Aperture: {name}")
             object.__setattr__(self, name, found)
-            if found.dtype == np.float32 and (farthest := np.abs(found).max(initial=0)) > _FLOAT32_M:
+            dtype = np.dtype(getattr(given, "dtype", np.float64))
+            farthest = float(np.abs(found).max(initial=0)) if dtype.kind == "f" and dtype.itemsize < 8 else 0.0
+            apart_m = float(np.spacing(np.array(farthest, dtype))) if farthest else 0.0
+            if apart_m >= _COARSEST_M:
                 raise CampaignError(
-                    f"float32, whose numbers near {farthest:.3g} m are {np.spacing(farthest):.2g} m apart",
+                    f"{dtype.name}, whose numbers near {farthest:.3g} m are {apart_m:.2g} m apart",
                     where=f"Aperture: {name}",
                     expected="float64: phase centres count to fractions of a wavelength",
                     remedy="Keep float64 from the log on.",

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Mapping
 from dataclasses import replace
+from numbers import Integral
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -193,7 +194,7 @@ def backproject(  # noqa: PLR0913 - each choice is a keyword, so that an editor 
             "numerical_error_db": round(error.bound_db, 2),
             "numerical_error_confidence": CONFIDENCE,
             "numerical_error_estimate_db": round(error.estimate_db, 2),
-            "certified_pixels": certified_pixels,
+            "certified_pixels": int(certified_pixels),
         }
         flags = Flags.merged(flags, plan.replaced_by(formation.plan.setting, "the image"))
         if error.bound_db > accuracy_db:
@@ -226,9 +227,13 @@ def backproject(  # noqa: PLR0913 - each choice is a keyword, so that an editor 
 
 def _check_kinds(inputs: PhaseHistory | Profiles, beams: Any, certified_pixels: Any) -> None:
     """Raise CampaignError unless beams and number of pixels are such."""
-    if not isinstance(certified_pixels, int) or certified_pixels < 0:
+    counted = isinstance(certified_pixels, Integral) and not isinstance(certified_pixels, bool)
+    if not counted or not 0 <= certified_pixels <= _MOST_CERTIFIED:
         raise CampaignError(
-            quoted(certified_pixels), "backproject: certified_pixels", "a number of pixels", "Give 0 for none."
+            quoted(certified_pixels),
+            "backproject: certified_pixels",
+            f"a number of pixels, 0 to {_MOST_CERTIFIED}",
+            "Give 0 for none.",
         )
     if beams is None:
         return
@@ -245,6 +250,9 @@ def _check_kinds(inputs: PhaseHistory | Profiles, beams: Any, certified_pixels: 
                 remedy="Give one set of axes for each pulse.",
             )
 
+
+_MOST_CERTIFIED = 1_000_000
+"""Pixels that may be compared with the exact sum: a hundredth of them bounds the error as well."""
 
 _SUM = 1e-3
 """Of 1, by which the sum of weights may be off: a hundredth of a decibel."""

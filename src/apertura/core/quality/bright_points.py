@@ -316,6 +316,7 @@ def _cell_maxima(magnitude: NDArray[np.float32], window: Window, cell_px: int) -
 
     Pixels at the block's edges are compared with their neighbours inside it.
     """
+    cell_px = min(cell_px, max(magnitude.shape))
     highest = magnitude
     for axis in (0, 1):
         lines, about = np.swapaxes(highest, 0, axis), np.swapaxes(highest.copy(), 0, axis)

@@ -63,6 +63,8 @@ class SceneGrid:
             raise CampaignError(
                 quoted(self.shape), "SceneGrid: shape", "numbers of rows and columns", "Give two whole numbers above 0."
             )
+        rows, columns = map(int, sides)  # numbers of few bits overflow where they are multiplied
+        object.__setattr__(self, "shape", (rows, columns))
         metres = {"west_m": self.west_m, "north_m": self.north_m, "spacing_m": self.spacing_m}
         wrong = [name for name, one in metres.items() if not (isinstance(one, Real) and np.isfinite(one))]
         if wrong or self.spacing_m <= 0:
