@@ -1,5 +1,8 @@
 """Tiles and blocks of pulses: the same image, however it is cut, and one block's tables at a time."""
 
+import os
+import signal
+
 import numpy as np
 import pytest
 import toy_engine
@@ -29,6 +32,19 @@ def test_an_image_from_blocks_of_pulses_is_that_of_all_pulses(engine, form_optio
         images.append(np.zeros(drawn.grid.shape, np.complex64))
         compute_tiles(image, list(drawn.grid.tiles(16)), images[-1], threads=2)
     assert numerical_error(images[1].ravel(), images[0].ravel().astype(np.complex128)).rms_db < -130
+
+
+@pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")  # of fork in a process with threads
+def test_a_child_that_is_forked_after_an_image_forms_it_too(toy):
+    """Dask's threads do not live on in a child, which would wait for them for ever: here for ten seconds."""
+    drawn = draw(np.random.default_rng(2), pixels=40, pulses=64)
+    image = image_array(drawn.profiles, Setting("toy", {"refine": 1}, {}, -20.0, 1.0), drawn.grid, FlatGround(0.0))
+    expected = image.compute()
+    child = os.fork()
+    if child == 0:
+        signal.alarm(10)
+        os._exit(0 if np.array_equal(image.compute(), expected) else 1)
+    assert os.waitpid(child, 0)[1] == 0
 
 
 def test_blocks_of_pulses_are_prepared_one_after_the_other(toy):

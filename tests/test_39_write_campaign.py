@@ -60,6 +60,32 @@ def test_samples_of_any_dtype_come_back_with_tags_frames_and_positions(tmp_path,
     sigmf.fromfile(str(made / "raw/f01/uav1")).validate()
 
 
+def along(latitude, longitude, speed_m_s, unit=np.degrees):
+    """A log of one epoch per second along a meridian, in degrees or radians."""
+    north = np.radians(latitude) + speed_m_s * np.arange(10) / 6.37e6
+    place = np.stack([unit(north), unit(np.full(10, np.radians(longitude))), np.full(10, 600.0)], -1)
+    return replace(NODE, track=place, track_utc=np.datetime64("2025-05-14T09:30", "ns") + np.arange(10) * 10**9)
+
+
+NEAR = {"crs": "EPSG:32632", "bounds_m": [574000, 5317000, 574010, 5317010], "height_m": 500.0}  # at 48 N, 10 E
+GULF = {"crs": "EPSG:32631", "bounds_m": [184000, 92000, 184010, 92010], "height_m": 0.0}  # at 0.83 N, 0.16 E
+
+
+@pytest.mark.parametrize("scene", [None, NEAR])
+def test_a_track_in_radians_is_refused(tmp_path, scene):
+    config = CONFIG | ({"scene": scene} if scene else {})
+    message = complaint(lambda: write(tmp_path / "c", along(48.0, 10.0, 8.0, np.float64), config=config))
+    assert "in radians the track lies" in message
+    assert "expected degrees" in message
+    assert not (tmp_path / "c").exists()
+
+
+@pytest.mark.parametrize(("speed_m_s", "scene"), [(8.0, None), (8.0, GULF), (0.4, GULF)])
+def test_a_track_in_degrees_beside_the_gulf_s_origin_is_taken(tmp_path, speed_m_s, scene):
+    config = CONFIG | ({"scene": scene} if scene else {})
+    assert write(tmp_path / "c", along(0.83, 0.16, speed_m_s), config=config).is_dir()
+
+
 @settings(max_examples=20, deadline=None, derandomize=True)
 @given(gaps=st.lists(st.integers(1, 10**12), min_size=1, max_size=9), between=st.integers(0, 5))
 def test_captures_come_back_to_the_nanosecond_whatever_lies_between_them(tmp_path_factory, gaps, between):

@@ -1,6 +1,8 @@
 """An image as a dask array of tiles: computed on request, each tile on its own, here or by workers of a cluster."""
 
 import os
+import sys
+import threading
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -118,6 +120,18 @@ def _unusable(scheduler: str, found: str, remedy: str) -> CampaignError:
 
 
 # ---- An image as a dask array of tiles
+
+
+def _forget_threads() -> None:
+    """Let dask start its threads anew in a forked child, which has none of its parent's and would wait for ever."""
+    threaded: Any = sys.modules.get("dask.threaded")
+    if threaded is not None:
+        threaded.default_pool, threaded.main_thread = None, threading.current_thread()
+        threaded.pools_lock = threading.Lock()
+        threaded.pools.clear()
+
+
+os.register_at_fork(after_in_child=_forget_threads)
 
 _NOTHING = np.complex64(complex(np.nan, np.nan))
 

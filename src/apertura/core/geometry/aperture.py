@@ -90,7 +90,7 @@ def as_array(value: Any, kind: type, where: str) -> Any:
         )
     if np.ma.is_masked(value):
         raise CampaignError(
-            f"{np.ma.count_masked(value)} masked values",
+            f"{int(np.ma.getmaskarray(value).sum())} masked values",
             where=where,
             expected="a value everywhere: a mask is not looked at",
             remedy="Leave out the pulses with masked values, or fill them.",

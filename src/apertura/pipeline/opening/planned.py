@@ -186,7 +186,7 @@ def errors_of_the_plan() -> Iterator[None]:
             part.replace(str(CONFIG), "the plan").replace("the flight log", "the planned track")
             for part in (error.where, error.expected, error.remedy)
         )
-        raise CampaignError(error.found, where, expected, remedy) from error
+        raise CampaignError(error.found, where, expected, remedy) from None
 
 
 def _opened(plan: FlightPlan, campaign: Campaign) -> OpenPlan:

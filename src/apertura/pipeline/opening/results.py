@@ -35,6 +35,13 @@ class OpenCampaign:
 
     campaign: Campaign
 
+    def __repr__(self) -> str:
+        """Return the folder, and the pairs of each flight."""
+        pairs = "; ".join(f"{flight}: {', '.join(names)}" for flight, names in self.pairs.items())
+        return (
+            f"<OpenCampaign {self.campaign.settings.campaign} in {self.campaign.root}: {pairs or 'no image flights'}>"
+        )
+
     @property
     def pairs(self) -> dict[str, tuple[str, ...]]:
         """Flight that becomes images → its pairs, transmitter-receiver."""

@@ -10,11 +10,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from apertura.common.errors import CampaignError
+from apertura.core.geometry.geodesy import LOCAL, ecef_from_geodetic, frame_from_map
 from apertura.formats.campaign_files import DATATYPES, new_folder, write_config, write_csv_log, write_recording
 from apertura.formats.reading import open_recording
 from apertura.formats.times import outside, utc_times
 from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.config import SampledWaveform, validated
+from apertura.pipeline.config import SampledWaveform, Scene, validated
 from apertura.pipeline.opening.reading import read_log
 from apertura.pipeline.opening.transmitted import transmitted
 
@@ -137,11 +138,12 @@ def write_campaign(
                 (root / "raw" / name).mkdir()
                 for node, recorded in flight.nodes.items():
                     _write_node(root / "raw" / name / node, recorded, settings.waveform)
+                    _check_degrees(root / "raw" / name / node, recorded, settings.scene)
             transmitted(campaign, settings.waveform)
             _check_opens(campaign, flights)
         except CampaignError as problem:
             where = problem.where.replace(str(root), str(directory))
-            raise CampaignError(problem.found, where, problem.expected, problem.remedy) from problem
+            raise CampaignError(problem.found, where, problem.expected, problem.remedy) from None
     return directory
 
 
@@ -179,6 +181,40 @@ def _write_log(stem: Path, recorded: RecordedNode) -> None:
         if values is not None and values.shape != (len(time), 3):
             raise _wrong(stem, f"{name} of shape {values.shape}", f"({len(time)}, 3), as track_utc has epochs")
     write_csv_log(stem.with_name(f"{stem.name}.track.csv"), time, track, attitude)
+
+
+_LARGEST_RAD = np.pi / 2, np.pi
+_FARTHEST_M = 200e3  # of a track from its scene
+_SLOWEST_M_S, _FASTEST_M_S = 1.0, 120.0  # over ground, of a flight that images
+
+
+def _check_degrees(stem: Path, recorded: RecordedNode, scene: Scene) -> None:
+    """Raise CampaignError where latitude and longitude of a track are in radians.
+
+    As degrees they lie in the Gulf of Guinea, where there is no land, and 57 times nearer to each other. A track there
+    is refused if it fits the scene, or without a scene on Earth a flight's speed, in radians alone.
+    """
+    track = recorded.track
+    if isinstance(track, str | Path) or (np.abs(np.asarray(track)[:, :2]) > _LARGEST_RAD).any():
+        return
+    given = np.asarray(track, np.float64)
+    places = [
+        ecef_from_geodetic(factor * given[:, 0], factor * given[:, 1], given[:, 2]) for factor in (1.0, np.degrees(1.0))
+    ]
+    if scene.crs not in {"auto", LOCAL} and scene.bounds_m != "auto":
+        xmin, ymin, xmax, ymax = scene.bounds_m
+        middle = frame_from_map(scene.crs, (xmin + xmax) / 2, (ymin + ymax) / 2, 0.0)
+        fits = [float(np.linalg.norm(place - middle, axis=1).min()) < _FARTHEST_M for place in places]
+        how = f"within {_FARTHEST_M / 1e3:g} km of scene.bounds_m"
+    else:
+        seconds = np.diff(_times(recorded.track_utc, stem, "track_utc")) / np.timedelta64(1, "s")
+        speeds = [float(np.median(np.linalg.norm(np.diff(place, axis=0), axis=1) / seconds)) for place in places]
+        fits = [_SLOWEST_M_S <= speed <= _FASTEST_M_S for speed in speeds]
+        how = f"with a median speed of {speeds[1]:.3g} m/s instead of {speeds[0]:.2g} m/s"
+    if fits == [False, True]:
+        latitude, longitude = given[0, :2]
+        found = f"latitude {latitude:.6g}, longitude {longitude:.6g}: in radians the track lies {how}"
+        raise _wrong(stem, found, "degrees (a flight that is really there: state scene.crs and scene.bounds_m)")
 
 
 def _samples(recorded: RecordedNode, stem: Path) -> NDArray[Any]:
