@@ -38,12 +38,13 @@ def test_an_image_from_blocks_of_pulses_is_that_of_all_pulses(engine, form_optio
 def test_a_child_that_is_forked_after_an_image_forms_it_too(toy):
     """Dask's threads do not live on in a child, which would wait for them for ever: here for ten seconds."""
     drawn = draw(np.random.default_rng(2), pixels=40, pulses=64)
-    image = image_array(drawn.profiles, Setting("toy", {"refine": 1}, {}, -20.0, 1.0), drawn.grid, FlatGround(0.0))
-    expected = image.compute()
+    setting = Setting("toy", {"refine": 1}, {}, -20.0, 1.0)
+    image = image_array(drawn.profiles, setting, drawn.grid, FlatGround(0.0), side_px=16)
+    expected = image.compute(scheduler="threads")
     child = os.fork()
     if child == 0:
         signal.alarm(10)
-        os._exit(0 if np.array_equal(image.compute(), expected) else 1)
+        os._exit(0 if np.array_equal(image.compute(scheduler="threads"), expected) else 1)
     assert os.waitpid(child, 0)[1] == 0
 
 
