@@ -38,7 +38,8 @@ def facts():
     return {
         **projection(WKT, (4, 6), PLACE[:6]),
         "sar:instrument_mode": "bistatic",
-        "sar:product_type": "SLC",
+        "product:type": "SLC",
+        "view:incidence_angle": 45.0,
         "processing:level": "L1",
         "processing:lineage": "apertura step export f01 a-b",
         "processing:software": {"apertura": "1", "python": "3", "gdal": "3", "proj": "9"},
@@ -69,7 +70,13 @@ def item(slc, **changes):
 def test_a_raster_says_its_bands_and_inputs(slc):
     found = read_facts(slc)
     assert found.bands == [
-        {"data_type": "cfloat32", "sampling": "area", "spatial_resolution": 0.5, "nodata": "nan", "unit": "1"}
+        {
+            "data_type": "cfloat32",
+            "raster:sampling": "area",
+            "raster:spatial_resolution": 0.5,
+            "nodata": "nan",
+            "unit": "1",
+        }
     ]
     assert found.inputs == {"raw/codes.npy": DIGEST}
 
@@ -90,6 +97,10 @@ def test_an_item_declares_and_keeps_every_extension(slc):
 BROKEN = {
     "sar: band of no letter": lambda found: found["properties"].update({"sar:frequency_band": "Q"}),
     "sar: no mode": lambda found: found["properties"].pop("sar:instrument_mode"),
+    "sar: side of no name": lambda found: found["properties"].update({"sar:observation_direction": "front"}),
+    "sar: deprecated product type": lambda found: found["properties"].update({"sar:product_type": "SLC"}),
+    "product: no type": lambda found: found["properties"].pop("product:type"),
+    "view: angle below ground": lambda found: found["properties"].update({"view:incidence_angle": 91.0}),
     "projection: half a shape": lambda found: found["properties"].update({"proj:shape": [4]}),
     "projection: no transform": lambda found: found["properties"].pop("proj:transform"),
     "processing: no lineage": lambda found: found["properties"].pop("processing:lineage"),
@@ -97,8 +108,8 @@ BROKEN = {
     "file: sha256 of 31 bytes": lambda found: found["assets"]["slc"].update({"file:checksum": "1220" + "ab" * 31}),
     "file: no size": lambda found: found["assets"]["slc"].pop("file:size"),
     "file: input by md5": lambda found: found["links"][0].update({"file:checksum": "d50110" + "ab" * 16}),
-    "raster: no bands": lambda found: found["assets"]["slc"].pop("raster:bands"),
-    "raster: type of no name": lambda found: found["assets"]["slc"]["raster:bands"][0].update({"data_type": "complex"}),
+    "raster: no bands": lambda found: found["assets"]["slc"].pop("bands"),
+    "raster: type of no name": lambda found: found["assets"]["slc"]["bands"][0].update({"data_type": "complex"}),
     "core: no geometry": lambda found: found.pop("geometry"),
     "core: place without footprint": lambda found: found.update({"geometry": None}),
     "core: no time": lambda found: found["properties"].update({"datetime": "yesterday"}),
@@ -179,11 +190,28 @@ def test_a_campaign_without_a_place_has_items_without_geometry_and_no_collection
     assert not (folder / "collection.json").exists()
 
 
-def test_a_frequency_between_the_letters_is_stated_without_the_extension(slc):
-    document = item(slc, acquisition=AcquisitionTime(START, START, 0.7e9, 1e8))
-    assert document["properties"]["sar:center_frequency"] == 0.7
-    assert EXTENSIONS["sar"] not in document["stac_extensions"]
+@pytest.mark.parametrize(
+    ("ghz", "band"), [(0.15, None), (0.25, "P"), (0.7, "P"), (1.0, "L"), (39.9, "Ka"), (77.0, None)]
+)
+def test_every_frequency_has_the_extension_and_its_letter_where_there_is_one(slc, ghz, band):
+    """The table of bands of the extension: P from 0.25 to 1 GHz; no letter is required."""
+    document = item(slc, acquisition=AcquisitionTime(START, START, 1e9 * ghz, 1e8))
+    assert document["properties"]["sar:center_frequency"] == ghz
+    assert document["properties"].get("sar:frequency_band") == band
+    assert EXTENSIONS["sar"] in document["stac_extensions"]
     assert document_problem(document) is None
+
+
+def test_author_licence_and_doi_are_those_of_the_collection(slc):
+    files = catalog_files("tandem", [image(slc)], licence="CC-BY-4.0", author="A. Nother", doi="10.5281/zenodo.1")
+    collection = files["collection.json"]
+    assert document_problem(collection) is None
+    assert (collection["license"], collection["providers"]) == (
+        "CC-BY-4.0",
+        [{"name": "A. Nother", "roles": ["producer"]}],
+    )
+    assert {"rel": "cite-as", "href": "https://doi.org/10.5281/zenodo.1"} in collection["links"]
+    assert catalog_files("tandem", [image(slc)])["collection.json"]["license"] == "other"
 
 
 def test_times_of_a_recording_without_a_clock_say_so(slc):

@@ -262,6 +262,15 @@ def unstaged_log_settings(place: JobPlace) -> Mapping[str, Any]:
     return {"log": {node: log_settings(JobPlace(place.campaign, Scope.NODE, at)) for node, at in nodes.items()}}
 
 
+def polarisations(place: JobPlace) -> Mapping[str, Any]:
+    """Return the stated polarisations of the pairs."""
+    from apertura.pipeline.config import polarisation_of
+
+    names = sorted({pair for _, pair in place.pairs})
+    labels = {pair: polarisation_of(place.campaign.settings.nodes, pair) for pair in names}
+    return {"polarisations": {pair: label for pair, label in labels.items() if label}} if any(labels.values()) else {}
+
+
 def stated_errors(place: JobPlace) -> Mapping[str, Any]:
     """Return what the config states of the errors of a flight's logs."""
     nodes = place.campaign.values["nodes"]

@@ -94,6 +94,8 @@ class CrateRun:
         Files of the campaign beside its results.
     workflow
         Files of the workflow, as they lie beside the crate.
+    author, licence, doi
+        As the campaign states them: a name, an SPDX identifier, a DOI; None: not stated.
     """
 
     campaign: str
@@ -103,6 +105,9 @@ class CrateRun:
     jobs: Sequence[CrateJob]
     inputs: Sequence[Listed]
     workflow: Sequence[Listed]
+    author: str | None = None
+    licence: str | None = None
+    doi: str | None = None
 
 
 # ---- RO-Crate document, profile Provenance Run Crate 0.5 ------------------------------------------------------------
@@ -123,7 +128,7 @@ _PROFILES = {
 }
 _TERMS = "https://w3id.org/ro/terms/workflow-run/context"
 _COMPLETED = "http://schema.org/CompletedActionStatus"
-_LICENCE = "#licence"
+_LICENCE, _AUTHOR = "#licence", "#author"
 _RUN, _ORGANISED, _LOCK = "#run", "#organised", "#lock"
 
 
@@ -176,7 +181,9 @@ def _root(run: CrateRun, parts: Sequence[str], actions: Sequence[Mapping[str, An
         "name": run.campaign,
         "description": about,
         "datePublished": run.recorded_until,
-        "license": {"@id": _LICENCE},
+        "license": {"@id": _licence_id(run)},
+        **({"author": {"@id": _AUTHOR}} if run.author else {}),
+        **({"identifier": f"https://doi.org/{run.doi}"} if run.doi else {}),
         "conformsTo": _refs(_PROFILES),
         "hasPart": _refs(parts),
         "mainEntity": {"@id": WORKFLOW},
@@ -184,15 +191,24 @@ def _root(run: CrateRun, parts: Sequence[str], actions: Sequence[Mapping[str, An
     }
 
 
+def _licence_id(run: CrateRun) -> str:
+    return f"https://spdx.org/licenses/{run.licence}" if run.licence else _LICENCE
+
+
 def _software(run: CrateRun) -> Iterator[dict[str, Any]]:
     for uri, name in _PROFILES.items():
         yield {"@id": uri, "@type": "CreativeWork", "name": name, "version": uri.rpartition("/")[2]}
-    yield {
-        "@id": _LICENCE,
-        "@type": "CreativeWork",
-        "name": "not stated",
-        "description": "The campaign says nothing of a licence: ask whoever recorded it.",
-    }
+    if run.licence:
+        yield {"@id": _licence_id(run), "@type": "CreativeWork", "name": run.licence, "identifier": run.licence}
+    else:
+        yield {
+            "@id": _LICENCE,
+            "@type": "CreativeWork",
+            "name": "not stated",
+            "description": "No licence is configured (metadata.licence): ask the owner of the recordings.",
+        }
+    if run.author:
+        yield {"@id": _AUTHOR, "@type": "Person", "name": run.author}
     for name, version in run.software.items():
         yield {"@id": f"#software/{name}", "@type": "SoftwareApplication", "name": name, "version": version}
     yield {

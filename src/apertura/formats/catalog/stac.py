@@ -22,14 +22,16 @@ _BASE = "https://stac-extensions.github.io"
 EXTENSIONS: Mapping[str, str] = {
     "file": f"{_BASE}/file/v2.1.0/schema.json",
     "processing": f"{_BASE}/processing/v1.2.0/schema.json",
+    "product": f"{_BASE}/product/v1.0.0/schema.json",
     "proj": f"{_BASE}/projection/v2.0.0/schema.json",
-    "raster": f"{_BASE}/raster/v1.1.0/schema.json",
+    "raster": f"{_BASE}/raster/v2.0.0/schema.json",
     "sar": f"{_BASE}/sar/v1.3.0/schema.json",
+    "view": f"{_BASE}/view/v1.1.0/schema.json",
 }
 """Prefix of the fields → address of the schema, which is its name: nothing is fetched."""
 
 _BANDS_GHZ = {
-    "P": (0.25, 0.5),
+    "P": (0.25, 1.0),
     "L": (1.0, 2.0),
     "S": (2.0, 4.0),
     "C": (4.0, 8.0),
@@ -38,7 +40,7 @@ _BANDS_GHZ = {
     "K": (18.0, 26.5),
     "Ka": (26.5, 40.0),
 }
-"""Frequency bands of the extension; it knows none between P and L, nor above Ka."""
+"""Frequency bands of the extension; it knows none below P, nor above Ka."""
 
 _FIRST_CLOCK = datetime(1980, 1, 6, tzinfo=UTC)  # GPS time begins; nothing here was recorded before
 _NO_CLOCK = "none: the recording carries no time of day, so times count pulses from 1970-01-01"
@@ -172,7 +174,7 @@ class FileFacts:
     title
         Title for people.
     bands
-        Of a raster: fields of the raster extension, one mapping a band.
+        Of a raster: common fields and those of the raster extension, one mapping a band.
     inputs
         Source file of a raster → sha256.
     place
@@ -233,8 +235,8 @@ def _band(raster: Any, number: int) -> dict[str, Any]:
     dtype, nodata, unit = (of[number] for of in (raster.dtypes, raster.nodatavals, raster.units))
     band: dict[str, Any] = {
         "data_type": {"complex64": "cfloat32", "complex128": "cfloat64"}.get(dtype, dtype),
-        "sampling": "area",
-        "spatial_resolution": raster.res[0],
+        "raster:sampling": "area",
+        "raster:spatial_resolution": raster.res[0],
     }
     if nodata is not None:
         band["nodata"] = "nan" if nodata != nodata else nodata  # noqa: PLR0124 - NaN alone differs from itself
@@ -261,7 +263,7 @@ def asset_of(path: Path, href: str, *, sha256: str, facts: FileFacts) -> pystac.
     roles = _ROLES.get(name) or _ROLES_OF_TYPE.get(path.suffix) or ("metadata",)
     extra = {"file:checksum": multihash(sha256), "file:size": path.stat().st_size}
     if facts.bands:
-        extra["raster:bands"] = facts.bands
+        extra["bands"] = facts.bands
     return pystac.Asset(href, facts.title, media_type=media_type(name), roles=list(roles), extra_fields=extra)
 
 
@@ -344,7 +346,7 @@ def item_of(image: Image, root: str) -> pystac.Item:
         facts,
         flown.start,
         flown.end,
-        [uri for prefix, uri in EXTENSIONS.items() if prefix != "sar" or "sar:frequency_band" in facts],
+        [uri for prefix, uri in EXTENSIONS.items() if prefix != "view" or "view:incidence_angle" in facts],
     )
     for key, asset in image.assets.items():
         item.add_asset(key, asset)
@@ -379,7 +381,14 @@ def _places(nested: Sequence[Any]) -> Iterator[tuple[float, float]]:
             yield from _places(part)
 
 
-def catalog_files(campaign: str, images: Sequence[Image]) -> dict[str, dict[str, Any]]:
+def catalog_files(
+    campaign: str,
+    images: Sequence[Image],
+    *,
+    licence: str | None = None,
+    author: str | None = None,
+    doi: str | None = None,
+) -> dict[str, dict[str, Any]]:
     """Return every file of the catalog of some images, its path in the catalog's folder → JSON.
 
     Links are relative and nothing names itself, so that the folder may be moved or served from anywhere.
@@ -390,12 +399,19 @@ def catalog_files(campaign: str, images: Sequence[Image]) -> dict[str, dict[str,
         Its name, free text.
     images
         In any order; their files lie in the folder that holds the catalog's folder.
+    licence, author, doi
+        Of all images: an SPDX identifier, a name, a DOI; None: not stated.
     """
     ordered = sorted(images, key=lambda image: (image.flight, image.name))
     times = min(image.acquisition.start for image in ordered), max(image.acquisition.end for image in ordered)
     facts = {RECORDED: [pystac.utils.datetime_to_str(time) for time in times]}
     catalog = pystac.Catalog("apertura", f"Images of the campaign {campaign}.", title=campaign, extra_fields=facts)
     parent = _parent(campaign, ordered, times)
+    if isinstance(parent, pystac.Collection):
+        parent.license = licence or "other"
+        parent.providers = [pystac.Provider(author, roles=[pystac.ProviderRole.PRODUCER])] if author else None
+    if doi:
+        parent.add_link(pystac.Link("cite-as", f"https://doi.org/{quote(doi)}"))
     catalog.add_child(parent)
     for image in ordered:
         item = item_of(image, "../../../..")

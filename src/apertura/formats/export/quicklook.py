@@ -126,6 +126,7 @@ def footer(tags: Mapping[str, str]) -> str:
     known = (
         ("APERTURA_VERSION", "apertura {}"),
         ("APERTURA_ERROR_DB", "numerical error below {} dB"),
+        ("APERTURA_LOOK_SIDE", "looks {}"),
         ("APERTURA_CODE_SHA256", "code {:.12}"),
     )
     lines = [words.format(tags[tag].replace("-", "−")) for tag, words in known if tag in tags]

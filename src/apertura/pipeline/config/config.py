@@ -9,11 +9,22 @@ from apertura.common import documents
 from apertura.common.documents import read_yaml
 from apertura.pipeline.config.nodes import Node
 from apertura.pipeline.config.processing import Bench, Calibration, Interferometry, Processing, Scene
-from apertura.pipeline.config.section import Name, RawRoot, Section, Title
+from apertura.pipeline.config.section import Doi, Licence, Name, RawRoot, Section, Title
 from apertura.pipeline.config.waveform import PhaseHistoryWaveform, Waveform
 
 CONFIG = Path("config/config.yaml")
 """Path of the config in a campaign folder."""
+
+
+class Metadata(Section):
+    """Statements about the campaign that no file of it holds."""
+
+    author: Title | None = Field(None, description="who recorded the campaign; null: not stated")
+    licence: Licence | None = Field(
+        None, description="licence of the products, an SPDX identifier such as CC-BY-4.0; null: not stated"
+    )
+    platform: Title | None = Field(None, description="aircraft, such as a type or a registration; null: not stated")
+    doi: Doi | None = Field(None, description="DOI of the data set, such as 10.5281/zenodo.1234567; null: none")
 
 
 class Settings(Section):
@@ -34,6 +45,9 @@ class Settings(Section):
     bench: Bench = Field(default_factory=Bench, description="what is known of a set-up on the bench, before a flight")
     interferometry: Interferometry = Field(
         default_factory=Interferometry, description="images compared in phase, two by two, for coherence and heights"
+    )
+    metadata: Metadata = Field(
+        default_factory=Metadata, description="author, licence, platform and DOI for GeoTIFF tags, STAC and RO-Crate"
     )
 
     @model_validator(mode="after")

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import AfterValidator, BaseModel, ConfigDict
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from apertura.common.documents import read_text
 from apertura.common.errors import CampaignError, quoted
@@ -94,6 +94,12 @@ CrsName = Annotated[str, AfterValidator(plain_crs)]
 
 RawRoot = Annotated[str, AfterValidator(_absolute)]
 """The path of a folder outside the campaign."""
+
+Licence = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9.+-]{0,63}$")]
+"""An SPDX identifier."""
+
+Doi = Annotated[str, Field(pattern=r"^10\.[0-9]{4,9}/[A-Za-z0-9._;()/:-]{1,100}$")]
+"""A digital object identifier, without https://doi.org/."""
 
 Title = Annotated[str, AfterValidator(_title)]
 """What people read: a line without what WKT, HTML or a terminal would take for their own."""

@@ -36,6 +36,9 @@ def ro_crate(campaign: Campaign) -> Sequence[Path]:
         list(_jobs(campaign, made, known)),
         _inputs(campaign, known),
         [Listed(name, sha256_text(text), len(text.encode())) for name, text in workflow.items()],
+        author=campaign.settings.metadata.author,
+        licence=campaign.settings.metadata.licence,
+        doi=campaign.settings.metadata.doi,
     )
     written = [campaign.result(name) for name in (CRATE, *workflow)]
     write_json(written[0], crate_document(run))

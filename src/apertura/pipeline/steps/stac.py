@@ -42,7 +42,9 @@ def stac(campaign: Campaign) -> list[Path]:
     lineage = result_of(campaign, "stac").begin(campaign.root)
     manifest, folder = campaign.root / lineage.result.manifest, campaign.result("stac")
     described = _Described(campaign, settled_scene(campaign))
-    files = catalog_files(campaign.settings.campaign, described.images())
+    stated = campaign.settings.metadata
+    by_whom = {"licence": stated.licence, "author": stated.author, "doi": stated.doi}
+    files = catalog_files(campaign.settings.campaign, described.images(), **by_whom)
     manifest.unlink(missing_ok=True)
     for name, document in files.items():
         write_json(campaign.result("stac", name), document)
@@ -72,7 +74,7 @@ class _Described:
         files = self._listed(flight, pair, "export") | self._listed(flight, pair, "layers")
         facts: dict[str, Any] = {
             "sar:instrument_mode": _mode(pair),
-            "sar:product_type": "SLC",
+            "product:type": "SLC",
             "sar:looks_range": 1,
             "sar:looks_azimuth": 1,
         }
@@ -92,7 +94,12 @@ class _Described:
     def _sum(self, flight: str, name: str, pairs: Sequence[Image], looks: NDArray[np.float32]) -> Image:
         others = tuple(f"{other}_" for other in _SUMS if other != name)
         listed = self._listed(flight, FUSED, "export")
-        facts = {"sar:instrument_mode": "multistatic", "sar:product_type": _SUMS[name]}
+        facts: dict[str, Any] = {"sar:instrument_mode": "multistatic", "product:type": _SUMS[name]}
+        sides = {pair.properties.get("sar:observation_direction") for pair in pairs}
+        if len(sides) == 1 and None not in sides:
+            facts["sar:observation_direction"] = sides.pop()
+        angles = [pair.properties["view:incidence_angle"] for pair in pairs]
+        facts["view:incidence_angle"] = round(float(np.mean(angles)), 4)
         return Image(
             flight,
             name,
@@ -135,6 +142,7 @@ class _Described:
             return {
                 **self._shared,
                 **(_resolution(report.get("brightest") or {}) if verdict == "focused" else {}),
+                **(_view(report["view"]) if "view" in report else {}),
                 "processing:lineage": f"apertura step export {flight} {name}; code {code}; lock {self._lock}",
                 "apertura:verdict": verdict,
                 "apertura:flags": sorted(report["flags"]),
@@ -153,6 +161,7 @@ class _Described:
             **projection(grid.crs_wkt, grid.shape, grid.transform),
             "sar:pixel_spacing_range": grid.spacing_m,
             "sar:pixel_spacing_azimuth": grid.spacing_m,
+            **({"platform": platform} if (platform := self.campaign.settings.metadata.platform) else {}),
             "processing:level": "L1",
             "processing:software": software(),
         }
@@ -176,6 +185,13 @@ def _resolution(brightest: Mapping[str, Any]) -> dict[str, float]:
     """Return the widths at -3 dB of an image's brightest point, as they were measured."""
     widths = {"range": brightest.get("ground_range_width_m"), "azimuth": brightest.get("cross_range_width_m")}
     return {f"sar:resolution_{axis}": float(width) for axis, width in widths.items() if width is not None}
+
+
+def _view(view: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the direction in which a pair looks at the middle of the scene."""
+    directions = {"sar:observation_direction": view["side"], "view:azimuth": view["look_deg"]}
+    known = {name: value for name, value in directions.items() if value not in {"both", None}}
+    return known | {"view:incidence_angle": float(view["incidence_deg"])}
 
 
 def _mode(pair: str) -> str:
