@@ -7,6 +7,8 @@ import pytest
 from matplotlib.figure import Figure
 from rasterio import Affine
 
+from apertura.core.geometry.geodesy import ecef_from_geodetic, frame_from_map, geodetic_from_ecef, map_from_frame
+from apertura.formats.catalog.stac import bounds
 from apertura.formats.export.coverage import Covered, feature_collection, footprint, write_coverage
 
 TRANSFORM = Affine(2.0, 0, 100.0, 0, -2.0, 80.0)
@@ -44,6 +46,37 @@ def test_geojson_places_tracks_and_footprints_by_longitude_and_latitude():
         "kind": "footprint", "flight": "f01", "pair": "a-b",
         "covered_share": 0.8, "area_m2": 256.0, "looks_median": 7.0, "looks_most": 7.0,
     }  # fmt: skip
+
+
+def near_the_antimeridian(at_m):
+    """Places of EPSG:32660 as they are exported."""
+    latitude, longitude, height = geodetic_from_ecef(frame_from_map("EPSG:32660", *at_m.T)).T
+    return np.stack([longitude, latitude, height], -1)
+
+
+def test_footprint_and_track_across_180_degrees_are_cut_there_and_their_bounds_run_west_to_east():
+    """RFC 7946, 3.1.9 and 5.2: the same area in two polygons, and a line in two parts."""
+    east, north, _ = map_from_frame("EPSG:32660", ecef_from_geodetic(np.array(48.0), np.array(180.0), np.array(0.0)))
+    place = Affine(2.0, 0, east - 9, 0, -2.0, north + 8)
+    track = np.stack([np.linspace(east - 20, east + 20, 9), np.full(9, north - 30), np.full(9, 30.0)], -1)
+    one = Covered("f01", "a-a", {"transmitter": track}, 7 * RING)
+    line, area_of = feature_collection([one], place, near_the_antimeridian, height_m=0.0)["features"]
+    assert line["geometry"]["type"] == "MultiLineString"
+    ends = [np.array(part)[:, 0] for part in line["geometry"]["coordinates"]]
+    assert (ends[0][-1], ends[1][0]) == (180.0, -180.0)
+    assert (np.diff(ends[0]) > 0).all()
+    assert (np.diff(ends[1]) > 0).all()
+    polygons = [[np.array(ring) for ring in rings] for rings in area_of["geometry"]["coordinates"]]
+    sides = [np.sign(rings[0][:, 0]) for rings in polygons]
+    assert {float(side[0]) for side in sides} == {-1.0, 1.0}
+    assert all((side == side[0]).all() for side in sides)
+    metres = 6378137.0 * np.radians(1.0) * np.array([np.cos(np.radians(48.0)), 0.9973])
+    found = sum(area(ring * metres) for rings in polygons for ring in rings)
+    assert found == pytest.approx((7 * 10 - 2 * 3) * 4, rel=0.02)
+    west, south, east_deg, north_deg = bounds([area_of["geometry"]])
+    assert 179.9 < west < 180
+    assert -180 < east_deg < -179.9
+    assert south < north_deg
 
 
 def test_a_campaign_without_place_on_earth_has_features_without_geometry():

@@ -21,10 +21,11 @@ from matplotlib import image
 from rasterio import Affine
 
 from apertura.core.echo.dechirp import FrequencySweep
+from apertura.core.geometry.geodesy import ecef_from_geodetic
 from apertura.formats.export.cog import write_power, write_slc
 from apertura.formats.reading import read_track
 from apertura.formats.tracks.track import make_track
-from apertura.pipeline.examination.facts import log_facts
+from apertura.pipeline.examination.facts import bounds_of, log_facts
 from apertura.simulation.fmcw import FmcwFlight, write_fmcw_campaign
 from apertura.views.inspect.look import inspect_path, look
 from apertura.views.inspect.pictures import draw_history, draw_log
@@ -406,3 +407,12 @@ def test_a_preview_of_phase_history_spreads_its_pulses_over_the_whole_of_it():
     assert len(strongest) <= 256
     assert strongest.max() - strongest.min() > 45
     assert tuple(drawn.get_extent()[2:]) == (count, 0)
+
+
+def test_a_track_across_180_degrees_has_bounds_from_west_to_east_and_a_middle_on_it():
+    longitude = np.array([179.9999, -179.9998, 180.0, 179.9998])
+    position = ecef_from_geodetic(np.full(4, 48.0), longitude, np.full(4, 30.0))
+    assert bounds_of(position, "ecef")["longitude_deg"] == pytest.approx([179.9998, -179.9998], abs=1e-9)
+    times = np.datetime64("2025-05-14T09:30", "ns") + np.arange(4) * np.timedelta64(1, "s")
+    facts = log_facts(make_track(times, position, frame="ecef", node="uav1", where=Path("a.csv")))
+    assert abs(facts.middle_geodetic[1]) == pytest.approx(179.99995, abs=1e-6)

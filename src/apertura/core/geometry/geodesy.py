@@ -120,6 +120,34 @@ def is_on_wgs84(crs: str) -> bool:
     )
 
 
+def longitude_range(longitude_deg: NDArray[np.float64]) -> tuple[float, float]:
+    """Return the westernmost and the easternmost of longitudes in -180 to 180°; west > east across the antimeridian.
+
+    The widest gap between neighbours on the circle is outside (RFC 7946, 5.2).
+
+    Examples
+    --------
+    >>> longitude_range(np.array([9.0, 10.0, 9.5])), longitude_range(np.array([179.9, -179.8, 180.0]))
+    ((9.0, 10.0), (179.9, -179.8))
+    """
+    around = np.sort(longitude_deg)
+    gaps = np.append(np.diff(around), around[0] + 360 - around[-1])
+    last = int(gaps[::-1].argmax())  # of equal gaps that over the antimeridian
+    end = len(around) - 1 - last
+    return float(around[(end + 1) % len(around)]), float(around[end])
+
+
+def longitudes_about(longitude_deg: NDArray[np.float64], middle_deg: float) -> NDArray[np.float64]:
+    """Return longitudes without a jump about a middle: within 180° of it.
+
+    Examples
+    --------
+    >>> longitudes_about(np.array([179.5, -179.5]), 180.0)
+    array([179.5, 180.5])
+    """
+    return np.asarray((longitude_deg - middle_deg + 180) % 360 - 180 + middle_deg)
+
+
 def frame_from_map(crs: str, x: ArrayLike, y: ArrayLike, height_m: ArrayLike) -> Positions:
     """Return (..., 3) float64 positions (m) in the processing frame: ECEF, or the local axes themselves.
 

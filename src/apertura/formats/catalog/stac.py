@@ -8,11 +8,13 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
+import numpy as np
 import pystac
 from pystac.layout import CustomLayoutStrategy
 
 from apertura.common.errors import CampaignError
 from apertura.common.raster import opened_raster
+from apertura.core.geometry.geodesy import longitude_range
 from apertura.formats.catalog import CATALOG
 
 # ---- Fields and schemas of STAC extensions --------------------------------------------------------------------------
@@ -361,7 +363,7 @@ def item_of(image: Image, root: str) -> pystac.Item:
 
 
 def bounds(geometries: Iterable[Mapping[str, Any]]) -> list[float]:
-    """Return west, south, east, north of GeoJSON geometries, degrees.
+    """Return west, south, east, north of GeoJSON geometries, degrees; west > east across the antimeridian.
 
     Examples
     --------
@@ -370,7 +372,8 @@ def bounds(geometries: Iterable[Mapping[str, Any]]) -> list[float]:
     """
     places = [place for geometry in geometries for place in _places(geometry["coordinates"])]
     longitudes, latitudes = zip(*places, strict=True)
-    return [min(longitudes), min(latitudes), max(longitudes), max(latitudes)]
+    west, east = longitude_range(np.array(longitudes))
+    return [west, min(latitudes), east, max(latitudes)]
 
 
 def _places(nested: Sequence[Any]) -> Iterator[tuple[float, float]]:

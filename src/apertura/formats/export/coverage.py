@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ MARGIN = 0.04
 """Left free around tracks and scene, of the longer side."""
 
 _NAMED = 8  # flights in the legend
+_HALF_DEG = 180.0  # of longitude: neighbours farther apart lie on both sides of the antimeridian
 _SMALL = 0.25  # of the map's longer side: a smaller scene is drawn once more by itself
 _COLOURS = tuple(colormaps["tab10"](number) for number in range(10))
 
@@ -106,17 +108,76 @@ def feature_collection(
         for antenna, track_m in one.tracks_m.items():
             line = None
             if place is not None:
-                line = {"type": "LineString", "coordinates": _rounded(place(track_m), heights=True)}
+                parts = [_rounded(part, heights=True) for part in cut_line(place(track_m))]
+                whole = len(parts) == 1
+                kind, at = ("LineString", parts[0]) if whole else ("MultiLineString", parts)
+                line = {"type": kind, "coordinates": at}
             features.append(_feature(line, {"kind": "track", "antenna": antenna, **named}))
         area = None
         if place is not None:
-            at = [
-                [_rounded(place(np.c_[ring, np.full(len(ring), height_m)])) for ring in rings]
-                for rings in footprint(one.looks, transform)
-            ]
-            area = {"type": "MultiPolygon", "coordinates": at}
+            areas = placed_footprint(one.looks, transform, place, height_m=height_m)
+            area = {"type": "MultiPolygon", "coordinates": [[_rounded(ring) for ring in rings] for rings in areas]}
         features.append(_feature(area, {"kind": "footprint", **named, **_statistics(one.looks, transform)}))
     return {"type": "FeatureCollection", "features": features}
+
+
+def placed_footprint(
+    looks: NDArray[np.float32],
+    transform: Affine,
+    place: Callable[[NDArray[np.float64]], NDArray[np.float64]],
+    *,
+    height_m: float,
+) -> list[list[Ring]]:
+    """Return the polygons of `footprint` as longitude, latitude and height; cut at the antimeridian (RFC 7946, 3.1.9).
+
+    Parameters
+    ----------
+    looks, transform
+        As of `footprint`.
+    place, height_m
+        As of `feature_collection`.
+    """
+
+    def placed(ring: Ring) -> Ring:
+        return place(np.c_[ring, np.full(len(ring), height_m)])
+
+    polygons = [[placed(ring) for ring in rings] for rings in footprint(looks, transform)]
+    if not any(np.ptp(ring[:, 0]) > _HALF_DEG for rings in polygons for ring in rings):
+        return polygons
+    # Each side has the pixels that reach into it; what of them lies beyond is moved onto the antimeridian.
+    down, right = np.mgrid[: looks.shape[0] + 1, : looks.shape[1] + 1]
+    corners = np.stack(transform @ (right.ravel(), down.ravel()), -1)
+    east_of = (placed(corners)[:, 0] % 360 - _HALF_DEG).reshape(down.shape)
+    of_pixel = np.stack([east_of[:-1, :-1], east_of[1:, :-1], east_of[:-1, 1:], east_of[1:, 1:]])
+    cut = []
+    for side, there in ((-1, of_pixel.min(axis=0) < 0), (1, of_pixel.max(axis=0) > 0)):
+        for rings in footprint(np.where(there, looks, 0), transform):
+            parts = [placed(ring) for ring in rings]
+            for ring in parts:
+                beyond = ring[:, 0] % 360 - _HALF_DEG
+                ring[:, 0] = side * np.maximum(side * beyond, 0.0) - side * _HALF_DEG
+            cut.append(parts)
+    return cut
+
+
+def cut_line(places: Ring) -> list[Ring]:
+    """Return a line of longitude, latitude and height in parts that end at the antimeridian (RFC 7946, 3.1.9).
+
+    Examples
+    --------
+    >>> [part.tolist() for part in cut_line(np.array([[179.0, 10.0, 5.0], [-178.0, 13.0, 8.0]]))]
+    [[[179.0, 10.0, 5.0], [180.0, 11.0, 6.0]], [[-180.0, 11.0, 6.0], [-178.0, 13.0, 8.0]]]
+    """
+    parts, begun = [], places[:1]
+    for before, after in pairwise(places):
+        if abs(after[0] - before[0]) > _HALF_DEG:
+            side = np.copysign(_HALF_DEG, before[0])
+            further = after + [2 * side, 0.0, 0.0]
+            crossing = before + (side - before[0]) / (further[0] - before[0]) * (further - before)
+            parts.append(np.concatenate([begun, [crossing]]))
+            begun = np.array([crossing - [2 * side, 0.0, 0.0]])
+        begun = np.concatenate([begun, [after]])
+    return [*parts, begun]
 
 
 def _feature(geometry: Mapping[str, Any] | None, properties: Mapping[str, Any]) -> dict[str, Any]:

@@ -9,7 +9,6 @@ import yaml
 from rasterio import Affine
 
 from apertura import __version__
-from apertura.common.arrays import Floats
 from apertura.common.atomic import made_folder, write_json, write_text
 from apertura.common.confined import ConfinedPath
 from apertura.common.errors import CampaignError
@@ -17,7 +16,7 @@ from apertura.common.provenance import canonical_json
 from apertura.core.geometry.geodesy import LOCAL
 from apertura.formats.campaign_files import write_config
 from apertura.formats.export.cog import Band, write_cog
-from apertura.formats.export.coverage import Covered, feature_collection, footprint, write_coverage
+from apertura.formats.export.coverage import Covered, feature_collection, placed_footprint, write_coverage
 from apertura.formats.export.layers import BISTATIC_ANGLE, INCIDENCE, LOOKS, MASK
 from apertura.formats.export.style import write_layer_style, write_mask_style
 from apertura.formats.tracks.missions import write_kml
@@ -95,16 +94,13 @@ def _write_tracks(design: Design, folder: Path) -> list[Path]:
     if on_earth is None:
         return [picture, features]
 
-    def ring(place_m: Floats) -> Floats:
-        return np.asarray(on_earth(np.c_[place_m, np.full(len(place_m), scene.level.height_m)]))
-
     lines = {
         f"{flight} {node}": np.asarray(on_earth(course.place_m[:: max(1, len(course.place_m) // _VERTICES)]))
         for flight, nodes in design.opened.courses.items()
         for node, course in nodes.items()
     }
     areas = {
-        f"{one.flight} {one.pair}": [[ring(part) for part in rings] for rings in footprint(one.looks, transform)]
+        f"{one.flight} {one.pair}": placed_footprint(one.looks, transform, on_earth, height_m=scene.level.height_m)
         for one in covered
     }
     write_kml(folder / "tracks.kml", title, lines, areas)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
-from apertura.core.geometry.geodesy import geodetic_from_ecef
+from apertura.core.geometry.geodesy import geodetic_from_ecef, longitude_range, longitudes_about
 from apertura.core.geometry.track_checks import LONG_GAP, CheckedTrack, check_track
 from apertura.formats.recordings.recording import Recording
 from apertura.formats.tracks.track import FIXES
@@ -110,7 +110,7 @@ def log_facts(track: "xr.Dataset") -> LogFacts:
         frame=frame,
         bounds=_bounds(places, frame),
         middle_m=np.median(position, axis=0),
-        middle_geodetic=np.median(places, axis=0) if frame == "ecef" else None,
+        middle_geodetic=_middle(places) if frame == "ecef" else None,
         length_m=float(steps_m.sum()),
         median_speed_m_s=float(np.median(speed_m_s)),
         largest_speed_m_s=float(speed_m_s.max()),
@@ -137,6 +137,8 @@ def log_faults(track: "xr.Dataset") -> CheckedTrack:
 def bounds_of(position_m: NDArray[np.float64], frame: str) -> dict[str, Range]:
     """Return lowest and highest of each coordinate of (n, 3) positions, geodetic where they are on Earth.
 
+    Longitudes are those of the west and of the east end: the first is the larger one across the antimeridian.
+
     Examples
     --------
     >>> bounds_of(np.array([[0.0, 1, 2], [5, 1, 2]]), "local")
@@ -148,7 +150,15 @@ def bounds_of(position_m: NDArray[np.float64], frame: str) -> dict[str, Range]:
 def _bounds(places: NDArray[np.float64], frame: str) -> dict[str, Range]:
     earth = frame == "ecef"
     names = ("latitude_deg", "longitude_deg", "height_m") if earth else ("east_m", "north_m", "up_m")
-    return {name: [float(one.min()), float(one.max())] for name, one in zip(names, places.T, strict=True)}
+    found = {name: [float(one.min()), float(one.max())] for name, one in zip(names, places.T, strict=True)}
+    return found | ({"longitude_deg": [*longitude_range(places[:, 1])]} if earth else {})
+
+
+def _middle(places: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the median of latitude, longitude and height, also across the antimeridian."""
+    latitude, longitude, height = places.T
+    middle = np.median(longitudes_about(longitude, longitude[0]))
+    return np.array([np.median(latitude), (middle + 180) % 360 - 180, np.median(height)])
 
 
 def _fixes(track: "xr.Dataset") -> dict[str, int] | None:

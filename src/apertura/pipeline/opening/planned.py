@@ -272,8 +272,8 @@ def _crs(plan: FlightPlan, campaign: Campaign) -> str:
     track = next(
         track for flight in plan.flights.values() for track in flight.tracks.values() if isinstance(track, MissionTrack)
     )
-    latitude, longitude, height = read_mission(campaign.file(track.file, "flights")).place.mean(axis=0)
-    return utm_crs(ecef_from_geodetic(*(np.array(one) for one in (latitude, longitude, height))))
+    latitude, longitude, height = read_mission(campaign.file(track.file, "flights")).place.T
+    return utm_crs(ecef_from_geodetic(latitude, longitude, height).mean(axis=0))  # longitudes have no mean at 180°
 
 
 # ---- Courses of nodes -----------------------------------------------------------------------------------------------
