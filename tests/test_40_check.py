@@ -11,8 +11,10 @@ import numpy as np
 import pytest
 from folders import ROOT, edit_config, edit_data, edit_meta
 
-from apertura.pipeline.check import CHECKS, as_line, print_problems, problems
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.check import CHECKS, as_line, assumptions, print_findings, print_problems, problems
 from apertura.pipeline.check.recordings import odd_interval_s
+from apertura.pipeline.examination.campaign import Examination
 from apertura.simulation import PRESETS, preset, simulate
 
 EVERY_SECOND = np.timedelta64(50, "ms") * np.arange(0, 80, 2)
@@ -301,3 +303,20 @@ def test_a_file_from_the_future_is_reported_with_what_to_do(tiny):
         assert len(lines) == count
     assert "dated 2.0 h in the future; expected a time that has been, by this machine's clock" in lines[0]
     assert "run `touch raw/f01/uav1.sigmf-meta`" in lines[0]
+
+
+def test_a_ground_height_that_is_not_configured_is_noted_and_named_in_what_follows_from_it(tiny):
+    edit_config(tiny, lambda document: document["scene"].pop("height_m"))
+    (line,) = assumptions(Examination(Campaign.load(tiny)))
+    assert line.startswith("note: no ground height is configured: scene.height_m is 0 m")
+    assert "the track is 625 m above the ellipsoid" in line
+    assert "scene.height_m, which is 0 m, as by default" in only(tiny)
+    edit_config(tiny, lambda document: document["scene"].update(height_m=620.0))
+    assert [*assumptions(Examination(Campaign.load(tiny)))] == []
+
+
+def test_a_sound_folder_is_told_with_the_next_command(tiny, capsys):
+    assert print_findings(tiny) == 0
+    line = capsys.readouterr().out
+    assert line.startswith("no problem found in 1 flight, 2 recordings with their logs. Next: apertura plan ")
+    assert line.endswith(f", then apertura run {tiny}\n")

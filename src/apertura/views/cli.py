@@ -4,6 +4,7 @@ Commands import what they run when they run: help and mistakes in the command li
 """
 
 import os
+import shlex
 import sys
 from contextlib import suppress
 from pathlib import Path
@@ -539,6 +540,7 @@ def init(
         from apertura.pipeline.design.writing import write_campaign_config
 
         print(*map(as_typed, write_campaign_config(read_flight_plan(path), folder)), sep="\n")
+        print(_next_after_init(directory))
         return
     from apertura.common.atomic import made_folder, write_text
     from apertura.pipeline.config.template import config_template, flights_template
@@ -550,6 +552,15 @@ def init(
             raise CampaignError("exists already", path, "a new folder", "Choose another folder; nothing was changed.")
         write_text(path, text)
         print(as_typed(path))
+    print(_next_after_init(directory))
+
+
+def _next_after_init(directory: Path) -> str:
+    folder = shlex.quote(str(directory))
+    return (
+        "Next: state radar, nodes and scene in config.yaml and the flights in flights.tsv, copy recordings and logs to "
+        f"{folder}/raw/<flight>/, then: apertura check {folder}"
+    )
 
 
 @app.command()

@@ -4,13 +4,14 @@ A problem is what cannot be imaged at all; what makes an image worse is measured
 """
 
 import pkgutil
+import shlex
 import sys
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, TextIO, TypeVar
 
 from apertura.common.confined import ConfinedPath
-from apertura.common.errors import CampaignError
+from apertura.common.errors import CampaignError, number_of
 from apertura.common.processes import as_typed
 from apertura.pipeline.campaign import Campaign, check_name
 from apertura.pipeline.config import (
@@ -25,6 +26,7 @@ from apertura.pipeline.config import (
     read_segments,
     read_settings,
 )
+from apertura.pipeline.config.processing import HEIGHT_DEFAULT
 from apertura.pipeline.config.section import table_rows
 
 if TYPE_CHECKING:
@@ -106,11 +108,31 @@ def problems_of(examined: "Examination", *, without: Collection[str] = ()) -> li
 
 
 def print_problems(root: str | Path, *, without: Collection[str] = (), stream: TextIO | None = None) -> int:
-    """Print the problems of a campaign folder, one line each; return how many there are."""
-    wrong = problems(root, without=without)
-    for problem in wrong:
-        print(as_typed(as_line(problem)), file=stream or sys.stdout)
+    """Print the problems of a campaign folder, one line each, else what to know of it; return how many problems."""
+    campaign, wrong = load(Path(root))
+    notes: list[str] = []
+    if campaign is not None:
+        from apertura.pipeline.examination.campaign import Examination
+
+        examined = Examination(campaign)
+        wrong += problems_of(examined, without=without)
+        notes = [] if wrong else [*assumptions(examined)]
+    for line in (*map(as_line, wrong), *notes):
+        print(as_typed(line), file=stream or sys.stdout)
     return len(wrong)
+
+
+def assumptions(examined: "Examination") -> Iterator[str]:
+    """Yield what is assumed where the config leaves it open, and is easily wrong."""
+    from apertura.core.geometry.geodesy import LOCAL, geodetic_from_ecef
+
+    scene = examined.campaign.settings.scene
+    if scene.height_is_default and scene.crs != LOCAL and examined.middle_m is not None:
+        above_m = float(geodetic_from_ecef(examined.middle_m)[2])
+        yield (
+            f"note: {HEIGHT_DEFAULT}; the track is {above_m:.0f} m above the ellipsoid. State scene.height_m, or a "
+            "DEM by scene.dem"
+        )
 
 
 def print_findings(root: str | Path, *, products: bool = False, paranoid: bool = False) -> int:
@@ -139,6 +161,11 @@ def print_findings(root: str | Path, *, products: bool = False, paranoid: bool =
         lines += [f"{manifest}: damaged, {why}. Delete it and run the workflow again." for manifest, why in damaged]
     for line in lines:
         print(line)
+    folder = shlex.quote(as_typed(root))
+    flights, nodes = len(campaign.flights), sum(len(flight.participants) for flight in campaign.flights)
+    examined = f"{number_of(flights, 'flight')}, {number_of(nodes, 'recording')} with their logs"
+    then = f"apertura run {folder}" if lines else f"apertura plan {folder}, then apertura run {folder}"
+    print(f"no problem found in {examined}. Next: {then}")
     return len(lines)
 
 

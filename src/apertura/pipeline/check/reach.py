@@ -93,8 +93,12 @@ def _too_high(examined: Examination, distance_m: float) -> str:
         return ""
     return (
         f"The track is {above_m:.0f} m above the ground: check heights in the logs (metres, not feet, above the "
-        "ellipsoid) and scene.height_m."
+        f"ellipsoid) and scene.height_m{_default(examined)}."
     )
+
+
+def _default(examined: Examination) -> str:
+    return ", which is 0 m, as by default" if examined.campaign.settings.scene.height_is_default else ""
 
 
 def _reach(

@@ -267,6 +267,9 @@ class Air(Section):
         return self.temperature_c, self.pressure_hpa, self.relative_humidity
 
 
+HEIGHT_DEFAULT = "no ground height is configured: scene.height_m is 0 m, the ellipsoid itself"
+
+
 class Scene(Section):
     """The campaign's output grid."""
 
@@ -281,7 +284,7 @@ class Scene(Section):
     spacing_m: float | Literal["auto"] = Field("auto", description="pixel spacing, m, or auto")
     height_m: float = Field(0.0, description="height of flat ground, m; not used where there is a dem")
     height_std_m: float | None = Field(
-        None, ge=0, description="standard deviation of the ground's heights, m; null: nobody said"
+        None, ge=0, description="standard deviation of the ground's heights, m; null: not stated"
     )
     height_datum: Literal["ellipsoid", "egm96", "egm2008"] = Field("ellipsoid", description="what height_m counts from")
     dem: str | None = Field(None, description="terrain instead of flat ground: a GeoTIFF of heights, in any CRS")
@@ -310,6 +313,11 @@ class Scene(Section):
         "name, position_m and std_m as of reference_points, kind (trihedral, dihedral, sphere), size_m, and of corners "
         "azimuth_deg and elevation_deg",
     )
+
+    @property
+    def height_is_default(self) -> bool:
+        """Whether flat ground lies at 0 m: what the template says, and hardly any ground is at."""
+        return self.dem is None and self.height_m == 0
 
     @model_validator(mode="after")
     def _points_are_somewhere(self) -> Self:

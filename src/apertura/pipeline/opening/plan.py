@@ -37,6 +37,7 @@ from apertura.core.scene.clearance import check_antennas
 from apertura.core.scene.terrain import GroundModels
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import CONFIG, Node, SampledWaveform
+from apertura.pipeline.config.processing import HEIGHT_DEFAULT
 from apertura.pipeline.opening.pair import OpenPair, scene_illumination
 from apertura.pipeline.opening.scene import OpenScene
 
@@ -355,12 +356,13 @@ def _check_held(farthest: NDArray[np.float64], limit: NDArray[np.float64], campa
     beyond = np.flatnonzero(farthest > limit)
     if beyond.size:
         pulse = int((farthest - limit).argmax())
+        height = f" First of all: {HEIGHT_DEFAULT}." if campaign.settings.scene.height_is_default else ""
         raise CampaignError(
             f"at {number_of(beyond.size, 'pulse')} echoes of the scene arrive after {limit_name}, worst at pulse "
             f"{pulse}: total path {farthest[pulse]:.1f} m",
             where=where,
             expected=f"at most {limit[pulse]:.1f} m (c·{key} less the path offsets)",
-            remedy=f"Make scene.bounds_m smaller, or check path_offset_m and {key}.",
+            remedy=f"Make scene.bounds_m smaller, or check path_offset_m and {key}.{height}",
         )
 
 
