@@ -1,5 +1,7 @@
 """The grid of a campaign: pixels, windows and positions; automatic bounds and spacing; the range it takes up."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -15,6 +17,9 @@ from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.map_crs import block
 from apertura.core.scene.swath import swath
 from apertura.core.scene.terrain import FlatGround
+from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.config import Scene
+from apertura.pipeline.opening.scene import Flown, settled
 
 
 def test_places_above_the_scene_come_back_as_rows_columns_and_heights():
@@ -124,6 +129,23 @@ def test_automatic_bounds_hold_ground_on_both_sides_of_the_track():
     farthest = Aperture(tx, tx).path(np.array([[x, y, 0.0] for x in (xmin, xmax) for y in (ymin, ymax)])).max()
     assert 16 < farthest <= 20  # the corners, from the ends of the track; in whole metres
     assert utm_crs(ecef_from_projected("EPSG:32755", *map(np.array, (5e5, 6.1e6, 0.0)))) == "EPSG:32755"
+
+
+def test_an_automatic_grid_has_no_more_pixels_than_the_pass_recorded_samples_for(tiny):
+    """A circle of 5 m over 30 m resolves 6 cm everywhere: 9 pixels per sample of 100 pulses of 512 subcarriers."""
+    turn = np.linspace(0, 2 * np.pi, 100)
+    circle = np.stack([5 * np.sin(turn), 5 * np.cos(turn), np.full(100, 30.0)], -1)
+    frequency = 1.2e9 + 4e5 * np.arange(512)
+    flown = Flown(Aperture(circle, circle), frequency, np.inf)
+    campaign = Campaign.load(tiny)
+    scene = Scene(crs="local")
+    campaign = replace(campaign, settings=campaign.settings.model_copy(update={"scene": scene}))
+    grid, _, chosen = settled(campaign, lambda: flown)
+    assert np.prod(grid.shape) <= 9 * 100 * 512
+    assert "than the 0.461 Mpx that this pass fills: state scene.bounds_m" in chosen["spacing_m"]
+    small = campaign.settings.model_copy(update={"scene": Scene(crs="local", bounds_m=(-200, -200, 200, 200))})
+    grid, _, chosen = settled(replace(campaign, settings=small), lambda: flown)  # bounds that somebody wants stay fine
+    assert chosen["spacing_m"].startswith("a third of the finest resolution cell")
 
 
 def test_a_flight_at_the_edge_of_a_utm_zone_gets_automatic_bounds_that_its_zone_takes():

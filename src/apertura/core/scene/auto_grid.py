@@ -121,6 +121,41 @@ def auto_spacing(
     return _one_two_five(1.0 / (CELLS_PER_PIXEL * widest))
 
 
+MOST_PIXELS = 25_000_000
+"""Of an automatic grid: 200 MB of an image."""
+
+_FEWEST_PIXELS = 250_000  # that an automatic grid may always have
+
+
+def most_pixels(pulses: int, subcarriers: int) -> int:
+    """Return the largest number of pixels of an automatic grid: as many cells as the pass recorded samples.
+
+    Each cell has `CELLS_PER_PIXEL` pixels in both axes.
+
+    Examples
+    --------
+    >>> most_pixels(300, 1024), most_pixels(10, 512), most_pixels(10**6, 1024)
+    (2764800, 250000, 25000000)
+    """
+    return min(MOST_PIXELS, max(_FEWEST_PIXELS, round(CELLS_PER_PIXEL**2) * pulses * subcarriers))
+
+
+def coarsened(spacing_m: float, bounds_m: tuple[float, float, float, float], most: int) -> float:
+    """Return a spacing of the series 1-2-5, at least the given one, with which bounds hold no more pixels than `most`.
+
+    Examples
+    --------
+    >>> coarsened(0.01, (0.0, 0.0, 106.0, 106.0), 25_000_000), coarsened(0.5, (0.0, 0.0, 106.0, 106.0), 25_000_000)
+    (0.05, 0.5)
+    """
+    xmin, ymin, xmax, ymax = bounds_m
+    least = ((xmax - xmin) * (ymax - ymin) / most) ** 0.5
+    if spacing_m >= least:
+        return spacing_m
+    fitting = _one_two_five(least)
+    return fitting if fitting >= least * (1 - 1e-9) else _one_two_five(2.5 * fitting)
+
+
 def _one_two_five(value: float) -> float:
     decade = 10.0 ** np.floor(np.log10(value))
     return float(max(step * decade for step in (1, 2, 5) if step * decade <= value * (1 + 1e-9)))

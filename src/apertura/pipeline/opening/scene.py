@@ -16,7 +16,7 @@ from apertura.common.errors import CampaignError, quoted
 from apertura.common.provenance import sha256_file
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.geodesy import frame_from_map, geodetic_from_ecef, map_from_frame
-from apertura.core.scene.auto_grid import auto_bounds, auto_spacing, utm_crs
+from apertura.core.scene.auto_grid import auto_bounds, auto_spacing, coarsened, most_pixels, utm_crs
 from apertura.core.scene.dem import COVER_NODES, Dem, UncheckedDem, open_dem
 from apertura.core.scene.geoid import geoid_file, undulation
 from apertura.core.scene.grid import SceneGrid
@@ -297,8 +297,16 @@ def settled(campaign: Campaign, flown: Callable[[], Flown]) -> tuple[SceneGrid, 
         bounds, height_m = _bounds(flown(), ground)
         chosen["bounds_m"] = "ground that the first image flight illuminates well (docs/theory.md, eq. 8)"
     if spacing == "auto":
-        spacing = _spacing(flown(), ground, bounds, height_m)
+        finest = _spacing(flown(), ground, bounds, height_m)
         chosen["spacing_m"] = "a third of the finest resolution cell (docs/theory.md, eq. 8)"
+        most = most_pixels(len(flown().aperture), len(flown().frequency_hz))
+        spacing = coarsened(finest, bounds, most) if requested.bounds_m == "auto" else finest
+        if spacing > finest:
+            megapixels = (bounds[2] - bounds[0]) * (bounds[3] - bounds[1]) / finest**2 / 1e6
+            chosen["spacing_m"] = (
+                f"coarser than a third of the finest resolution cell, {finest:g} m, which on automatic bounds makes "
+                f"{megapixels:.3g} Mpx, more than the {most / 1e6:.3g} Mpx that this pass fills: state scene.bounds_m"
+            )
     if "auto" in {requested.bounds_m, requested.spacing_m}:
         bounds = _whole_pixels(bounds, spacing)
     grid = SceneGrid.from_bounds(crs, bounds, spacing_m=spacing, name=campaign.settings.campaign)
