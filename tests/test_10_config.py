@@ -162,3 +162,14 @@ def test_of_a_compound_crs_pixels_lie_in_the_horizontal_part(asked, taken):
 def test_heights_of_a_crs_that_are_not_those_stated_and_texts_of_proj_are_refused(asked, told):
     with pytest.raises(CampaignError, match=re.escape(told)):
         a_scene(asked)
+
+
+def test_bounds_that_are_no_multiple_of_the_spacing_name_the_nearest_and_no_keys():
+    document = {"campaign": "c", "waveform": {"kind": "phase_history", "format": "cphd"}, "nodes": {"a": {}}}
+    document["scene"] = {"crs": "EPSG:32632", "bounds_m": [0.0, 0.0, 10.1, 10.0], "spacing_m": 0.25}
+    with pytest.raises(CampaignError) as refused:
+        validated(document, where="config.yaml")
+    assert "10.1, 10.0] is 40.4 × 40 pixels of 0.25 m; the nearest whole grid is [0.0, 0.0, 10.0, 10.0]" in str(
+        refused.value
+    )
+    assert refused.value.expected == "values that go together"

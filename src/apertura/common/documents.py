@@ -286,10 +286,12 @@ def validated(model: type[T], document: object, *, where: object, expected: str)
         value = adapter.validate_python(document)
     except ValidationError as error:
         found = _complaints(error, adapter.json_schema())
+        if all(item["type"] == "value_error" for item in error.errors(include_url=False, include_context=False)):
+            expected = "values that go together"  # keys and types are right
         raise CampaignError(found, where=where, expected=expected, remedy="Correct what is named.") from error
     except ArithmeticError as error:  # of numbers that are each allowed and not together
         found = f"numbers too large or small to calculate with ({error})"
-        raise CampaignError(found, where=where, expected=expected, remedy="Correct the wildest.") from error
+        raise CampaignError(found, where=where, expected=expected, remedy="Correct the most extreme value.") from error
     for key, number in _numbers(adapter.dump_python(value, warnings=False), ()):
         if not abs(number) <= LARGEST_NUMBER:
             found = f"{quoted(key)[1:-1]} is {quoted(number)}"

@@ -5,6 +5,7 @@ Commands import what they run when they run: help and mistakes in the command li
 
 import os
 import shlex
+import signal
 import sys
 from contextlib import suppress
 from pathlib import Path
@@ -16,7 +17,15 @@ from typer.main import get_group
 
 from apertura import __version__
 from apertura.common.errors import CampaignError, explained
-from apertura.common.processes import INTERRUPTED, Interrupted, as_typed, ended_by_signals, given, leave_status
+from apertura.common.processes import (
+    INTERRUPTED,
+    SIGNALLED,
+    Interrupted,
+    as_typed,
+    ended_by_signals,
+    given,
+    leave_status,
+)
 from apertura.views.step_commands import Threads
 from apertura.views.step_commands import app as step
 
@@ -95,6 +104,10 @@ def _opened(campaign: Path) -> "Campaign":
     return Campaign.load(given(campaign))
 
 
+_UNREAD = SIGNALLED + signal.SIGPIPE
+"""Exit status where the reader of the output has gone, as `head` does: that of other commands, without a message."""
+
+
 def main() -> None:
     """Run the command line; exits with 0, 2 (one message: something to see to), 130 (a signal) or 1 (a defect)."""
     with ended_by_signals():
@@ -111,9 +124,10 @@ def main() -> None:
             raise SystemExit(INTERRUPTED) from None
         except SystemExit as ended:
             if isinstance(ended.__context__, BrokenPipeError):  # typer takes it for a failure of ours
-                _say(str(explained(ended.__context__)))
-                raise SystemExit(2) from None
+                raise SystemExit(_UNREAD) from None
             raise
+        except BrokenPipeError:
+            raise SystemExit(_UNREAD) from None
         except Exception as error:
             message = explained(error)
             leave_status(2 if message else 1)

@@ -192,7 +192,7 @@ def ground_of(terrain: Terrain | float | None, grid: SceneGrid) -> Terrain:
             quoted(terrain) if isinstance(terrain, str | Path) else f"an object of type {type(terrain).__name__}",
             where="terrain",
             expected="a height in metres, a FlatGround, Plane or Dem",
-            remedy="Open a file of heights by apertura.open_dem(path, datum).",
+            remedy="Open a file of heights by apertura.open_dem(path, grid, datum=...).",
         )
     return terrain
 
