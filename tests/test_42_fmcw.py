@@ -148,7 +148,7 @@ def test_a_mixer_of_the_other_sign_is_flagged(tmp_path):
     run_steps(root, exports=False)
     raised = image_of(root).attrs["quality"]["flags"]
     assert {"echo_elsewhere", "defocused"} & set(raised)
-    assert any("I and Q are swapped, waveform.iq" in line for line in raised.values())
+    assert any("change waveform.iq between complex and conjugate" in line for line in raised.values())
 
 
 def test_sweeps_so_slow_that_the_antenna_moves_are_flagged(tmp_path):

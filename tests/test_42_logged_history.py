@@ -122,6 +122,17 @@ def test_refined_tracks_of_a_phase_history_are_written_for_its_log(campaign):
 
 
 @pytest.mark.slow
+def test_a_history_whose_phases_count_upwards_is_imaged_by_the_key(campaign):
+    keep_time(campaign)
+    file = campaign / "raw/f01/uav1.npz"
+    stored = dict(np.load(file))
+    np.savez(file, **stored | {"transfer": stored["transfer"].conj()})
+    edit_config(campaign, lambda document: document["waveform"].update(iq="conjugate"))
+    run_steps(campaign, exports=False)
+    assert brightest(campaign)[:2] == (1.0, 20.0)
+
+
+@pytest.mark.slow
 def test_by_a_clock_half_a_second_off_the_target_is_as_far_off_as_was_flown_meanwhile(campaign):
     keep_time(campaign, BEHIND_S + 0.5)
     run_steps(campaign, exports=False)

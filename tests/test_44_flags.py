@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from folders import complaint, edit_config, ingest_all, quality_of
+from folders import complaint, edit_config, edit_data, ingest_all, quality_of
 
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.opening.echo import PairEcho
@@ -155,6 +155,35 @@ def test_a_wrong_code_is_flagged_in_a_monostatic_image(tmp_path):
     assert "code_unconfirmed" in own["flags"]
     assert own["code"]["carried"] is secondary["code"]["carried"] is False
     assert "right without one" in secondary["flags"]["wrong_code"]
+
+
+def swap(samples):
+    pairs = samples.reshape(-1, 2)
+    pairs[:] = pairs[:, ::-1].copy()
+
+
+def conjugate(samples):
+    np.negative(samples[1::2], out=samples[1::2])
+
+
+@pytest.mark.parametrize(("change", "order"), [(swap, "swapped"), (conjugate, "conjugate")])
+def test_i_and_q_in_another_order_are_named_and_taken_by_the_key(tmp_path, change, order):
+    campaign = flown(tmp_path)
+    right = {pair: echo_of(campaign, pair).transfer.values for pair in ("uav1-uav1", "uav1-uav2")}
+    for node in ("uav1", "uav2"):
+        edit_data(campaign.root.real(), node, change)
+    ingest_all(campaign)
+    flags = echo_of(campaign, "uav1-uav1").attrs["flags"]
+    assert "set waveform.iq to swapped where I and Q are swapped" in flags["spectrum_inverted"]
+    message = complaint(lambda: echo_of(campaign, "uav1-uav2"))
+    assert "the code is in the conjugates of the samples" in message
+    edit_config(campaign.root.real(), lambda document: document["waveform"].update(iq=order))
+    campaign = Campaign.load(campaign.root)
+    ingest_all(campaign)
+    for pair, transfer in right.items():
+        found = echo_of(campaign, pair)
+        assert found.attrs["flags"] == {}
+        np.testing.assert_array_equal(found.transfer.values, transfer)
 
 
 @pytest.mark.quick("0.022-True")

@@ -275,7 +275,7 @@ _OF_IMAGES = {
         "where the pulses hold the strong echo",
         "pulses hold a strong echo outside the scene's ranges, or that no place gathers",
         "heights and datum of log and scene; scene.bounds_m; path offsets; I and Q swapped: "
-        "waveform.iq of fmcw, else conjugate the samples",
+        "waveform.iq; from Python, conjugate the samples",
         "core/imaging/focus_check.py"),
     "pairs_apart": Flag(
         "cm between the points, east and north",
@@ -377,7 +377,7 @@ _OF_BENCHES = {
         "data lines of the converter; the recorder's format", "methods/synchronisation/channels.py"),
     "spectrum_inverted": Flag(
         "the node", "I and Q are swapped, or the mixer's oscillator is above the band",
-        "order of I and Q in the recorder; the local oscillator's side", "pipeline/opening/bench.py"),
+        "order of I and Q in the recorder; the local oscillator's side: waveform.iq", "core/echo/transfer.py"),
     "link_weak": Flag(
         "dB of a compressed pulse", "the path hardly stands out of the noise",
         "attenuators, cables, gain; which channel is which", "methods/synchronisation/links.py"),

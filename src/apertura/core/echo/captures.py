@@ -1,6 +1,7 @@
 """Captures of a pair: read in blocks of pulses, checked for saturation, resampled to a true clock."""
 
 from collections.abc import Callable, Iterator, Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,32 @@ AT_ONCE = 64
 
 SATURATED_SHARE = 1e-4
 """Share of the samples at the converter's end stops above which it clips; a symbol 12 dB below has one or two."""
+
+
+def ordered(iq: Samples, order: str) -> Samples:
+    """Return I and Q of the radar's samples, given `waveform.iq`: complex, swapped or conjugate.
+
+    Examples
+    --------
+    >>> [ordered(np.array([3, 4], np.int16), one).tolist() for one in ("complex", "swapped", "conjugate")]
+    [[3, 4], [4, 3], [3, -4]]
+    """
+    return conjugates(iq) if order == "conjugate" else iq[..., ::-1] if order == "swapped" else iq
+
+
+def conjugates(iq: Samples) -> Samples:
+    """Return I and Q of the conjugate samples, in the same type; the lowest integer, which has none, by one less.
+
+    Examples
+    --------
+    >>> conjugates(np.array([[3, -32768], [1, 5]], np.int16)).tolist()
+    [[3, 32767], [1, -5]]
+    """
+    turned: Any = iq.copy()
+    if turned.dtype.kind == "i":
+        turned[..., 1] = np.maximum(turned[..., 1], -np.iinfo(turned.dtype).max)
+    np.negative(turned[..., 1], out=turned[..., 1])
+    return np.asarray(turned)
 
 
 def blocks_of(pulses: Pulses, size: int = AT_ONCE) -> Iterator[Pulses]:

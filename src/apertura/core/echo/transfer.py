@@ -14,16 +14,32 @@ from numpy.typing import NDArray
 
 from apertura.common.arrays import Complexes, Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.common.errors import CampaignError
 from apertura.common.flags import Flags
 from apertura.common.progress import progress
 from apertura.core.echo.baseline import BaselineResidual, baseline_residual, detect_wrong_association
-from apertura.core.echo.captures import Pulses, Read, Samples, Saturation, blocks_of, correct_clock, spread
+from apertura.core.echo.captures import (
+    Pulses,
+    Read,
+    Samples,
+    Saturation,
+    blocks_of,
+    conjugates,
+    correct_clock,
+    spread,
+)
 from apertura.core.echo.clock import GROUPS, clock_of, decide_clock
 from apertura.core.echo.demodulate import Numerology, demodulate
 from apertura.core.echo.line_of_sight import LineOfSight
 from apertura.core.echo.own_pulses import CodeEvidence, own_code, phase_stability
 from apertura.core.echo.sidelink import DIVIDING, METHODS, choose, edges
 from apertura.core.echo.sidelink_state import SidelinkState, measure_blocks, second_path_flags
+
+_INVERTED = (
+    "the code is in the conjugates of the samples: set waveform.iq to swapped where I and Q are swapped, to conjugate "
+    "where the local oscillator lies above the band"
+)
+_COMPRESSED = 4.0  # times the peak of a delay profile over its mean, of conjugates against samples
 
 _STRETCH = 128  # neighbouring pulses on which own code and phase are checked
 _CLOCK_STRETCH = 256
@@ -169,8 +185,13 @@ def transfer_by_code(read: Read, inverse: Complexes, numerology: Numerology, *, 
     some = np.concatenate(spread(len(time_s), groups=GROUPS, each=_STRETCH))
     sample = np.concatenate([demodulator.transfer(read(block)) for block in blocks_of(some)])
     code = own_code(sample, prefix_cells=numerology.delay_cells)
+    inverted: Mapping[str, str] = {}
+    if not code.carried:
+        other = [demodulator.transfer({"radar": conjugates(read(block)["radar"])}) for block in blocks_of(some)]
+        if own_code(np.concatenate(other), prefix_cells=numerology.delay_cells).carried:
+            code, inverted = CodeEvidence(False, _INVERTED), {"spectrum_inverted": _INVERTED}
     phase = phase_stability(sample, time_s[some], prefix_cells=numerology.delay_cells)
-    flags = Flags.merged(code.flags, phase.flags if phase else {})
+    flags = Flags.merged(code.flags, inverted, phase.flags if phase else {})
     report = {"code": code.report, **({"own_phase": phase.report} if phase else {})}
     return Transfer(np.ones(len(time_s), bool), flags, report, None, form, saturation)
 
@@ -218,11 +239,20 @@ def transfer_by_sidelink(
     demodulator = Demodulator(inverse, numerology, symbol_samples)
     receiver = _Receiver.measured(read, demodulator, len(sidelink_m), accuracy_db)
     with progress("sidelinks", len(sidelink_m)) as done:
-        state = measure_blocks(lambda: receiver.sidelink(done), f"{where}: sidelink")
+        try:
+            state = measure_blocks(lambda: receiver.sidelink(done), f"{where}: sidelink")
+        except CampaignError as unlocked:
+            if not _compresses_conjugated(read, demodulator, len(sidelink_m)):
+                raise
+            expected, remedy = "samples I + jQ in the order of the recorder", "Set waveform.iq to swapped or conjugate."
+            raise CampaignError(f"{unlocked.found}; {_INVERTED}", f"{where}: sidelink", expected, remedy) from None
     chosen, reason = choose(state) if method == "auto" else (method, "asked for")
     unclocked = receiver.clock_flags if numerology.repeats or chosen not in DIVIDING else {}
     cell_m = SPEED_OF_LIGHT_M_S / (numerology.numbers.size * numerology.spacing_hz)
     delay_m = state.delay_cells * cell_m
+    inverted = "wrong_code" in state.flags and _compresses_conjugated(read, demodulator, len(sidelink_m))
+    if inverted:
+        state = replace(state, flags={"wrong_code": f"{state.flags['wrong_code']}; {_INVERTED}"})
     residual = baseline_residual(delay_m, sidelink_m)
     wrong = detect_wrong_association(residual)
     flags = Flags.merged(
@@ -231,6 +261,7 @@ def transfer_by_sidelink(
         edges(chosen, state),
         second_path_flags(state, cell_m=cell_m),
         {"association_suspect": wrong} if wrong else {},
+        {"spectrum_inverted": _INVERTED} if inverted else {},
     )
     quality = {"method": chosen, "reason": reason, **_sidelink_report(state, residual)}
     correction = Correction(chosen, state.path, receiver.clock_hz, receiver.sfo_ppm)
@@ -265,6 +296,18 @@ def forming(
         return demodulator.transfer(iq, correction)
 
     return form
+
+
+def _compresses_conjugated(read: Read, demodulator: Demodulator, count: int) -> bool:
+    """Return whether the sidelink, the code removed, is a path in the conjugates of its samples, and noise in these."""
+    some = np.concatenate(spread(count, groups=4, each=16))
+
+    def compression(samples: Samples) -> float:
+        power = np.abs(np.fft.ifft(demodulator.symbols(samples), axis=1)) ** 2
+        return float(np.median(power.max(axis=1) / power.mean(axis=1)))
+
+    sidelink = read(some)["sidelink"]
+    return compression(conjugates(sidelink)) > _COMPRESSED * compression(sidelink)
 
 
 def as_complex(iq: Samples) -> Complexes:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from apertura.common.atomic import naming
 from apertura.common.errors import CampaignError
+from apertura.core.echo.captures import ordered
 
 # ---- Real samples at an intermediate frequency to complex baseband --------------------------------------------------
 
@@ -407,9 +408,9 @@ class SampleFile:
             "The file was cut short or is being copied; copy it again and run the workflow again.",
         )
 
-    def channel(self, index: int) -> "ChannelOfFile":
-        """Return one channel, to be read by slices."""
-        return ChannelOfFile(self, index)
+    def channel(self, index: int, order: str = "complex") -> "ChannelOfFile":
+        """Return one channel, to be read by slices, with I and Q as `waveform.iq` states their order."""
+        return ChannelOfFile(self, index, order)
 
 
 @dataclass(frozen=True)
@@ -418,10 +419,11 @@ class ChannelOfFile:
 
     file: SampleFile
     index: int
+    order: str = "complex"
 
     def __len__(self) -> int:
         return len(self.file)
 
     def __getitem__(self, span: slice) -> Samples:
         first, last, _ = span.indices(len(self))
-        return np.ascontiguousarray(self.file.read(first, max(first, last))[:, self.index])
+        return np.ascontiguousarray(ordered(self.file.read(first, max(first, last))[:, self.index], self.order))

@@ -26,6 +26,11 @@ class SampledWaveform(Section):
     carrier_hz: float = Field(gt=0, description="RF carrier: what lies at baseband zero, Hz", examples=[1.2e9])
     sample_rate_hz: float = Field(gt=0, description="complex sample rate f_s, Hz", examples=[1.024e9])
     prf_hz: float = Field(gt=0, description="pulse repetition frequency, Hz", examples=[100.0])
+    iq: Literal["complex", "swapped", "conjugate"] = Field(
+        "complex",
+        description="complex: I+jQ; swapped: the recorder wrote Q before I; conjugate: the local oscillator lies above "
+        "the band",
+    )
 
     @property
     @abstractmethod
@@ -239,6 +244,9 @@ class PhaseHistoryWaveform(Section):
     channel: str | None = Field(None, description="of a CPHD file with several channels the one to image")
     corrections: Literal["none", "stored"] = Field(
         "none", description="of afrl_mat files that hold corrections of their passes (data.af): stored applies them"
+    )
+    iq: Literal["complex", "conjugate"] = Field(
+        "complex", description="complex: samples as recorded; conjugate: their conjugates, where phases count upwards"
     )
 
     @field_validator("format")

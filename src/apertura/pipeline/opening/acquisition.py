@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from apertura.common.errors import CampaignError
 from apertura.core.echo.association import Association, associate
-from apertura.core.echo.captures import Read, Samples
+from apertura.core.echo.captures import Read, Samples, ordered
 from apertura.core.echo.demodulate import Numerology
 from apertura.formats.recordings.sample_file import SampleFile, SampleLayout
 from apertura.pipeline.campaign import Campaign
@@ -82,6 +82,8 @@ class Captured:
         Its files of samples, for messages.
     numerology
         Of the symbol.
+    order
+        `waveform.iq`.
     """
 
     raw: xr.Dataset
@@ -89,6 +91,7 @@ class Captured:
     files: Path
     recording: str
     numerology: Numerology
+    order: str
 
     def reader(self, channels: Sequence[str], pulses: NDArray[np.int64]) -> Read:
         """Return a function that reads channels of some captures from the recorder's file, block by block.
@@ -119,6 +122,7 @@ class Captured:
                     remedy=f"Copy it there. `processing: {{keep: [echo]}}` in {CONFIG} keeps them from then on.",
                 )
             iq = self.samples.captures(start[captures], length)
+            iq = np.ascontiguousarray(ordered(iq, self.order))
             # I and Q move together: one by one they cost more than their transform
             both = np.dtype(f"i{2 * iq.itemsize}")
             pairs = iq.view(both)[..., 0]
@@ -148,7 +152,7 @@ class Captured:
         check_rates(sent.waveform, recorded, where=recording)
         opened = SampleFile(samples, len(raw.attrs["channels"]), SampleLayout.of(raw))
         check_mixing(opened, sent.numerology, where=recording)
-        return cls(raw, opened, files, recording, sent.numerology)
+        return cls(raw, opened, files, recording, sent.numerology, sent.waveform.iq)
 
 
 @dataclass(frozen=True)

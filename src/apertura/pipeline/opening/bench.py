@@ -10,7 +10,16 @@ import numpy as np
 from apertura.common.arrays import Complexes, Floats
 from apertura.common.errors import CampaignError
 from apertura.common.flags import Flags
-from apertura.core.echo.captures import SATURATED_SHARE, Pulses, Read, Samples, Saturation, blocks_of, spread
+from apertura.core.echo.captures import (
+    SATURATED_SHARE,
+    Pulses,
+    Read,
+    Samples,
+    Saturation,
+    blocks_of,
+    conjugates,
+    spread,
+)
 from apertura.core.echo.clock import GROUPS, ClockOffset, clock_of
 from apertura.core.echo.demodulate import demodulate
 from apertura.core.echo.transfer import Transfer, as_complex, transfer_by_code, transfer_by_sidelink
@@ -411,7 +420,7 @@ def _node(campaign: Campaign, flight: str, name: str, sent: Transmitted, *, own:
     pair = f"{campaign.flight(flight).transmitter}-{name}"
     if _is_inverted(read, sent, "radar" if own else "sidelink", len(every)):
         read = _conjugated(read)
-        flags.append({"spectrum_inverted": f"{name}: the code is in the conjugates of its samples, not in the samples"})
+        flags.append({"spectrum_inverted": f"{name}: the code is in the conjugates of its samples: toggle waveform.iq"})
     before, clock, contact, state = None, None, None, None
     measured: Transfer | None = None
     if own:
@@ -478,11 +487,7 @@ def _by_code(read: Read, sent: Transmitted, channel: str) -> Any:
 
 
 def _conjugated(read: Read) -> Read:
-    def conjugates(some: Pulses) -> dict[str, Samples]:
-        # in float32: the conjugate of the lowest integer is none
-        return {name: iq * np.array([1, -1], np.float32) for name, iq in read(some).items()}
-
-    return conjugates
+    return lambda some: {name: conjugates(iq) for name, iq in read(some).items()}
 
 
 def _is_inverted(read: Read, sent: Transmitted, channel: str, count: int) -> bool:

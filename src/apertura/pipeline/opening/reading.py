@@ -19,4 +19,7 @@ def read_history(campaign: Campaign, flight: str, node: str, *, pair: str) -> "x
     """Return the phase history recorded by a node of a pair, by its format and the config."""
     described = campaign.settings.waveform.model_dump()
     files = campaign.history_files(flight, node)
-    return read_phase_history(described["format"], files, pair=pair, described=described)
+    history = read_phase_history(described["format"], files, pair=pair, described=described)
+    if described["kind"] == "phase_history" and described["iq"] == "conjugate":
+        return history.assign(transfer=history.transfer.conj())
+    return history

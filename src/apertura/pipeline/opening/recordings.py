@@ -78,7 +78,8 @@ def _triggered(recording: Recording, campaign: Campaign, *, node: str) -> xr.Dat
     framing = framing_of(recording, campaign)
     rate = campaign.settings.processing.false_alarms_per_s
     channel = "sidelink" if "sidelink" in recording.channels else "radar"
-    samples, length = recording.samples.channel(recording.channels.index(channel)), waveform.capture_samples
+    samples = recording.samples.channel(recording.channels.index(channel), waveform.iq)
+    length = waveform.capture_samples
     bits = 8 * recording.samples.sample_bytes // len(recording.channels)
     captures = trigger_captures(samples, framing, symbol_samples=length, false_alarms_per_s=rate, sample_bits=bits)
     if not captures.start.size:
