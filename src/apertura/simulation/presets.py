@@ -46,7 +46,7 @@ SEGMENT_M, GAP_M, SPEED_M_S, FLIGHT_PRF_HZ = 3.4, 2.4, 0.5, 20.0
 
 
 def paper_lab(*, pulses: int = STATIC_PULSES, snr_db: float = COHERENT_SNR_DB["cables"]) -> CampaignSpecification:
-    """Return the lab: nothing but coaxial cables and attenuators between two nodes.
+    """Return the lab: nothing but coaxial cables between two nodes.
 
     Parameters
     ----------
@@ -57,10 +57,10 @@ def paper_lab(*, pulses: int = STATIC_PULSES, snr_db: float = COHERENT_SNR_DB["c
 
     Notes
     -----
-    Printed, in the paper's laboratory experiment: coaxial cables and attenuators, a radar path of 10 m, a sidelink of
-    5 m, no target; Γ = 0.986 after correction. In its table of parameters: the waveform, at 100 Hz. Of its text on
-    clocks: 10 ppb. Not printed: any SNR (that of the radar channel is what Γ needs, that of the sidelink 40 dB per
-    subcarrier), start and phase of the secondary's captures (±40 ns, ±π), losses of the cables, and whether their
+    Printed, in the paper's laboratory experiment: coaxial cables, a radar path of 10 m, a sidelink of 5 m, no target; Γ
+    = 0.986 after correction. In its table of parameters: the waveform, at 100 Hz. Of its text on clocks: 10 ppb.
+    Not printed: any SNR (that of the radar channel is what Γ needs, that of the sidelink 40 dB per subcarrier),
+    start and phase of the secondary's captures (±40 ns, ±π), losses of cables and attenuators, and whether their
     lengths are electrical (so here).
     """
     joint = (PointTarget((0.0, 0.0, 1.0 - _JOINT_M), _JOINT_M**2),)
@@ -74,11 +74,11 @@ def paper_static(*, pulses: int = STATIC_PULSES) -> CampaignSpecification:
 
     Notes
     -----
-    Printed, in the paper's static experiment: an anechoic chamber (no clutter), cylinders of 15 cm, mono- and bistatic
-    recordings of one split receive signal; Γ = 0.9999 at the first, 0.9995 at the second. Not printed: where the
-    cylinders stand (4 m and 6.5 m), whether 15 cm is their height (so here) or diameter, the SNR (what each Γ needs),
-    noise that the split signal has in common (none), how the sidelink is led (the lab's cable), the clock of the
-    secondary (the lab's).
+    Printed, in the paper's static experiment: an anechoic chamber (no clutter), cylinders with a diameter of 15 cm, a
+    sidelink by antennas, mono- and bistatic recordings of one split receive signal; Γ = 0.9999 at the first, 0.9995
+    at the second. Not printed: where the cylinders stand (4 m and 6.5 m), their height (15 cm here; they are lines
+    without a diameter), the SNR (what each Γ needs), noise that the split signal has in common (none), the clock of
+    the secondary (the lab's). Other than printed: the sidelink is the lab's cable.
     """
     near_m, far_m, antenna_up_m = 4.0, 6.5, 1.0
     weaker_db = COHERENT_SNR_DB["first cylinder"] - COHERENT_SNR_DB["second cylinder"]
@@ -108,11 +108,12 @@ def paper_uav(*, pulses: int = 275) -> CampaignSpecification:
 
     Notes
     -----
-    Printed, in the paper's table of the flight: 20 Hz, 0.5 m/s, height 4.5 to 5 m (4.8 m here), ground range 11.5 m,
-    L = 3.4 m, 4.7 m between the UAVs, one behind the other; of its images: 12 m × 4 m (12 m along the track here), an
-    extended target. Not printed: what the target is (rough, 1.2 m × 1.2 m, here), what else stands there (four points,
-    to measure widths and phases at), the clutter (17 dB under a point per m²), any SNR (0 dB per subcarrier, 30 dB in
-    the sidelink), lever arms, wobble, and which parts of the track image: theirs lie 2.4 m apart at their midpoints.
+    Printed, in the paper's table of the flight: 20 Hz, 0.5 m/s, height 4.5 to 5 m (4.8 m here), ground range 11.5 m, L
+    = 3.4 m, 4.7 m between the UAVs, one behind the other; of its images: 12 m × 4 m (12 m along the track here), an
+    extended target, a power generator. Not printed: its size (rough, 1.2 m × 1.2 m, here), what else stands there
+    (four points, to measure widths and phases at), the clutter (17 dB under a point per m²), any SNR (0 dB per
+    subcarrier, 30 dB in the sidelink), lever arms, wobble, and which parts of the track image: theirs lie 2.4 m
+    apart at their midpoints.
     """
     targets = (
         PointTarget((0.0, 0.0, 0.0)),

@@ -23,7 +23,7 @@ from apertura.simulation.impairments import Clock, Impairments, Localization, Ti
 from apertura.simulation.observation import observe
 from apertura.simulation.presets import paper_waveform
 from apertura.simulation.synthesis import samples, straight_pair, transfer_functions
-from apertura_research.paper.claims import Claim, compare, require
+from apertura_research.paper.claims import Claim, compare, fitted_to, require
 from apertura_research.paper.losses import ERRORS, TOLERATED_DB, peak_losses_db
 from apertura_research.paper_scene import (
     RX_AHEAD_M,
@@ -147,9 +147,11 @@ def position_claims(*, draws: int = DRAWS, seed: int = 3) -> list[Claim]:
                 words="positions suffice whose range error is λ/10 at most",
                 note=f"monostatic, moving average of 1 s, each draw as large as the largest of all pulses and targets "
                 f"allows: σ = {np.mean(sigmas_cm):.2f} cm per axis in the mean"),
-        require(f"bistatic over monostatic loss at {SIGMA_CM:g} cm", bistatic_db / mono_db, "1", style=".2f",
-                limit="1 ± 0.35", met=abs(bistatic_db / mono_db - 1) <= 0.35, words="the need is about equal",
-                note=f"mono {mono_db:.2f} dB, bistatic {bistatic_db:.2f} dB, {draws} draws"),
+        fitted_to(
+            require(f"bistatic over monostatic loss at {SIGMA_CM:g} cm", bistatic_db / mono_db, "1", style=".2f",
+                    limit="1 ± 0.35", met=abs(bistatic_db / mono_db - 1) <= 0.35, words="the need is about equal",
+                    note=f"the width of 'about' is chosen here; mono {mono_db:.2f} dB, bistatic {bistatic_db:.2f} dB, "
+                    f"{draws} draws")),
         _worst_bistatic(),
         _along_the_sidelink(),
     ]  # fmt: skip

@@ -74,6 +74,7 @@ def effect_claims() -> list[Claim]:
             "cells",
             limit="less than half a cell c/2B",
             met=_shift_cells(scene, still, little) < 0.5,
+            words="0.5 ns leaves the range profile",
             style=".3f",
             note=f"its peak is {20 * np.log10(_level(little) / _level(still)):+.3f} dB; the phase turns by "
             f"{360 * scene.waveform.carrier_hz * SMALL_TIMING_S:.0f}°, which is what defocuses",
@@ -84,6 +85,7 @@ def effect_claims() -> list[Claim]:
             "dB",
             limit="below −90 dB of the peak",
             met=magnitude_db < -90,
+            words="a carrier phase leaves the magnitude",
             style=".0f",
             note=f"largest change anywhere; the phase turned by {np.degrees(turned.phase - still.phase) % 360:.0f}°",
         ),

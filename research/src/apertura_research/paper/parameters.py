@@ -156,8 +156,8 @@ def _clocks() -> list[Claim]:
     )
     return [
         compare("SFO limit f_s(1 − 1/(1 + 1/BT))", sfo_hz / 1e3, "kHz", paper="200", style=".5g"),
-        compare("clock error of each node at the SFO limit, ±", sfo_ppm / 2, "ppm", paper="100", within=0.05,
-                note=opposite),
+        compare("clock error of each node at the SFO limit, ±", sfo_ppm / 2, "ppm", paper="100",
+                reason=f"the paper counts two clocks that err in opposite directions, and rounds: {opposite}"),
         compare("CFO limit Δf/10", cfo_hz / 1e3, "kHz", paper="10", note=first),
         compare("CFO of a clock off by 10 ppb", at_carrier_hz, "Hz", paper="41", reason=swapped),
         compare("SFO of a clock off by 10 ppb", at_converter_hz, "Hz", paper="12", reason=swapped),
