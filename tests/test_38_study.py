@@ -92,7 +92,11 @@ def test_what_the_paper_prints_stands_digit_by_digit_even_where_it_is_wrong():
     assert printed["duty cycle at 20 Hz"] == ("0.031", "0.03125", AGREES)
     assert printed["mean data rate at 20 Hz"] == ("9.0", "8.96", AGREES)
     assert printed["UAV flight: ground-range width, Hann, mono"][::2] == ("58", AGREES)
-    assert printed["clock error of each node at the SFO limit, ±"] == ("100", "97.64", EXPLAINED)  # two clocks in opposite directions, and rounded
+    assert printed["clock error of each node at the SFO limit, ±"] == (
+        "100",
+        "97.64",
+        EXPLAINED,
+    )  # two clocks in opposite directions, and rounded
     assert printed["CFO of a clock off by 10 ppb"] == ("41", "12", EXPLAINED)
     assert printed["SFO of a clock off by 10 ppb"] == ("12", "40.96", EXPLAINED)
     assert not any("8.3" in row.paper for row in rows.values())

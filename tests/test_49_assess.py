@@ -71,8 +71,8 @@ def test_the_summary_says_each_flag_once_and_whole(finished_sample, capsys, tmp_
     print_summary(Campaign.load(root))
     said = capsys.readouterr().out
     assert said.count("a line [with brackets]") == 1
-    assert "not stated, so not in the budget" in said
-    assert re.search(r"points may lie \d\.\d+ m off, mostly by heights, not stated; assumed 3 m", said)
+    assert "left out of the budget, no uncertainty is configured" in said
+    assert re.search(r"targets may be misplaced by \d\.\d+ m, mostly by heights, not stated; assumed 3 m", said)
 
 
 def flip_right_arm(document):

@@ -43,7 +43,7 @@ def typed(monkeypatch, capsys):
     return run
 
 
-@pytest.mark.parametrize("words", ["check", "plan", "summary", "list", "status", "run -n", "score --no-paths"])
+@pytest.mark.parametrize("words", ["check", "plan", "summary", "list", "status", "run -n", "score"])
 def test_the_folder_in_hand_is_the_campaign(finished_tiny, typed, words):
     status, out, err = typed(*words.split(), folder=finished_tiny.root)
     assert (status, err) == (0, "")
@@ -166,7 +166,7 @@ def test_an_image_that_was_overtaken_is_not_finished_although_its_report_is_ther
 
 
 @pytest.mark.quick("samples-summary", "all-list", "samples-verify -q")
-@pytest.mark.parametrize("words", ["check", "summary", "list", "status", "score --no-paths", "verify -q", "run -n"])
+@pytest.mark.parametrize("words", ["check", "summary", "list", "status", "score", "verify -q", "run -n"])
 @pytest.mark.parametrize("lost", ["samples", "all"])
 def test_results_are_read_where_their_recordings_are_not(finished_tiny, tmp_path, typed, words, lost):
     root = copy_writable(finished_tiny.root, tmp_path / "campaign")

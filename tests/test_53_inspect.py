@@ -416,3 +416,17 @@ def test_a_track_across_180_degrees_has_bounds_from_west_to_east_and_a_middle_on
     times = np.datetime64("2025-05-14T09:30", "ns") + np.arange(4) * np.timedelta64(1, "s")
     facts = log_facts(make_track(times, position, frame="ecef", node="uav1", where=Path("a.csv")))
     assert abs(facts.middle_geodetic[1]) == pytest.approx(179.99995, abs=1e-6)
+
+
+def test_a_named_pipe_in_place_of_the_log_is_not_waited_for(tiny):
+    log = tiny / "raw/f01/uav1.track.csv"
+    log.unlink()
+    os.mkfifo(log)
+    done = subprocess.run(
+        [APERTURA, "inspect", str(tiny / "raw/f01/uav1.sigmf-meta")],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert "uav1.track.csv is no plain file" in done.stdout

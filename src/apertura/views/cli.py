@@ -71,7 +71,7 @@ app = typer.Typer(cls=Commands, no_args_is_help=True, help="SAR images from camp
 app.add_typer(step, name="step", hidden=True)  # for rules, and to paste what one runs
 
 
-CampaignFolder = Annotated[Path, typer.Argument(help="campaign folder, else the one in hand", show_default=False)]
+CampaignFolder = Annotated[Path, typer.Argument(help="campaign folder, default: current folder", show_default=False)]
 Cores = Annotated[int, typer.Option(min=1, help="cores to use")]
 Paranoid = Annotated[bool, typer.Option("--paranoid", help="read every input again, whatever its times say")]
 HERE = Path()
@@ -192,7 +192,7 @@ def align(
         list[str],
         typer.Argument(
             metavar="[CAMPAIGN] FLIGHT NODE",
-            help="campaign folder, else the one in hand; flight; node that sends and receives",
+            help="campaign folder, default: current folder; flight; node that sends and receives",
         ),
     ],
     *,
@@ -391,11 +391,11 @@ def summary(campaign: CampaignFolder = HERE) -> None:
 @app.command()
 def score(
     campaign: Annotated[
-        Path, typer.Argument(help="campaign folder with truth.json, else the one in hand", show_default=False)
+        Path, typer.Argument(help="campaign folder with truth.json, default: current folder", show_default=False)
     ] = HERE,
-    paths: bool = True,
+    paths: Annotated[bool, typer.Option("--paths", help="list the files of all products, too")] = False,
 ) -> None:
-    """Compare where point targets are found with where they were put, and print the products' paths."""
+    """Compare the measured positions of point targets with the true ones."""
     opened = _opened(campaign)
     from apertura.views.score import print_findings
     from apertura.views.summary import print_stale
@@ -436,7 +436,7 @@ def verify(
     product: Annotated[
         Path,
         typer.Argument(
-            help="a file, a stage or a manifest of a campaign, or a campaign folder, else the one in hand",
+            help="a file, a stage or a manifest of a campaign, or a campaign folder, default: current folder",
             show_default=False,
         ),
     ] = HERE,
@@ -465,7 +465,7 @@ def reproduce(
     product: Annotated[
         Path,
         typer.Argument(
-            help="a file, a stage or a manifest of a campaign, or a campaign folder, else the one in hand",
+            help="a file, a stage or a manifest of a campaign, or a campaign folder, default: current folder",
             show_default=False,
         ),
     ] = HERE,

@@ -90,7 +90,7 @@ def _table(plan: Plan, title: str) -> "Table":
     table.add_section()
     memory, disk = decimal(plan.memory_bytes), decimal(plan.disk_bytes)
     line = f"about {plan.predicted_seconds:.2g} s, {memory} of memory, {disk} on disk"
-    table.add_row("predicted", f"{plan.accuracy_db:.0f} dB asked", line, f"{plan.predicted_error_db:.1f} dB")
+    table.add_row("predicted", f"{plan.accuracy_db:.0f} dB requested", line, f"{plan.predicted_error_db:.1f} dB")
     return table
 
 
@@ -102,12 +102,24 @@ def _budget_table(lines: list[BudgetLine]) -> "Table":
         table.add_column(heading, overflow="fold")
     for line in lines:
         report = line.report
-        table.add_row(report["cause"], report["stated"], *_effect(line.effect))
+        stated = "; ".join(dict.fromkeys(report["stated"].split("; ")))  # nodes that are alike, once
+        table.add_row(report["cause"], stated, *_effect(line.effect))
     table.add_section()
-    table.add_row("all that is expected", "", *_effect(expected(lines)))
+    table.add_row("sum of all expected", "", *_effect(expected(lines)))
     return table
 
 
 def _effect(effect: Effect) -> tuple[str, str, str]:
     phase = f"{effect.phase_rad:.2g} rad" if isfinite(effect.phase_rad) else "not predicted"
-    return f"{effect.loss_db:.2f} dB".replace("-0.00", "0.00"), f"{100 * effect.shift_m:.2g} cm", phase
+    return f"{abs(effect.loss_db):.2f} dB", _length(effect.shift_m), phase
+
+
+def _length(metres: float) -> str:
+    """Return a length in centimetres, from a metre on in metres.
+
+    Examples
+    --------
+    >>> _length(0.0132), _length(2.13)
+    ('1.3 cm', '2.1 m')
+    """
+    return f"{metres:.2g} m" if metres >= 1 else f"{100 * metres:.2g} cm"

@@ -1,4 +1,4 @@
-"""Found against put: every point target of truth.json, in the GeoTIFFs a user would open."""
+"""Measured and true positions of the point targets of truth.json, in the exported GeoTIFFs."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -131,10 +131,10 @@ def _along_track(campaign: Campaign, flight: Flight, grid: SceneGrid) -> tuple[f
 
 
 def print_findings(campaign: Campaign, *, paths: bool) -> None:
-    """Print a short table of what `score` finds, and where the products lie."""
+    """Print a table of what `score` finds; with `paths` also the files of all products."""
     campaign.check_images()
     console = Console(width=120)
-    table = Table(title=f"{campaign.settings.campaign}: found against put", title_justify="left")
+    table = Table(title=f"{campaign.settings.campaign}: measured and true positions", title_justify="left")
     calibrated = ("RCS, dBsm", "put") if campaign.calibrated else ()
     headings = ("flight", "image", "target", "east", "north", "off by", "cross-range", "ground range", *calibrated)
     for heading in headings:

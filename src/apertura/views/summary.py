@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-_HEADINGS = ("image", "verdict", "lost", "budget", "in phase", "error <", "pulses", "flags")
-_WHOLE = {"image", "verdict", "lost", "error <", "pulses"}
+_HEADINGS = ("image", "verdict", "focus loss", "expected loss", "coherence", "numerical error", "pulses", "flags")
+_WHOLE = {"image", "verdict", "focus loss", "pulses"}
 _WIDE = 120
 _MOST_FLIGHTS = 3
 
@@ -65,10 +65,12 @@ def print_summary(campaign: Campaign) -> None:
     console.print(_table(values))
     unsure = max(values.values(), key=lambda one: one.place_m, default=None)
     if unsure and unsure.place_m:
-        console.print(f"points may lie {unsure.place_m:.2g} m off, mostly by {unsure.place_cause}", soft_wrap=True)
+        console.print(
+            f"targets may be misplaced by {unsure.place_m:.2g} m, mostly by {unsure.place_cause}", soft_wrap=True
+        )
     not_stated = dict.fromkeys(cause for one in values.values() for cause in one.not_stated)
     if not_stated:
-        console.print(f"not stated, so not in the budget; image.json says what they would do: {', '.join(not_stated)}")
+        console.print(f"left out of the budget, no uncertainty is configured: {', '.join(not_stated)}; see image.json")
     interferograms = dict(_interferograms(campaign))
     for name, report in interferograms.items():
         console.print(f"interferogram {name.removeprefix(f'{INTERFEROMETRY} ')}: {report['says']}", soft_wrap=True)

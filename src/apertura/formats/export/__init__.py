@@ -131,7 +131,7 @@ EXPORTS: tuple[Export, ...] = (
         "noncoherent_db.tif",
         "noncoherent",
         "apertura.formats.export.db:write_db",
-        opened="in a GIS, added without phases",
+        opened="in a GIS, the incoherent sum",
     ),
     Export("noncoherent_db.qml", "noncoherent", "apertura.formats.export.style:write_db_style"),
     Export("noncoherent_magnitude.tif", "magnitude", "apertura.formats.export.cog:write_magnitude"),

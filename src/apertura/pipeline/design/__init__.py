@@ -31,7 +31,7 @@ def design(
         A YAML file, its document, or a `FlightPlan`: the keys of config/config.yaml, and flights with tracks; see
         docs/howto/design.md.
     root
-        Folder in which files that the plan names lie; by default that of the YAML file, else the one in hand.
+        Folder in which files that the plan names lie; by default that of the YAML file, else the current folder.
     threads
         Tiles computed at once.
 

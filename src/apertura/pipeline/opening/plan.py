@@ -119,7 +119,7 @@ def paths_to(pair: OpenPair, scene: OpenScene, place_m: NDArray[np.float64]) -> 
 
 def _positions(campaign: Campaign, pair: OpenPair, paths: PointPaths) -> list[BudgetLine]:
     if pair.left is not None:
-        return [BudgetLine("positions", "what the refined tracks leave", pair.left)]
+        return [BudgetLine("positions", "error remaining after refinement", pair.left)]
     return position_lines(paths, pair.positions, sidelink=_by_sidelink(campaign, pair))
 
 

@@ -235,6 +235,8 @@ def _against_log(
     recording: "Recording", node: str, log: Path, beside: Surroundings
 ) -> tuple[dict[str, Any], list[str]]:
     """Return facts of how much of a recording its log covers, and what it leaves out."""
+    if not log.is_file():  # a named pipe or a device would be waited for
+        return {}, [f"a readable flight log: {log.name} is no plain file"]
     try:
         logged = read_track(log, node=node, options=beside.options).time.values
     except CampaignError as problem:

@@ -121,7 +121,7 @@ def _listed(values: list[Any], unit: str) -> str:
 def _number(value: float, unit: str) -> str:
     if unit == "Hz":
         scale, prefix = next(((scale, prefix) for scale, prefix in _PREFIXES if abs(value) >= scale), (1.0, ""))
-        return f"{value / scale:.9g} {prefix}Hz"
+        return f"{value / scale:.7g} {prefix}Hz"
     if unit == "share":
         return f"{100 * value:.4g} %"
     digits = {"deg": ".6f", "dB": ".1f", "m": ".2f" if abs(value) >= 1 else ".3g"}.get(unit, ".6g")

@@ -333,7 +333,7 @@ def _line(pair: PairSoFar, told: Mapping[str, Any], every: int) -> str:
         _extent(told),
         told["verdict"],
         f"peak at {told['peak']['x_m']:.2f}, {told['peak']['y_m']:.2f}",
-        ", ".join(told["flags"]),
+        ", ".join(flag for flag in told["flags"] if flag != told["verdict"]),
     )
     return f"{name}: {'; '.join(word for word in words if word)}"
 
