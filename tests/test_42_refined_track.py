@@ -76,12 +76,12 @@ def test_tracks_left_alone_have_no_knots_and_their_images_say_why(finished_tiny)
     assert stage.attrs["nodes"] == ["uav1", "uav2"]
     quality = quality_of(finished_tiny, "uav1-uav2")
     assert quality["autofocus"] == {
-        "decision": "off: auto: nobody said how well positions of uav1 are known; state nodes.<node>.position_std_m to "
+        "decision": "off: auto: position accuracy of uav1 is not configured; state nodes.<node>.position_std_m to "
         "have them refined",
         "accepted": False,
         "why": "images are formed from the logs as they are",
     }
-    assert quality["models"]["autofocus"].startswith("off: auto: nobody said")
+    assert quality["models"]["autofocus"].startswith("off: auto: position accuracy")
 
 
 def test_where_nothing_is_corrected_images_are_formed_from_the_very_same_arrays(finished_tiny):

@@ -1,5 +1,7 @@
 """Tracks as refined, as files for other programs: what is read from them again is what was refined."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -172,7 +174,7 @@ def test_a_campaign_whose_tracks_are_left_alone_has_its_logs_as_they_are(finishe
     assert read_manifest(folder / "tracks.manifest.json")["files"].keys() == files
     for node in ("uav1", "uav2"):
         logged = open_stage(finished_tiny.stage("track", "f01", node), "track")
-        assert "% as logged: autofocus off: auto: nobody said" in (folder / f"{node}.pos").read_text()
+        assert "% as logged: autofocus off: auto: position accuracy" in (folder / f"{node}.pos").read_text()
         for read in (
             read_rtklib_pos(folder / f"{node}.pos", node=node),
             read_csv_track(folder / f"{node}.csv", node=node),
@@ -189,3 +191,13 @@ def test_the_picture_shows_a_column_for_each_node(log, tmp_path):
         write_picture(tmp_path / f"{count}.png", [log] * count, title="a flight", outcome="refined: as told", tags={})
     one, four = (imread(tmp_path / f"{count}.png") for count in (1, 4))
     assert four.shape[1] > 1.5 * one.shape[1]
+
+
+def test_without_a_correction_the_picture_shows_the_logs_in_two_panels(log, tmp_path):
+    still = replace(log, moved_m=np.zeros((30, 3)), left_m=np.full((30, 3), np.nan))
+    for name, logs in (("still", [still] * 4), ("moved", [log] * 4)):
+        write_picture(tmp_path / f"{name}.png", logs, title="a flight", outcome="as logged: off", tags={})
+    still_px, moved_px = (imread(tmp_path / f"{name}.png") for name in ("still", "moved"))
+    assert still_px.shape[0] < moved_px.shape[0]
+    assert still_px.shape[1] < moved_px.shape[1]
+    assert (still_px[..., :3].min(axis=-1) < 0.9).any()  # lines are drawn

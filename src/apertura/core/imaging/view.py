@@ -33,15 +33,16 @@ def view_report(formation: Formation, began: np.datetime64, time_s: NDArray[np.f
     Returns
     -------
     dict
-        `first_utc`, `last_utc`: the pulses that illuminate the middle, all of them where none does. `heading_deg`,
-        `look_deg`: directions of flight and of view of the antennas' midpoint, clockwise from grid north.
-        `incidence_deg`: of the transmitter, from the vertical. `bistatic_angle_deg`. `range_m`: half the total path.
-        `height_m`: of the midpoint above the ground. `side`: of the direction of flight on which the scene lies, right,
-        left, or both where a track turns around it; `side_mirror_rad`: rms phase by which the echo of the mirrored
-        scene differs, and `side_observable`: whether it exceeds 1 rad, so that a mirrored image is not in focus.
-        `centre_hz`, `band_hz`. `carrier_cycles_m`: the spatial frequency
-        that the image's band lies about, east and north (docs/theory/interferometry.md, eq. 1).
-        `carriers_cycles_m`: the same at three rows times three columns from corner to corner (`carrier_at`).
+        `first_utc`, `last_utc`: the pulses that illuminate the middle, all of them where none does.
+        `heading_deg`, `look_deg`: directions of flight and of view of the antennas' midpoint, clockwise from
+        grid north. `incidence_deg`: of the transmitter, from the vertical. `bistatic_angle_deg`. `range_m`:
+        half the total path. `height_m`: of the midpoint above the ground. `speed_m_s`: of the midpoint, mean.
+        `side`: of the direction of flight on which the scene lies, right, left, or both where a track turns
+        around it; `side_mirror_rad`: rms phase by which the echo of the mirrored scene differs, and
+        `side_observable`: whether it exceeds 1 rad, so that a mirrored image is not in focus. `centre_hz`,
+        `band_hz`. `carrier_cycles_m`: the spatial frequency that the image's band lies about, east and north
+        (docs/theory/interferometry.md, eq. 1). `carriers_cycles_m`: the same at three rows times three columns
+        from corner to corner (`carrier_at`).
     """
     here, (east, north) = ground_axes(formation, *((size - 1) / 2 for size in formation.grid.shape))
     profiles, beams = formation.profiles, formation.beams
@@ -62,6 +63,7 @@ def view_report(formation: Formation, began: np.datetime64, time_s: NDArray[np.f
         "last_utc": str(times[1]),
         "heading_deg": _bearing_deg(flown @ east, flown @ north),
         "look_deg": _bearing_deg(looked @ east, looked @ north),
+        "speed_m_s": _speed_m_s(middle, time_s[counted]),
         "side": _side(middle, here, up),
         "side_mirror_rad": float(f"{mirror_rad:.4g}"),
         "side_observable": bool(mirror_rad > _OBSERVABLE_RAD),
@@ -100,6 +102,12 @@ def ground_axes(formation: Formation, row: float, column: float) -> tuple[NDArra
     here, east, north = formation.positions_at([row, row, row - 0.5], [column, column + 0.5, column])
     axes = np.stack([east - here, north - here])
     return here, axes / np.linalg.norm(axes, axis=1, keepdims=True)
+
+
+def _speed_m_s(middle_m: NDArray[np.float64], time_s: NDArray[np.float64]) -> float | None:
+    lasting_s = float(time_s[-1] - time_s[0])
+    length_m = float(np.linalg.norm(np.diff(middle_m, axis=0), axis=1).sum())
+    return round(length_m / lasting_s, 3) if lasting_s > 0 else None
 
 
 def _side(middle_m: NDArray[np.float64], here_m: NDArray[np.float64], up: NDArray[np.float64]) -> str:

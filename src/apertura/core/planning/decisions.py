@@ -75,7 +75,7 @@ def decide_autofocus(requested: str, loss_db: Mapping[str, float], unstated: Col
     if requested != "auto":
         return Decision("autofocus", requested, "asked for")
     if unstated:
-        missing = f"auto: nobody said how well positions of {' and '.join(unstated)} are known"
+        missing = f"auto: position accuracy of {' and '.join(unstated)} is not configured"
         return Decision("autofocus", "off", f"{missing}; state nodes.<node>.position_std_m to have them refined")
     pair, worst_db = min(loss_db.items(), key=lambda one: one[1])
     value, than = ("on", "more") if worst_db < -TOLERATED_LOSS_DB else ("off", "no more")

@@ -4,6 +4,7 @@ import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import matplotlib.style
 import numpy as np
@@ -188,7 +189,9 @@ def write_csv(path: Path, log: RefinedLog) -> None:
 
 
 def write_picture(path: Path, logs: Sequence[RefinedLog], *, title: str, outcome: str, tags: Mapping[str, str]) -> None:
-    """Draw by how much each log was moved to east, north and up over time, and how sure that is, as a PNG.
+    """Draw the correction of each log to east, north and up over time with its deviation, as a PNG.
+
+    Where no log was corrected, the logs themselves: their course over ground, and their heights over time.
 
     Parameters
     ----------
@@ -204,19 +207,46 @@ def write_picture(path: Path, logs: Sequence[RefinedLog], *, title: str, outcome
         Provenance, name → text; lies in the file.
     """
     with matplotlib.style.context("default"), matplotlib.rc_context({"font.size": 8, "text.parse_math": False}):
-        figure = Figure(figsize=(max(6.4, 0.6 + 3.0 * len(logs)), 5.6), layout="constrained")
+        corrected = any(log.refined.any() or log.moved_m.any() for log in logs)
+        size = (max(6.4, 0.6 + 3.0 * len(logs)), 5.6) if corrected else (6.4, 3.6)
+        figure = Figure(figsize=size, layout="constrained")
         FigureCanvasAgg(figure)
-        drawn = figure.subplots(3, len(logs), sharex="col", sharey=True, squeeze=False)
-        for column, log in zip(drawn.T, logs, strict=True):
-            _draw(column, log)
-        for axes, name in zip(drawn[:, 0], _AXES, strict=True):
-            axes.set_ylabel(f"{name}, cm")
-        handles, labels = drawn[0, 0].get_legend_handles_labels()
+        if corrected:
+            drawn = figure.subplots(3, len(logs), sharex="col", sharey=True, squeeze=False)
+            for column, log in zip(drawn.T, logs, strict=True):
+                _draw(column, log)
+            for axes, name in zip(drawn[:, 0], _AXES, strict=True):
+                axes.set_ylabel(f"{name}, cm")
+            handles, labels = drawn[0, 0].get_legend_handles_labels()
+        else:
+            handles, labels = _draw_logged(figure, logs)
         figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
         wrapped = textwrap.fill(outcome, int(figure.get_figwidth() * 13))
         figure.suptitle(f"{title}\n{wrapped}", fontsize=9)
         with replacement(path) as temporary:
             figure.savefig(temporary, dpi=DPI, metadata={"Title": title, **dict(sorted(tags.items()))})
+
+
+def _draw_logged(figure: Figure, logs: Sequence[RefinedLog]) -> tuple[list[Any], list[str]]:
+    """Draw the course of logs over ground, and their heights; return lines and names for a legend."""
+    ground, height = figure.subplots(1, 2)
+    first = logs[0].track.position.values[0]
+    axes_m = LOCAL_NED if logs[0].local else ned_axes(first[None])[0]
+    for log in logs:
+        some = np.unique(np.linspace(0, len(log.time_s) - 1, min(len(log.time_s), _DOTS)).round().astype(int))
+        north, east, down = ((log.track.position.values[some] - first) @ axes_m).T
+        (line,) = ground.plot(east, north, linewidth=1.2, label=log.node)
+        ground.plot(east[-1:], north[-1:], "o", color=line.get_color(), markersize=4)
+        since_s = (log.track.time.values[some] - logs[0].track.time.values[0]) / np.timedelta64(1, "s")
+        height.plot(since_s, -down, linewidth=1.2, color=line.get_color())
+    ground.set_aspect("equal", adjustable="datalim")
+    began = np.datetime_as_string(logs[0].track.time.values[0], "s")
+    ground.set(xlabel=f"east of the first epoch of {logs[0].node}, m", ylabel="north, m", title="course, dot: end")
+    height.set(xlabel=f"time after {began}Z, s", ylabel="height above that epoch, m", title="height")
+    for axes in (ground, height):
+        axes.grid(visible=True, color="0.9", linewidth=0.6)
+    handles, labels = ground.get_legend_handles_labels()
+    return list(handles), list(labels)
 
 
 def _draw(column: Sequence[Axes], log: RefinedLog) -> None:

@@ -237,7 +237,7 @@ def draw_pulses(path: Path, record: PulseRecord, *, title: str, tags: Mapping[st
 def _draw_counts(axes: Axes, record: PulseRecord) -> None:
     last = float(record.sent_s.max()) if record.sent_s.size else 0.0
     interval = float(np.median(np.diff(record.sent_s))) if last else 1.0
-    width = interval * max(1, np.ceil(last / interval / _BINS))  # of whole intervals, else columns seem to lack pulses
+    width = interval * _of_bin(round(last / interval) + 1)  # of whole intervals, else columns seem to lack pulses
     edges = np.arange(-interval / 2, last + width, width)
     kept, left = (np.histogram(record.sent_s[some], edges)[0] for some in (record.kept, ~record.kept))
     axes.stairs(kept, edges, fill=True, color=BLUE, label=f"kept: {int(record.kept.sum())}")
@@ -256,6 +256,18 @@ def _draw_counts(axes: Axes, record: PulseRecord) -> None:
     axes.set(title="pulses", ylabel=label, ylim=(0, 1.45 * max(1, (kept + left).max())))
     axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))
     axes.legend(loc="upper right", ncols=2)
+
+
+def _of_bin(slots: int) -> int:
+    """Return how many pulses a column counts: so many that the last column is as full as can be.
+
+    Examples
+    --------
+    >>> _of_bin(40), _of_bin(302)  # 302 = 37·8 + 6
+    (1, 8)
+    """
+    least = max(1, -(-slots // _BINS))
+    return max(range(least, 2 * least + 1), key=lambda count: ((slots - 1) % count + 1) / count)
 
 
 def _why(reasons: Mapping[str, int]) -> str:

@@ -8,7 +8,9 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from apertura.common.atomic import replacement, write_text
+from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.paths import shipped
+from apertura.core.geometry.geodesy import LOCAL, geodetic_from_ecef
 from apertura.formats.export import exports_in
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.config import FUSED
@@ -48,10 +50,13 @@ def page(campaign: Campaign, flight: str) -> list[Path]:
 
 
 def _blocks(campaign: Campaign, flight: str, reports: Mapping[str, Mapping[str, Any]]) -> Iterator[Block]:
+    yield Table("Summary of the flight.", ("quantity", "value"), flight_rows(campaign, flight, reports))
     yield Table(
-        "What was asked, and the grid that it gave; all else is auto and decided below.", ASKED, asked_rows(campaign)
+        "Configuration and output grid (settings not listed are chosen automatically, see Processing decisions).",
+        ASKED,
+        asked_rows(campaign),
     )
-    yield Table("What each image says of itself.", VERDICTS, [verdict_row(*one) for one in reports.items()])
+    yield Table("Image quality.", VERDICTS, [verdict_row(*one) for one in reports.items()])
     if FUSED in reports:
         yield Heading(2, "Pairs and their sums")
         yield Paragraph(" ".join(sentences("Sum of the pairs", reports[FUSED])))
@@ -61,9 +66,9 @@ def _blocks(campaign: Campaign, flight: str, reports: Mapping[str, Mapping[str, 
     raised = flag_rows(reports)
     yield Heading(2, "Flags")
     if raised:
-        yield Table("What crossed a limit of a method, what it means and what to do.", FLAGGED, raised)
+        yield Table("Flags raised, their meaning, and what to do.", FLAGGED, raised)
     else:
-        yield Paragraph("No image of this flight carries a flag: nothing known was crossed.")
+        yield Paragraph("No flags raised.")
 
 
 def _pair_blocks(campaign: Campaign, flight: str, pair: str, report: Mapping[str, Any]) -> Iterator[Block]:
@@ -74,11 +79,11 @@ def _pair_blocks(campaign: Campaign, flight: str, pair: str, report: Mapping[str
     yield Paragraph(" ".join(sentences(f"Image {pair}", report)))
     yield from _pictures(folder, shown)
     yield Table(
-        "Error budget; in brackets what a size assumed would do where nobody stated one.",
+        "Error budget; in brackets the effect of an assumed size where none is configured.",
         BUDGET,
         budget_rows(report["budget"]),
     )
-    yield Table("What the planner decided, and why.", DECISIONS, decision_rows(report))
+    yield Table("Processing decisions, with reasons.", DECISIONS, decision_rows(report))
 
 
 def _pictures(folder: Path, shown: Mapping[str, str]) -> Iterator[Block]:
@@ -91,6 +96,35 @@ def _pictures(folder: Path, shown: Mapping[str, str]) -> Iterator[Block]:
 def _caption(name: str) -> str:
     """Return what the workflow's report says below a picture."""
     return " ".join((shipped() / "workflow" / "report" / f"{name}.rst").read_text(encoding="utf-8").split())
+
+
+def flight_rows(campaign: Campaign, flight: str, reports: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, str]]:
+    """Return date, place, band and geometry of a flight, the latter of its first pair."""
+    pairs = campaign.flight(flight).pairs
+    views = [reports[pair]["view"] for pair in pairs if "view" in reports[pair]]
+    scene = settled_scene(campaign)
+    rows = [] if scene.grid.crs == LOCAL else [("middle of the scene", _place_text(geodetic_from_ecef(scene.middle_m)))]
+    if not views:
+        return rows
+    first, last = min(one["first_utc"] for one in views), max(one["last_utc"] for one in views)
+    own, wave_m = views[0], SPEED_OF_LIGHT_M_S / views[0]["centre_hz"]
+    speed = own.get("speed_m_s")
+    return [
+        ("recorded, UTC", f"{first[:19].replace('T', ' ')} to {last[:19].replace('T', ' ')}"),
+        *rows,
+        ("band", f"{frequency_text(own['centre_hz'])} ± {frequency_text(own['band_hz'] / 2)}, {100 * wave_m:.3g} cm"),
+        ("speed", "not known" if speed is None else f"{speed:.3g} m/s"),
+        ("height above the scene", f"{own['height_m']:.3g} m"),
+        ("range, incidence at the middle", f"{own['range_m']:.4g} m, {own['incidence_deg']:.3g}°"),
+        ("side", own["side"] + ("" if own["side_observable"] or own["side"] == "both" else ", assumed")),
+    ]
+
+
+def _place_text(place: Any) -> str:
+    latitude, longitude, _ = map(float, place)
+    return (
+        f"{abs(latitude):.5f}° {'N' if latitude >= 0 else 'S'}, {abs(longitude):.5f}° {'E' if longitude >= 0 else 'W'}"
+    )
 
 
 def asked_rows(campaign: Campaign) -> list[tuple[str, str]]:
@@ -111,9 +145,28 @@ def asked_rows(campaign: Campaign) -> list[tuple[str, str]]:
 
 
 def _set_rows(section: str, values: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Return the settings of a section that are not left to apertura."""
+    """Return the settings of a section that are not chosen automatically, and matter to its format."""
     unset: tuple[object, ...] = ("auto", None, "", (), [], {})
-    return [(f"{section}: {name}", setting_text(value)) for name, value in values.items() if value not in unset]
+    without = {"trigger"} if str(values.get("format")).startswith("beat_") and values["format"] != "beat_wav" else set()
+    return [
+        (f"{section}: {name.removesuffix('_hz')}", frequency_text(value))
+        if name.endswith("_hz") and isinstance(value, int | float)
+        else (f"{section}: {name}", setting_text(value))
+        for name, value in values.items()
+        if value not in unset and name not in without
+    ]
+
+
+def frequency_text(hz: float) -> str:
+    """Return a frequency in the unit that keeps it short.
+
+    Examples
+    --------
+    >>> frequency_text(1_204_800_000), frequency_text(4e5), frequency_text(20)
+    ('1.2048 GHz', '400 kHz', '20 Hz')
+    """
+    size, unit = next((one for one in ((1e9, "GHz"), (1e6, "MHz"), (1e3, "kHz")) if abs(hz) >= one[0]), (1.0, "Hz"))
+    return f"{hz / size:.9g} {unit}"
 
 
 def setting_text(value: object) -> str:
@@ -121,9 +174,13 @@ def setting_text(value: object) -> str:
 
     Examples
     --------
-    >>> [setting_text(value) for value in (1_204_800_000.0, 3.125e-06, {"align_phase": False}, "hann")]
-    ['1204800000', '3.125e-06', 'align_phase: False', 'hann']
+    >>> [setting_text(value) for value in (12.5, 3.125e-06, {"align_phase": False}, "hann", ["sigma0"])]
+    ['12.5', '3.125e-06', 'align_phase: no', 'hann', 'sigma0']
     """
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, list | tuple):
+        return ", ".join(map(setting_text, value))
     if isinstance(value, float):
         return f"{value:.12g}"
     if isinstance(value, Mapping):
