@@ -311,7 +311,7 @@ def test_layers_keep_angles_bits_and_the_unknown(tmp_path):
         with rasterio.open(tmp_path / name) as raster:
             assert np.array_equal(raster.read(1), layer, equal_nan=name != "mask.tif")
             assert np.array_equal(raster.dataset_mask() == 0, np.arange(600)[:, None] + np.zeros(600) < 10)
-            assert raster.units == ({"mask.tif": "bits", "looks.tif": "pulses", "nesz.tif": "dB"}.get(name, "deg"),)
+            assert raster.units == ({"mask.tif": "class", "looks.tif": "pulses", "nesz.tif": "dB"}.get(name, "deg"),)
         assert np.array_equal(overviews(tmp_path / name)[0], layer[::2, ::2], equal_nan=name != "mask.tif")
 
 

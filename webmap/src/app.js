@@ -118,7 +118,7 @@ class Page {
     const before = this.layer;
     this.layer = layers.find((one) => one.file === file) ?? layers[0];
     byId('image').value = `${this.image.flight}/${this.image.image}`;
-    byId('layer').replaceChildren(...layers.map((one) => element('option', { value: one.file, textContent: one.file.replace(/\.tif$/, '').replaceAll('_', ' ') })));
+    byId('layer').replaceChildren(...layers.map((one) => element('option', { value: one.file, textContent: one.file.replace(/\.tif$/, '').replaceAll('_', ' ').replace(/ db$/, ', dB') })));
     byId('layer').value = this.layer.file;
     byId('title').textContent = `${this.layer.title}${this.layer.unit ? `, ${this.layer.unit}` : ''}`;
     if (Object.hasOwn(RAMPS, colours ?? '')) byId('colours').value = colours;

@@ -32,7 +32,7 @@ BISTATIC_ANGLE = Band(
 MASK = Band(
     "uint8",
     OUTSIDE,
-    "bits",
+    "class",
     "0 valid, 1 shadow, 2 layover, 3 both, 255 outside",
     "MODE",
     {value: colour for value, (_, colour) in CLASSES.items()},

@@ -45,7 +45,7 @@ UNITS: Mapping[str, tuple[str, str]] = {
     "looks": ("pulses", "effective number of pulses that make the pixel"),
     "incidence": ("deg", "incidence at closest approach, from the terrain's normal"),
     "bistatic_angle": ("deg", "angle between transmitter and receiver at closest approach"),
-    "mask": ("bits", "0 seen, 1 shadow, 2 layover, 3 both, 255 outside"),
+    "mask": ("class", "0 visible, 1 shadow, 2 layover, 3 both, 255 outside"),
     "nesz": ("dB", "noise-equivalent sigma0"),
     "snr": ("dB", "ground of expect.sigma0_db over noise"),
     "point_snr": ("dB", "point of expect.rcs_dbsm over noise"),
