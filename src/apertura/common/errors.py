@@ -1,10 +1,13 @@
 """Errors that a user can cause, and those of a full, read-only or broken machine."""
 
 import errno
+import logging
 import os
 import shutil
+from functools import lru_cache
 from pathlib import Path
 
+_LOG = logging.getLogger(__name__)
 _REMEDIES = {
     errno.ENOSPC: "Make room there",
     errno.EDQUOT: "Make room there, or ask for a larger quota",
@@ -53,6 +56,20 @@ def shown(text: object, longest: int = 80) -> str:
     if not line.isprintable():
         line = "".join(one if one.isprintable() else one.encode("unicode_escape").decode("ascii") for one in line)
     return line if whole and len(line) <= longest else line[:longest] + "…"
+
+
+@lru_cache(maxsize=1000)
+def print_remark(where: str, remark: str) -> None:
+    """Print how a file was read, once in a process: commands may read a file for each of their checks.
+
+    Parameters
+    ----------
+    where
+        The file.
+    remark
+        One line; also what an untrusted file holds.
+    """
+    _LOG.warning("%s: %s", shown(where, 300), shown(remark, 500))
 
 
 def number_of(count: int, what: str) -> str:

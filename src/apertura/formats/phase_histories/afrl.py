@@ -3,7 +3,6 @@
 It enters at `echo`: there are no raw samples, no clock and no code to remove.
 """
 
-import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
@@ -14,7 +13,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
-from apertura.common.errors import CampaignError, shown
+from apertura.common.errors import CampaignError, print_remark
 from apertura.formats.isolated import UnreadableError, read_isolated
 from apertura.formats.phase_histories import phase_history
 from apertura.formats.phase_histories.mat_fields import CORRECTIONS
@@ -25,7 +24,6 @@ _EXPECTED = "a Gotcha .mat file with data.fp (frequency, pulse), freq, x, y, z, 
 _LARGEST = {"fp": LARGEST, "freq": 1e12, "x": 1e7, "y": 1e7, "z": 1e7, "r0": 1e7, "r_correct": 1e4, "ph_correct": 1e4}
 """Largest values of fields: samples, Hz, m, rad."""
 
-_LOG = logging.getLogger(__name__)
 
 _EPOCH = np.datetime64("1970-01-01", "ns")
 
@@ -126,7 +124,7 @@ def joined(
         f"data.af holds corrections of {moved.min():.2f} to {moved.max():.2f} m of r0, and of phases, which are not "
         "applied: waveform.corrections: stored applies them"
     )
-    _LOG.warning("%s: %s", shown(paths[0], 300), remark)
+    print_remark(str(paths[0]), remark)
     return echo.assign_attrs(remarks=[remark])
 
 

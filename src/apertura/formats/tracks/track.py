@@ -1,6 +1,5 @@
 """What every flight log becomes: times in UTC, positions in ECEF, attitude in radians."""
 
-import logging
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -10,7 +9,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from apertura.common.errors import CampaignError, number_of, quoted, shown
+from apertura.common.errors import CampaignError, number_of, print_remark, quoted
 from apertura.common.leap_seconds import KNOWN_UNTIL
 from apertura.core.geometry.geodesy import ecef_from_geodetic
 from apertura.formats.times import outside, utc_times
@@ -34,7 +33,6 @@ FARTHEST_M = 1e5
 _ROLLOVER = np.timedelta64(1024 * 7, "D")
 """Period of the week number that GPS satellites send."""
 
-_LOG = logging.getLogger(__name__)
 _EARTH_M = 6.37e6
 _NOWHERE_DEG = 1e-7  # a receiver without a fix logs 0, 0; no flight passes within a centimetre of it
 _WIDEST_DEG = 1080.0
@@ -141,7 +139,7 @@ def remarked(track: xr.Dataset, remark: str, where: Path) -> xr.Dataset:
     where
         The log.
     """
-    _LOG.warning("%s: %s", shown(where, 300), shown(remark, 500))
+    print_remark(str(where), remark)
     return track.assign_attrs(remarks=[*track.attrs.get("remarks", ()), remark])
 
 

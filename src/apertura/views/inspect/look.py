@@ -57,7 +57,9 @@ def inspect_path(
     if plot is not None and (plot.suffix.lower() != ".png" or plot == path or (plot.exists() and not _is_png(plot))):
         found = "a file that is no picture" if plot.exists() else "another suffix than .png"
         raise CampaignError(found, f"--plot {plot}", "the name of a new .png file", "Choose another name.")
-    logging.getLogger("apertura.formats").addHandler(logging.NullHandler())  # remarks of readers are in the report
+    logging.getLogger("apertura.common.errors").addHandler(
+        logging.NullHandler()
+    )  # remarks of readers are in the report
     report = look(path, settings)
     drawn = None if plot is None or report.picture is None else _drawn(report.picture(), plot)
     if as_json:
