@@ -43,7 +43,7 @@ STEP_M = 20.0
 """Metres on the ground over which a step is measured: 100 m of height."""
 
 _FILL_MARGIN = 16  # posts about those of a scene that are read to see whether a block of them is a void
-_MOST_STEPS = 4_000_000
+_MOST_STEPS = 1_000_000
 _TILE_PX = 512
 _SAME_RASTER = "the raster that was opened before"
 
@@ -201,33 +201,24 @@ class Dem(Terrain):
         Posts about those that are asked for are read, too: only a block that ends within them is known to be one.
         """
         from rasterio.windows import Window
-        from scipy.ndimage import binary_dilation, label
 
         begin = [max(0, one - _FILL_MARGIN) for one in first]
         end = [min(size, one + n + _FILL_MARGIN) for one, n, size in zip(first, counts, self.shape, strict=True)]
         stored, heights = _heights(raster, Window(begin[1], begin[0], end[1] - begin[1], end[0] - begin[0]))
         heights *= self.metres_per_unit
-        wall_m = max(STEEPEST * STEP_M, STEEPEST * self._post_m)
+        wall_m = STEEPEST * max(STEP_M, self._post_m)
         for value in FILLS:
-            blocks, count = label(stored == value)
-            for number in range(1, count + 1):
-                block = blocks == number
-                around = binary_dilation(block) & ~block
-                edges = (block[0].any(), block[-1].any(), block[:, 0].any(), block[:, -1].any())
-                walls = np.abs(heights[around] - heights[block][0])
-                if any(edges) or not walls.size or not np.nanmin(walls, initial=np.inf) > wall_m:
-                    continue
-                seen = block[tuple(slice(a - b, a - b + n) for a, b, n in zip(first, begin, counts, strict=True))]
-                if np.isnan(bilinear(np.where(seen, np.nan, 0.0)[None], *place)).any():
-                    row, column = (int(axis[0]) + one for axis, one in zip(np.nonzero(block), begin, strict=True))
-                    raise CampaignError(
-                        f"{number_of(int(block.sum()), 'post')} from row {row}, column {column} on are exactly "
-                        f"{value:g}, and all posts beside at least {np.nanmin(walls):.0f} m off: a void filled with "
-                        f"{value:g}",
-                        where=self.path,
-                        expected="heights of the ground, and voids declared as nodata",
-                        remedy=f"Declare {value:g} as nodata of those posts and fill them with a GIS.",
-                    )
+            block, lowest_m = walled(heights, stored == value, wall_m=wall_m)
+            seen = block[tuple(slice(a - b, a - b + n) for a, b, n in zip(first, begin, counts, strict=True))]
+            if seen.any() and np.isnan(bilinear(np.where(seen, np.nan, 0.0)[None], *place)).any():
+                row, column = (int(axis[0]) + one for axis, one in zip(np.nonzero(block), begin, strict=True))
+                raise CampaignError(
+                    f"{number_of(int(block.sum()), 'post')} from row {row}, column {column} on are exactly {value:g}, "
+                    f"and all posts beside at least {lowest_m:.0f} m off: a void filled with {value:g}",
+                    where=self.path,
+                    expected="heights of the ground, and voids declared as nodata",
+                    remedy=f"Declare {value:g} as nodata of those posts and fill them with a GIS.",
+                )
 
     @property
     def _post_m(self) -> float:
@@ -247,6 +238,49 @@ class Dem(Terrain):
             remedy="Declare the value that stands for a void as nodata (and fill the voids under the scene), or "
             "correct the unit of the heights.",
         )
+
+
+def walled(heights: Floats, same: NDArray[np.bool_], *, wall_m: float) -> tuple[NDArray[np.bool_], float]:
+    """Return which posts are in blocks of `same` posts whose neighbours are all off by a wall, and the lowest of walls.
+
+    Parameters
+    ----------
+    heights
+        (row, column) float64, metres, NaN in voids, which are no neighbours.
+    same
+        (row, column) bool: posts of one height.
+    wall_m
+        Metres by which neighbours in the same row or column must be off.
+
+    Returns
+    -------
+    tuple
+        (row, column) bool, none of a block that touches an edge; metres, infinite where there is no block.
+
+    Examples
+    --------
+    >>> pit = np.full((5, 5), 620.0)
+    >>> pit[2, 2:4] = 0.0
+    >>> block, lowest_m = walled(pit, pit == 0.0, wall_m=100.0)
+    >>> np.argwhere(block).tolist(), lowest_m
+    ([[2, 2], [2, 3]], 620.0)
+    """
+    from scipy.ndimage import label
+
+    padded, inner = np.pad(heights, 1, constant_values=np.nan), np.pad(same, 1)
+    off_m = np.full(same.shape, np.inf)
+    for way in ((slice(None, -2), slice(1, -1)), (slice(2, None), slice(1, -1))):
+        for rows, columns in (way, way[::-1]):
+            apart_m = np.where(inner[rows, columns], np.nan, np.abs(padded[rows, columns] - heights))
+            off_m = np.fmin(off_m, np.where(same, apart_m, np.nan))
+    if not (same & np.isfinite(off_m) & (off_m > wall_m)).any():
+        return np.zeros_like(same), np.inf
+    blocks, _ = label(same)
+    open_ones = np.unique(
+        np.concatenate([blocks[same & (off_m <= wall_m)], blocks[0], blocks[-1], blocks[:, 0], blocks[:, -1]])
+    )
+    block = same & ~np.isin(blocks, open_ones)
+    return block, float(off_m[block].min(initial=np.inf))
 
 
 @dataclass(frozen=True)
