@@ -20,7 +20,7 @@ from apertura.core.imaging.range_profiles import range_compress
 from apertura.core.scene.terrain import FlatGround
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.steps import image
-from apertura.views.chart.pareto import Point, with_front
+from apertura.views.chart.pareto import Point, draw_points, with_front
 from apertura.views.chart.speed_accuracy import LEAST_ROWS, Part, measure, speed_accuracy
 from apertura.views.plan import expected_plan
 
@@ -139,3 +139,18 @@ def test_an_engine_that_reads_the_phase_history_is_charted_on_it(part, toy, monk
     monkeypatch.setattr(toy_engine, "form", reference.form)
     assert measured_by_toy(part, 1e6).error_db < -130
     assert {type(history) for history in given} == {PhaseHistory}
+
+
+@pytest.mark.parametrize(("exact_s", "shown"), [(10.0, True), (3600.0, False)])
+def test_a_double_sum_far_beyond_the_settings_does_not_stretch_the_axis(tmp_path, monkeypatch, exact_s, shown):
+    drawn = []
+    monkeypatch.setattr("apertura.views.chart.pareto.save_png", lambda figure, _: drawn.append(figure))
+    rest = {"presum": 1, "pixel_pulses_per_s": 1e9, "predicted_seconds": 1.0, "predicted_error_db": -60.0}
+    settings = [
+        Point("native", "a", seconds=s, error_db=-60 * s, on_front=False, planned=False, **rest) for s in (1, 5)
+    ]
+    exact = Point("reference", "b", seconds=exact_s, error_db=None, on_front=True, planned=False, **rest)
+    draw_points([*settings, exact], tmp_path / "chart.png", title="one", accuracy_db=-60.0)
+    (figure,) = drawn
+    assert (figure.axes[0].get_xlim()[1] >= exact_s) == shown
+    assert any("beyond the axis" in text.get_text() for text in figure.legends[0].get_texts()) != shown

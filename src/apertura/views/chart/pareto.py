@@ -48,6 +48,9 @@ def with_front(points: Sequence[Point]) -> list[Point]:
     return marked
 
 
+_BESIDE = 3.0  # times the slowest point: a double sum up to there is drawn where it lies
+
+
 def draw_points(points: Sequence[Point], path: Path, *, title: str, accuracy_db: float) -> None:
     """Draw error against seconds of points, fastest first, and the accuracy that the campaign asks for, as PNG."""
     figure = Figure(figsize=(10, 6.5), layout="constrained")
@@ -56,13 +59,17 @@ def draw_points(points: Sequence[Point], path: Path, *, title: str, accuracy_db:
         places = _places([point for point in points if point.engine == engine and not point.planned])
         if places[0]:
             axes.plot(*places, linestyle="none", color=colour, marker=marker, alpha=0.6, label=engine)
+    slowest_s = max((point.seconds for point in points if point.error_db is not None), default=np.inf)
     front = [point for point in points if point.on_front]
     axes.plot(*_places(front), color="0.4", drawstyle="steps-post", zorder=0, label="Pareto front")
     for point in points:
         if point.error_db is None:
             chosen = "planner's choice: " if point.planned else ""
-            label = f"{chosen}the double sum, which errors are measured against"
-            axes.axvline(point.seconds, color="0.4", linestyle=":", label=label)
+            label = f"{chosen}the double sum, reference of the errors: {point.seconds:.3g} s"
+            if point.seconds <= _BESIDE * slowest_s:
+                axes.axvline(point.seconds, color="0.4", linestyle=":", label=label)
+            else:  # beyond the axis: a line there would squeeze the points
+                axes.plot([], [], color="0.4", linestyle=":", label=f"{label}, beyond the axis")
         elif point.planned:
             thin = f", {point.presum}:1 pulses" if point.presum > 1 else ""
             label = f"planner's choice: {point.setting}{thin}"

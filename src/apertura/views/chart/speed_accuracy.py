@@ -101,7 +101,8 @@ def speed_accuracy(campaign: Campaign, flight: str, pair: str, *, seconds: float
         replace(point, predicted_seconds=point.predicted_seconds - search.tile_seconds)
         for point in measure(part, plan, _settings(search), seconds=seconds)
     ]
-    size = f"{scene.grid.shape[0]} × {scene.grid.shape[1]} pixels, {len(history)} pulses"
+    some = "" if len(history) == len(opened.time_s) else f"the middle {len(history)} of "
+    size = f"{scene.grid.shape[0]} × {scene.grid.shape[1]} pixels, {some}{len(opened.time_s)} pulses"
     title = f"{campaign.settings.campaign}, {flight}/{pair}: {size}"
     paths = [campaign.result(STUDY) / f"speed_accuracy.{suffix}" for suffix in ("csv", "png", "html")]
     write_table(paths[0], points, digits=6)
