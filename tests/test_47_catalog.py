@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from urllib.parse import unquote
 
@@ -16,6 +17,7 @@ from rocrate.rocrate import ROCrate
 from apertura.common.errors import CampaignError
 from apertura.common.provenance import lock_sha256, sha256_file, software
 from apertura.formats.catalog import CATALOG, CRATE
+from apertura.formats.catalog.crate import CrateRun, Listed, crate_document
 from apertura.formats.catalog.validation import stac_problems
 from apertura.pipeline.campaign import Campaign
 from apertura.pipeline.lineage import on_demand, places_of, result_of, results_of
@@ -75,6 +77,8 @@ def test_an_item_lies_where_its_raster_lies(finished_tiny):
         assert item.properties["proj:transform"] == list(raster.transform)[:6]
         assert item.properties["proj:shape"] == list(raster.shape)
         assert item.properties["proj:bbox"] == pytest.approx(list(raster.bounds), abs=1e-6)
+        assert item.properties["sar:observation_direction"] == "right"
+        assert 0 < item.properties["view:incidence_angle"] < 90
         assert item.bbox == pytest.approx(transform_bounds(raster.crs, "OGC:CRS84", *raster.bounds), abs=2e-7)
 
 
@@ -285,3 +289,16 @@ def test_a_verdict_is_the_same_word_in_every_product(finished, monkeypatch):
         if name != "fused":
             stated = open_stage(campaign.stage("cube"), "cube").verdict.sel(flight="f01", pair=name)
             assert str(stated.values) == verdict
+
+
+def test_a_crate_states_author_licence_and_doi_where_the_campaign_does():
+    rules = [Listed("workflow/Snakefile", "2" * 64, 10)]
+    versions = {"apertura": "1", "snakemake": "9"}
+    run = CrateRun("tandem", "2025-05-14T09:30:00Z", versions, "3" * 64, [], [], rules)
+    for stated, licence in (({}, "#licence"), ({"licence": "CC-BY-4.0"}, "https://spdx.org/licenses/CC-BY-4.0")):
+        found = crate_document(replace(run, author="A. Nother", doi="10.5281/zenodo.1", **stated))
+        entities = {entity["@id"]: entity for entity in found["@graph"]}
+        assert entities["./"]["license"] == {"@id": licence}
+        assert entities["./"]["identifier"] == "https://doi.org/10.5281/zenodo.1"
+        assert entities[entities["./"]["author"]["@id"]]["name"] == "A. Nother"
+        assert licence in entities
