@@ -256,8 +256,10 @@ VACUUM = {
     "pipeline/opening/reflectors.py": "phase that an error of a place leaves, to 0.03 %",
     "pipeline/opening/pair.py": _ELECTRICAL,
     "pipeline/steps/calibration.py": _ELECTRICAL,
+    "pipeline/steps/export.py": _SIZE,
     "views/design.py": _DRAWN,
     "views/inspect/pictures.py": _DRAWN,
+    "views/report/step.py": _SIZE,
 }
 """Modules that take the speed of light in vacuum, and why: what turns delay into path takes that of its arrays."""
 

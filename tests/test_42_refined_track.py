@@ -236,7 +236,7 @@ def test_the_plan_says_whether_tracks_will_be_refined_and_then_what_became_of_it
     edit_config(tiny, lambda document: [node.update(position_std_m=0.02) for node in document["nodes"].values()])
     print_plan(Campaign.load(tiny))
     told = " ".join(capsys.readouterr().out.replace("│", " ").split())
-    assert told.count("autofocus on auto: errors of position that are stated cost") == 2
+    assert told.count("autofocus on auto: configured position errors cost") == 2
 
 
 def asked_on(folder, *, pulses, half_m, std_m=0.0, said_m=0.02):

@@ -353,7 +353,7 @@ def _draw_layers(path: Path, design: Design) -> None:
                 norm = BoundaryNorm(np.arange(-0.5, 5), 5)
                 picture = axes.imshow(shown, extent=extent, cmap=colours, norm=norm, interpolation="nearest")
                 bar = figure.colorbar(picture, ax=axes, ticks=range(5), shrink=0.8)
-                bar.ax.set_yticklabels(["seen", "shadow", "layover", "both", "outside"])
+                bar.ax.set_yticklabels(["visible", "shadow", "layover", "both", "outside"])
             else:
                 seen = np.ma.masked_where(image.layers["mask"][::step, ::step] != 0, shown)
                 ends = dict(zip(("vmin", "vmax"), _ends(seen), strict=True))

@@ -68,7 +68,7 @@ def decide_autofocus(requested: str, loss_db: Mapping[str, float], unstated: Col
     Examples
     --------
     >>> decide_autofocus("auto", {"a-a": -0.1, "a-b": -0.9}, []).reason
-    'auto: errors of position that are stated cost 0.90 dB in a-b, more than the 0.2 dB borne'
+    'auto: configured position errors cost 0.90 dB in a-b, more than the tolerated 0.2 dB'
     >>> decide_autofocus("auto", {"a-a": 0.0}, ["a"]).value
     'off'
     """
@@ -79,8 +79,8 @@ def decide_autofocus(requested: str, loss_db: Mapping[str, float], unstated: Col
         return Decision("autofocus", "off", f"{missing}; state nodes.<node>.position_std_m to have them refined")
     pair, worst_db = min(loss_db.items(), key=lambda one: one[1])
     value, than = ("on", "more") if worst_db < -TOLERATED_LOSS_DB else ("off", "no more")
-    cost = f"errors of position that are stated cost {-worst_db:.2f} dB in {pair}"
-    return Decision("autofocus", value, f"auto: {cost}, {than} than the {TOLERATED_LOSS_DB} dB borne")
+    cost = f"configured position errors cost {-worst_db:.2f} dB in {pair}"
+    return Decision("autofocus", value, f"auto: {cost}, {than} than the tolerated {TOLERATED_LOSS_DB} dB")
 
 
 # ---- Model of the ground
