@@ -108,7 +108,10 @@ def test_coherence_is_that_of_the_printed_recordings_and_of_the_noise_of_echo_fr
         if name.startswith("lack of coherence"):
             assert float(claim.computed) == pytest.approx(1.0, abs=0.7)
     alike = [claims[f"{what} monostatic, static"] for what in ("phase of bistatic less", "gain of bistatic over")]
-    assert [(claim.about, claim.verdict) for claim in alike] == [(PAPER, AGREES)] * 2
+    assert [(claim.about, claim.verdict) for claim in alike] == [
+        (PAPER, EXPLAINED)
+    ] * 2  # one simulated signal is split
+    assert all("by construction" in claim.note for claim in alike)
 
 
 @pytest.mark.slow
