@@ -8,8 +8,11 @@ import numpy as np
 import pytest
 from folders import SHARED, copy_writable, edit_config, edit_track, run_steps
 
+from apertura.common.errors import CampaignError
+from apertura.core.geometry.aperture import Aperture
 from apertura.core.scene.grid import SceneGrid
 from apertura.pipeline.campaign import Campaign
+from apertura.pipeline.opening.acquisition import check_rates
 from apertura.pipeline.opening.diagnosis import Hypothesis, Trial, explanation
 from apertura.pipeline.opening.images import assessment_of
 from apertura.pipeline.steps import assess, cube, echo, export, image, profile
@@ -295,3 +298,26 @@ def test_a_path_of_the_papers_flight_that_is_wrong_is_told_by_phase_or_place(
     assert len(told["fusion"]["left_out"]) == 1
     assert told["fusion"]["ties"] == [[*told["fusion"]["left_out"]]]
     assert "a tie: " in told["flags"]["pair_left_out"]
+
+
+@pytest.mark.parametrize("height_m", [-3.0, 0.5, 3.0])
+def test_a_hypothesis_on_the_height_is_tried_where_its_point_then_lies(monkeypatch, height_m):
+    """A ground 3 m lower shifts points by several metres: as far as their mean path stays what it is."""
+    track = np.stack([np.linspace(-5, 5, 64), np.full(64, -30.0), np.full(64, 25.0)], -1)
+    found = [SimpleNamespace(history=SimpleNamespace(aperture=Aperture(track, track + [0.0, 4.0, 2.0])))]
+    here_m = np.array([1.0, 2.0, 0.0])
+    monkeypatch.setattr(assess, "_ground", lambda *_: here_m)
+    scene = SimpleNamespace(axes=np.eye(3))
+    east_m, north_m = assess._moved_by_height(scene, (1.0, 2.0), found, height_m)
+    there_m = here_m + [east_m, north_m, height_m]
+    before, after = (found[0].history.aperture.path(one[None]).mean() for one in (here_m, there_m))
+    assert np.hypot(east_m, north_m) > 0.6 * abs(height_m)
+    assert abs(after - before) < 0.06 * abs(height_m)
+
+
+def test_a_carrier_that_a_recording_does_not_state_is_that_of_the_config():
+    """SigMF makes core:frequency optional: absent, it is no contradiction."""
+    waveform = SimpleNamespace(carrier_hz=1.3e9, sample_rate_hz=5e7)
+    check_rates(waveform, {"carrier_hz": 0.0, "sample_rate_hz": 5e7}, where="uav1.sigmf-meta")
+    with pytest.raises(CampaignError, match="recorded with carrier_hz 1200000000"):
+        check_rates(waveform, {"carrier_hz": 1.2e9}, where="uav1.sigmf-meta")

@@ -126,6 +126,7 @@ def _shift(east_m: float, north_m: float) -> Callable[[list[float]], list[float]
 MISTAKES = {
     "height_47m": Mistake("ground 47 m too high", section("scene", height_m=lambda m: m + 47), "height"),
     "height_2m": Mistake("ground 2 m too high", section("scene", height_m=lambda m: m + 2), "height"),
+    "height_3m": Mistake("ground 3 m too high", section("scene", height_m=lambda m: m + 3), "height"),
     "height_0m5": Mistake("ground 0.5 m too high", section("scene", height_m=lambda m: m + 0.5), "height"),
     "height_below_0m5": Mistake("ground 0.5 m too low", section("scene", height_m=lambda m: m - 0.5), "height"),
     "height_below_1m": Mistake("ground 1 m too low", section("scene", height_m=lambda m: m - 1.0), "height"),

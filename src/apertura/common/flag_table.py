@@ -136,7 +136,7 @@ _OF_RECORDINGS = {
     "wrong_code": Flag(
         "SNR of the sidelink",
         "the sidelink carries another code: the transmitter's if all its pairs say so, else another transmitter's",
-        "waveform.codes; the recording", "core/echo/sidelink_state.py"),
+        "waveform.codes, waveform.carrier_is, waveform.iq; the recording", "core/echo/sidelink_state.py"),
     "sidelink_lost": Flag(
         "pulses dropped", "pulses without a sidelink were dropped", "blockage, antenna", "core/echo/sidelink_state.py"),
     "second_arrival": Flag(
@@ -257,7 +257,8 @@ _OF_IMAGES = {
         "motions against the errors stated", "track errors found are much larger than stated",
         "position_std_m, position_correlation_s; lever arms, heights, times", "methods/autofocus/evidence.py"),
     "prior_too_wide": Flag(
-        "motions against the errors stated", "track errors found are much smaller than stated; no error of the image",
+        "motions against the errors stated",
+        "track errors found are much smaller than stated: refinement is freer than needed",
         "position_std_m, position_correlation_s", "methods/autofocus/evidence.py"),
     "cycle_slip_suspected": Flag(
         "parts of the track, how far off", "parts of the refined track may be a wavelength off",
@@ -265,7 +266,7 @@ _OF_IMAGES = {
     "defocused": Flag(
         "dB lost at bright points, dB that the budget expects",
         "bright points lost more than 1 dB of their peak to phase errors",
-        "the hypothesis named; positions, lever arms, heights, times", "core/imaging/focus_check.py"),
+        "the hypothesis, where one is named; positions, lever arms, heights, times", "core/imaging/focus_check.py"),
     "loss_unexpected": Flag(
         "dB lost at bright points, dB expected, with deviations",
         "the loss is about 1 dB at most, yet three deviations above the budget, or what a cause of another image "
@@ -280,7 +281,7 @@ _OF_IMAGES = {
     "pairs_apart": Flag(
         "cm between the points, east and north",
         "a pair shows the same points at other places than most, or as many say one place as the other",
-        "the hypothesis named; path offsets, lever arms, scene.height_m", "pipeline/steps/assess.py"),
+        "the hypothesis, where one is named; path offsets, lever arms, scene.height_m", "pipeline/steps/assess.py"),
     "pairs_out_of_phase": Flag(
         "phase against the pairs that agree",
         "a pair shows points in another phase than most, or opinions are even: the sum leaves it out",

@@ -63,6 +63,8 @@ def print_summary(campaign: Campaign) -> None:
     if not console.is_terminal:
         console = Console(highlight=False, width=max(_WIDE, console.width))
     console.print(_table(values))
+    for why, images in _undecided(values).items():
+        console.print(f"{_some(images)}: {why}", soft_wrap=True)
     unsure = max(values.values(), key=lambda one: one.place_m, default=None)
     if unsure and unsure.place_m:
         console.print(
@@ -78,6 +80,15 @@ def print_summary(campaign: Campaign) -> None:
     if missing := [" ".join(image) for image in names if image not in there]:
         console.print(f"not there yet: {_some(missing)}; apertura run makes what is missing", soft_wrap=True)
     print_products(campaign)
+
+
+def _undecided(values: Mapping[str, ImageValues]) -> dict[str, list[str]]:
+    """Return reason → images whose verdict is not `focused` although no flag of theirs says why."""
+    reasons = dict[str, list[str]]()
+    for name, one in values.items():
+        if one.verdict not in ("", "focused") and not one.flags:
+            reasons.setdefault(f"{one.verdict}: {one.why}", []).append(name)
+    return reasons
 
 
 def print_stale(campaign: Campaign) -> None:

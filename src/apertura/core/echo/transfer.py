@@ -37,7 +37,7 @@ from apertura.core.echo.sidelink_state import SidelinkState, measure_blocks, sec
 
 _INVERTED = (
     "the code is in the conjugates of the samples: set waveform.iq to swapped where I and Q are swapped, to conjugate "
-    "where the local oscillator lies above the band"
+    "where the local oscillator lies above the band; of one node alone, conjugate its samples"
 )
 _COMPRESSED = 4.0  # times the peak of a delay profile over its mean, of conjugates against samples
 

@@ -476,8 +476,8 @@ def _conjugated(formation: Formation, peak: float) -> str | None:
         return None
     return (
         f"with conjugated samples its brightest place is {min(gained_db, 99):.0f} dB brighter: "
-        "I and Q are swapped, or phases count the other way: change waveform.iq between complex and conjugate; from "
-        "Python, conjugate the samples"
+        "I and Q are swapped, or phases count the other way: change waveform.iq between complex and conjugate, of real "
+        "beats the sign of waveform.bandwidth_hz; from Python, conjugate the samples"
     )
 
 

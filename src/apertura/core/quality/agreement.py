@@ -99,6 +99,11 @@ class Agreement:
         return float(np.hypot(self.shift_east_m, self.shift_north_m))
 
     @property
+    def shift_std_along_m(self) -> float:
+        """Standard deviation of the distance along the shift: a cell is not as long in every direction."""
+        return self.shift_m * self.shift_std_units / self.shift_units if self.shift_units else self.shift_std_m
+
+    @property
     def shifted(self) -> bool:
         """Whether the images show different places, by more than the uncertainty of their points."""
         return self.spread or self.shift_units > SHIFTED + 3 * self.shift_std_units or self.cycle_off

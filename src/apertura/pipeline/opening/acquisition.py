@@ -27,10 +27,13 @@ _SAME = 1e-9
 
 
 def check_rates(waveform: SampledWaveform, recorded: Mapping[str, float], *, where: Path | str) -> None:
-    """Raise CampaignError unless what was `recorded`, sample_rate_hz and carrier_hz, is that of the waveform."""
+    """Raise CampaignError unless what was `recorded`, sample_rate_hz and carrier_hz, is that of the waveform.
+
+    A carrier of 0 is not stated by the recording: that of the config is taken.
+    """
     for key, value in recorded.items():
         stated = float(getattr(waveform, key))
-        if not abs(value - stated) <= _SAME * stated:
+        if value and not abs(value - stated) <= _SAME * stated:
             raise CampaignError(
                 f"recorded with {key} {value:.6f}",
                 where=where,

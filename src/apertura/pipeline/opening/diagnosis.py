@@ -23,7 +23,7 @@ MOST_PULSES = 512
 
 _SHIFTS_S = (18.0, 37.0, 19.0, 17.0, 5.0, 3.0, 2.0, 1.0, 0.7, 0.5, 0.3, 0.2, 0.1, 0.05)
 _UNDULATION_M = 10.0  # from here on heights above a geoid may have been taken for ellipsoidal ones, or the reverse
-_HEIGHTS_M = (50.0, 47.0, 20.0, 10.0, 5.0, 2.0, 1.0, 0.5)
+_HEIGHTS_M = (50.0, 47.0, 20.0, 10.0, 5.0, 4.0, 3.0, 2.5, 2.0, 1.5, 1.0, 0.5)
 _PREFIX_SAMPLES = (1, 2, 3, 5, 10, 20, 50)
 _TIME_SYSTEMS = {
     18.0: ": GPST taken for UTC?",
@@ -339,5 +339,8 @@ def explanation(trials: Sequence[Trial], drawn: Sequence[Trial], lost_db: float)
     what = best.hypothesis.what
     if rivals:  # a constant of each pair does it, whatever made it: a path, an arm, a log, a phase
         what = f"pairs are off by a constant: of a path, an arm, a phase, a log's place or time, such as: {what}"
+        heights = [one for one in rivals if isinstance(one, Trial) and one.hypothesis.kind == "height"]
+        if heights:  # along a straight track a height does nearly the same
+            what += f"; or {max(heights, key=lambda one: one.gain_db).hypothesis.what}"
     report = {"what": what, "kind": "offset" if rivals else best.hypothesis.kind}
     return [report | {"gain_db": round(best.gain_db, 2), "lost_db": round(max(lost_db, best.gain_db), 2)}]

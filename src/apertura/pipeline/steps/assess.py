@@ -110,7 +110,9 @@ def hypotheses(
     lost_db = _db(_possible(found, here, height_m, focused) / now)
 
     def moved(hypothesis: Hypothesis) -> tuple[float, float]:
-        return _moved(scene.grid, brightest, found, hypothesis.histories)
+        x_m, y_m = _moved(scene.grid, brightest, found, hypothesis.histories)
+        east_m, north_m = _moved_by_height(scene, brightest, found, hypothesis.height_m)
+        return x_m + east_m, y_m + north_m
 
     def peak(hypothesis: Hypothesis, place: tuple[float, float], pairs: slice = slice(None)) -> float:
         grid = _around(scene, place, cell_m)
@@ -257,6 +259,20 @@ def _moved(
             rows.append(ends[1, 0] - ends[0, 0])
             columns.append(ends[1, 1] - ends[0, 1])
     return place[0] + grid.spacing_m * float(np.mean(columns)), place[1] - grid.spacing_m * float(np.mean(rows))
+
+
+def _moved_by_height(
+    scene: OpenScene, place: tuple[float, float], found: Sequence[PairGeometry], height_m: float
+) -> tuple[float, float]:
+    """Return by how much a point of unchanged paths moves, metres east and north, on ground higher by `height_m`.
+
+    With g the mean gradient of the path, g·dx = 0: dx = −g_up height g_level/|g_level|² along the level.
+    """
+    here_m = _ground(scene, place)
+    gradient = np.mean([one.history.aperture.path_gradient(here_m).mean(axis=0) for one in found], axis=0).reshape(3)
+    east, north, up = scene.axes @ gradient
+    level = max(float(east**2 + north**2), 1e-6)
+    return -up * height_m * east / level, -up * height_m * north / level
 
 
 # ---- Rule `assess`: agreement of a flight's images, and which are added ---------------------------------------------
@@ -438,10 +454,10 @@ def _disagreement(chosen: CoherentSum, pair: str, blind: Sequence[str]) -> dict[
     if one.shifted:
         return {
             "pairs_apart": (
-                f"{where} of {pair} lie {100 * one.shift_m:.1f} ± {100 * one.shift_std_m:.1f} cm from where {agreeing} "
-                f"{'has' if len(chosen.agreeing) == 1 else 'have'} them, {100 * one.shift_east_m:+.1f} cm east and "
-                f"{100 * one.shift_north_m:+.1f} cm north{_SPREAD * one.spread}: positions, lever arms, path offsets "
-                "or heights are wrong"
+                f"{where} of {pair} lie {100 * one.shift_m:.1f} ± {100 * one.shift_std_along_m:.1f} cm from where "
+                f"{agreeing} {'has' if len(chosen.agreeing) == 1 else 'have'} them, "
+                f"{100 * one.shift_east_m:+.1f} cm east and {100 * one.shift_north_m:+.1f} cm north"
+                f"{_SPREAD * one.spread}: positions, lever arms, path offsets or heights are wrong"
             ),
             **({_PHASE: _phase_line(one, where, pair, chosen.reference)} if one.out_of_phase else {}),
         }

@@ -384,8 +384,9 @@ def _between_flights(
         if found is not None and found.shifted:
             line = (
                 f"{found.points} {found.by} of flight {name} lie {100 * found.shift_m:.1f} ± "
-                f"{100 * found.shift_std_m:.1f} cm from where flight {first} has them, {100 * found.shift_east_m:+.1f} "
-                f"cm east and {100 * found.shift_north_m:+.1f} cm north: a base station, datum or time system differs"
+                f"{100 * found.shift_std_along_m:.1f} cm from where flight {first} has them, "
+                f"{100 * found.shift_east_m:+.1f} cm east and "
+                f"{100 * found.shift_north_m:+.1f} cm north: a base station, datum or time system differs"
             )
             flags[name] = Flags({"flights_apart": line})
     return {"agreement": {"reference": first, "flights": between}, "flags": flags}
