@@ -311,8 +311,9 @@ def test_a_hypothesis_on_the_height_is_tried_where_its_point_then_lies(monkeypat
     east_m, north_m = assess._moved_by_height(scene, (1.0, 2.0), found, height_m)
     there_m = here_m + [east_m, north_m, height_m]
     before, after = (found[0].history.aperture.path(one[None]).mean() for one in (here_m, there_m))
-    assert np.hypot(east_m, north_m) > 0.6 * abs(height_m)
-    assert abs(after - before) < 0.06 * abs(height_m)
+    moved_m = np.hypot(east_m, north_m)
+    assert moved_m > 0.6 * abs(height_m)
+    assert abs(after - before) < (moved_m**2 + height_m**2) / 30  # of second order: a path of 80 m is curved
 
 
 def test_a_carrier_that_a_recording_does_not_state_is_that_of_the_config():
