@@ -134,12 +134,21 @@ def footer(tags: Mapping[str, str]) -> str:
 
 
 def _focus_words(tags: Mapping[str, str]) -> list[str]:
-    """Return the verdict on the focus, and the loss measured."""
+    """Return the verdict on the focus, the loss measured, and the uncertainty of places where it exceeds a cell.
+
+    Examples
+    --------
+    >>> focus = {"verdict": "focused", "loss_db": -0.04, "cell_m": 0.1, "expected_shift_m": 1.24}
+    >>> _focus_words({"APERTURA_FOCUS": json.dumps(focus)})
+    ['focus: focused (0.0 dB lost)', 'geolocation uncertainty 1.2 m']
+    """
     if "APERTURA_FOCUS" not in tags:
         return []
     focus = json.loads(tags["APERTURA_FOCUS"])
     loss = f" ({abs(focus['loss_db']):.1f} dB lost)" if "loss_db" in focus else ""
-    return [f"focus: {focus['verdict']}{loss}"]
+    shift_m = focus.get("expected_shift_m", 0.0)
+    place = [f"geolocation uncertainty {shift_m:.2g} m"] if shift_m > focus.get("cell_m", 0.0) else []
+    return [f"focus: {focus['verdict']}{loss}", *place]
 
 
 def shrink(image: NorthUpRaster, most: int) -> tuple[NDArray[np.float64], int]:

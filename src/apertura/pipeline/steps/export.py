@@ -113,9 +113,13 @@ def export_fused(campaign: Campaign, flight: str) -> list[Path]:
     )
     against = {*of_sum, *(flag for pair in added for flag in of_pairs[pair])}  # of pairs left out, none
     worst = _worst(images, assessed["fusion"])
+    focuses = [images[pair].attrs["quality"]["focus"] for pair in added]
+    places = {name: max(one.get(name, 0.0) for one in focuses) for name in ("cell_m", "expected_shift_m")}
     report = {
         **worst,
-        "focus": focus_with_flags(_focus(images, at_points, [*added]), against, error_db=worst["numerical_error_db"]),
+        "focus": focus_with_flags(
+            _focus(images, at_points, [*added]) | places, against, error_db=worst["numerical_error_db"]
+        ),
         **_measures(grid, windows, sums, images, assessed),
         "fusion": assessed["fusion"],
         "coherence": _coherence(measured, assessed) | {"isolated": isolated},
