@@ -68,7 +68,7 @@ CHANGES = [
     ("formats/tracks/px4_ulog.py", "code", set()),  # no log of the campaign is of that format
     ("formats/tracks/csv_track.py", "comment", set()),
     ("formats/tracks/csv_track.py", "code", READ - {"raw"}),
-    ("formats/recordings/sigmf.py", "code", READ - {"track"} | {"cphd"}),
+    ("formats/recordings/sigmf.py", "code", READ - {"track", "tracks"} | {"cphd"}),
     ("views/webmap/server.py", "code", set()),  # what a browser is shown, of results that are there
     ("common/flag_table.py", "code", {"page", "report", "map"}),
     ("common/errors.py", "code", set()),

@@ -330,7 +330,8 @@ def check_delivered(campaign, node, right):
     )
     with (campaign.results / "f01" / "tracks" / f"{node}.csv").open() as stream:
         table = list(csv.DictReader(stream))
-    delivered = {column: np.array([float(row[column]) for row in table]) for column in table[0] if column != "time_utc"}
+    words = {"time_utc", "quality"}
+    delivered = {column: np.array([float(row[column]) for row in table]) for column in table[0] if column not in words}
     written_m = ecef_from_geodetic(*(delivered[name] for name in ("latitude_deg", "longitude_deg", "height_m")))
     enu = ned_axes(true_m)[..., [1, 0, 2]] * [1.0, 1.0, -1.0]
     before_m, after_m = (np.einsum("nai,na->ni", enu, one - true_m) for one in (logged_m, written_m))

@@ -453,6 +453,9 @@ def with_text(config, way, text):
 
 UNUSED = {
     ("campaign",),
+    ("metadata", "author"),
+    ("metadata", "licence"),
+    ("metadata", "platform"),
     ("nodes", "*", "log", "columns", "*"),
     ("nodes", "*", "log", "start_utc"),
     ("nodes", "*", "log", "body"),
