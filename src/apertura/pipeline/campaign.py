@@ -175,7 +175,9 @@ class Campaign(RawFolder):
 
     def is_current(self, result: ConfinedPath) -> bool:
         """Return whether a stage or document is finished and not `outdated`."""
-        manifest = result.with_name(f"{result.stem}.manifest.json")
+        from apertura.pipeline.store.manifest import manifest_of  # whoever asks has the store's arrays loaded
+
+        manifest = manifest_of(result)
         return manifest.is_file() and self.relative(manifest) not in self.outdated
 
     def file(self, name: str, key: str) -> ConfinedPath:

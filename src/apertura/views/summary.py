@@ -36,12 +36,7 @@ _MOST_FLIGHTS = 3
 def is_finished(campaign: Campaign) -> bool:
     """Return whether every image has its report, made and not overtaken since."""
     images = ((flight.name, name) for flight in campaign.image_flights for name in flight.images)
-    return all(_is_made(campaign, *image, name="export") for image in images)
-
-
-def _is_made(campaign: Campaign, *where: str, name: str) -> bool:
-    """Return whether a result is finished: a run that made it stale and did not come to it has left its files alone."""
-    return (campaign.root / campaign.manifest(name, *where)).is_file()
+    return all(campaign.is_current(campaign.result(*image, "export")) for image in images)
 
 
 def print_summary(campaign: Campaign) -> None:
@@ -56,7 +51,7 @@ def print_summary(campaign: Campaign) -> None:
 
     campaign.check_images()
     names = [(flight.name, name) for flight in campaign.image_flights for name in flight.images]
-    there = [image for image in names if _is_made(campaign, *image, name="export")]
+    there = [image for image in names if campaign.is_current(campaign.result(*image, "export"))]
     reports = {" ".join(image): read_report(campaign, *image) for image in there or names[:1]}
     values = {name: ImageValues.of(report) for name, report in reports.items()}
     console = Console(highlight=False)
@@ -110,7 +105,7 @@ def print_benches(campaign: Campaign) -> None:
     """Print a line for each flight of kind bench that was measured: how many lines carry a flag, and its page."""
     for flight in campaign.flights:
         report, page = (campaign.result(flight.name, name) for name in ("bench.json", "bench.html"))
-        if flight.kind == "bench" and _is_made(campaign, flight.name, name="bench"):
+        if flight.kind == "bench" and campaign.is_current(campaign.result(flight.name, "bench")):
             flags = open_listed(report, report.with_name("bench.manifest.json"))["flags"]
             verdict = f"look at {', '.join(printable(flags))}" if flags else "every line within its limit"
             print(f"bench {flight.name}: {verdict}: {campaign.relative(page)}")
@@ -139,7 +134,7 @@ def _interferograms(campaign: Campaign) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield what each interferogram that is there states."""
     for name in campaign.settings.interferometry.pairs:
         path = campaign.result(INTERFEROMETRY, name, "interferogram.json")
-        if _is_made(campaign, INTERFEROMETRY, name, name="interferogram"):
+        if campaign.is_current(campaign.result(INTERFEROMETRY, name, "interferogram")):
             report = open_listed(path, path.with_name("interferogram.manifest.json"))
             with undamaged(path, expected="the report of an interferogram", remedy="Run the workflow again."):
                 says = {"says": shown(report["says"], 400), "flags": printable(report["flags"])}
