@@ -20,11 +20,10 @@ import rasterio
 import yaml
 from numpy.typing import NDArray
 
+from apertura.campaign.folder import Campaign
 from apertura.core.geometry.atmosphere import refractivity, standard_weather
 from apertura.core.quality.point_targets import find_peak
 from apertura.core.scene.grid import SceneGrid
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.opening.scene import settled_scene
 from apertura.simulation import (
     CampaignSpecification,
     PointTarget,
@@ -35,6 +34,7 @@ from apertura.simulation import (
     simulate,
 )
 from apertura.simulation.impairments import Impairments
+from apertura.stages.scene import settled_scene
 
 BAND_HZ, CARRIER_HZ = 200e6, 1.3e9
 """Range cells of 75 cm, waves of 21 cm."""

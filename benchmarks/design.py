@@ -18,19 +18,19 @@ from judging.run import image_steps
 from rich.console import Console
 from rich.table import Table
 
+from apertura.campaign.folder import Campaign
+from apertura.campaign.store import open_stage
 from apertura.core.geometry.geodesy import frame_from_map, geodetic_from_ecef
 from apertura.core.quality.point_targets import cut_through, find_peak
 from apertura.core.scene.angles import surface
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.config.flight_plan import FlightPlan
-from apertura.pipeline.design import designed
-from apertura.pipeline.design.rehearsal import rehearse
-from apertura.pipeline.opening.pair import open_pair
-from apertura.pipeline.opening.radiometry import calibrated_pair
-from apertura.pipeline.opening.scene import open_scene
-from apertura.pipeline.steps import interferogram, layers
-from apertura.pipeline.store import open_stage
 from apertura.simulation.scene import Clutter, Origin, PointTarget
+from apertura.stages import interferogram, layers
+from apertura.stages.pair import open_pair
+from apertura.stages.radiometry import calibrated_pair
+from apertura.stages.scene import open_scene
+from apertura.tools.design import designed
+from apertura.tools.design.flight_plan import FlightPlan
+from apertura.tools.design.rehearsal import rehearse
 
 EAST, NORTH = 570661.0, 5363707.0
 CRS = "EPSG:32632"

@@ -22,11 +22,11 @@ from scipy import fft
 matplotlib.use("agg")
 from matplotlib import pyplot as plt
 
+from apertura.campaign.folder import Campaign
 from apertura.formats.reading import open_recording
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.lineage import places
-from apertura.pipeline.rules import RESULTS
 from apertura.simulation import preset, simulate
+from apertura.workflow.lineage import places
+from apertura.workflow.rules import RESULTS
 
 PRF_HZ = 500
 FLIGHT = "f01"

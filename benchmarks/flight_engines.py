@@ -19,6 +19,8 @@ from pathlib import Path
 
 import numpy as np
 
+from apertura.campaign.folder import Campaign
+from apertura.campaign.store import open_stage
 from apertura.common.contracts import Window
 from apertura.core.backprojection.engines import ENGINES, load_engine
 from apertura.core.backprojection.tiles import compute_tiles
@@ -26,12 +28,10 @@ from apertura.core.imaging.formation import Formation
 from apertura.core.imaging.range_profiles import profiles_of
 from apertura.core.planning.planner import make_plan
 from apertura.core.quality.error_check import random_pixels
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.opening.autofocus import open_refined
-from apertura.pipeline.opening.pair import open_pair
-from apertura.pipeline.opening.plan import job_of
-from apertura.pipeline.opening.scene import open_scene
-from apertura.pipeline.store import open_stage
+from apertura.stages.pair import open_pair
+from apertura.stages.planning import job_of
+from apertura.stages.refine import open_refined
+from apertura.stages.scene import open_scene
 
 FLIGHT = "f01"
 

@@ -12,12 +12,10 @@ from pathlib import Path
 import numpy as np
 import yaml
 
+from apertura.campaign.folder import Campaign
+from apertura.campaign.store import open_stage
 from apertura.core.echo.dechirp import FrequencySweep
 from apertura.core.quality.point_targets import cut_through, find_peak
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.opening.scene import open_scene
-from apertura.pipeline.steps import echo, image, ingest, profile, refine, scene
-from apertura.pipeline.store import open_stage
 from apertura.simulation import (
     CampaignSpecification,
     ImageGrid,
@@ -30,6 +28,8 @@ from apertura.simulation import (
     simulate,
 )
 from apertura.simulation.fmcw import FmcwFlight, write_fmcw_campaign
+from apertura.stages import echo, image, ingest, profile, refine, scene
+from apertura.stages.scene import open_scene
 
 TARGETS = ((0.0, 0.0, 0.0), (-2.0, 2.0, 0.0), (2.5, -1.5, 0.0))
 PULSES, PRF_HZ, SPEED_M_S, HALF_M, SPACING_M = 200, 100.0, 5.0, 3.5, 0.0625

@@ -23,8 +23,8 @@ from pathlib import Path
 
 import numpy as np
 
+from apertura.campaign.folder import Campaign
 from apertura.formats.reading import open_recording
-from apertura.pipeline.campaign import Campaign
 from apertura.simulation import preset, simulate
 
 PRF_HZ = 500
@@ -175,7 +175,7 @@ class LogWriter:
     def __init__(self, campaign: Campaign, flight: str, node: str, replayed: Path) -> None:
         path = campaign.track_file(flight, node)
         self.to, self.content, self.written = replayed / "raw" / flight / path.name, path.read_bytes(), 0
-        from apertura.pipeline.opening.reading import read_log
+        from apertura.stages.node_log import read_log
 
         epochs = read_log(campaign, flight, node).time.values
         self.first, self.last = epochs[0], epochs[-1]

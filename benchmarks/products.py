@@ -20,11 +20,11 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.opening.scene import settled_scene
-from apertura.pipeline.steps import assess, echo, image, ingest, profile, refine, scene
-from apertura.pipeline.store import create, finish, open_array, open_stage, save_document, writing
+from apertura.campaign.folder import Campaign
+from apertura.campaign.store import create, finish, open_array, open_stage, save_document, writing
 from apertura.simulation import ImageGrid, preset, simulate
+from apertura.stages import assess, echo, image, ingest, profile, refine, scene
+from apertura.stages.scene import settled_scene
 
 TILE = 256
 LIT = 0.8
@@ -85,7 +85,7 @@ def measured(root: Path, *step: str) -> None:
 
 def run_step(root: str, *step: str) -> None:
     """Run a step here; print its peak memory and seconds of the processor."""
-    from apertura.views.step_commands import app
+    from apertura.tools.step_commands import app
 
     app([*step, "--campaign", root], standalone_mode=False)
     used = resource.getrusage(resource.RUSAGE_SELF)

@@ -28,13 +28,13 @@ from apertura.core.imaging.speckle import Multilook, Speckle
 from apertura.core.quality.bright_points import bright_point
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import FlatGround, Plane, Terrain
-from apertura.pipeline.opening.radiometry import LEAST_CONTRAST
 from apertura.simulation.echoes import transfer
 from apertura.simulation.impairments import Impairments, Radio, draw_impairments
 from apertura.simulation.observation import physical
 from apertura.simulation.scene import Scatterers
 from apertura.simulation.synthesis import Geometry, receive, transfer_functions
 from apertura.simulation.waveform import TransmitWaveform, qpsk_codes
+from apertura.stages.radiometry import LEAST_CONTRAST
 
 RCS_M2, RANGES_M, SQUINTS_DEG = (0.1, 1.0, 10.0), (14.0, 25.0, 40.0, 70.0, 110.0), (-25.0, 0.0, 25.0)
 COUNTS, WIDTH_DEG, STATED_STD_DB = 8192.0, (60.0, 60.0), 0.5

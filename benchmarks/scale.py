@@ -43,13 +43,13 @@ def campaign_of(root, flights):
 
 def finish(root):
     """Put a file in the place of every result, with the manifest that its step would write."""
+    from apertura.campaign.digests import Sources
+    from apertura.campaign.folder import Campaign
+    from apertura.campaign.store import record_files
     from apertura.common.atomic import write_json
     from apertura.common.provenance import code_sha256
     from apertura.formats.export import exports_in
-    from apertura.pipeline.campaign import Campaign
-    from apertura.pipeline.digests import Sources
-    from apertura.pipeline.lineage import results_of
-    from apertura.pipeline.store import record_files
+    from apertura.workflow.lineage import results_of
 
     beside = {
         "scene": ["scene.json"],

@@ -21,10 +21,10 @@ from spoiling.folder import RX, TX, Folder
 from spoiling.logs import Log
 from spoiling.of_logs import logs, noisy
 
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.opening.scene import settled_scene
-from apertura.pipeline.steps import echo, image, ingest, profile, refine, scene
-from apertura.pipeline.store import open_stage
+from apertura.campaign.folder import Campaign
+from apertura.campaign.store import open_stage
+from apertura.stages import echo, image, ingest, profile, refine, scene
+from apertura.stages.scene import settled_scene
 
 SIZES_CM = (0.0, 0.5, 1.0, 2.0, 4.0)
 

@@ -12,16 +12,16 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
+from apertura.campaign.folder import Campaign
+from apertura.campaign.store import open_stage
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.echo.compression import window_weights
 from apertura.core.geometry.geodesy import frame_from_map
 from apertura.core.quality.point_targets import cut_through, find_peak
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.opening.scene import open_scene
-from apertura.pipeline.steps import echo, image, ingest, profile, refine, scene
-from apertura.pipeline.store import open_stage
 from apertura.simulation import Impairments, PulseSpecification, WaveformSpecification, preset, simulate
 from apertura.simulation.scene import PointTarget
+from apertura.stages import echo, image, ingest, profile, refine, scene
+from apertura.stages.scene import open_scene
 
 PULSE = {"carrier_hz": 1.4048e9, "pulse_s": 1e-6, "listen_s": 0.78125e-6, "sample_rate_hz": 1.024e9, "prf_hz": 20.0}
 BAND = {"lead_s": 0.1e-6, "band_hz": (-204.8e6, 204.8e6)}

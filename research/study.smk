@@ -64,8 +64,8 @@ rule paper_campaign:
         processed=lambda wildcards: PROCESSED[wildcards.experiment],
         code=code_sha256(
             "apertura.simulation.presets",
-            "apertura.pipeline.steps.echo",
-            "apertura.pipeline.steps.cube",
+            "apertura.stages.echo",
+            "apertura.stages.cube",
         ),
     message:
         "the paper's experiment {wildcards.experiment}, through the ordinary steps"

@@ -89,7 +89,7 @@ def all_steps(made_once):
     """A copy of a campaign folder with all its results, by the name of what is made; read only."""
     from folders import copy_writable, run_steps
 
-    from apertura.pipeline.campaign import Campaign
+    from apertura.campaign.folder import Campaign
 
     def made(name, source):
         return Campaign.load(made_once(name, lambda root: run_steps(copy_writable(source, root))))

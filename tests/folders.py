@@ -11,12 +11,28 @@ import numpy as np
 import pytest
 import yaml
 
+from apertura.campaign.config import FUSED, SampledWaveform
+from apertura.campaign.folder import Campaign
+from apertura.campaign.store import open_stage
+from apertura.check.examination import Examination
+from apertura.check.files import check_files
 from apertura.common.errors import CampaignError
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.check.files import check_files
-from apertura.pipeline.config import FUSED, SampledWaveform
-from apertura.pipeline.examination.campaign import Examination
-from apertura.pipeline.steps import (
+from apertura.simulation import (
+    CampaignSpecification,
+    Framing,
+    ImageGrid,
+    Impairments,
+    Origin,
+    PointTarget,
+    SimulatedFlight,
+    SimulatedNode,
+    Straight,
+    WaveformSpecification,
+)
+from apertura.simulation.observation import Observation, fly
+from apertura.simulation.scene import scatterers
+from apertura.simulation.specification import DrawnCampaign, draw_campaign
+from apertura.stages import (
     assess,
     coverage,
     cube,
@@ -34,22 +50,6 @@ from apertura.pipeline.steps import (
     stac,
     tracks,
 )
-from apertura.pipeline.store import open_stage
-from apertura.simulation import (
-    CampaignSpecification,
-    Framing,
-    ImageGrid,
-    Impairments,
-    Origin,
-    PointTarget,
-    SimulatedFlight,
-    SimulatedNode,
-    Straight,
-    WaveformSpecification,
-)
-from apertura.simulation.observation import Observation, fly
-from apertura.simulation.scene import scatterers
-from apertura.simulation.specification import DrawnCampaign, draw_campaign
 from apertura.views.webmap import step as webmap
 
 ROOT = Path(__file__).parents[1]

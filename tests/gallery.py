@@ -408,7 +408,7 @@ def samples(folder: Path) -> Made:
 def verify(folder: Path) -> Made:
     from spoilt import flip
 
-    from apertura.pipeline.store import read_manifest
+    from apertura.campaign.store import read_manifest
     from apertura.views.verify.chain import verify as verified
 
     product = "results/f01/fused/coherent_db.tif"

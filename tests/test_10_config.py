@@ -11,12 +11,12 @@ from typer.main import get_command
 from typer.testing import CliRunner
 
 import apertura
+from apertura.campaign.config import Processing, Scene, Settings, validated
+from apertura.campaign.config.template import WAVEFORMS, config_schema, config_template
+from apertura.cli import app
 from apertura.common import documents
 from apertura.common.errors import CampaignError
-from apertura.pipeline.config import Processing, Scene, Settings, validated
-from apertura.pipeline.config.template import WAVEFORMS, config_schema, config_template
-from apertura.pipeline.lineage import result_of
-from apertura.views.cli import app
+from apertura.workflow.lineage import result_of
 
 ROOT = Path(__file__).parents[1]
 CONDA_NAMES = {"dask": "dask-core", "matplotlib": "matplotlib-base", "snakemake": "snakemake-minimal"}

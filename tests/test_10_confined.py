@@ -234,10 +234,10 @@ _CHANGES_BY_NAME = {
 }
 _ELSEWHERE = {
     ("common/processes.py", "os.open"): "folders that Landlock is told of, opened without following by their names",
-    ("views/cli.py", "os.open"): "/dev/null",
+    ("cli.py", "os.open"): "/dev/null",
     ("views/report/step.py", "shutil.copyfile"): "from a temporary folder into a replacement",
-    ("pipeline/design/rehearsal.py", "shutil.copyfile"): "into a campaign folder that was just made",
-    ("pipeline/opening/writing.py", "shutil.copyfile"): "into a replacement of the whole campaign folder",
+    ("tools/design/rehearsal.py", "shutil.copyfile"): "into a campaign folder that was just made",
+    ("tools/write_campaign.py", "shutil.copyfile"): "into a replacement of the whole campaign folder",
 }
 
 

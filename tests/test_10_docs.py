@@ -106,7 +106,7 @@ def test_every_dotted_name_in_a_document_resolves():
 def test_every_command_that_a_document_gives_exists():
     from typer.main import get_command
 
-    from apertura.views.cli import app
+    from apertura.cli import app
 
     root = get_command(app)
     commands = {name: root.get_command(None, name) for name in root.list_commands(None)}
@@ -165,9 +165,9 @@ def test_the_layers_told_to_contributors_are_those_that_imports_are_checked_agai
     contracts = tomllib.loads(text_of(ROOT / "pyproject.toml"))["tool"]["importlinter"]["contracts"]
     checked = [set(re.findall(r"apertura\.([a-z]+)", layer)) for layer in contracts[0]["layers"]]
     table = text_of(ROOT / "CONTRIBUTING.md").partition("| layer of")[2]
-    rows = re.findall(r"^\| (`[^|]*/`) \| ([^|]*)\|", table, re.M)[: len(checked) - 2]
-    assert [set(re.findall(r"`(\w+)/`", layer)) for layer, _ in rows] == [names for names in checked if names]
-    for names, (_, packages) in zip(filter(None, checked), rows, strict=True):
+    rows = re.findall(r"^\| (`[^|]*/`) \| ([^|]*)\|", table, re.M)[: len(checked) - 3]
+    assert [set(re.findall(r"`(\w+)/`", layer)) for layer, _ in rows] == [names for names in checked if names - {"cli"}]
+    for names, (_, packages) in zip([names for names in checked if names - {"cli"}], rows, strict=True):
         for package in re.findall(r"`(\w+)/`", packages):
             assert any((ROOT / "src/apertura" / layer / package).is_dir() for layer in names), package
 

@@ -7,11 +7,11 @@ import tracemalloc
 import pytest
 from folders import complaint
 
+from apertura.campaign.config import read_settings
+from apertura.campaign.config.template import config_template
 from apertura.common.confined import ConfinedPath
 from apertura.common.documents import DEEPEST, LARGEST_YAML, read_json, read_yaml, undamaged
 from apertura.common.errors import CampaignError, quoted, shown
-from apertura.pipeline.config import read_settings
-from apertura.pipeline.config.template import config_template
 
 BOMB = "a0: &a0 [x, y]\n" + "".join(f"a{n + 1}: &a{n + 1} [{', '.join([f'*a{n}'] * 9)}]\n" for n in range(20))
 

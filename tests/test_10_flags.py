@@ -49,7 +49,7 @@ def test_the_page_from_symptom_to_remedy_names_flags_that_exist_and_those_that_s
     named = {flag for row in rows for flag in re.findall(r"`(\w+)`", row[1])}
     assert all(re.findall(r"`\w+`", row[1]) and row[2].strip(" |") for row in rows)
     assert named <= set(FLAGS)
-    from apertura.pipeline.steps.assess import _LOOKS_WRONG
+    from apertura.stages.assess import _LOOKS_WRONG
 
     assert {*_LOOKS_WRONG, "attitude_suspect", "outside_swath", "accuracy_missed", "wrong_code"} <= named
 

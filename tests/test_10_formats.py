@@ -6,6 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from apertura.campaign.config import Flight, PulseWaveform, read_flights, read_segments
+from apertura.campaign.config.flights import read_clocks
 from apertura.common.errors import CampaignError
 from apertura.common.leap_seconds import gps_ahead_s
 from apertura.formats.beam_pattern import read_beam_pattern
@@ -15,8 +17,6 @@ from apertura.formats.recordings.sample_file import EDGE, SETTLING, SampleLayout
 from apertura.formats.recordings.sigmf import Capture, Global, SigmfCollection, SigmfFraming
 from apertura.formats.tracks.log_options import LogOptions
 from apertura.formats.tracks.track import FIXES
-from apertura.pipeline.config import Flight, PulseWaveform, read_flights, read_segments
-from apertura.pipeline.config.flights import read_clocks
 
 TEXT = (Path(__file__).parents[1] / "docs/formats.md").read_text(encoding="utf-8")
 

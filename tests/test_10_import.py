@@ -27,18 +27,18 @@ def test_importing_apertura_loads_no_library():
 
 
 def test_the_command_line_loads_no_library_of_a_step():
-    assert not HEAVY & loaded_by("import apertura.views.cli")
-    assert "typer" in loaded_by("import apertura.views.cli")
+    assert not HEAVY & loaded_by("import apertura.cli")
+    assert "typer" in loaded_by("import apertura.cli")
 
 
 def test_reading_a_config_loads_no_arrays():
-    assert not (HEAVY - {"pydantic"}) & loaded_by("import apertura.pipeline.campaign")
+    assert not (HEAVY - {"pydantic"}) & loaded_by("import apertura.campaign.folder")
 
 
 def test_a_step_over_level_ground_loads_neither_a_compiler_nor_transforms():
     """Each costs a tenth of a second of every job."""
     heavy = {"numba", "scipy.fft", "scipy.ndimage", "scipy.special"}
-    loaded_by(f"import sys, apertura.pipeline.steps.layers\nassert not {heavy} & set(sys.modules)")
+    loaded_by(f"import sys, apertura.stages.layers\nassert not {heavy} & set(sys.modules)")
 
 
 def test_every_public_name_is_documented_and_listed():
@@ -64,6 +64,6 @@ def test_the_version_is_printed_and_is_what_the_build_reads():
     source = Path(apertura.__file__).read_text(encoding="utf-8")
     assert re.search(r'^__version__ = "(.+)"$', source, re.MULTILINE)[1] == apertura.__version__
     for words in (["--version"],):
-        command = [sys.executable, "-c", "from apertura.views.cli import main; main()", *words]
+        command = [sys.executable, "-c", "from apertura.cli import main; main()", *words]
         printed = subprocess.run(command, capture_output=True, text=True, check=True).stdout
         assert printed == f"{apertura.__version__}\n"

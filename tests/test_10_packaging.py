@@ -10,8 +10,8 @@ import pytest
 import yaml
 
 import apertura
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.check import problems
+from apertura.campaign.folder import Campaign
+from apertura.check import problems
 from apertura.simulation import simulate
 from apertura.simulation.specification import read_specification
 

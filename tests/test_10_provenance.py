@@ -52,23 +52,23 @@ def changes(copied, file, *modules):
         ("formats/tracks/rtklib.py", "ingest", False),
         ("simulation/presets.py", "image", False),
         ("common/constants.py", "image", True),
-        ("pipeline/config/nodes.py", "ingest", True),
-        ("pipeline/store/progress.py", "ingest", True),
+        ("campaign/config/nodes.py", "ingest", True),
+        ("campaign/store/progress.py", "ingest", True),
         ("common/errors.py", "image", False),
         ("formats/names.py", "ingest", True),
         ("formats/tracks/px4_ulog.py", "ingest", False),
-        ("views/cli.py", "ingest", False),
+        ("cli.py", "ingest", False),
     ],
 )
 def test_editing_a_module_changes_what_depends_on_it_and_nothing_else(copied, edited, step, reruns):
-    assert changes(copied, edited, f"apertura.pipeline.steps.{step}", *RUN.get(step, ())) is reruns
+    assert changes(copied, edited, f"apertura.stages.{step}", *RUN.get(step, ())) is reruns
 
 
 @pytest.mark.parametrize(("step", "reruns"), [("image", True), ("echo", False)])
 def test_compiling_other_sources_changes_what_runs_them(copied, step, reruns):
     digests = copied / "core/backprojection/engines/_backprojection.sha256"
     digests.write_text("of other sources")
-    assert changes(copied, digests, f"apertura.pipeline.steps.{step}", *RUN.get(step, ())) is reruns
+    assert changes(copied, digests, f"apertura.stages.{step}", *RUN.get(step, ())) is reruns
 
 
 LOADED = """
@@ -77,7 +77,7 @@ from apertura.common.code_imports import WITHOUT_EFFECT
 for name in WITHOUT_EFFECT:
     __import__(name)
 before = set(sys.modules)
-import apertura.pipeline.steps.image
+import apertura.stages.image
 ours = {name: module for name, module in sys.modules.items() if name.partition(".")[0] == "apertura"}
 print(json.dumps([name for name, module in ours.items() if name not in before and not hasattr(module, "__path__")]))
 """
@@ -88,11 +88,11 @@ def test_every_module_that_an_import_loads_is_in_the_closure():
     shown = subprocess.run([sys.executable, "-c", LOADED], check=True, capture_output=True, text=True)
     loaded = set(json.loads(shown.stdout))
     assert {
-        "apertura.pipeline.store.stages",
+        "apertura.campaign.store.stages",
         "apertura.core.backprojection.tiles",
         "apertura.core.geometry.aperture",
     } <= loaded
-    assert loaded <= set(import_closure(["apertura.pipeline.steps.image"]))
+    assert loaded <= set(import_closure(["apertura.stages.image"]))
 
 
 def test_a_module_of_another_package_counts_with_what_it_imports_of_apertura(monkeypatch, copied):

@@ -14,11 +14,7 @@ import pytest
 import xarray as xr
 import zarr
 
-from apertura.common.contracts import STAGES, check
-from apertura.common.errors import CampaignError, ContractError
-from apertura.common.provenance import sha256_tree
-from apertura.pipeline.steps.stamping import stamp
-from apertura.pipeline.store import (
+from apertura.campaign.store import (
     finish,
     manifest_of,
     mark_rewritten,
@@ -33,8 +29,12 @@ from apertura.pipeline.store import (
     write_blocks,
     writing,
 )
-from apertura.pipeline.store.chunks import StageStore
-from apertura.pipeline.store.manifest import check_stage
+from apertura.campaign.store.chunks import StageStore
+from apertura.campaign.store.manifest import check_stage
+from apertura.common.contracts import STAGES, check
+from apertura.common.errors import CampaignError, ContractError
+from apertura.common.provenance import sha256_tree
+from apertura.stages.stamping import stamp
 
 NOTHING = {"runspec": {}, "inputs": {}, "code_sha256": "0"}
 
@@ -271,7 +271,7 @@ def test_no_name_in_work_of_a_stranger_removes_anything_else(tmp_path):
 
 
 def test_a_second_writer_waits_for_the_first(tmp_path):
-    holder = "from apertura.pipeline.store import writing\nfrom pathlib import Path\nimport sys, time\n"
+    holder = "from apertura.campaign.store import writing\nfrom pathlib import Path\nimport sys, time\n"
     holder += "with writing(Path(sys.argv[1])):\n    print('held', flush=True)\n    time.sleep(1.5)\n"
     with subprocess.Popen(
         [sys.executable, "-c", holder, str(tmp_path / "image.zarr")], stdout=subprocess.PIPE, text=True

@@ -10,11 +10,11 @@ import pytest
 import zarr
 from folders import complaint, require_files
 
+from apertura.campaign.folder import Campaign
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.contracts import check
 from apertura.common.errors import CampaignError
 from apertura.formats.reading import read_phase_history
-from apertura.pipeline.campaign import Campaign
 
 pytestmark = pytest.mark.usefixtures("reader")
 

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.io import savemat
 
+from apertura.campaign.folder import Campaign
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.contracts import check
 from apertura.common.errors import CampaignError
@@ -21,7 +22,6 @@ from apertura.formats.recordings.recording import Captures, Recording
 from apertura.formats.recordings.sample_file import SampleFile
 from apertura.formats.tracks.log_options import LogOptions
 from apertura.formats.tracks.track import make_track
-from apertura.pipeline.campaign import Campaign
 
 QUICK = settings(max_examples=30, deadline=None, derandomize=True)
 EPOCHS = st.lists(

@@ -9,20 +9,20 @@ import pytest
 import sigmf
 from folders import complaint, copy_writable, edit_meta, small_simulation
 
+from apertura.campaign.folder import Campaign
+from apertura.campaign.store import open_stage
+from apertura.check.examination import Examination
+from apertura.check.files import check_files
+from apertura.check.recordings import check_recordings
 from apertura.common.contracts import check
 from apertura.common.errors import CampaignError
 from apertura.core.echo.captures import SATURATED_SHARE, Saturation
 from apertura.formats.names import recording_files
 from apertura.formats.reading import open_recording
 from apertura.formats.recordings.sample_file import EDGE, SETTLING, Mixing, SampleFile, SampleLayout
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.check.files import check_files
-from apertura.pipeline.check.recordings import check_recordings
-from apertura.pipeline.examination.campaign import Examination
-from apertura.pipeline.opening.echo import PairEcho
-from apertura.pipeline.steps import echo, ingest
-from apertura.pipeline.store import open_stage
 from apertura.simulation.campaign import write_campaign
+from apertura.stages import echo, ingest
+from apertura.stages.transfer import PairEcho
 from apertura.views.inspect.look import look
 
 RATE_HZ, DFT = 64e6, 256

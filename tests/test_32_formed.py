@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from folders import complaint, contents, copy_writable, ingest_all, make_images, settle_ground, state
 
+from apertura.campaign.folder import Campaign
+from apertura.campaign.store import open_stage
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.backprojection.inputs import PhaseHistory
 from apertura.core.echo.demodulate import remove_path
@@ -14,14 +16,12 @@ from apertura.core.geometry.aperture import Aperture
 from apertura.core.imaging.range_profiles import CompressionError, range_compress
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import FlatGround
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.opening.acquisition import open_acquisition
-from apertura.pipeline.opening.echo import PairEcho
-from apertura.pipeline.opening.transmitted import transmitted
-from apertura.pipeline.steps import echo
-from apertura.pipeline.store import open_stage
 from apertura.simulation import ImageGrid, preset, simulate
 from apertura.simulation.impairments import Clock
+from apertura.stages import echo, transfer
+from apertura.stages.acquisition import open_acquisition
+from apertura.stages.transfer import PairEcho
+from apertura.stages.transmitted import transmitted
 
 PAIRS = "uav1-uav1", "uav1-uav2"
 
@@ -47,7 +47,7 @@ def formed(root, tmp_path, name, **processing):
 def test_what_is_formed_is_what_a_stage_keeps_to_the_bit(drifting, tmp_path, method):
     campaign = formed(drifting, tmp_path, "a", sidelink=method)
     for pair in PAIRS:
-        echo.transfer(campaign, "f01", pair)
+        transfer.transfer(campaign, "f01", pair)
         stage, kept = PairEcho.opened(campaign, "f01", pair).stage, open_stage(kept_of(campaign, pair), "transfer")
         assert "transfer" not in open_stage(campaign.stage("echo", "f01", pair), "echo")
         np.testing.assert_array_equal(stage.transfer.values, kept.transfer.values)
@@ -89,7 +89,7 @@ def test_profiles_and_images_of_what_was_kept_are_those_of_the_recording_to_the_
     for lost in (False, True):
         campaign = formed(drifting, tmp_path, f"lost {lost}", window="none")
         for pair in PAIRS:
-            echo.transfer(campaign, "f01", pair)
+            transfer.transfer(campaign, "f01", pair)
         if lost:
             for path in (campaign.root / "raw/f01").glob("*.sigmf-data"):
                 path.unlink()
@@ -101,7 +101,7 @@ def test_profiles_and_images_of_what_was_kept_are_those_of_the_recording_to_the_
 
 def test_what_was_kept_of_another_echo_is_not_read(drifting, tmp_path):
     campaign = formed(drifting, tmp_path, "a")
-    echo.transfer(campaign, "f01", "uav1-uav2")
+    transfer.transfer(campaign, "f01", "uav1-uav2")
     campaign = state(campaign.root, "processing", sidelink="gated")
     echo.echo(campaign, "f01", "uav1-uav2")
     (campaign.root / "raw/f01/uav2.sigmf-data").unlink()

@@ -4,17 +4,17 @@ import numpy as np
 import pytest
 import yaml
 
+from apertura.campaign.config import PulseWaveform, validated
+from apertura.campaign.folder import Campaign
 from apertura.common.errors import CampaignError
 from apertura.core.echo.captures import blocks_of
 from apertura.core.echo.demodulate import Numerology, demodulate
 from apertura.core.echo.pulse_filter import occupied_band, pulse_filter, pulse_spectrum, truncation_flags
 from apertura.core.echo.transfer import transfer_by_sidelink
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.config import PulseWaveform, validated
-from apertura.pipeline.opening.transmitted import read_pulse, transmitted
 from apertura.simulation.echoes import Paths
 from apertura.simulation.synthesis import Channel, samples
 from apertura.simulation.waveform import TransmitPulse, pulse_samples
+from apertura.stages.transmitted import read_pulse, transmitted
 
 RATE = 256e6
 SIZES = {"bandwidth_hz": 128e6, "pulse_s": 2e-6, "sample_rate_hz": RATE}

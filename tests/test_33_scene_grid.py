@@ -9,6 +9,8 @@ from hypothesis import strategies as st
 from pyproj import Geod, Transformer
 from scenes import UTM_GRID
 
+from apertura.campaign.config import Scene
+from apertura.campaign.folder import Campaign
 from apertura.common.errors import CampaignError
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.geodesy import ecef_from_geodetic, ecef_from_projected, projected_from_ecef
@@ -17,9 +19,7 @@ from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.map_crs import block
 from apertura.core.scene.swath import swath
 from apertura.core.scene.terrain import FlatGround
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.config import Scene
-from apertura.pipeline.opening.scene import Flown, settled
+from apertura.stages.scene import Flown, settled
 
 
 def test_places_above_the_scene_come_back_as_rows_columns_and_heights():

@@ -8,6 +8,7 @@ import pytest
 from apertura_research.autofocus.cases import GRID, case
 from apertura_research.autofocus.outcomes import judge
 
+from apertura.campaign.config import Node
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.antenna.beam import Beams
 from apertura.core.backprojection.contributions import block_contributions
@@ -26,7 +27,6 @@ from apertura.methods.autofocus.objective import Sharpness
 from apertura.methods.autofocus.patches import LEAST_RATIO, bright_places, looks_of, sampled_looks
 from apertura.methods.autofocus.refine import TrackSearch, refine
 from apertura.methods.autofocus.solve import effects
-from apertura.pipeline.config import Node
 
 FREQUENCY_HZ = 1.2e9 + 3.2e6 * np.arange(128)
 TIME_S = np.linspace(0, 30, 300)

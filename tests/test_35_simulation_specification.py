@@ -8,9 +8,10 @@ import yaml
 from folders import contents, recordings_of, require_files, small_simulation
 from typer.testing import CliRunner
 
+from apertura.campaign.folder import Campaign
+from apertura.cli import app
 from apertura.common.errors import CampaignError
 from apertura.core.geometry.geodesy import projected_from_ecef
-from apertura.pipeline.campaign import Campaign
 from apertura.simulation import preset, read_specification, simulate, specification_text
 from apertura.simulation.impairments import Impairments, TimeTag, UniformPhase
 from apertura.simulation.presets import PRESETS
@@ -22,7 +23,6 @@ from apertura.simulation.specification import (
     SimulatedNode,
 )
 from apertura.simulation.waveform import WaveformSpecification
-from apertura.views.cli import app
 
 
 @pytest.mark.quick("demo", "paper", "swarm", "continuous", "flight", "paper-lab")

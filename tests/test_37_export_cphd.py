@@ -10,17 +10,17 @@ import sarkit.verification
 import yaml
 from folders import edit_config, make_images, settle_ground
 
+from apertura.campaign.folder import Campaign
+from apertura.campaign.store import open_stage
+from apertura.check import problems
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.geometry.geodesy import ecef_from_geodetic, ned_axes
 from apertura.formats.export.cphd import CphdCollection, write_cphd
 from apertura.formats.reading import read_phase_history
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.check import problems
-from apertura.pipeline.lineage import on_demand, results_of
-from apertura.pipeline.opening.echo import PairEcho
-from apertura.pipeline.stale import stale_results
-from apertura.pipeline.steps import cphd, echo, tracks
-from apertura.pipeline.store import open_stage
+from apertura.stages import cphd, echo, tracks
+from apertura.stages.transfer import PairEcho
+from apertura.workflow.lineage import on_demand, results_of
+from apertura.workflow.stale import stale_results
 
 AT = np.array([48.0, 11.0, 600.0])
 

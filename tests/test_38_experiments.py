@@ -23,11 +23,11 @@ from apertura_research.paper.fusion import (
 from apertura_research.paper.losses import ERRORS
 from folders import recordings_of, run_steps
 
+from apertura.campaign.folder import Campaign
 from apertura.core.quality.measures import coherence_factor
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.steps import echo, ingest
 from apertura.simulation import preset, simulate
 from apertura.simulation.presets import GAP_M, SEGMENT_M
+from apertura.stages import echo, ingest
 
 PULSES = 16
 

@@ -5,8 +5,8 @@ import csv
 import pytest
 from folders import copy_writable
 
-from apertura.pipeline.campaign import Campaign
-from apertura.views.chart.whole import Whole, draw_whole, spread_db, whole_chart
+from apertura.campaign.folder import Campaign
+from apertura.tools.chart.whole import Whole, draw_whole, spread_db, whole_chart
 
 
 def whole(setting="a", *, loss_db=-0.1):

@@ -13,10 +13,10 @@ from apertura.core.geometry.aperture import Aperture
 from apertura.core.imaging.resolution import Resolution
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import FlatGround, Plane
-from apertura.pipeline.config.flight_plan import FlightPlan, read_flight_plan
-from apertura.pipeline.design import designed
-from apertura.pipeline.design.judgement import helpful_changes, judge, refinement_line, search, tried_report
-from apertura.pipeline.opening.planned import open_plan
+from apertura.tools.design import designed
+from apertura.tools.design.flight_plan import FlightPlan, read_flight_plan
+from apertura.tools.design.judgement import helpful_changes, judge, refinement_line, search, tried_report
+from apertura.tools.design.planned import open_plan
 
 HERE = Path()
 CARRIER, SPACING, COUNT = 1.3e9, 4e5, 512

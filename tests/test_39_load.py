@@ -8,13 +8,13 @@ import pytest
 import rasterio
 from folders import complaint, copy_writable, edit_config, ingest_all
 
+from apertura.campaign.folder import Campaign
+from apertura.campaign.store import record_files
 from apertura.common.errors import CampaignError
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.opening.pair import open_pair
-from apertura.pipeline.opening.results import OpenCampaign, open_campaign
-from apertura.pipeline.opening.scene import expected_scene, settled_scene
-from apertura.pipeline.steps import echo, scene
-from apertura.pipeline.store import record_files
+from apertura.stages import echo, scene
+from apertura.stages.pair import open_pair
+from apertura.stages.scene import expected_scene, settled_scene
+from apertura.tools.open_campaign import OpenCampaign, open_campaign
 from apertura.views.plan import first_flight
 from apertura.views.score import score
 

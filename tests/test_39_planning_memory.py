@@ -7,7 +7,7 @@ from scenes import monostatic, plan, straight_track
 
 from apertura.common.errors import CampaignError
 from apertura.core.planning.plan import memory_limit
-from apertura.pipeline.opening.plan import check_fits
+from apertura.stages.planning import check_fits
 
 
 def test_a_job_that_does_not_fit_is_refused_with_the_numbers():

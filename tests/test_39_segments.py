@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from folders import ingest_all
 
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.lineage import result_of
-from apertura.pipeline.opening.pair import open_pair
-from apertura.pipeline.steps import echo
-from apertura.pipeline.store import open_stage
+from apertura.campaign.folder import Campaign
+from apertura.campaign.store import open_stage
 from apertura.simulation import preset, simulate
+from apertura.stages import echo
+from apertura.stages.pair import open_pair
+from apertura.workflow.lineage import result_of
 
 FIRST = np.datetime64("2025-05-14T09:30:00")
 HEADING = "flight\tpair\tstart\tend\n"

@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import apertura as ap
+from apertura.campaign.folder import Campaign
 from apertura.core.geometry.geodesy import geodetic_from_ecef
 from apertura.formats.reading import open_recording
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.opening.reading import read_log
+from apertura.stages.node_log import read_log
 
 WAVEFORM = {
     "kind": "ofdm",

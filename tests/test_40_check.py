@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from folders import ROOT, edit_config, edit_data, edit_meta
 
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.check import CHECKS, as_line, assumptions, print_findings, print_problems, problems
-from apertura.pipeline.check.recordings import odd_interval_s
-from apertura.pipeline.examination.campaign import Examination
+from apertura.campaign.folder import Campaign
+from apertura.check import CHECKS, as_line, assumptions, print_findings, print_problems, problems
+from apertura.check.examination import Examination
+from apertura.check.recordings import odd_interval_s
 from apertura.simulation import PRESETS, preset, simulate
 
 EVERY_SECOND = np.timedelta64(50, "ms") * np.arange(0, 80, 2)
@@ -127,7 +127,7 @@ def test_samples_are_not_read(tiny):
 @pytest.mark.slow
 def test_no_library_is_imported_that_headers_do_not_need(tiny):
     heavy = ("zarr", "matplotlib", "scipy.io", "rasterio", "snakemake", "jsonschema")
-    code = f"import sys; from apertura.pipeline.check import problems; assert problems({str(tiny)!r}) == []"
+    code = f"import sys; from apertura.check import problems; assert problems({str(tiny)!r}) == []"
     code += "; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert sorted(set(heavy) & set(done.stdout.split())) == []

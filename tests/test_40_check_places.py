@@ -9,14 +9,14 @@ import rasterio
 from folders import edit_config, edit_track
 from rasterio.transform import from_origin
 
+from apertura.campaign.folder import Campaign
+from apertura.check import as_line, problems, resources
+from apertura.check.georeferencing import needles
+from apertura.check.hints import likely_cause
 from apertura.common.confined import ConfinedPath
 from apertura.core.geometry.geodesy import projected_from_ecef
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.check import as_line, problems, resources
-from apertura.pipeline.check.hints import likely_cause
-from apertura.pipeline.check.scene import needles
-from apertura.pipeline.opening.reading import read_log
 from apertura.simulation.presets import DEMO_ORIGIN
+from apertura.stages.node_log import read_log
 
 TX, RX = "raw/f01/uav1.track.csv", "raw/f01/uav2.track.pos"
 

@@ -6,11 +6,11 @@ import rasterio
 from folders import edit_config, edit_meta, edit_track, run_steps, state
 from rasterio.transform import from_origin
 
+from apertura.campaign.folder import Campaign
+from apertura.check import problems
 from apertura.common.errors import CampaignError
 from apertura.core.geometry.geodesy import map_from_frame
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.check import problems
-from apertura.pipeline.opening.reading import read_log
+from apertura.stages.node_log import read_log
 
 
 def processing(**keys):

@@ -10,17 +10,17 @@ import pytest
 import yaml
 from folders import copy_writable, require_files
 
+from apertura.campaign.config.config import validated
+from apertura.campaign.folder import Campaign
+from apertura.check import problems
+from apertura.check.examination import Examination
+from apertura.check.files import check_links
 from apertura.common.errors import CampaignError
 from apertura.common.provenance import sha256_file
 from apertura.core.geometry.geodesy import local_crs
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.check import problems
-from apertura.pipeline.check.files import check_links
-from apertura.pipeline.config.config import validated
-from apertura.pipeline.examination.campaign import Examination
-from apertura.pipeline.headers import Headers
-from apertura.pipeline.lineage import results_of
-from apertura.pipeline.steps import ingest
+from apertura.stages import ingest
+from apertura.workflow.headers import Headers
+from apertura.workflow.lineage import results_of
 
 
 def edit(root, key, value, *, load=True):

@@ -5,13 +5,13 @@ from inspect import signature
 
 import pytest
 
+from apertura.campaign.folder import Campaign
 from apertura.formats.catalog import CATALOG, CRATE
 from apertura.formats.export import COVERAGE, MAP, PHASE_HISTORY
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.headers import Headers
-from apertura.pipeline.lineage import places_of
-from apertura.pipeline.rules import RESULTS, RULES
-from apertura.views.step_commands import app
+from apertura.tools.step_commands import app
+from apertura.workflow.headers import Headers
+from apertura.workflow.lineage import places_of
+from apertura.workflow.rules import RESULTS, RULES
 
 
 @pytest.mark.parametrize("rule", RULES.values(), ids=list(RULES))

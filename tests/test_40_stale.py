@@ -9,16 +9,19 @@ import pytest
 import yaml
 from folders import copy_writable, state
 
+from apertura.campaign.digests import Sources, digest_of
+from apertura.campaign.folder import Campaign
+from apertura.check import problems
 from apertura.common.errors import CampaignError
 from apertura.common.processes import hold
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.check import problems
-from apertura.pipeline.digests import Sources, digest_of
-from apertura.pipeline.lineage import modules_of, on_demand, results_of
-from apertura.pipeline.opening.scene import expected_scene
-from apertura.pipeline.resources import Resources
-from apertura.pipeline.rules import RESULTS
-from apertura.pipeline.stale import (
+from apertura.stages import echo, ingest, scene, transfer
+from apertura.stages.scene import expected_scene
+from apertura.views.plan import first_flight, print_plan
+from apertura.views.summary import print_summary
+from apertura.workflow.lineage import modules_of, on_demand, results_of
+from apertura.workflow.resources import Resources
+from apertura.workflow.rules import RESULTS
+from apertura.workflow.stale import (
     absent_files,
     absent_lines,
     any_is_missing,
@@ -29,9 +32,6 @@ from apertura.pipeline.stale import (
     wanted_files,
     without_outdated,
 )
-from apertura.pipeline.steps import echo, ingest, scene
-from apertura.views.plan import first_flight, print_plan
-from apertura.views.summary import print_summary
 
 LOG = "raw/f01/uav2.track.pos"
 
@@ -109,7 +109,7 @@ def test_samples_replaced_under_their_old_time_and_size_are_noticed_although_the
 def test_a_hash_is_taken_once_per_state_of_a_file_and_again_when_asked(tmp_path, monkeypatch):
     path = tmp_path / "raw.bin"
     path.write_bytes(bytes(100_000))
-    monkeypatch.setattr("apertura.pipeline.digests._SETTLED_S", -1.0)
+    monkeypatch.setattr("apertura.campaign.digests._SETTLED_S", -1.0)
     first, kept = digest_of(tmp_path, "raw.bin"), tmp_path / "results/.hashes/raw.bin.json"
     forged = json.loads(kept.read_text()) | {"sha256": "0" * 64}
     kept.write_text(json.dumps(forged))
@@ -166,7 +166,7 @@ def test_other_code_makes_stale_what_it_makes(finished, monkeypatch):
     def other(campaign, result, *where):
         return ("apertura.common.constants",) if result == "profile" else modules_of(campaign, result, *where)
 
-    monkeypatch.setattr("apertura.pipeline.lineage.modules_of", other)
+    monkeypatch.setattr("apertura.workflow.lineage.modules_of", other)
     found = stale_results(Campaign.load(finished))
     assert found["results/f01/uav1-uav1/profile.manifest.json"] == "its code has changed"
     assert not {"raw", "track", "echo", "scene"} & names(found)
@@ -262,8 +262,8 @@ def test_a_report_that_was_edited_is_not_believed(finished):
 def test_a_damaged_document_is_not_read(finished, file):
     path = finished / "results" / file
     path.write_text(path.read_text().replace("1", "2", 1))
-    from apertura.pipeline.opening.images import assessment_of
-    from apertura.pipeline.opening.scene import settled_scene
+    from apertura.stages.agreement import assessment_of
+    from apertura.stages.scene import settled_scene
 
     campaign = Campaign.load(finished)
     with pytest.raises(CampaignError, match=r"not as they were written, first .*Delete .*manifest\.json"):
@@ -312,7 +312,7 @@ def test_results_are_told_from_stale_ones_where_all_of_raw_was_left_behind(finis
 def test_an_image_is_made_again_of_what_was_kept_of_a_recording_and_of_nothing_else(finished):
     campaign = Campaign.load(finished)
     for pair in ("uav1-uav1", "uav1-uav2"):
-        echo.transfer(campaign, "f01", pair)
+        transfer.transfer(campaign, "f01", pair)
     archive(finished)
     campaign = state(finished, "processing", engine="numba")
     assert "image" in names(stale_results(campaign))
@@ -332,7 +332,7 @@ def test_what_is_kept_overtakes_no_other_result_whether_it_is_asked_for_or_no_lo
     assert not on_demand(campaign, kept)
     assert any_is_missing(campaign)
     for pair in ("uav1-uav1", "uav1-uav2"):
-        echo.transfer(campaign, "f01", pair)
+        transfer.transfer(campaign, "f01", pair)
     assert not any_is_missing(campaign)
     campaign = state(finished, "processing", keep=[])
     assert names(stale_results(campaign)) == {"ro_crate"}

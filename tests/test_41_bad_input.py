@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from folders import complaint, edit_config, edit_data, edit_meta, edit_track, ingest_all, require_files
 
+from apertura.campaign.folder import Campaign
 from apertura.formats.recordings.sample_file import SampleFile
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.opening.pair import open_pair
-from apertura.pipeline.steps import echo, ingest, profile, scene
+from apertura.stages import echo, ingest, profile, scene
+from apertura.stages.pair import open_pair
 
 
 def nothing_half_written(root):

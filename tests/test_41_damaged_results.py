@@ -5,12 +5,12 @@ import re
 import pytest
 from folders import complaint, edit_config
 
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.opening.images import assessment_of
-from apertura.pipeline.opening.results import open_campaign
-from apertura.pipeline.opening.scene import settled_scene
-from apertura.pipeline.steps.calibration import calibrated
-from apertura.pipeline.store import manifest_of, record_files, save_document
+from apertura.campaign.folder import Campaign
+from apertura.campaign.store import manifest_of, record_files, save_document
+from apertura.stages.agreement import assessment_of
+from apertura.stages.calibration import calibrated
+from apertura.stages.scene import settled_scene
+from apertura.tools.open_campaign import open_campaign
 from apertura.views.score import score
 from apertura.views.summary import print_summary
 

@@ -17,6 +17,9 @@ from rasterio import Affine
 from rasterio.transform import from_origin
 from scipy.io import savemat, wavfile
 
+from apertura.campaign.config import read_segments
+from apertura.campaign.folder import Campaign
+from apertura.check import problems
 from apertura.core.echo.dechirp import FrequencySweep, transfer_of
 from apertura.core.geometry.geodesy import ecef_from_geodetic
 from apertura.core.scene.dem import height_range, open_dem
@@ -25,11 +28,8 @@ from apertura.formats.phase_histories.pulson import MESSAGE, SAMPLE_RATE_HZ
 from apertura.formats.reading import read_phase_history, read_track
 from apertura.formats.recordings.sigmf import open_sigmf
 from apertura.formats.tracks.log_options import LogOptions
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.check import problems
-from apertura.pipeline.config import read_segments
-from apertura.pipeline.opening.transmitted import read_codes, read_framing
-from apertura.pipeline.steps import ingest
+from apertura.stages import ingest
+from apertura.stages.transmitted import read_codes, read_framing
 from tests.attack import logs
 
 # The campaign folder

@@ -9,6 +9,10 @@ from bench_setups import FLIGHT, RADAR_M, RECEIVED, RIGHT, SIDELINK_M, SPOILT, S
 from folders import edit_config
 
 import apertura as ap
+from apertura.campaign.folder import Campaign
+from apertura.campaign.store import open_stage
+from apertura.check import problems
+from apertura.cli import main
 from apertura.common.errors import CampaignError
 from apertura.common.flag_table import FLAGS
 from apertura.core.echo.demodulate import Numerology
@@ -16,16 +20,12 @@ from apertura.core.geometry.aperture import Aperture
 from apertura.core.planning.plan import no_aperture
 from apertura.methods.synchronisation.channels import measure_channel
 from apertura.methods.synchronisation.links import measure_link
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.check import problems
-from apertura.pipeline.opening.bench import Bench, measure_bench
-from apertura.pipeline.steps import echo, ingest
-from apertura.pipeline.store import open_stage
 from apertura.simulation import Impairments, preset
 from apertura.simulation.campaign import write_campaign
 from apertura.simulation.scene import Waypoints
-from apertura.views.cli import main
-from apertura.views.report.bench import PAGE, PICTURE, REPORT, print_bench
+from apertura.stages import echo, ingest
+from apertura.tools.bench.measurement import Bench, measure_bench
+from apertura.tools.bench.report import PAGE, PICTURE, REPORT, print_bench
 
 QUICK = ("reference unlocked", "sidelink leaks", "I and Q swapped", "cable warms up", "split unequal")
 

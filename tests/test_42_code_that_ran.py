@@ -7,11 +7,11 @@ import threading
 
 import pytest
 
+from apertura.campaign.folder import Campaign
 from apertura.common.code_imports import PACKAGE, WITHOUT_EFFECT, import_closure
 from apertura.common.provenance import code_sha256
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.lineage import places_of, result_of
-from apertura.pipeline.rules import RESULTS
+from apertura.workflow.lineage import places_of, result_of
+from apertura.workflow.rules import RESULTS
 
 NOT_RUN = {"track", "report", "speed_accuracy", "whole"}
 """Made by the step of another result, by Snakemake itself, or by whole runs."""
@@ -72,10 +72,10 @@ CHANGES = [
     ("views/webmap/server.py", "code", set()),  # what a browser is shown, of results that are there
     ("common/flag_table.py", "code", {"page", "report", "map"}),
     ("common/errors.py", "code", set()),
-    ("pipeline/config/nodes.py", "docstring", set()),
+    ("campaign/config/nodes.py", "docstring", set()),
     ("core/echo/dechirp.py", "docstring", set()),
     ("formats/export/cog.py", "code", {"export", "fused", "layers", "mosaic", "pictures_fused"}),
-    ("pipeline/rules.py", "code", set()),  # sources and settings are compared for themselves
+    ("workflow/rules.py", "code", set()),  # sources and settings are compared for themselves
     ("core/backprojection/engines/numba.py", "comment", set()),
     ("core/backprojection/engines/numba.py", "code", FOCUSED),
     ("common/constants.py", "code", EVERY),

@@ -9,16 +9,16 @@ import pytest
 import yaml
 from folders import ROOT, complaint, edit_config, run_steps
 
+from apertura.campaign.config import validated
+from apertura.campaign.folder import Campaign
+from apertura.campaign.store import open_stage
+from apertura.check import problems
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.echo.dechirp import FrequencySweep, transfer_of
 from apertura.core.quality.point_targets import find_peak
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.check import problems
-from apertura.pipeline.config import validated
-from apertura.pipeline.opening.pair import recorded_echo
-from apertura.pipeline.opening.scene import open_scene
-from apertura.pipeline.store import open_stage
 from apertura.simulation.fmcw import FmcwFlight, write_fmcw_campaign
+from apertura.stages.scene import open_scene
+from apertura.stages.transfer import recorded_echo
 
 FAST = FrequencySweep(2.2e9, 400e6, 20e-6, 25e6)
 """400 MHz about 2.4 GHz in 20 µs: gamma 2e13 Hz/s, real beats to 12.5 MHz, which are 187 m of path."""

@@ -8,15 +8,15 @@ import xarray as xr
 import yaml
 from folders import complaint, edit_config, run_steps
 
+from apertura.campaign.folder import Campaign
+from apertura.campaign.store import open_stage
+from apertura.check import problems
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.geometry.geodesy import ecef_from_projected, geodetic_from_ecef
 from apertura.formats.names import PHASE_HISTORIES, HistoryFormat
 from apertura.formats.tracks.csv_track import read_csv_track
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.check import problems
-from apertura.pipeline.steps import tracks
-from apertura.pipeline.store import open_stage
-from apertura.views.look.follow import Look
+from apertura.stages import tracks
+from apertura.tools.look.follow import Look
 
 CRS = "EPSG:32632"
 EAST, NORTH = 570_000.0, 5_363_000.0

@@ -10,20 +10,19 @@ from spoiling.logs import read_log, write_log
 from spoiling.of_logs import noisy
 from track_noise import saying
 
+from apertura.campaign.config.processing import Processing
+from apertura.campaign.store import open_stage
 from apertura.core.imaging.range_profiles import profiles_of
 from apertura.methods.autofocus.one_phase import METHODS, MOST_LOSS_DB, SpaceVariance
 from apertura.methods.autofocus.patches import Candidates
 from apertura.methods.autofocus.path_offsets import refine_one_phase
-from apertura.pipeline.config.processing import Processing
-from apertura.pipeline.opening.autofocus import ONE_PHASE, autofocus_of, clock_s, decide_method, open_refined
-from apertura.pipeline.opening.pair import open_pair
-from apertura.pipeline.opening.scene import open_scene
-from apertura.pipeline.stale import stale_results
-from apertura.pipeline.steps import refine
-from apertura.pipeline.steps.refine import refinement_inputs
-from apertura.pipeline.store import open_stage
 from apertura.simulation import ImageGrid, PointTarget, SimulatedFlight, Straight, preset, simulate
+from apertura.stages import refine
+from apertura.stages.pair import open_pair
+from apertura.stages.refine import ONE_PHASE, autofocus_of, clock_s, decide_method, open_refined, refinement_inputs
+from apertura.stages.scene import open_scene
 from apertura.views.score import score
+from apertura.workflow.stale import stale_results
 
 PAIRS = ("uav1-uav1", "uav1-uav2")
 ENOUGH, LACKING = SpaceVariance(0.2, -MOST_LOSS_DB + 0.01), SpaceVariance(0.3, -MOST_LOSS_DB - 0.01)

@@ -7,6 +7,8 @@ import pytest
 import rasterio
 from folders import copy_writable, run_steps
 
+from apertura.campaign.folder import Campaign
+from apertura.campaign.store import open_stage
 from apertura.core.backprojection.engines import load_engine, reference
 from apertura.core.backprojection.inputs import PhaseHistory, Profiles
 from apertura.core.echo.compression import compress, range_step, window_weights
@@ -14,11 +16,9 @@ from apertura.core.echo.sidelink import METHODS
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.quality.measures import numerical_error
 from apertura.core.quality.point_targets import BandLimitedPatch, find_peak
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.opening.echo import PairEcho
-from apertura.pipeline.opening.scene import open_scene
-from apertura.pipeline.steps import echo
-from apertura.pipeline.store import open_stage
+from apertura.stages import echo
+from apertura.stages.scene import open_scene
+from apertura.stages.transfer import PairEcho
 from apertura.views.score import score
 
 
@@ -181,7 +181,7 @@ def test_two_runs_give_the_same_bytes(tiny, finished_tiny):
 def test_a_threefold_thread_count_changes_nothing(tiny, finished_tiny):
     campaign = Campaign.load(tiny)
     run_steps(tiny, exports=False)
-    from apertura.pipeline.steps import image
+    from apertura.stages import image
 
     image.image(campaign, "f01", "uav1-uav1", threads=6)
     one = open_stage(campaign.stage("image", "f01", "uav1-uav1"), "image").image.values

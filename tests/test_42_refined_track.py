@@ -12,6 +12,9 @@ from spoiling.logs import read_log, write_log
 from spoiling.of_logs import late, noisy
 from track_noise import saying
 
+from apertura.campaign.folder import Campaign
+from apertura.campaign.store import open_stage, save_stage
+from apertura.check import as_line, problems
 from apertura.common.errors import CampaignError
 from apertura.core.geometry.geodesy import ecef_from_geodetic, ned_axes
 from apertura.core.geometry.phase_centres import TrackCorrection
@@ -19,24 +22,20 @@ from apertura.core.imaging.range_profiles import profiles_of
 from apertura.core.planning.decisions import TOLERATED_LOSS_DB, decide_autofocus
 from apertura.core.planning.plan import Decision
 from apertura.methods.autofocus.inputs import PairRecord, Refinement
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.check import as_line, problems
-from apertura.pipeline.opening.acquisition import open_acquisition
-from apertura.pipeline.opening.autofocus import RefinedTrack, clock_s, open_refined
-from apertura.pipeline.opening.diagnosis import evidence_of, moved_evidence
-from apertura.pipeline.opening.echo import PairEcho
-from apertura.pipeline.opening.pair import open_pair
-from apertura.pipeline.opening.results import open_campaign
-from apertura.pipeline.opening.scene import open_scene
-from apertura.pipeline.opening.transmitted import transmitted
-from apertura.pipeline.stale import stale_results
-from apertura.pipeline.steps import echo, image, profile, refine, scene, tracks
-from apertura.pipeline.steps.refine import RefinementInputs, reference_points
-from apertura.pipeline.steps.stamping import stamped
-from apertura.pipeline.store import open_stage, save_stage
 from apertura.simulation import ImageGrid, preset, simulate
+from apertura.stages import echo, image, profile, refine, scene, tracks
+from apertura.stages.acquisition import open_acquisition
+from apertura.stages.diagnosis import evidence_of, moved_evidence
+from apertura.stages.pair import open_pair
+from apertura.stages.refine import RefinedTrack, RefinementInputs, clock_s, open_refined, reference_points
+from apertura.stages.scene import open_scene
+from apertura.stages.stamping import stamped
+from apertura.stages.transfer import PairEcho
+from apertura.stages.transmitted import transmitted
+from apertura.tools.open_campaign import open_campaign
 from apertura.views.plan import print_plan
 from apertura.views.score import score
+from apertura.workflow.stale import stale_results
 
 PAIRS = ("uav1-uav1", "uav1-uav2")
 FOUND = (Decision("autofocus", "on", "asked for"), Decision("autofocus_method", "tracks", "asked for"))

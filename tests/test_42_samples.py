@@ -9,24 +9,24 @@ import pytest
 import yaml
 from folders import edit_config, run_steps
 
+from apertura.campaign.config import validated
+from apertura.campaign.folder import Campaign
+from apertura.campaign.store import open_stage
+from apertura.check import problems
 from apertura.common.errors import CampaignError
 from apertura.core.echo.compression import window_weights
 from apertura.core.quality.point_targets import find_peak
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.check import problems
-from apertura.pipeline.config import validated
-from apertura.pipeline.opening.echo import PairEcho
-from apertura.pipeline.opening.pair import open_pair
-from apertura.pipeline.opening.plan import budget_of
-from apertura.pipeline.opening.scene import open_scene
-from apertura.pipeline.opening.transmitted import read_pulse
-from apertura.pipeline.resources import Resources
-from apertura.pipeline.steps import echo, ingest
-from apertura.pipeline.steps.assess import hypotheses
-from apertura.pipeline.store import open_stage
 from apertura.simulation import Impairments, PointTarget, PulseSpecification, preset, read_specification, simulate
 from apertura.simulation.impairments import Timing
 from apertura.simulation.specification import specification_text
+from apertura.stages import echo, ingest
+from apertura.stages.assess import hypotheses
+from apertura.stages.pair import open_pair
+from apertura.stages.planning import budget_of
+from apertura.stages.scene import open_scene
+from apertura.stages.transfer import PairEcho
+from apertura.stages.transmitted import read_pulse
+from apertura.workflow.resources import Resources
 
 ROOT = Path(__file__).parents[1]
 PAIRS = "uav1-uav1", "uav1-uav2"

@@ -8,14 +8,14 @@ import xarray as xr
 from matplotlib.image import imread
 from PIL import Image
 
+from apertura.campaign.store import open_stage, read_manifest
 from apertura.core.geometry.geodesy import ecef_from_geodetic, geodetic_from_ecef, ned_axes
 from apertura.core.geometry.phase_centres import TrackCorrection
 from apertura.formats.export.tracks import RefinedLog, write_csv, write_picture, write_pos
 from apertura.formats.tracks.csv_track import read_csv_track
 from apertura.formats.tracks.rtklib import read_rtklib_pos
-from apertura.pipeline.opening.autofocus import RefinedTrack
-from apertura.pipeline.steps.tracks import outcome_of, refined_log
-from apertura.pipeline.store import open_stage, read_manifest
+from apertura.stages.refine import RefinedTrack
+from apertura.stages.tracks import outcome_of, refined_log
 
 BEGUN = np.datetime64("2025-05-14T09:30:00.123456789", "ns")
 ENU = [1, 0, 2]

@@ -8,18 +8,18 @@ import pytest
 import xarray as xr
 from folders import complaint, copy_writable, image_of, run_steps, state
 
+from apertura.campaign.folder import Campaign
+from apertura.campaign.store import open_stage
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.geometry.atmosphere import Atmosphere, standard_weather
 from apertura.core.geometry.geodesy import geodetic_from_ecef
 from apertura.core.quality.point_targets import find_peak
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.opening.air import in_air, scene_air
-from apertura.pipeline.opening.node_log import raw_log
-from apertura.pipeline.opening.pair import open_pair
-from apertura.pipeline.opening.plan import air_decision
-from apertura.pipeline.store import open_stage
 from apertura.simulation import PointTarget, SimulatedNode, Straight, WaveformSpecification, preset, simulate
 from apertura.simulation.impairments import Impairments
+from apertura.stages.air import in_air, scene_air
+from apertura.stages.node_log import raw_log
+from apertura.stages.pair import open_pair
+from apertura.stages.planning import air_decision
 
 C = SPEED_OF_LIGHT_M_S
 

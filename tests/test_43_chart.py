@@ -11,6 +11,7 @@ import yaml
 from folders import copy_writable, quality_of
 from scenes import TARGET_GRID, plan, point_history
 
+from apertura.campaign.folder import Campaign
 from apertura.common.errors import CampaignError
 from apertura.common.tables import write_table
 from apertura.core.backprojection.engines import reference
@@ -18,10 +19,9 @@ from apertura.core.backprojection.engines.engine import Setting
 from apertura.core.backprojection.inputs import PhaseHistory
 from apertura.core.imaging.range_profiles import range_compress
 from apertura.core.scene.terrain import FlatGround
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.steps import image
-from apertura.views.chart.pareto import Point, draw_points, with_front
-from apertura.views.chart.speed_accuracy import LEAST_ROWS, Part, measure, speed_accuracy
+from apertura.stages import image
+from apertura.tools.chart.pareto import Point, draw_points, with_front
+from apertura.tools.chart.speed_accuracy import LEAST_ROWS, Part, measure, speed_accuracy
 from apertura.views.plan import expected_plan
 
 
@@ -144,7 +144,7 @@ def test_an_engine_that_reads_the_phase_history_is_charted_on_it(part, toy, monk
 @pytest.mark.parametrize(("exact_s", "shown"), [(10.0, True), (3600.0, False)])
 def test_a_double_sum_far_beyond_the_settings_does_not_stretch_the_axis(tmp_path, monkeypatch, exact_s, shown):
     drawn = []
-    monkeypatch.setattr("apertura.views.chart.pareto.save_png", lambda figure, _: drawn.append(figure))
+    monkeypatch.setattr("apertura.tools.chart.pareto.save_png", lambda figure, _: drawn.append(figure))
     rest = {"presum": 1, "pixel_pulses_per_s": 1e9, "predicted_seconds": 1.0, "predicted_error_db": -60.0}
     settings = [
         Point("native", "a", seconds=s, error_db=-60 * s, on_front=False, planned=False, **rest) for s in (1, 5)

@@ -14,22 +14,22 @@ import yaml
 from folders import complaint, copy_writable, require_files, run_steps, settle_ground
 from rasterio.transform import from_origin
 
+from apertura.campaign.folder import Campaign
+from apertura.campaign.store import open_stage
+from apertura.cli import main
 from apertura.core.backprojection.engines import load_engine
 from apertura.core.geometry.geodesy import projected_from_ecef
 from apertura.core.imaging.range_profiles import profiles_of
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import FlatGround
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.opening.echo import PairEcho
-from apertura.pipeline.opening.pair import open_pair
-from apertura.pipeline.opening.plan import job_of, plan_pair
-from apertura.pipeline.opening.scene import ConfiguredGround, OpenScene, expected_scene, open_scene, settled_scene
-from apertura.pipeline.steps import profile, scene
-from apertura.pipeline.store import open_stage
 from apertura.simulation import ImageGrid, preset, simulate
 from apertura.simulation.presets import DEMO_ORIGIN
 from apertura.simulation.scene import PointTarget
-from apertura.views.cli import main
+from apertura.stages import profile, scene
+from apertura.stages.pair import open_pair
+from apertura.stages.planning import job_of, plan_pair
+from apertura.stages.scene import ConfiguredGround, OpenScene, expected_scene, open_scene, settled_scene
+from apertura.stages.transfer import PairEcho
 from apertura.views.plan import expected_plan
 from apertura.views.score import score
 

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from folders import complaint, edit_config, edit_data, ingest_all, quality_of
 
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.opening.echo import PairEcho
-from apertura.pipeline.steps import echo, image, profile, refine, scene
-from apertura.pipeline.store import open_stage
+from apertura.campaign.folder import Campaign
+from apertura.campaign.store import open_stage
 from apertura.simulation import ImageGrid, preset, simulate
 from apertura.simulation.impairments import Adc, Blockage, Clock, Reflection, Ripple, TimeTag, UniformPhase
+from apertura.stages import echo, image, profile, refine, scene
+from apertura.stages.transfer import PairEcho
 
 
 def flown(folder, node="uav2", *, pulses=40, **impairments):

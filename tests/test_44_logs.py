@@ -7,22 +7,22 @@ import numpy as np
 import pytest
 from folders import complaint, edit_config, edit_data, edit_track, small_simulation
 
+from apertura.campaign.config import Node
+from apertura.campaign.folder import Campaign
 from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.geodesy import ecef_from_geodetic
 from apertura.formats.tracks.track import damaged, make_track
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.config import Node
-from apertura.pipeline.opening.echo import PairEcho
-from apertura.pipeline.opening.node_log import NodeLog, raw_log
-from apertura.pipeline.opening.pair import open_pair
-from apertura.pipeline.opening.plan import budget_of
-from apertura.pipeline.opening.positions import place
-from apertura.pipeline.opening.scene import expected_scene
-from apertura.pipeline.steps import echo, ingest
 from apertura.simulation import Impairments, PointTarget, Straight, simulate
 from apertura.simulation.impairments import TimeTag
 from apertura.simulation.scene import Wobble
+from apertura.stages import echo, ingest
+from apertura.stages.node_log import NodeLog, raw_log
+from apertura.stages.pair import open_pair
+from apertura.stages.planning import budget_of
+from apertura.stages.positions import place
+from apertura.stages.scene import expected_scene
+from apertura.stages.transfer import PairEcho
 
 
 def small_campaign(folder, *, pulses=40, prf_hz=20.0, **changes):

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from folders import complaint, copy_writable, edit_data, small_simulation
 
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.steps import ingest
-from apertura.pipeline.store import open_stage
+from apertura.campaign.folder import Campaign
+from apertura.campaign.store import open_stage
 from apertura.simulation import Framing, Impairments, simulate
+from apertura.stages import ingest
 
 
 @pytest.fixture(scope="module")

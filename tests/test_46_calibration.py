@@ -8,12 +8,12 @@ import pytest
 import yaml
 from folders import complaint, edit_config
 
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.lineage import result_of
-from apertura.pipeline.opening.echo import PairEcho
-from apertura.pipeline.steps import calibration, echo, ingest
+from apertura.campaign.folder import Campaign
 from apertura.simulation import ImageGrid, preset, simulate
 from apertura.simulation.scene import PointTarget
+from apertura.stages import calibration, echo, ingest
+from apertura.stages.transfer import PairEcho
+from apertura.workflow.lineage import result_of
 
 PAIRS = ("uav1-uav1", "uav1-uav2")
 

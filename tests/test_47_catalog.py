@@ -14,19 +14,19 @@ from folders import contents, copy_writable
 from rasterio.warp import transform_bounds
 from rocrate.rocrate import ROCrate
 
+from apertura.campaign.folder import Campaign
+from apertura.campaign.store import open_stage, read_manifest
 from apertura.common.errors import CampaignError
 from apertura.common.provenance import lock_sha256, sha256_file, software
 from apertura.formats.catalog import CATALOG, CRATE
 from apertura.formats.catalog.crate import CrateRun, Listed, crate_document
 from apertura.formats.catalog.validation import stac_problems
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.lineage import on_demand, places_of, result_of, results_of
-from apertura.pipeline.rules import RESULTS
-from apertura.pipeline.steps import assess, cube, export
-from apertura.pipeline.steps.ro_crate import ro_crate
-from apertura.pipeline.steps.stac import stac
-from apertura.pipeline.store import open_stage, read_manifest
+from apertura.stages import assess, cube, export
+from apertura.stages.ro_crate import ro_crate
+from apertura.stages.stac import stac
 from apertura.views.verify.crate import changed_files
+from apertura.workflow.lineage import on_demand, places_of, result_of, results_of
+from apertura.workflow.rules import RESULTS
 
 ROOT = Path(__file__).parents[1]
 
@@ -269,7 +269,7 @@ def test_a_frequency_is_the_same_number_in_every_product(finished_tiny):
 def test_a_verdict_is_the_same_word_in_every_product(finished, monkeypatch):
     """A wrong code of a sharp pair: neither its image nor the sum that holds it is called focused anywhere."""
     line = [("uav1-uav2", "wrong_code", "another code")]
-    monkeypatch.setattr("apertura.pipeline.steps.assess.wrong_codes", lambda _: line)
+    monkeypatch.setattr("apertura.stages.assess.wrong_codes", lambda _: line)
     campaign = Campaign.load(finished)
     assess.assess(campaign, "f01")
     cube.cube(campaign)

@@ -5,9 +5,9 @@ import pytest
 import rasterio
 from folders import copy_writable, edit_config
 
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.steps import cube, export
-from apertura.pipeline.store import create, finish, open_array, open_stage, writing
+from apertura.campaign.folder import Campaign
+from apertura.campaign.store import create, finish, open_array, open_stage, writing
+from apertura.stages import cube, export
 
 SIDE = 32
 EMPTY = {"uav1-uav1": [(0, 0)], "uav1-uav2": [(0, 0), (1, 1)]}

@@ -21,15 +21,15 @@ from readers import (
     sampled_by_rioxarray,
 )
 
+from apertura.campaign.folder import Campaign
 from apertura.common.errors import CampaignError
 from apertura.core.geometry.geodesy import LOCAL
 from apertura.core.scene.grid import SceneGrid
 from apertura.formats.export import exports_in, mosaics, product_files, write_exports
 from apertura.formats.export.mosaic import write_mosaic
 from apertura.formats.export.radiometry import ECHO
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.stale import damaged_results
-from apertura.pipeline.steps import mosaic
+from apertura.stages import mosaic
+from apertura.workflow.stale import damaged_results
 
 FLOWN = {"f01": ("uav1-uav1", "uav1-uav2", "fused")}
 RASTERS = [name for name in product_files(FLOWN) if name.endswith((".tif", ".vrt"))]

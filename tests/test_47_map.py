@@ -13,11 +13,11 @@ import rasterio
 from folders import copy_writable
 from pyproj import Transformer
 
+from apertura.campaign.folder import Campaign
+from apertura.campaign.store import record_files
 from apertura.common.errors import CampaignError
 from apertura.common.provenance import sha256_file
 from apertura.formats.export import exports_in, product_files
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.store import record_files
 from apertura.views.webmap.server import FILES, SHELL, served
 from apertura.views.webmap.step import webmap
 

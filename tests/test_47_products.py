@@ -12,11 +12,11 @@ from folders import run_steps
 from pyproj import Transformer
 from rio_cogeo.cogeo import cog_validate
 
+from apertura.campaign.store import open_stage, read_manifest
 from apertura.common.paths import shipped
 from apertura.common.provenance import Provenance, packages, sha256_file, software
 from apertura.core.backprojection.engines import instruction_set
 from apertura.formats.export import exports_in, product_files
-from apertura.pipeline.store import open_stage, read_manifest
 from apertura.simulation import ImageGrid, preset, simulate
 
 PAIRS = ("uav1-uav1", "uav1-uav2")

@@ -9,23 +9,23 @@ import rasterio
 import rasterio.transform
 from folders import complaint, copy_writable, edit_config, export_flight, run_steps, state
 
+from apertura.campaign.folder import Campaign
 from apertura.core.geometry.geodesy import projected_from_ecef
 from apertura.core.quality.bright_points import BrightPoint
 from apertura.formats.export import product_files
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.lineage import result_of
-from apertura.pipeline.opening.pair import open_pair
-from apertura.pipeline.opening.radiometry import calibrated_pair
-from apertura.pipeline.opening.scene import open_scene
-from apertura.pipeline.steps.export import export_fused
-from apertura.pipeline.steps.layers import layers
-from apertura.pipeline.steps.mosaic import mosaic
-from apertura.pipeline.steps.stac import stac
 from apertura.simulation import GaussianBeam, ImageGrid, PointTarget, Radio, preset, simulate
 from apertura.simulation.presets import DEMO_ORIGIN
+from apertura.stages.export import export_fused
+from apertura.stages.layers import layers
+from apertura.stages.mosaic import mosaic
+from apertura.stages.pair import open_pair
+from apertura.stages.radiometry import calibrated_pair
+from apertura.stages.scene import open_scene
+from apertura.stages.stac import stac
 from apertura.views.score import score
 from apertura.views.verify.chain import verify
 from apertura.views.webmap.step import webmap
+from apertura.workflow.lineage import result_of
 
 RCS_M2 = (0.1, 1.0, 10.0)
 PLACES = ((-2.0, -1.5, 0.0), (0.0, 1.2, 0.0), (2.0, -0.5, 0.0))

@@ -10,22 +10,20 @@ import pytest
 import rasterio
 from folders import complaint, copy_writable, edit_config, export_flight, run_steps, state
 
+from apertura.campaign.folder import Campaign
+from apertura.check import as_line, problems
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.imaging.reflectors import Reflector
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.check import as_line, problems
-from apertura.pipeline.lineage import result_of
-from apertura.pipeline.opening.constants import Constants, PairConstant, Radar, read_constants
-from apertura.pipeline.opening.pair import open_pair
-from apertura.pipeline.opening.radiometry import calibrated_pair
-from apertura.pipeline.opening.reflectors import measured_constants
-from apertura.pipeline.opening.scene import open_scene
-from apertura.pipeline.stale import stale_results
-from apertura.pipeline.steps import cphd, export, layers
 from apertura.simulation import GaussianBeam, ImageGrid, PointTarget, Radio, preset, simulate
-from apertura.views.reflectors import write_constants
+from apertura.stages import cphd, export, layers
+from apertura.stages.pair import open_pair
+from apertura.stages.radiometry import Constants, PairConstant, Radar, calibrated_pair, read_constants
+from apertura.stages.scene import open_scene
+from apertura.tools.reflectors import measured_constants, write_constants
 from apertura.views.score import score
 from apertura.views.verify.chain import verify
+from apertura.workflow.lineage import result_of
+from apertura.workflow.stale import stale_results
 
 RADIO = Radio(10.0, 8.0, 9.0, full_scale_dbm=4.0, gain_db=37.3, noise_figure_db=6.0, amplitude_std_db=0.5)
 PAIRS = ("uav1-uav1", "uav1-uav2")

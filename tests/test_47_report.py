@@ -7,8 +7,8 @@ import pytest
 from docutils.core import publish_parts
 from folders import complaint, copy_writable, edit_config
 
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.store import open_document, read_manifest
+from apertura.campaign.folder import Campaign
+from apertura.campaign.store import open_document, read_manifest
 from apertura.views.report import PICTURES
 from apertura.views.report.image_drawings import steadiness
 from apertura.views.report.pictures import Shown, pictures

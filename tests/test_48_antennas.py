@@ -8,13 +8,10 @@ import rasterio
 import yaml
 from folders import complaint, copy_writable, edit_config, quality_of
 
+from apertura.campaign.folder import Campaign
+from apertura.campaign.store import open_stage
 from apertura.core.quality.point_targets import cut_through, find_peak
 from apertura.formats.export.layers import OUTSIDE
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.lineage import result_of
-from apertura.pipeline.opening.echo import PairEcho
-from apertura.pipeline.steps import echo, image, ingest, layers, profile, refine, scene
-from apertura.pipeline.store import open_stage
 from apertura.simulation import (
     GaussianBeam,
     ImageGrid,
@@ -27,7 +24,10 @@ from apertura.simulation import (
     simulate,
 )
 from apertura.simulation.presets import DEMO_ORIGIN
+from apertura.stages import echo, image, ingest, layers, profile, refine, scene
+from apertura.stages.transfer import PairEcho
 from apertura.views.plan import expected_plan
+from apertura.workflow.lineage import result_of
 
 PULSES, STEP_M, BACK_M, UP_M = 80, 0.1, 11.5, 4.8
 DEPRESSION_DEG = float(np.degrees(np.arctan2(UP_M, BACK_M)))

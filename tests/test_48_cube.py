@@ -12,11 +12,11 @@ import zarr
 from folders import ROOT, complaint, copy_writable, edit_config, run_steps
 from walked import walk
 
+from apertura.campaign.folder import Campaign
+from apertura.campaign.store import create, damaged_files, finish, manifest_of, open_stage, writing
 from apertura.methods.interferometry.coherence import chance, coherence
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.steps import cube
-from apertura.pipeline.store import create, damaged_files, finish, manifest_of, open_stage, writing
 from apertura.simulation import ImageGrid, preset, simulate
+from apertura.stages import cube
 
 LIFTED_M = 0.1
 

@@ -6,18 +6,18 @@ import pystac
 import pytest
 from folders import complaint, copy_writable, run_steps
 
+from apertura.campaign.folder import Campaign
+from apertura.campaign.store import open_stage
 from apertura.common.contracts import SUMMED
 from apertura.formats.catalog import CATALOG
 from apertura.formats.export import product_files
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.lineage import places_of
-from apertura.pipeline.steps.export import export_fused
-from apertura.pipeline.store import open_stage
+from apertura.stages.export import export_fused
 from apertura.views.report.pictures import pictures
 from apertura.views.report.step import landing, page
 from apertura.views.report.sums import pictures_fused
 from apertura.views.score import score
 from apertura.views.summary import is_finished, print_summary
+from apertura.workflow.lineage import places_of
 
 PAIR = "uav1-uav1"
 

@@ -7,9 +7,9 @@ import pytest
 import rasterio
 
 import apertura as ap
+from apertura.campaign.store import open_stage
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.imaging.view import view_report
-from apertura.pipeline.store import open_stage
 
 PAIRS = ("uav1-uav1", "uav1-uav2")
 

@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 from folders import SHARED, copy_writable, edit_config, edit_track, run_steps
 
+from apertura.campaign.folder import Campaign
+from apertura.campaign.store import record_files
 from apertura.common.errors import CampaignError
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.scene.grid import SceneGrid
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.opening.acquisition import check_rates
-from apertura.pipeline.opening.diagnosis import Hypothesis, Trial, explanation
-from apertura.pipeline.opening.images import assessment_of
-from apertura.pipeline.steps import assess, cube, echo, export, image, profile
-from apertura.pipeline.store import record_files
 from apertura.simulation import preset, simulate
+from apertura.stages import assess, cube, echo, export, image, profile
+from apertura.stages.acquisition import check_rates
+from apertura.stages.agreement import assessment_of
+from apertura.stages.diagnosis import Hypothesis, Trial, explanation
 from apertura.views.summary import print_summary
 
 PAIRS = ("uav1-uav1", "uav1-uav2")
@@ -230,7 +230,7 @@ def with_longer_path(root, added_m):
 @pytest.mark.slow
 def test_a_sum_whose_phase_nothing_tells_says_so_and_that_its_peaks_are_lost(finished_tiny, tmp_path, monkeypatch):
     root = copy_writable(finished_tiny.root, tmp_path / "campaign")
-    monkeypatch.setattr("apertura.pipeline.steps.assess.agreement_of", lambda *_: None)
+    monkeypatch.setattr("apertura.stages.assess.agreement_of", lambda *_: None)
     told = with_longer_path(root, 0.214 / 4)
     assert [*told["fusion"]["phases_rad"]] == list(PAIRS)
     assert "is added with phase 0: it shares nothing with" in told["flags"]["phase_unmeasured"]

@@ -7,11 +7,9 @@ import pytest
 import rasterio
 from folders import complaint, contents, copy_writable, edit_config, run_steps
 
+from apertura.campaign.config import Interferometry
+from apertura.campaign.folder import Campaign
 from apertura.formats.export import exports_in
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.config import Interferometry
-from apertura.pipeline.lineage import result_of
-from apertura.pipeline.steps.interferogram import interferogram
 from apertura.simulation import (
     CampaignSpecification,
     Clutter,
@@ -25,8 +23,10 @@ from apertura.simulation import (
     WaveformSpecification,
     simulate,
 )
+from apertura.stages.interferogram import interferogram
 from apertura.views.summary import print_summary
 from apertura.views.verify.chain import print_verified
+from apertura.workflow.lineage import result_of
 
 SLOPE = (0.03, 0.06)
 MARKS = ((-3.0, -2.5), (3.0, 3.0))

@@ -5,11 +5,11 @@ import time
 import pytest
 from folders import complaint, contents, copy_writable, edit_config
 
+from apertura.campaign.folder import Campaign
 from apertura.core.backprojection.tiles import NAMED_BY
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.lineage import result_of
-from apertura.pipeline.stale import stale_results
-from apertura.pipeline.steps.image import image
+from apertura.stages.image import image
+from apertura.workflow.lineage import result_of
+from apertura.workflow.stale import stale_results
 
 distributed = pytest.importorskip("distributed")
 

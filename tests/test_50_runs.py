@@ -17,15 +17,15 @@ import pytest
 from folders import ROOT, copy_writable
 from rich.console import Console
 
+from apertura.campaign.folder import Campaign
 from apertura.common.errors import CampaignError
 from apertura.common.processes import hold, holder, keep_caches_writable
 from apertura.common.progress import progress_path
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.resources import Resources
-from apertura.pipeline.runs.journal import JobRecord, JournalReader, RunRecord, a_step_was_killed, failures, note
-from apertura.pipeline.runs.outlook import Outlook, StepProgress
-from apertura.pipeline.runs.results import clean, print_list, states
-from apertura.pipeline.runs.screen import Bar, Screen, bars, print_status, table
+from apertura.run.journal import JobRecord, JournalReader, RunRecord, a_step_was_killed, failures, note
+from apertura.run.outlook import Outlook, StepProgress
+from apertura.run.results import clean, print_list, states
+from apertura.run.screen import Bar, Screen, bars, print_status, table
+from apertura.workflow.resources import Resources
 
 PLANNED = {"ingest": 2, "image": 2, "cube": 1, "all": 1, "total": 6}
 
@@ -486,7 +486,7 @@ def test_clean_waits_for_no_run_and_no_step(finished):
     before = files(finished.results)
     with hold(finished.root), pytest.raises(CampaignError, match="another run holds this campaign"):
         clean(finished, unfinished_only=False, agreed=True)
-    from apertura.pipeline.store import writing
+    from apertura.campaign.store import writing
 
     with (
         writing(finished.stage("echo", "f01", "uav1-uav1")),

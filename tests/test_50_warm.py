@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from apertura.pipeline.runs.warm import Shell
+from apertura.run.warm import Shell
 
 STEP = "set -euo pipefail;  apertura step image f01 uav1-uav2 --threads 2 > results/logs/f01/uav1-uav2.image.log 2>&1"
 

@@ -13,9 +13,9 @@ import pytest
 import yaml
 from folders import copy_writable
 
+from apertura.campaign.folder import Campaign
 from apertura.common.processes import hold
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.stale import stale_results
+from apertura.workflow.stale import stale_results
 
 ROOT = Path(__file__).parents[1]
 
@@ -303,7 +303,7 @@ def test_steps_are_forks_that_end_with_the_run_whatever_is_killed_outright(tiny,
     run = apertura("run", tiny, "--cores", 2, *TO_IMAGES)  # others may be begun before the images, and would be more
     wait_for_tiles(tiny, run, count=2)
     processes = below(run.pid)
-    assert all(b"apertura.pipeline.runs.warm" in command for command in processes.values())
+    assert all(b"apertura.run.warm" in command for command in processes.values())
     warm, snakemake_itself, *steps = processes
     assert steps
     os.kill({"the run": run.pid, "snakemake": snakemake_itself}.get(killed, warm), signal.SIGKILL)

@@ -60,7 +60,7 @@ def test_a_full_disk_under_the_output_is_one_message(finished_tiny):
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
 def test_a_step_that_is_asked_to_end_says_so_and_ends_with_130(tiny, number):
-    code = "import time; from apertura.views import cli; cli.app = lambda: time.sleep(60); print('up', flush=True)"
+    code = "import time; from apertura import cli; cli.app = lambda: time.sleep(60); print('up', flush=True)"
     code += "; cli.main()"
     step = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert step.stdout.readline() == "up\n"
@@ -71,14 +71,14 @@ def test_a_step_that_is_asked_to_end_says_so_and_ends_with_130(tiny, number):
 
 
 def test_a_defect_shows_its_traceback_and_ends_with_1():
-    code = "from apertura.views import cli; cli.app = lambda: 1 / 0; cli.main()"
+    code = "from apertura import cli; cli.app = lambda: 1 / 0; cli.main()"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 1
     assert "ZeroDivisionError" in done.stderr
 
 
 def test_memory_that_runs_out_is_one_message():
-    code = "import numpy; from apertura.views import cli; cli.app = lambda: numpy.empty(1 << 50); cli.main()"
+    code = "import numpy; from apertura import cli; cli.app = lambda: numpy.empty(1 << 50); cli.main()"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 2
     assert done.stderr.startswith("error: out of memory")
@@ -91,7 +91,7 @@ def test_a_study_without_its_distribution_says_what_to_install(words):
     code = (
         "import importlib.metadata as metadata, sys\n"
         "metadata.entry_points = lambda **_: ()\n"
-        "from apertura.views.cli import main\n"
+        "from apertura.cli import main\n"
         "main()\n"
     )
     command = [sys.executable, "-c", code, "study", *words]

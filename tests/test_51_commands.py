@@ -9,12 +9,12 @@ import pytest
 import yaml
 from folders import copy_writable, state
 
+from apertura import cli
+from apertura.campaign.config import FUSED
+from apertura.campaign.folder import Campaign
 from apertura.common import processes
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.config import FUSED
-from apertura.pipeline.opening.scene import settled_scene
-from apertura.pipeline.steps.align import align
-from apertura.views import cli
+from apertura.stages.scene import settled_scene
+from apertura.tools.align import align
 from apertura.views.summary import is_finished
 
 SAMPLES = ["raw/f01/uav1.sigmf-data", "raw/f01/uav2.sigmf-data"]
@@ -93,7 +93,7 @@ def test_help_names_what_the_documents_use_and_hides_what_rules_use(typed):
 
 def test_options_of_run_reach_snakemake(monkeypatch, typed, tiny):
     given = []
-    monkeypatch.setattr("apertura.pipeline.workflow.run_workflow", lambda *words, **_: given.append(words[2:]) or 0)
+    monkeypatch.setattr("apertura.run.driver.run_workflow", lambda *words, **_: given.append(words[2:]) or 0)
     typed("run", "--until", "export", "-n", "--set-scatter", "tiles=4", "--profile", "profiles/slurm", folder=tiny)
     typed("run", tiny, "phase_history", "-np", "--batch=all=1/3")
     typed("run", "--until", "echo", "scene", "terrain", tiny)

@@ -10,16 +10,16 @@ import rasterio
 import yaml
 from folders import run_steps
 
+from apertura import cli
+from apertura.campaign.folder import Campaign
+from apertura.campaign.store import open_stage
 from apertura.common.documents import read_json
 from apertura.core.quality.point_targets import cut_through, find_peak
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.config.flight_plan import FlightPlan, read_flight_plan
-from apertura.pipeline.design import designed
-from apertura.pipeline.design.rehearsal import rehearse
-from apertura.pipeline.opening.scene import open_scene
-from apertura.pipeline.store import open_stage
 from apertura.simulation.scene import PointTarget
-from apertura.views import cli
+from apertura.stages.scene import open_scene
+from apertura.tools.design import designed
+from apertura.tools.design.flight_plan import FlightPlan, read_flight_plan
+from apertura.tools.design.rehearsal import rehearse
 
 EAST, NORTH = 570661.0, 5363707.0
 PLAN = {
@@ -169,7 +169,7 @@ def test_what_was_predicted_is_measured_after_the_same_plan_was_sampled_and_proc
     (tmp_path / "plan.yaml").write_text(yaml.safe_dump(document))
     _, out, _ = typed(monkeypatch, capsys, "compare", tmp_path / "plan.yaml", tmp_path / "flown")
     assert "another radar: waveform.carrier_hz: 1.2e+09 planned, 1.3e+09 in the campaign" in out
-    from apertura.pipeline.steps.layers import layers
+    from apertura.stages.layers import layers
 
     layers(campaign, "f01", "uav1-uav1")
     with rasterio.open(str(campaign.result("f01", "uav1-uav1", "nesz.tif"))) as raster:

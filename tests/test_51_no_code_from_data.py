@@ -20,12 +20,12 @@ from folders import copy_writable, edit_config, run_steps
 from test_43_terrain import write_plane
 from typer.main import get_command
 
+from apertura.campaign.config.template import config_schema
+from apertura.campaign.store.chunks import array_of
+from apertura.cli import app
 from apertura.common.errors import CampaignError
 from apertura.common.processes import SAFE_PATH
-from apertura.pipeline.config.template import config_schema
-from apertura.pipeline.store.chunks import array_of
-from apertura.pipeline.workflow import code_from_outside
-from apertura.views.cli import app
+from apertura.run.driver import code_from_outside
 
 ROOT = Path(__file__).parents[1]
 BIN = Path(sys.executable).parent
@@ -468,7 +468,7 @@ import sys, traceback, yaml
 from pathlib import Path
 from apertura.common.processes import leave_working_folder
 leave_working_folder()
-from apertura.pipeline.check import as_line, problems
+from apertura.check import as_line, problems
 root = Path(sys.argv[1])
 for path in sorted(Path(sys.argv[2]).iterdir()):
     (root / "config/config.yaml").write_bytes(path.read_bytes())

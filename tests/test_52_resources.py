@@ -9,9 +9,9 @@ from types import SimpleNamespace
 import pytest
 from folders import ROOT, copy_writable, edit_config
 
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.resources import Resources
-from apertura.pipeline.rules import RULES
+from apertura.campaign.folder import Campaign
+from apertura.workflow.resources import Resources
+from apertura.workflow.rules import RULES
 
 BESIDE_MB = 2 * 135
 """Snakemake, which starts the job, and Snakemake again, which starts the step: measured."""

@@ -20,12 +20,12 @@ from folders import SHARED, copy_writable
 from matplotlib import image
 from rasterio import Affine
 
+from apertura.check.facts import bounds_of, log_facts
 from apertura.core.echo.dechirp import FrequencySweep
 from apertura.core.geometry.geodesy import ecef_from_geodetic
 from apertura.formats.export.cog import write_power, write_slc
 from apertura.formats.reading import read_track
 from apertura.formats.tracks.track import make_track
-from apertura.pipeline.examination.facts import bounds_of, log_facts
 from apertura.simulation.fmcw import FmcwFlight, write_fmcw_campaign
 from apertura.views.inspect.look import inspect_path, look
 from apertura.views.inspect.pictures import draw_history, draw_log

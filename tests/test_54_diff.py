@@ -7,9 +7,9 @@ import pytest
 from folders import complaint, copy_writable, edit_config
 from rasterio import Affine
 
+from apertura.campaign.folder import Campaign
 from apertura.formats.export.cog import write_power, write_slc
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.steps import export, profile
+from apertura.stages import export, profile
 from apertura.views.verify.diff import Tally, differences, first_difference, print_differences
 from apertura.views.verify.products import flat
 

@@ -19,10 +19,10 @@ from folders import ROOT, copy_writable, run_steps
 from matplotlib.image import imread
 from pyproj import Transformer
 
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.store import record_files
+from apertura.campaign.folder import Campaign
+from apertura.campaign.store import record_files
 from apertura.simulation import preset, simulate
-from apertura.views.look.follow import Look
+from apertura.tools.look.follow import Look
 from apertura.views.webmap.server import is_built
 
 APERTURA = Path(sys.executable).parent / "apertura"

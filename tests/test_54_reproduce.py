@@ -7,7 +7,7 @@ import pytest
 from folders import complaint, contents, copy_writable
 
 from apertura.common.processes import hold
-from apertura.pipeline.workflow import run_workflow
+from apertura.run.driver import run_workflow
 from apertura.views.verify.products import manifests
 from apertura.views.verify.reproduce import print_reproduced
 

@@ -109,7 +109,7 @@ VERIFY = """
 import sys
 sys.meta_path[:] = [finder for finder in sys.meta_path if "editable" not in type(finder).__module__]
 sys.path.insert(0, sys.argv.pop(1))
-from apertura.views.cli import main
+from apertura.cli import main
 main()
 """
 

@@ -17,21 +17,21 @@ import rasterio
 from folders import ROOT, copy_writable, ingest_all, settle_ground, state
 
 import apertura as ap
+from apertura.campaign.folder import Campaign
+from apertura.campaign.store import open_stage
 from apertura.common.errors import CampaignError
 from apertura.core.echo.compression import window_weights
 from apertura.formats.recordings.sigmf import GrowingSigmf, open_sigmf
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.opening.echo import PairEcho
-from apertura.pipeline.opening.scene import settled_scene
-from apertura.pipeline.opening.transmitted import transmitted
-from apertura.pipeline.runs.results import clean
-from apertura.pipeline.steps import echo
-from apertura.pipeline.store import open_stage
+from apertura.run.results import clean
 from apertura.simulation import ImageGrid, preset
-from apertura.views.look import image as look_image
-from apertura.views.look import pair as look_pair
-from apertura.views.look.follow import Look
-from apertura.views.look.node import NodeSoFar
+from apertura.stages import echo
+from apertura.stages.scene import settled_scene
+from apertura.stages.transfer import PairEcho
+from apertura.stages.transmitted import transmitted
+from apertura.tools.look import image as look_image
+from apertura.tools.look import pair as look_pair
+from apertura.tools.look.follow import Look
+from apertura.tools.look.node import NodeSoFar
 from apertura.views.webmap.server import served_look
 
 sys.path.insert(0, str(ROOT / "benchmarks"))

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from folders import complaint, run_steps
 
+from apertura.campaign.folder import Campaign
+from apertura.campaign.store import open_stage
+from apertura.check import problems
 from apertura.formats.tracks.optitrack import body_position
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.check import problems
-from apertura.pipeline.steps.align import align, write_clock
-from apertura.pipeline.store import open_stage
+from apertura.tools.align import align, write_clock
 from apertura.views.score import score
 
 EXAMPLES = Path(__file__).parents[1] / "examples"

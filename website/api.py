@@ -26,7 +26,7 @@ _OF = {
     "RecordedFlight": "Campaigns",
     "RecordedNode": "Campaigns",
 }
-_GIVEN = {"open_campaign": "apertura.pipeline.opening.results.OpenCampaign"}
+_GIVEN = {"open_campaign": "apertura.tools.open_campaign.OpenCampaign"}
 """Public function → what it returns, which is made by nobody else."""
 
 _OTHERS = "Geometry and ground"

@@ -6,7 +6,7 @@ from typing import Any
 import typer
 from typer.main import get_command
 
-from apertura.views.cli import app
+from apertura.cli import app
 
 _HEAD = """# Command line
 

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from pathlib import Path
 
-from apertura.pipeline.config.template import config_schema, config_template, flights_template
+from apertura.campaign.config.template import config_schema, config_template, flights_template
 from website.api import api_page
 from website.cli import cli_page
 from website.flags import flags_page

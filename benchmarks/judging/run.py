@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.campaign.config import FUSED, Flight
+from apertura.campaign.folder import Campaign
+from apertura.campaign.store import open_stage
 from apertura.common.errors import CampaignError
 from apertura.core.scene.grid import SceneGrid
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.config import FUSED, Flight
-from apertura.pipeline.opening.scene import settled_scene
-from apertura.pipeline.steps import assess, cube, echo, export, image, ingest, profile, refine, scene
-from apertura.pipeline.store import open_stage
+from apertura.stages import assess, cube, echo, export, image, ingest, profile, refine, scene
+from apertura.stages.scene import settled_scene
 
 
 @dataclass(frozen=True)

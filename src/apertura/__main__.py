@@ -33,7 +33,7 @@ def main() -> None:
     os.environ[_ENCODING] = f"{os.environ.get(_ENCODING, '').partition(':')[0]}:backslashreplace"
     os.environ[ALGEBRA_THREADS] = "1"
     os.environ[_BACKEND] = "agg"  # pictures are files; a backend of the caller's may be none that is here
-    from apertura.views.cli import main as run
+    from apertura.cli import main as run
 
     run()
 

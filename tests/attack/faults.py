@@ -21,7 +21,7 @@ from collections.abc import Iterator
 from itertools import cycle, islice
 from pathlib import Path
 
-from apertura.pipeline.rules import RULES
+from apertura.workflow.rules import RULES
 from tests.attack.faults_campaign import TARGETS, make_campaign
 from tests.attack.faults_control import (
     ENVIRONMENT,
@@ -81,7 +81,7 @@ def may_mount() -> bool:
 
 def _campaign_of_faults(asked: argparse.Namespace) -> int:
     for module in (
-        "apertura.views.cli",
+        "apertura.cli",
         "matplotlib.pyplot",
         "rasterio",
         "zarr",

@@ -180,7 +180,7 @@ def _mount(folder: Path, size: int, *, again: bool = False) -> None:
 
 def _command(words: list[str]) -> int:
     """Return the exit status of a command line, as its process would have it."""
-    from apertura.views.cli import main
+    from apertura.cli import main
 
     sys.argv = words
     try:

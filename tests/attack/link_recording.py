@@ -36,9 +36,9 @@ def serve() -> None:
 
     Runs in an interpreter of its own, which has imported the package and has no thread.
     """
-    from apertura.pipeline.rules import RULES
+    from apertura.workflow.rules import RULES
 
-    for name in ("apertura.__main__", "apertura.views.cli", *sorted({rule.module for rule in RULES.values()})):
+    for name in ("apertura.__main__", "apertura.cli", *sorted({rule.module for rule in RULES.values()})):
         importlib.import_module(name)
     for line in iter(sys.stdin.readline, ""):
         order = json.loads(line)

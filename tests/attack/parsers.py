@@ -6,6 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from apertura.campaign.config import Flight, PulseWaveform, read_clocks, read_flights, read_segments, read_settings
+from apertura.campaign.folder import Campaign
+from apertura.campaign.store import manifest_of, read_manifest, record_files
 from apertura.common.errors import CampaignError, shown
 from apertura.core.scene.dem import open_dem
 from apertura.core.scene.geoid import geoid_file, undulation
@@ -28,17 +31,14 @@ from apertura.formats.recordings.sigmf import GrowingSigmf, check_listed
 from apertura.formats.tracks import ardupilot, dataflash_fields, px4_ulog, ulog_fields
 from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions
 from apertura.formats.tracks.missions import read_mission
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.config import Flight, PulseWaveform, read_clocks, read_flights, read_segments, read_settings
-from apertura.pipeline.config.flight_plan import read_flight_plan
-from apertura.pipeline.opening.constants import read_constants
-from apertura.pipeline.opening.images import assessment_of
-from apertura.pipeline.opening.results import OpenCampaign
-from apertura.pipeline.opening.scene import settled_scene
-from apertura.pipeline.opening.transmitted import read_codes, read_framing, read_pulse
-from apertura.pipeline.steps.calibration import calibrated
-from apertura.pipeline.store import manifest_of, read_manifest, record_files
 from apertura.simulation.specification import read_specification
+from apertura.stages.agreement import assessment_of
+from apertura.stages.calibration import calibrated
+from apertura.stages.radiometry import read_constants
+from apertura.stages.scene import settled_scene
+from apertura.stages.transmitted import read_codes, read_framing, read_pulse
+from apertura.tools.design.flight_plan import read_flight_plan
+from apertura.tools.open_campaign import OpenCampaign
 
 from . import beats, mutators, products, seeds
 

@@ -14,10 +14,10 @@ import zarr
 from rasterio.transform import from_origin
 from scipy.io import savemat
 
+from apertura.campaign.config.template import config_template, flights_template
 from apertura.core.geometry.geodesy import ecef_from_geodetic
 from apertura.formats.export.cphd import CphdCollection, write_cphd
 from apertura.formats.phase_histories.pulson import MESSAGE
-from apertura.pipeline.config.template import config_template, flights_template
 from apertura.simulation import preset
 from apertura.simulation.specification import specification_text
 from tests.autopilot_logs import (

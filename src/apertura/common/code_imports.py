@@ -17,10 +17,10 @@ WITHOUT_EFFECT = (
     "apertura.common.errors",  # texts of messages: a step that raised one has no result
     "apertura.common.progress",  # lines of a log
     "apertura.common.processes",  # where a process may look for code, and how it ends
-    "apertura.pipeline.lineage",  # sources, settings and code of a result: a manifest records each, for itself
-    "apertura.pipeline.rules",  # the rows that these follow from
-    "apertura.pipeline.rule_inputs",
-    "apertura.pipeline.digests",  # their hashes
+    "apertura.workflow.lineage",  # sources, settings and code of a result: a manifest records each, for itself
+    "apertura.workflow.rules",  # the rows that these follow from
+    "apertura.workflow.rule_inputs",
+    "apertura.campaign.digests",  # their hashes
 )
 """Modules, with those below them, excluded from code hashes: nothing that they compute is in a result."""
 

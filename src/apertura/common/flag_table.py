@@ -56,7 +56,7 @@ _OF_RECORDINGS = {
         "start and end of recordings; tags late by whole intervals", "core/echo/association.py"),
     "fix_poor": Flag(
         "pulses dropped, per node", "the log's solution is poorer than asked", "the log; nodes.<n>.worst_fix",
-        "pipeline/opening/positions.py"),
+        "stages/positions.py"),
     "alignment_ambiguous": Flag(
         "the other offset, dB that it is worse", "another clock offset focuses nearly as well, or all do",
         "a reflector (apertura align --point); changes of speed", "methods/synchronisation/clock_alignment.py"),
@@ -75,33 +75,33 @@ _OF_RECORDINGS = {
         "waveform.sweep_s; fly slower, or stand while sweeping", "core/echo/dechirp.py"),
     "track_epochs_dropped": Flag(
         "epochs left out, by reason", "epochs without a fix, damaged or doubled",
-        "the log, if track_gap comes with it; else nothing", "pipeline/opening/positions.py"),
+        "the log, if track_gap comes with it; else nothing", "stages/positions.py"),
     "track_log_damaged": Flag(
         "bytes or lines of the log that are no messages", "the log is damaged: epochs are lost, or may be wrong",
-        "the medium, or the copy of the log", "pipeline/opening/positions.py"),
+        "the medium, or the copy of the log", "stages/positions.py"),
     "track_gap": Flag(
         "pulses dropped, longest gap", "the spline does not bridge the log's gap", "the log's rate and losses",
-        "pipeline/opening/positions.py"),
+        "stages/positions.py"),
     "track_outlier": Flag(
         "pulses dropped, outliers, the worst", "epochs of the log stand out, or it has a step",
-        "multipath, cycle slips, the log's export", "pipeline/opening/positions.py"),
+        "multipath, cycle slips, the log's export", "stages/positions.py"),
     "hover": Flag(
         "pulses dropped, how long the antennas stood",
         "antennas stood still: these pulses would all weigh on one direction",
-        "config/segments.tsv, which decides alone where it names the pair", "pipeline/opening/positions.py"),
+        "config/segments.tsv, which decides alone where it names the pair", "stages/positions.py"),
     "track_frozen": Flag(
         "pulses dropped, epochs, the worst", "epochs repeat the position before them",
-        "rate of the receiver against that of the log", "pipeline/opening/positions.py"),
+        "rate of the receiver against that of the log", "stages/positions.py"),
     "track_positions": Flag(
         "m that positions err by", "rounded coordinates of the log displace positions",
-        "decimals of the log's coordinates: 8 of degrees, 6 of minutes (NMEA)", "pipeline/opening/positions.py"),
+        "decimals of the log's coordinates: 8 of degrees, 6 of minutes (NMEA)", "stages/positions.py"),
     "track_times": Flag(
         "m along the flight that positions err by", "rounded times of the log displace positions along the flight",
-        "decimals of the log's times", "pipeline/opening/positions.py"),
+        "decimals of the log's times", "stages/positions.py"),
     "attitude_suspect": Flag(
         "degrees of yaw off the course, as logged and by another convention",
         "attitude looks like radians, or anticlockwise: lever arms and beams turn wrongly",
-        "the log's export; nodes.<n>.attitude course, or none", "pipeline/opening/positions.py"),
+        "the log's export; nodes.<n>.attitude course, or none", "stages/positions.py"),
     "time_tag_jitter": Flag(
         "scatter of the tags, s rms, and the repetition interval", "single pulses may pair with a neighbour",
         "frame counters", "core/echo/association.py"),
@@ -116,7 +116,7 @@ _OF_RECORDINGS = {
     "captures_repeated": Flag(
         "captures left out, of how many; the number of the first",
         "captures repeat earlier ones bit for bit: the recorder wrote old samples again; ghosts without this",
-        "buffers of the recorder; the copy of the recording", "pipeline/opening/echo.py"),
+        "buffers of the recorder; the copy of the recording", "stages/echo.py"),
     "captures_limited": Flag(
         "captures, of how many; their crest factor and that of the others, dB",
         "part of the captures is limited below the converter's end stops: echoes are weaker there, and distorted",
@@ -202,7 +202,7 @@ _OF_IMAGES = {
         "unit and datum of scene.dem", "core/scene/clearance.py"),
     "terrain_step": Flag(
         "m of height, over m on the ground, its place", "a step of the DEM is steeper than 79 degrees",
-        "voids filled with a constant, seams of the DEM; nothing, if it is a cliff", "pipeline/opening/scene.py"),
+        "voids filled with a constant, seams of the DEM; nothing, if it is a cliff", "stages/scene.py"),
     "outside_swath": Flag(
         "share of the scene, integration angle",
         "no pulse passes part of the scene inside the integration angle: no data",
@@ -281,49 +281,49 @@ _OF_IMAGES = {
     "pairs_apart": Flag(
         "cm between the points, east and north",
         "a pair shows the same points at other places than most, or as many say one place as the other",
-        "the hypothesis, where one is named; path offsets, lever arms, scene.height_m", "pipeline/steps/assess.py"),
+        "the hypothesis, where one is named; path offsets, lever arms, scene.height_m", "stages/assess.py"),
     "pairs_out_of_phase": Flag(
         "phase against the pairs that agree",
         "a pair shows points in another phase than most, or opinions are even: the sum leaves it out",
-        "path offsets; processing.fusion.align_phase", "pipeline/steps/assess.py"),
+        "path offsets; processing.fusion.align_phase", "stages/assess.py"),
     "pair_left_out": Flag(
         "the pair, why, the phase that would align it", "the coherent sum is without that pair",
-        "the flags of that pair; processing.fusion.align_phase", "pipeline/steps/export.py"),
+        "the flags of that pair; processing.fusion.align_phase", "stages/export.py"),
     "phase_unmeasured": Flag(
         "the pair, why, dB that a wrong phase costs",
         "the phase offset of a pair in the coherent sum is not observable: if wrong, targets split",
         "what the line names: a finer scene.spacing_m, else a reflector in the scene or a calibration flight",
-        "pipeline/steps/export.py"),
+        "stages/export.py"),
     "sum_incoherent": Flag(
         "share of power in phase at bright points, dB lost",
         "pairs of the coherent sum are not in phase: its peaks are weaker than theirs",
-        "pairs_out_of_phase, phase_unmeasured; positions; processing.fusion.align_phase", "pipeline/steps/export.py"),
+        "pairs_out_of_phase, phase_unmeasured; positions; processing.fusion.align_phase", "stages/export.py"),
     "flights_apart": Flag(
         "cm between the points, east and north", "two flights show the same points at different places",
-        "base station, datum, time system of one flight", "pipeline/steps/cube.py"),
+        "base station, datum, time system of one flight", "stages/cube.py"),
     "pair_unconfirmed": Flag(
         "bright points in common", "a pair shows none of the bright points of another",
-        "SNR of its echo; names of its channels", "pipeline/steps/assess.py"),
+        "SNR of its echo; names of its channels", "stages/assess.py"),
     "pair_uncalibrated": Flag(
         "file of constants, pair", "no constant of the pair is known: backscattering coefficients hold no value",
-        "a reflector that serves the pair; transmit_power_dbm and receivers of its nodes", "pipeline/steps/layers.py"),
+        "a reflector that serves the pair; transmit_power_dbm and receivers of its nodes", "stages/layers.py"),
     "constant_drifts": Flag(
         "dB or rad between flights or calibrations, standard deviation",
         "constant or phase changed by over three standard deviations",
-        "cables, gains, temperature; what the antennas point at", "pipeline/opening/reflectors.py"),
+        "cables, gains, temperature; what the antennas point at", "tools/reflectors.py"),
     "reflectors_disagree": Flag(
         "reflectors, sum of squares, its chance", "reflectors disagree: the constant's standard deviation was widened",
-        "places, sizes, orientation of reflectors; other echoes; antenna patterns", "pipeline/opening/reflectors.py"),
+        "places, sizes, orientation of reflectors; other echoes; antenna patterns", "tools/reflectors.py"),
     "constant_disagrees": Flag(
         "dB between the radio stated and the constant measured, in standard deviations",
         "the config contradicts the reflectors, whose constant was used", "transmit_power_dbm, antenna gains, receiver",
-        "pipeline/opening/radiometry.py"),
+        "stages/radiometry.py"),
     "noise_disagrees": Flag(
         "dB of the noise measured against the figure stated, or over the reflectors",
         "above: interference, too little gain, a wrong gain or full scale; below: the latter, and every cross-section "
         "is wrong alike",
         "nodes.<n>.receiver: gain_db, full_scale_dbm or full_scale_v, full_scale_counts, noise_figure_db",
-        "pipeline/opening/radiometry.py"),
+        "stages/radiometry.py"),
     "engine_replaced": Flag(
         "tiles, engine requested and engine used, accuracy",
         "the requested engine misses the requested accuracy: another one formed the image, or some of its tiles",

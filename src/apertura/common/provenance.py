@@ -85,7 +85,7 @@ _READ_BYTES = 1 << 22
 
 
 class StampedStage(Protocol):
-    """A dataset stamped by `apertura.pipeline.steps.stamping.stamp`: its attributes state its provenance."""
+    """A dataset stamped by `apertura.stages.stamping.stamp`: its attributes state its provenance."""
 
     @property
     def attrs(self) -> Mapping[str, Any]: ...  # noqa: D102
@@ -248,7 +248,7 @@ def code_sha256(*modules: str, package: Path = PACKAGE) -> str:
     Parameters
     ----------
     *modules
-        Dotted names such as ``apertura.pipeline.steps.echo``. Of a module of another package that package counts, and
+        Dotted names such as ``apertura.stages.echo``. Of a module of another package that package counts, and
         what it imports of apertura.
     package
         Folder of apertura's sources.

@@ -1,7 +1,7 @@
 """Names of recorders, flight logs and phase histories: which file is of which format, and which function reads it.
 
 Rows name their readers and import none: looking up a file's name loads no format, and the code hash of a
-result (`apertura.pipeline.lineage`) holds the readers of its own campaign alone. To add a format: one file with
+result (`apertura.workflow.lineage`) holds the readers of its own campaign alone. To add a format: one file with
 its reader, one row here.
 """
 

@@ -4,13 +4,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from apertura.campaign.config import FUSED
+from apertura.campaign.folder import Campaign
 from apertura.common.documents import undamaged
 from apertura.common.errors import shown
 from apertura.common.flag_table import FLAGS
 from apertura.core.quality.budget import is_counted
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.config import FUSED
-from apertura.pipeline.opening.images import report_of
+from apertura.stages.agreement import report_of
 
 REPORT = "image.json"
 

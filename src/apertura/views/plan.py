@@ -4,16 +4,16 @@ from dataclasses import replace
 from math import isfinite
 from typing import TYPE_CHECKING
 
+from apertura.campaign.folder import Campaign
 from apertura.common.errors import CampaignError, number_of
 from apertura.core.planning.plan import Plan
 from apertura.core.quality.budget import BudgetLine, expected
 from apertura.core.quality.path_errors import Effect
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.opening.autofocus import expected_track
-from apertura.pipeline.opening.pair import open_pair
-from apertura.pipeline.opening.plan import budget_of, plan_pair
-from apertura.pipeline.opening.scene import Flown, expected_scene
-from apertura.pipeline.stale import outdated_lines, without_outdated
+from apertura.stages.pair import open_pair
+from apertura.stages.planning import budget_of, plan_pair
+from apertura.stages.refine import expected_track
+from apertura.stages.scene import Flown, expected_scene
+from apertura.workflow.stale import outdated_lines, without_outdated
 
 if TYPE_CHECKING:
     from rich.table import Table

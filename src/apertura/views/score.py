@@ -8,6 +8,9 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from apertura.campaign.config import FUSED, Flight
+from apertura.campaign.folder import Campaign
+from apertura.campaign.store import open_listed, open_stage
 from apertura.common.documents import read_json, undamaged
 from apertura.common.errors import CampaignError
 from apertura.common.raster import opened_raster
@@ -16,12 +19,9 @@ from apertura.core.quality.point_targets import cut_through, find_peak
 from apertura.core.scene.grid import SceneGrid
 from apertura.formats.export import product, product_files
 from apertura.formats.export.radiometry import CROSS_SECTIONS
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.config import FUSED, Flight
-from apertura.pipeline.opening.pair import open_pair
-from apertura.pipeline.opening.radiometry import calibrated_pair
-from apertura.pipeline.opening.scene import open_scene, settled_scene
-from apertura.pipeline.store import open_listed, open_stage
+from apertura.stages.pair import open_pair
+from apertura.stages.radiometry import calibrated_pair
+from apertura.stages.scene import open_scene, settled_scene
 from apertura.views.summary import print_summary
 
 REACH_M = 1.0

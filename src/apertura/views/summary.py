@@ -4,16 +4,13 @@ import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from apertura.campaign.config import FUSED
+from apertura.campaign.folder import Campaign
+from apertura.campaign.store import open_listed
 from apertura.common.documents import undamaged
 from apertura.common.errors import number_of, shown
 from apertura.formats.export import MAP, exports_in
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.config import FUSED
-from apertura.pipeline.lineage import on_demand
-from apertura.pipeline.rules import INTERFEROMETRY
-from apertura.pipeline.runs.results import counted, states
-from apertura.pipeline.stale import absent_lines, stale_results
-from apertura.pipeline.store import open_listed
+from apertura.run.results import counted, states
 from apertura.views.image_report import (
     ImageValues,
     Report,
@@ -22,6 +19,9 @@ from apertura.views.image_report import (
     raised_flags,
     read_report,
 )
+from apertura.workflow.lineage import on_demand
+from apertura.workflow.rules import INTERFEROMETRY
+from apertura.workflow.stale import absent_lines, stale_results
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -23,7 +23,7 @@ from apertura.core.planning.planner import make_plan
 from apertura.core.quality.budget import NO_EFFECT, arithmetic_line
 from apertura.core.quality.point_targets import locate_maximum
 from apertura.core.scene.terrain import GroundModels
-from apertura.pipeline.opening.images import ComparedImage, agreement_of
+from apertura.stages.agreement import ComparedImage, agreement_of
 from apertura_research.error_atlas.causes import CAUSES
 from apertura_research.error_atlas.flight import GRID, PAIRS, AssumedFlight, Received, TrueFlight
 

@@ -8,6 +8,8 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from apertura.campaign.folder import Campaign
+from apertura.campaign.store import open_stage
 from apertura.common.arrays import Complexes, Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.echo.captures import correct_clock
@@ -15,14 +17,12 @@ from apertura.core.echo.clock import estimate_clock
 from apertura.core.echo.demodulate import Numerology
 from apertura.core.echo.sidelink import METHODS, divide
 from apertura.core.geometry.aperture import Aperture
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.steps.ingest import ingest
-from apertura.pipeline.store import open_stage
 from apertura.simulation import preset, simulate
 from apertura.simulation.impairments import Clock, Impairments, Localization, Timing, UniformPhase
 from apertura.simulation.observation import observe
 from apertura.simulation.presets import paper_waveform
 from apertura.simulation.synthesis import samples, straight_pair, transfer_functions
+from apertura.stages.ingest import ingest
 from apertura_research.paper.claims import Claim, compare, fitted_to, require
 from apertura_research.paper.losses import ERRORS, TOLERATED_DB, peak_losses_db
 from apertura_research.paper_scene import (

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.campaign.config import SampledWaveform
 from apertura.common.arrays import Complexes, Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.backprojection.engines import reference
@@ -15,12 +16,11 @@ from apertura.core.echo.demodulate import remove_path
 from apertura.core.echo.transfer import transfer_by_code
 from apertura.core.imaging.range_profiles import phase_history_of
 from apertura.core.quality.measures import coherence_factor
-from apertura.pipeline.config import SampledWaveform
-from apertura.pipeline.opening.acquisition import open_acquisition
-from apertura.pipeline.opening.results import OpenCampaign, open_campaign
-from apertura.pipeline.opening.transmitted import transmitted
 from apertura.simulation import CampaignSpecification, Line, PointTarget, preset
 from apertura.simulation.scene import Clutter, Target, Vector
+from apertura.stages.acquisition import open_acquisition
+from apertura.stages.transmitted import transmitted
+from apertura.tools.open_campaign import OpenCampaign, open_campaign
 from apertura_research.paper.claims import (
     DISAGREES,
     PAPER,

@@ -5,14 +5,14 @@ from typing import Any
 
 import numpy as np
 
+from apertura.campaign.folder import Campaign
+from apertura.check import as_line, load, problems_of
+from apertura.check.examination import Examination, Key
+from apertura.check.facts import LogFacts
+from apertura.check.times import LOST_CAPTURE, Span, TimeFacts, inside, time_facts
 from apertura.common.arrays import Times
 from apertura.common.errors import CampaignError
 from apertura.formats.reading import read_phase_history
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.check import as_line, load, problems_of
-from apertura.pipeline.examination.campaign import Examination, Key
-from apertura.pipeline.examination.facts import LogFacts
-from apertura.pipeline.examination.times import LOST_CAPTURE, Span, TimeFacts, inside, time_facts
 from apertura.views.inspect.report import Report
 
 _LINES = ("recorded", "logged")

@@ -9,12 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apertura.common.errors import CampaignError, shown
-from apertura.core.scene.dem import open_dem
-from apertura.formats.names import PHASE_HISTORIES, log_format, log_suffixes
-from apertura.formats.npy import read_npy
-from apertura.formats.reading import open_recording, read_phase_history, read_track
-from apertura.pipeline.examination.facts import (
+from apertura.check.facts import (
     METRES,
     PRODUCT_TAG,
     DemFacts,
@@ -27,7 +22,12 @@ from apertura.pipeline.examination.facts import (
     log_faults,
     recording_facts,
 )
-from apertura.pipeline.examination.times import TimeFacts, inside, own_clock, utc
+from apertura.check.times import TimeFacts, inside, own_clock, utc
+from apertura.common.errors import CampaignError, shown
+from apertura.core.scene.dem import open_dem
+from apertura.formats.names import PHASE_HISTORIES, log_format, log_suffixes
+from apertura.formats.npy import read_npy
+from apertura.formats.reading import open_recording, read_phase_history, read_track
 from apertura.views.inspect.report import Report
 from apertura.views.inspect.surroundings import NODE, Surroundings
 
@@ -135,7 +135,7 @@ def _log_lacks(path: Path, log: LogFacts, beside: Surroundings) -> list[str]:
 
 
 def _attitude_lacks(track: "xr.Dataset") -> list[str]:
-    from apertura.pipeline.opening.node_log import yaw_fault_of
+    from apertura.stages.node_log import yaw_fault_of
 
     fault = yaw_fault_of(track)
     return [] if fault is None else [f"an attitude in degrees, yaw clockwise from north: {fault.line}"]

@@ -8,12 +8,12 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import ScalarFormatter
 from numpy.typing import NDArray
 
+from apertura.check.times import LOST_CAPTURE, Span, gaps, interval_s, seconds, utc
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import number_of, shown
 from apertura.core.geometry.geodesy import geodetic_from_ecef, ned_axes
 from apertura.core.geometry.track_checks import LONG_GAP
 from apertura.formats.tracks.track import FIXES
-from apertura.pipeline.examination.times import LOST_CAPTURE, Span, gaps, interval_s, seconds, utc
 
 if TYPE_CHECKING:
     import xarray as xr

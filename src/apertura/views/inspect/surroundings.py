@@ -6,11 +6,11 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, get_args
 
+from apertura.campaign.config import CLOCKS, CONFIG, read_settings
+from apertura.campaign.config.nodes import Log
 from apertura.common.documents import validated
 from apertura.common.errors import CampaignError
 from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions, QualityNumbers, TimeSystem
-from apertura.pipeline.config import CLOCKS, CONFIG, read_settings
-from apertura.pipeline.config.nodes import Log
 
 NODE = "<node>"
 """Stands for a name that is not known."""

@@ -11,6 +11,10 @@ import xarray as xr
 from numpy.typing import NDArray
 from rasterio import Affine
 
+from apertura.campaign.config import SampledWaveform
+from apertura.campaign.folder import Campaign
+from apertura.campaign.store import blocks_of_rows, open_stage, record_files
+from apertura.check.times import counted
 from apertura.common.arrays import Floats
 from apertura.common.progress import progress
 from apertura.common.provenance import Provenance
@@ -18,16 +22,11 @@ from apertura.core.backprojection.contributions import block_contributions
 from apertura.core.geometry.geodesy import LOCAL, map_from_frame
 from apertura.core.imaging.range_profiles import aperture_of, profiles_of
 from apertura.formats.export.coverage import footprint
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.config import SampledWaveform
-from apertura.pipeline.examination.times import counted
-from apertura.pipeline.lineage import result_of
-from apertura.pipeline.opening.autofocus import open_refined
-from apertura.pipeline.opening.pair import open_pair
-from apertura.pipeline.opening.scene import OpenScene, open_scene
-from apertura.pipeline.steps.coverage import crs_name, few_looks
-from apertura.pipeline.steps.stamping import tags_of
-from apertura.pipeline.store import blocks_of_rows, open_stage, record_files
+from apertura.stages.coverage import crs_name, few_looks
+from apertura.stages.pair import open_pair
+from apertura.stages.refine import open_refined
+from apertura.stages.scene import OpenScene, open_scene
+from apertura.stages.stamping import tags_of
 from apertura.views.report import PICTURES
 from apertura.views.report.flight_drawings import (
     FlownGeometry,
@@ -47,6 +46,7 @@ from apertura.views.report.image_drawings import (
     sidelink_error_rad,
 )
 from apertura.views.report.sheet import thinned
+from apertura.workflow.lineage import result_of
 
 
 def pictures(campaign: Campaign, flight: str, pair: str) -> Sequence[Path]:

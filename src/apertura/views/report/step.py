@@ -7,16 +7,15 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from apertura.campaign.config import FUSED
+from apertura.campaign.folder import Campaign
+from apertura.campaign.store import check_listed, record_files
 from apertura.common.atomic import replacement, write_text
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.paths import shipped
 from apertura.core.geometry.geodesy import LOCAL, geodetic_from_ecef
 from apertura.formats.export import exports_in
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.config import FUSED
-from apertura.pipeline.lineage import result_of
-from apertura.pipeline.opening.scene import OpenScene, settled_scene
-from apertura.pipeline.store import check_listed, record_files
+from apertura.stages.scene import OpenScene, settled_scene
 from apertura.views.image_report import (
     BUDGET,
     DECISIONS,
@@ -33,6 +32,7 @@ from apertura.views.image_report import (
 from apertura.views.report import PAGE, PICTURES, SUM_PICTURES
 from apertura.views.report.page import Block, Heading, Paragraph, Picture, Table, rst_table, rst_text
 from apertura.views.report.page import page as page_of
+from apertura.workflow.lineage import result_of
 
 ASKED = ("key", "value")
 """Headings of what was asked."""

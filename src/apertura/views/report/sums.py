@@ -4,20 +4,20 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from apertura.campaign.config import FUSED
+from apertura.campaign.folder import Campaign
+from apertura.campaign.store import open_stage, record_files
 from apertura.common.provenance import Provenance
 from apertura.common.raster import opened_raster
 from apertura.core.geometry.geodesy import LOCAL
 from apertura.formats.export import product
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.config import FUSED
-from apertura.pipeline.lineage import result_of
-from apertura.pipeline.opening.images import averaged, report_of
-from apertura.pipeline.opening.scene import settled_scene
-from apertura.pipeline.steps.stamping import tags_of
-from apertura.pipeline.store import open_stage, record_files
+from apertura.stages.agreement import averaged, report_of
+from apertura.stages.scene import settled_scene
+from apertura.stages.stamping import tags_of
 from apertura.views.report import SUM_PICTURES
 from apertura.views.report.image_drawings import draw_cuts, drawn_cuts
 from apertura.views.report.panels import draw_panels
+from apertura.workflow.lineage import result_of
 
 _DOTS = 480  # of the longer side of a panel
 _MOST_PANELS = 2  # pairs beside their sums

@@ -8,15 +8,14 @@ from pathlib import Path
 from typing import Any, Literal
 
 from apertura import __version__
+from apertura.campaign.config import CONFIG
+from apertura.campaign.digests import Result
+from apertura.campaign.folder import Campaign
+from apertura.campaign.store import compare, compare_origin, read_manifest, sha256_present, states_origin
+from apertura.campaign.store.manifest import Difference
 from apertura.common.confined import ConfinedPath
 from apertura.common.errors import CampaignError, number_of, shown
 from apertura.common.provenance import lock_sha256, sha256_file, software
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.config import CONFIG
-from apertura.pipeline.digests import Result
-from apertura.pipeline.lineage import on_demand, results_of
-from apertura.pipeline.store import compare, compare_origin, read_manifest, sha256_present, states_origin
-from apertura.pipeline.store.manifest import Difference
 from apertura.views.verify.products import (
     SUFFIX,
     TAGGED,
@@ -27,6 +26,7 @@ from apertura.views.verify.products import (
     manifests,
     read_tags,
 )
+from apertura.workflow.lineage import on_demand, results_of
 
 State = Literal["changed", "missing", "same"]
 

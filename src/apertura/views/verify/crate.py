@@ -2,12 +2,12 @@
 
 from pathlib import Path
 
+from apertura.campaign.store import compare
 from apertura.common.errors import CampaignError, shown
 from apertura.common.provenance import sha256_file
 from apertura.formats.catalog import CATALOG, CRATE
 from apertura.formats.catalog.crate import recorded_files
 from apertura.formats.catalog.validation import stac_problems
-from apertura.pipeline.store import compare
 
 _MOST = 20
 

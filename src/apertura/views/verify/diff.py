@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.campaign.store import open_stage
 from apertura.common.errors import CampaignError, shown
 from apertura.common.raster import opened_raster
 from apertura.formats.export.writing import blocks_of
-from apertura.pipeline.store import open_stage
 from apertura.views.verify.chain import shortened
 from apertura.views.verify.products import EXPECTED, REMEDY, SECTIONS, as_product, picture, sections_of
 

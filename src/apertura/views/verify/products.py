@@ -8,14 +8,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from apertura.campaign.config import CONFIG
+from apertura.campaign.store import manifest_of, open_stage, read_manifest
 from apertura.common.confined import ConfinedPath
 from apertura.common.contracts import STAGES
 from apertura.common.documents import read_json, undamaged
 from apertura.common.errors import CampaignError, shown
 from apertura.common.provenance import canonical_json, sha256_file
 from apertura.common.raster import opened_raster
-from apertura.pipeline.config import CONFIG
-from apertura.pipeline.store import manifest_of, open_stage, read_manifest
 
 SUFFIX = ".manifest.json"
 

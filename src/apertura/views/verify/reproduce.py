@@ -5,15 +5,15 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from apertura.campaign.folder import Campaign
+from apertura.campaign.store import read_manifest
 from apertura.common.confined import ConfinedPath
 from apertura.common.errors import CampaignError, number_of, shown
 from apertura.common.processes import holder
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.lineage import on_demand, results_of, with_inputs
-from apertura.pipeline.store import read_manifest
-from apertura.pipeline.workflow import run_workflow
+from apertura.run.driver import run_workflow
 from apertura.views.verify.diff import differences, first_difference
 from apertura.views.verify.products import find_product
+from apertura.workflow.lineage import on_demand, results_of, with_inputs
 
 _LINES = 8
 _LONGEST = 400

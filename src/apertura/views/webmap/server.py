@@ -20,15 +20,15 @@ from io import BytesIO
 from pathlib import Path
 from typing import IO
 
+from apertura.campaign.digests import digest_of
+from apertura.campaign.folder import Campaign
+from apertura.campaign.store import manifest_of, open_listed, read_manifest
 from apertura.common.confined import ConfinedPath
 from apertura.common.documents import read_json, undamaged
 from apertura.common.errors import CampaignError
 from apertura.common.processes import Interrupted
 from apertura.common.provenance import sha256_file
 from apertura.formats.export import LOOK, MAP, product_files
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.digests import digest_of
-from apertura.pipeline.store import manifest_of, open_listed, read_manifest
 from apertura.views.webmap.document import asked_file, named_files
 
 LOOPBACK = "127.0.0.1"

@@ -7,6 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from apertura.campaign.config import FUSED
+from apertura.campaign.digests import digest_of
+from apertura.campaign.folder import Campaign
+from apertura.campaign.store import check_listed, read_manifest, record_files
 from apertura.common.atomic import write_json
 from apertura.common.documents import read_json, undamaged
 from apertura.common.errors import CampaignError
@@ -14,14 +18,10 @@ from apertura.common.raster import opened_raster
 from apertura.core.geometry.geodesy import LOCAL, frame_from_map, geodetic_from_ecef
 from apertura.core.scene.grid import SceneGrid
 from apertura.formats.export import COVERAGE, MAP, Export, exports_in
-from apertura.pipeline.campaign import Campaign
-from apertura.pipeline.config import FUSED
-from apertura.pipeline.digests import digest_of
-from apertura.pipeline.lineage import result_of
-from apertura.pipeline.opening.scene import settled_scene
-from apertura.pipeline.store import check_listed, read_manifest, record_files
+from apertura.stages.scene import settled_scene
 from apertura.views.image_report import read_report
 from apertura.views.webmap.document import Layer, Place, found_places, image_entry, map_document, url_of
+from apertura.workflow.lineage import result_of
 
 _FEW = 512  # places along a raster's longer side that its range of values is taken from
 _MOST_TARGETS = 1000

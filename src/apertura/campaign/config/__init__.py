@@ -1,0 +1,91 @@
+"""The campaign folder's config: one model generates the defaults, the JSON schema and the validation.
+
+Only `pipeline`, `views` and `research` use these objects; other layers get plain arrays and numbers.
+"""
+
+from apertura.campaign.config.config import CONFIG, Settings, located, read_settings, validated
+from apertura.campaign.config.flights import (
+    CLOCK_COLUMNS,
+    CLOCKS,
+    FLIGHTS,
+    FUSED,
+    KINDS,
+    SEGMENTS,
+    ClockRow,
+    Flight,
+    Segment,
+    read_clocks,
+    read_flights,
+    read_segments,
+)
+from apertura.campaign.config.nodes import (
+    Antenna,
+    Antennas,
+    LeverArms,
+    Node,
+    PathOffsets,
+    Receiver,
+    check_radio,
+    polarisation_of,
+    radio_of,
+)
+from apertura.campaign.config.processing import (
+    Calibration,
+    Interferometry,
+    KnownReflector,
+    Processing,
+    Scene,
+    check_interferometry,
+)
+from apertura.campaign.config.section import Name, Section
+from apertura.campaign.config.waveform import (
+    FmcwWaveform,
+    OfdmWaveform,
+    PhaseHistoryWaveform,
+    PulseWaveform,
+    SampledWaveform,
+    Waveform,
+)
+
+__all__ = [
+    "CLOCKS",
+    "CLOCK_COLUMNS",
+    "CONFIG",
+    "FLIGHTS",
+    "FUSED",
+    "KINDS",
+    "SEGMENTS",
+    "Antenna",
+    "Antennas",
+    "Calibration",
+    "ClockRow",
+    "Flight",
+    "FmcwWaveform",
+    "Interferometry",
+    "KnownReflector",
+    "LeverArms",
+    "Name",
+    "Node",
+    "OfdmWaveform",
+    "PathOffsets",
+    "PhaseHistoryWaveform",
+    "Processing",
+    "PulseWaveform",
+    "Receiver",
+    "SampledWaveform",
+    "Scene",
+    "Section",
+    "Segment",
+    "Settings",
+    "Waveform",
+    "check_interferometry",
+    "check_radio",
+    "located",
+    "polarisation_of",
+    "radio_of",
+    "read_clocks",
+    "read_flights",
+    "read_segments",
+    "read_settings",
+    "validated",
+]

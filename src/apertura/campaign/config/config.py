@@ -1,0 +1,111 @@
+"""The config as one value: config/config.yaml validated as `Settings`; all errors are one message."""
+
+from pathlib import Path
+from typing import Self
+
+from pydantic import Field, model_validator
+
+from apertura.campaign.config.nodes import Node
+from apertura.campaign.config.processing import Bench, Calibration, Interferometry, Processing, Scene
+from apertura.campaign.config.section import Doi, Licence, Name, RawRoot, Section, Title
+from apertura.campaign.config.waveform import PhaseHistoryWaveform, Waveform
+from apertura.common import documents
+from apertura.common.documents import read_yaml
+
+CONFIG = Path("config/config.yaml")
+"""Path of the config in a campaign folder."""
+
+
+class Metadata(Section):
+    """Statements about the campaign that no file of it holds."""
+
+    author: Title | None = Field(None, description="who recorded the campaign; null: not stated")
+    licence: Licence | None = Field(
+        None, description="licence of the products, an SPDX identifier such as CC-BY-4.0; null: not stated"
+    )
+    platform: Title | None = Field(None, description="aircraft, such as a type or a registration; null: not stated")
+    doi: Doi | None = Field(None, description="DOI of the data set, such as 10.5281/zenodo.1234567; null: none")
+
+
+class Settings(Section):
+    """config/config.yaml."""
+
+    campaign: Title = Field(description="name of the campaign", examples=["my_campaign"])
+    waveform: Waveform = Field(description="what was transmitted")
+    raw_root: RawRoot | None = Field(
+        None,
+        description="absolute path of a folder that is read in place of raw/, as on another disk; null: raw/ itself",
+    )
+    nodes: dict[Name, Node] = Field(min_length=1, description="one section per UAV, named as in flights.tsv")
+    scene: Scene = Field(default_factory=Scene, description="the grid of every raster of the campaign")
+    processing: Processing = Field(default_factory=Processing, description="how to compute")
+    calibration: Calibration | None = Field(
+        None, description="path offsets from a calibration flight: flight, reflector_m, search_m; null: as stated above"
+    )
+    bench: Bench = Field(default_factory=Bench, description="what is known of a set-up on the bench, before a flight")
+    interferometry: Interferometry = Field(
+        default_factory=Interferometry, description="images compared in phase, two by two, for coherence and heights"
+    )
+    metadata: Metadata = Field(
+        default_factory=Metadata, description="author, licence, platform and DOI for GeoTIFF tags, STAC and RO-Crate"
+    )
+
+    @model_validator(mode="after")
+    def _calibration_needs_a_place(self) -> Self:
+        if self.calibration is not None and self.scene.crs == "auto":
+            raise ValueError("calibration.reflector_m is in scene.crs, which is auto: give the CRS")
+        return self
+
+    @model_validator(mode="after")
+    def _beams_need_a_log(self) -> Self:
+        named = [name for name, node in self.nodes.items() if node.antennas.any()]
+        if named and isinstance(self.waveform, PhaseHistoryWaveform):
+            raise ValueError(
+                f"nodes.{named[0]}.antennas has a beam, but phase history carries no attitude: set it to null"
+            )
+        return self
+
+
+def read_settings(path: Path) -> Settings:
+    """Return the settings in a config file.
+
+    Raises
+    ------
+    CampaignError
+        If it is not there, is not YAML, or `validated` refuses it.
+    """
+    remedy = "`apertura init` writes a commented one."
+    return validated(read_yaml(path, expected="a campaign folder", remedy=remedy), where=path)
+
+
+def located(message: str) -> str:
+    """Return a message with the config's path before it, where it begins with a key of it.
+
+    Examples
+    --------
+    >>> located("scene.dem: no such file; ..."), located("scene.tif: no such file; ...")
+    ('config/config.yaml: scene.dem: no such file; ...', 'scene.tif: no such file; ...')
+    """
+    section, _, key = message.partition(": ")[0].partition(".")
+    field = Settings.model_fields.get(section)
+    known = field is not None and (not key or key in getattr(field.annotation, "model_fields", {}))
+    return f"{CONFIG}: {message}" if known else message
+
+
+def validated(document: object, *, where: object) -> Settings:
+    """Return `document` as Settings; one message names every wrong key and the nearest valid one.
+
+    Raises
+    ------
+    CampaignError
+        With file, key, what was found and what was expected.
+
+    Examples
+    --------
+    >>> validated({"campaing": "x"}, where="config.yaml")
+    Traceback (most recent call last):
+    ...
+    apertura.common.errors.CampaignError: config.yaml: campaing: unknown key (did you mean 'campaign'?); ...
+    """
+    expected = f"the keys and values of {CONFIG} as `apertura init` writes it"
+    return documents.validated(Settings, document, where=where, expected=expected)

@@ -1,0 +1,309 @@
+"""Tables of the config: flights.tsv, segments.tsv and clocks.tsv."""
+
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pydantic import TypeAdapter, ValidationError
+
+from apertura.campaign.config.config import CONFIG
+from apertura.campaign.config.section import Name, table_rows
+from apertura.common.errors import CampaignError, quoted
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+
+# ---- config/flights.tsv: one line per flight -----------------------------------------------------------------------
+
+FLIGHTS = Path("config/flights.tsv")
+_COLUMNS = ["flight", "kind", "transmitter", "nodes"]
+KINDS = ("bench", "calibration", "image")
+"""Of flights: a radar that stands still; a flight past a reflector, which corrects the echoes of others; images."""
+_NAME: TypeAdapter[str] = TypeAdapter(Name)
+
+FUSED = "fused"
+"""Name of the sums of a flight's pairs, among its images and as a folder."""
+
+
+@dataclass(frozen=True)
+class Flight:
+    """One line of flights.tsv."""
+
+    name: str
+    kind: str
+    transmitter: str
+    nodes: tuple[str, ...]
+
+    @property
+    def participants(self) -> tuple[str, ...]:
+        """The transmitter and then the receivers, each once.
+
+        Examples
+        --------
+        >>> Flight("f01", "image", "a", ("b", "a")).participants
+        ('a', 'b')
+        """
+        return tuple(dict.fromkeys((self.transmitter, *self.nodes)))
+
+    @property
+    def recorded(self) -> tuple[str, ...]:
+        """Of which nodes there is a recording: of all, on a bench also without the transmitter's.
+
+        Examples
+        --------
+        >>> Flight("f01", "image", "a", ("b",)).recorded, Flight("b01", "bench", "a", ("b",)).recorded
+        (('a', 'b'), ('b',))
+        """
+        return self.nodes if self.kind == "bench" else self.participants
+
+    @property
+    def pairs(self) -> tuple[str, ...]:
+        """Transmitter-receiver names, as folders are named."""
+        return tuple(f"{self.transmitter}-{node}" for node in self.nodes)
+
+    @property
+    def images(self) -> tuple[str, ...]:
+        """Names of its images: its pairs, and their sums where there are two pairs to add.
+
+        Examples
+        --------
+        >>> Flight("f01", "image", "a", ("a", "b")).images, Flight("f02", "image", "a", ("b",)).images
+        (('a-a', 'a-b', 'fused'), ('a-b',))
+        """
+        return (*self.pairs, FUSED) if len(self.pairs) > 1 else self.pairs
+
+
+def read_flights(path: Path, *, nodes: Collection[str]) -> Iterator[Flight]:
+    """Yield the flights of a flights.tsv.
+
+    Parameters
+    ----------
+    path
+        Tab-separated, columns flight, kind, transmitter, nodes.
+    nodes
+        Names that the config knows.
+
+    Raises
+    ------
+    CampaignError
+        Naming file and line.
+    """
+    seen: set[str] = set()
+    for where, cells in table_rows(path, _COLUMNS, remedy="Write one line per flight."):
+        flight = _flight(cells, nodes, where=where)
+        if flight.name in seen:
+            raise CampaignError(
+                f"flight {flight.name} a second time",
+                where=where,
+                expected="each flight once",
+                remedy="Join the lines or rename one flight.",
+            )
+        seen.add(flight.name)
+        yield flight
+    if not seen:
+        raise CampaignError("no flights", where=path, expected="at least one line", remedy="Add a flight.")
+
+
+def _flight(cells: dict[str, str], known: Collection[str], *, where: str) -> Flight:
+    nodes = tuple(name.strip() for name in cells["nodes"].split(",") if name.strip())
+    problem = None
+    try:
+        _NAME.validate_python(cells["flight"])
+    except ValidationError as error:
+        problem = error.errors()[0]["msg"].removeprefix("Value error, ")
+    if cells["kind"] not in KINDS:
+        problem = f"kind {quoted(cells['kind'])} is none of {', '.join(KINDS)}"
+    unknown = [name for name in (cells["transmitter"], *nodes) if name not in known]
+    if unknown:
+        problem = f"node {quoted(unknown[0])} is not in {CONFIG}: nodes"
+    if not nodes or len(set(nodes)) != len(nodes):
+        problem = f"nodes {quoted(cells['nodes'])} are none or doubled"
+    if problem:
+        raise CampaignError(
+            problem,
+            where=where,
+            expected=f"flight, {'|'.join(KINDS)}, a transmitter and nodes among {sorted(known)}",
+            remedy="Correct the line.",
+        )
+    return Flight(cells["flight"], cells["kind"], cells["transmitter"], nodes)
+
+
+# ---- config/segments.tsv: part of the track that images a pair ------------------------------------------------------
+
+SEGMENTS = Path("config/segments.tsv")
+_FIRST_YEAR, _LAST_YEAR = 1980, 2199
+_SEGMENT_COLUMNS = ["flight", "pair", "start", "end"]
+
+
+@dataclass(frozen=True)
+class Segment:
+    """One line of segments.tsv: pulses from start to end, both included, image the pair.
+
+    Attributes
+    ----------
+    start, end
+        UTC, ISO 8601 without time zone, on the transmitter's time tags.
+    """
+
+    flight: str
+    pair: str
+    start: str
+    end: str
+
+
+def read_segments(path: Path, *, flights: Sequence[Flight]) -> Iterator[Segment]:
+    """Yield the lines of a segments.tsv; none where there is no such file.
+
+    Parameters
+    ----------
+    path
+        Tab-separated, columns flight, pair, start, end; several lines of a pair are all used.
+    flights
+        Those of flights.tsv.
+
+    Raises
+    ------
+    CampaignError
+        Naming file and line.
+    """
+    if not path.is_file():
+        return
+    pairs = {flight.name: flight.pairs for flight in flights}
+    for where, cells in table_rows(path, _SEGMENT_COLUMNS, remedy="Write one line per segment."):
+        problem, expected = None, "flight, pair, start and end in UTC such as 2025-05-14T09:30:00.5"
+        if cells["flight"] not in pairs:
+            problem, expected = f"flight {quoted(cells['flight'])} is not in {FLIGHTS}", f"one of {', '.join(pairs)}"
+        elif cells["pair"] not in pairs[cells["flight"]]:
+            problem = f"flight {cells['flight']} has no pair {quoted(cells['pair'])}"
+            expected = f"one of {', '.join(pairs[cells['flight']])}"
+        start, end = (_utc(cells[name]) for name in ("start", "end"))
+        for name, time in (("start", start), ("end", end)):
+            if not problem and time is None:
+                problem = f"{name} {quoted(cells[name])} is no time"
+        if not problem and start is not None and end is not None and start >= end:
+            problem, expected = f"start {cells['start']} is not before end {cells['end']}", "a start before its end"
+        if problem or start is None or end is None:
+            raise CampaignError(str(problem), where=where, expected=expected, remedy="Correct the line.")
+        yield Segment(cells["flight"], cells["pair"], start.isoformat(), end.isoformat())
+
+
+def _utc(text: str) -> datetime | None:
+    """Return a time in UTC; one without time zone is UTC already. None if the text is no time."""
+    try:
+        time = datetime.fromisoformat(text)
+        time = time.astimezone(UTC).replace(tzinfo=None) if time.tzinfo else time
+    except (ValueError, OverflowError):
+        return None
+    return time if _FIRST_YEAR <= time.year <= _LAST_YEAR else None
+
+
+# ---- config/clocks.tsv: offset and drift of recorders against logs --------------------------------------------------
+
+CLOCKS = Path("config/clocks.tsv")
+CLOCK_COLUMNS = ["flight", "node", "offset_s", "drift_ppm", "std_s"]
+_FARTHEST_S, _LARGEST_PPM = Decimal(5_000_000_000), Decimal(1000)
+_EXPECTED = "flight, node, seconds to add to the recorder's time, ppm by which it runs slow, standard deviation in s"
+
+
+@dataclass(frozen=True)
+class ClockRow:
+    """The clock of a node's recorder in one flight, against that of the node's log.
+
+    Attributes
+    ----------
+    offset_ns
+        To be added to the recorder's times, at its first pulse.
+    drift_ppm
+        By which more is to be added for every second since.
+    std_s
+        Standard deviation of the offset; None: unknown.
+    """
+
+    flight: str
+    node: str
+    offset_ns: int = 0
+    drift_ppm: float = 0.0
+    std_s: float | None = None
+
+    def utc(self, times: "NDArray[np.datetime64]") -> "NDArray[np.datetime64]":
+        """Return times of a recorder converted to the log's clock.
+
+        Parameters
+        ----------
+        times
+            (pulse,) datetime64[ns], ascending, the first of the recording first.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> times = np.array(["2025-01-01T00:00:00", "2025-01-01T00:01:40"], "datetime64[ns]")
+        >>> (ClockRow("f01", "uav1", offset_ns=10**9, drift_ppm=10.0).utc(times) - times).astype(int).tolist()
+        [1000000000, 1001000000]
+        """
+        if not times.size:
+            return times
+        elapsed_ns = (times - times[0]).astype("int64")
+        further_ns = self.offset_ns + (elapsed_ns * (self.drift_ppm * 1e-6)).round().astype("int64")
+        shifted: NDArray[np.datetime64] = times + further_ns.astype("timedelta64[ns]")
+        return shifted
+
+
+def read_clocks(path: Path, *, flights: Sequence[Flight]) -> Iterator[ClockRow]:
+    """Yield the lines of a clocks.tsv; none where there is no such file.
+
+    Parameters
+    ----------
+    path
+        Tab-separated, columns flight, node, offset_s, drift_ppm, std_s, which the last two may leave empty.
+    flights
+        Those of flights.tsv.
+
+    Raises
+    ------
+    CampaignError
+        Naming file and line.
+    """
+    if not path.is_file():
+        return
+    nodes = {flight.name: flight.participants for flight in flights}
+    stated: set[tuple[str, str]] = set()
+    for where, cells in table_rows(path, CLOCK_COLUMNS, remedy="Write one line per flight and node."):
+        flight, node = cells["flight"], cells["node"]
+        problem = ""
+        if flight not in nodes:
+            problem = f"flight {quoted(flight)} is not in {FLIGHTS}"
+        elif node not in nodes[flight]:
+            problem = f"flight {flight} has no node {quoted(node)}"
+        elif (flight, node) in stated:
+            problem = f"flight {flight}, node {node} a second time"
+        if problem:
+            raise CampaignError(problem, where=where, expected=_EXPECTED, remedy="Correct the line.")
+        stated.add((flight, node))
+        offset = _number(cells, "offset_s", where, most=_FARTHEST_S) or Decimal(0)
+        drift = _number(cells, "drift_ppm", where, most=_LARGEST_PPM) or Decimal(0)
+        std = _number(cells, "std_s", where, most=_FARTHEST_S)
+        offset_ns = int((offset * 1_000_000_000).to_integral_value())
+        yield ClockRow(flight, node, offset_ns, float(drift), None if std is None else float(abs(std)))
+
+
+def _number(cells: dict[str, str], name: str, where: str, *, most: Decimal) -> Decimal | None:
+    """Return a cell as it is written, to all of its digits; None where it is empty."""
+    if not cells[name]:
+        return None
+    try:
+        value = Decimal(cells[name])
+    except InvalidOperation:
+        value = Decimal("nan")
+    if value.is_finite() and -most <= value <= most:
+        return value
+    raise CampaignError(
+        f"{name} {quoted(cells[name])}",
+        where=where,
+        expected=f"a number between -{most} and {most}, or nothing",
+        remedy="Correct the line; `apertura align` writes it.",
+    )

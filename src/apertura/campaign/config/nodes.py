@@ -1,0 +1,341 @@
+"""Section `nodes`: equipment of each UAV, lever arms, antennas, and values that its log lacks."""
+
+import math
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, field_validator, model_validator
+
+from apertura.campaign.config.section import Metres3, Section
+from apertura.common.errors import CampaignError
+from apertura.formats.names import TRACKS
+from apertura.formats.tracks.log_options import LogOptions
+
+# ---- Section `nodes.<n>.log`: values that a flight log lacks --------------------------------------------------------
+
+Latitude = Annotated[float, Field(ge=-90, le=90)]
+Longitude = Annotated[float, Field(ge=-180, le=360)]
+Cell = Annotated[str, Field(min_length=1, max_length=200)]
+
+
+class Log(Section):
+    """How a flight log is to be read where it leaves that open."""
+
+    format: str | None = Field(None, description=f"one of {', '.join(TRACKS)}; null: by the file's suffix and heading")
+    time_system: Literal["utc", "gpst"] | None = Field(
+        None, description="of times whose log does not say whether they are utc or gpst, which is ahead by leap seconds"
+    )
+    start_utc: str | None = Field(
+        None,
+        description="time zero of a log that counts from its beginning, or the day of one that writes times of day "
+        "only, ISO 8601 in UTC",
+    )
+    columns: dict[Cell, Cell] = Field(
+        default_factory=dict, description="column that apertura reads → its name in a CSV log"
+    )
+    scales: dict[Cell, Annotated[float, Field(gt=0, le=1e12)]] = Field(
+        default_factory=dict, description="column that apertura reads → factor of its numbers in a CSV log: 1e-7, 0.001"
+    )
+    quality: Literal["rtklib", "gga"] | None = Field(
+        None,
+        description="how a CSV log numbers kinds of solution: rtklib (1 fix, 2 float, 5 single) or gga (4 fix, 5 "
+        "float, 1 single); null: it names them",
+    )
+    base: tuple[Latitude, Longitude, float] | None = Field(
+        None, description="where baselines begin: latitude, longitude (deg), ellipsoidal height (m), WGS 84"
+    )
+    body: str | None = Field(None, description="which rigid body or device, where the log holds several")
+    height_offset_m: float | None = Field(
+        None, description="to be added to logged heights to give ellipsoidal ones, where the log has others, m"
+    )
+    longest_gap_s: float | None = Field(
+        None, gt=0, description="pulses in longer gaps between epochs are left out, s; null: where a spline may err"
+    )
+    smoothing_m: float | None = Field(
+        None, gt=0, description="noise of logged positions that a smoothing spline takes off, m; null: none is"
+    )
+
+    @field_validator("format")
+    @classmethod
+    def _format_is_known(cls, name: str | None) -> str | None:
+        if name is not None and name not in TRACKS:
+            raise ValueError(f"no such format; choose {', '.join(TRACKS)}")
+        return name
+
+    @property
+    def options(self) -> LogOptions:
+        """As readers take them."""
+        read = self.model_dump(exclude={"longest_gap_s", "smoothing_m"})
+        return LogOptions(**read)
+
+
+# ---- Section `nodes`: equipment, lever arms, antennas ---------------------------------------------------------------
+
+_OHMS = 50.0  # that voltages are stated in
+StandardDeviation = Annotated[float, Field(gt=0)]
+Beamwidth = Annotated[float, Field(gt=0, le=180)]
+
+
+class Antenna(Section):
+    """Where one antenna looks and how widely; its horizontal axis lies in the body's forward-right plane."""
+
+    boresight_deg: tuple[Annotated[float, Field(ge=-180, le=360)], Annotated[float, Field(ge=-90, le=90)]] = Field(
+        description="azimuth clockwise from forward, elevation above the forward-right plane (down is negative), deg"
+    )
+    beamwidth_deg: tuple[Beamwidth, Beamwidth] | None = Field(
+        None, description="full width at -3 dB (one way) in azimuth and elevation of a Gaussian beam, deg"
+    )
+    pattern: str | None = Field(
+        None,
+        description="instead of beamwidth_deg a CSV of both cuts: columns cut (azimuth, elevation), angle_deg, "
+        "gain_db, and phase_deg where it is known",
+    )
+    cutoff_db: float = Field(
+        -20.0, ge=-80, le=-3, description="gain below which a cut ends: pulses beyond are left out, dB under its peak"
+    )
+
+    @model_validator(mode="after")
+    def _one_pattern(self) -> Self:
+        if (self.beamwidth_deg is None) == (self.pattern is None):
+            raise ValueError("give either beamwidth_deg, [azimuth, elevation], or pattern, a CSV file")
+        return self
+
+
+Decibels = Annotated[float, Field(ge=-300, le=300)]
+Gain = Annotated[float, Field(ge=-60, le=80)]
+Polarisation = Literal["H", "V", "L", "R"]
+
+_BEAM = "null (isotropic), or boresight_deg with beamwidth_deg or pattern, and cutoff_db"
+
+
+class Antennas(Section):
+    """The beams of a node."""
+
+    radar_tx: Antenna | None = Field(None, description=f"transmitting radar antenna: {_BEAM}")
+    radar_rx: Antenna | None = Field(None, description=f"receiving radar antenna: {_BEAM}")
+    radar_tx_gain_dbi: Gain | None = Field(
+        None, description="peak gain of the transmitting radar antenna, to which its beam is relative, dBi"
+    )
+    radar_rx_gain_dbi: Gain | None = Field(
+        None, description="peak gain of the receiving radar antenna, to which its beam is relative, dBi"
+    )
+    radar_tx_polarisation: Polarisation | None = Field(
+        None, description="what the transmitting radar antenna sends: H, V, L or R; null: not stated"
+    )
+    radar_rx_polarisation: Polarisation | None = Field(
+        None, description="what the receiving radar antenna takes in: H, V, L or R; null: not stated"
+    )
+
+    def any(self) -> bool:
+        """Return whether one of them has a beam."""
+        return self.radar_tx is not None or self.radar_rx is not None
+
+
+class LeverArms(Section):
+    """From the logged point to each phase centre, body axes forward-right-down."""
+
+    radar_tx: Metres3 = Field((0.0, 0.0, 0.0), description="transmitting radar antenna, m")
+    radar_rx: Metres3 = Field((0.0, 0.0, 0.0), description="receiving radar antenna, m")
+    sidelink: Metres3 = Field((0.0, 0.0, 0.0), description="sidelink antenna, m")
+
+    def any(self) -> bool:
+        """Return whether one of them is not zero."""
+        return any(any(arm) for arm in (self.radar_tx, self.radar_rx, self.sidelink))
+
+
+class PathOffsets(Section):
+    """Electrical path beyond geometry, metres of total path, of the receiving node."""
+
+    radar: float = Field(0.0, description="radar channel, m")
+    sidelink: float = Field(0.0, description="sidelink channel, m")
+
+
+class Receiver(Section):
+    """From the port of the receiving radar antenna to the numbers recorded."""
+
+    full_scale_counts: float = Field(
+        gt=0, le=2**32, description="|I + jQ| of a complex sine at full scale, in the numbers recorded: 8192 of 14 bits"
+    )
+    full_scale_dbm: Decibels | None = Field(None, description="power of that sine at the converter's input, dBm")
+    full_scale_v: Annotated[float, Field(gt=0, le=1e6)] | None = Field(
+        None, description="instead of full_scale_dbm, its amplitude (half of peak to peak) in 50 ohms, V"
+    )
+    gain_db: Decibels = Field(description="from the antenna's port to the converter's input, cables included, dB")
+    noise_figure_db: Annotated[float, Field(ge=0, le=100)] | None = Field(
+        None, description="noise figure at the antenna's port, dB: what measured noise is compared with; null: unknown"
+    )
+
+    @model_validator(mode="after")
+    def _one_full_scale(self) -> Self:
+        if (self.full_scale_dbm is None) == (self.full_scale_v is None):
+            raise ValueError("give either full_scale_dbm or full_scale_v, what the converter takes as full scale")
+        return self
+
+    @property
+    def at_full_scale_dbm(self) -> float:
+        """Power of a sine at full scale, dBm.
+
+        Examples
+        --------
+        >>> round(Receiver(full_scale_counts=8192, full_scale_v=0.5, gain_db=30).at_full_scale_dbm, 2)
+        3.98
+        """
+        if self.full_scale_v is None:
+            return float(self.full_scale_dbm or 0.0)
+        return 10 * math.log10(self.full_scale_v**2 / (2 * _OHMS) * 1e3)
+
+
+class Node(Section):
+    """One UAV."""
+
+    lever_arms_m: LeverArms = Field(default_factory=LeverArms, description="logged point → phase centres, body axes")
+    antennas: Antennas = Field(default_factory=Antennas, description="beams: where the antennas look, in body axes")
+    path_offset_m: PathOffsets = Field(
+        default_factory=PathOffsets, description="electrical path beyond geometry, as receiver"
+    )
+    transmit_power_dbm: Decibels | None = Field(
+        None, description="mean power at the transmitting antenna's port while the signal is sent, dBm; null: unknown"
+    )
+    receiver: Receiver | None = Field(
+        None,
+        description="its radar receiver: full_scale_counts, full_scale_dbm or full_scale_v, gain_db, noise_figure_db; "
+        "with transmit_power_dbm and both gains of antennas images are calibrated to sigma0; null: they are relative",
+    )
+    amplitude_std_db: Annotated[float, Field(ge=0, le=100)] | None = Field(
+        None,
+        description="error of what is stated of power, antenna gains and receiver together, standard deviation, dB; "
+        "null: nobody knows",
+    )
+    attitude: Literal["log", "course", "none"] = Field(
+        "none", description="where attitude comes from: the log, the course over ground, or none"
+    )
+    log: Log = Field(default_factory=Log, description="how the flight log is read, where it leaves that open")
+    worst_fix: Literal["auto", "fix", "float", "any"] = Field(
+        "auto",
+        description="poorest solution to image with, where the log says: fix, float, or any; auto: fix where the log "
+        "has RTK at all, else any; pulses of poorer ones are left out",
+    )
+    position_std_m: StandardDeviation | tuple[StandardDeviation, StandardDeviation, StandardDeviation] | None = Field(
+        None,
+        description="error of logged positions, standard deviation, m: one number, or [north, east, up]; null: what "
+        "the log itself states, if it does",
+    )
+    position_correlation_s: float = Field(
+        1.0,
+        gt=0,
+        description="how long an error of position lasts, as white noise after a moving average so long: its "
+        "autocorrelation falls in a straight line to zero there, to 1/e at 0.63 of it, s",
+    )
+    position_drift_m: float = Field(
+        0.0,
+        ge=0,
+        description="slow error of position over a flight, offset, slope and bow, standard deviation in each axis, m: "
+        "what a refinement of tracks may correct beside what position_std_m allows",
+    )
+    attitude_std_deg: StandardDeviation | tuple[StandardDeviation, StandardDeviation] | None = Field(
+        None,
+        description="error of attitude, standard deviation, deg: one number, or [roll and pitch, heading]; null: "
+        "nobody knows, and the budget takes that of a small inertial unit, or of the course",
+    )
+    attitude_correlation_s: float = Field(
+        100.0, gt=0, description="how long an error of attitude lasts, as position_correlation_s, s"
+    )
+    lever_arm_std_m: StandardDeviation | None = Field(
+        None,
+        description="error of lever_arms_m in each axis, standard deviation, m; null: nobody knows, and the budget "
+        "takes 1 cm",
+    )
+    time_tag_std_s: float = Field(
+        3e-3, ge=0, description="error that all time tags of a flight share, standard deviation, s"
+    )
+
+    @property
+    def attitude_error_deg(self) -> tuple[float, float] | None:
+        """Value of `attitude_std_deg` for the vertical and for heading."""
+        stated = self.attitude_std_deg
+        return stated if stated is None or isinstance(stated, tuple) else (stated, stated)
+
+    @property
+    def poorest_fix(self) -> str:
+        """Value of `worst_fix` for a log with RTK."""
+        return "fix" if self.worst_fix == "auto" else self.worst_fix
+
+    @model_validator(mode="after")
+    def _lever_arm_needs_attitude(self) -> Self:
+        if self.attitude == "none" and self.lever_arms_m.any():
+            raise ValueError(
+                "lever_arms_m is not zero but attitude is none: body axes cannot be turned to north-east-down; "
+                "set attitude to log or course, or the lever arms to zero"
+            )
+        if self.attitude == "none" and self.antennas.any():
+            raise ValueError(
+                "antennas has a beam but attitude is none: body axes cannot be turned to north-east-down; "
+                "set attitude to log or course, or the beam to null"
+            )
+        return self
+
+
+# ---- The radio of a pair, where images are calibrated --------------------------------------------------------------
+
+
+def radio_of(nodes: Mapping[str, Node], pair: str) -> dict[str, object]:
+    """Return key of the config → what it states of a pair's radio; None where it states nothing.
+
+    Examples
+    --------
+    >>> list(radio_of({"a": Node(transmit_power_dbm=10.0), "b": Node()}, "a-b"))[:2]
+    ['nodes.a.transmit_power_dbm', 'nodes.a.antennas.radar_tx_gain_dbi']
+    """
+    tx, rx = pair.split("-")
+    return {
+        f"nodes.{tx}.transmit_power_dbm": nodes[tx].transmit_power_dbm,
+        f"nodes.{tx}.antennas.radar_tx_gain_dbi": nodes[tx].antennas.radar_tx_gain_dbi,
+        f"nodes.{rx}.antennas.radar_rx_gain_dbi": nodes[rx].antennas.radar_rx_gain_dbi,
+        f"nodes.{rx}.receiver": nodes[rx].receiver,
+    }
+
+
+def polarisation_of(nodes: Mapping[str, Node], pair: str) -> str | None:
+    """Return the polarisations of a pair, as sent and as received; None unless both are stated.
+
+    Examples
+    --------
+    >>> own = Node(antennas=Antennas(radar_tx_polarisation="H", radar_rx_polarisation="V"))
+    >>> polarisation_of({"a": own, "b": Node()}, "a-a"), polarisation_of({"a": own, "b": Node()}, "a-b")
+    ('HV', None)
+    """
+    tx, rx = pair.split("-")
+    sent, received = nodes[tx].antennas.radar_tx_polarisation, nodes[rx].antennas.radar_rx_polarisation
+    return f"{sent}{received}" if sent and received else None
+
+
+def check_radio(nodes: Mapping[str, Node], pairs: Iterable[str], *, sampled: bool, where: Path) -> None:
+    """Raise CampaignError unless the radio of all pairs is stated, or of none.
+
+    Parameters
+    ----------
+    nodes, pairs
+        Of the campaign.
+    sampled
+        Whether samples were recorded: the scale of recorded phase histories is not known.
+    where
+        The config.
+
+    Raises
+    ------
+    CampaignError
+        If the radio of some pair is stated in parts.
+    """
+    stated = {key: value for pair in pairs for key, value in radio_of(nodes, pair).items()}
+    missing = [key for key, value in stated.items() if value is None]
+    if len(missing) < len(stated) and (missing or not sampled):
+        raise CampaignError(
+            f"{', '.join(missing)} {'is' if len(missing) == 1 else 'are'} not stated, "
+            f"{next(key for key, value in stated.items() if value is not None)} is"
+            if missing
+            else "a radio is stated, but numbers of a recorded phase history have no stated scale",
+            where=where,
+            expected="power, both antenna gains and receiver of every pair, or of none of them",
+            remedy="State what is missing, or set the rest to null: images are then relative.",
+        )

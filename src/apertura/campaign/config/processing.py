@@ -1,0 +1,393 @@
+"""Sections `scene`, `processing`, `calibration`, `interferometry`: grid, ground, how to compute, what to compare."""
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import Field, field_validator, model_validator
+
+from apertura.campaign.config.section import CrsName, Metres3, Name, Section, Title, plain_crs
+from apertura.common.constants import LARGEST_REFRACTIVITY, VERTICAL_DATUMS
+from apertura.common.errors import CampaignError, quoted
+from apertura.core.imaging.choices import ImagingChoices
+
+# ---- Sections `processing` and `calibration` ------------------------------------------------------------------------
+
+
+class Fusion(Section):
+    """How the images of a flight's pairs are added up."""
+
+    align_phase: bool = Field(
+        False, description="take a constant phase between pairs, measured at bright points, off before they are added"
+    )
+
+
+class Multilooking(Section):
+    """Mean power on a coarser grid."""
+
+    spacing_m: float = Field(gt=0, description="side of the squares that power is averaged over, to whole pixels, m")
+    subtract_noise: bool = Field(
+        False, description="take the noise measured off: what is left of places without echo scatters about zero"
+    )
+    speckle_filter: Literal["none", "lee"] = Field("none", description="what is done against the speckle that is left")
+
+
+class Processing(ImagingChoices):
+    """How to compute; every key has a default."""
+
+    sidelink: Literal["auto", "divide", "wiener", "gated", "two_parameter"] = Field(
+        "auto", description="correction of a secondary node by its sidelink; auto takes the cheapest adequate"
+    )
+    fusion: Fusion = Field(default_factory=Fusion, description="how the images of a flight's pairs are added up")
+    autofocus: Literal["auto", "on", "off"] = Field(
+        "auto",
+        description="tracks refined by the images themselves; auto: where errors of position that are stated cost more "
+        "than they should",
+    )
+    autofocus_method: Literal["auto", "tracks", "phase_gradient", "minimum_entropy"] = Field(
+        "auto",
+        description="what is refined: tracks, or one phase per pulse and pair by either method; auto: one phase, by "
+        "minimum_entropy, where all of the scene sees errors of position alike, else tracks",
+    )
+    radiometry: tuple[Literal["sigma0", "gamma0", "beta0"], ...] = Field(
+        ("sigma0",),
+        description="which backscattering coefficients are written of calibrated images, sigma0_db.tif and so on",
+    )
+    radiometric_calibration: str | None = Field(
+        None,
+        description="file that `apertura reflectors` wrote of flights of this radar: its constants calibrate images in "
+        "place of the radio that nodes state; null: that radio",
+    )
+    multilook: Multilooking | None = Field(
+        None,
+        description="mean power of squares of pixels, multilook_db.tif and so on, such as {spacing_m: 1.0, "
+        "subtract_noise: true, speckle_filter: lee}; null: none",
+    )
+    keep: tuple[Literal["echo"], ...] = Field(
+        (),
+        description="what is written though no image needs it: echo, the transfer functions of every pulse in "
+        "transfer.zarr, from which pairs are imaged again where the recording is no longer there",
+    )
+    scheduler: str = Field(
+        "threads",
+        description="who forms the tiles: threads of the step, or the dask scheduler at tcp://host:port, if whoever "
+        "runs this names the same in DASK_SCHEDULER_ADDRESS",
+    )
+    false_alarms_per_s: float = Field(
+        1e-3, gt=0, description="how often noise alone may trigger in a continuous recording, per second"
+    )
+
+    @field_validator("autofocus", mode="before")
+    @classmethod
+    def _yaml_reads_on_and_off_as_truth(cls, word: object) -> object:
+        return {True: "on", False: "off"}[word] if isinstance(word, bool) else word
+
+    @field_validator("scheduler")
+    @classmethod
+    def _scheduler_is_an_address(cls, text: str) -> str:
+        if text != "threads" and not re.fullmatch(r"tcp://[A-Za-z0-9_.-]+:[0-9]{1,5}", text):
+            raise ValueError("neither threads nor an address tcp://host:port")
+        return text
+
+
+class Calibration(Section):
+    """Which flight the path offsets come from."""
+
+    flight: Name = Field(description="flight of kind calibration whose offsets the imaging flights use")
+    reflector_m: Metres3 = Field(description="reflector: easting, northing in scene.crs, ellipsoidal height, m")
+    search_m: float = Field(10.0, gt=0, description="offsets of either sign up to this are considered, m")
+
+
+class Bench(Section):
+    """What is known of a set-up that stands still, in flights of kind bench."""
+
+    radar_m: float | None = Field(
+        None,
+        ge=0,
+        description="path of the strongest echo, or of its cable, from transmitter to receiver, m; null: unknown",
+    )
+    sidelink_m: float | None = Field(
+        None, ge=0, description="path of the sidelink, or of its cable, without path_offset_m, m; null: unknown"
+    )
+    split: bool = Field(False, description="whether one signal is split to the radar channels of all nodes")
+
+
+# ---- Section `interferometry`: pairs of images for interferograms ---------------------------------------------------
+
+LEAST_WINDOW_PX = 3
+"""Any two pixels are coherent: a window must hold several."""
+
+_IMAGE = r"([A-Za-z0-9_.]+)/([A-Za-z0-9_.]+-[A-Za-z0-9_.]+)"
+
+
+class Interferometry(Section):
+    """Phase between two images of one scene."""
+
+    pairs: Mapping[Name, tuple[str, str]] = Field(
+        default_factory=dict,
+        description="name → two images, [flight/transmitter-receiver, flight/transmitter-receiver], such as "
+        "two_tracks: [f01/uav1-uav1, f02/uav1-uav1]; none by default",
+    )
+    window_px: int = Field(
+        15, ge=LEAST_WINDOW_PX, le=255, description="side of the square that coherence and phase are means of, odd"
+    )
+
+    @field_validator("pairs")
+    @classmethod
+    def _two_images(cls, pairs: Mapping[str, tuple[str, str]]) -> Mapping[str, tuple[str, str]]:
+        for name, images in pairs.items():
+            for image in images:
+                if not re.fullmatch(_IMAGE, image):
+                    raise ValueError(f"{name}: {quoted(image)} is not flight/transmitter-receiver")
+            if images[0] == images[1]:
+                raise ValueError(f"{name}: {images[0]} is named twice: an image has no phase against itself")
+        return pairs
+
+    @field_validator("window_px")
+    @classmethod
+    def _has_a_middle(cls, side: int) -> int:
+        if side % 2 == 0:
+            raise ValueError("must be odd, so that a pixel is in its middle")
+        return side
+
+    def images(self, name: str) -> tuple[tuple[str, str], tuple[str, str]]:
+        """Return flight and pair of the two images of an interferogram.
+
+        Examples
+        --------
+        >>> Interferometry(pairs={"two": ("f01/a-a", "f02/a-b")}).images("two")
+        (('f01', 'a-a'), ('f02', 'a-b'))
+        """
+        first, second = ((flight, pair) for flight, _, pair in (one.partition("/") for one in self.pairs[name]))
+        return first, second
+
+
+def check_interferometry(requested: Interferometry, known: Sequence[str], *, where: Path) -> None:
+    """Raise CampaignError unless every image named is one of the campaign's.
+
+    Parameters
+    ----------
+    asked
+        The section.
+    known
+        Images of the campaign, flight/pair.
+    where
+        The config.
+    """
+    for name, images in requested.pairs.items():
+        for image in images:
+            if image not in known:
+                raise CampaignError(
+                    f"no image {quoted(image)}",
+                    where=f"{where}: interferometry.pairs.{name}",
+                    expected=f"two of {', '.join(known) or 'no image at all'}",
+                    remedy="Correct the flight or the pair, or add them to flights.tsv.",
+                )
+
+
+# ---- Section `scene`: the grid of every raster, and the ground under it --------------------------------------------
+
+
+class KnownPoint(Section):
+    """A point of known place that is visible in the images: it fixes the position of refined tracks."""
+
+    name: Title = Field(description="what it is called")
+    position_m: Metres3 = Field(description="easting, northing in scene.crs, ellipsoidal height (z in local), m")
+    std_m: float = Field(gt=0, description="standard deviation of each coordinate, m")
+
+
+_CORNERS = ("trihedral", "dihedral")  # that look somewhere
+_SIZES = {"trihedral": "[leg]", "dihedral": "[across the seam, along it]", "sphere": "[radius]"}
+
+
+class KnownReflector(KnownPoint):
+    """A reflector whose radar cross-section follows from its shape."""
+
+    kind: Literal["trihedral", "dihedral", "sphere"] = Field(description="of three triangles, two rectangles, a sphere")
+    size_m: tuple[Annotated[float, Field(gt=0, le=100)], ...] = Field(
+        description="trihedral: [leg of its triangles]; dihedral: [across the seam, along it]; sphere: [radius], m"
+    )
+    azimuth_deg: float | None = Field(
+        None, ge=-360, le=360, description="where its boresight points, clockwise from the north of scene.crs, deg"
+    )
+    elevation_deg: float | None = Field(None, ge=-90, le=90, description="and above the horizontal, deg")
+    roll_deg: float = Field(
+        0.0,
+        ge=-360,
+        le=360,
+        description="clockwise about the boresight, seen along it from behind; 0: seam of a dihedral level, one seam "
+        "of a trihedral upward in the vertical plane of the boresight, deg",
+    )
+    rcs_std_db: float = Field(
+        0.0, ge=0, le=100, description="error of its cross-section as built and set up, standard deviation, dB"
+    )
+
+    @model_validator(mode="after")
+    def _is_complete(self) -> Self:
+        if len(self.size_m) != (2 if self.kind == "dihedral" else 1):
+            raise ValueError(f"size_m={list(self.size_m)}: a {self.kind} has {_SIZES[self.kind]}")
+        aimed = [value for value in (self.azimuth_deg, self.elevation_deg) if value is not None]
+        if len(aimed) != (2 if self.kind in _CORNERS else 0):
+            raise ValueError(
+                f"a {self.kind} looks somewhere: state both azimuth_deg and elevation_deg"
+                if self.kind in _CORNERS
+                else "a sphere looks nowhere: azimuth_deg and elevation_deg are of corners"
+            )
+        return self
+
+
+class Air(Section):
+    """Air at the ground of the scene, in place of the standard atmosphere: as measured, or its refractivity."""
+
+    temperature_c: float | None = Field(None, ge=-60, le=60, description="at the ground, °C")
+    pressure_hpa: float | None = Field(None, ge=300, le=1100, description="at the ground, not reduced to the sea, hPa")
+    relative_humidity: float | None = Field(None, ge=0, le=100, description="at the ground, %")
+    refractivity_n: float | None = Field(
+        None, ge=0, le=LARGEST_REFRACTIVITY, description="(n - 1)·10⁶ at the ground, instead of the other three"
+    )
+
+    @model_validator(mode="after")
+    def _one_way(self) -> Self:
+        weather = self.temperature_c, self.pressure_hpa, self.relative_humidity
+        given = sum(value is not None for value in weather)
+        if given != (3 if self.refractivity_n is None else 0):
+            raise ValueError(
+                f"{given} of temperature_c, pressure_hpa, relative_humidity"
+                f"{' beside refractivity_n' if self.refractivity_n is not None else ''}: give all three, or "
+                "refractivity_n alone"
+            )
+        return self
+
+    @property
+    def weather(self) -> tuple[float, float, float]:
+        """Temperature, °C, pressure, hPa, and humidity, %; ValueError where refractivity is stated instead."""
+        if self.temperature_c is None or self.pressure_hpa is None or self.relative_humidity is None:
+            raise ValueError("the refractivity is stated, and no weather")
+        return self.temperature_c, self.pressure_hpa, self.relative_humidity
+
+
+HEIGHT_DEFAULT = "no ground height is configured: scene.height_m is 0 m, the ellipsoid itself"
+
+
+class Scene(Section):
+    """The campaign's output grid."""
+
+    crs: CrsName = Field(
+        "auto",
+        description="authority and code, such as EPSG:32632, auto (UTM zone of the track) or local (a frame without a "
+        "place on Earth)",
+    )
+    bounds_m: tuple[float, float, float, float] | Literal["auto"] = Field(
+        "auto", description="[xmin, ymin, xmax, ymax], outer pixel edges in crs, or auto"
+    )
+    spacing_m: float | Literal["auto"] = Field("auto", description="pixel spacing, m, or auto")
+    height_m: float = Field(0.0, description="height of flat ground, m; not used where there is a dem")
+    height_std_m: float | None = Field(
+        None, ge=0, description="standard deviation of the ground's heights, m; null: not stated"
+    )
+    height_datum: Literal["ellipsoid", "egm96", "egm2008"] = Field("ellipsoid", description="what height_m counts from")
+    dem: str | None = Field(None, description="terrain instead of flat ground: a GeoTIFF of heights, in any CRS")
+    dem_datum: Literal["ellipsoid", "egm96", "egm2008", "carried"] | None = Field(
+        None, description="what the heights of dem count from; carried: its own CRS says it"
+    )
+    geoid: str | None = Field(
+        None, description="grid file of the geoid heights count from (.gtx, .tif); null: looked for where PROJ looks"
+    )
+    atmosphere: Literal["auto", "vacuum"] | Air = Field(
+        "auto",
+        description="air that the waves fly through: auto, standard atmosphere at the ground's height with 50 % "
+        "humidity; {temperature_c: x, pressure_hpa: y, relative_humidity: z} measured at the ground; "
+        "{refractivity_n: 290} there, 0 for recordings simulated in vacuum; vacuum, an approximation whose error is "
+        "in the budget; air thins with height",
+    )
+    reference_points: tuple[KnownPoint, ...] = Field(
+        (),
+        description="bright points whose places are known, which tracks refined are tied to: a list of name, "
+        "position_m [easting, northing, ellipsoidal height] and std_m",
+    )
+
+    reflectors: tuple[KnownReflector, ...] = Field(
+        (),
+        description="reflectors of known cross-section, which `apertura reflectors` measures constants at: a list of "
+        "name, position_m and std_m as of reference_points, kind (trihedral, dihedral, sphere), size_m, and of corners "
+        "azimuth_deg and elevation_deg",
+    )
+
+    @property
+    def height_is_default(self) -> bool:
+        """Whether flat ground lies at 0 m: what the template says, and hardly any ground is at."""
+        return self.dem is None and self.height_m == 0
+
+    @model_validator(mode="after")
+    def _points_are_somewhere(self) -> Self:
+        for key in ("reference_points", "reflectors"):
+            names = [point.name for point in getattr(self, key)]
+            if names and self.crs == "auto":
+                raise ValueError(f"{key} are in crs, which is auto: give the CRS")
+            twice = sorted({name for name in names if names.count(name) > 1})
+            if twice:
+                raise ValueError(f"{key}: two are called {twice[0]!r}")
+        return self
+
+    @model_validator(mode="after")
+    def _datum_is_stated(self) -> Self:
+        if self.dem is not None and self.dem_datum is None:
+            raise ValueError(
+                "dem is given without dem_datum: state what its heights count from "
+                "(ellipsoid, egm96, egm2008, or carried where its CRS says it); it is never guessed"
+            )
+        if self.dem is None and self.dem_datum is not None:
+            raise ValueError(f"dem_datum={self.dem_datum} is given without dem")
+        stated = {self.dem_datum, self.height_datum}
+        if self.crs == "local" and stated & {"egm96", "egm2008"}:
+            raise ValueError(
+                "heights in the local frame count from no geoid: take carried for dem_datum, and ellipsoid"
+            )
+        return self
+
+    @model_validator(mode="before")
+    @classmethod
+    def _heights_of_crs_are_those_stated(cls, values: Any) -> Any:
+        """Take the horizontal part of a compound CRS, whose heights must be those that the datum states."""
+        crs = values.get("crs") if isinstance(values, dict) else None
+        if not isinstance(crs, str) or "+" not in plain_crs(crs):
+            return values
+        horizontal, _, vertical = crs.partition("+")
+        vertical = (vertical if ":" in vertical else f"{horizontal.partition(':')[0]}:{vertical}").upper()
+        key = "height_datum" if values.get("dem") is None else "dem_datum"
+        stated, carried = values.get(key, "ellipsoid"), VERTICAL_DATUMS.get(vertical, vertical)
+        if stated != carried:
+            raise ValueError(
+                f"crs={crs} says heights of {carried}, {key} says {quoted(stated)}: "
+                f"heights count from what {key} says; give crs={horizontal}, and {key} as it is"
+            )
+        return {**values, "crs": horizontal}
+
+    @model_validator(mode="after")
+    def _bounds_are_pixels(self) -> Self:
+        if self.spacing_m != "auto" and self.spacing_m <= 0:
+            raise ValueError(f"spacing_m={self.spacing_m}: must be positive")
+        if self.bounds_m == "auto":
+            return self
+        xmin, ymin, xmax, ymax = self.bounds_m
+        if xmin >= xmax or ymin >= ymax:
+            sorted_m = [min(xmin, xmax), min(ymin, ymax), max(xmin, xmax), max(ymin, ymax)]
+            raise ValueError(
+                f"bounds_m={list(self.bounds_m)}: must be [xmin, ymin, xmax, ymax] with min < max, in order {sorted_m}"
+            )
+        if self.spacing_m != "auto":
+            self._divisible(xmin, ymin, xmax, ymax, self.spacing_m)
+        return self
+
+    def _divisible(self, xmin: float, ymin: float, xmax: float, ymax: float, spacing: float) -> None:
+        counts = ((xmax - xmin) / spacing, (ymax - ymin) / spacing)
+        if any(abs(count - round(count)) > 1e-6 * max(count, 1.0) for count in counts):
+            columns, rows = (max(1, round(count)) for count in counts)
+            degrees = self.crs != "local" and max(map(abs, (xmin, ymin, xmax, ymax))) <= 180 and xmax - xmin < 1
+            hint = ": these look like degrees, bounds_m is in metres of crs" if degrees else ""
+            nearest = [xmin, round(ymax - rows * spacing, 9), round(xmin + columns * spacing, 9), ymax]
+            raise ValueError(
+                f"bounds_m={list(self.bounds_m)} is {counts[0]:.6g} × {counts[1]:.6g} pixels of {spacing} m; "
+                f"the nearest whole grid is {nearest}{hint}"
+            )

@@ -1,0 +1,132 @@
+"""The commented config every campaign starts from, and its JSON schema, both generated from `Settings`."""
+
+import json
+import types
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any, Union, get_args, get_origin
+
+import yaml
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+from pydantic_core import PydanticUndefined
+
+from apertura.campaign.config import Node, Settings
+from apertura.campaign.config.waveform import Waveform
+from apertura.common.errors import CampaignError, quoted
+from apertura.core.backprojection.engines import ENGINES, load_engine
+
+WAVEFORMS: dict[str, type[BaseModel]] = {
+    get_args(one.model_fields["kind"].annotation)[0]: one for one in get_args(get_args(Waveform)[0])
+}
+"""waveform.kind and the section that it stands for."""
+
+_FLIGHTS = "flight\tkind\ttransmitter\tnodes\nf01\timage\tuav1\t{nodes}\n"
+_NODES = {"fmcw": ("uav1",), "phase_history": ("uav1",)}
+"""Kind of waveform → nodes of the example, where one radar sends and receives by itself; else two."""
+
+
+def config_template(kind: str = "ofdm") -> str:
+    """Return config/config.yaml with every key, its meaning as a comment, and its default or an example.
+
+    Parameters
+    ----------
+    kind
+        Of waveform: a key of `WAVEFORMS`.
+
+    Raises
+    ------
+    CampaignError
+        If there is no such kind.
+
+    Examples
+    --------
+    >>> print(config_template().splitlines()[2])
+    # name of the campaign
+    """
+    if kind not in WAVEFORMS:
+        raise CampaignError(
+            f"kind {quoted(kind)}", where="apertura init", expected=", ".join(WAVEFORMS), remedy="Choose one of them."
+        )
+    examples = {"waveform": WAVEFORMS[kind], "nodes": dict.fromkeys(_nodes(kind), Node)}
+    header = "# Generated from the settings model by `apertura init`; see config/README.md.\n\n"
+    return header + "\n".join(_section(Settings, 0, examples)) + "\n"
+
+
+def flights_template(kind: str = "ofdm") -> str:
+    """Return config/flights.tsv with one flight, for a kind of waveform."""
+    return _FLIGHTS.format(nodes=",".join(_nodes(kind)))
+
+
+def _nodes(kind: str) -> tuple[str, ...]:
+    return _NODES.get(kind, ("uav1", "uav2"))
+
+
+def config_schema() -> str:
+    """Return the JSON schema of config/config.yaml."""
+    return json.dumps(Settings.model_json_schema(), indent=1) + "\n"
+
+
+def _section(model: type[BaseModel], depth: int, examples: Mapping[str, Any] = MappingProxyType({})) -> list[str]:
+    lines: list[str] = []
+    for name, field in model.model_fields.items():
+        indent = "  " * depth
+        lines.append(f"{indent}# {field.description}{_choices(field)}")
+        if name == "engine_options":
+            lines += [f"{indent}#   {line}" for line in _options_of_each_engine()]
+        value = examples[name] if name in examples else _value(field)
+        if isinstance(value, type) and issubclass(value, BaseModel):
+            lines += [f"{indent}{name}:", *_section(value, depth + 1)]
+        elif isinstance(value, dict) and value:
+            lines.append(f"{indent}{name}:")
+            for key, inner in value.items():
+                lines += [f"{indent}  {key}:", *_section(inner, depth + 2)]
+        else:
+            lines.append(f"{indent}{name}: {_scalar(value)}")
+    return lines
+
+
+def _options_of_each_engine() -> list[str]:
+    engines = {name: load_engine(name).Options.model_fields for name in ENGINES}
+    return [
+        f"{name}.{key}: {field.description}{_choices(field)}"
+        for name, fields in engines.items()
+        for key, field in fields.items()
+    ]
+
+
+def _value(field: FieldInfo) -> Any:
+    if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
+        return field.annotation
+    if field.examples:
+        return field.examples[0]
+    if field.default is not PydanticUndefined:
+        return field.default
+    if field.default_factory is dict:
+        return {}
+    return get_args(field.annotation)[0]  # a Literal without default: its first choice
+
+
+def _choices(field: FieldInfo) -> str:
+    """Return the words or the range that a field takes, in brackets, unless its description names them."""
+    kinds = (
+        get_args(field.annotation) if get_origin(field.annotation) in (Union, types.UnionType) else (field.annotation,)
+    )
+    words = [str(word) for kind in kinds if str(kind).startswith("typing.Literal") for word in get_args(kind)]
+    listed = [word for word in words if word not in (field.description or "")]
+    if listed and len(words) > 1:
+        return f" ({' | '.join(words)})"
+    limits = [
+        limit
+        for kind in kinds
+        for about in getattr(kind, "__metadata__", ())
+        for limit in getattr(about, "metadata", ())
+    ]
+    ends = [getattr(limit, end) for end in ("gt", "ge", "lt", "le") for limit in limits if hasattr(limit, end)]
+    above = any(hasattr(limit, "gt") for limit in limits)
+    return f" ({'above ' if above else ''}{ends[0]:g} to {ends[1]:g})" if len(ends) == 2 else ""
+
+
+def _scalar(value: Any) -> str:
+    plain = list(value) if isinstance(value, tuple) else value
+    return yaml.safe_dump(plain, default_flow_style=True).removesuffix("\n").removesuffix("\n...")

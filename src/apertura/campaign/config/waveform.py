@@ -1,0 +1,334 @@
+"""Section `waveform`: what was transmitted, as samples or as transfer functions."""
+
+from abc import abstractmethod
+from typing import Annotated, ClassVar, Literal, Self
+
+from pydantic import Field, field_validator, model_validator
+
+from apertura.campaign.config.section import WAVEFORM_KINDS, Section
+from apertura.formats.names import PHASE_HISTORIES
+
+# ---- Waveforms recorded as samples: OFDM symbols, sampled pulses ----------------------------------------------------
+
+
+class SampledWaveform(Section):
+    """One pulse per trigger, recorded as samples: the common interface from captures to transfer functions.
+
+    Each kind states in `file_key` the key that names the file of the transmitted signal, in `delay_key` and
+    `limit_name` the key and the name of the interval in which an echo must arrive.
+    """
+
+    file_key: ClassVar[str]
+    delay_key: ClassVar[str]
+    limit_name: ClassVar[str]
+
+    kind: str = Field(description=WAVEFORM_KINDS)
+    carrier_hz: float = Field(gt=0, description="RF carrier: what lies at baseband zero, Hz", examples=[1.2e9])
+    sample_rate_hz: float = Field(gt=0, description="complex sample rate f_s, Hz", examples=[1.024e9])
+    prf_hz: float = Field(gt=0, description="pulse repetition frequency, Hz", examples=[100.0])
+    iq: Literal["complex", "swapped", "conjugate"] = Field(
+        "complex",
+        description="complex: I+jQ; swapped: the recorder wrote Q before I; conjugate: the local oscillator lies above "
+        "the band",
+    )
+
+    @property
+    @abstractmethod
+    def longest_delay_s(self) -> float:
+        """Delay up to which a whole echo is recorded, seconds."""
+
+    @property
+    @abstractmethod
+    def middle_s(self) -> float:
+        """Time of the middle of the measured part of the pulse, seconds after its beginning."""
+
+    @property
+    @abstractmethod
+    def capture_s(self) -> float:
+        """Duration of a capture, seconds; nothing beyond is used."""
+
+    @property
+    @abstractmethod
+    def needed_samples(self) -> int:
+        """Samples that a capture must hold."""
+
+    @property
+    @abstractmethod
+    def most_subcarriers(self) -> int:
+        """Frequencies that an echo is measured at, at most."""
+
+    @property
+    @abstractmethod
+    def widest_band_hz(self) -> float:
+        """Bandwidth, at most."""
+
+    @property
+    def capture_samples(self) -> int:
+        """Samples of a whole capture."""
+        return round(self.capture_s * self.sample_rate_hz)
+
+
+class OfdmWaveform(SampledWaveform):
+    """One OFDM symbol per pulse."""
+
+    file_key, delay_key, limit_name = "codes", "cyclic_prefix_s", "the cyclic prefix"
+
+    kind: Literal["ofdm"] = Field(description=WAVEFORM_KINDS)
+    codes: str = Field("raw/codes.npy", description="transmitted code symbols, complex64 (subcarriers,)")
+    carrier_is: Literal["band_start", "band_centre"] = Field(
+        "band_start", description="which subcarrier the carrier is: n = 0…N-1 (band_start) or -N/2…N/2-1 (band_centre)"
+    )
+    subcarriers: int = Field(gt=1, description="number of subcarriers N", examples=[4096])
+    subcarrier_spacing_hz: float = Field(gt=0, description="subcarrier spacing Δf, Hz", examples=[100e3])
+    symbol_s: float = Field(gt=0, description="transmitted symbol T without prefix, s", examples=[12.5e-6])
+    cyclic_prefix_s: float = Field(ge=0, description="cyclic prefix T_cp, s", examples=[3.125e-6])
+
+    @property
+    def longest_delay_s(self) -> float:
+        """The cyclic prefix."""
+        return self.cyclic_prefix_s
+
+    @property
+    def middle_s(self) -> float:
+        """The middle of the symbol."""
+        return self.cyclic_prefix_s + self.symbol_s / 2
+
+    @property
+    def capture_s(self) -> float:
+        """Prefix and symbol."""
+        return self.cyclic_prefix_s + self.symbol_s
+
+    @property
+    def prefix_samples(self) -> int:
+        """T_cp·f_s."""
+        return round(self.cyclic_prefix_s * self.sample_rate_hz)
+
+    @property
+    def dft_samples(self) -> int:
+        """f_s/Δf."""
+        return round(self.sample_rate_hz / self.subcarrier_spacing_hz)
+
+    @property
+    def needed_samples(self) -> int:
+        """Prefix and one period 1/Δf."""
+        return self.prefix_samples + self.dft_samples
+
+    @property
+    def most_subcarriers(self) -> int:
+        """N."""
+        return self.subcarriers
+
+    @property
+    def widest_band_hz(self) -> float:
+        """NΔf."""
+        return self.subcarriers * self.subcarrier_spacing_hz
+
+    @model_validator(mode="after")
+    def _dft_fits(self) -> Self:
+        length = self.sample_rate_hz / self.subcarrier_spacing_hz
+        if abs(length - round(length)) > 1e-6 * length:
+            raise ValueError(
+                f"sample_rate_hz/subcarrier_spacing_hz = {length:.6f} must be an integer: it is the DFT length"
+            )
+        if self.subcarriers > round(length):
+            raise ValueError(f"subcarriers={self.subcarriers} exceed the DFT length {round(length)}")
+        if self.symbol_s < (1 - 1e-9) / self.subcarrier_spacing_hz:
+            raise ValueError(
+                f"symbol_s={self.symbol_s:g} is shorter than the DFT window 1/subcarrier_spacing_hz = "
+                f"{1 / self.subcarrier_spacing_hz:g} s"
+            )
+        return self
+
+
+class PulseWaveform(SampledWaveform):
+    """A pulse given by its samples and sent once per trigger: a chirp, a code, whatever a loop-back captured."""
+
+    file_key, delay_key, limit_name = "pulse", "listen_s", "the listening time"
+
+    kind: Literal["samples"] = Field(description=WAVEFORM_KINDS)
+    pulse: str = Field(
+        "raw/pulse.npy", description="the pulse at sample_rate_hz: .npy of (sample,) complex, or (sample, 2) integers"
+    )
+    pulse_s: float = Field(gt=0, description="how long the pulse lasts: all of the file, s", examples=[1e-6])
+    lead_s: float = Field(0.0, ge=0, description="how long before the pulse a capture begins, s")
+    listen_s: float = Field(gt=0, description="longest delay whose echo a capture holds to its end, s", examples=[2e-6])
+    band_hz: tuple[float, float] | None = Field(
+        None, description="baseband frequencies that images are made of, Hz; null: where the pulse has its energy"
+    )
+    filter: Literal["auto", "inverse", "matched"] = Field(
+        "auto",
+        description="inverse leaves the window's sidelobes, matched the least noise; "
+        "auto: inverse, unless the spectrum is flat or has too many gaps",
+    )
+
+    @property
+    def longest_delay_s(self) -> float:
+        """As stated."""
+        return self.listen_s
+
+    @property
+    def middle_s(self) -> float:
+        """The middle of the pulse."""
+        return self.pulse_s / 2
+
+    @property
+    def capture_s(self) -> float:
+        """Lead time, pulse, and longest delay."""
+        return self.lead_s + self.pulse_s + self.listen_s
+
+    @property
+    def needed_samples(self) -> int:
+        """All of a capture: its end holds the end of the last echo."""
+        return self.capture_samples
+
+    @property
+    def most_subcarriers(self) -> int:
+        """Those of the band."""
+        return min(self.capture_samples, int(self.widest_band_hz / self.sample_rate_hz * self.capture_samples) + 1)
+
+    @property
+    def widest_band_hz(self) -> float:
+        """As stated, or all that the samples carry."""
+        return self.sample_rate_hz if self.band_hz is None else self.band_hz[1] - self.band_hz[0]
+
+    @model_validator(mode="after")
+    def _fits_its_samples(self) -> Self:
+        if self.band_hz is not None:
+            low, high = self.band_hz
+            half = self.sample_rate_hz / 2
+            if not -half <= low < high <= half:
+                raise ValueError(
+                    f"band_hz={[low, high]} must rise within ±sample_rate_hz/2 = ±{half:g} Hz: beyond, it aliases"
+                )
+        if self.capture_s * self.prf_hz > 1:
+            raise ValueError(
+                f"lead_s + pulse_s + listen_s = {self.capture_s:g} s is longer than 1/prf_hz = {1 / self.prf_hz:g} s"
+            )
+        return self
+
+
+# ---- Waveforms as transfer functions: phase histories, beat signals of FMCW -----------------------------------------
+
+_MOST_SAMPLES = 1_000_000
+"""Of a sweep; ramps of real radars have 100 to 100 000."""
+
+_LONGEST_REFERENCE_M = 1e6
+
+
+def _formats(kind: str) -> list[str]:
+    return [name for name, row in PHASE_HISTORIES.items() if row.waveform == kind]
+
+
+def _known(name: str, kind: str) -> str:
+    if name not in _formats(kind):
+        raise ValueError(f"no such format; choose {', '.join(_formats(kind))}")
+    return name
+
+
+class PhaseHistoryWaveform(Section):
+    """Frequency-domain samples with antenna positions, recorded by another radar."""
+
+    kind: Literal["phase_history"] = Field(description=WAVEFORM_KINDS)
+    format: str = Field(
+        description=f"format of the files raw/<flight>/<node>.*: {', '.join(_formats('phase_history'))}",
+        examples=["hdf5"],
+        json_schema_extra={"enum": [*_formats("phase_history")]},
+    )
+
+    air: Literal["auto", "measured", "point", "corrected"] = Field(
+        "auto",
+        description="air in the delays of the files: measured, delays as they were; point, samples are referred to a "
+        "point whose distance the file states, so that only what lies beyond it is delayed by air; corrected, whoever "
+        "made them took it out; auto: point for afrl_mat and cphd, else measured",
+    )
+    channel: str | None = Field(None, description="of a CPHD file with several channels the one to image")
+    corrections: Literal["none", "stored"] = Field(
+        "none", description="of afrl_mat files that hold corrections of their passes (data.af): stored applies them"
+    )
+    iq: Literal["complex", "conjugate"] = Field(
+        "complex", description="complex: samples as recorded; conjugate: their conjugates, where phases count upwards"
+    )
+
+    @field_validator("format")
+    @classmethod
+    def _format_is_known(cls, name: str) -> str:
+        return _known(name, "phase_history")
+
+    @model_validator(mode="after")
+    def _keys_are_of_their_format(self) -> Self:
+        if self.channel is not None and self.format != "cphd":
+            raise ValueError(f"channel={self.channel!r} is of format cphd, and not of {self.format}")
+        if self.corrections != "none" and self.format != "afrl_mat":
+            raise ValueError(f"corrections={self.corrections!r} is of format afrl_mat, and not of {self.format}")
+        return self
+
+
+class Trigger(Section):
+    """Where sweeps begin in a .wav file."""
+
+    sync_channel: int = Field(1, ge=1, le=64, description="channel of the sync pulses, counted from 1")
+    beat_channel: int = Field(2, ge=1, le=64, description="channel of the beat signal, counted from 1")
+    edge: Literal["rising", "falling"] = Field("rising", description="of the sync pulses, where a sweep begins")
+    threshold: float = Field(
+        0.3, gt=0, lt=1, description="how far beyond the middle of its levels sync must go, of half their distance"
+    )
+
+
+class FmcwWaveform(Section):
+    """Linear sweeps, mixed with their echoes when received: the beat signal was recorded."""
+
+    kind: Literal["fmcw"] = Field(description=WAVEFORM_KINDS)
+    format: str = Field(
+        description=f"format of the files raw/<flight>/<node>.*: {', '.join(_formats('fmcw'))}",
+        examples=["beat_npy"],
+        json_schema_extra={"enum": [*_formats("fmcw")]},
+    )
+    start_hz: float = Field(
+        gt=0, description="RF frequency at the first sample of a sweep, or at its trigger, Hz", examples=[2.2e9]
+    )
+    bandwidth_hz: float = Field(
+        description="what frequency rises by in sweep_s, Hz; negative: sweeps that fall", examples=[400e6]
+    )
+    sweep_s: float = Field(gt=0, description="how long a sweep is linear, s", examples=[20e-6])
+    sample_rate_hz: float = Field(gt=0, description="of the beat signal, Hz", examples=[25e6])
+    iq: Literal["real", "complex", "conjugate"] = Field(
+        "real",
+        description="real: one mixer; complex: I+jQ of echo times conjugate sweep, whose beats are negative in a "
+        "sweep that rises; conjugate: the other way about",
+    )
+    settle_s: float = Field(0.0, ge=0, description="left out at the beginning of every sweep, s")
+    reference_path_m: float = Field(0.0, ge=0, description="path of the sweep to the mixer inside the radar, m")
+    prf_hz: float | None = Field(None, ge=1e-3, description="sweeps per second, Hz; null: files hold times or triggers")
+    start_utc: str | None = Field(
+        None,
+        description="when files without times began, ISO 8601 in UTC by the recorder; null: 1970, config/clocks.tsv "
+        "says the rest",
+    )
+    trigger: Trigger = Field(default_factory=Trigger, description="where sweeps begin in a .wav file")
+
+    @field_validator("format")
+    @classmethod
+    def _format_is_known(cls, name: str) -> str:
+        return _known(name, "fmcw")
+
+    @model_validator(mode="after")
+    def _sweeps_hold_samples(self) -> Self:
+        if not self.bandwidth_hz or self.start_hz + self.bandwidth_hz <= 0:
+            raise ValueError(
+                f"bandwidth_hz={self.bandwidth_hz:g} from start_hz={self.start_hz:g} is no band above 0 Hz"
+            )
+        if not 8 <= (self.sweep_s - self.settle_s) * self.sample_rate_hz <= _MOST_SAMPLES:
+            raise ValueError(
+                f"(sweep_s - settle_s)*sample_rate_hz = {(self.sweep_s - self.settle_s) * self.sample_rate_hz:g} "
+                f"samples per sweep: must be 8 to {_MOST_SAMPLES}"
+            )
+        if self.reference_path_m > _LONGEST_REFERENCE_M:
+            raise ValueError(f"reference_path_m={self.reference_path_m:g}: at most {_LONGEST_REFERENCE_M:g}")
+        if self.prf_hz is not None and self.prf_hz * self.sweep_s > 1 + 1e-9:
+            raise ValueError(f"sweep_s={self.sweep_s:g} is longer than 1/prf_hz = {1 / self.prf_hz:g} s")
+        return self
+
+
+# ---- Section `waveform`: what was transmitted ----------------------------------------------------------------------
+
+Waveform = Annotated[OfdmWaveform | PulseWaveform | PhaseHistoryWaveform | FmcwWaveform, Field(discriminator="kind")]

@@ -1,0 +1,61 @@
+"""Stages on disk: zarr folders that are complete or absent, each beside a manifest of hashes.
+
+A stage is written as ``<stage>.zarr.wip`` under a kernel lock, finished by a rename, and described by
+``<stage>.manifest.json``, which is written last: where the manifest stands, the folder is complete. Documents and
+products have manifests of the same kind. Each names its files with their hashes and what they were made from.
+"""
+
+from apertura.campaign.store.manifest import (
+    check_listed,
+    compare,
+    compare_origin,
+    damaged_files,
+    manifest_of,
+    open_document,
+    open_listed,
+    read_manifest,
+    record_files,
+    remake,
+    save_document,
+    sha256_present,
+    states_origin,
+)
+from apertura.campaign.store.progress import (
+    create,
+    finish,
+    mark_rewritten,
+    missing,
+    open_array,
+    resume,
+    sharing,
+    writing,
+)
+from apertura.campaign.store.stages import blocks_of_rows, open_stage, save_stage, write_blocks
+
+__all__ = [
+    "blocks_of_rows",
+    "check_listed",
+    "compare",
+    "compare_origin",
+    "create",
+    "damaged_files",
+    "finish",
+    "manifest_of",
+    "mark_rewritten",
+    "missing",
+    "open_array",
+    "open_document",
+    "open_listed",
+    "open_stage",
+    "read_manifest",
+    "record_files",
+    "remake",
+    "resume",
+    "save_document",
+    "save_stage",
+    "sha256_present",
+    "sharing",
+    "states_origin",
+    "write_blocks",
+    "writing",
+]

@@ -1,0 +1,218 @@
+"""Chunks on disk: brought to the disk before they are renamed, checked by their sum when they are read."""
+
+import asyncio
+import hashlib
+import json
+import warnings
+from collections.abc import Hashable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import google_crc32c
+import zarr
+from zarr.abc.store import ByteRequest
+from zarr.codecs import Crc32cCodec, ZstdCodec
+from zarr.core.buffer import Buffer, BufferPrototype
+from zarr.errors import ZarrUserWarning
+from zarr.storage import LocalStore, MemoryStore
+
+from apertura.campaign.store.manifest import manifest_of
+from apertura.common.atomic import write_beside
+from apertura.common.confined import ConfinedPath
+from apertura.common.documents import other_codec
+from apertura.common.errors import CampaignError
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+# What a user has set for zarr (ZARR_…, ~/.config/zarr) changes no byte of ours: one order of arrays and of sums.
+zarr.config.update(zarr.config.defaults[0], priority="new")
+zarr.config.set({"array.write_empty_chunks": True})  # no chunk means not computed yet: zeros are written too
+
+CODECS = (ZstdCodec(), Crc32cCodec())
+"""How the bytes of a chunk are packed; the sum comes last, so that it is over the bytes on the disk."""
+
+_SUM_BYTES = 4
+_METADATA = "zarr.json"
+
+
+class StageStore(LocalStore):
+    """A folder of a stage, as zarr reads and writes it.
+
+    A file is complete or absent, also after a power failure; a chunk that is not what was written is never handed out:
+    by its own sum, and of a finished stage by its hash in the manifest, where that is given, when it is first read.
+
+    Parameters
+    ----------
+    folder, read_only
+        As `zarr.storage.LocalStore` takes them.
+    sha256
+        File of the folder → hash.
+    finished_later
+        Leave it to `finish` to bring all files to the disk at once: what is there after a kill is begun anew.
+    """
+
+    root: ConfinedPath
+
+    def __init__(
+        self,
+        folder: Path,
+        *,
+        read_only: bool = False,
+        sha256: Mapping[str, str] | None = None,
+        finished_later: bool = False,
+    ) -> None:
+        super().__init__(ConfinedPath.of(folder), read_only=read_only)
+        self._finished_later = finished_later
+        self._unchecked = {key: digest for key, digest in (sha256 or {}).items() if _METADATA not in key}
+
+    async def get(
+        self, key: str, prototype: BufferPrototype | None = None, byte_range: ByteRequest | None = None
+    ) -> Buffer | None:
+        """Return a file of the folder; `CampaignError` if it is a chunk and not what was written."""
+        return self._checked(key, await super().get(key, prototype, byte_range), byte_range)
+
+    def get_sync(
+        self, key: str, *, prototype: BufferPrototype | None = None, byte_range: ByteRequest | None = None
+    ) -> Buffer | None:
+        """As `get`."""
+        return self._checked(key, super().get_sync(key, prototype=prototype, byte_range=byte_range), byte_range)
+
+    async def set(self, key: str, value: Buffer) -> None:
+        """Write a file of the folder."""
+        await asyncio.to_thread(self.set_sync, key, value)
+
+    def set_sync(self, key: str, value: Buffer) -> None:
+        """As `set`."""
+        self._check_writable()
+        path = self.root / key
+        if self._finished_later:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(value.to_bytes())
+        else:
+            write_beside(path, value.to_bytes())
+
+    async def set_if_not_exists(self, key: str, value: Buffer) -> None:
+        """Write a file that is not there; a file of a stage has one writer."""
+        if not await self.exists(key):
+            await self.set(key, value)
+
+    async def delete(self, key: str) -> None:
+        """Remove a file, or a folder with its contents."""
+        self._check_writable()
+        await asyncio.to_thread((self.root / key).remove)
+
+    async def delete_dir(self, prefix: str) -> None:
+        """As `delete`."""
+        await self.delete(prefix)
+
+    def _checked(self, key: str, value: Buffer | None, byte_range: ByteRequest | None) -> Buffer | None:
+        name = key.rpartition("/")[2]
+        if name.startswith(".z"):  # of version 2, which is not ours, and whose filters may be a pickle
+            return None
+        if name == _METADATA and value is not None and other_codec(_json(value)) is not None:
+            raise damaged(self.root, key)
+        if value is None and key in self._unchecked:  # zarr would take a chunk that is gone for one that is empty
+            raise damaged(self.root, key)
+        if value is None or byte_range is not None or name == _METADATA:
+            return value
+        content = value.as_numpy_array()
+        whole = google_crc32c.value(content[:-_SUM_BYTES]) == int.from_bytes(content[-_SUM_BYTES:].tobytes(), "little")
+        expected = self._unchecked.get(key)
+        if not whole or (expected is not None and expected != hashlib.sha256(content.data).hexdigest()):
+            raise damaged(self.root, key)
+        self._unchecked.pop(key, None)
+        return value
+
+
+def _json(value: Buffer) -> object:
+    try:
+        return json.loads(value.to_bytes())
+    except (ValueError, RecursionError):
+        return None  # zarr raises its own error
+
+
+def array_of(folder: Path, name: str, mode: str) -> Any:
+    """Return an array of a stage, a `zarr.Array`."""
+    return zarr.open_array(StageStore(folder, read_only=mode == "r"), path=name, mode=mode)
+
+
+def update_attributes(folder: Path, attributes: Mapping[str, Any]) -> None:
+    """Write attributes of a stage in work."""
+    zarr.open_group(StageStore(folder), mode="r+").attrs.update(attributes)
+
+
+def damaged(folder: Path, key: str) -> CampaignError:
+    """Return the error that a chunk of a stage, finished or in work, is not what was written."""
+    finished = folder.suffix == ".zarr"
+    return CampaignError(
+        "damaged since it was written",
+        where=folder / key,
+        expected="bytes that agree with their sum",
+        remedy=f"Delete {manifest_of(folder)} and run the workflow again." if finished else "Run the workflow again.",
+    )
+
+
+def encoding_of(dataset: "xr.Dataset", chunks: Mapping[str, int]) -> dict[Hashable, dict[str, Any]]:
+    """Return how each variable of a stage is written.
+
+    Parameters
+    ----------
+    dataset
+        The stage.
+    chunks
+        Dimension → chunk length; a dimension not named is one chunk.
+    """
+    encoding: dict[Hashable, dict[str, Any]] = {}
+    for name, array in dataset.variables.items():
+        encoding[name] = {"compressors": CODECS}
+        if array.ndim and array.size:
+            encoding[name]["chunks"] = tuple(chunks.get(str(dim), size) for dim, size in array.sizes.items())
+    if "time" in encoding:
+        encoding["time"] |= {"units": "nanoseconds since 1970-01-01", "dtype": "int64"}
+    if "spatial_ref" in dataset.variables:
+        for name, values in dataset.data_vars.items():
+            if {"y", "x"} <= set(values.dims):
+                encoding[name]["grid_mapping"] = "spatial_ref"
+    return encoding
+
+
+def skeleton(
+    stage: "xr.Dataset", chunks: Mapping[str, tuple[int, ...]], *, packed: bool = True, consolidated: bool = False
+) -> dict[str, bytes]:
+    """Return the files of a stage before anything is computed: its metadata and coordinates, path → bytes.
+
+    Parameters
+    ----------
+    stage
+        The stamped stage; of the arrays in `chunks` only dims, dtype, fill value and attributes count, so they may be
+        broadcast.
+    chunks
+        Array that is written chunk by chunk → shape of its chunks.
+    packed
+        Whether those are compressed; noise is not made smaller by it.
+    consolidated
+        Whether the stage's own metadata repeat those of its arrays, for readers that open many of them.
+    """
+    files: dict[str, Buffer] = {}
+    rest, store = stage.drop_vars(list(chunks)), MemoryStore(files)
+    rest.to_zarr(store, mode="w", consolidated=False, zarr_format=3, encoding=encoding_of(rest, {}))
+    group = zarr.open_group(store, mode="r+")
+    for name, shape in chunks.items():
+        array = stage[name]
+        group.create_array(
+            name,
+            shape=array.shape,
+            chunks=shape,
+            dtype=array.dtype,
+            compressors=CODECS if packed else CODECS[-1:],
+            fill_value=array.values.flat[0],  # of a chunk that is never written
+            dimension_names=[str(dim) for dim in array.dims],
+            attributes=array.attrs | ({"grid_mapping": "spatial_ref"} if {"y", "x"} <= set(array.dims) else {}),
+        )
+    if consolidated:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ZarrUserWarning)  # of version 3 it is not in the standard yet
+            zarr.consolidate_metadata(store)
+    return {path: content.to_bytes() for path, content in files.items()}

@@ -1,0 +1,244 @@
+"""What is wrong with a campaign folder, all of it at once, before anything runs: headers, logs and numbers, no samples.
+
+A problem is what cannot be imaged at all; what makes an image worse is measured by a step, and is a flag.
+"""
+
+import pkgutil
+import shlex
+import sys
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, TextIO, TypeVar
+
+from apertura.campaign.config import (
+    CLOCKS,
+    CONFIG,
+    FLIGHTS,
+    SEGMENTS,
+    Flight,
+    located,
+    read_clocks,
+    read_flights,
+    read_segments,
+    read_settings,
+)
+from apertura.campaign.config.processing import HEIGHT_DEFAULT
+from apertura.campaign.config.section import table_rows
+from apertura.campaign.folder import Campaign, check_name
+from apertura.common.confined import ConfinedPath
+from apertura.common.errors import CampaignError, number_of
+from apertura.common.processes import as_typed
+
+if TYPE_CHECKING:
+    from apertura.check.examination import Examination
+
+T = TypeVar("T")
+Check = Callable[["Examination"], Iterable[CampaignError]]
+
+CHECKS: Mapping[str, str] = {
+    "flights": "apertura.check.files:check_flights",
+    "files": "apertura.check.files:check_files",
+    "raw_root": "apertura.check.files:check_raw_root",
+    "links": "apertura.check.files:check_links",
+    "modules": "apertura.check.files:check_modules",
+    "results": "apertura.check.resources:check_writable",
+    "codes": "apertura.check.recordings:check_codes",
+    "recordings": "apertura.check.recordings:check_recordings",
+    "histories": "apertura.check.recordings:check_histories",
+    "channels": "apertura.check.recordings:check_receivers",
+    "intervals": "apertura.check.recordings:check_intervals",
+    "overlap": "apertura.check.recordings:check_overlap",
+    "segments": "apertura.check.recordings:check_segments",
+    "tracks": "apertura.check.tracks:check_tracks",
+    "attitude": "apertura.check.tracks:check_attitude",
+    "coverage": "apertura.check.tracks:check_coverage",
+    "patterns": "apertura.check.reach:check_patterns",
+    "constants": "apertura.check.reach:check_constants",
+    "crs": "apertura.check.georeferencing:check_scene_crs",
+    "reference_points": "apertura.check.georeferencing:check_reference_points",
+    "dem": "apertura.check.georeferencing:check_dem",
+    "spikes": "apertura.check.georeferencing:check_spikes",
+    "apart": "apertura.check.reach:check_nodes_apart",
+    "distance": "apertura.check.reach:check_distance",
+    "aperture": "apertura.check.reach:check_aperture",
+    "ground": "apertura.check.reach:check_ground",
+    "calibration": "apertura.check.reach:check_calibration",
+    "memory": "apertura.check.resources:check_memory",
+    "disk": "apertura.check.resources:check_disk",
+    "scheduler": "apertura.check.resources:check_scheduler",
+    "imaging": "apertura.check.imaging:check_imaging",
+    "plan": "apertura.check.imaging:check_plan",
+}
+"""Name → ``module:function``; a function takes an `Examination` and yields problems, or raises one."""
+
+LAST = frozenset({"imaging", "plan"})
+"""Of these, what is asked where nothing else is wrong: it opens pairs as steps do, and would say the same again."""
+
+
+def problems(root: str | Path, *, without: Collection[str] = ()) -> list[CampaignError]:
+    """Return what is wrong with a campaign folder; an empty list: nothing known.
+
+    Parameters
+    ----------
+    root
+        The campaign folder.
+    without
+        Names of checks to leave out, such as 'memory' where steps run on another machine.
+
+    Examples
+    --------
+    >>> [str(problem) for problem in problems("nowhere")]
+    ['nowhere: no such folder; expected a campaign folder. `apertura init` makes one.']
+    """
+    campaign, wrong = load(Path(root))
+    if campaign is None:
+        return wrong
+    from apertura.check.examination import Examination
+
+    return [*wrong, *problems_of(Examination(campaign), without=without)]
+
+
+def problems_of(examined: "Examination", *, without: Collection[str] = ()) -> list[CampaignError]:
+    """Return what is wrong with a campaign that is opened already; `without` as of `problems`."""
+    wrong: list[CampaignError] = []
+    for name, function in CHECKS.items():
+        if name not in without and not (name in LAST and wrong):
+            wrong += _each(pkgutil.resolve_name(function), examined)
+    return list({str(problem): problem for problem in wrong}.values())
+
+
+def print_problems(root: str | Path, *, without: Collection[str] = (), stream: TextIO | None = None) -> int:
+    """Print the problems of a campaign folder, one line each, else what to know of it; return how many problems."""
+    campaign, wrong = load(Path(root))
+    notes: list[str] = []
+    if campaign is not None:
+        from apertura.check.examination import Examination
+
+        examined = Examination(campaign)
+        wrong += problems_of(examined, without=without)
+        notes = [] if wrong else [*assumptions(examined)]
+    for line in (*map(as_line, wrong), *notes):
+        print(as_typed(line), file=stream or sys.stdout)
+    return len(wrong)
+
+
+def assumptions(examined: "Examination") -> Iterator[str]:
+    """Yield what is assumed where the config leaves it open, and is easily wrong."""
+    from apertura.core.geometry.geodesy import LOCAL, geodetic_from_ecef
+
+    scene = examined.campaign.settings.scene
+    if scene.height_is_default and scene.crs != LOCAL and examined.middle_m is not None:
+        above_m = float(geodetic_from_ecef(examined.middle_m)[2])
+        yield (
+            f"note: {HEIGHT_DEFAULT}; the track is {above_m:.0f} m above the ellipsoid. State scene.height_m, or a "
+            "DEM by scene.dem"
+        )
+
+
+def print_findings(root: str | Path, *, products: bool = False, paranoid: bool = False) -> int:
+    """Print the problems of a campaign folder and which of its results are stale; return how many lines.
+
+    Parameters
+    ----------
+    root
+        The campaign folder.
+    products
+        Read every byte of the results, too, and name what is not as it was written.
+    paranoid
+        Read every input again, also those that have not changed since they were hashed.
+    """
+    count = print_problems(root)
+    campaign, _ = load(Path(root))
+    if campaign is None or count:
+        return count
+    from apertura.workflow.stale import absent_lines, damaged_results, stale_lines, stale_results
+
+    for line in absent_lines(campaign):  # nothing is wrong with that
+        print(line)
+    lines = list(stale_lines(stale_results(campaign, paranoid=paranoid)))
+    if products:
+        damaged = damaged_results(campaign).items()
+        lines += [f"{manifest}: damaged, {why}. Delete it and run the workflow again." for manifest, why in damaged]
+    for line in lines:
+        print(line)
+    folder = shlex.quote(as_typed(root))
+    flights, nodes = len(campaign.flights), sum(len(flight.participants) for flight in campaign.flights)
+    examined = f"{number_of(flights, 'flight')}, {number_of(nodes, 'recording')} with their logs"
+    then = f"apertura run {folder}" if lines else f"apertura plan {folder}, then apertura run {folder}"
+    print(f"no problem found in {examined}. Next: {then}")
+    return len(lines)
+
+
+def as_line(problem: CampaignError) -> str:
+    r"""Return a problem as one line, with the config's place where it names a key alone.
+
+    Examples
+    --------
+    >>> as_line(CampaignError("a\nb", "scene.dem", "c", "D."))
+    'config/config.yaml: scene.dem: a\\nb; expected c. D.'
+    """
+    return " ".join(located(str(problem)).split())
+
+
+def _each(check: Check, examined: "Examination") -> Iterator[CampaignError]:
+    """Yield what a check yields, and what it raises in the end."""
+    try:
+        yield from check(examined)
+    except CampaignError as problem:
+        yield problem
+
+
+class _AnyNode(frozenset[str]):
+    """Stands for the nodes of a config that cannot be read: a flight may name any."""
+
+    def __contains__(self, _: object) -> bool:
+        return True
+
+
+def load(root: Path) -> tuple[Campaign | None, list[CampaignError]]:
+    """Return a campaign, or None and what is wrong with config.yaml and its tables, each read whatever the others are.
+
+    Examples
+    --------
+    >>> load(Path("nowhere"))[0] is None
+    True
+    """
+    try:
+        check_name(root)
+    except CampaignError as problem:
+        return None, [problem]
+    root = ConfinedPath.at(root)
+    if not root.is_dir():
+        remedy = "`apertura init` makes one."
+        return None, [CampaignError("no such folder", where=root, expected="a campaign folder", remedy=remedy)]
+    wrong: list[CampaignError] = []
+    settings = _tried(lambda: read_settings(root / CONFIG), wrong)
+    nodes = settings.nodes if settings else _AnyNode()
+    flights = _tried(lambda: tuple(read_flights(root / FLIGHTS, nodes=nodes)), wrong)
+    listed = _listed_flights(root / FLIGHTS) if flights is None else flights
+    segments = _tried(lambda: tuple(read_segments(root / SEGMENTS, flights=listed)), wrong) if listed else ()
+    clocks = _tried(lambda: tuple(read_clocks(root / CLOCKS, flights=listed)), wrong) if listed else ()
+    if settings is None or flights is None or segments is None or clocks is None:
+        return None, wrong
+    campaign = Campaign(root, settings, flights, segments, clocks)
+    _tried(campaign.check_radio, wrong)
+    return campaign, wrong
+
+
+def _tried(read: Callable[[], T], wrong: list[CampaignError]) -> T | None:
+    try:
+        return read()
+    except CampaignError as problem:
+        wrong.append(problem)
+        return None
+
+
+def _listed_flights(path: Path) -> tuple[Flight, ...]:
+    """Return the flights of a table with a line that is wrong, as it names them, so that segments are compared."""
+    rows = _tried(
+        lambda: [cells for _, cells in table_rows(path, ["flight", "kind", "transmitter", "nodes"], remedy="")], []
+    )
+    return tuple(
+        Flight(row["flight"], row["kind"], row["transmitter"], tuple(map(str.strip, row["nodes"].split(","))))
+        for row in rows or ()
+    )

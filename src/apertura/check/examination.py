@@ -1,0 +1,288 @@
+"""A campaign's recordings, logs, ground and grid, each opened once at the first use."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pyproj import CRS
+from pyproj.exceptions import ProjError
+
+from apertura.campaign.config import SampledWaveform
+from apertura.campaign.folder import Campaign, size_of
+from apertura.check.facts import LogFacts, RecordingFacts, log_facts, recording_facts
+from apertura.common.confined import ConfinedPath
+from apertura.common.errors import CampaignError
+from apertura.core.geometry.geodesy import LOCAL, geodetic_from_ecef
+from apertura.formats.names import PHASE_HISTORIES
+from apertura.formats.reading import open_recording, read_track
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from apertura.core.scene.grid import SceneGrid
+    from apertura.formats.recordings.recording import Recording
+    from apertura.stages.scene import ConfiguredGround
+    from apertura.stages.transmitted import Transmitted
+
+T = TypeVar("T")
+Key = tuple[str, str]
+"""Flight and node."""
+
+_SMALL_BYTES = 64 << 20  # of phase history, which is read to be checked
+_NODES = 128  # pixels along a side of a grid whose spacing is not settled yet
+
+
+@dataclass(frozen=True)
+class Examination:
+    """A campaign and its files, opened; what is wrong with those that do not open stands beside.
+
+    Parameters
+    ----------
+    campaign
+        Settings and flights.
+    """
+
+    campaign: Campaign
+
+    @property
+    def waveform(self) -> SampledWaveform | None:
+        """What was transmitted, where it was recorded as samples; None: phase history."""
+        stated = self.campaign.settings.waveform
+        return stated if isinstance(stated, SampledWaveform) else None
+
+    @property
+    def transmitted(self) -> "Transmitted | None":
+        """What was transmitted; None without samples, or where the file is not what the waveform says."""
+        return self._transmitted[0]
+
+    @property
+    def transmitted_problems(self) -> list[CampaignError]:
+        """What is wrong with the file of what was transmitted."""
+        return self._transmitted[1]
+
+    @cached_property
+    def _transmitted(self) -> "tuple[Transmitted | None, list[CampaignError]]":
+        from apertura.stages.transmitted import transmitted
+
+        try:
+            return (transmitted(self.campaign, self.waveform) if self.waveform else None), []
+        except CampaignError as problem:
+            return None, [problem]
+
+    @property
+    def keys(self) -> tuple[Key, ...]:
+        """Every flight and node of which something was recorded, or a log is needed."""
+        every = [(flight, node) for flight in self.campaign.flights for node in flight.recorded]
+        return tuple(
+            (flight.name, node) for flight, node in every if self.waveform or self.campaign.logged(flight.name, node)
+        )
+
+    def needs_log(self, key: Key) -> bool:
+        """Return whether a flight needs the logs of its nodes: on a bench nothing moves."""
+        return self.campaign.flight(key[0]).kind != "bench"
+
+    @property
+    def recordings(self) -> dict[Key, "Recording"]:
+        """Recordings that open."""
+        return self._recordings[0]
+
+    @cached_property
+    def recorded(self) -> dict[Key, RecordingFacts]:
+        """What the headers of these recordings say."""
+        return {key: recording_facts(recording) for key, recording in self.recordings.items()}
+
+    @property
+    def recording_problems(self) -> list[CampaignError]:
+        """Why other recordings cannot be opened."""
+        return self._recordings[1]
+
+    @property
+    def tracks(self) -> dict[Key, "xr.Dataset"]:
+        """Flight logs that can be read, as `track` stages."""
+        return self._tracks[0]
+
+    @cached_property
+    def logs(self) -> dict[Key, LogFacts]:
+        """What these logs hold."""
+        return {key: log_facts(track) for key, track in self.tracks.items()}
+
+    @property
+    def track_problems(self) -> list[CampaignError]:
+        """Why other logs cannot be read."""
+        return self._tracks[1]
+
+    def opens(self, flight: str, pair: str) -> bool:
+        """Return whether a pair can be opened by logs and headers, or its phase history is small."""
+        if self.waveform is not None:
+            keys = {(flight, node) for node in pair.split("-")}
+            return keys <= self.tracks.keys() & self.recordings.keys()
+        files = self.campaign.history_files(flight, pair.split("-")[1])
+        return 0 < sum(map(size_of, files)) <= _SMALL_BYTES
+
+    @cached_property
+    def history_problems(self) -> list[CampaignError]:
+        """What is wrong with phase history: of every pair whose files are small, and of one that states the frame."""
+        if self.waveform is not None:
+            return []
+        from apertura.stages.transfer import recorded_echo
+
+        problems: list[CampaignError] = []
+        pairs = [(flight.name, pair) for flight in self.campaign.flights for pair in flight.pairs]
+        for number, (flight, pair) in enumerate(pairs):
+            try:
+                files = self.campaign.history_files(flight, pair.split("-")[1])
+            except CampaignError:  # for 'files' to name
+                continue
+            size = sum(map(size_of, files))
+            if not size or (size > _SMALL_BYTES and (number or self.frame)):
+                continue
+            try:
+                recorded_echo(self.campaign, flight, pair)
+            except CampaignError as problem:
+                problems.append(problem)
+        return problems
+
+    @cached_property
+    def _recordings(self) -> tuple[dict[Key, "Recording"], list[CampaignError]]:
+        return self._each(self.campaign.recording_files, self._opened)
+
+    def _opened(self, files: tuple[Path, ...], key: Key) -> "Recording":
+        """Return a recording by the clock of its node's log."""
+        recording = open_recording(files)
+        captures = recording.captures
+        return replace(recording, captures=replace(captures, time=self.campaign.clock(*key).utc(captures.time)))
+
+    @cached_property
+    def _tracks(self) -> tuple[dict[Key, "xr.Dataset"], list[CampaignError]]:
+        def files(flight: str, node: str) -> tuple[ConfinedPath, ...]:
+            return (self.campaign.track_file(flight, node),)
+
+        options = {name: node.log.options for name, node in self.campaign.settings.nodes.items()}
+        return self._each(
+            files, lambda logs, key: read_track(logs[0], node=key[1], options=options[key[1]]), self.needs_log
+        )
+
+    def _each(
+        self,
+        files: Callable[[str, str], tuple[ConfinedPath, ...]],
+        open_files: Callable[[tuple[ConfinedPath, ...], Key], T],
+        needed: Callable[[Key], bool] = lambda _: True,
+    ) -> tuple[dict[Key, T], list[CampaignError]]:
+        """Open files that are there and not empty; the check 'files' names the others."""
+        opened: dict[Key, T] = {}
+        problems: list[CampaignError] = []
+        for flight, node in filter(needed, self.keys):
+            try:
+                paths = files(flight, node)
+                if not all(map(size_of, paths)):
+                    continue
+            except CampaignError:
+                continue
+            try:
+                opened[flight, node] = open_files(paths, (flight, node))
+            except CampaignError as problem:
+                problems.append(problem)
+        return opened, problems
+
+    @property
+    def frame(self) -> str:
+        """What positions are in, ecef or local; empty where only the samples say."""
+        frames = [track.attrs["frame"] for track in self.tracks.values()]
+        if frames or self.waveform:
+            return next(iter(frames), "ecef")
+        return PHASE_HISTORIES[self.campaign.settings.waveform.format].frame  # type: ignore[union-attr]
+
+    @cached_property
+    def crs(self) -> str | None:
+        """CRS of the scene; `auto` is the zone of the first image flight; None if unknown or not in metres."""
+        requested = self.campaign.settings.scene.crs
+        if requested != "auto":
+            return requested if requested == LOCAL or in_metres(requested) else None
+        from apertura.core.scene.auto_grid import utm_crs
+
+        middle = self.middle_m
+        return None if middle is None else utm_crs(middle)
+
+    @property
+    def other_frame(self) -> bool:
+        """Whether the scene's CRS is another frame than positions are in."""
+        return bool(self.frame) and (self.campaign.settings.scene.crs == LOCAL) is not (self.frame == LOCAL)
+
+    @cached_property
+    def middle_m(self) -> NDArray[np.float64] | None:
+        """Where the first image flight flew: (3,) float64 ECEF, metres; None without a log."""
+        first = {flight.name for flight in self.campaign.image_flights[:1]}
+        logs = [
+            track.position.values
+            for key, track in self.tracks.items()
+            if key[0] in first and track.attrs["frame"] == "ecef"
+        ]
+        return np.median(np.concatenate(logs), axis=0) if logs else None
+
+    @cached_property
+    def grid(self) -> "SceneGrid | None":
+        """The scene's pixels, coarser ones where the spacing is `auto`; None where bounds are, or the CRS is wrong."""
+        from apertura.core.scene.grid import SceneGrid
+
+        requested = self.campaign.settings.scene
+        if self.crs is None or requested.bounds_m == "auto" or self.other_frame:
+            return None
+        xmin, ymin, xmax, ymax = requested.bounds_m
+        spacing = min(xmax - xmin, ymax - ymin) / _NODES if requested.spacing_m == "auto" else requested.spacing_m
+        try:
+            return SceneGrid.from_bounds(self.crs, requested.bounds_m, spacing_m=spacing)
+        except CampaignError:
+            return None
+
+    @property
+    def ground(self) -> "ConfiguredGround | None":
+        """The ground as the config states it, opened; None where it cannot be, or the CRS is not known."""
+        return self._ground[0]
+
+    @property
+    def ground_problems(self) -> list[CampaignError]:
+        """Why the ground cannot be opened."""
+        return self._ground[1]
+
+    @property
+    def level_m(self) -> float:
+        """Height of flat ground under the grid, metres above the ellipsoid; of the track, where a DEM says it."""
+        return self._ground[2]
+
+    @cached_property
+    def _ground(self) -> "tuple[ConfiguredGround | None, list[CampaignError], float]":
+        from apertura.stages.scene import ConfiguredGround
+
+        track_m = 0.0 if self.middle_m is None else float(geodetic_from_ecef(self.middle_m)[2])
+        requested = self.campaign.settings.scene
+        try:
+            files = self.campaign.height_files()
+        except CampaignError:
+            return None, [], track_m
+        if self.crs is None or not all(map(size_of, files.values())):
+            return None, [], track_m
+        try:
+            ground = ConfiguredGround.of(requested, files, crs=self.crs)
+            return ground, [], track_m if ground.dem or self.grid is None else ground.level(self.grid).height_m
+        except CampaignError as problem:
+            return None, [problem], track_m
+
+
+def in_metres(crs: str) -> bool:
+    """Return whether PROJ knows a CRS and it is projected in metres.
+
+    Examples
+    --------
+    >>> [in_metres(crs) for crs in ("EPSG:32632", "EPSG:4326", "EPSG:2225", "EPSG:5555", "EPSG:99999")]
+    [True, False, False, False, False]
+    """
+    try:
+        system = CRS(crs)
+    except ProjError:
+        return False
+    metres = all(axis.unit_name == "metre" for axis in system.axis_info)
+    return system.is_projected and not system.is_compound and metres

@@ -1,0 +1,233 @@
+"""Whether the scene's CRS, reference points and DEM are of the place where images were taken."""
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+from pyproj import CRS, Transformer
+
+from apertura.campaign.config import CONFIG
+from apertura.check.examination import Examination
+from apertura.check.hints import likely_place
+from apertura.common.errors import CampaignError
+from apertura.core.geometry.geodesy import LOCAL, ecef_from_geodetic, projected_from_ecef
+from apertura.core.scene.auto_grid import utm_crs
+from apertura.core.scene.dem import Dem
+from apertura.core.scene.grid import SceneGrid
+from apertura.core.scene.map_crs import check_crs, horizontal_crs
+
+_WHERE = f"{CONFIG}: scene.crs"
+_FAR_UP_M = 1000.0  # between a point and the ground: heights are known at least so well
+TALLEST_M = 500.0
+"""Nothing narrower than two posts stands out of all land about it by more, and by more than ten posts are wide."""
+
+_STEEPEST_POSTS = 10.0
+_PER_POST = 2  # samples
+_WINDOW = 7  # samples: three and a half posts
+_MOST_SAMPLES = 1_000_000
+_COARSE = 256
+_MARGIN = _WINDOW - 1  # samples about the scene, which are not judged
+
+
+def check_scene_crs(examined: Examination) -> Iterator[CampaignError]:
+    """Yield a CRS that is not projected in metres, is not the frame of the recordings, or is not made for the place."""
+    crs = examined.campaign.settings.scene.crs
+    if examined.other_frame:
+        yield _other_frame(crs)
+    elif examined.history_problems:
+        return  # which frame they are in is not known
+    elif crs not in {LOCAL, "auto"} and examined.crs is None:
+        yield _not_in_metres(examined, crs)
+    elif examined.crs not in {LOCAL, None}:
+        yield from _elsewhere(examined, str(examined.crs))
+
+
+def check_reference_points(examined: Examination) -> Iterator[CampaignError]:
+    """Yield each known point, or reflector, outside the scene, or so high that it is no height of the ground."""
+    grid = examined.grid
+    if grid is None:
+        return
+    scene = examined.campaign.settings.scene
+    known = {"reference_points": scene.reference_points, "reflectors": scene.reflectors}
+    for key, number, point in ((key, *one) for key, points in known.items() for one in enumerate(points)):
+        west, south, east, north = grid.bounds_m
+        x, y, height_m = point.position_m
+        where, remedy = f"{CONFIG}: scene.{key}[{number}]", "Correct position_m, or take the point out."
+        if not (west <= x <= east and south <= y <= north):
+            swapped = west <= y <= east and south <= x <= north
+            yield CampaignError(
+                f"{point.name} at {x:.2f}, {y:.2f} lies outside the scene",
+                where=where,
+                expected=f"easting {west:.2f} to {east:.2f}, northing {south:.2f} to {north:.2f} in {grid.crs}",
+                remedy="Easting comes before northing." if swapped else remedy,
+            )
+        elif examined.ground is not None and abs(height_m - examined.level_m) > _FAR_UP_M:
+            yield CampaignError(
+                f"{point.name} is at height {height_m:.1f} m",
+                where=where,
+                expected=f"a point of the scene, whose ground lies at about {examined.level_m:.1f} m",
+                remedy=f"Heights count from {'the ellipsoid' if grid.frame == 'ecef' else 'the local frame'}. {remedy}",
+            )
+
+
+def _elsewhere(examined: Examination, crs: str) -> Iterator[CampaignError]:
+    """Yield bounds, or where they are `auto` a track, that lie beyond where the CRS is of use."""
+    bounds = examined.campaign.settings.scene.bounds_m
+    if bounds != "auto":
+        try:
+            check_crs(crs, bounds)
+        except CampaignError as problem:
+            hint = likely_place(examined)
+            yield (
+                problem
+                if not hint
+                else CampaignError(
+                    f"bounds_m {list(bounds)} are not in {crs}",
+                    where=f"{CONFIG}: scene.bounds_m",
+                    expected=f"[xmin, ymin, xmax, ymax], metres in {crs}",
+                    remedy=hint,
+                )
+            )
+    elif examined.middle_m is not None:
+        east, north = projected_from_ecef(crs, examined.middle_m)[:2].tolist()
+        try:
+            check_crs(crs, (east - 1, north - 1, east + 1, north + 1))
+        except CampaignError:
+            zone, name = utm_crs(examined.middle_m), CRS(crs).name
+            yield CampaignError(
+                f"{crs} ({name}) is not made for where the track lies",
+                where=_WHERE,
+                expected="a CRS that is of use there, such as the UTM zone of the place",
+                remedy=f"Set scene.crs to {zone}, or to auto.",
+            )
+
+
+def _other_frame(crs: str) -> CampaignError:
+    local = crs == LOCAL
+    data = "positions on Earth, in latitude and longitude" if local else "positions in metres of a frame of their own"
+    expected = "an EPSG code, or auto" if local else LOCAL
+    return CampaignError(f"{crs} for {data}", where=_WHERE, expected=expected, remedy="Correct scene.crs.")
+
+
+def _not_in_metres(examined: Examination, crs: str) -> CampaignError:
+    """Return what is wrong with a CRS wherever it is used, with the UTM zone that would do."""
+    try:
+        system = horizontal_crs(crs)
+    except CampaignError as problem:
+        return CampaignError(problem.found, _WHERE, problem.expected, problem.remedy)
+    units = {axis.unit_name for axis in system.axis_info} - {"metre"}
+    kind = "counts in degrees" if system.is_geographic else f"counts in {', '.join(sorted(units))}"
+    zone = _zone(examined, degrees=system.is_geographic) or "the UTM zone of the place"
+    return CampaignError(
+        f"{crs} ({system.name}) {kind if units else 'is not projected'}",
+        where=_WHERE,
+        expected="a projected CRS in metres",
+        remedy=f"Set scene.crs to {zone}, and scene.bounds_m in metres of it; or both to auto.",
+    )
+
+
+def _zone(examined: Examination, *, degrees: bool) -> str:
+    """Return the UTM zone of the track, or of bounds in degrees; '' where neither is known."""
+    bounds = examined.campaign.settings.scene.bounds_m
+    if examined.middle_m is not None:
+        return utm_crs(examined.middle_m)
+    if not degrees or bounds == "auto" or np.abs(bounds).max() > 180 or np.abs(bounds[1::2]).max() > 90:
+        return ""
+    longitude, latitude = (np.array((bounds[axis] + bounds[axis + 2]) / 2) for axis in (0, 1))
+    return utm_crs(ecef_from_geodetic(latitude, longitude, np.array(0.0)))
+
+
+def check_dem(examined: Examination) -> Iterator[CampaignError]:
+    """Yield a DEM or grid of a geoid that does not open, a DEM that ends inside the scene, heights not on Earth."""
+    yield from examined.ground_problems
+    dem, grid = examined.ground and examined.ground.dem, examined.grid
+    if dem and grid:
+        dem.check_cover(grid)
+
+
+def check_spikes(examined: Examination) -> Iterator[CampaignError]:
+    """Yield a DEM with single posts under the scene that stand out of it, up or down.
+
+    Heights are sampled twice a post. An opening (the largest minimum over windows of seven samples that hold a place)
+    takes away what is narrower than the window and leaves slopes, ridges and cliffs, however high; a closing does so
+    from below. What is taken away must be higher than 500 m, and than ten posts are wide: steeper than 80° all round.
+    Of a scene larger than a million samples, that many about its middle are tested.
+    """
+    dem, grid = examined.ground and examined.ground.dem, examined.grid
+    if not dem or not grid:
+        return
+    post_m = post_width_m(dem, grid)
+    window = sampled_about(grid, post_m / _PER_POST)
+    heights = _heights(dem, grid, window)
+    spikes = needles(heights, taller_than_m=max(TALLEST_M, _STEEPEST_POSTS * post_m))
+    if not spikes.any():
+        return
+    row, column = np.argwhere(spikes)[0]
+    x, y = window.map_at(row, column)
+    yield CampaignError(
+        f"{heights[row, column]:.0f} m at x {x:.1f}, y {y:.1f}, where the land about it has "
+        f"{np.nanmedian(heights[max(row - 6, 0) : row + 7, max(column - 6, 0) : column + 7]):.0f} m; "
+        f"{int(spikes.sum())} of {spikes.size} samples stand out so",
+        where=dem.path,
+        expected=f"posts that stand out of all their neighbours by at most {TALLEST_M:.0f} m, or ten posts' width",
+        remedy="Set those posts to nodata and fill them with a GIS.",
+    )
+
+
+def _heights(dem: Dem, grid: SceneGrid, window: SceneGrid) -> NDArray[np.float64]:
+    """Return the heights of a window; of the scene alone where posts beside it have no height on Earth."""
+    try:
+        return dem.heights(window)
+    except CampaignError:
+        dem.heights(grid.coarse(_COARSE))
+    return np.full(window.shape, np.nan)
+
+
+def post_width_m(dem: Dem, grid: SceneGrid) -> float:
+    """Return how far posts of a DEM are apart at the middle of a grid, metres, the narrower way."""
+    xmin, ymin, xmax, ymax = grid.bounds_m
+    x, y = (xmin + xmax) / 2 + np.array([0.0, 1.0, 0.0]), (ymin + ymax) / 2 + np.array([0.0, 0.0, 1.0])
+    if grid.crs != LOCAL:
+        x, y = Transformer.from_crs(grid.crs, dem.horizontal, always_xy=True).transform(x, y)
+    a, b, _, d, e, _ = dem.pixel_from_map
+    posts = np.stack([a * x + b * y, d * x + e * y])
+    per_metre = np.linalg.norm(posts[:, 1:] - posts[:, :1], axis=0).max()
+    return float(1 / per_metre)
+
+
+def sampled_about(grid: SceneGrid, spacing_m: float) -> SceneGrid:
+    """Return samples of so many metres over a grid and a margin about it, at most a million in its middle."""
+    (xmin, ymin, xmax, ymax), most = grid.bounds_m, int(np.sqrt(_MOST_SAMPLES))
+    sides = [min(round(side / spacing_m) + 2 * _MARGIN, most) for side in (xmax - xmin, ymax - ymin)]
+    west, north = (xmin + xmax - sides[0] * spacing_m) / 2, (ymin + ymax + sides[1] * spacing_m) / 2
+    return SceneGrid(grid.crs, west, north, spacing_m, (sides[1], sides[0]))
+
+
+def needles(heights: NDArray[np.float64], *, taller_than_m: float) -> NDArray[np.bool_]:
+    """Return (row, column) bool: what stands out of a surface, up or down, narrower than a window of seven samples.
+
+    Within two windows' half widths of a void or of the edge nothing is reported: the land beyond is not known.
+
+    Examples
+    --------
+    >>> cliff = np.where(np.arange(40) < 20, 0.0, 3000.0) + np.zeros((40, 1))
+    >>> spike = cliff.copy()
+    >>> spike[10, 10] = 900.0
+    >>> needles(cliff, taller_than_m=500.0).sum(), np.argwhere(needles(spike, taller_than_m=500.0))
+    (np.int64(0), array([[10, 10]]))
+    """
+    with np.errstate(invalid="ignore"):
+        up = heights - _over_windows(_over_windows(heights, np.fmin), np.fmax)
+        down = _over_windows(_over_windows(heights, np.fmax), np.fmin) - heights
+        near = _over_windows(_over_windows(heights, np.maximum), np.maximum)  # NaN beside a void and an edge
+        return np.asarray(((up > taller_than_m) | (down > taller_than_m)) & np.isfinite(near))
+
+
+def _over_windows(heights: NDArray[np.float64], by: np.ufunc) -> NDArray[np.float64]:
+    """Return the extreme of the window about each sample, both ways; outside is NaN, as voids are."""
+    half = _WINDOW // 2
+    for axis in (0, 1):
+        padded = np.pad(heights, [(half, half) if way == axis else (0, 0) for way in (0, 1)], constant_values=np.nan)
+        parts = [np.take(padded, range(first, first + heights.shape[axis]), axis) for first in range(_WINDOW)]
+        heights = by.reduce(parts)
+    return heights

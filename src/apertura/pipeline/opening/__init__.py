@@ -1,1 +1,0 @@
-"""Opening a campaign: its grid, ground, pairs and antennas, once."""

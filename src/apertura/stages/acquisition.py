@@ -1,0 +1,215 @@
+"""Recording of one node in a flight: samples by channel, antennas by pulse, by the clocks of recorder and log."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from apertura.campaign.config import CONFIG, SampledWaveform
+from apertura.campaign.digests import digest_of
+from apertura.campaign.folder import Campaign
+from apertura.campaign.store import open_stage
+from apertura.common.errors import CampaignError
+from apertura.core.echo.association import Association, associate
+from apertura.core.echo.captures import Read, Samples, ordered
+from apertura.core.echo.demodulate import Numerology
+from apertura.formats.recordings.sample_file import SampleFile, SampleLayout
+from apertura.stages.node_log import NodeLog, shortest_wave
+from apertura.stages.transmitted import Transmitted, check_mixing
+
+# ---- What a recording must be ---------------------------------------------------------------------------------------
+
+_SAME = 1e-9
+"""Carriers and rates that differ by less, relative to what the config states, are the same."""
+
+
+def check_rates(waveform: SampledWaveform, recorded: Mapping[str, float], *, where: Path | str) -> None:
+    """Raise CampaignError unless what was `recorded`, sample_rate_hz and carrier_hz, is that of the waveform.
+
+    A carrier of 0 is not stated by the recording: that of the config is taken.
+    """
+    for key, value in recorded.items():
+        stated = float(getattr(waveform, key))
+        if value and not abs(value - stated) <= _SAME * stated:
+            raise CampaignError(
+                f"recorded with {key} {value:.6f}",
+                where=where,
+                expected=f"{stated:.6f}, as {CONFIG}: waveform.{key}",
+                remedy="Correct whichever is wrong; every node of a flight shares one waveform.",
+            )
+
+
+def check_channels(recorded: Sequence[str], needed: Sequence[str], *, where: Path | str) -> None:
+    """Raise CampaignError unless channels were recorded under the names `needed`."""
+    for channel in needed:
+        if channel not in recorded:
+            raise CampaignError(
+                f"apertura:channels {[*recorded]}",
+                where=where,
+                expected=f"a channel named {channel!r}",
+                remedy="A secondary node needs its sidelink; name the channel or take the node out of the flight.",
+            )
+
+
+def check_length(samples: int, needed: int, *, where: Path | str) -> None:
+    """Raise CampaignError unless captures hold as many samples as an echo takes."""
+    if samples < needed:
+        raise CampaignError(
+            f"captures of {samples} samples",
+            where=where,
+            expected=f"at least {needed}: cyclic prefix and one period of 1/subcarrier_spacing_hz, or lead_s, "
+            "pulse_s and listen_s",
+            remedy=f"Correct the waveform in {CONFIG}, or record longer captures.",
+        )
+
+
+# ---- Recording of one node: samples by channel, antennas by pulse ---------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Captured:
+    """What one node recorded in one flight.
+
+    Attributes
+    ----------
+    raw
+        Its stage, or what it would hold.
+    samples
+        The recorder's file.
+    files
+        raw/<flight>/<node>, with which its files' names begin.
+    recording
+        Its files of samples, for messages.
+    numerology
+        Of the symbol.
+    order
+        `waveform.iq`.
+    """
+
+    raw: xr.Dataset
+    samples: SampleFile
+    files: Path
+    recording: str
+    numerology: Numerology
+    order: str
+
+    def reader(self, channels: Sequence[str], pulses: NDArray[np.int64]) -> Read:
+        """Return a function that reads channels of some captures from the recorder's file, block by block.
+
+        Parameters
+        ----------
+        channels
+            Names.
+        pulses
+            (capture,) int64, captures of the recording; the function takes indices into this.
+
+        Raises
+        ------
+        CampaignError
+            If a channel was not recorded, or captures are shorter than prefix and DFT window.
+        """
+        recorded, length = list(self.raw.attrs["channels"]), int(self.raw.attrs["capture_samples"])
+        check_channels(recorded, channels, where=self.recording)
+        check_length(length, self.numerology.prefix_samples + self.numerology.dft_samples, where=self.recording)
+        start, places = self.raw.start.values[pulses], {name: recorded.index(name) for name in channels}
+
+        def read(captures: NDArray[np.int64]) -> dict[str, Samples]:
+            if not self.samples.path.is_file():
+                raise CampaignError(
+                    "no such file",
+                    where=self.samples.path,
+                    expected="the recording that transfer functions are formed from: stage `transfer` keeps none",
+                    remedy=f"Copy it there. `processing: {{keep: [echo]}}` in {CONFIG} keeps them from then on.",
+                )
+            iq = self.samples.captures(start[captures], length)
+            iq = np.ascontiguousarray(ordered(iq, self.order))
+            # I and Q move together: one by one they cost more than their transform
+            both = np.dtype(f"i{2 * iq.itemsize}")
+            pairs = iq.view(both)[..., 0]
+            return {
+                name: np.ascontiguousarray(pairs[:, :, place])[..., None].view(iq.dtype)
+                for name, place in places.items()
+            }
+
+        return read
+
+    @classmethod
+    def of(cls, raw: xr.Dataset, samples: Path, files: Path, recording: str, sent: Transmitted) -> "Captured":
+        """Return captures of a file of samples; raise CampaignError unless carrier and rate are those of what was sent.
+
+        Parameters
+        ----------
+        raw
+            Stage `raw`, or what it would hold.
+        samples
+            The recorder's file.
+        files, recording
+            As the attributes.
+        sent
+            What was transmitted.
+        """
+        recorded = {"sample_rate_hz": raw.attrs["sample_rate_hz"], "carrier_hz": raw.attrs["frequency_hz"]}
+        check_rates(sent.waveform, recorded, where=recording)
+        opened = SampleFile(samples, len(raw.attrs["channels"]), SampleLayout.of(raw))
+        check_mixing(opened, sent.numerology, where=recording)
+        return cls(raw, opened, files, recording, sent.numerology, sent.waveform.iq)
+
+
+@dataclass(frozen=True)
+class Acquisition(Captured, NodeLog):
+    """What one node recorded in one flight, beside its log."""
+
+
+def open_acquisition(campaign: Campaign, flight: str, node: str, sent: Transmitted) -> Acquisition:
+    """Return the finished raw and track stages of a node.
+
+    Raises
+    ------
+    CampaignError
+        If it was recorded at another carrier or sample rate than what was sent.
+    """
+    raw, track = (open_stage(campaign.stage(stage, flight, node), stage) for stage in ("raw", "track"))
+    raw = raw.assign(time=("pulse", campaign.clock(flight, node).utc(raw.time.values)))
+    files = Path("raw") / flight / node
+    recording, log = (_read_from(stage, files) for stage in (raw, track))
+    path = campaign.root.named(raw.attrs["samples"], where=campaign.stage("raw", flight, node))
+    captured = Captured.of(raw, path, files, recording, sent)
+    _check_same(campaign, raw)
+    wave_m = shortest_wave(sent.numerology.frequency_hz)
+    own = {field.name: getattr(captured, field.name) for field in fields(captured)}
+    return Acquisition(node, campaign.node(flight, node), track, log, wave_m, **own)
+
+
+def _check_same(campaign: Campaign, raw: xr.Dataset) -> None:
+    """Raise CampaignError where the recorder's file is there and not the one that the stage describes."""
+    name = raw.attrs["samples"]
+    if (campaign.root / name).is_file() and digest_of(campaign.root, name) != raw.attrs["inputs"][name]:
+        raise CampaignError(
+            "changed since it was ingested",
+            where=campaign.root / name,
+            expected="the file that the raw stage describes",
+            remedy="Run the workflow again: it ingests the recording first.",
+        )
+
+
+def _read_from(stage: xr.Dataset, files: Path) -> str:
+    """Return the node's own files that a stage was read from, without the preamble."""
+    own = [name for name in stage.attrs["inputs"] if name.startswith(f"{files.as_posix()}.")]
+    return " and ".join(own or stage.attrs["inputs"])  # a collection may give other names
+
+
+def common_pulses(tx: Acquisition, rx: Acquisition, *, prf_hz: float) -> Association:
+    """Return the pulses that a transmitter and a receiver have in common."""
+    tx_time, rx_time = (node.raw.time.values.astype("datetime64[ns]").astype(np.int64) for node in (tx, rx))
+    return associate(
+        tx_time,
+        rx_time,
+        repetition_interval_s=1 / prf_hz,
+        tx_frame=tx.raw.frame.values,
+        rx_frame=rx.raw.frame.values,
+        speed_m_s=tx.speed_m_s,
+        where=f"{tx.files} and {rx.files}",
+    )

@@ -1,0 +1,422 @@
+"""Rule `cube`: every image of the campaign on one grid, each flight's pairs added up, and phases between images."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor
+from dataclasses import dataclass
+from itertools import compress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from apertura.campaign.config import FUSED
+from apertura.campaign.folder import Campaign
+from apertura.campaign.store import create, finish, open_array, open_stage, writing
+from apertura.common.contracts import MEASURED, QUOTED, RASTERS, SUMMED, Window
+from apertura.common.documents import undamaged
+from apertura.common.flags import Flags
+from apertura.core.combination import clutter_reduction_db, coherent_sum, magnitude_sum, noncoherent_sum
+from apertura.core.quality.focus import focus_with_flags
+from apertura.core.quality.measures import BlockRaster, held, image_statistics
+from apertura.core.scene.grid import SceneGrid
+from apertura.methods.interferometry.coherence import chance, coherence, common_band, window_px
+from apertura.stages.agreement import ComparedImage, agreement_of, agreement_report, assessment_of
+from apertura.stages.scene import settled_scene
+from apertura.stages.stamping import stamped
+from apertura.workflow.lineage import result_of
+
+# ---- Coordinates and quality of each flight and pair ----------------------------------------------------------------
+
+Images = Mapping[tuple[str, str], xr.Dataset]
+"""Flight and pair → stage `image`."""
+
+_TEXTS = np.dtypes.StringDType()
+
+
+Sums = Mapping[str, Mapping[str, Any]]
+"""Flight that has pairs to add up → its coherent sum, as step `assess` chose it."""
+
+
+def labels(images: Images, assessed: Mapping[str, Mapping[str, Any]], sums: Sums, pairs: Sequence[str]) -> xr.Dataset:
+    """Return coordinates flight, pair, time and what pairs and flights are compared with; values of every image.
+
+    Parameters
+    ----------
+    images
+        Those that were formed.
+    assessed
+        Flight → what step `assess` wrote of it.
+    sums
+        Of the flights that have any.
+    pairs
+        Every pair of the campaign.
+    """
+    values = {name: _filled(dtype, (len(assessed), len(pairs))) for name, (_, dtype, _, _) in QUOTED.items()}
+    for place, (flight, one) in enumerate(assessed.items()):
+        for pair in pairs:
+            if (flight, pair) in images:
+                measures = _quoted(images[flight, pair], one["pairs"][pair])
+                measures["phase_removed"] = sums[flight]["phases_rad"].get(pair) if flight in sums else None
+                for name, value in measures.items():
+                    if value is not None:
+                        values[name][place, pairs.index(pair)] = value
+    return xr.Dataset(
+        {name: (QUOTED[name][0], array) for name, array in values.items()},
+        coords={
+            "flight": ("flight", np.array([*assessed], _TEXTS)),
+            "pair": ("pair", np.array(pairs, _TEXTS)),
+            "time": ("flight", np.array([_middle(images, flight) for flight in assessed]), {"standard_name": "time"}),
+            "reference_pair": ("flight", np.array([one["reference"] for one in assessed.values()], _TEXTS)),
+            "reference_flight": ("pair", np.array([*reference_flights(images, pairs).values()], _TEXTS)),
+        },
+    )
+
+
+def reference_flights(images: Images, pairs: Sequence[str]) -> dict[str, str]:
+    """Return pair → the first flight that flew it."""
+    return {pair: next(flight for flight, other in images if other == pair) for pair in pairs}
+
+
+def _filled(dtype: str, shape: tuple[int, int]) -> Any:
+    return np.full(shape, "", _TEXTS) if dtype == "T" else np.full(shape, np.nan)
+
+
+def _middle(images: Images, flight: str) -> Any:
+    """Return the middle of the pulses of all pairs of a flight, UTC."""
+    views = [image.attrs["quality"]["view"] for (name, _), image in images.items() if name == flight]
+    ends = np.array([view[end] for view in views for end in ("first_utc", "last_utc")], "datetime64[ns]")
+    return ends.min() + (ends.max() - ends.min()) // 2
+
+
+def _quoted(image: xr.Dataset, assessed: Mapping[str, Any]) -> dict[str, float | str | None]:
+    """Return the quality of an image and its assessment: name of a row of `QUOTED` → value or None."""
+    quality = image.attrs["quality"]
+    view, focus, pulses = quality["view"], quality["focus"], quality.get("pulses", {})  # a phase history has none
+    flags = {*image.attrs["flags"], *assessed["flags"]}
+    return {
+        "heading": view["heading_deg"],
+        "look_direction": view["look_deg"],
+        "incidence": view["incidence_deg"],
+        "bistatic_angle": view["bistatic_angle_deg"],
+        "range": view["range_m"],
+        "height": view["height_m"],
+        "centre_frequency": view["centre_hz"],
+        "bandwidth": view["band_hz"],
+        "resolution_cell": focus["cell_m"],
+        "loss": focus.get("loss_db"),
+        "numerical_error": quality["numerical_error_db"],
+        "entropy": quality["entropy"],
+        "noise_floor": quality["noise_floor_db"],
+        "pulses_used": pulses.get("used"),
+        "pulses_dropped": pulses.get("dropped"),
+        "peak": quality["brightest"]["amplitude"],
+        "verdict": focus_with_flags(focus, flags, error_db=quality["numerical_error_db"])["verdict"],
+        "flags": ",".join(sorted(flags)),
+    }
+
+
+# ---- Coherence and phase between the images of a cube ---------------------------------------------------------------
+
+_TILES_AT_ONCE = 4
+"""Along a side: tiles are read with a margin, and what they share is read once."""
+
+Compared = Mapping[str, Mapping[tuple[str, str], tuple[str, str]]]
+"""'pair' or 'flight' → image, by flight and pair → the image it is compared with."""
+
+
+def compared(images: Images, references: Mapping[str, str], first_flights: Mapping[str, str]) -> Compared:
+    """Return which images are compared: each with its flight's reference pair, and with its pair's first flight.
+
+    Parameters
+    ----------
+    images
+        Those that were formed.
+    references
+        Flight → its reference pair.
+    first_flights
+        Pair → the flight that others are compared with.
+    """
+    to = {
+        "pair": {(flight, pair): (flight, references[flight]) for flight, pair in images},
+        "flight": {(flight, pair): (first_flights[pair], pair) for flight, pair in images},
+    }
+    return {kind: {one: other for one, other in rows.items() if one != other} for kind, rows in to.items()}
+
+
+def window_of(images: Images, spacing_m: float) -> int:
+    """Return the side (pixels) of the window that coherence is measured in: every image has 16 looks in it."""
+    return max(window_px(_spectrum(image), spacing_m) for image in images.values())
+
+
+def shared_band(one: xr.Dataset, other: xr.Dataset) -> float:
+    """Return the coherence of unchanged ground, docs/theory/interferometry.md, eq. 1a."""
+    carriers = tuple(np.array(image.attrs["quality"]["view"]["carrier_cycles_m"]) for image in (one, other))
+    return common_band((carriers[0], carriers[1]), (_spectrum(one), _spectrum(other)))
+
+
+def write_phase(
+    images: tuple[BlockRaster, BlockRaster],
+    arrays: tuple[Any, Any],
+    grid: SceneGrid,
+    *,
+    side: int,
+    window: int,
+    workers: Executor,
+) -> tuple[float, float]:
+    """Write coherence and phase of two images tile by tile; return looks, and the coherence of chance.
+
+    Parameters
+    ----------
+    images
+        An image and the one it is compared with.
+    arrays
+        Of coherence and phase, (y, x) float32; a tile that one of the images does not hold is not written.
+    grid
+        Of all.
+    side, window
+        Of a tile, and of the window, pixels.
+    workers
+        Who measure tiles; how many do changes nothing in what is written.
+
+    Returns
+    -------
+    tuple
+        NaN of images without a tile in common.
+    """
+    shares: list[float] = []
+    for block in grid.tiles(_TILES_AT_ONCE * side):
+        wide = _widened(block, window // 2, grid.shape)
+        first, second = (np.asarray(image[wide]) for image in images)
+
+        def measured(tile: Window, wide: Window = wide, first: Any = first, second: Any = second) -> float | None:
+            around = _widened(tile, window // 2, grid.shape)
+            part, middle = _against(around, wide), _against(tile, around)
+            if not (np.isfinite(first[part]) & np.isfinite(second[part])).any():
+                return None
+            magnitude, phase, looks = coherence(first[part], second[part], window=window)
+            if not np.isfinite(magnitude[middle]).any():
+                return None
+            for array, values in zip(arrays, (magnitude, phase), strict=True):
+                array[tile] = values[middle]
+            return 1 / looks
+
+        shares += [share for share in workers.map(measured, _inside(grid, block, side)) if share is not None]
+    looks = 1 / float(np.mean(shares)) if shares else float("nan")
+    return looks, chance(looks) if shares else looks
+
+
+def _spectrum(image: xr.Dataset) -> Any:
+    return np.array(image.attrs["quality"]["focus"]["spectrum_cycles2_m2"])
+
+
+def _inside(grid: SceneGrid, block: Window, side: int) -> Iterator[Window]:
+    for rows, columns in grid[block].tiles(side):
+        top, left = block[0].start, block[1].start
+        yield slice(rows.start + top, rows.stop + top), slice(columns.start + left, columns.stop + left)
+
+
+def _widened(window: Window, by: int, shape: tuple[int, int]) -> Window:
+    rows, columns = (
+        slice(max(0, part.start - by), min(size, part.stop + by)) for part, size in zip(window, shape, strict=True)
+    )
+    return rows, columns
+
+
+def _against(window: Window, whole: Window) -> Window:
+    """Return a window counted from where another begins."""
+    rows, columns = (slice(part.start - of.start, part.stop - of.start) for part, of in zip(window, whole, strict=True))
+    return rows, columns
+
+
+# ---- Rule `cube`: all images, sums of each flight, phases between images --------------------------------------------
+
+_PHASE = "coherence", "phase"
+
+
+def cube(campaign: Campaign, *, threads: int = 1) -> Path:
+    """Write results/cube.zarr: images (flight, pair, y, x), sums of each flight, coherence and phase between images.
+
+    Sums are there where a flight has two pairs, and NaN of flights of one.
+    Tile by tile; a tile that no pulse of a pair illuminates is not stored and reads as NaN, as in its image.
+    """
+    flights, lineage = campaign.image_flights, result_of(campaign, "cube").begin(campaign.root)
+    images = {
+        (flight.name, pair): open_stage(campaign.stage("image", flight.name, pair), "image")
+        for flight in flights
+        for pair in flight.pairs
+    }
+    assessed = {flight.name: assessment_of(campaign, flight.name) for flight in flights}
+    sums = {flight.name: assessed[flight.name]["fusion"] for flight in flights if FUSED in flight.images}
+    grid, side = settled_scene(campaign).grid, campaign.settings.processing.tile_px
+    folder, windows = campaign.stage("cube"), list(grid.tiles(side))
+    with undamaged(folder, expected="images as this version forms them", remedy="Run the workflow again."):
+        described = _empty(campaign.settings.campaign, images, assessed, sums, grid, windows)
+    with writing(folder) as wip, ThreadPoolExecutor(threads) as workers:
+        empty = stamped(
+            described,
+            "cube",
+            modules=lineage.modules,
+            parents={"/".join(name): image for name, image in images.items()},
+            settings={"fusion": sums},
+        )
+        tile = {"y": side, "x": side, "flight": 1, "pair": 1}
+        chunks = {name: tuple(tile[dim] for dim in dims) for name, (dims, *_) in RASTERS.items() if name in empty}
+        whole = {name: empty[name].shape for name in MEASURED if name in empty}
+        create(wip, empty, chunks | whole, consolidated=True)
+        arrays = _CubeArrays(
+            {name: open_array(wip, name) for name in (*chunks, *whole)}, [*assessed], empty.attrs["pairs"]
+        )
+        for flight in assessed:
+            _write_images(images, sums.get(flight), arrays, flight, windows, workers)
+        for flight, fusion in sums.items():
+            single_db = [images[flight, pair].attrs["quality"]["noise_floor_db"] for pair in fusion["phases_rad"]]
+            sum_db = image_statistics(arrays.plane("coherent", flight), windows).noise_floor_db
+            arrays.plane("coherent_noise_floor", flight)[()] = sum_db
+            arrays.plane("clutter_reduction", flight)[()] = clutter_reduction_db(single_db, sum_db)
+        references = {flight: one["reference"] for flight, one in assessed.items()}
+        _compare(images, references, arrays, grid, side=side, workers=workers)
+        finish(wip, folder, lineage=lineage)
+    return folder
+
+
+@dataclass(frozen=True)
+class _Plane:
+    """The plane of an array of one flight, or of one pair of it."""
+
+    array: Any
+    place: tuple[int, ...]
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Of the plane."""
+        shape: tuple[int, ...] = self.array.shape[len(self.place) :]
+        return shape
+
+    def __getitem__(self, window: Window) -> Any:
+        return self.array[(*self.place, *window)]
+
+    def __setitem__(self, window: Window | tuple[()], values: Any) -> None:
+        self.array[(*self.place, *window)] = values
+
+
+@dataclass(frozen=True)
+class _CubeArrays:
+    """The arrays of the cube, by name, flight and pair."""
+
+    arrays: Mapping[str, Any]
+    flights: Sequence[str]
+    pairs: Sequence[str]
+
+    def plane(self, name: str, flight: str, pair: str | None = None) -> _Plane:
+        """Return a plane of an array, to be read and written by windows."""
+        place = (self.flights.index(flight), *([] if pair is None else [self.pairs.index(pair)]))
+        return _Plane(self.arrays[name], place)
+
+
+def _write_images(
+    images: Images,
+    fusion: Mapping[str, Any] | None,
+    arrays: _CubeArrays,
+    flight: str,
+    windows: list[Window],
+    workers: Executor,
+) -> None:
+    """Copy the images of a flight and write their sums, tile by tile, each read once; `fusion`: None without sums."""
+    present = {pair: image for (name, pair), image in images.items() if name == flight}
+    copies = [arrays.plane("image", flight, pair) for pair in present]
+    phases_rad = {} if fusion is None else fusion["phases_rad"]
+    peaks = np.array([image.attrs["quality"]["brightest"]["amplitude"] for image in present.values()])
+    added = np.array([pair in phases_rad for pair in present])
+    turned = np.array([phases_rad[pair] for pair in present if pair in phases_rad])
+    named = () if fusion is None else ("coherent", "noncoherent", "magnitude")
+    sums = {name: arrays.plane(name, flight) for name in named}
+
+    def write(window: Window) -> None:
+        stack = np.stack([image.image[window].values for image in present.values()])
+        there = ~np.isnan(stack).all(axis=(1, 2))
+        for copy, block in zip(compress(copies, there), stack[there], strict=True):
+            copy[window] = block
+        if sums and there[added].any():
+            sums["coherent"][window] = coherent_sum(stack[added], peaks[added], turned)
+        if sums and there.any():
+            sums["noncoherent"][window] = noncoherent_sum(stack, peaks)
+            sums["magnitude"][window] = magnitude_sum(stack, peaks)
+
+    for _ in workers.map(write, windows):
+        pass
+
+
+def _compare(
+    images: Images,
+    references: Mapping[str, str],
+    arrays: _CubeArrays,
+    grid: SceneGrid,
+    *,
+    side: int,
+    workers: Executor,
+) -> None:
+    """Write coherence and phase of each image with its flight's reference pair and its pair's first flight."""
+    window = window_of(images, grid.spacing_m)
+    for kind, rows in compared(images, references, reference_flights(images, arrays.pairs)).items():
+        for other in dict.fromkeys(rows.values()):
+            against = held(images[other].image)
+            for one in (image for image, its in rows.items() if its == other):
+                planes = [arrays.plane(f"{kind}_{name}", *one) for name in _PHASE]
+                both, to = (held(images[one].image), against), (planes[0], planes[1])
+                measures = write_phase(both, to, grid, side=side, window=window, workers=workers)
+                shared = shared_band(images[one], images[other])
+                for name, value in zip(("looks", "chance", "common_band"), (*measures, shared), strict=True):
+                    arrays.plane(f"{kind}_{name}", *one)[()] = value
+
+
+def _between_flights(
+    references: Mapping[str, xr.Dataset], grid: SceneGrid, windows: Sequence[Window]
+) -> dict[str, Any]:
+    """Return the shift of each flight's reference image against the first flight's, and its flags."""
+    first, *others = references
+    shown = {name: ComparedImage.of(image, grid, windows) for name, image in references.items()} if others else {}
+    between: dict[str, Any] = {}
+    flags: dict[str, Flags] = {}
+    for name in others:
+        found = agreement_of(shown[first], shown[name], grid, windows)
+        between[name] = agreement_report(found)
+        if found is not None and found.shifted:
+            line = (
+                f"{found.points} {found.by} of flight {name} lie {100 * found.shift_m:.1f} ± "
+                f"{100 * found.shift_std_along_m:.1f} cm from where flight {first} has them, "
+                f"{100 * found.shift_east_m:+.1f} cm east and "
+                f"{100 * found.shift_north_m:+.1f} cm north: a base station, datum or time system differs"
+            )
+            flags[name] = Flags({"flights_apart": line})
+    return {"agreement": {"reference": first, "flights": between}, "flags": flags}
+
+
+def _empty(
+    campaign: str,
+    images: Images,
+    assessed: Mapping[str, Mapping[str, Any]],
+    sums: Sums,
+    grid: SceneGrid,
+    windows: Sequence[Window],
+) -> xr.Dataset:
+    """Return the cube of a campaign of this name without the values of its rasters and of measures on them."""
+    pairs = sorted({pair for _, pair in images})
+    named = labels(images, assessed, sums, pairs)
+    sizes = {**named.sizes, "y": grid.shape[0], "x": grid.shape[1]}
+    for name, (dims, dtype, _, _) in {**RASTERS, **MEASURED}.items():
+        if name in SUMMED and not sums:
+            continue
+        nothing = np.full((), complex(np.nan, np.nan) if dtype == "complex64" else np.nan, dtype)
+        named[name] = dims, np.broadcast_to(nothing, tuple(sizes[dim] for dim in dims))
+    references = {flight: images[flight, one["reference"]] for flight, one in assessed.items()}
+    return named.assign_coords(grid.coordinates).assign_attrs(
+        Conventions="CF-1.11",
+        title=f"SAR images of campaign {campaign}",
+        history="rule cube of apertura: runspec, inputs and code_sha256 say of what and how",
+        flights=[*assessed],
+        pairs=pairs,
+        fusion=sums,
+        coherence_window=window_of(images, grid.spacing_m),
+        **_between_flights(references, grid, windows),
+    )

@@ -1,0 +1,267 @@
+"""Rule `echo`: what is measured of a pair's recordings and tracks: pulses, phase centres, clock and sidelink.
+
+The calibrated transfer functions follow from it and the recordings. They are in it of a recorder that stores transfer
+functions itself; else rule `transfer` keeps them where `processing.keep` says so.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from apertura.campaign.config import Processing, PulseWaveform, SampledWaveform
+from apertura.campaign.folder import Campaign
+from apertura.campaign.store import save_stage
+from apertura.common.arrays import Times
+from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.common.flags import Flags
+from apertura.common.provenance import merged
+from apertura.core.echo.association import Association, missing_flags, tag_jitter_s
+from apertura.core.echo.captures import Saturation
+from apertura.core.echo.pulse_filter import truncation_flags
+from apertura.core.echo.sidelink import DIVIDING
+from apertura.core.echo.transfer import (
+    Transfer,
+    transfer_by_code,
+    transfer_by_sidelink,
+)
+from apertura.core.geometry.aperture import Aperture
+from apertura.core.geometry.atmosphere import SceneAir
+from apertura.core.quality.budget import strictest_accuracy_db
+from apertura.stages.acquisition import Acquisition, common_pulses, open_acquisition
+from apertura.stages.air import scene_air, stated_air
+from apertura.stages.calibration import calibrated, calibration_spec
+from apertura.stages.positions import PulsePositions, place
+from apertura.stages.stamping import stamped
+from apertura.stages.transfer import PairEcho, forming_from, recorded_echo, save_transfer
+from apertura.stages.transmitted import Transmitted, transmitted
+from apertura.workflow.lineage import result_of
+
+
+def echo(campaign: Campaign, flight: str, pair: str) -> Path:
+    """Write results/<flight>/<pair>/echo.zarr."""
+    lineage = result_of(campaign, "echo", flight, pair).begin(campaign.root)
+    waveform = campaign.settings.waveform
+    parents: list[xr.Dataset] = []
+    calibration = calibrated(campaign, flight, pair)
+    if not isinstance(waveform, SampledWaveform):
+        files = [campaign.root / name for name in lineage.result.sources]
+        formed = PairEcho.recorded(recorded_echo(campaign, flight, pair))
+    else:
+        files = [campaign.sent_file]
+        sent = transmitted(campaign, waveform)
+        tx, rx = pair.split("-")
+        nodes = {node: open_acquisition(campaign, flight, node, sent) for node in dict.fromkeys((tx, rx))}
+        parents = [stage for node in nodes.values() for stage in (node.raw, node.track)]
+        air = scene_air(campaign, nodes[tx].track.position.values)
+        hovers = bool(campaign.segments_of(flight, pair))
+        formed = pair_echo(nodes[tx], nodes[rx], sent, campaign.settings.processing, calibration, air, hovers=hovers)
+    formed = formed.within(campaign, flight, pair)
+    inputs = {name: lineage.sources.digests[name] for name in map(campaign.relative, files)}
+    if calibration:
+        inputs = merged(inputs, calibration["inputs"])
+    relevant = {**lineage.result.settings, "calibration": calibration_spec(calibration)}
+    folder = campaign.stage("echo", flight, pair)
+    how: dict[str, Any] = {"modules": lineage.modules, "parents": parents, "settings": relevant, "inputs": inputs}
+    if isinstance(waveform, SampledWaveform):
+        save_stage(stamped(formed.dataset, "echo", **how), folder, lineage=lineage)
+    else:
+        save_transfer(formed, stamped(formed.hollow, "echo", **how), folder, lineage)
+    return folder
+
+
+def pair_echo(
+    tx: Acquisition,
+    rx: Acquisition,
+    sent: Transmitted,
+    processing: Processing,
+    calibration: dict[str, Any] | None,
+    air: SceneAir,
+    *,
+    hovers: bool = False,
+) -> PairEcho:
+    """Return the echo of a pair from its nodes' recordings; path offsets are the calibration's, or the config's.
+
+    Pulses of a hover are left out unless `hovers`, as `apertura.stages.positions.place` does.
+    """
+    pulses = common_pulses(tx, rx, prf_hz=sent.waveform.prf_hz)
+    repeats = rx.raw.repeats.values[pulses.rx_index]
+    paired = np.flatnonzero(~pulses.outlier & ~repeats)
+    positions = place(tx, rx, tx.raw.time.values[pulses.tx_index[paired]], hovers=hovers)
+    paired = paired[positions.good]
+    at = tx.raw.time.values[pulses.tx_index[paired]]
+    measured, sidelink_m = _transfer((tx, rx), pulses.rx_index[paired], at, sent, processing, air)
+    at = at[measured.kept]
+    offset_m = calibration["offset_m"] if calibration else _stated_offset_m(rx, monostatic=tx.name == rx.name)
+    beyond_m = offset_m - sidelink_m  # electrical path of an echo beyond tx → scene → rx
+    aperture = Aperture(tx.antenna("radar_tx", at), rx.antenna("radar_rx", at))
+    flown = air.over(aperture)
+    delay_s = beyond_m / SPEED_OF_LIGHT_M_S
+    dataset = xr.Dataset(
+        {
+            "time": ("pulse", at),
+            "capture": ("pulse", pulses.rx_index[paired][measured.kept]),
+            "path_removed": ("pulse", beyond_m),
+            "tx_position": (("pulse", "axis"), aperture.tx_m),
+            "rx_position": (("pulse", "axis"), aperture.rx_m),
+            "frequency": ("subcarrier", rx.numerology.frequency_hz),
+            "reference_delay": ("pulse", np.zeros(len(beyond_m))),
+            "path_limit": ("pulse", flown.wave_speed_m_s * (sent.waveform.longest_delay_s - delay_s)),
+            **_sidelink(measured),
+            **_axes((tx, rx), at),
+            **_sidelink_vector((tx, rx), at),
+        },
+        attrs=_attributes((tx, rx), pulses, positions, measured, repeats, at=at, calibration=calibration)
+        | {"stated_offset_m": offset_m, **stated_air(flown)},
+    )
+    saturation = Saturation()
+    return PairEcho(dataset, forming_from(rx, sent, saturation, divided=tx.name != rx.name), saturation)
+
+
+def _attributes(
+    nodes: tuple[Acquisition, Acquisition],
+    pulses: Association,
+    positions: PulsePositions,
+    measured: Transfer,
+    repeats: NDArray[np.bool_],
+    *,
+    at: Times,
+    calibration: dict[str, Any] | None,
+) -> dict[str, Any]:
+    """Return the attributes of an echo whose pulses were sent `at`: flags, counts of pulses left out, reports."""
+    missing = missing_flags(at.astype("datetime64[ns]").astype(np.int64))
+    attrs = {
+        "frame": "ecef",
+        "pair": "-".join(node.name for node in nodes),
+        **measured.report,
+        "positions": positions.report,
+        "time_tags": _time_tags(nodes[0], pulses),
+        "flags": Flags.merged(
+            pulses.flags,
+            _repeated(nodes[1], pulses, repeats),
+            positions.flags,
+            measured.flags,
+            missing,
+            calibration["flags"] if calibration else {},
+        ),
+        "pulses": _counted(len(nodes[0].raw.time), pulses, repeats, positions, measured),
+    }
+    if calibration:
+        attrs["calibration"] = {name: calibration[name] for name in ("flight", "offset_m", "std_m")}
+    return attrs
+
+
+def _transfer(
+    nodes: tuple[Acquisition, Acquisition],
+    captures: NDArray[np.int64],
+    at: Times,
+    sent: Transmitted,
+    processing: Processing,
+    air: SceneAir,
+) -> tuple[Transfer, NDArray[np.float64]]:
+    """Return the transfer functions of captures, sent `at` the transmitter's tags, and electrical lengths of sidelinks.
+
+    In metres; 0 without. Both ends are taken from the logs at the transmitter's tag (docs/theory.md, "Geometry").
+    """
+    tx, rx = nodes
+    if tx.name == rx.name:
+        read, sent_ns = rx.reader(["radar"], captures), at.astype("datetime64[ns]").astype(np.int64)
+        measured = transfer_by_code(read, sent.inverse, rx.numerology, time_s=(sent_ns - sent_ns[0]) * 1e-9)
+        return _of_what_was_sent(measured, sent), np.zeros(len(at))
+    length_m = air.electrical_m(tx.antenna("sidelink", at), rx.antenna("sidelink", at))
+    measured = transfer_by_sidelink(
+        rx.reader(["radar", "sidelink"], captures),
+        sent.inverse,
+        rx.numerology,
+        symbol_samples=sent.waveform.capture_samples,
+        sidelink_m=length_m,
+        method=processing.sidelink,
+        accuracy_db=strictest_accuracy_db(processing.accuracy_db),
+        where=str(rx.files),
+    )
+    return _of_what_was_sent(measured, sent), length_m[measured.kept]
+
+
+def _sidelink(measured: Transfer) -> dict[str, tuple[str, Any]]:
+    """Return what was measured of the sidelink in each pulse; nothing of a node that hears itself."""
+    correction, kept = measured.correction, measured.kept
+    if correction is None:
+        return {}
+    known = {
+        "sidelink_delay": measured.sidelink_delay_m,
+        "sidelink_snr": measured.sidelink_snr_db,
+        "sidelink_phase": measured.sidelink_phase_rad,
+        "sidelink_amplitude": np.where(correction.path.locked, correction.path.amplitude, np.nan)[kept],
+        "clock_offset": correction.clock_hz if correction.clock_hz is None else correction.clock_hz[kept],
+    }
+    return {name: ("pulse", values) for name, values in known.items() if values is not None}
+
+
+def _of_what_was_sent(measured: Transfer, sent: Transmitted) -> Transfer:
+    """Return what captures measured, with what was decided of the waveform, and whether they hold it whole."""
+    flags, waveform = dict(sent.flags), sent.waveform
+    if measured.report.get("sidelink", {}).get("method") in DIVIDING:
+        flags.pop("waveform_sidelobes", None)  # the pulse cancels: it is in both channels
+    if isinstance(waveform, PulseWaveform) and measured.sidelink_delay_m is not None:
+        window = {name: getattr(waveform, name) for name in ("lead_s", "pulse_s", "listen_s")}
+        cell_s = 1 / (sent.numerology.numbers.size * sent.numerology.spacing_hz)
+        cut = truncation_flags(measured.sidelink_delay_m / SPEED_OF_LIGHT_M_S, cell_s=cell_s, **window)
+        flags = Flags.merged(flags, cut)
+    report = {**measured.report, **({"waveform": sent.report} if sent.report else {})}
+    return replace(measured, flags=Flags.merged(measured.flags, flags), report=report)
+
+
+def _time_tags(tx: Acquisition, pulses: Association) -> dict[str, Any]:
+    """Return how the nodes' tags lie to each other, and what is known of the transmitter's own errors."""
+    return {
+        **{name: getattr(pulses, name) for name in ("offset_s", "drift_ppm", "residual_s", "method")},
+        "std_s": tx.settings.time_tag_std_s,
+        "jitter_s": tag_jitter_s(tx.raw.time.values.astype("datetime64[ns]").astype(np.int64)),
+    }
+
+
+def _repeated(rx: Acquisition, pulses: Association, repeats: NDArray[np.bool_]) -> Flags:
+    """Raise a flag where captures of the receiver repeat earlier ones bit for bit; they are left out."""
+    if not repeats.any():
+        return Flags()
+    first = int(pulses.rx_index[int(repeats.argmax())])
+    line = f"{int(repeats.sum())} of {len(repeats)} captures of {rx.name}, the first is number {first}"
+    return Flags({"captures_repeated": line})
+
+
+def _counted(
+    sent: int, pulses: Association, repeats: NDArray[np.bool_], positions: PulsePositions, measured: Transfer
+) -> dict[str, Any]:
+    """Return how many of the pulses sent are used, how many not, and why."""
+    used = int(measured.kept.sum())
+    reasons = {
+        "unpaired": pulses.tx_dropped,
+        "time_tag_outlier": int(pulses.outlier.sum()),
+        "captures_repeated": int((repeats & ~pulses.outlier).sum()),
+        **positions.reasons,
+        "sidelink_lost": int((~measured.kept).sum()),
+    }
+    return {"used": used, "dropped": sent - used, "reasons": {why: count for why, count in reasons.items() if count}}
+
+
+def _axes(nodes: tuple[Acquisition, Acquisition], at: Times) -> dict[str, tuple[tuple[str, ...], NDArray[np.float64]]]:
+    """Return the body axes of the nodes whose attitude counts."""
+    tx, rx = nodes
+    turning = {"tx_axes": tx.turns("radar_tx") and tx, "rx_axes": rx.turns("radar_rx") and rx}
+    return {name: (("pulse", "axis", "body"), node.body_axes(at)) for name, node in turning.items() if node}
+
+
+def _sidelink_vector(nodes: tuple[Acquisition, Acquisition], at: Times) -> dict[str, tuple[tuple[str, ...], Any]]:
+    """Return b of docs/theory/autofocus.md, eq. 2, where the echo was given back its length."""
+    tx, rx = nodes
+    if tx.name == rx.name:
+        return {}
+    return {"sidelink_vector": (("pulse", "axis"), tx.antenna("sidelink", at) - rx.antenna("sidelink", at))}
+
+
+def _stated_offset_m(rx: Acquisition, *, monostatic: bool) -> float:
+    stated = rx.settings.path_offset_m
+    return stated.radar if monostatic else stated.radar - stated.sidelink

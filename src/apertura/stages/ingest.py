@@ -1,0 +1,124 @@
+"""Rule `ingest`: the recording and log of a node in a flight, as stages `raw` and `track`."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import xarray as xr
+
+from apertura.campaign.config import CONFIG, PulseWaveform, SampledWaveform
+from apertura.campaign.digests import digest_of
+from apertura.campaign.folder import Campaign
+from apertura.campaign.store import save_stage
+from apertura.common.errors import CampaignError
+from apertura.core.echo.trigger import PulseFraming, trigger_captures
+from apertura.formats.reading import open_recording
+from apertura.formats.recordings.recording import Recording
+from apertura.stages.node_log import read_log
+from apertura.stages.stamping import stamped
+from apertura.stages.transmitted import read_framing
+from apertura.workflow.lineage import result_of
+
+
+def checked_recording(campaign: Campaign, flight: str, node: str) -> Recording:
+    """Return a node's recording; raise CampaignError where its samples are not those that the recorder hashed."""
+    recording = open_recording(campaign.recording_files(flight, node))
+    recording.check_hash(lambda path: digest_of(campaign.root, campaign.relative(path), algorithm="sha512"))
+    return recording
+
+
+def preamble_files(recording: Recording, campaign: Campaign) -> tuple[Path, ...]:
+    """Return the file of chips that the recorder's metadata name, which must lie in the campaign; none of triggers."""
+    if recording.framing is None:
+        return ()
+    name = recording.framing["preamble"]
+    return (campaign.root.named(name, where=f"{recording.files[0]}: apertura:framing.preamble"),)
+
+
+def captures_of(recording: Recording, campaign: Campaign, *, node: str) -> xr.Dataset:
+    """Return the `raw` stage of a recording.
+
+    Raises
+    ------
+    CampaignError
+        If a capture holds only zeros, the file ends before the last, or no preamble is found in samples that run
+        through.
+    """
+    if recording.framing is None:
+        dataset = recording.cut(recording.captures, node=node)
+    else:
+        dataset = _triggered(recording, campaign, node=node)
+    dataset.attrs["samples"] = campaign.relative(recording.samples.path)
+    return dataset
+
+
+def framing_of(recording: Recording, campaign: Campaign) -> PulseFraming:
+    """Return what was sent before each symbol of a continuous recording.
+
+    Raises
+    ------
+    CampaignError
+        If the preamble is none, or the waveform begins before its captures can.
+    """
+    waveform = campaign.settings.waveform
+    if isinstance(waveform, PulseWaveform) and waveform.lead_s:
+        raise CampaignError(
+            f"waveform.lead_s is {waveform.lead_s:g}, and {recording.files[0].name} never stopped",
+            where=CONFIG,
+            expected="0: its captures are cut where the pulse begins",
+            remedy="Set waveform.lead_s to 0.",
+        )
+    return read_framing(
+        preamble_files(recording, campaign)[0],
+        recording.framing or {},
+        sample_rate_hz=recording.sample_rate_hz,
+        where=recording.files[0],
+    )
+
+
+def _triggered(recording: Recording, campaign: Campaign, *, node: str) -> xr.Dataset:
+    """Return the `raw` stage of a continuous recording, as a triggered recorder would have written it."""
+    waveform, described = campaign.settings.waveform, recording.framing or {}
+    if not isinstance(waveform, SampledWaveform):
+        raise TypeError("a recording of samples needs a waveform that was recorded as samples")
+    framing = framing_of(recording, campaign)
+    rate = campaign.settings.processing.false_alarms_per_s
+    channel = "sidelink" if "sidelink" in recording.channels else "radar"
+    samples = recording.samples.channel(recording.channels.index(channel), waveform.iq)
+    length = waveform.capture_samples
+    bits = 8 * recording.samples.sample_bytes // len(recording.channels)
+    captures = trigger_captures(samples, framing, symbol_samples=length, false_alarms_per_s=rate, sample_bits=bits)
+    if not captures.start.size:
+        raise CampaignError(
+            f"no preamble in {len(samples)} samples at a threshold for {rate} false alarms per second",
+            where=recording.files[-1],
+            expected=f"preambles of {described['preamble']} in channel {channel}",
+            remedy="Check the preamble file and apertura:framing, or record with more signal.",
+        )
+    dataset = recording.cut(recording.captures_at(captures.start, length, captures.frame), node=node)
+    return dataset.assign_attrs(trigger=captures.report)
+
+
+def ingest(campaign: Campaign, flight: str, node: str) -> tuple[Path, Path]:
+    """Write results/<flight>/<node>/raw.zarr and track.zarr from a node's recording and flight log.
+
+    Raises
+    ------
+    CampaignError
+        If a file is missing, damaged, or not what its format promises.
+    """
+    logged = result_of(campaign, "track", flight, node).begin(campaign.root)
+    log = read_log(campaign, flight, node)
+    how: dict[str, Any] = {"settings": logged.result.settings, "inputs": logged.sources.digests}
+    track = stamped(log, "track", modules=logged.modules, **how)
+    recording = checked_recording(campaign, flight, node)
+    recorded = result_of(campaign, "raw", flight, node).begin(
+        campaign.root, further=[*map(campaign.relative, preamble_files(recording, campaign))]
+    )
+    settings: Mapping[str, Any] = {} if recording.framing is None else recorded.result.settings
+    dataset = captures_of(recording, campaign, node=node)
+    raw = stamped(dataset, "raw", modules=recorded.modules, settings=settings, inputs=recorded.sources.digests)
+    folders = campaign.stage("raw", flight, node), campaign.stage("track", flight, node)
+    save_stage(raw, folders[0], lineage=recorded)
+    save_stage(track, folders[1], lineage=logged)
+    return folders

@@ -1,0 +1,376 @@
+"""Rule `layers`: angles, mask, looks, noise, σ⁰ and mean power of a pair, as GeoTIFFs."""
+
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rasterio.windows
+import xarray as xr
+from numpy.typing import NDArray
+from rasterio import Affine
+
+from apertura.campaign.config import polarisation_of
+from apertura.campaign.config.processing import Multilooking
+from apertura.campaign.folder import Campaign
+from apertura.campaign.store import open_stage, record_files
+from apertura.common.arrays import Floats
+from apertura.common.atomic import write_json
+from apertura.common.contracts import Window
+from apertura.common.flags import Flags
+from apertura.common.provenance import Provenance
+from apertura.common.raster import opened_raster
+from apertura.core.imaging.noise import PulseNoise, noise_places, noise_power
+from apertura.core.imaging.radiometry import Quantity
+from apertura.core.imaging.range_profiles import profiles_of
+from apertura.core.imaging.speckle import Multilook
+from apertura.core.scene.angles import surface
+from apertura.core.scene.grid import SceneGrid
+from apertura.core.scene.looks import BLOCK_PX, Looks
+from apertura.core.scene.terrain import FlatGround
+from apertura.formats.export import product, remove_outdated, write_exports
+from apertura.formats.export.layers import OUTSIDE
+from apertura.formats.export.radiometry import CROSS_SECTIONS, ECHO, of_coefficient, of_multilooked
+from apertura.stages.pair import open_pair, pattern_digests
+from apertura.stages.planning import integration_of, weighing
+from apertura.stages.radiometry import POINTS_LISTED, CalibratedPair, calibrated_pair, points_of
+from apertura.stages.scene import OpenScene, open_scene
+from apertura.stages.stamping import tags_of
+from apertura.stages.transfer import PairEcho
+from apertura.workflow.lineage import result_of
+
+
+@dataclass(frozen=True)
+class LazyLayer:
+    """A raster whose blocks are computed on reading, tile by tile, in threads.
+
+    Attributes
+    ----------
+    grid
+        Its pixels.
+    dtype
+        Of the values.
+    of
+        Window of the grid → values (row, column).
+    threads
+        Tiles computed at once.
+    tile_px
+        Side of a tile.
+    """
+
+    grid: SceneGrid
+    dtype: type[np.generic]
+    of: Callable[[Window], NDArray[Any]]
+    threads: int
+    tile_px: int = BLOCK_PX
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        return self.grid.shape
+
+    def __getitem__(self, block: Window) -> NDArray[Any]:
+        """Return the values of a block of rows and columns."""
+        part = self.grid[block]
+        values = np.empty(part.shape, self.dtype)
+
+        def work(tile: Window) -> None:
+            rows, columns = (slice(at.start + by, at.stop + by) for at, by in zip(tile, part.first, strict=True))
+            values[tile] = self.of((rows, columns))
+
+        with ThreadPoolExecutor(self.threads) as pool:
+            list(pool.map(work, part.tiles(self.tile_px)))
+        return values
+
+
+_FEWEST_CELLS = 64  # along a tile of mean power: those around it that the filter reads, too, are few
+
+
+def side_of(grid: SceneGrid, asked: Multilooking) -> int:
+    """Return the side of the squares that power is averaged over, pixels."""
+    return max(1, round(asked.spacing_m / grid.spacing_m))
+
+
+def multilook_of(
+    image: Callable[[Window], NDArray[np.complex64]],
+    grid: SceneGrid,
+    asked: Multilooking,
+    *,
+    noise: Callable[[Window], Floats] | None = None,
+) -> Multilook:
+    """Return the mean power of an image as it is asked for, `noise` taken off; else as `Multilook`."""
+    filtered = asked.speckle_filter == "lee"
+    return Multilook.of(image, grid.shape, side_of(grid, asked), noise=noise, filtered=filtered)
+
+
+def coarse(
+    grid: SceneGrid, cells: Multilook, *, threads: int, of: Callable[[Window], Floats] | None = None
+) -> LazyLayer:
+    """Return the raster of squares of pixels: their mean power, or a function of a window of squares."""
+    coarser = replace(grid, spacing_m=cells.side * grid.spacing_m, shape=cells.shape)
+    return LazyLayer(coarser, np.float32, of or cells.mean, threads, max(_FEWEST_CELLS, BLOCK_PX // cells.side))
+
+
+def said_of(cells: Multilook, means: Mapping[str, Any], *, noise: str) -> dict[str, Any]:
+    """Return what mean power means, of pixels that mean `means`."""
+    return of_multilooked(
+        means,
+        side_px=cells.side,
+        looks=cells.looks,
+        found=cells.found,
+        noise=noise,
+        speckle="Lee" if cells.filtered else "none",
+    )
+
+
+def layers(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> list[Path]:
+    """Write incidence, bistatic angle, mask, looks and noise of one pair, σ⁰ where its radio is stated, and mean power.
+
+    Returns their paths. What the radio makes of bright points and of noise is in radiometry.json.
+    """
+    lineage = result_of(campaign, "layers", flight, pair).begin(campaign.root)
+    echo = PairEcho.opened(campaign, flight, pair).stage
+    profile = open_stage(campaign.stage("profile", flight, pair), "profile")
+    scene, profiles = open_scene(campaign), profiles_of(profile, lazy=True)
+    opened = open_pair(campaign, flight, pair, echo=echo)
+    beams, calibrated = weighing(campaign, opened, scene), calibrated_pair(campaign, opened, scene, threads=threads)
+    looks = Looks.of(scene.grid, scene.terrain, profiles.aperture, beams, threads=threads)
+    places_m = noise_places(scene.grid, scene.terrain)
+    measured_noise = noise_power(profiles, places_m, time_s=opened.time_s, beams=beams)
+    noise = measured_noise.power
+    asked, multilook = campaign.settings.processing.radiometry, campaign.settings.processing.multilook
+    measured = campaign.calibrated or multilook is not None
+    image = open_stage(campaign.stage("image", flight, pair), "image") if measured else None
+    origin = Provenance.of(
+        lineage.modules,
+        [echo, profile, *([] if image is None else [image]), *scene.parents],
+        settings={**lineage.result.settings, **scene.spec},
+        inputs=pattern_digests(campaign, pair) | scene.inputs,
+    )
+    folder, written = campaign.result(flight, pair), list[Path]()
+
+    def write(kind: str, rasters: Mapping[str, LazyLayer], means: Mapping[str, Mapping[str, Any]]) -> None:
+        (grid,) = {raster.grid for raster in rasters.values()} or {scene.grid}
+        written.extend(
+            write_exports(
+                kind,
+                folder,
+                rasters,
+                titles={name: f"{campaign.settings.campaign} · flight {flight} · {pair} · {name}" for name in rasters},
+                tags=tags_of(origin, lineage) | {"APERTURA_PULSE_NOISE": f"{noise:.4g}"},
+                radiometry=means,
+                transform=Affine(*grid.transform),
+                crs=grid.crs_wkt,
+            )
+        )
+
+    label, std_db = polarisation_of(campaign.settings.nodes, pair), None if calibrated is None else calibrated.std_db
+    means_of = partial(of_coefficient, std_db=std_db, polarisation=label)
+    absolute = {} if calibrated is None else {"nesz": means_of("sigma0", noise="alone")}
+    write("layers", layer_rasters(scene, looks, noise, calibrated, threads=threads), absolute)
+    if image is not None:
+        powers, means = dict[str, GroundPower](), dict[str, Mapping[str, Any]]()
+        if campaign.calibrated:
+            mask = folder / product("mask", "write_mask").file
+            known = calibrated is not None
+            powers = {name: GroundPower(scene, image, calibrated, mask, name, known) for name in asked}
+            means = {name: means_of(name) for name in asked}
+            images = ((name, one.amplitude) for name, one in powers.items())
+            write("radiometry", {name: LazyLayer(scene.grid, np.complex64, of, threads) for name, of in images}, means)
+            written.append(folder / CROSS_SECTIONS)
+            report = _report(scene, image, calibrated, measured_noise) if calibrated else _no_constant(campaign, pair)
+            write_json(written[-1], report | {"polarisation": label})
+        if multilook is not None:
+            per_weight = noise / integration_of(campaign, opened, scene).count ** 2
+            averaged = {f"multilook_{name}": (power, means[name]) for name, power in powers.items()}
+            for source, (power, meaning) in (
+                averaged or {"multilook": (GroundPower(scene, image), ECHO.report)}
+            ).items():
+                raster, said = _multilooked(power, meaning, looks, per_weight, multilook, threads=threads)
+                write("multilook", {source: raster}, {source: said})
+            if multilook.subtract_noise and np.isfinite(noise):
+                write("multilook", *_noise_of_echoes(scene, image, looks, per_weight, multilook, threads=threads))
+    remove_outdated(folder, written)
+    record_files(campaign.root / lineage.result.manifest, written, lineage)
+    return written
+
+
+@dataclass(frozen=True, eq=False)
+class GroundPower:
+    """Power of an image, as its ground scatters it where the pair is calibrated.
+
+    Attributes
+    ----------
+    scene, image
+        Grid and ground, and the stage.
+    calibrated, mask, quantity
+        Of a calibrated pair: what its power is divided by, and the file in which other values than 0 are places whose
+        power is not that of their ground alone. None: power as it is.
+    is_known
+        Whether the power is known; False: of a pair without a constant in a campaign that is calibrated.
+    """
+
+    scene: OpenScene
+    image: xr.Dataset
+    calibrated: CalibratedPair | None = None
+    mask: Path | None = None
+    quantity: Quantity = "sigma0"
+    is_known: bool = True
+
+    def per_one(self, window: Window) -> NDArray[np.float64]:
+        """Return the mean power of a window, (row, column), of ground that is 1; NaN where it is not told."""
+        if self.calibrated is None:
+            return np.full([part.stop - part.start for part in window], 1.0 if self.is_known else np.nan)
+        scene, flat = self.scene, isinstance(self.scene.terrain, FlatGround)
+        normal = None if flat and self.quantity == "sigma0" else surface(scene.grid, scene.terrain, window)[1]
+        power = self.calibrated.calibration.power(window, self.quantity, normal)
+        if flat or self.mask is None:
+            return power
+        with opened_raster(self.mask, expected="what this step has written", remedy="Run it again.") as raster:
+            return np.where(raster.read(1, window=rasterio.windows.Window.from_slices(*window)) == 0, power, np.nan)
+
+    def amplitude(self, window: Window) -> NDArray[np.complex64]:
+        """Return the complex pixels of a window whose power it is, (row, column)."""
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return np.asarray(self.image.image[window].values / np.sqrt(self.per_one(window)), np.complex64)
+
+
+def _multilooked(
+    power: GroundPower, means: Mapping[str, Any], looks: Looks, pulse_noise: float, asked: Multilooking, *, threads: int
+) -> tuple[LazyLayer, dict[str, Any]]:
+    """Return mean power on a coarser grid, float32, and what it means; `pulse_noise` is noise per Σw² of a pixel."""
+
+    def noise(window: Window) -> Floats:
+        return pulse_noise * looks.weight_squares(window) / power.per_one(window)
+
+    subtracted = noise if asked.subtract_noise and np.isfinite(pulse_noise) else None
+    cells = multilook_of(power.amplitude, power.scene.grid, asked, noise=subtracted)
+    noise_is = "in it" if subtracted is None else "subtracted"
+    return coarse(power.scene.grid, cells, threads=threads), said_of(cells, means, noise=noise_is)
+
+
+def _noise_of_echoes(
+    scene: OpenScene, image: xr.Dataset, looks: Looks, pulse_noise: float, asked: Multilooking, *, threads: int
+) -> tuple[dict[str, LazyLayer], dict[str, dict[str, Any]]]:
+    """Return mean power of the noise in the pixels of power.tif, on the coarser grid, which sums of pairs are told."""
+    side = side_of(scene.grid, asked)
+    cells = Multilook(
+        GroundPower(scene, image).amplitude,
+        scene.grid.shape,
+        side,
+        lambda window: pulse_noise * looks.weight_squares(window),
+        False,
+        *3 * [float("nan")],
+    )
+    raster = coarse(scene.grid, cells, threads=threads, of=cells.mean_noise)
+    means = {"amplitude": "root of the power of noise", "power": f"mean power of noise of {side} x {side} pixels"}
+    return {"multilook_noise": raster}, {"multilook_noise": ECHO.report | means}
+
+
+def _report(scene: OpenScene, image: xr.Dataset, calibrated: CalibratedPair, noise: PulseNoise) -> dict[str, Any]:
+    """Return what the radio says of an image, for radiometry.json."""
+    found = points_of(image.image, image.attrs["quality"], scene, list(scene.grid.tiles(BLOCK_PX)))
+    constant = calibrated.calibration.constant
+    noise_said, noise_flags = calibrated.noise_report(noise, bound="pulses_sparse" in image.attrs["flags"])
+    return {
+        "calibrated_by": calibrated.calibrated_by,
+        "constant_db": round(10 * float(np.log10(constant)), 3),
+        "std_db": calibrated.std_db,
+        "pointing_std_db": round(calibrated.pointing_std_db, 3),
+        "flags": Flags.merged(calibrated.flags, noise_flags),
+        "link": calibrated.link and asdict(calibrated.link),
+        "noise": {"pulse": noise.power if np.isfinite(noise.power) else None, **noise_said},
+        "points": calibrated.points(found, scene, noise.power),
+        "points_listed": POINTS_LISTED,
+    }
+
+
+def _no_constant(campaign: Campaign, pair: str) -> dict[str, Any]:
+    """Return radiometry.json of a pair without a constant in a campaign that is calibrated."""
+    line = f"{campaign.calibration_file and campaign.calibration_file.name} has no constant of {pair}"
+    return {
+        "calibrated_by": None,
+        "constant_db": None,
+        "std_db": None,
+        "pointing_std_db": 0.0,
+        "flags": Flags({"pair_uncalibrated": f"{line}: its backscattering coefficients hold no value"}),
+        "link": None,
+        "noise": {"pulse": None, "noise_figure_db": None, "noise_figure_measured_db": None, "std_db": None},
+        "points": [],
+        "points_listed": POINTS_LISTED,
+    }
+
+
+def layer_rasters(
+    scene: OpenScene, looks: Looks, noise: float, calibrated: CalibratedPair | None, *, threads: int
+) -> dict[str, LazyLayer]:
+    """Return the layers of a pair.
+
+    Parameters
+    ----------
+    scene, looks
+        Grid and ground; pulses that make each pixel.
+    noise
+        Of one pulse in its range profile, power; NaN where nobody knows.
+    calibrated
+        Of the pair; None: its noise is relative.
+    threads
+        Tiles computed at once.
+    """
+    grid, terrain = scene.grid, scene.terrain
+    level, noise_db = isinstance(terrain, FlatGround), np.float32(10 * np.log10(noise or np.nan))
+
+    def angle(of: Callable[[Window], NDArray[Any]], window: Window) -> NDArray[Any]:
+        return _inside(looks, window, of(window))
+
+    def nesz(window: Window) -> NDArray[Any]:
+        if calibrated is not None:
+            calibration, normal = calibrated.calibration, None if level else surface(grid, terrain, window)[1]
+            power = (noise or np.nan) * calibration.pixel_noise(window) / calibration.power(window, "sigma0", normal)
+            return _inside(looks, window, 10 * np.log10(power))
+        effective = looks.effective(window)
+        with np.errstate(divide="ignore"):
+            power_db = noise_db - 10 * np.log10(effective)
+        return np.where(effective > 0, power_db, np.float32(np.nan))
+
+    return {
+        "incidence": LazyLayer(grid, np.float32, partial(angle, looks.incidence_deg), threads),
+        "bistatic_angle": LazyLayer(grid, np.float32, partial(angle, looks.bistatic_angle_deg), threads),
+        "mask": LazyLayer(grid, np.uint8, _mask(scene, looks), threads),
+        "looks": LazyLayer(grid, np.float32, looks.effective, threads),
+        "nesz": LazyLayer(grid, np.float32, nesz, threads),
+    }
+
+
+def _inside(looks: Looks, window: Window, values: NDArray[Any]) -> NDArray[Any]:
+    lit = looks.illuminated(window)
+    return values if lit.all() else np.where(lit, values, values.dtype.type(np.nan))
+
+
+def _mask(scene: OpenScene, looks: Looks) -> Callable[[Window], NDArray[np.uint8]]:
+    """Return the mask of a window, each pixel by the pulses that form the nearest node of the lattice."""
+
+    def outside(window: Window) -> NDArray[np.uint8]:
+        return np.where(looks.illuminated(window), 0, OUTSIDE).astype(np.uint8)
+
+    if isinstance(scene.terrain, FlatGround):
+        return outside
+    from apertura.core.scene.visibility import Relief, visibility  # slow to import: it brings a compiler
+
+    relief = Relief.of(scene.grid, scene.terrain, scene.level.height_m)
+
+    def mask(window: Window) -> NDArray[np.uint8]:
+        illuminated, marked = looks.illuminated(window), outside(window)
+        if not illuminated.any():
+            return marked
+        for node, part in looks.lattice.nearest(window):
+            here = tuple(slice(at.start - by.start, at.stop - by.start) for at, by in zip(part, window, strict=True))
+            if illuminated[here].any():
+                tx, rx = (relief.above(leg) for leg in looks.aperture[looks.pulses[node].astype(np.int64)].legs)
+                marked[here] = np.where(illuminated[here], visibility(relief, tx, rx, part), OUTSIDE)
+        return marked
+
+    return mask

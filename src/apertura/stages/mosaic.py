@@ -1,0 +1,56 @@
+"""Rule `mosaic`: each product of all flights as one raster for a GIS, on the campaign's grid."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+from apertura.campaign.folder import Campaign
+from apertura.campaign.store import read_manifest, record_files
+from apertura.common.errors import CampaignError
+from apertura.common.provenance import sha256_file
+from apertura.formats.export import EXPORTS, MOSAICS, mosaics, remove_outdated
+from apertura.formats.export.mosaic import write_mosaic
+from apertura.workflow.lineage import result_of
+
+
+def mosaic(campaign: Campaign) -> Sequence[Path]:
+    """Write results/mosaic/<pair>/<product>.vrt and their styles; return their paths.
+
+    Flights lie upon one another in the order of config/flights.tsv, the last uppermost.
+    """
+    lineage = result_of(campaign, "mosaic").begin(campaign.root)
+    made = _made(campaign.root, lineage.result.sources)
+    styles = {row.file: row for row in EXPORTS if row.style}
+    written = []
+    for name, files in mosaics(campaign.images, campaign.coefficients).items():
+        path, sources = campaign.result(MOSAICS, name), [campaign.result(file) for file in files]
+        for source in sources:
+            _check(source, made)
+        flown = f"{len(sources)} flight{'s' * (len(sources) > 1)}"
+        title = f"{campaign.settings.campaign} · {name.removesuffix('.vrt')} of {flown}"
+        write_mosaic(path, sources, title=title)
+        written.append(path)
+        if style := styles.get(path.with_suffix(".qml").name):
+            written.append(path.with_suffix(".qml"))
+            style.write(written[-1])
+    for folder in {path.parent for path in written}:
+        remove_outdated(folder, written)
+    record_files(campaign.root / lineage.result.manifest, written, lineage)
+    return written
+
+
+def _made(root: Path, manifests: Iterable[str]) -> dict[Path, tuple[Path, str]]:
+    """Return product → the manifest that describes it, and its hash there."""
+    paths = [root / manifest for manifest in manifests]
+    hashes = [(path, name, digest) for path in paths for name, digest in read_manifest(path)["files"].items()]
+    return {path.parent / name: (path, digest) for path, name, digest in hashes}
+
+
+def _check(product: Path, made: Mapping[Path, tuple[Path, str]]) -> None:
+    manifest, digest = made.get(product, (product, ""))
+    if not product.is_file() or sha256_file(product) != digest:
+        raise CampaignError(
+            "not as it was written" if product.is_file() else "no such file",
+            where=product,
+            expected=f"what {manifest.name} describes",
+            remedy=f"Delete {manifest} and run the workflow again.",
+        )

@@ -1,0 +1,180 @@
+"""Where a node was: its flight log, how far it can be trusted, and its antennas at any time."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from apertura.campaign.config import Node
+from apertura.campaign.folder import Campaign
+from apertura.common.arrays import Times
+from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.core.geometry.geodesy import LOCAL, LOCAL_NED, ned_axes
+from apertura.core.geometry.phase_centres import attitude_axes, phase_centres, position_spline
+from apertura.core.geometry.track_checks import CheckedTrack, YawFault, check_track, check_yaw
+from apertura.formats.reading import read_phase_history, read_track
+from apertura.formats.tracks.track import FIXES
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+def read_log(campaign: Campaign, flight: str, node: str) -> "xr.Dataset":
+    """Return the `track` stage of a node's flight log."""
+    options = campaign.settings.nodes[node].log.options
+    return read_track(campaign.track_file(flight, node), node=node, options=options)
+
+
+def read_history(campaign: Campaign, flight: str, node: str, *, pair: str) -> "xr.Dataset":
+    """Return the phase history recorded by a node of a pair, by its format and the config."""
+    described = campaign.settings.waveform.model_dump()
+    files = campaign.history_files(flight, node)
+    history = read_phase_history(described["format"], files, pair=pair, described=described)
+    if described["kind"] == "phase_history" and described["iq"] == "conjugate":
+        return history.assign(transfer=history.transfer.conj())
+    return history
+
+
+@dataclass(frozen=True)
+class NodeLog:
+    """A node's log in one flight, with the node's settings.
+
+    Attributes
+    ----------
+    name, settings
+        Of the node.
+    track
+        Its stage.
+    log
+        Its file, for messages.
+    shortest_wave_m
+        Wavelength of the highest frequency, metres: errors between epochs are compared with it.
+    """
+
+    name: str
+    settings: Node
+    track: xr.Dataset
+    log: str
+    shortest_wave_m: float
+
+    @cached_property
+    def checked(self) -> CheckedTrack:
+        """Epochs of the log that may be used: errors up to λ/16 between epochs are tolerated."""
+        poor = np.zeros(self.track.sizes["epoch"], bool)
+        if "fix" in self.track:
+            poor = poorer_fix(self.track.fix.values, self.settings.worst_fix)
+        return check_track(
+            self.log_seconds(self.track.time.values),
+            self.track.position.values,
+            poor_fix=poor,
+            tolerated_m=self.shortest_wave_m / 16,
+            longest_gap_s=self.settings.log.longest_gap_s or np.inf,
+        )
+
+    @cached_property
+    def yaw_fault(self) -> YawFault | None:
+        """What its attitude contradicts the course by, where it is the log's and turns antennas."""
+        turns = self.settings.attitude == "log" and (self.settings.antennas.any() or self.settings.lever_arms_m.any())
+        return yaw_fault_of(self.track.isel(epoch=self.checked.kept)) if turns else None
+
+    def log_seconds(self, at: Times) -> NDArray[np.float64]:
+        """Return times as seconds since the log's first epoch, float64."""
+        return np.asarray((at - self.track.time.values[0]) / np.timedelta64(1, "s"))
+
+    def log_time(self, time_s: float) -> str:
+        """Return the UTC time of day, to 10 ms, of seconds since the log's first epoch."""
+        time = self.track.time.values[0] + np.timedelta64(round(time_s * 1e9), "ns")
+        return f"{np.datetime_as_string(time, 'ms')[11:-1]}Z"
+
+    @property
+    def interval_s(self) -> float:
+        """Median time between epochs of the log, seconds."""
+        return float(np.median(np.diff(self.log_seconds(self.track.time.values))))
+
+    @property
+    def speed_m_s(self) -> float:
+        """Median speed over the log, metres per second."""
+        step_m = np.linalg.norm(np.diff(self.track.position.values, axis=0), axis=1)
+        return float(np.median(step_m / np.diff(self.log_seconds(self.track.time.values))))
+
+    @cached_property
+    def smoothing_residual_m(self) -> float | None:
+        """RMS change of the valid epochs by smoothing, in one axis, metres; None without smoothing."""
+        if self.settings.log.smoothing_m is None:
+            return None
+        times, position, _ = self._sound
+        smooth = position_spline(self.log_seconds(times), position, smoothing_m=self.settings.log.smoothing_m)
+        return float(np.sqrt(np.mean((smooth(self.log_seconds(times)) - position) ** 2)))
+
+    def antenna(self, name: Literal["radar_tx", "radar_rx", "sidelink"], at: Times) -> NDArray[np.float64]:
+        """Return where an antenna was, by the sound epochs of the log, (time, 3) float64 metres in the log's frame."""
+        return phase_centres(
+            *self._sound, at=at, lever_arm_m=getattr(self.settings.lever_arms_m, name), **self._from_log
+        )
+
+    @property
+    def has_attitude(self) -> bool:
+        """Whether body axes are known: from the log at all its sound epochs, or from the course."""
+        _, _, logged = self._sound
+        return self.settings.attitude == "course" or (
+            self.settings.attitude == "log" and bool(np.isfinite(logged).all())
+        )
+
+    def turns(self, name: Literal["radar_tx", "radar_rx"]) -> bool:
+        """Return whether attitude counts where this antenna is used: it has a beam, or the node has a lever arm."""
+        return getattr(self.settings.antennas, name) is not None or self.settings.lever_arms_m.any()
+
+    def body_axes(self, at: Times) -> NDArray[np.float64]:
+        """Return forward, right, down of the body in the log's frame at given times, (time, axis, body) float64."""
+        return attitude_axes(*self._sound, at=at, **self._from_log)
+
+    @cached_property
+    def _sound(self) -> tuple[Times, NDArray[np.float64], NDArray[np.float64]]:
+        sound = self.track.isel(epoch=self.checked.kept)
+        return sound.time.values, sound.position.values, sound.attitude.values
+
+    @property
+    def _from_log(self) -> dict[str, Any]:
+        return {
+            "attitude_from": self.settings.attitude,
+            "where": self.log,
+            "frame": self.track.attrs["frame"],
+            "smoothing_m": self.settings.log.smoothing_m,
+        }
+
+
+def raw_log(campaign: Campaign, flight: str, node: str, wave_m: float) -> NodeLog:
+    """Return where a node was by its log as it lies in raw/; `wave_m` is the shortest wavelength."""
+    file = str(campaign.track_file(flight, node))
+    return NodeLog(node, campaign.node(flight, node), read_log(campaign, flight, node), file, wave_m)
+
+
+def yaw_fault_of(track: xr.Dataset) -> YawFault | None:
+    """Return what the attitude of a track contradicts its course by."""
+    position = track.position.values
+    ned = LOCAL_NED if track.attrs["frame"] == LOCAL else ned_axes(position)
+    return check_yaw(position, track.attitude.values, ned)
+
+
+def shortest_wave(frequency_hz: NDArray[np.float64]) -> float:
+    """Return the wavelength of the highest of ascending frequencies (Hz), metres."""
+    return SPEED_OF_LIGHT_M_S / float(frequency_hz[-1])
+
+
+def poorer_fix(fix: NDArray[np.int8], worst: Literal["auto", "fix", "float", "any"]) -> NDArray[np.bool_]:
+    """Return (epoch,) bool: solutions poorer than `worst`; none where nothing is logged, nor by auto without RTK.
+
+    Examples
+    --------
+    >>> poorer_fix(np.array([1, 2, 5, 0], np.int8), "auto"), poorer_fix(np.array([5, 4], np.int8), "auto")
+    (array([False,  True,  True, False]), array([False, False]))
+    >>> poorer_fix(np.array([5, 4], np.int8), "fix")
+    array([ True,  True])
+    """
+    rtk = FIXES["fix"], FIXES["float"]
+    if worst == "any" or (worst == "auto" and not np.isin(fix, rtk).any()):
+        return np.zeros(len(fix), bool)
+    return ~np.isin(fix, (0, *rtk[: 1 + (worst == "float")]))

@@ -1,0 +1,378 @@
+"""A pair, opened once: pulses, beams and echo, or before that is formed its geometry from the flight logs."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from apertura.campaign.config import Antenna, SampledWaveform
+from apertura.campaign.folder import Campaign
+from apertura.common.arrays import Times
+from apertura.common.errors import CampaignError
+from apertura.common.provenance import sha256_file
+from apertura.core.antenna.beam import LIMITS_RAD, Beam, Beams, antenna_axes, gaussian_cut, sampled_cut, sampled_phase
+from apertura.core.antenna.illumination import Illumination, illuminate
+from apertura.core.backprojection.inputs import PhaseHistory
+from apertura.core.echo.compression import window_weights
+from apertura.core.geometry.aperture import Aperture
+from apertura.core.imaging.range_profiles import phase_history_of
+from apertura.core.quality.budget import NodePositions
+from apertura.core.quality.path_errors import Effect
+from apertura.formats.beam_pattern import read_beam_pattern
+from apertura.formats.reading import open_recording
+from apertura.stages.air import scene_air
+from apertura.stages.node_log import NodeLog, raw_log, shortest_wave
+from apertura.stages.positions import inside_segments, keep_segments, place, position_error
+from apertura.stages.scene import Flown, OpenScene
+from apertura.stages.transfer import PairEcho, recorded_echo
+from apertura.stages.transmitted import transmitted
+
+# ---- Antennas of a pair: from the config to the beams that weigh pulses ---------------------------------------------
+
+_STAGED = {"radar_tx": "tx_axes", "radar_rx": "rx_axes"}
+_POINTS = 33
+
+
+def body_axes(echo: xr.Dataset) -> dict[str, NDArray[np.float64]]:
+    """Return what an echo stage holds of the bodies' attitude: radar_tx, radar_rx → (pulse, axis, body)."""
+    return {point: echo[name].values for point, name in _STAGED.items() if name in echo}
+
+
+def beams_of(campaign: Campaign, pair: str, axes: Mapping[str, NDArray[np.float64]]) -> Beams | None:
+    """Return the beams of a pair; None where its antennas are isotropic.
+
+    Parameters
+    ----------
+    campaign, pair
+        Which.
+    axes
+        radar_tx, radar_rx → (pulse, axis, body), forward, right and down of the body in the frame of the pixels.
+    """
+    stated = campaign.antennas(pair)
+    if not stated:
+        return None
+    patterns = campaign.pattern_files(pair)
+    files = {point: patterns.get(f"nodes.{node}.antennas.{point}.pattern") for point, (node, _) in stated.items()}
+    found = {point: _beam(antenna, files[point], axes[point]) for point, (_, antenna) in stated.items()}
+    return Beams(found.get("radar_tx"), found.get("radar_rx"))
+
+
+def pattern_digests(campaign: Campaign, pair: str) -> dict[str, str]:
+    """Return key of the config → sha256 of each sampled pattern of a pair's antennas, for provenance."""
+    return {key: sha256_file(path) for key, path in campaign.pattern_files(pair).items()}
+
+
+def _beam(antenna: Antenna, pattern: Path | None, axes: NDArray[np.float64]) -> Beam:
+    if antenna.beamwidth_deg is None:
+        if pattern is None:
+            raise TypeError("an antenna has a beamwidth or a pattern")
+        sampled = read_beam_pattern(pattern)
+        cuts = tuple(sampled_cut(angle, gain, cutoff_db=antenna.cutoff_db) for angle, gain, _ in sampled)
+        phases = [
+            None if phase is None else sampled_phase(angle, phase, cut[0])
+            for (angle, _, phase), cut in zip(sampled, cuts, strict=True)
+        ]
+    else:
+        widths = zip(antenna.beamwidth_deg, LIMITS_RAD.values(), strict=True)
+        azimuth, elevation = (
+            gaussian_cut(width, cutoff_db=antenna.cutoff_db, limit_rad=limit) for width, limit in widths
+        )
+        cuts, phases = (azimuth, elevation), [None, None]
+    return Beam(antenna_axes(axes, antenna.boresight_deg), *cuts[0], *cuts[1], *phases)
+
+
+def antennas_report(campaign: Campaign, pair: str, illumination: Illumination | None) -> dict[str, Any]:
+    """Return the antennas of a pair for image.json: as stated, and how many pulses illuminate the scene."""
+    stated = {point: {"node": node, **beam.model_dump()} for point, (node, beam) in campaign.antennas(pair).items()}
+    if illumination is None or not stated:
+        return {}
+    return {"antennas": {**stated, "pulses_seeing": {**illumination.counts, "of": illumination.pulses}}}
+
+
+def scene_illumination(
+    campaign: Campaign,
+    pair: str,
+    beams: Beams | None,
+    scene: OpenScene,
+    aperture: Aperture,
+) -> Illumination | None:
+    """Return how many pulses illuminate points of the scene; None without beams.
+
+    Parameters
+    ----------
+    campaign, pair
+        Which.
+    beams
+        Of the pair.
+    scene
+        The campaign's.
+    aperture
+        Of the pair.
+
+    Raises
+    ------
+    CampaignError
+        If no pulse illuminates any point of the scene.
+    """
+    if beams is None:
+        return None
+    points = scene.grid.sample_points(_POINTS, scene.level.height_m)
+    illumination = illuminate(beams, aperture, points.reshape(-1, 3))
+    if illumination.unilluminated == 1:
+        _refuse(campaign, pair, beams, points[points.shape[0] // 2, points.shape[1] // 2], aperture)
+    return illumination
+
+
+def _refuse(
+    campaign: Campaign,
+    pair: str,
+    beams: Beams,
+    middle_m: NDArray[np.float64],
+    aperture: Aperture,
+) -> None:
+    """Raise with how far off each boresight the middle of the scene lies, at the pulse where that is least."""
+    stated = campaign.antennas(pair)
+    keys, lines = [f"nodes.{node}.antennas.{point}" for point, (node, _) in stated.items()], []
+    legs = {"radar_tx": (beams.transmit, aperture.tx_m), "radar_rx": (beams.receive, aperture.rx_m)}
+    for point, (node, _) in stated.items():
+        beam, place = legs[point]
+        if beam is None:
+            continue
+        azimuth, elevation = beam.angles(place, middle_m[None])[..., 0]
+        off = np.degrees(np.arccos(np.cos(azimuth) * np.cos(elevation)))
+        best = int(off.argmin())
+        side, up, *ends = np.degrees([azimuth[best], elevation[best], beam.azimuth_rad[-1], beam.elevation_rad[-1]])
+        lines.append(
+            f"{off[best]:.0f}° from the boresight of {node}'s {point} at best: azimuth {side:+.0f}°, elevation "
+            f"{up:+.0f}°, while its pattern ends at {ends[0]:.0f}° and {ends[1]:.0f}°"
+        )
+    raise CampaignError(
+        f"zero pulses in the beam: the middle of the scene lies {'; and '.join(lines)}",
+        where=f"config/config.yaml: {', '.join(keys)}",
+        expected="a scene that both antennas illuminate in some pulse",
+        remedy="Check boresight_deg (azimuth clockwise from forward: right is +90; elevation: down is negative), the "
+        "log's yaw (clockwise from north) and scene.bounds_m.",
+    )
+
+
+# ---- A pair, opened from its echo, or before that from the flight logs ----------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class OpenPair:
+    """What is known of a pair.
+
+    Attributes
+    ----------
+    flight, name
+        Which: the name is transmitter-receiver.
+    aperture
+        Phase centres.
+    frequency_hz, weight
+        (subcarrier,) float64, RF frequency and window.
+    path_limits_m
+        (pulse,) float64, longest total path inside the cyclic prefix.
+    time_s
+        (pulse,) float64, seconds from the first.
+    began
+        The first pulse, UTC.
+    positions
+        What is known of the node's positions, or of the transmitter's and the receiver's.
+    history
+        The echo itself; None before it is formed.
+    beams
+        Of the antennas; None where they are isotropic.
+    axes
+        As of `beams_of`, of antennas whose attitude counts.
+    sidelink_m
+        (pulse, 3) float64, metres, from the receiver's sidelink point to the transmitter's; None where the echo was not
+        given back a sidelink's length, and before it is formed.
+    left
+        What is left of errors of position after the tracks were refined; None where they are those of the logs.
+    report
+        Attributes of stage echo; empty before it is formed.
+    wave_speed_m_s
+        Speed of the wave along the paths.
+    air
+        What is known of it, as stage echo states it.
+    """
+
+    flight: str
+    name: str
+    aperture: Aperture
+    frequency_hz: NDArray[np.float64]
+    weight: NDArray[np.float64]
+    path_limits_m: NDArray[np.float64]
+    time_s: NDArray[np.float64]
+    began: np.datetime64
+    positions: tuple[NodePositions, ...]
+    history: PhaseHistory | None = None
+    beams: Beams | None = None
+    axes: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
+    sidelink_m: NDArray[np.float64] | None = None
+    left: Effect | None = None
+    report: Mapping[str, Any] = field(default_factory=dict)
+    wave_speed_m_s: float = field(kw_only=True)
+    air: Mapping[str, Any] = field(kw_only=True)
+
+    @property
+    def monostatic(self) -> bool:
+        """Whether one node sends and receives."""
+        tx, rx = self.name.split("-")
+        return tx == rx
+
+    @property
+    def path_limit_m(self) -> float:
+        """Longest total path inside the cyclic prefix of every pulse."""
+        return float(self.path_limits_m.min())
+
+    @property
+    def flown(self) -> Flown:
+        """What `auto` settles the grid from."""
+        return Flown(self.aperture, self.frequency_hz, self.path_limit_m)
+
+
+def open_pair(
+    campaign: Campaign, flight: str, pair: str, *, echo: xr.Dataset | None = None, recorded: Times | None = None
+) -> OpenPair:
+    """Return an open pair from `echo`, its stage as far as it is formed, or from the logs.
+
+    From the logs in any case where the tags of pulses that both nodes `recorded` are given.
+    """
+    waveform = campaign.settings.waveform
+    if echo is None and recorded is None and campaign.is_current(campaign.stage("echo", flight, pair)):
+        echo = PairEcho.opened(campaign, flight, pair).stage
+    if echo is None:
+        if isinstance(waveform, SampledWaveform):
+            return _expected(campaign, flight, pair, waveform, recorded)
+        echo = keep_segments(campaign, flight, pair, recorded_echo(campaign, flight, pair))
+    history = phase_history_of(echo, campaign.settings.processing.window, lazy=True)
+    axes = body_axes(echo)
+    stated = echo.attrs.get("positions", {})
+    return OpenPair(
+        flight,
+        pair,
+        history.aperture,
+        history.frequency_hz,
+        history.weight,
+        echo.path_limit.values,
+        time_s=_seconds(echo.time.values),
+        began=echo.time.values[0],
+        positions=tuple(_positions(stated.get(leg, {})) for leg in _legs(pair)),
+        history=history,
+        beams=beams_of(campaign, pair, axes),
+        axes=axes,
+        sidelink_m=echo.sidelink_vector.values if "sidelink_vector" in echo else None,
+        report=echo.attrs,
+        wave_speed_m_s=history.wave_speed_m_s,
+        air=echo.attrs["atmosphere"],
+    )
+
+
+def _expected(
+    campaign: Campaign, flight: str, pair: str, waveform: SampledWaveform, recorded: Times | None
+) -> OpenPair:
+    """Return the pair expected from the logs: the pulses that all logs place, but those of hovers."""
+    frequency = transmitted(campaign, waveform).numerology.frequency_hz
+    tx, rx = (raw_log(campaign, flight, node, shortest_wave(frequency)) for node in pair.split("-"))
+    first = max(log.track.time.values[0] for log in (tx, rx))
+    last = min(log.track.time.values[-1] for log in (tx, rx))
+    if recorded is None:
+        recorded = open_recording(campaign.recording_files(flight, tx.name)).captures.time
+        recorded = campaign.clock(flight, tx.name).utc(recorded)
+    times = _pulse_times(recorded, first, last, waveform.prf_hz)
+    times = times[inside_segments(campaign, flight, pair, times)]
+    times = times[place(tx, rx, times, hovers=bool(campaign.segments_of(flight, pair))).good]
+    return expected_pair(campaign, flight, (tx, rx), times, frequency_hz=frequency, delay_s=waveform.longest_delay_s)
+
+
+def expected_pair(
+    campaign: Campaign,
+    flight: str,
+    nodes: tuple[NodeLog, NodeLog],
+    times: NDArray[np.datetime64],
+    *,
+    frequency_hz: NDArray[np.float64],
+    delay_s: float,
+) -> OpenPair:
+    """Return a pair before its echo is formed, or flown.
+
+    Parameters
+    ----------
+    campaign, flight
+        Settings, and which flight.
+    nodes
+        Where transmitter and receiver were, or are meant to be.
+    times
+        (pulse,) datetime64[ns], UTC, within both logs.
+    frequency_hz
+        (subcarrier,) float64, ascending.
+    delay_s
+        Longest delay whose echo is recorded whole.
+    """
+    tx, rx = nodes
+    turning = {"radar_tx": tx.turns("radar_tx") and tx, "radar_rx": rx.turns("radar_rx") and rx}
+    axes = {antenna: log.body_axes(times) for antenna, log in turning.items() if log}
+    offset = rx.settings.path_offset_m
+    beyond_m = np.full(len(times), offset.radar)
+    if tx.name != rx.name:
+        length_m = np.linalg.norm(tx.antenna("sidelink", times) - rx.antenna("sidelink", times), axis=1)
+        beyond_m -= offset.sidelink + length_m
+    weight = window_weights(campaign.settings.processing.window, len(frequency_hz))
+    aperture = Aperture(tx.antenna("radar_tx", times), rx.antenna("radar_rx", times))
+    flown = scene_air(campaign, aperture.tx_m).over(aperture)
+    limits_m = flown.wave_speed_m_s * delay_s - beyond_m
+    known = {log.name: _positions(position_error(log.track, log.settings, times)) for log in (tx, rx)}
+    pair = f"{tx.name}-{rx.name}"
+    return OpenPair(
+        flight,
+        pair,
+        aperture,
+        frequency_hz,
+        weight,
+        limits_m,
+        time_s=_seconds(times),
+        began=times[0],
+        positions=tuple(known.values()),
+        beams=beams_of(campaign, pair, axes),
+        axes=axes,
+        wave_speed_m_s=flown.wave_speed_m_s,
+        air=flown.report,
+    )
+
+
+def _pulse_times(
+    recorded: NDArray[np.datetime64], first: np.datetime64, last: np.datetime64, prf_hz: float
+) -> NDArray[np.datetime64]:
+    """Return the recorded capture times inside the logs, or a regular series where the recorder ran through."""
+    if len(recorded) < 2:
+        count = int((last - first) / np.timedelta64(1, "s") * prf_hz) + 1
+        recorded = first + (1e9 / prf_hz * np.arange(count)).astype("timedelta64[ns]")
+    return recorded[(recorded >= first) & (recorded <= last)]
+
+
+def _legs(pair: str) -> tuple[str, ...]:
+    """Return which legs of a pair have positions of their own: one where one node sends and receives."""
+    tx, rx = pair.split("-")
+    return ("tx",) if tx == rx else ("tx", "rx")
+
+
+def _positions(stated: Mapping[str, Any]) -> NodePositions:
+    """Return the position errors of a node stated in an echo stage, whose deviations are north, east, up."""
+    std = stated.get("std_m")
+    axes = None if std is None else (float(std[1]), float(std[0]), float(std[2]))
+    return NodePositions(
+        axes,
+        float(stated.get("correlation_s", 1.0)),
+        str(stated.get("stated_by", "nobody")),
+        float(stated.get("drift_m", 0.0)),
+        stated.get("receiver"),
+    )
+
+
+def _seconds(times: NDArray[np.datetime64]) -> NDArray[np.float64]:
+    return np.asarray((times - times[0]) / np.timedelta64(1, "s"), np.float64)

@@ -1,0 +1,418 @@
+"""How each pair of a campaign will be imaged, and its error budget: from its echo, or from the flight logs."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.filesize import decimal
+
+from apertura.campaign.config import CONFIG, Node, SampledWaveform
+from apertura.campaign.config.processing import HEIGHT_DEFAULT
+from apertura.campaign.folder import Campaign
+from apertura.common.errors import CampaignError, number_of
+from apertura.common.flags import Flags
+from apertura.core.antenna.beam import Beams
+from apertura.core.backprojection.job import Integration, Job
+from apertura.core.echo.compression import centre_frequency
+from apertura.core.geometry.atmosphere import USUAL_N
+from apertura.core.imaging.job import decide_integration, imaging_job
+from apertura.core.imaging.range_profiles import GUARD_SAMPLES, RangeWindow
+from apertura.core.planning.decisions import decide_accuracy
+from apertura.core.planning.plan import Decision, Plan, memory_limit
+from apertura.core.planning.planner import make_plan
+from apertura.core.quality.budget import (
+    NO_EFFECT,
+    BudgetLine,
+    NodeAttitude,
+    antenna_line,
+    attitude_lines,
+    expected,
+    height_line,
+    noise_loss,
+    offset_line,
+    position_lines,
+    summed,
+)
+from apertura.core.quality.path_errors import MOST_PULSES, Effect, PointPaths
+from apertura.core.scene.clearance import check_antennas
+from apertura.core.scene.terrain import GroundModels
+from apertura.stages.pair import OpenPair, scene_illumination
+from apertura.stages.scene import OpenScene
+
+# ---- Error budget of a pair, from config, logs and echo -------------------------------------------------------------
+
+_MS, _CM, _PPM = 1e-3, 1e-2, 1e-6
+_SHOWN_CELLS = 0.01  # of a range cell: a shift below it is lost in any peak of 20 dB (docs/theory/focus.md, eq. 6)
+
+
+def budget_of(
+    campaign: Campaign, pair: OpenPair, scene: OpenScene, *, place_m: NDArray[np.float64] | None = None
+) -> list[BudgetLine]:
+    """Return what is expected to spoil an image of a pair, but for arithmetic: one line per cause.
+
+    Parameters
+    ----------
+    campaign, pair, scene
+        Settings, pair and ground; before the echo is formed, by the config and the logs.
+    place_m
+        (3,) float64, metres in the frame of the pixels: the point that the effects are those on; the middle of the
+        scene by default.
+
+    Notes
+    -----
+    Source: docs/theory/focus.md, "Budget".
+    """
+    paths = paths_to(pair, scene, scene.middle_m if place_m is None else place_m)
+    monostatic, sidelink = pair.monostatic, pair.report.get("sidelink", {})
+    flown = [*_positions(campaign, pair, paths), *_attitude(campaign, pair, paths)]
+    lines = [
+        *flown,
+        height_line(paths, campaign.settings.scene.height_std_m, expected_db=expected(flown).loss_db),
+        offset_line(
+            paths,
+            "time tags",
+            -_MS * paths.rate_m_s,
+            _stated_tags_ms(campaign, pair),
+            unit="ms",
+            common=True,
+        ),
+        offset_line(
+            paths,
+            "calibration",
+            np.full(len(paths.time_s), _CM),
+            _scaled(pair.report, "calibration", "std_m", _CM),
+            unit="cm of path",
+        ),
+        _air(campaign, pair, paths),
+        _sampling(pair.report.get("pulses", {})),
+        _antenna(pair, paths),
+    ]
+    if not monostatic:
+        total = paths.aperture.path(paths.point_m)
+        lines.append(offset_line(paths, "clock", _PPM * total, _scaled(pair.report, "clock", "std_ppm", 1), unit="ppm"))
+        if "snr_db" in sidelink:
+            lines += _sidelink(sidelink, subcarriers=len(pair.frequency_hz))
+    if isinstance(campaign.settings.waveform, SampledWaveform):
+        effect = paths.of_offset(campaign.settings.waveform.middle_s * paths.rate_m_s)
+        lines.append(BudgetLine("stop and go", f"{np.abs(paths.rate_m_s).max():.2g} m/s of path at most", effect))
+    return [*lines, *_between_epochs(paths, pair)]
+
+
+def positions_loss_db(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> float:
+    """Return what errors of position that somebody stated are expected to cost an image of a pair, dB, 0 or less."""
+    lines = _positions(campaign, pair, paths_to(pair, scene, scene.middle_m))
+    return summed(line.effect for line in lines if line.stated is not None).loss_db
+
+
+def paths_to(pair: OpenPair, scene: OpenScene, place_m: NDArray[np.float64]) -> PointPaths:
+    """Return the paths of a pair to a place of the scene, (3,) float64 metres in the frame of the pixels."""
+    return PointPaths.of(
+        pair.aperture,
+        pair.time_s,
+        point_m=place_m,
+        axes=scene.axes,
+        wavelength_m=pair.wave_speed_m_s / centre_frequency(pair.frequency_hz),
+    )
+
+
+def _positions(campaign: Campaign, pair: OpenPair, paths: PointPaths) -> list[BudgetLine]:
+    if pair.left is not None:
+        return [BudgetLine("positions", "error remaining after refinement", pair.left)]
+    return position_lines(paths, pair.positions, sidelink=_by_sidelink(campaign, pair))
+
+
+def _by_sidelink(campaign: Campaign, pair: OpenPair) -> bool:
+    """Return whether echoes are divided by a sidelink whose length comes from the logs."""
+    return not pair.monostatic and isinstance(campaign.settings.waveform, SampledWaveform)
+
+
+def _attitude(campaign: Campaign, pair: OpenPair, paths: PointPaths) -> list[BudgetLine]:
+    """Return what errors of attitude and of lever arms do; nothing where refined tracks have moved the antennas."""
+    if pair.left is not None or not pair.axes:
+        return []
+    some = pair.aperture.sample(MOST_PULSES)
+    legs = dict(zip(pair.name.split("-"), ("radar_tx", "radar_rx"), strict=True))
+    nodes = [_attitude_of(campaign.settings.nodes[name], pair.axes.get(point), some) for name, point in legs.items()]
+    return attitude_lines(paths, nodes, sidelink=_by_sidelink(campaign, pair))
+
+
+def _attitude_of(node: Node, axes: NDArray[np.float64] | None, some: slice) -> NodeAttitude | None:
+    arms = node.lever_arms_m
+    if axes is None or not arms.any():
+        return None
+    return NodeAttitude(
+        axes[some],
+        (arms.radar_tx, arms.radar_rx, arms.sidelink),
+        node.attitude,
+        node.attitude_error_deg,
+        node.attitude_correlation_s,
+        node.lever_arm_std_m,
+    )
+
+
+def _between_epochs(paths: PointPaths, pair: OpenPair) -> list[BudgetLine]:
+    """Return the error of the spline between epochs of the logs: noise of one epoch's correlation time."""
+    stated = pair.report.get("positions", {})
+    errors = [stated.get(leg, {}).get("interpolation_m") for leg in ("tx", "rx")[: len(pair.positions)]]
+    if any(error is None for error in errors):
+        return []
+    slopes = paths.by_node(same=len(errors) == 1, sidelink=not pair.monostatic)
+    parts = [(np.linalg.norm(slope, axis=1) * error, 0.0) for slope, error in zip(slopes, errors, strict=True)]
+    words = " and ".join(f"{1e3 * error:.2g} mm" for error in errors)
+    return [BudgetLine("between epochs", f"{words} rms", paths.of_noise(*parts))]
+
+
+def _air(campaign: Campaign, pair: OpenPair, paths: PointPaths) -> BudgetLine:
+    """Return what the uncertainty of the air's refractivity does: all pairs lie wrong alike, less what paths differ by.
+
+    Against the transmitter's own image a pair's phase is off by what its path differs, the sidelink's length included
+    (docs/theory/atmosphere.md, eq. 6).
+    """
+    per_n, said = 1e-6 * float(pair.air["std_n"]), f"{pair.air['source']}: N = {pair.air['refractivity_n']:.1f}"
+    tx_m, rx_m = (np.linalg.norm(leg - paths.point_m, axis=1) for leg in paths.aperture.legs)
+    known_m, further_m = np.zeros(len(tx_m)), rx_m - tx_m
+    if _by_sidelink(campaign, pair):
+        known_m = np.linalg.norm(paths.aperture.tx_m - paths.aperture.rx_m, axis=1)
+    effect = paths.of_offset(per_n * (tx_m + rx_m - known_m), common=True)
+    phase_rad = 2 * np.pi / paths.wavelength_m * per_n * float(np.abs(further_m - known_m).mean())
+    effect = replace(effect, phase_rad=0.0 if pair.monostatic else phase_rad)
+    said = f"{said} ± {pair.air['std_n']:.1f}"
+    assumed = campaign.settings.scene.atmosphere == "auto"
+    return BudgetLine("atmosphere", None if assumed else said, effect, assumed=said if assumed else None)
+
+
+def air_decision(pair: OpenPair) -> Decision:
+    """Return which air the paths of a pair are of, and what vacuum would have done: one constant for all of them."""
+    air = pair.air
+    cell_m = pair.wave_speed_m_s / float(np.ptp(pair.frequency_hz)) / 2
+    moved_m, left_m, other = float(air["vacuum_would_move_m"]), float(air["one_constant_leaves_m"]), "vacuum"
+    if not air["refractivity_n"]:
+        moved_m, other = 1e-6 * USUAL_N * float(air["range_m"]), f"air of N = {USUAL_N:.0f}"
+    shows = "" if moved_m > _SHOWN_CELLS * cell_m else ", which does not show"
+    why = (
+        f"{air['source']}; mean along the paths from {air['antennas_m']:.0f} m; {other} would move the image by "
+        f"{100 * moved_m:.2g} cm of slant range, {moved_m / cell_m:.2g} of a cell{shows}; one value for all pulses "
+        f"leaves {100 * left_m:.1g} cm of path"
+    )
+    return Decision("atmosphere", f"N = {air['refractivity_n']:.1f}", why)
+
+
+def _scaled(report: Mapping[str, Any], section: str, name: str, unit: float) -> float | None:
+    value = (report.get(section) or {}).get(name)
+    return None if value is None else float(value) / unit
+
+
+def _stated_tags_ms(campaign: Campaign, pair: OpenPair) -> float | None:
+    """Return the deviation of the pulses' tags, milliseconds; None where the config has only its default."""
+    tx, rx = pair.name.split("-")
+    sampled = isinstance(campaign.settings.waveform, SampledWaveform)
+    name = tx if sampled else rx  # who tagged the pulses
+    if name not in campaign.settings.nodes:
+        return None
+    node = campaign.node(pair.flight, name)
+    return node.time_tag_std_s / _MS if "time_tag_std_s" in node.model_fields_set else None
+
+
+def _sampling(pulses: Mapping[str, Any]) -> BudgetLine:
+    used, dropped = pulses.get("used"), pulses.get("dropped", 0)
+    stated = None if used is None else f"{dropped} of {used + dropped} pulses missing"
+    return BudgetLine("missing pulses", stated, NO_EFFECT)
+
+
+def _antenna(pair: OpenPair, paths: PointPaths) -> BudgetLine:
+    """Return the line of the antennas: beams weigh the pulses; what phase their patterns have is not taken out."""
+    if pair.beams is None:
+        return BudgetLine("antenna", None, NO_EFFECT, "a beam without a phase of its own")
+    some, point = pair.beams[pair.aperture.sample(MOST_PULSES)], paths.point_m[None]
+    phase = some.phase(paths.aperture, point)
+    if phase is None:
+        return BudgetLine("antenna", "weighed by the beams stated", NO_EFFECT)
+    return antenna_line(paths, phase[:, 0], some.weight(paths.aperture, point)[:, 0])
+
+
+def _sidelink(report: Mapping[str, Any], *, subcarriers: int) -> list[BudgetLine]:
+    """Return noise of the sidelink as phase noise of each pulse, and what an echo in it turns the phase by at most."""
+    noise = noise_loss(10 ** (-report["snr_db"] / 10) / (2 * subcarriers))
+    echo = 10 ** (report["echo_db"] / 20)
+    return [
+        BudgetLine("sidelink noise", f"{report['snr_db']:.1f} dB per subcarrier", noise),
+        BudgetLine(
+            "sidelink echo", f"at most {report['echo_db']:.1f} dB", Effect(0.0, 0.0, float(np.arcsin(min(1.0, echo))))
+        ),
+    ]
+
+
+# ---- Plan of each pair, from its echo or before that from the flight logs -------------------------------------------
+
+
+def plan_pair(campaign: Campaign, pair: OpenPair, scene: OpenScene, *, threads: int = 1) -> Plan:
+    """Return how an open pair will be imaged.
+
+    Parameters
+    ----------
+    campaign
+        With its settings.
+    pair, scene
+        The open pair, and the campaign's grid and ground.
+    threads
+        Tiles formed at once: for seconds and bytes; nothing is chosen by it.
+
+    Raises
+    ------
+    CampaignError
+        If the job cannot fit in memory or on the disk, or its geometry is impossible.
+    """
+    where = f"flight {pair.flight}, pair {pair.name}"
+    flags = check_antennas(scene.grid, scene.terrain, pair.aperture, where=where)
+    accuracy = accuracy_of(campaign, pair, scene)
+    plan = plan_job(campaign, job_of(campaign, pair, scene, threads=threads), accuracy_db=float(accuracy.value))
+    plan = replace(
+        plan,
+        decisions=(*plan.decisions, accuracy, air_decision(pair)),
+        flags=Flags.merged(flags, scene.flags, plan.flags),
+    )
+    written = campaign.is_current(campaign.stage("image", pair.flight, pair.name))
+    free_disk = None if written else campaign.root.free_bytes()
+    check_fits(plan, free_disk=free_disk, where=f"{pair.flight}/{pair.name}")
+    return plan
+
+
+def plan_job(campaign: Campaign, job: Job, *, accuracy_db: float) -> Plan:
+    """Return how a job will be done at an accuracy and with the overrides of a campaign."""
+    overrides = campaign.settings.processing.planned
+    return make_plan(job, accuracy_db=accuracy_db, overrides=overrides, where=f"{CONFIG}: processing")
+
+
+def accuracy_of(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> Decision:
+    """Return the numerical error to request, and why."""
+    requested = campaign.settings.processing.accuracy_db
+    if requested != "auto":
+        return Decision("accuracy_db", requested, "asked for")
+    return decide_accuracy(budget_of(campaign, pair, scene))
+
+
+def job_of(campaign: Campaign, pair: OpenPair, scene: OpenScene, *, threads: int = 1) -> Job:
+    """Return the planner's job of an open pair, or of some of its pulses."""
+    ground = GroundModels.of(scene.terrain, scene.level, scene.grid)
+    job = imaging_job(
+        pair.aperture,
+        pair.frequency_hz,
+        pair.weight,
+        scene.grid,
+        ground,
+        beams=pair.beams,
+        integration=campaign.settings.processing.integrated,
+        wave_speed_m_s=pair.wave_speed_m_s,
+    )
+    return replace(
+        job,
+        illumination=scene_illumination(campaign, pair.name, job.beams, scene, pair.aperture),
+        tile_px=campaign.settings.processing.tile_px,
+        threads=threads,
+        path_limit_m=pair.path_limit_m,
+        memory_bytes=memory_limit(),
+    )
+
+
+def weighing(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> Beams | None:
+    """Return the weights of a pair's pulses over the scene by antennas and sector; None where all count alike.
+
+    As in `job_of`, but without the echo: the ranges that profiles must cover follow from it.
+    """
+    return Beams.within(integration_of(campaign, pair, scene).sector, pair.beams)
+
+
+def ranges_of(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> RangeWindow:
+    """Return the ranges that the profiles of a pair cover.
+
+    Raises
+    ------
+    CampaignError
+        If an antenna is in the ground, or echoes of the scene were not recorded, or repeat themselves.
+    """
+    where = f"flight {pair.flight}, pair {pair.name}"
+    check_antennas(scene.grid, scene.terrain, pair.aperture, where=where)
+    window = RangeWindow.of(
+        pair.aperture,
+        scene.grid,
+        scene.terrain,
+        pair.frequency_hz,
+        beams=weighing(campaign, pair, scene),
+        wave_speed_m_s=pair.wave_speed_m_s,
+    )
+    _check_held(window.farthest_m, pair.path_limits_m, campaign, where=where)
+    _check_unambiguous(window)
+    return window
+
+
+def _check_held(farthest: NDArray[np.float64], limit: NDArray[np.float64], campaign: Campaign, *, where: str) -> None:
+    """Raise CampaignError where echoes of the scene arrive after the captures end."""
+    waveform = campaign.settings.waveform
+    key, limit_name = "path_limit", "the recorded delays"
+    if isinstance(waveform, SampledWaveform):
+        key, limit_name = waveform.delay_key, waveform.limit_name
+    beyond = np.flatnonzero(farthest > limit)
+    if beyond.size:
+        pulse = int((farthest - limit).argmax())
+        height = f" First of all: {HEIGHT_DEFAULT}." if campaign.settings.scene.height_is_default else ""
+        raise CampaignError(
+            f"at {number_of(beyond.size, 'pulse')} echoes of the scene arrive after {limit_name}, worst at pulse "
+            f"{pulse}: total path {farthest[pulse]:.1f} m",
+            where=where,
+            expected=f"at most {limit[pulse]:.1f} m (c·{key} less the path offsets)",
+            remedy=f"Make scene.bounds_m smaller, or check path_offset_m and {key}.{height}",
+        )
+
+
+def _check_unambiguous(window: RangeWindow) -> None:
+    if window.samples > window.unambiguous:
+        spans_m, most_m = (
+            (count - 2 * GUARD_SAMPLES) * window.step_m for count in (window.samples, window.unambiguous)
+        )
+        raise CampaignError(
+            f"the scene spans {spans_m:.1f} m of total path",
+            where=f"{CONFIG}: scene.bounds_m",
+            expected=f"less than the unambiguous {most_m:.1f} m",
+            remedy="Make the scene smaller.",
+        )
+
+
+def integration_of(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> Integration:
+    """Return over how much of a flight the pixels of a pair are integrated."""
+    centre_hz, requested = centre_frequency(pair.frequency_hz), campaign.settings.processing.integrated
+    return decide_integration(
+        pair.aperture, centre_hz, scene.grid, scene.level, antennas=pair.beams, requested=requested
+    )
+
+
+def check_fits(plan: Plan, *, free_disk: int | None, where: str, memory: int | None = None) -> None:
+    """Raise CampaignError, with the numbers, unless the plan fits this machine.
+
+    Parameters
+    ----------
+    plan
+        Of one pair.
+    free_disk
+        Bytes; None: not checked.
+    where
+        Flight and pair.
+    memory
+        Bytes, by default those of this machine or of the control group that the process runs in.
+    """
+    memory = memory or memory_limit()
+    if plan.memory_bytes > memory:
+        raise CampaignError(
+            f"imaging needs {decimal(plan.memory_bytes)} of memory",
+            where=where,
+            expected=f"at most the {decimal(memory)} that this machine, or the job's share of it, has",
+            remedy="Make scene.bounds_m smaller, use fewer threads, or ask for more memory.",
+        )
+    if free_disk is not None and plan.disk_bytes > free_disk:
+        raise CampaignError(
+            f"the results need {decimal(plan.disk_bytes)} on disk",
+            where=where,
+            expected=f"at most the {decimal(free_disk)} that are free",
+            remedy="Free some space, make scene.bounds_m smaller or scene.spacing_m larger.",
+        )

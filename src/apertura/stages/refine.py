@@ -1,0 +1,454 @@
+"""Rule `refine`: errors of a flight's tracks as its images show them, all pairs together, or why they are left."""
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from apertura.campaign.folder import Campaign
+from apertura.campaign.store import open_stage, save_stage
+from apertura.common.arrays import Floats, Times
+from apertura.common.flags import Flags
+from apertura.common.provenance import merged
+from apertura.core.backprojection.inputs import Profiles
+from apertura.core.geometry.aperture import Aperture
+from apertura.core.geometry.geodesy import frame_from_map
+from apertura.core.geometry.phase_centres import TrackCorrection
+from apertura.core.imaging.range_profiles import profiles_of
+from apertura.core.planning.decisions import decide_autofocus
+from apertura.core.planning.plan import Decision
+from apertura.core.quality.budget import NodePositions
+from apertura.core.quality.path_errors import Effect
+from apertura.methods.autofocus.causes import Cause, late_logs, other_arm, other_height
+from apertura.methods.autofocus.evidence import FOLDS
+from apertura.methods.autofocus.inputs import PairRecord, ReferencePoint, Refinement, TrackErrors
+from apertura.methods.autofocus.one_phase import SpaceVariance, space_variance
+from apertura.methods.autofocus.patches import Candidates
+from apertura.methods.autofocus.path_offsets import refine_one_phase
+from apertura.methods.autofocus.refine import refine as refine_tracks
+from apertura.stages.acquisition import Acquisition
+from apertura.stages.node_log import raw_log
+from apertura.stages.pair import OpenPair, open_pair, pattern_digests
+from apertura.stages.planning import paths_to, positions_loss_db, weighing
+from apertura.stages.scene import OpenScene, open_scene
+from apertura.stages.stamping import stamped
+from apertura.workflow.lineage import result_of
+
+# ---- Decision whether and how the tracks of a flight are refined ----------------------------------------------------
+
+ASSUMED_STD_M = 0.02
+"""Metres in each axis, assumed for positions of unstated error when a refinement is requested: a fair RTK solution."""
+
+LEAST_STD_M = 1e-3
+"""Metres, lower bound of a stated deviation: a prior of zero would fix the track."""
+
+ONE_PHASE = "minimum_entropy"
+"""Method of auto where one phase suffices: accepted at least as often as phase_gradient, at its cost."""
+
+
+def autofocus_of(campaign: Campaign, pairs: Sequence[OpenPair], scene: OpenScene) -> tuple[Decision, ...]:
+    """Return whether the tracks of a flight, of which these are all pairs, are to be refined; if so, how; and why."""
+    requested = campaign.settings.processing
+    silent = [node for node, known in positions_of(pairs).items() if known.std_m is None]
+    loss_db = {pair.name: positions_loss_db(campaign, pair, scene) for pair in pairs}
+    decision = decide_autofocus(requested.autofocus, loss_db, silent)
+    if decision.value == "off":
+        return (decision,)
+    variances = {pair.name: _variance(pair, scene, errors_of(pairs)) for pair in pairs}
+    known = bool(campaign.settings.scene.reference_points)
+    return decision, decide_method(requested.autofocus_method, variances, known_points=known)
+
+
+def decide_method(requested: str, variances: Mapping[str, SpaceVariance], *, known_points: bool) -> Decision:
+    """Return how tracks are refined, and why.
+
+    Parameters
+    ----------
+    requested
+        auto, tracks, or a row of `apertura.methods.autofocus.one_phase.METHODS`.
+    variances
+        Pair → what one phase per pulse leaves of it.
+    known_points
+        Whether the scene has reference points: only the method tracks can use them.
+
+    Examples
+    --------
+    >>> decide_method("auto", {"a-a": SpaceVariance(0.02, -0.001)}, known_points=False).value
+    'minimum_entropy'
+    >>> decide_method("auto", {"a-a": SpaceVariance(0.02, -0.001)}, known_points=True).value
+    'tracks'
+    """
+    if requested != "auto":
+        return Decision("autofocus_method", requested, "asked for")
+    if known_points:
+        return Decision("autofocus_method", "tracks", "auto: only tracks can be tied to scene.reference_points")
+    pair, worst = min(variances.items(), key=lambda one: one[1].loss_db)
+    value = ONE_PHASE if worst.method == "one_phase" else "tracks"
+    return Decision("autofocus_method", value, f"auto: in {pair} {worst.reason}")
+
+
+def positions_of(pairs: Sequence[OpenPair]) -> Mapping[str, NodePositions]:
+    """Return node → what is known of the errors of its log; it is the same in each pair."""
+    return {
+        node: known
+        for pair in pairs
+        for node, known in zip(dict.fromkeys(pair.name.split("-")), pair.positions, strict=True)
+    }
+
+
+def errors_of(pairs: Sequence[OpenPair]) -> Mapping[str, TrackErrors]:
+    """Return node → the errors that its log is taken to have."""
+    return {
+        node: TrackErrors(_stated(known), known.correlation_s, known.drift_m)
+        for node, known in positions_of(pairs).items()
+    }
+
+
+def _variance(pair: OpenPair, scene: OpenScene, errors: Mapping[str, TrackErrors]) -> SpaceVariance:
+    """Return what one phase per pulse leaves at the corners of the scene."""
+    last_row, last_column = (size - 1 for size in scene.grid.shape)
+    rows, columns = np.array([0, 0, last_row, last_row]), np.array([0, last_column, 0, last_column])
+    corners_m = scene.terrain.positions_at(scene.grid, rows, columns)
+    of_nodes = [errors[node] for node in dict.fromkeys(pair.name.split("-"))]
+    return space_variance(paths_to(pair, scene, scene.middle_m), corners_m, of_nodes)
+
+
+def _stated(known: NodePositions) -> tuple[float, float, float]:
+    """Return the errors of a node's log, east, north, up."""
+    east, north, up = (max(one, LEAST_STD_M) for one in known.std_m or (ASSUMED_STD_M,) * 3)
+    return east, north, up
+
+
+# ---- Refined tracks, from which images take their phase centres -----------------------------------------------------
+
+_QUOTED = ("gain_fitted_db", "gain_held_out_db", "gain_std_db")
+
+
+@dataclass(frozen=True, eq=False)
+class RefinedTrack:
+    """Outcome of step `refine` for a flight.
+
+    Attributes
+    ----------
+    stage
+        `refined_track`, from which images inherit.
+    correction
+        Of the flight's nodes and pairs, seconds from `began`; None where images are formed from the logs as they are.
+    began
+        Zero of the correction's clock, UTC.
+    """
+
+    stage: xr.Dataset
+    correction: TrackCorrection | None
+    began: np.datetime64
+
+    @classmethod
+    def of(cls, stage: xr.Dataset) -> "RefinedTrack":
+        """Return the outcome stored in a stage."""
+        time, nodes = stage.time.values, stage.attrs["nodes"]
+        if not stage.attrs["accepted"] or not len(time):
+            return cls(stage, None, np.datetime64(0, "ns"))
+        moved_m = dict(zip(nodes, stage.correction.values, strict=True))
+        further_m = dict(zip(stage.attrs["pairs"], stage.further.values, strict=True))
+        return cls(stage, TrackCorrection(_seconds(time - time[0]), moved_m, further_m), time[0])
+
+    @property
+    def decisions(self) -> tuple[Decision, ...]:
+        """Whether tracks were to be refined, why, and what became of it; if so, how."""
+        became = {"autofocus": f"; {self.stage.attrs['why']}"}
+        made = self.stage.attrs["decisions"].items()
+        return tuple(Decision(name, one["value"], one["reason"] + became.get(name, "")) for name, one in made)
+
+    def report(self, pair: str) -> dict[str, Any]:
+        """Return the refinement of a pair's tracks for image.json."""
+        attrs = self.stage.attrs
+        made = {name: f"{one['value']}: {one['reason']}" for name, one in attrs["decisions"].items()}
+        return {
+            "decision": made["autofocus"],
+            **({"method": made["autofocus_method"]} if "autofocus_method" in made else {}),
+            "accepted": attrs["accepted"],
+            "why": attrs["why"],
+            **{name: attrs["report"][name] for name in _QUOTED if name in attrs["report"]},
+            **({} if self.correction is None else _sizes_cm(self.correction, pair)),
+        }
+
+    def pair(self, logged: OpenPair) -> OpenPair:
+        """Return an open pair as images are formed from it; its errors are those that the refinement leaves."""
+        if self.correction is None:
+            return logged
+        aperture, further_m = self._moved(self.correction, logged)
+        history = None if logged.history is None else logged.history.moved(aperture, further_m)
+        left = self.stage.attrs["left"]
+        return replace(logged, aperture=aperture, history=history, left=Effect(**left) if left else None)
+
+    def profiles(self, logged: OpenPair, profiles: Profiles) -> Profiles:
+        """Return the range profiles of a pair as images are formed from them."""
+        return profiles if self.correction is None else profiles.moved(*self._moved(self.correction, logged))
+
+    def node(self, logged: Acquisition) -> Acquisition:
+        """Return a node with its log corrected."""
+        if self.correction is None:
+            return logged
+        moved_m = self.moved_m(logged.name, logged.track.time.values)
+        return replace(logged, track=logged.track.assign(position=logged.track.position + moved_m))
+
+    def moved_m(self, node: str, at: Times) -> NDArray[np.float64]:
+        """Return what is added to the logged points of a node at some times, (time, 3) float64 metres in the frame.
+
+        Before the first pulse and after the last it stays what it was there.
+        """
+        if self.correction is None:
+            return np.zeros((len(at), 3))
+        return self.correction.at(node, _seconds(at - self.began))
+
+    def left_m(self, node: str, at: Times) -> NDArray[np.float64]:
+        """Return the standard deviation of what the refinement leaves of a node's error, along the axes of the frame.
+
+        Returns
+        -------
+        ndarray
+            (time, 3) float64, metres; NaN where the images say nothing of the node: before the first pulse, after the
+            last, and everywhere if no track was moved.
+        """
+        left_m, nodes = np.full((len(at), 3), np.nan), self.stage.attrs["nodes"]
+        if self.correction is None or self.correction.further_m or node not in nodes:
+            return left_m
+        knots_s, at_s = self.correction.time_s, _seconds(at - self.began)
+        inside = (at_s >= knots_s[0]) & (at_s <= knots_s[-1])
+        std_m = self.stage["std"].values[nodes.index(node)]
+        left_m[inside] = np.stack([np.interp(at_s[inside], knots_s, axis) for axis in std_m.T], axis=-1)
+        return left_m
+
+    def _moved(self, correction: TrackCorrection, logged: OpenPair) -> tuple[Aperture, NDArray[np.float64]]:
+        """Return the phase centres of a pair, and by how much paths of its echoes are longer than with the logs."""
+        time_s = clock_s(logged, self.began)
+        aperture = correction.aperture(logged.aperture, logged.name, time_s)
+        return aperture, correction.longer_m(logged.name, time_s, logged.sidelink_m)
+
+
+def open_refined(campaign: Campaign, flight: str) -> RefinedTrack:
+    """Return what step `refine` wrote of a flight."""
+    return RefinedTrack.of(open_stage(campaign.stage("refined_track", flight), "refined_track"))
+
+
+def expected_track(
+    campaign: Campaign, pairs: Sequence[OpenPair], scene: OpenScene
+) -> tuple[list[OpenPair], tuple[Decision, ...]]:
+    """Return the pairs of a flight as they are or will be imaged; whether and how their tracks are refined, and why.
+
+    Before step `refine` ran, the pairs are those of the logs, whatever was decided.
+    """
+    if campaign.is_current(campaign.stage("refined_track", pairs[0].flight)):
+        track = open_refined(campaign, pairs[0].flight)
+        return [track.pair(pair) for pair in pairs], track.decisions
+    return list(pairs), autofocus_of(campaign, pairs, scene)
+
+
+def clock_s(pair: OpenPair, began: np.datetime64) -> NDArray[np.float64]:
+    """Return the times of a pair's pulses, (pulse,) float64 seconds from an instant."""
+    return pair.time_s + float(_seconds(pair.began - began))
+
+
+def _sizes_cm(correction: TrackCorrection, pair: str) -> dict[str, Any]:
+    """Return how far the nodes of a pair were moved, or by how much its echoes lie further, rms."""
+    if pair in correction.further_m:
+        return {"further_rms_cm": _rms_cm(correction.further_m[pair][:, None])}
+    nodes = dict.fromkeys(pair.split("-"))
+    return {"rms_cm": {node: _rms_cm(correction.moved_m[node]) for node in nodes if node in correction.moved_m}}
+
+
+def _rms_cm(moved_m: NDArray[np.float64]) -> float:
+    return round(100 * float(np.sqrt((moved_m**2).sum(axis=-1).mean())), 2)
+
+
+def _seconds(span: Any) -> Any:
+    return span / np.timedelta64(1, "s")
+
+
+# ---- Inputs of a refinement of tracks from an open flight: profiles of each pair, errors of the logs ---------------
+
+
+@dataclass(frozen=True, eq=False)
+class RefinementInputs:
+    """Inputs of the refinement of a flight's tracks.
+
+    Attributes
+    ----------
+    records
+        One for each pair, by the flight's clock.
+    errors
+        Node → error statistics of its log.
+    points
+        Points of the scene whose places are known.
+    began
+        Zero of the clock, UTC.
+    causes
+        Constants of the config that may be wrong.
+    """
+
+    records: tuple[PairRecord, ...]
+    errors: Mapping[str, TrackErrors]
+    points: tuple[ReferencePoint, ...]
+    began: np.datetime64
+    causes: tuple[Cause, ...] = ()
+
+
+def refinement_inputs(campaign: Campaign, pairs: Mapping[OpenPair, Profiles], scene: OpenScene) -> RefinementInputs:
+    """Return the inputs of the refinement of a flight's tracks.
+
+    Parameters
+    ----------
+    campaign
+        With its settings.
+    pairs
+        Every pair of the flight, as the logs have it, and its range profiles.
+    scene
+        The campaign's.
+    """
+    began = min(pair.began for pair in pairs)
+    records = [
+        PairRecord(pair.name, profiles, clock_s(pair, began), pair.sidelink_m, weighing(campaign, pair, scene))
+        for pair, profiles in pairs.items()
+    ]
+    flight, height = next(iter(pairs)).flight, scene.axes[2]
+    causes = tuple(_causes(campaign, flight, records, began, height))
+    return RefinementInputs(tuple(records), errors_of(list(pairs)), reference_points(campaign), began, causes)
+
+
+def _causes(
+    campaign: Campaign, flight: str, records: Sequence[PairRecord], began: np.datetime64, up: Floats
+) -> Iterator[Cause]:
+    """Yield what may be wrong: height of the ground; times of logs; lever arms of nodes whose attitude is known."""
+    flown = {
+        node: (one.time_s, leg)
+        for one in records
+        for node, leg in zip(one.nodes, one.profiles.aperture.legs, strict=True)
+    }
+    yield other_height(list(flown), records[0].time_s, up)
+    logged = [node for node in flown if campaign.logged(flight, node)]
+    for node in logged:
+        yield late_logs([node], flown)
+        time_s, _ = flown[node]
+        wave_m = 2 * np.pi / records[0].profiles.wavenumber_rad_m
+        log = raw_log(campaign, flight, node, wave_m)
+        if log.has_attitude:
+            yield other_arm(node, time_s, log.body_axes(began + (1e9 * time_s).astype("timedelta64[ns]")))
+    if len(logged) > 1:
+        yield late_logs(logged, flown)
+
+
+def reference_points(campaign: Campaign) -> tuple[ReferencePoint, ...]:
+    """Return the reference points of the config, in the frame of the phase centres."""
+    requested, points = campaign.settings.scene, []
+    for point in requested.reference_points:
+        x, y, z = frame_from_map(requested.crs, *point.position_m).tolist()
+        points.append(ReferencePoint(point.name, (x, y, z), point.std_m))
+    return tuple(points)
+
+
+# ---- Rule `refine`: corrections of a flight's tracks by the images of all its pairs, or why there are none ---------
+
+
+def refine(campaign: Campaign, flight: str) -> Path:
+    """Write results/<flight>/refined_track.zarr; without corrections it states the reason and has no knots."""
+    lineage = result_of(campaign, "refined_track", flight).begin(campaign.root)
+    names, scene = campaign.flight(flight).pairs, open_scene(campaign)
+    requested = campaign.settings.processing.autofocus
+    pairs = [] if requested == "off" else [open_pair(campaign, flight, pair) for pair in names]
+    decisions, folder = autofocus_of(campaign, pairs, scene), campaign.stage("refined_track", flight)
+    if decisions[0].value == "on":
+        stages = {pair: open_stage(campaign.stage("profile", flight, pair), "profile") for pair in names}
+        profiles = {pair: profiles_of(stages[pair.name], lazy=True) for pair in pairs}
+        given = refinement_inputs(campaign, profiles, scene)
+        found = _searched(given, scene, str(decisions[1].value))
+        stage = refined_stage(found, decisions, given, scene)
+    else:
+        found = _unrefined(node for pair in names for node in pair.split("-"))
+        stages, stage = {}, refined_stage(found, decisions, None, scene)
+    print("; ".join([*(f"{one.name} {one.value}: {one.reason}" for one in decisions), found.why]), flush=True)
+    patterns = [pattern_digests(campaign, pair) for pair in names]
+    inherits: dict[str, Any] = {"parents": stages, "inputs": merged(scene.inputs, *patterns)}
+    settings = {**lineage.result.settings, "refined": found.accepted}
+    # Images that are formed from the logs depend on their own echoes alone, not on those read here.
+    how: dict[str, Any] = {"modules": lineage.modules, "settings": settings, **(inherits if found.accepted else {})}
+    save_stage(stamped(stage, "refined_track", **how), folder, lineage=lineage)
+    return folder
+
+
+def _searched(given: RefinementInputs, scene: OpenScene, method: str) -> Refinement:
+    """Return the refinement of tracks, or of one phase per pulse where there are places enough to validate it."""
+    records, errors = given.records, given.errors
+    found = None if method == "tracks" else Candidates.of(records, scene.grid, scene.terrain, errors)
+    if found is None or len(found.patches) < FOLDS:
+        points, causes = given.points, given.causes
+        return refine_tracks(records, scene.grid, scene.terrain, errors, reference_points=points, causes=causes)
+    return refine_one_phase(records, found, errors, method=method)
+
+
+def _unrefined(nodes: Any) -> Refinement:
+    """Return the refinement that leaves the tracks of some nodes as logged."""
+    nothing = {node: np.zeros((0, 3)) for node in dict.fromkeys(nodes)}
+    why = "images are formed from the logs as they are"
+    return Refinement(TrackCorrection(np.zeros(0), nothing), nothing, accepted=False, why=why)
+
+
+def refined_stage(
+    found: Refinement, decisions: Sequence[Decision], given: RefinementInputs | None, scene: OpenScene
+) -> xr.Dataset:
+    """Return stage `refined_track`, to be stamped.
+
+    Parameters
+    ----------
+    found, decisions
+        The refinement; whether it was tried, how, and why.
+    given
+        Its inputs; None where it was not tried.
+    scene
+        The campaign's.
+    """
+    knots_s, nodes = found.correction.time_s, list(found.correction.moved_m)
+    further_m = found.correction.further_m
+    began = np.datetime64(0, "ns") if given is None else given.began.astype("datetime64[ns]")
+    logged = _logged(() if given is None else given.records, knots_s)
+    moved_m, std_m = (np.stack([values[node] for node in nodes]) for values in (found.correction.moved_m, found.std_m))
+    position_m = np.stack([logged.get(node, np.zeros((0, 3))) for node in nodes])
+    by_node = ("node", "knot", "axis")
+    return xr.Dataset(
+        {
+            "time": ("knot", began + np.rint(1e9 * knots_s).astype("timedelta64[ns]")),
+            "correction": (by_node, moved_m),
+            "further": (("pair", "knot"), np.reshape([*further_m.values()], (len(further_m), len(knots_s)))),
+            "std": (by_node, std_m),
+            "position": (by_node, position_m),
+        },
+        attrs={
+            "frame": scene.grid.frame,
+            "flags": Flags(found.flags),
+            "nodes": nodes,
+            "pairs": list(further_m),
+            "decisions": {one.name: {"value": one.value, "reason": one.reason} for one in decisions},
+            "accepted": found.accepted,
+            "why": found.why,
+            "report": dict(found.report),
+            "left": _left(found.report),
+        },
+    )
+
+
+def _logged(records: Collection[PairRecord], knots_s: NDArray[np.float64]) -> Mapping[str, NDArray[np.float64]]:
+    """Return node → (knot, 3), its radar phase centre as the log has it, in the first pair that it takes part in."""
+    places: dict[str, NDArray[np.float64]] = {}
+    for one in records:
+        for node, leg in zip(one.nodes, one.profiles.aperture.legs, strict=True):
+            places.setdefault(node, np.stack([np.interp(knots_s, one.time_s, axis) for axis in leg.T], axis=-1))
+    return places
+
+
+def _left(report: Mapping[str, Any]) -> dict[str, float]:
+    """Return the effect of the remaining errors on an image, by the names of `Effect`; {} where unknown."""
+    named = {"loss_db": "left_db", "shift_m": "gauge_shift_m", "phase_rad": "left_rad"}
+    return {effect: report[name] for effect, name in named.items()} if {*named.values()} <= report.keys() else {}

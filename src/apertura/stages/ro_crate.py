@@ -1,0 +1,141 @@
+"""Rule `ro_crate`: the whole run as an RO-Crate, results/ro-crate-metadata.json; last of all."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from apertura.campaign.digests import Result
+from apertura.campaign.folder import Campaign
+from apertura.campaign.store import read_manifest, record_files, remake
+from apertura.common.atomic import write_json, write_text
+from apertura.common.documents import read_json, undamaged
+from apertura.common.paths import shipped
+from apertura.common.provenance import lock_sha256, sha256_text, software
+from apertura.formats.catalog import CATALOG, CRATE
+from apertura.formats.catalog.crate import CrateJob, CrateRun, Listed, crate_document
+from apertura.formats.catalog.stac import RECORDED
+from apertura.workflow.lineage import on_demand, places_of, result_of
+from apertura.workflow.rules import RESULTS, RULES
+
+
+def ro_crate(campaign: Campaign) -> Sequence[Path]:
+    """Write results/ro-crate-metadata.json, and the workflow beside it; return their paths."""
+    lineage = result_of(campaign, "ro_crate").begin(campaign.root)
+    manifest, workflow = campaign.root / lineage.result.manifest, _workflow()
+    manifest.unlink(missing_ok=True)
+    for name, text in workflow.items():
+        write_text(campaign.result(name), text)
+    made = list(_results(campaign))
+    read = {name: sha256 for one in reversed(made) for name, sha256 in one.recorded["sources"].items()}
+    known = {**read, **lineage.sources.digests}
+    run = CrateRun(
+        campaign.settings.campaign,
+        _recorded_until(campaign),
+        software(),
+        lock_sha256(),
+        list(_jobs(campaign, made, known)),
+        _inputs(campaign, known),
+        [Listed(name, sha256_text(text), len(text.encode())) for name, text in workflow.items()],
+        author=campaign.settings.metadata.author,
+        licence=campaign.settings.metadata.licence,
+        doi=campaign.settings.metadata.doi,
+    )
+    written = [campaign.result(name) for name in (CRATE, *workflow)]
+    write_json(written[0], crate_document(run))
+    record_files(manifest, written, lineage)
+    return written
+
+
+def _workflow() -> dict[str, str]:
+    """Return name in the results → text of each file of the workflow."""
+    folder = shipped() / "workflow"
+    paths = [folder / "Snakefile", *sorted((folder / "rules").glob("*.smk"))]
+    return {f"workflow/{path.relative_to(folder).as_posix()}": path.read_text("utf-8") for path in paths}
+
+
+class _Made(NamedTuple):
+    """A result and its manifest."""
+
+    name: str
+    where: tuple[str, ...]
+    result: Result
+    recorded: Mapping[str, Any]
+
+
+def _results(campaign: Campaign) -> Iterator[_Made]:
+    """Yield every result that the crate describes."""
+    for name, where, result in places_of(campaign):
+        if name != "ro_crate" and not on_demand(campaign, result.manifest):
+            path = campaign.root / result.manifest
+            recorded, expected = read_manifest(path), "a manifest that states the sources of a result"
+            with undamaged(path, expected=expected, remedy=f"Delete {path} and run the workflow again."):
+                hashes = {key: str(recorded[key]) for key in ("code", "settings")}
+                yield _Made(name, where, result, {**recorded, **hashes, "sources": dict(recorded["sources"])})
+
+
+def _jobs(campaign: Campaign, made: Sequence[_Made], known: Mapping[str, str]) -> Iterator[CrateJob]:
+    """Yield every job behind some results; one job makes several.
+
+    Parameters
+    ----------
+    campaign
+        Its folder has the files.
+    made
+        The results.
+    known
+        File of the campaign → sha256, of inputs as the first result found them, of results as they are.
+    """
+    jobs = dict[tuple[str, tuple[str, ...]], list[_Made]]()
+    for one in made:
+        jobs.setdefault((RESULTS[one.name].name, one.where), []).append(one)
+    for (rule, where), parts in jobs.items():
+        doubts = [doubt for one in parts for doubt in _doubts(one.recorded, one.result, known)]
+        yield CrateJob(
+            rule,
+            where,
+            RULES[rule].command_line(where),
+            parts[0].recorded["code"],
+            {name: value for one in parts for name, value in one.result.settings.items()},
+            list(dict.fromkeys(source for one in parts for source in one.recorded["sources"])),
+            [file for one in parts for file in _files(campaign, one, known)],
+            list(dict.fromkeys(doubts)),
+        )
+
+
+def _doubts(recorded: Mapping[str, Any], result: Result, known: Mapping[str, str]) -> Iterator[str]:
+    """Yield why a result would not be made so today."""
+    if recorded["code"] != result.code_sha256:
+        yield f"made by other code than is installed now, which is {result.code_sha256}"
+    if recorded["settings"] != result.settings_sha256:
+        yield f"made under other settings than these, of sha256 {recorded['settings']}"
+    for name, sha256 in recorded["sources"].items():
+        if known.get(name) != sha256:
+            yield f"made from {name} of sha256 {sha256}, which has changed since"
+
+
+def _files(campaign: Campaign, one: _Made, known: Mapping[str, str]) -> list[Listed]:
+    """Return the files of a result and its manifest."""
+    manifest = one.result.manifest.removeprefix("results/")
+    folder, where = manifest.rpartition("/")[0], campaign.root / one.result.manifest
+    files = {f"{folder}/{name}" if folder else name: sha256 for name, sha256 in sorted(one.recorded["files"].items())}
+    files[manifest] = known[one.result.manifest]
+    return [Listed(name, sha256, _size(campaign.results.named(name, where=where))) for name, sha256 in files.items()]
+
+
+def _inputs(campaign: Campaign, known: Mapping[str, str]) -> list[Listed]:
+    """Return the recordings, as they were when they were read, and the config, as it is."""
+    names = sorted(name for name in known if not name.startswith("results/"))
+    return [Listed(name, known[name], _size(campaign.root.named(name, where=campaign.root))) for name in names]
+
+
+def _size(path: Path) -> int | None:
+    return path.stat().st_size if path.is_file() else None
+
+
+def _recorded_until(campaign: Campaign) -> str:
+    """Return the time of the last pulse, as the catalog has it."""
+    path = campaign.result("stac", CATALOG)
+    remedy = remake(campaign.result("stac"))
+    document = read_json(path, expected="the catalog that step stac writes", remedy=remedy)
+    with undamaged(path, expected="the catalog that step stac writes", remedy=remedy):
+        return str(document[RECORDED][1])

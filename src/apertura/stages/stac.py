@@ -1,0 +1,199 @@
+"""Rule `stac`: every image of a campaign in a static STAC catalog."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apertura.campaign.config import FUSED, polarisation_of
+from apertura.campaign.folder import Campaign
+from apertura.campaign.store import open_listed, open_stage, read_manifest, record_files
+from apertura.common.atomic import write_json
+from apertura.common.documents import undamaged
+from apertura.common.errors import CampaignError
+from apertura.common.provenance import lock_sha256, software
+from apertura.core.echo.compression import centre_frequency
+from apertura.formats.catalog import CATALOG
+from apertura.formats.catalog.stac import (
+    AcquisitionTime,
+    Image,
+    asset_of,
+    catalog_files,
+    instant,
+    projection,
+    read_facts,
+)
+from apertura.formats.export.coverage import Covered, feature_collection
+from apertura.stages.coverage import few_looks, place_of, transform_of
+from apertura.stages.scene import OpenScene, settled_scene
+from apertura.workflow.lineage import result_of
+
+_SUMS = {"coherent": "SLC", "noncoherent": "MLI"}
+"""Sum of a flight's pairs → type of product; what begins with the name of the other is not its file."""
+
+
+def stac(campaign: Campaign) -> list[Path]:
+    """Write results/stac/; return the path of catalog.json, where it begins."""
+    lineage = result_of(campaign, "stac").begin(campaign.root)
+    manifest, folder = campaign.root / lineage.result.manifest, campaign.result("stac")
+    described = _Described(campaign, settled_scene(campaign))
+    stated = campaign.settings.metadata
+    by_whom = {"licence": stated.licence, "author": stated.author, "doi": stated.doi}
+    files = catalog_files(campaign.settings.campaign, described.images(), **by_whom)
+    manifest.unlink(missing_ok=True)
+    for name, document in files.items():
+        write_json(campaign.result("stac", name), document)
+    record_files(manifest, [folder / name for name in files], lineage)
+    return [folder / CATALOG]
+
+
+@dataclass(frozen=True)
+class _Described:
+    """A campaign whose images are described."""
+
+    campaign: Campaign
+    scene: OpenScene
+
+    def images(self) -> list[Image]:
+        """Return the catalog's images by flight: every pair, then every sum."""
+        images = []
+        for flight in self.campaign.image_flights:
+            looks = {pair: few_looks(self.campaign, flight.name, pair) for pair in flight.pairs}
+            pairs = [self._pair(flight.name, pair, looks[pair]) for pair in flight.pairs]
+            together = np.sum(list(looks.values()), axis=0)
+            sums = _SUMS if FUSED in flight.images else ()
+            images += pairs + [self._sum(flight.name, name, pairs, together) for name in sums]
+        return images
+
+    def _pair(self, flight: str, pair: str, looks: NDArray[np.float32]) -> Image:
+        files = self._listed(flight, pair, "export") | self._listed(flight, pair, "layers")
+        facts: dict[str, Any] = {
+            "sar:instrument_mode": _mode(pair),
+            "product:type": "SLC",
+            "sar:looks_range": 1,
+            "sar:looks_azimuth": 1,
+        }
+        label = polarisation_of(self.campaign.settings.nodes, pair)
+        if label and {*label} <= {"H", "V"}:
+            facts["sar:polarizations"] = [label]
+        return Image(
+            flight,
+            pair,
+            f"{self.campaign.settings.campaign} · flight {flight} · {pair}",
+            self._footprint(looks),
+            self._acquisition(flight, pair),
+            {**facts, **self._properties(flight, pair)},
+            *self._assets(files),
+        )
+
+    def _sum(self, flight: str, name: str, pairs: Sequence[Image], looks: NDArray[np.float32]) -> Image:
+        others = tuple(f"{other}_" for other in _SUMS if other != name)
+        listed = self._listed(flight, FUSED, "export")
+        facts: dict[str, Any] = {"sar:instrument_mode": "multistatic", "product:type": _SUMS[name]}
+        sides = {pair.properties.get("sar:observation_direction") for pair in pairs}
+        if len(sides) == 1 and None not in sides:
+            facts["sar:observation_direction"] = sides.pop()
+        angles = [pair.properties["view:incidence_angle"] for pair in pairs]
+        facts["view:incidence_angle"] = round(float(np.mean(angles)), 4)
+        return Image(
+            flight,
+            name,
+            f"{self.campaign.settings.campaign} · flight {flight} · {name} sum of {len(pairs)} pairs",
+            self._footprint(looks),
+            AcquisitionTime.together([pair.acquisition for pair in pairs]),
+            {**facts, **self._properties(flight, FUSED)},
+            *self._assets({path: digest for path, digest in listed.items() if not path.name.startswith(others)}),
+            [pair.name for pair in pairs],
+        )
+
+    def _listed(self, flight: str, name: str, result: str) -> dict[Path, str]:
+        """Return the files of a result with their hashes, as its manifest has them."""
+        manifest = self.campaign.root / self.campaign.manifest(result, flight, name)
+        hashes: Mapping[str, str] = read_manifest(manifest)["files"]
+        return {manifest.parent.named(file, where=manifest): digest for file, digest in hashes.items()}
+
+    def _assets(self, files: Mapping[Path, str]) -> tuple[dict[str, Any], dict[str, str]]:
+        """Return the assets of some files by their keys, and file → sha256 of what their rasters were made from."""
+        assets, inputs = {}, dict[str, str]()
+        for path, digest in files.items():
+            if not path.is_file():
+                raise CampaignError("no such file", path, "a finished product", "Run the workflow again.")
+            facts, name = read_facts(path), quote(self.campaign.relative(path).removeprefix("results/"))
+            key = path.stem if path.suffix == ".tif" else path.name
+            assets[key] = asset_of(path, f"../../../{name}", sha256=digest, facts=facts)
+            if facts.place.get("proj:shape", list(self.scene.grid.shape)) != list(self.scene.grid.shape):
+                assets[key].extra_fields |= facts.place
+            inputs = inputs or dict(facts.inputs)
+        return assets, inputs
+
+    def _properties(self, flight: str, name: str) -> dict[str, Any]:
+        """Return the properties of an image: projection, processing, quality."""
+        path = self.campaign.result(flight, name, "image.json")
+        manifest = path.with_name("export.manifest.json")
+        report, remedy = open_listed(path, manifest), f"Delete {manifest} and run the workflow again."
+        code = read_manifest(manifest).get("code", "unknown")
+        with undamaged(path, expected="the report of an image", remedy=remedy):
+            verdict = str(report["focus"]["verdict"])
+            return {
+                **self._shared,
+                **(_resolution(report.get("brightest") or {}) if verdict == "focused" else {}),
+                **(_view(report["view"]) if "view" in report else {}),
+                "processing:lineage": f"apertura step export {flight} {name}; code {code}; lock {self._lock}",
+                "apertura:verdict": verdict,
+                "apertura:flags": sorted(report["flags"]),
+                "apertura:numerical_error_db": float(report["numerical_error_db"]),
+            }
+
+    @cached_property
+    def _lock(self) -> str:
+        return lock_sha256()
+
+    @cached_property
+    def _shared(self) -> dict[str, Any]:
+        """What all images share: the grid and the software."""
+        grid = self.scene.grid
+        return {
+            **projection(grid.crs_wkt, grid.shape, grid.transform),
+            "sar:pixel_spacing_range": grid.spacing_m,
+            "sar:pixel_spacing_azimuth": grid.spacing_m,
+            **({"platform": platform} if (platform := self.campaign.settings.metadata.platform) else {}),
+            "processing:level": "L1",
+            "processing:software": software(),
+        }
+
+    def _footprint(self, looks: NDArray[np.float32]) -> dict[str, Any] | None:
+        covered, transform = Covered("", "", {}, looks), transform_of(self.scene.grid, looks)
+        found = feature_collection([covered], transform, place_of(self.scene), height_m=self.scene.level.height_m)
+        geometry: dict[str, Any] | None = found["features"][0]["geometry"]
+        return geometry if geometry and geometry["coordinates"] else None
+
+    def _acquisition(self, flight: str, pair: str) -> AcquisitionTime:
+        echo = open_stage(self.campaign.stage("echo", flight, pair), "echo")
+        times, frequency = echo.time.values.astype(np.int64), echo.frequency.values
+        span_hz = float(frequency[-1] - frequency[0])
+        bandwidth_hz = span_hz * frequency.size / max(frequency.size - 1, 1)
+        ends = instant(int(times.min())), instant(int(times.max()))
+        return AcquisitionTime(*ends, centre_frequency(frequency), bandwidth_hz)
+
+
+def _resolution(brightest: Mapping[str, Any]) -> dict[str, float]:
+    """Return the widths at -3 dB of an image's brightest point, as they were measured."""
+    widths = {"range": brightest.get("ground_range_width_m"), "azimuth": brightest.get("cross_range_width_m")}
+    return {f"sar:resolution_{axis}": float(width) for axis, width in widths.items() if width is not None}
+
+
+def _view(view: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the direction in which a pair looks at the middle of the scene."""
+    directions = {"sar:observation_direction": view["side"], "view:azimuth": view["look_deg"]}
+    known = {name: value for name, value in directions.items() if value not in {"both", None}}
+    return known | {"view:incidence_angle": float(view["incidence_deg"])}
+
+
+def _mode(pair: str) -> str:
+    """Return monostatic or bistatic, in the terms of the extension sar."""
+    return "monostatic" if len(set(pair.split("-"))) == 1 else "bistatic"

@@ -1,0 +1,267 @@
+"""What was transmitted: code symbols or the samples of a pulse, and what was sent before each symbol."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apertura.campaign.config import CONFIG, OfdmWaveform, PulseWaveform, SampledWaveform
+from apertura.campaign.folder import Campaign
+from apertura.common.errors import CampaignError
+from apertura.core.echo.demodulate import Numerology, subcarrier_numbers
+from apertura.core.echo.pulse_filter import occupied_band, pulse_filter, pulse_spectrum
+from apertura.core.echo.trigger import PulseFraming
+from apertura.formats.npy import read_npy
+from apertura.formats.recordings.sample_file import SampleFile
+
+# ---- Band limits of real samples ------------------------------------------------------------------------------------
+
+
+def check_mixing(samples: SampleFile, numerology: Numerology, *, where: object) -> None:
+    """Raise CampaignError if real samples are mixed so that a subcarrier and mirror image meet, or prefixes are short.
+
+    Parameters
+    ----------
+    samples
+        Of a recording; complex ones are never wrong.
+    numerology
+        Of the symbol.
+    where
+        The recording, for the message.
+    """
+    mixing = samples.layout.mixing
+    if mixing is None:
+        return
+    low_hz, high_hz = (float(numerology.frequency_hz[end]) - numerology.carrier_hz for end in (0, -1))
+    problem = mixing.problem(low_hz, high_hz, numerology.prefix_samples)
+    if problem:
+        raise CampaignError(
+            problem,
+            where=where,
+            expected="apertura:if_hz and waveform such that the whole band lies inside one Nyquist zone",
+            remedy="Correct apertura:if_hz (where baseband zero lies, before aliasing) or the waveform.",
+        )
+
+
+# ---- The transmitted signal: code symbols or samples of a pulse -----------------------------------------------------
+
+MOST_SYMBOLS = 1 << 24
+"""Code symbols of a waveform."""
+
+MOST_PULSE_SAMPLES = 1 << 22
+"""Of a pulse, and of a capture."""
+
+MOST_CHIPS = 1 << 20
+"""Chips of a preamble."""
+
+MOST_LEAD_SAMPLES = 1 << 26
+"""Samples before a symbol."""
+
+_FEWEST_BINS = 16  # of a band
+_LEAST_INSIDE = 0.01  # of the pulse's energy, in the band
+
+
+@dataclass(frozen=True, eq=False)
+class Transmitted:
+    """The transmitted signal as echo processing needs it, for any kind of waveform.
+
+    Attributes
+    ----------
+    waveform
+        As the config states it.
+    numerology
+        Grid of the frequencies that echoes are measured at.
+    inverse
+        (subcarrier,) complex64, inverse filter of the transmitted signal.
+    mean_power
+        E|s|² while it is sent, in the units that echoes are divided by: of a symbol, of a pulse whose peak is 1.
+    report, flags
+        Decisions on it, and flags.
+    """
+
+    waveform: SampledWaveform
+    numerology: Numerology
+    inverse: NDArray[np.complex64]
+    mean_power: float
+    report: dict[str, Any] = field(default_factory=dict)
+    flags: dict[str, str] = field(default_factory=dict)
+
+
+def transmitted(campaign: Campaign, waveform: SampledWaveform) -> Transmitted:
+    """Return the transmitted signal, from a waveform and the campaign's file of codes or samples.
+
+    Of a flight plan without that file: codes of one power, or a linear chirp over the band.
+
+    Raises
+    ------
+    CampaignError
+        If the file is missing or contradicts the waveform.
+    """
+    if isinstance(waveform, OfdmWaveform):
+        count, unsaid = waveform.subcarriers, campaign.planned and not campaign.sent_file.is_file()
+        codes = np.ones(count, np.complex64) if unsaid else read_codes(campaign.sent_file, count)
+        return Transmitted(waveform, symbol_numerology(waveform), 1 / codes, float((np.abs(codes) ** 2).sum()))
+    if isinstance(waveform, PulseWaveform):
+        unsaid = campaign.planned and not campaign.sent_file.is_file()
+        pulse = _chirp(waveform) if unsaid else read_pulse(campaign.sent_file, waveform)
+        return _pulse_sent(pulse, waveform, where=campaign.sent_file)
+    raise TypeError(f"no way to take out what a {type(waveform).__name__} sends")
+
+
+def symbol_numerology(waveform: OfdmWaveform) -> Numerology:
+    """Return how receivers sample an OFDM symbol."""
+    return Numerology(
+        waveform.carrier_hz,
+        waveform.sample_rate_hz,
+        subcarrier_numbers(waveform.subcarriers, carrier_is=waveform.carrier_is),
+        prefix_samples=waveform.prefix_samples,
+        dft_samples=waveform.dft_samples,
+    )
+
+
+def _chirp(waveform: PulseWaveform) -> NDArray[np.complex128]:
+    """Return a linear chirp over the band of a waveform, or over 0.8 of all that its samples carry."""
+    half = 0.4 * waveform.sample_rate_hz
+    low, high = waveform.band_hz or (-half, half)
+    time = np.arange(round(waveform.pulse_s * waveform.sample_rate_hz)) / waveform.sample_rate_hz
+    return np.asarray(np.exp(2j * np.pi * (low * time + (high - low) / waveform.pulse_s * time**2 / 2)))
+
+
+def _pulse_sent(pulse: NDArray[np.complex128], waveform: PulseWaveform, *, where: Path) -> Transmitted:
+    """Return a pulse that is sent once: a DFT of the whole capture, and its filter (docs/theory/waveforms.md)."""
+    length = waveform.capture_samples
+    lead = waveform.lead_s * waveform.sample_rate_hz
+    spectrum = pulse_spectrum(pulse, lead=lead, length=length)
+    power = np.abs(spectrum) ** 2
+    if waveform.band_hz is None:
+        first, last = occupied_band(power)
+    else:
+        spacing_hz = waveform.sample_rate_hz / length
+        first = int(np.ceil(waveform.band_hz[0] / spacing_hz - 1e-6))
+        last = min(int(np.floor(waveform.band_hz[1] / spacing_hz + 1e-6)), first + length - 1)
+    numbers = np.arange(first, last + 1)
+    inside = float(power[numbers % length].sum() / power.sum())
+    if numbers.size < _FEWEST_BINS or inside < _LEAST_INSIDE:
+        raise CampaignError(
+            f"{max(numbers.size, 0)} bins of {waveform.sample_rate_hz / length:g} Hz hold {inside:.2g} of its energy",
+            where=where,
+            expected=f"at least {_FEWEST_BINS} bins and {_LEAST_INSIDE} of the energy, as {CONFIG}: waveform.band_hz",
+            remedy="Correct band_hz (baseband: what the carrier is subtracted from), or the file.",
+        )
+    chosen = pulse_filter(spectrum[numbers % length], requested=waveform.filter)
+    longest = length - round((waveform.lead_s + waveform.pulse_s) * waveform.sample_rate_hz)
+    numerology = Numerology(waveform.carrier_hz, waveform.sample_rate_hz, numbers, 0, length, longest)
+    band_hz = [float(number * numerology.spacing_hz) for number in (first, last)]
+    report = {**chosen.report, "band_hz": band_hz, "energy_inside": round(inside, 4)}
+    mean_power = float((np.abs(pulse) ** 2).mean())
+    return Transmitted(waveform, numerology, chosen.inverse, mean_power, report, chosen.flags)
+
+
+def read_pulse(path: Path, waveform: PulseWaveform) -> NDArray[np.complex128]:
+    """Return a transmitted pulse, (sample,) complex128.
+
+    Raises
+    ------
+    CampaignError
+        If the file is missing, is not as long as waveform.pulse_s, silent, or not finite.
+    """
+    count = round(waveform.pulse_s * waveform.sample_rate_hz)
+    expected = f"({count},) complex or ({count}, 2) integers, as {CONFIG}: waveform.pulse_s times sample_rate_hz"
+    remedy = "Use the samples that were transmitted, or correct the waveform."
+    if not path.is_file():
+        raise CampaignError("no such file", where=path, expected=expected, remedy="Copy it there.")
+    stored = read_npy(path, kinds="ci", most=2 * MOST_PULSE_SAMPLES, expected=expected, remedy=remedy)
+    if waveform.capture_samples > MOST_PULSE_SAMPLES:
+        raise CampaignError(
+            f"captures of {waveform.capture_samples} samples",
+            where=f"{CONFIG}: waveform",
+            expected=f"no more than {MOST_PULSE_SAMPLES} in lead_s, pulse_s and listen_s",
+            remedy="Shorten listen_s to the longest delay of the scene.",
+        )
+    pairs = stored.dtype.kind == "i" and stored.shape == (count, 2)
+    if not (pairs or (stored.dtype.kind == "c" and stored.shape == (count,))):
+        raise CampaignError(f"{stored.dtype} of shape {stored.shape}", where=path, expected=expected, remedy=remedy)
+    with np.errstate(over="ignore", invalid="ignore"):  # becomes infinite or is none, and is refused as such
+        pulse = stored[:, 0] + 1j * stored[:, 1].astype(np.float64) if pairs else stored.astype(np.complex128)
+        level = np.abs(pulse)
+    lost = int((~np.isfinite(level)).sum())
+    if lost or not level.max() > 0:
+        found = f"{lost} samples that are no number" if lost else "silence: every sample is zero"
+        raise CampaignError(found, where=path, expected=expected, remedy=remedy)
+    return np.asarray(pulse / level.max(), np.complex128)
+
+
+def read_codes(path: Path, subcarriers: int) -> NDArray[np.complex64]:
+    """Return the transmitted code symbols, (subcarrier,) complex64.
+
+    Raises
+    ------
+    CampaignError
+        If the file is missing, of another length, or a symbol is zero or not finite.
+    """
+    expected = f"({subcarriers},) complex64 without zeros, as config/config.yaml: waveform.subcarriers"
+    remedy = "Use the codes that were transmitted, or correct the waveform."
+    if not path.is_file():
+        raise CampaignError("no such file", where=path, expected=expected, remedy="Copy it there.")
+    stored = read_npy(path, kinds="c", most=MOST_SYMBOLS, expected=expected, remedy=remedy)
+    with np.errstate(over="ignore", invalid="ignore"):  # becomes infinite or is none, and is refused as such
+        codes = stored.astype(np.complex64)
+        zeros = int((codes == 0).sum())
+    usable = codes.shape == (subcarriers,) and np.isfinite(codes).all() and np.abs(codes).min() > 0
+    if not usable:
+        raise CampaignError(
+            f"{stored.dtype} of shape {codes.shape}, {zeros} of them zero, "
+            f"{int((~np.isfinite(codes)).sum())} not finite",
+            where=path,
+            expected=expected,
+            remedy=remedy,
+        )
+    return codes
+
+
+def read_framing(path: Path, described: Mapping[str, Any], *, sample_rate_hz: float, where: Path) -> PulseFraming:
+    """Return what was sent before each symbol.
+
+    Parameters
+    ----------
+    path
+        .npy file of the preamble's chips, ±1.
+    described
+        The recorder's apertura:framing.
+    sample_rate_hz
+        Complex samples per second.
+    where
+        The file that describes it, for messages.
+
+    Raises
+    ------
+    CampaignError
+        If the preamble is missing, is not chips of ±1, or takes longer than any pulse.
+    """
+    if not path.is_file():
+        raise CampaignError(
+            "no such file",
+            where=path,
+            expected=f"the preamble that {where.name}: apertura:framing names",
+            remedy="Copy it there.",
+        )
+    expected = f"one dimension of chips +1 and -1, no more than {MOST_CHIPS}"
+    chips = read_npy(path, kinds="if", most=MOST_CHIPS, expected=expected, remedy="Save the preamble that was sent.")
+    if chips.ndim != 1 or not chips.size or not np.isin(chips, (-1, 1)).all():
+        found = f"{chips.dtype} of shape {chips.shape}, {int((~np.isin(chips, (-1, 1))).sum())} neither 1 nor -1"
+        raise CampaignError(found, where=path, expected=expected, remedy="Save the preamble that was sent.")
+    keys = ("chip_samples", "centre_hz", "counter_bits", "bit_chips", "guard_samples")
+    framing = PulseFraming(
+        chips.astype(np.int64), sample_rate_hz=sample_rate_hz, **{key: described[key] for key in keys}
+    )
+    if framing.lead_samples > MOST_LEAD_SAMPLES:
+        raise CampaignError(
+            f"{framing.lead_samples} samples of preamble, counter and guard before each symbol",
+            where=where,
+            expected=f"no more than {MOST_LEAD_SAMPLES}",
+            remedy="Correct apertura:framing.",
+        )
+    return framing

@@ -1,0 +1,519 @@
+"""A flight of kind bench as measured: channels and clocks of its nodes, links of its pairs, and a verdict per line."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from apertura.campaign.config import CONFIG, SampledWaveform
+from apertura.campaign.folder import Campaign
+from apertura.common.arrays import Complexes, Floats
+from apertura.common.errors import CampaignError
+from apertura.common.flags import Flags
+from apertura.core.echo.captures import (
+    SATURATED_SHARE,
+    Pulses,
+    Read,
+    Samples,
+    Saturation,
+    blocks_of,
+    conjugates,
+    spread,
+)
+from apertura.core.echo.clock import GROUPS, ClockOffset, clock_of
+from apertura.core.echo.demodulate import demodulate
+from apertura.core.echo.transfer import Transfer, as_complex, transfer_by_code, transfer_by_sidelink
+from apertura.core.quality.budget import strictest_accuracy_db
+from apertura.methods.synchronisation.channels import (
+    DC_DB,
+    FEWEST_COUNTS,
+    IMAGE_DB,
+    MISSED_SHARE,
+    Channel,
+    Triggers,
+    measure_channel,
+    triggers,
+)
+from apertura.methods.synchronisation.links import (
+    AMPLITUDE_DB,
+    DRIFT_PPM,
+    DROPOUT_SHARE,
+    LEAKAGE_DB,
+    PATH_CELLS,
+    PHASE_RAD,
+    SPLIT_DB,
+    SPLIT_RAD,
+    TONE_DB,
+    UNLOCKED_PPM,
+    WEAK_DB,
+    Contact,
+    Link,
+    PathOffset,
+    SplitAgreement,
+    clock_flags,
+    measure_contact,
+    measure_link,
+    reversed_flags,
+    split_agreement,
+)
+from apertura.stages.acquisition import Captured
+from apertura.stages.ingest import captures_of, checked_recording
+from apertura.stages.transmitted import Transmitted, transmitted
+
+_CHANNELS = ("radar", "sidelink")
+_STRETCH = 256  # neighbouring captures, amid each of 16 parts of a recording
+_EVERY_CAPTURE = 4096
+"""Captures of a node whose samples are looked at one by one; of longer recordings so many, evenly spread."""
+
+
+@dataclass(frozen=True)
+class Line:
+    """One line of the verdict.
+
+    Attributes
+    ----------
+    of
+        Node, node and channel, or pair.
+    what
+        Quantity.
+    measured, limit
+        With units.
+    flags
+        Names of the flags that it carries; none: nothing to look at.
+    """
+
+    of: str
+    what: str
+    measured: str
+    limit: str
+    flags: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class BenchNode:
+    """What one node recorded on the bench.
+
+    Attributes
+    ----------
+    name
+        Of the node.
+    triggers, channels, saturated
+        Pulses recorded; samples by channel; share of them at the end stops.
+    clock
+        Against the transmitter's; None of the transmitter, and where it cannot be measured.
+    sidelink, contact
+        State of the sidelink as measured for the correction, and its amplitude; None without.
+    link
+        Its strongest path: own echo of the transmitter, else the echo divided by the sidelink; None where none locks.
+    coherence_before
+        Γ of the radar channel as if there were no sidelink.
+    flags
+        Of all that.
+    """
+
+    name: str
+    triggers: Triggers
+    channels: tuple[Channel, ...]
+    saturated: Mapping[str, float]
+    clock: ClockOffset | None
+    sidelink: Mapping[str, Any] | None
+    contact: Contact | None
+    link: Link | None
+    coherence_before: float | None
+    flags: Flags
+
+
+@dataclass(frozen=True, eq=False)
+class Bench:
+    """A flight of kind bench as measured.
+
+    Attributes
+    ----------
+    flight, transmitter
+        Names.
+    nodes
+        Those that recorded, the transmitter first.
+    offsets
+        Node → path of its radar channel, less that of its sidelink, beyond the set-up.
+    splits
+        Pair → its radar channel against the transmitter's, where one signal feeds both.
+    carrier_hz, interval_s
+        Nominal carrier, and time between pulses.
+    """
+
+    flight: str
+    transmitter: str
+    nodes: tuple[BenchNode, ...]
+    offsets: Mapping[str, PathOffset]
+    splits: Mapping[str, SplitAgreement]
+    carrier_hz: float
+    interval_s: float
+    further: Flags = field(default_factory=Flags)
+
+    def pair(self, node: str) -> str:
+        """Return the name of the pair of a node."""
+        return f"{self.transmitter}-{node}"
+
+    @property
+    def flags(self) -> Flags:
+        """All flags."""
+        return Flags.merged(*(node.flags for node in self.nodes), self.further)
+
+    @property
+    def lines(self) -> list[Line]:
+        """The verdict, line by line."""
+        return [line for node in self.nodes for line in self._lines(node)]
+
+    def _lines(self, node: BenchNode) -> Iterator[Line]:
+        raised = [*node.flags, *(name for name, line in self.further.items() if self.pair(node.name) in line)]
+
+        def line(of: str, what: str, measured: str, limit: str, *names: str) -> Line:
+            return Line(of, what, measured, limit, tuple(name for name in names if name in raised))
+
+        count = node.triggers
+        lost, due = count.missed + count.beyond, count.due + count.beyond
+        yield line(
+            node.name,
+            "pulses",
+            f"{count.recorded} recorded, {lost} of {due} missed, {count.false} false",
+            f"missed {100 * MISSED_SHARE:g} %, false 0",
+            "triggers_missed",
+            "triggers_false",
+        )
+        for channel in node.channels:
+            of, mine = f"{node.name} {channel.name}", channel.flags
+            level = f"{channel.counts:.0f} counts rms" if channel.integers else f"{channel.counts:.3g} rms"
+            share = node.saturated.get(channel.name, 0.0)
+            yield line(of, "level", level, f"at least {FEWEST_COUNTS:g}", *({"channel_weak"} & {*mine}))
+            yield line(
+                of,
+                "samples at the end stops",
+                f"{100 * share:.3f} %",
+                f"{100 * SATURATED_SHARE:g} %",
+                *([f"saturated_{channel.name}"] if share > SATURATED_SHARE else []),
+            )
+            if channel.stuck:
+                bits = ", ".join(map(str, channel.stuck))
+                yield line(of, "bits that never change", bits, "none", *({"channel_bits_stuck"} & {*mine}))
+            yield line(of, "DC", f"{channel.dc_db:.1f} dB", f"{DC_DB:g} dB", *({"channel_dc"} & {*mine}))
+            worst = max(IMAGE_DB, channel.image_floor_db)
+            yield line(
+                of, "mirror image", f"{channel.image_db:.1f} dB", f"{worst:.0f} dB", *({"channel_image"} & {*mine})
+            )
+        yield from self._received(node, line)
+        if node.link is not None:
+            yield from self._link(node, node.link, line)
+        else:
+            yield line(self.pair(node.name), "path", "none above the noise", "one", "link_weak", "sidelink_lost")
+
+    def _received(self, node: BenchNode, line: Any) -> Iterator[Line]:
+        """Yield what a receiver's sidelink and clock say."""
+        if node.name == self.transmitter:
+            return
+        if node.clock is not None:
+            ppm, std = node.clock.cfo_hz / self.carrier_hz * 1e6, node.clock.cfo_std_hz / self.carrier_hz * 1e6
+            sampling = f"{node.clock.sfo_ppm:+.4f} ± {node.clock.sfo_std_ppm:.4f} ppm of the sampling rate"
+            yield line(node.name, "clock, carrier", f"{ppm:+.4f} ± {std:.4f} ppm", f"{UNLOCKED_PPM:g} ppm",
+                       "clock_unlocked", "clock_ambiguous")  # fmt: skip
+            yield line(node.name, "clock, sampling", sampling, "as the carrier")
+            moved = node.clock.cfo_slope_hz * node.triggers.recorded / self.carrier_hz * 1e6
+            yield line(node.name, "clock, change over the recording", f"{moved:+.4f} ppm", f"{DRIFT_PPM:g} ppm",
+                       "clock_drifts")  # fmt: skip
+        of = f"{node.name} sidelink"
+        if node.sidelink is not None:
+            state = node.sidelink
+            yield line(of, "SNR", f"{state['snr_db']:.1f} dB per subcarrier", "by the correction", "sidelink_noisy")
+            yield line(of, "lock", f"{100 * state['lock_rate']:.1f} % of the pulses", "100 %", "sidelink_lost")
+            yield line(of, "echo beside the direct path", f"at most {state['echo_db']:.1f} dB", "by the correction",
+                       "sidelink_echo", "second_arrival", "sidelink_ripple_or_echo")  # fmt: skip
+            yield line(of, "ripple of the band", f"{state['ripple_db']:.2f} dB", "by the correction",
+                       "sidelink_ripple", "sidelink_nulls")  # fmt: skip
+            yield line(of, "correction", f"{state['method']}: {state['reason']}", "", "wrong_code")
+        if node.contact is not None:
+            yield self._steady(node.contact, of)
+
+    def _steady(self, contact: Contact, of: str) -> Line:
+        return Line(of, "amplitude", contact.line.removeprefix("amplitude "),
+                    f"{AMPLITUDE_DB:g} dB, {100 * DROPOUT_SHARE:g} %",
+                    tuple(contact.flags))  # fmt: skip
+
+    def _link(self, node: BenchNode, link: Link, line: Any) -> Iterator[Line]:
+        pair, drift, moved = self.pair(node.name), link.phase_drift_rad, link.delay_drift_ps
+        if node.coherence_before is not None:
+            yield line(pair, "coherence Γ without the sidelink", f"{node.coherence_before:.4f}", "none")
+        yield line(
+            pair,
+            "coherence Γ",
+            f"{link.coherence:.6f}",
+            f"{link.coherence_limit:.6f} ± {link.coherence_std:.6f} by the SNR",
+            "link_incoherent",
+            "phase_unstable",
+        )
+        yield line(pair, "SNR of a compressed pulse", f"{10 * np.log10(link.snr):.1f} dB", f"{WEAK_DB:g} dB",
+                   "link_weak", "code_unconfirmed", "wrong_code", "spectrum_inverted")  # fmt: skip
+        yield line(
+            pair,
+            "phase",
+            f"{link.phase_excess_rad:.4f} rad rms beyond noise of {link.noise_rad:.4f}",
+            f"{PHASE_RAD:g} rad",
+            "link_incoherent",
+        )
+        yield line(
+            pair,
+            "drift over the recording",
+            f"{drift[0]:+.4f} ± {drift[1]:.4f} rad, {moved[0]:+.2f} ± {moved[1]:.2f} ps",
+            f"{PHASE_RAD:g} rad",
+            "link_drifts",
+        )
+        yield self._steady(link.contact, pair)
+        path = f"{link.path_m:+.4f} ± {link.path_std_m:.4f} m"
+        yield line(pair, "path", path, "one of all pulses", "channels_swapped", "delay_jumps")
+        yield line(pair, "strongest tone", f"{link.tone_db:.1f} dB at {link.tone_hz / 1e6:.2f} MHz",
+                   f"{TONE_DB:g} dB of the noise", "interference")  # fmt: skip
+        if (offset := self.offsets.get(node.name)) is not None:
+            yield line(
+                pair,
+                "path beyond the set-up",
+                f"{offset.offset_m:+.4f} ± {offset.std_m:.4f} m, config {offset.stated_m:+.4f} m",
+                f"{PATH_CELLS * offset.cell_m:.3f} m",
+                "path_disagrees",
+            )
+        if link.direct_db is not None:
+            yield line(pair, "sidelink in the radar channel", f"{link.direct_db:.1f} dB of the path",
+                       f"{LEAKAGE_DB:g} dB", "channel_leaks")  # fmt: skip
+        if link.arrivals:
+            others = ", ".join(f"{one.level_db:.1f} dB {one.later_m:+.2f} m" for one in link.arrivals)
+            yield line(pair, "other arrivals", others, "")
+        if (split := self.splits.get(pair)) is not None:
+            yield line(
+                pair,
+                f"against {self.pair(self.transmitter)}, one signal",
+                f"{split.gain_db:+.2f} dB, {split.phase_rad:+.3f} ± {split.phase_std_rad:.3f} rad, paths "
+                f"{split.path_m:+.3f} m apart, the receiver's beyond its "
+                f"sidelink; over the band {split.band_db:.2f} dB, {split.band_rad:.3f} rad rms",
+                f"{SPLIT_DB:g} dB, {SPLIT_RAD:g} rad",
+                "split_disagrees",
+            )
+
+    @property
+    def report(self) -> dict[str, Any]:
+        """Everything measured, as a JSON document."""
+        return {
+            "flight": self.flight,
+            "transmitter": self.transmitter,
+            "lines": [vars(line) | {"flags": list(line.flags)} for line in self.lines],
+            "links": {self.pair(node.name): _link_report(node, self.interval_s) for node in self.nodes if node.link},
+            "path_offset_m": {
+                node.name: {
+                    "offset_m": round(self.offsets[node.name].offset_m, 5),
+                    "std_m": round(self.offsets[node.name].std_m, 5),
+                    "stated_m": self.offsets[node.name].stated_m,
+                    "doubts": sorted(_DOUBTS & node.flags.keys()),
+                }
+                for node in self.nodes
+                if node.name in self.offsets
+            },
+            "flags": self.flags,
+        }
+
+
+_DOUBTS = frozenset({
+    "link_weak", "link_incoherent", "contact_loose", "delay_jumps", "wrong_code", "code_unconfirmed",
+    "spectrum_inverted", "saturated_radar", "saturated_sidelink", "sidelink_lost", "interference",
+})  # fmt: skip
+"""Flags of a node whose measured path goes into no config."""
+
+
+def _link_report(node: BenchNode, interval_s: float) -> dict[str, Any]:
+    link = node.link
+    if link is None:
+        return {}
+    drift, moved = link.phase_drift_rad, link.delay_drift_ps
+    return {
+        "coherence": link.coherence,
+        "coherence_limit": round(link.coherence_limit, 9),
+        "coherence_std": round(link.coherence_std, 9),
+        "coherence_before": node.coherence_before,
+        "snr_db": round(10 * np.log10(link.snr), 2),
+        "phase_excess_rad": round(link.phase_excess_rad, 5),
+        "phase_drift_rad": [round(value, 5) for value in drift],
+        "delay_drift_ps": [round(value, 3) for value in moved],
+        "path_m": round(link.path_m, 5),
+        "path_std_m": round(link.path_std_m, 6),
+        "arrivals": [{"later_m": round(one.later_m, 3), "level_db": round(one.level_db, 1)} for one in link.arrivals],
+        "allan_deviation": [[time_s, float(f"{value:.4g}")] for time_s, value in link.deviation(interval_s)],
+    }
+
+
+def measure_bench(campaign: Campaign, flight: str) -> Bench:
+    """Measure a flight of kind bench from its recordings; no log is read.
+
+    Raises
+    ------
+    CampaignError
+        If what was recorded are no samples, or a recording does not open.
+    """
+    waveform = campaign.settings.waveform
+    if not isinstance(waveform, SampledWaveform):
+        raise CampaignError(
+            f"waveform.kind {waveform.kind}",
+            where=CONFIG,
+            expected="a waveform recorded as samples: clocks and channels are measured on them",
+            remedy="Take flights of kind bench out of flights.tsv.",
+        )
+    flown, sent = campaign.flight(flight), transmitted(campaign, waveform)
+    names = [name for name in flown.participants if name in flown.nodes]
+    nodes = tuple(_node(campaign, flight, name, sent, own=name == flown.transmitter) for name in names)
+    due = max((node.triggers.due for node in nodes), default=0)
+    nodes = tuple(_with_ends(node, due) for node in nodes)
+    stated, offsets, further = campaign.settings.bench, {}, []
+    for node in nodes:
+        own = node.name == flown.transmitter
+        expected_m = stated.radar_m if own or stated.radar_m is None else _less(stated.radar_m, stated.sidelink_m)
+        if node.link is None:
+            continue
+        if not own:
+            further.append(reversed_flags(node.link, expected_m))
+        if expected_m is not None:
+            paths = campaign.settings.nodes[node.name].path_offset_m
+            offset_m = paths.radar if own else paths.radar - paths.sidelink
+            link = node.link
+            offsets[node.name] = PathOffset(link.path_m - expected_m, link.path_std_m, offset_m, link.cell_m)
+            further.append(offsets[node.name].flags(link.name))
+    first = nodes[0].link if nodes and nodes[0].name == flown.transmitter else None
+    splits = {}
+    if stated.split and first is not None:
+        for node in nodes[1:]:
+            if node.link is not None:
+                splits[node.link.name] = split_agreement(first, node.link)
+                further.append(splits[node.link.name].flags(node.link.name))
+    return Bench(
+        flight, flown.transmitter, nodes, offsets, splits, waveform.carrier_hz, 1 / waveform.prf_hz,
+        Flags.merged(*further),
+    )  # fmt: skip
+
+
+def _with_ends(node: BenchNode, due: int) -> BenchNode:
+    """Return a node with the pulses that others recorded before it began or after it stopped."""
+    counted = replace(node.triggers, beyond=due - node.triggers.due)
+    return replace(node, triggers=counted, flags=Flags.merged(node.flags, counted.flags))
+
+
+def _less(radar_m: float, sidelink_m: float | None) -> float | None:
+    return None if sidelink_m is None else radar_m - sidelink_m
+
+
+def _node(campaign: Campaign, flight: str, name: str, sent: Transmitted, *, own: bool) -> BenchNode:
+    recording = checked_recording(campaign, flight, name)
+    raw = captures_of(recording, campaign, node=name)
+    where = f"raw/{flight}/{name}"
+    captured = Captured.of(raw, recording.samples.path, Path(where), where, sent)
+    time_s = np.asarray((raw.time.values - raw.time.values[0]) / np.timedelta64(1, "s"), np.float64)
+    counted = triggers(time_s, prf_hz=sent.waveform.prf_hz)
+    present = [channel for channel in _CHANNELS if channel in recording.channels]
+    every = np.arange(len(time_s))
+    read = captured.reader(present if own else list(_CHANNELS), every)
+    channels, saturation = _channels(read, present, captured, len(every))
+    flags = [channel.flags for channel in channels] + [saturation.flags]
+    pair = f"{campaign.flight(flight).transmitter}-{name}"
+    if _is_inverted(read, sent, "radar" if own else "sidelink", len(every)):
+        read = _conjugated(read)
+        flags.append({"spectrum_inverted": f"{name}: the code is in the conjugates of its samples: toggle waveform.iq"})
+    before, clock, contact, state = None, None, None, None
+    measured: Transfer | None = None
+    if own:
+        measured = transfer_by_code(read, sent.inverse, captured.numerology, time_s=time_s)
+    else:
+        contact = measure_contact(f"{name} sidelink", _by_code(read, sent, "sidelink"), len(every))
+        flags.append(contact.flags if contact else {})
+        clock, found = _clock(read, sent, name, len(every))
+        flags.append(found)
+        alone = measure_link(pair, _by_code(read, sent, "radar"), time_s, captured.numerology, divided=False)
+        before = alone.coherence if alone else None
+        try:
+            measured = transfer_by_sidelink(
+                read, sent.inverse, captured.numerology, symbol_samples=sent.waveform.capture_samples,
+                sidelink_m=np.zeros(len(every)), method=campaign.settings.processing.sidelink,
+                accuracy_db=strictest_accuracy_db(campaign.settings.processing.accuracy_db), where=where,
+            )  # fmt: skip
+        except CampaignError as nothing:
+            flags.append({"sidelink_lost": f"{name}: {nothing.found}"})
+        else:
+            state = measured.report["sidelink"]
+    link = None
+    if measured is not None:
+        # nothing moves: what echo processing says of geometry and of a phase that moves is measured better here
+        flags.append({key: line for key, line in measured.flags.items() if key not in _OF_FLIGHTS})
+        kept = np.flatnonzero(measured.kept)
+        if len(kept) > 1:
+            rows = measured.form
+            link = measure_link(
+                pair, lambda some: rows(kept[some]), time_s[kept], captured.numerology, divided=not own,
+                prefix_cells=captured.numerology.delay_cells if own else None,
+            )  # fmt: skip
+            flags.append(link.flags if link else {"link_weak": f"{pair}: no path above the noise"})
+    return BenchNode(
+        name, counted, channels, saturation.shares, clock, state, contact, link, before,
+        Flags.merged(*flags),
+    )  # fmt: skip
+
+
+_OF_FLIGHTS = frozenset({"association_suspect", "phase_unstable"})
+
+
+def _channels(read: Read, present: list[str], captured: Captured, count: int) -> tuple[tuple[Channel, ...], Saturation]:
+    """Return the state of each channel and how much of it is saturated, by some thousand captures."""
+    some = np.unique(np.linspace(0, count - 1, min(count, _EVERY_CAPTURE)).astype(np.int64))
+    saturation = Saturation()
+
+    def blocks(channel: str) -> Iterator[Samples]:
+        for one in blocks_of(some):
+            iq = read(one)[channel]
+            saturation.count({channel: iq})
+            yield iq
+
+    return tuple(measure_channel(name, blocks(name), captured.numerology) for name in present), saturation
+
+
+def _by_code(read: Read, sent: Transmitted, channel: str) -> Any:
+    """Return a function that forms the transfer functions of a channel by the code alone."""
+
+    def form(some: Pulses) -> Complexes:
+        return np.asarray(demodulate(as_complex(read(some)[channel]), sent.numerology) * sent.inverse)
+
+    return form
+
+
+def _conjugated(read: Read) -> Read:
+    return lambda some: {name: conjugates(iq) for name, iq in read(some).items()}
+
+
+def _is_inverted(read: Read, sent: Transmitted, channel: str, count: int) -> bool:
+    """Return whether the code locks in the conjugates of a channel's samples, and not in the samples."""
+    some = np.concatenate(spread(count, groups=4, each=16))
+
+    def locks(one: Read) -> bool:
+        contact = measure_contact(channel, lambda rows: _by_code(one, sent, channel)(some[rows]), len(some))
+        return contact is not None and 2 * contact.dropouts < contact.pulses
+
+    return not locks(read) and locks(_conjugated(read))
+
+
+def _clock(read: Read, sent: Transmitted, name: str, count: int) -> tuple[ClockOffset | None, dict[str, str]]:
+    groups = spread(count, groups=GROUPS, each=_STRETCH)
+    length = sent.waveform.capture_samples
+    try:
+        clock = clock_of(
+            (as_complex(read(some)["sidelink"][:, :length]) for some in groups), sent.numerology, pulses=count
+        )
+    except ValueError as error:
+        return None, {"clock_unmeasured": f"{name}: {error}"}
+    return clock, clock_flags(name, clock, sent.numerology, count)
+
+
+def series(link: Link) -> tuple[Floats, Floats, Floats, Floats]:
+    """Return (pulse,) time, s, phase, rad, delay, ps, and amplitude, dB of the median, as drawn."""
+    size = np.abs(link.terms)
+    return link.time_s, link.phase_rad, link.delay_ps, 20 * np.log10(size / np.median(size))

@@ -1,0 +1,218 @@
+"""Speed against accuracy on the user's own campaign: every engine and setting timed and measured."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from time import perf_counter
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apertura.campaign.folder import Campaign
+from apertura.campaign.store import open_stage, record_files
+from apertura.common.tables import write_table
+from apertura.core.antenna.beam import Beams
+from apertura.core.backprojection.engines import load_engine, reference
+from apertura.core.backprojection.engines.engine import Setting
+from apertura.core.backprojection.inputs import PhaseHistory, Profiles
+from apertura.core.imaging.certify import BRIGHT_PIXELS, RANDOM_PIXELS
+from apertura.core.imaging.range_profiles import profiles_of
+from apertura.core.planning.plan import Plan
+from apertura.core.planning.planner import SettingSearch
+from apertura.core.quality.error_check import Brightness, error_bound, random_pixels
+from apertura.stages.pair import open_pair
+from apertura.stages.planning import accuracy_of, job_of, plan_job
+from apertura.stages.refine import open_refined
+from apertura.stages.scene import OpenScene, open_scene
+from apertura.tools.chart.pareto import Point, draw_points, with_front, write_page
+from apertura.workflow.lineage import result_of
+from apertura.workflow.rules import STUDY
+
+PULSES, SIDE_PX = 1024, 256
+LEAST_ROWS = 32
+"""Rows of the window that every setting forms: the pixels whose exact values are known lie in them."""
+
+_TOLERANCES_RAD = (1.5e-3, 1.5e-4)
+_SLOW_SECONDS = 0.3
+"""A setting predicted to take longer than this on the window is timed on fewer of its rows."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """The part of a campaign that is measured: a block of pulses over a window of the image.
+
+    Attributes
+    ----------
+    history, profiles, beams
+        Of the block; None where the antennas have no beams.
+    pixels
+        (y, x, 3) float64, the window.
+    picked, density
+        (pixel, 2) int64, rows (the first `LEAST_ROWS` at most) and columns in the window whose exact values are known;
+        (pixel,) float64, how densely they are drawn there.
+    exact
+        (pixel,) complex128.
+    reference_seconds
+        What the exact values took.
+    """
+
+    history: PhaseHistory
+    profiles: Profiles
+    pixels: NDArray[np.float64]
+    picked: NDArray[np.int64]
+    density: NDArray[np.float64]
+    exact: NDArray[np.complex128]
+    total_pixels: int
+    reference_seconds: float
+    beams: Beams | None = None
+
+
+def speed_accuracy(campaign: Campaign, flight: str, pair: str, *, seconds: float = 60.0) -> Sequence[Path]:
+    """Write results/study/speed_accuracy.csv, .png and .html.
+
+    Parameters
+    ----------
+    campaign, flight, pair
+        Whose finished echo and profile stages are used.
+    seconds
+        When to stop measuring: the planner's choice and the reference come first, then settings by predicted cost.
+
+    Notes
+    -----
+    Engines are charted: placing pixels and storing tiles, which all share, is in no seconds.
+    """
+    lineage = result_of(campaign, "speed_accuracy").begin(campaign.root)
+    logged, track = open_pair(campaign, flight, pair), open_refined(campaign, flight)
+    scene = open_scene(campaign)
+    profiles = profiles_of(open_stage(campaign.stage("profile", flight, pair), "profile"))
+    opened, profiles = track.pair(logged), track.profiles(logged, profiles)
+    middle = len(profiles) // 2
+    block = slice(max(0, middle - PULSES // 2), middle + PULSES // 2)
+    if opened.history is None:
+        raise ValueError("the echo stage is not there")
+    history, beams = opened.history[block], opened.beams and opened.beams[block]
+    accuracy_db = float(accuracy_of(campaign, opened, scene).value)
+    opened = replace(opened, aperture=history.aperture, history=history, beams=beams)
+    job = job_of(campaign, opened, scene)
+    plan, search = plan_job(campaign, job, accuracy_db=accuracy_db), SettingSearch(job)
+    part = _part(history, profiles[block], scene, plan, total_pixels=job.pixels, beams=beams)
+    points = [
+        replace(point, predicted_seconds=point.predicted_seconds - search.tile_seconds)
+        for point in measure(part, plan, _settings(search), seconds=seconds)
+    ]
+    some = "" if len(history) == len(opened.time_s) else f"the middle {len(history)} of "
+    size = f"{scene.grid.shape[0]} × {scene.grid.shape[1]} pixels, {some}{len(opened.time_s)} pulses"
+    title = f"{campaign.settings.campaign}, {flight}/{pair}: {size}"
+    paths = [campaign.result(STUDY) / f"speed_accuracy.{suffix}" for suffix in ("csv", "png", "html")]
+    write_table(paths[0], points, digits=6)
+    draw_points(points, paths[1], title=title, accuracy_db=accuracy_db)
+    write_page([asdict(point) for point in points], paths[2], title=title, accuracy_db=accuracy_db)
+    record_files(campaign.root / lineage.result.manifest, paths, lineage)
+    return paths
+
+
+def _part(
+    history: PhaseHistory,
+    profiles: Profiles,
+    scene: OpenScene,
+    plan: Plan,
+    *,
+    total_pixels: int,
+    beams: Beams | None,
+) -> Part:
+    """Return the part; its pixels are drawn as for a certificate, by the brightness of the image as planned."""
+    window = []
+    for size in scene.grid.shape:
+        first = max(0, size - SIDE_PX) // 2 // 16 * 16
+        window.append(slice(first, min(size, first + SIDE_PX)))
+    pixels = scene.terrain.positions(scene.grid[window[0], window[1]])
+    rows = pixels[:LEAST_ROWS]
+    engine, generator = load_engine(plan.setting.engine), np.random.default_rng(0)
+    inputs = history if engine.READS == "phase_history" else plan.inputs(profiles)
+    prepared = engine.prepare(inputs, **plan.setting.options)
+    image = engine.form(prepared, rows, beams=beams, **plan.setting.form_options)
+    whole = [(slice(0, rows.shape[0]), slice(0, rows.shape[1]))]
+    brightness = Brightness.of(image, whole)
+    bright = brightness.draw(image, whole, BRIGHT_PIXELS, generator)
+    picked = np.concatenate([random_pixels(whole, RANDOM_PIXELS, generator), bright])
+    density = brightness.density(picked, image[tuple(picked.T)], whole, random=RANDOM_PIXELS)
+    begin = perf_counter()
+    exact = reference.form(history, rows[tuple(picked.T)], beams=beams)
+    return Part(history, profiles, pixels, picked, density, exact, total_pixels, perf_counter() - begin, beams)
+
+
+def _settings(search: SettingSearch) -> list[Setting]:
+    """Return the settings to measure, cheapest first: of every engine but the reference, which is timed once."""
+    return [
+        setting
+        for setting in search.settings(len(search.job.aperture))
+        if not _is_reference(setting)
+        and setting.form_options.get("tolerance_rad", _TOLERANCES_RAD[0]) in _TOLERANCES_RAD
+    ]
+
+
+def _is_reference(setting: Setting) -> bool:
+    return cast("object", load_engine(setting.engine)) is reference
+
+
+def measure(part: Part, plan: Plan, settings: Sequence[Setting], *, seconds: float) -> list[Point]:
+    """Return what the plan, the reference and as many settings as time allows take and err, fastest first."""
+    begin = perf_counter()
+    points = [_reference_point(part, plan)]
+    if not _is_reference(plan.setting):
+        points.append(_measured(part, plan.setting, plan))
+    unplanned = [s for s in settings if plan.presum is not None or s.line != plan.setting.line]
+    for setting in unplanned:
+        if perf_counter() - begin > seconds:
+            break
+        points.append(_measured(part, setting, None))
+    return with_front(sorted(points, key=lambda point: point.seconds))
+
+
+def _measured(part: Part, setting: Setting, plan: Plan | None) -> Point:
+    engine = load_engine(setting.engine)
+
+    def prepare() -> Any:
+        if engine.READS == "phase_history":
+            return engine.prepare(part.history, **setting.options)
+        return engine.prepare(part.profiles if plan is None else plan.inputs(part.profiles), **setting.options)
+
+    tables_s, prepared = _least(prepare, repeats=2)
+    quick = _SLOW_SECONDS / max(setting.form_seconds, 1e-9) * part.total_pixels / part.pixels.shape[1]
+    pixels = part.pixels[: max(LEAST_ROWS, round(quick))]
+    form_s, image = _least(lambda: engine.form(prepared, pixels, beams=part.beams, **setting.form_options), repeats=3)
+    power = float((np.abs(image[:LEAST_ROWS]) ** 2).sum())
+    error = error_bound(image[tuple(part.picked.T)], part.exact, part.density, power=power)
+    return _point(part, setting, tables_s + form_s * part.total_pixels / pixels[..., 0].size, error.bound_db, plan)
+
+
+def _reference_point(part: Part, plan: Plan) -> Point:
+    setting = plan.fallbacks[-1] if plan.fallbacks else plan.setting
+    taken = part.reference_seconds * part.total_pixels / len(part.picked)
+    return replace(_point(part, setting, taken, None, None), planned=_is_reference(plan.setting))
+
+
+def _point(part: Part, setting: Setting, taken: float, error_db: float | None, plan: Plan | None) -> Point:
+    """Return what a setting took and errs; `plan` where it is the planner's choice."""
+    return Point(
+        engine=setting.engine,
+        setting=setting.line,
+        presum=1 if plan is None or plan.presum is None else plan.presum.factor,
+        seconds=taken,
+        pixel_pulses_per_s=part.total_pixels * len(part.profiles) / taken,
+        error_db=error_db,
+        predicted_seconds=setting.seconds,
+        predicted_error_db=setting.error_db if plan is None else plan.predicted_error_db,
+        on_front=False,
+        planned=plan is not None,
+    )
+
+
+def _least(work: Any, *, repeats: int) -> tuple[float, Any]:
+    times = []
+    for _ in range(repeats):
+        begin = perf_counter()
+        result = work()
+        times.append(perf_counter() - begin)
+    return min(times), result

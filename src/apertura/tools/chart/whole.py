@@ -1,0 +1,276 @@
+"""Error against seconds of the whole chain from raw samples to GeoTIFFs, for settings that trade one for the other."""
+
+import contextlib
+import io
+import json
+import os
+import platform
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from time import perf_counter, process_time
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from apertura.campaign.config import Flight, SampledWaveform
+from apertura.campaign.folder import Campaign
+from apertura.campaign.store import record_files
+from apertura.common.atomic import remove
+from apertura.common.confined import ConfinedPath
+from apertura.common.errors import CampaignError
+from apertura.common.tables import write_table
+from apertura.core.quality.budget import is_counted
+from apertura.stages import assess, calibration, cube, echo, export, image, ingest, profile, refine, scene
+from apertura.tools.chart.png import save_png
+from apertura.workflow.lineage import result_of, with_inputs
+from apertura.workflow.rules import STUDY
+
+_FLOOR_DB = -110.0
+_LONGEST_DB = 20.0
+_MARKS = {
+    "o": "numerical error, certified; seconds from least to most",
+    "s": "expected by the budget: power lost from a peak",
+    "^": "measured at bright points: the same, ± σ",
+}
+
+
+@dataclass(frozen=True)
+class Whole:
+    """What one setting takes from raw samples to GeoTIFFs, and errs; of the pair that is worse.
+
+    Attributes
+    ----------
+    seconds, least_seconds, most_seconds
+        Of the processor over the repeats, which other work on the machine stretches little.
+    wall_seconds
+        By the clock on the wall, mean.
+    load
+        Mean load of the machine, processes that want to run.
+    expected_loss_db
+        By the lines of the budget that are expected, arithmetic included, 0 or less.
+    measured_loss_db, measured_std_db
+        At bright points; NaN where none is bright enough.
+    numerical_error_db
+        As certified.
+    flags
+        Of the pairs, with blanks between.
+    """
+
+    setting: str
+    seconds: float
+    least_seconds: float
+    most_seconds: float
+    wall_seconds: float
+    repeats: int
+    load: float
+    expected_loss_db: float
+    measured_loss_db: float
+    measured_std_db: float
+    numerical_error_db: float
+    flags: str
+
+
+def spread_db(loss_db: float) -> float:
+    """Return the share of a peak's power that a loss has spread around it, dB.
+
+    Examples
+    --------
+    >>> round(spread_db(-1.0), 1), spread_db(0.0)
+    (-6.9, -110.0)
+    """
+    return float(10 * np.log10(max(1 - 10 ** (min(loss_db, 0.0) / 10), 10 ** (_FLOOR_DB / 10))))
+
+
+def draw_whole(rows: Sequence[Whole], path: Path, *, title: str, refused: Collection[str]) -> None:
+    """Draw each setting's errors one above the other at its seconds, as PNG; settings that were refused are named."""
+    figure = Figure(figsize=(13, 7), layout="constrained")
+    axes, beside = figure.subplots(1, 2, width_ratios=(3.2, 1))
+    ordered = sorted(rows, key=lambda row: row.seconds)
+    for number, row in enumerate(ordered):
+        _draw_row(axes, row, f"C{number % 10}", str(number + 1))
+    for marker, label in _MARKS.items():
+        axes.plot([], [], marker, color="0.3", label=label)
+    axes.set_xlabel("Processor seconds from raw samples to GeoTIFFs")
+    axes.set_ylabel("Error, dB")
+    axes.grid(alpha=0.25)
+    axes.margins(y=0.1)
+    figure.suptitle(title, fontsize=10)
+    figure.legend(loc="outside lower center", ncols=len(_MARKS), fontsize=9)
+    lines = [f"{number}  {row.setting}: {row.wall_seconds:.1f} s" for number, row in enumerate(ordered, 1)]
+    lines += [f"–  {name}: refused" for name in refused]
+    names = sorted({flag for row in rows for flag in row.flags.split()})
+    beside.text(0, 1, "\n".join(["wall clock", *lines, "", "flags", *(names or ["none"])]), va="top", fontsize=9)
+    beside.axis("off")
+    save_png(figure, path)
+
+
+def _draw_row(axes: Axes, row: Whole, colour: str, number: str) -> None:
+    """Draw one setting: seconds with their spread, and each kind of error."""
+    lost = [row.measured_loss_db + sign * row.measured_std_db for sign in (0, 1, -1)]
+    heights = dict(zip(_MARKS, map(float, (row.numerical_error_db, spread_db(row.expected_loss_db))), strict=False))
+    axes.hlines(row.numerical_error_db, row.least_seconds, row.most_seconds, color=colour)
+    if np.isfinite(row.measured_loss_db):
+        heights["^"], low, high = map(spread_db, lost)
+        axes.vlines(row.seconds, max(low, heights["^"] - _LONGEST_DB), high, color=colour)
+    for marker, height in heights.items():
+        axes.plot(row.seconds, height, marker, color=colour)
+    axes.vlines(row.seconds, min(heights.values()), max(heights.values()), color=colour, linewidth=0.5, alpha=0.5)
+    place = (row.seconds, row.numerical_error_db)
+    axes.annotate(number, place, xytext=(0, -16), textcoords="offset points", ha="center", color=colour)
+
+
+_SETTINGS: Mapping[str, dict[str, Any]] = {
+    "as configured": {},
+    "accuracy −30 dB": {"accuracy_db": -30.0},
+    "accuracy −60 dB": {"accuracy_db": -60.0},
+    "accuracy −90 dB": {"accuracy_db": -90.0},
+    "presum 1": {"presum": 1},
+    "presum 2": {"presum": 2},
+    "level ground": {"terrain": "plane"},
+    "DEM": {"terrain": "dem"},
+    "sidelink divide": {"sidelink": "divide"},
+    "sidelink gated": {"sidelink": "gated"},
+    "sidelink two_parameter": {"sidelink": "two_parameter"},
+}
+"""Name → keys of `processing` that are changed, one at a time."""
+
+
+@dataclass(frozen=True)
+class _Run:
+    """One run from raw samples to GeoTIFFs."""
+
+    seconds: float
+    wall_seconds: float
+    load: float
+    reports: list[dict[str, Any]]
+
+
+def whole_chart(campaign: Campaign, *, repeats: int = 3) -> Sequence[Path]:
+    """Write results/study/whole.csv and .png: total error against seconds from raw samples to GeoTIFFs.
+
+    Parameters
+    ----------
+    campaign
+        Whose recordings are carried through every step again, into a folder that is removed afterwards.
+    repeats
+        Of every setting, taken in turn, so that what else the machine does touches all alike; one before them, which
+        is not counted, opens libraries and files.
+    """
+    lineage = result_of(campaign, "whole").begin(campaign.root)
+    work = with_inputs(campaign, campaign.result(STUDY) / "whole", link=False)
+    choices = {
+        name: _chosen(campaign, work, changes) for name, changes in _SETTINGS.items() if _applies(campaign, name)
+    }
+    runs: dict[str, list[_Run]] = {name: [] for name in choices}
+    refused: list[str] = []
+    _carried(choices["as configured"])
+    for _ in range(repeats):
+        for name in [name for name in choices if name not in refused]:
+            try:
+                runs[name].append(_carried(choices[name]))
+            except CampaignError:
+                refused.append(name)
+    remove(work)
+    rows = [_whole(name, some) for name, some in runs.items() if name not in refused]
+    paths = [campaign.result(STUDY) / f"whole.{suffix}" for suffix in ("csv", "png")]
+    write_table(paths[0], rows, digits=6)
+    draw_whole(rows, paths[1], title=_title(campaign, rows, repeats), refused=refused)
+    record_files(campaign.root / lineage.result.manifest, paths, lineage)
+    return paths
+
+
+def _applies(campaign: Campaign, name: str) -> bool:
+    """Return whether a setting makes a difference to ask for: terrain where there is a DEM, a sidelink where one is."""
+    if "terrain" in _SETTINGS[name]:
+        return campaign.settings.scene.dem is not None
+    receivers = any(len(set(pair.split("-"))) > 1 for pair in campaign.image_flights[0].pairs)
+    return "sidelink" not in _SETTINGS[name] or (receivers and isinstance(campaign.settings.waveform, SampledWaveform))
+
+
+def _chosen(campaign: Campaign, work: Path, changes: dict[str, Any]) -> Campaign:
+    """Return the campaign with changed settings, in another folder."""
+    processing = type(campaign.settings.processing)(**{**campaign.settings.processing.model_dump(), **changes})
+    return replace(
+        campaign, root=ConfinedPath.at(work), settings=campaign.settings.model_copy(update={"processing": processing})
+    )
+
+
+def _carried(campaign: Campaign) -> _Run:
+    """Carry a campaign through every step, in the order of the workflow's rules."""
+    campaign.results.remove()
+    flight, begin = campaign.image_flights[0], (process_time(), perf_counter())
+    with contextlib.redirect_stdout(io.StringIO()):
+        for other in campaign.flights:
+            if other.kind == "calibration":
+                _echoes(campaign, other)
+                calibration.calibrate(campaign, other.name)
+        _echoes(campaign, flight)
+        scene.scene(campaign)
+        if campaign.settings.scene.dem:
+            scene.terrain(campaign)
+        for pair in flight.pairs:
+            profile.profile(campaign, flight.name, pair)
+        refine.refine(campaign, flight.name)
+        for pair in flight.pairs:
+            image.image(campaign, flight.name, pair)
+        assess.assess(campaign, flight.name)
+        cube.cube(replace(campaign, flights=(flight,)))
+        for pair in flight.pairs:
+            export.export(campaign, flight.name, pair)
+    taken = process_time() - begin[0], perf_counter() - begin[1]
+    files = [campaign.results / flight.name / pair / "image.json" for pair in flight.pairs]
+    return _Run(*taken, os.getloadavg()[0], [json.loads(file.read_text(encoding="utf-8")) for file in files])
+
+
+def _echoes(campaign: Campaign, flight: Flight) -> None:
+    if isinstance(campaign.settings.waveform, SampledWaveform):
+        for node in flight.nodes:
+            ingest.ingest(campaign, flight.name, node)
+    for pair in flight.pairs:
+        echo.echo(campaign, flight.name, pair)
+
+
+def _whole(name: str, runs: list[_Run]) -> Whole:
+    """Return one setting's point: of the pair that is worse; errors are the same in every run."""
+    reports, seconds = runs[0].reports, [run.seconds for run in runs]
+    focus = [report["focus"] for report in reports]
+    worst: dict[str, Any] = min((one for one in focus if "loss_db" in one), key=lambda one: one["loss_db"], default={})
+    return Whole(
+        name,
+        float(np.mean(seconds)),
+        min(seconds),
+        max(seconds),
+        float(np.mean([run.wall_seconds for run in runs])),
+        len(runs),
+        float(np.mean([run.load for run in runs])),
+        min(_expected_db(report) for report in reports),
+        worst.get("loss_db", float("nan")),
+        worst.get("std_db", float("nan")),
+        max(report["numerical_error_db"] for report in reports),
+        " ".join(sorted({flag for report in reports for flag in report["flags"]})),
+    )
+
+
+def _expected_db(report: Mapping[str, Any]) -> float:
+    """Return the loss of all causes that are expected, unrounded."""
+    return float(sum(line["loss_db"] for line in report["budget"] if is_counted(line)))
+
+
+def _title(campaign: Campaign, rows: list[Whole], repeats: int) -> str:
+    load = f"load {min(row.load for row in rows):.1f} to {max(row.load for row in rows):.1f} on {os.cpu_count()} cores"
+    flight = campaign.image_flights[0]
+    return (
+        f"{campaign.settings.campaign}, {flight.name}, {', '.join(flight.pairs)}: from raw samples to GeoTIFFs\n"
+        f"{_processor()}, {load}; mean, least and most of {repeats} runs, one thread"
+    )
+
+
+def _processor() -> str:
+    """Return the name of this machine's processor."""
+    with contextlib.suppress(OSError, StopIteration):
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        return next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
+    return platform.processor() or platform.machine()

@@ -1,0 +1,110 @@
+"""Before a flight: what it will give, by the functions that the pipeline describes images with after it.
+
+`design` returns layers of every image of a plan, what recording and processing take, and whether requirements are met;
+`judgement` names the first cause and the change that helps most, `search` moves tracks within bounds. Nothing here has
+a formula of its own that an image's description has.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from apertura.common.documents import validated
+from apertura.common.errors import CampaignError, quoted
+from apertura.tools.design.computed import Design, designed
+from apertura.tools.design.flight_plan import FlightPlan, read_flight_plan
+from apertura.tools.design.judgement import report_of
+from apertura.tools.design.layers import UNITS
+
+
+def design(
+    plan: FlightPlan | Mapping[str, Any] | str | Path, *, root: Path | None = None, threads: int = 1
+) -> xr.Dataset:
+    """Return what a planned flight will give, pixel by pixel, for each pair and for the sums of flights.
+
+    Parameters
+    ----------
+    plan
+        A YAML file, its document, or a `FlightPlan`: the keys of config/config.yaml, and flights with tracks; see
+        docs/howto/design.md.
+    root
+        Folder in which files that the plan names lie; by default that of the YAML file, else the current folder.
+    threads
+        Tiles computed at once.
+
+    Returns
+    -------
+    xarray.Dataset
+        Layers of `UNITS` over (image, y, x), float32, on the later campaign's grid: NaN where a layer says nothing of
+        an image; `coherence` and `height_ambiguity` over (interferogram, y, x). Attributes: `judgement` of each
+        requirement, `recording`, `budget` and `flags` of each image.
+
+    Raises
+    ------
+    CampaignError
+        If a key is unknown, a track leads through the ground or beyond the DEM, nodes collide, or the pulses are too
+        few for the scene.
+
+    Examples
+    --------
+    >>> import apertura as ap
+    >>> node = {"attitude": "log"}
+    >>> found = ap.design({
+    ...     "campaign": "meadow",
+    ...     "waveform": {"kind": "ofdm", "subcarriers": 512, "subcarrier_spacing_hz": 4e5, "symbol_s": 2.5e-6,
+    ...                  "cyclic_prefix_s": 1e-6, "carrier_hz": 1.3e9, "sample_rate_hz": 2.56e8, "prf_hz": 100.0},
+    ...     "nodes": {"uav1": node},
+    ...     "scene": {"crs": "local", "bounds_m": [-10, 20, 10, 40], "spacing_m": 1.0},
+    ...     "flights": {"f01": {"transmitter": "uav1", "receivers": ["uav1"], "tracks": {"uav1": {
+    ...         "kind": "line", "start_m": [-20, 0], "end_m": [20, 0], "height_m": 30.0, "speed_m_s": 5.0}}}},
+    ...     "require": {"resolution_m": 2.0, "coverage": 0.95}})
+    >>> found.sizes["image"], [line["met"] for line in found.attrs["judgement"]]
+    (1, [True, True])
+    """
+    return dataset_of(designed(*as_plan(plan, root), threads=threads))
+
+
+def as_plan(plan: FlightPlan | Mapping[str, Any] | str | Path, root: Path | None) -> tuple[FlightPlan, Path]:
+    """Return a plan, read if it is a file, and the folder that its files lie in."""
+    if isinstance(plan, str | Path):
+        return read_flight_plan(Path(plan)), root or Path(plan).absolute().parent
+    if not isinstance(plan, FlightPlan):
+        if not isinstance(plan, Mapping):
+            expected = "a flight plan: a YAML file, its keys as a mapping, or a FlightPlan"
+            raise CampaignError(quoted(plan), "design: plan", expected, "Begin with that of docs/howto/design.md.")
+        plan = validated(FlightPlan, dict(plan), where="plan", expected="keys of a flight plan, docs/howto/design.md")
+    return plan, root or Path.cwd()
+
+
+def dataset_of(design: Design) -> xr.Dataset:
+    """Return a design as a dataset; see `design`."""
+    grid = design.opened.scene.grid
+    images, shape = list(design.images), grid.shape
+    names = [name for name in UNITS if any(name in image.layers for image in design.images.values())]
+
+    def stacked(layers: list[Mapping[str, Any]], name: str) -> np.ndarray:
+        dtype = np.uint8 if name == "mask" else np.float32
+        values = np.empty((len(layers), *shape), dtype)
+        for at, one in enumerate(layers):
+            values[at] = one.get(name, np.nan)
+        return values
+
+    each = [image.layers for image in design.images.values()]
+    variables: dict[str, Any] = {name: (("image", "y", "x"), stacked(each, name)) for name in names}
+    between = list(design.interferograms.values())
+    variables |= {
+        name: (("interferogram", "y", "x"), stacked(between, name)) for name in (between[0] if between else ())
+    }
+    data = xr.Dataset(
+        variables,
+        coords={"image": images, "x": grid.x_m, "y": grid.y_m}
+        | ({"interferogram": list(design.interferograms)} if between else {}),
+        attrs={"campaign": design.opened.campaign.settings.campaign, "crs": grid.crs, **report_of(design)},
+    )
+    for name in data.data_vars:
+        unit, meaning = UNITS[str(name)]
+        data[name].attrs |= {"units": unit, "long_name": meaning}
+    return data

@@ -1,0 +1,229 @@
+"""A flight plan with the images it will give, and what recording and processing them takes."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+
+from apertura.campaign.config import FmcwWaveform, SampledWaveform
+from apertura.common.errors import CampaignError
+from apertura.core.echo.compression import centre_frequency
+from apertura.core.planning.plan import undersampling
+from apertura.formats.phase_histories.fmcw import sweep_of
+from apertura.methods.autofocus.expected import expected_remainder
+from apertura.stages.pair import OpenPair
+from apertura.stages.refine import autofocus_of, errors_of
+from apertura.tools.design.flight_plan import FlightPlan
+from apertura.tools.design.layers import (
+    Layer,
+    PlannedImage,
+    PlannedRefinement,
+    coherence_layers,
+    planned_image,
+    planned_job,
+    summed_image,
+)
+from apertura.tools.design.planned import OpenPlan, errors_of_the_plan, open_plan
+from apertura.workflow.lineage import places
+from apertura.workflow.resources import Resources
+from apertura.workflow.rules import RULES
+
+_SAMPLE_BYTES = 4  # I and Q of 16 bits
+_REAL_BYTES = 2
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What recording and processing take.
+
+    Attributes
+    ----------
+    flight_s
+        Flight → time in the air, turns included, seconds; with take-off, transit and landing where the plan has a home.
+    transfer_s
+        Flight → the part of it before the first pulse and after the last: 0 where no home is known.
+    pulses
+        Flight → pulses sent in that time.
+    node_bytes_s
+        Flight → node → bytes per second of flight.
+    recorded_bytes
+        Of all nodes and flights.
+    processing_s
+        Of the whole workflow on the machine that its costs are from, seconds.
+    memory_bytes
+        Of its largest job.
+    """
+
+    flight_s: Mapping[str, float]
+    transfer_s: Mapping[str, float]
+    pulses: Mapping[str, int]
+    node_bytes_s: Mapping[str, Mapping[str, float]]
+    recorded_bytes: int
+    processing_s: float
+    memory_bytes: int
+
+    @classmethod
+    def of(cls, opened: OpenPlan) -> "Recording":
+        """Return what a plan takes."""
+        campaign, waveform = opened.campaign, opened.campaign.settings.waveform
+        prf_hz = float(getattr(waveform, "prf_hz", None) or 0.0)
+        sizes, flight_s, pulses = dict[tuple[str, str], tuple[int, int]](), dict[str, float](), dict[str, int]()
+        rates, transfer_s = dict[str, dict[str, float]](), dict[str, float]()
+        for flight in campaign.flights:
+            courses, climb_m_s = opened.courses[flight.name].values(), opened.plan.flights[flight.name].climb_m_s
+            lasting_s = max(course.length_s for course in courses)
+            transfer_s[flight.name] = max(course.transfer_s(climb_m_s) for course in courses)
+            count = int(lasting_s * prf_hz) + 1
+            flight_s[flight.name] = lasting_s + transfer_s[flight.name]
+            pulses[flight.name], rates[flight.name] = count, {}
+            for node in flight.participants:
+                if isinstance(waveform, SampledWaveform):
+                    channels = 1 if node == flight.transmitter else 2  # the sidelink beside the radar
+                    capture = waveform.capture_samples * channels * _SAMPLE_BYTES
+                elif isinstance(waveform, FmcwWaveform):
+                    samples = sweep_of(waveform.model_dump()).sweep_samples
+                    capture = samples * (_REAL_BYTES if waveform.iq == "real" else _SAMPLE_BYTES)
+                sizes[flight.name, node] = capture * count, count
+                rates[flight.name][node] = capture * prf_hz
+        scene = opened.scene
+        with_grid = campaign.settings.scene.model_copy(
+            update={"bounds_m": scene.grid.bounds_m, "spacing_m": scene.grid.spacing_m}
+        )
+        settled = campaign.settings.model_copy(update={"scene": with_grid})
+        asked = Resources(replace(campaign, settings=settled), sizes)
+        jobs = [(name, where) for name, rule in RULES.items() if not rule.on_demand for where in places(campaign, rule)]
+        wildcards = [
+            (name, SimpleNamespace(**dict(zip(RULES[name].of.wildcards, where, strict=False)))) for name, where in jobs
+        ]
+        memory_mb = [asked[name].mem_mb(which, 1) for name, which in wildcards if RULES[name].demand is not None]
+        return cls(
+            flight_s,
+            transfer_s,
+            pulses,
+            rates,
+            sum(size for size, _ in sizes.values()),
+            sum(asked.expected_seconds(name, *where) for name, where in jobs),
+            int(max(memory_mb, default=0) * 1e6),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Design:
+    """What a plan will give.
+
+    Attributes
+    ----------
+    opened
+        The plan.
+    images
+        flight/pair or flight/sum → image.
+    interferograms
+        Key of interferometry.pairs → its layers.
+    refinements
+        Flight → refinement of its tracks.
+    recording
+        What recording and processing take.
+    """
+
+    opened: OpenPlan
+    images: Mapping[str, PlannedImage]
+    refinements: Mapping[str, PlannedRefinement]
+    interferograms: Mapping[str, Mapping[str, Layer]]
+    recording: Recording
+
+    @property
+    def judged(self) -> list[PlannedImage]:
+        """The images that requirements are of: the sum of each flight, or its one pair."""
+        found = []
+        for flight in self.opened.campaign.flights:
+            name = f"{flight.name}/sum"
+            found.append(self.images.get(name) or self.images[f"{flight.name}/{flight.pairs[0]}"])
+        return found
+
+
+def designed(plan: FlightPlan, root: Path, *, threads: int = 1, coarse: int | None = None) -> Design:
+    """Return what a plan will give.
+
+    Parameters
+    ----------
+    plan
+        As read.
+    root
+        Folder in which files that it names lie.
+    threads
+        Tiles computed at once.
+    coarse
+        Pixels along the longer side of a coarser grid, integrated as the fine one; None: the grid itself.
+
+    Raises
+    ------
+    CampaignError
+        As `open_plan`, and where pulses are too few for the scene.
+    """
+    opened = open_plan(plan, root)
+    with errors_of_the_plan():
+        for pair in opened.pairs:  # on the grid itself: corners of a coarser one spread less
+            _check_sampled(opened, pair)
+        return _computed(opened, threads=threads, coarse=coarse)
+
+
+def _computed(opened: OpenPlan, *, threads: int, coarse: int | None) -> Design:
+    plan, recording = opened.plan, Recording.of(opened)
+    if coarse is not None:
+        opened = opened.coarse(coarse)
+    images, refinements = dict[str, PlannedImage](), dict[str, PlannedRefinement]()
+    for flight in opened.campaign.flights:
+        pairs = [pair for pair in opened.pairs if pair.flight == flight.name]
+        refinements[flight.name] = _refinement(opened, pairs)
+        own = [
+            planned_image(
+                opened.campaign,
+                pair,
+                opened.scene,
+                sigma0_db=plan.expect.sigma0_db,
+                rcs_dbsm=plan.expect.rcs_dbsm,
+                refinement=refinements[flight.name],
+                threads=threads,
+            )
+            for pair in pairs
+        ]
+        images |= {image.name: image for image in own}
+        if len(own) > 1:
+            total = summed_image(flight.name, own)
+            images[total.name] = total
+    by_name = {f"{pair.flight}/{pair.name}": pair for pair in opened.pairs}
+    interferograms = {
+        name: coherence_layers(opened.scene, (by_name[one], by_name[other]), (images[one], images[other]))
+        for name, (one, other) in opened.campaign.settings.interferometry.pairs.items()
+    }
+    return Design(opened, images, refinements, interferograms, recording)
+
+
+def _refinement(opened: OpenPlan, pairs: Sequence[OpenPair]) -> PlannedRefinement:
+    """Return whether the plan has the tracks of a flight refined, and what that is expected to leave."""
+    errors = errors_of([replace(pair, positions=tuple(one.assumed for one in pair.positions)) for pair in pairs])
+    remainder_db, obstacles = expected_remainder(
+        errors.values(),
+        wavelength_m=pairs[0].wave_speed_m_s / centre_frequency(pairs[0].frequency_hz),
+        pulse_interval_s=float(np.median(np.diff(pairs[0].time_s))),
+    )
+    decision, *_ = autofocus_of(opened.campaign, pairs, opened.scene)
+    return PlannedRefinement(decision, remainder_db, tuple(obstacles))
+
+
+def _check_sampled(opened: OpenPlan, pair: OpenPair) -> None:
+    """Raise CampaignError where pulses are so few that ghosts and folded echoes show."""
+    job, _, _ = planned_job(opened.campaign, pair, opened.scene)
+    if sparse := undersampling(job):
+        prf_hz = float(getattr(opened.plan.waveform, "prf_hz", None) or 0.0)
+        spread, _ = job.aperture.phase_rates(job.points_m, wavelength_m=pair.wave_speed_m_s / job.band_hz[1])
+        doppler_hz = spread / float(np.median(np.diff(pair.time_s)))
+        raise CampaignError(
+            f"{pair.flight}/{pair.name}: {sparse}",
+            "the plan: waveform.prf_hz",
+            f"{math.ceil(doppler_hz)} Hz or more, the spread of Doppler over the scene, instead of {prf_hz:g} Hz",
+            "Raise it, fly slower, state the antennas' beams, or make the scene smaller.",
+        )

@@ -1,0 +1,165 @@
+"""A design as files: layers as GeoTIFFs on the later campaign's grid, tracks and footprints, the campaign's config."""
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from rasterio import Affine
+
+from apertura import __version__
+from apertura.campaign.config import FLIGHTS
+from apertura.common.atomic import made_folder, write_json, write_text
+from apertura.common.confined import ConfinedPath
+from apertura.common.errors import CampaignError
+from apertura.common.provenance import canonical_json
+from apertura.core.geometry.geodesy import LOCAL
+from apertura.formats.campaign_files import write_config
+from apertura.formats.export.cog import Band, write_cog
+from apertura.formats.export.coverage import Covered, feature_collection, placed_footprint, write_coverage
+from apertura.formats.export.layers import BISTATIC_ANGLE, INCIDENCE, LOOKS, MASK
+from apertura.formats.export.style import write_layer_style, write_mask_style
+from apertura.formats.tracks.missions import write_kml
+from apertura.stages.coverage import crs_name, place_of, transform_of
+from apertura.tools.design.computed import Design
+from apertura.tools.design.flight_plan import FlightPlan
+from apertura.tools.design.judgement import Tried, report_of, tried_report
+from apertura.tools.design.layers import UNITS
+
+_BANDS = {"incidence": INCIDENCE, "bistatic_angle": BISTATIC_ANGLE, "mask": MASK, "looks": LOOKS}
+_DOTS = 480  # of the longer side of the scene, in footprints
+_VERTICES = 400  # of a track
+
+
+def write_design(design: Design, folder: Path, tried: Sequence[Tried] = ()) -> list[Path]:
+    """Write layers, tracks, footprints, a map and design.json into a folder; return their paths.
+
+    Parameters
+    ----------
+    design
+        As computed on the grid itself.
+    folder
+        Made where it is not there; files of the same names are replaced.
+    tried
+        Plans that a search tried: those that no other beats are in design.json.
+    """
+    folder, grid, written = made_folder(folder), design.opened.scene.grid, list[Path]()
+    place = {"transform": Affine(*grid.transform), "crs": grid.crs_wkt}
+    tags = tags_of(design)
+    images = {name: image.layers for name, image in design.images.items()}
+    for name, layers in {
+        **images,
+        **{f"interferometry/{one}": own for one, own in design.interferograms.items()},
+    }.items():
+        for layer, values in layers.items():
+            path = folder / name / f"{layer}.tif"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            unit, meaning = UNITS[layer]
+            band = _BANDS.get(layer) or Band("float32", np.nan, unit, meaning, "AVERAGE")
+            title = f"{design.opened.campaign.settings.campaign} · {name} · {layer}, planned"
+            write_cog(path, values.astype(band.dtype), band, **place, tags=tags, title=title)
+            style = path.with_suffix(".qml")
+            (write_mask_style if layer == "mask" else write_layer_style)(style)
+            written += [path, style]
+    return [*written, *_write_tracks(design, folder), _write_report(design, folder, tried)]
+
+
+PICTURE_TAGS = {"APERTURA_VERSION": __version__, "APERTURA_PLANNED": "true"}
+"""What pictures of a design say of where they come from; rasters name their plan, too."""
+
+
+def tags_of(design: Design) -> dict[str, str]:
+    """Return what rasters of a design say of where they come from."""
+    plan = design.opened.plan.model_dump(mode="json", exclude_unset=True)
+    return PICTURE_TAGS | {"APERTURA_PLAN": canonical_json(plan)}
+
+
+def _write_report(design: Design, folder: Path, tried: Sequence[Tried]) -> Path:
+    write_json(folder / "design.json", report_of(design) | ({"plans": tried_report(tried)} if tried else {}))
+    return folder / "design.json"
+
+
+def _write_tracks(design: Design, folder: Path) -> list[Path]:
+    """Write coverage.png, tracks.geojson and, of a scene on Earth, tracks.kml."""
+    scene, covered = design.opened.scene, list(_covered(design))
+    transform = transform_of(scene.grid, covered[0].looks)
+    title = f"{design.opened.campaign.settings.campaign} · planned"
+    picture, features = folder / "coverage.png", folder / "tracks.geojson"
+    name, local = crs_name(scene.grid), scene.grid.crs == LOCAL
+    write_coverage(picture, covered, transform, crs_name=name, title=title, tags=PICTURE_TAGS, local=local)
+    on_earth = place_of(scene)
+    found = feature_collection(covered, transform, on_earth, height_m=scene.level.height_m)
+    write_text(features, canonical_json(found) + "\n")
+    if on_earth is None:
+        return [picture, features]
+
+    lines = {
+        f"{flight} {node}": np.asarray(on_earth(course.place_m[:: max(1, len(course.place_m) // _VERTICES)]))
+        for flight, nodes in design.opened.courses.items()
+        for node, course in nodes.items()
+    }
+    areas = {
+        f"{one.flight} {one.pair}": placed_footprint(one.looks, transform, on_earth, height_m=scene.level.height_m)
+        for one in covered
+    }
+    write_kml(folder / "tracks.kml", title, lines, areas)
+    return [picture, features, folder / "tracks.kml"]
+
+
+def _covered(design: Design) -> Iterator[Covered]:
+    for pair in design.opened.pairs:
+        image = design.images[f"{pair.flight}/{pair.name}"]
+        step = max(1, max(image.layers["mask"].shape) // _DOTS)
+        looks = np.where(image.layers["mask"] == 0, image.layers["looks"], 0)[::step, ::step].astype(np.float32)
+        courses, nodes = design.opened.courses[pair.flight], pair.name.split("-")
+        legs = dict(zip(("transmitter", "receiver"), dict.fromkeys(nodes), strict=False))
+        tracks = {
+            leg: courses[node].place_m[:: max(1, len(courses[node].place_m) // _VERTICES)] for leg, node in legs.items()
+        }
+        imaged = {leg: courses[node].imaged_legs_m() for leg, node in legs.items()}
+        yield Covered(pair.flight, pair.name, tracks, looks, imaged)
+
+
+def write_campaign_config(plan: FlightPlan, directory: Path) -> Sequence[Path]:
+    """Write the config of the campaign that a plan becomes, ready for its recordings.
+
+    Raises
+    ------
+    CampaignError
+        If a config is there already; nothing is changed then.
+    """
+    directory = made_folder(directory)
+    paths = [directory / "config" / "config.yaml", directory / FLIGHTS]
+    for path in paths:
+        if path.exists():
+            raise CampaignError("exists already", path, "a new folder", "Choose another folder; nothing was changed.")
+    (directory / "config").mkdir(parents=True, exist_ok=True)
+    for flight in plan.image_flights:
+        (directory / "raw" / flight.name).mkdir(parents=True, exist_ok=True)
+    flights = [(one.name, one.kind, one.transmitter, one.nodes) for one in plan.image_flights]
+    write_config(directory, plan.document, flights)
+    return paths
+
+
+def plan_text(plan: FlightPlan) -> str:
+    """Return a plan as YAML, without what is at its default; `read_flight_plan` reads it back."""
+    return yaml.safe_dump(plan.model_dump(mode="json", exclude_unset=True), sort_keys=False, width=110)
+
+
+def copy_named(plan: FlightPlan, root: Path, folder: Path) -> None:
+    """Copy the files that a plan names, missions and heights, to the same places of another folder: it runs there."""
+
+    def named(value: Any) -> Iterator[str]:
+        if isinstance(value, str):
+            yield value
+        for part in value.values() if isinstance(value, dict) else value if isinstance(value, list | tuple) else ():
+            yield from named(part)
+
+    root, folder = ConfinedPath.at(root), made_folder(folder)
+    names = {Path(name) for name in named(plan.model_dump(mode="json", exclude_unset=True)) if name}
+    for name in sorted(name for name in names if not name.is_absolute() and ".." not in name.parts):
+        source, copy = root / name, folder / name
+        if source.is_file() and copy.real() != source.real():
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            source.copy_to(copy)

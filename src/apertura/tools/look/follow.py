@@ -1,0 +1,366 @@
+"""A campaign shown while it flies: pictures, verdicts and a page in results/look, until its recordings end."""
+
+import html
+import json
+import signal
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from functools import cache
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import numpy as np
+
+from apertura import __version__
+from apertura.campaign.config import CONFIG, SampledWaveform
+from apertura.campaign.folder import Campaign
+from apertura.common.atomic import write_json, write_text
+from apertura.common.errors import CampaignError
+from apertura.common.flags import Flags
+from apertura.common.processes import as_typed
+from apertura.core.planning.plan import Plan
+from apertura.core.scene.grid import SceneGrid
+from apertura.formats.export import LOOK
+from apertura.formats.export.quicklook import write_quicklook
+from apertura.stages.pair import open_pair
+from apertura.stages.scene import ConfiguredGround, Flown, settled
+from apertura.stages.transfer import PairEcho, recorded_echo
+from apertura.stages.transmitted import transmitted
+from apertura.tools.look.image import Block
+from apertura.tools.look.live_map import LiveMap, placed_on
+from apertura.tools.look.node import NodeSoFar
+from apertura.tools.look.pair import PairSoFar
+
+_POLLS = 2  # looks at the files for each picture
+_BEHIND = 3  # times the seconds between pictures: a delay above it takes every other pulse
+_AT_EASE = 0.3  # busy share of the time below which all of them are taken again
+_MOST_DECIMATED = 64
+
+
+class Look:
+    """A campaign while it flies.
+
+    Parameters
+    ----------
+    campaign
+        Its folder, whose recordings may still grow.
+    follow
+        Whether they do: what is there is else taken once.
+    every_s
+        Seconds between pictures.
+    end_after_s
+        Seconds without growth after which recordings have ended; they also have where they state the hash of their
+        samples and these are there.
+    threads
+        Tiles formed at once.
+
+    Raises
+    ------
+    CampaignError
+        If nothing becomes an image, or what is recorded cannot be followed.
+    """
+
+    def __init__(
+        self, campaign: Campaign, *, follow: bool, every_s: float = 5.0, end_after_s: float = 10.0, threads: int = 1
+    ) -> None:
+        campaign.check_images()
+        self.campaign, self.follow, self.every_s, self.end_after_s = campaign, follow, every_s, end_after_s
+        self.finish = threading.Event()
+        """Set: the recordings have ended."""
+        self.decimated, self.busy_s = 1, 0.0
+        self._map = LiveMap(campaign, LOOK, every_s=every_s)
+        self._delay_s = np.inf  # of the picture before
+        self._reported = set[str]()  # errors of files, printed once each
+        waveform = campaign.settings.waveform
+        self.nodes: dict[tuple[str, str], NodeSoFar] = {}
+        self.pairs: list[PairSoFar] = []
+        self._settled: tuple[SceneGrid, ConfiguredGround] | None = None
+        if not isinstance(waveform, SampledWaveform):
+            if follow:
+                raise CampaignError(
+                    f"waveform.kind {waveform.kind}, whose files state how much they hold before they hold it",
+                    campaign.root / CONFIG,
+                    "ofdm or samples, recorded as SigMF, for --follow",
+                    "Look without --follow at what has been written whole.",
+                )
+            for flight in campaign.image_flights:
+                for pair in flight.pairs:
+                    echo = PairEcho.recorded(recorded_echo(campaign, flight.name, pair))
+                    echo = echo.within(campaign, flight.name, pair)
+                    self.pairs.append(PairSoFar(campaign, flight.name, pair, self._scene, echo))
+            return
+        check_bounds(campaign, follow=follow)
+        sent, plans = transmitted(campaign, waveform), dict[int, Plan]()
+        for flight in campaign.image_flights:
+            for node in flight.participants:
+                self.nodes[flight.name, node] = NodeSoFar(campaign, flight.name, node, sent, follow=follow)
+            for pair in flight.pairs:
+                tx, rx = (self.nodes[flight.name, node] for node in pair.split("-"))
+                self.pairs.append(
+                    PairSoFar(campaign, flight.name, pair, self._scene, None, tx, rx, sent, threads, plans)
+                )
+
+    def _scene(self, block: Block) -> tuple[SceneGrid, ConfiguredGround]:
+        """Return the grid of all pairs and its ground; what is `auto` is settled by all that has come, once.
+
+        Of a flight that is followed, whose bounds are stated, by its first block.
+        """
+        if self._settled is None:
+            campaign, history = self.campaign, block.history
+            here = Flown(history.aperture, history.frequency_hz, np.inf)
+            self._settled = settled(campaign, cache(lambda: here if self.follow else self._flown()))[:2]
+        return self._settled
+
+    def _flown(self) -> Flown:
+        """Return what all pairs of the first flight flew, by its logs."""
+        pairs = [pair for pair in self.pairs if pair.flight == self.pairs[0].flight]
+        tags = [None if pair.tx is None else pair.tx.time for pair in pairs]
+        opened = (
+            open_pair(self.campaign, one.flight, one.name, recorded=at) for one, at in zip(pairs, tags, strict=True)
+        )
+        return Flown.together([pair.flown for pair in opened])
+
+    def _read(self) -> bool:
+        """Read what has come; begin anew the pairs of nodes whose files did. Return whether anything has come."""
+        grown = [node.read() for node in self.nodes.values()]
+        for node in self.nodes.values():
+            # While nothing was read, the lines of the pairs say what they wait for.
+            if node.waits and self.follow and node.has_read and node.waits not in self._reported:
+                self._reported.add(node.waits)
+                print(f"{datetime.now(UTC):%H:%M:%S}  {node.name} is not read at present: {node.waits}", flush=True)
+            if not node.begun_anew:
+                continue
+            print(f"{datetime.now(UTC):%H:%M:%S}  {node.begun_anew}", flush=True)
+            node.begun_anew = ""
+            for number, pair in enumerate(self.pairs):
+                if node in (pair.tx, pair.rx):
+                    self._map.drop(pair)
+                    self._picture(pair).unlink(missing_ok=True)
+                    self.pairs[number] = pair.anew()
+        return any(grown)
+
+    def run(self) -> None:
+        """Read, add and show until the recordings end, and then what the fine images still lack."""
+        poll_s, shown_at, ended = self.every_s / _POLLS, time.monotonic(), False
+        self._map.begin()
+        while not ended:
+            polled = time.monotonic()
+            grown = self._read()
+            grown_at = [node.grown_at for node in self.nodes.values() if node.grown_at is not None]
+            idle = bool(grown_at) and time.monotonic() - max(grown_at) > self.end_after_s
+            complete = not grown and all(node.complete for node in self.nodes.values())
+            ended = not self.follow or self.finish.is_set() or idle or complete
+            if self.follow and idle and not (complete or self.finish.is_set()):
+                lacks = "; ".join(node.lacks for node in self.nodes.values() if node.lacks)
+                print(f"ended: nothing has come for {self.end_after_s:g} s (--end-after); {lacks}", flush=True)
+            self._add(ended=ended, until=shown_at + self.every_s)
+            self.busy_s += time.monotonic() - polled
+            while not ended and time.monotonic() < polled + poll_s and any(one.refine_next() for one in self.pairs):
+                pass
+            if ended or time.monotonic() >= shown_at + self.every_s:
+                while ended and any(one.refine_next() for one in self.pairs):
+                    pass
+                self.show(ended=ended, elapsed_s=time.monotonic() - shown_at)
+                shown_at = time.monotonic()
+            elif not ended:
+                self.finish.wait(max(0.0, polled + poll_s - time.monotonic()))
+
+    def _add(self, *, ended: bool, until: float) -> None:
+        """Add what has come, pair by pair in turn, until it is time to show it."""
+        more = True
+        while more and (ended or time.monotonic() < until):
+            added = [one.add_next(ended=ended, every=self.decimated) for one in self.pairs]
+            more = any(added)
+
+    def show(self, *, ended: bool, elapsed_s: float) -> None:
+        """Write pictures, status and page, and say each in a line; take fewer pulses where it has fallen behind."""
+        began = time.monotonic()
+        pairs = {}
+        for pair in self.pairs:
+            told = self.show_pair(pair)
+            pairs[f"{pair.flight}/{pair.name}"] = told
+            print(f"{datetime.now(UTC):%H:%M:%S}  {_line(pair, told, self.decimated)}", flush=True)
+        delays = [one["delay_s"] for one in pairs.values() if one["delay_s"] is not None]
+        status = {
+            "campaign": self.campaign.settings.campaign,
+            "shown": f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ}",
+            "state": "ended" if ended else "following",
+            "one_pulse_in": self.decimated,
+            "pairs": pairs,
+        }
+        folder = self.campaign.result(LOOK)
+        write_json(folder / "status.json", status)
+        self._map.write(ended=ended)
+        write_text(folder / "index.html", _page(status, refresh_s=0 if ended else max(1, round(self.every_s))))
+        self.busy_s += time.monotonic() - began
+        busy = self.busy_s / max(elapsed_s, 1e-3)
+        self.busy_s = 0.0
+        delay_s, before_s = max(delays, default=0.0), self._delay_s
+        self._delay_s = delay_s if delays else before_s
+        if not ended and delay_s > max(before_s, _BEHIND * self.every_s):  # and it does not catch up
+            self.decimated = min(_MOST_DECIMATED, 2 * self.decimated)
+        elif busy < _AT_EASE and self.decimated > 1:
+            self.decimated //= 2
+
+    def show_pair(self, pair: PairSoFar) -> dict[str, Any]:
+        """Write the picture of a pair; return what is known of it, for the status."""
+        shown = pair.shown
+        told: dict[str, Any] = {"pulses": pair.counts, "waits": pair.waits, "delay_s": None, "image": None}
+        if shown is None or not shown.sums.any():
+            return told
+        judged, bound_db = pair.judged(), float(shown.error_db)
+        error_db = round(bound_db, 1) if np.isfinite(bound_db) else None
+        told |= {"peak": shown.peak, **judged, "flags": Flags.merged(pair.flags, judged["flags"])}
+        told |= {"share": shown.share, "error_db": error_db}
+        told |= {"spacing_m": shown.grid.spacing_m, "setting": shown.setting}
+        told["delay_s"] = pair.delay_s
+        path = self._picture(pair)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._draw(path, pair, told)
+        self._map.add(pair, told)
+        if pair.tx is not None:
+            pair.tx.read()
+            if pair.tx.begun_anew:
+                return {"pulses": pair.anew().counts, "waits": "", "delay_s": None, "image": None}
+        told |= {"delay_s": pair.delay_s, "pulses": pair.counts}  # when the picture is there
+        told["image"] = f"{pair.flight}/{pair.name}.png"
+        return told
+
+    def _picture(self, pair: PairSoFar) -> Path:
+        return self.campaign.result(LOOK, pair.flight, f"{pair.name}.png")
+
+    def _draw(self, path: Path, pair: PairSoFar, told: Mapping[str, Any]) -> None:
+        shown = pair.shown
+        if shown is None:
+            raise TypeError("a pair without an image is not drawn")
+        image, grid = shown.image, shown.grid
+        image[image == 0] = np.complex64(complex(np.nan, np.nan))  # no pulse has seen it yet
+        focus = {"verdict": told["verdict"], **({"loss_db": told["loss_db"]} if "loss_db" in told else {})}
+        tags = {
+            "APERTURA_VERSION": __version__,
+            "APERTURA_FOCUS": json.dumps(focus),
+            **({} if told["error_db"] is None else {"APERTURA_ERROR_DB": f"{told['error_db']:g}"}),
+            **({"APERTURA_FLAGS": json.dumps(told["flags"])} if told["flags"] else {}),
+        }
+        write_quicklook(
+            path,
+            image,
+            **placed_on(grid),
+            tags=tags,
+            title=f"{self.campaign.settings.campaign} · {pair.flight} {pair.name}, so far",
+            subtitle=_subtitle(pair, told, self.decimated),
+            markers=[(told["peak"]["x_m"], told["peak"]["y_m"], "peak")],
+        )
+
+
+def check_bounds(campaign: Campaign, *, follow: bool) -> None:
+    """Raise CampaignError where the scene of a campaign that is followed follows from the whole flight."""
+    if follow and campaign.settings.scene.bounds_m == "auto":
+        raise CampaignError(
+            "auto, which is settled by a whole flight",
+            where=f"{campaign.root / CONFIG}: scene.bounds_m",
+            expected="the bounds to look at, for --follow",
+            remedy="State scene.bounds_m.",
+        )
+
+
+@contextmanager
+def finished_by_interrupt(look: Look) -> Iterator[None]:
+    """Let Ctrl-C end the recordings once; a second one ends the command, as ever."""
+
+    def finish(_: int, __: FrameType | None) -> None:
+        signal.signal(signal.SIGINT, before)
+        print("finishing with what has come; Ctrl-C again to stop", flush=True)
+        look.finish.set()
+
+    before = signal.signal(signal.SIGINT, finish)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def look_at(campaign: Campaign, *, follow: bool, every_s: float, end_after_s: float, threads: int) -> None:
+    """Show a campaign as far as it has come, until its recordings end."""
+    look = Look(campaign, follow=follow, every_s=every_s, end_after_s=end_after_s, threads=threads)
+    print(f"shown in {as_typed(campaign.result(LOOK, 'index.html'))}", flush=True)
+    if not follow:
+        look.run()
+        return
+    with finished_by_interrupt(look):
+        look.run()
+
+
+# ---- In words -------------------------------------------------------------------------------------------------------
+
+
+def _decimation(every: int) -> str:
+    return f"1 pulse in {every}" if every > 1 else ""
+
+
+def _behind(delay_s: float | None) -> str:
+    return "" if delay_s is None else f"{delay_s:.1f} s behind"
+
+
+def _extent(told: Mapping[str, Any]) -> str:
+    of = "coarse: half the band, every 2nd pixel" if told["share"] == 2 else "fine"
+    return f"{of} ({told['spacing_m']:g} m)"
+
+
+def _subtitle(pair: PairSoFar, told: Mapping[str, Any], every: int) -> str:
+    until = "" if pair.until is None else f"{str(pair.until)[11:21]}Z"
+    words = (
+        f"{told['pulses']['added']} pulses to {until}",
+        _behind(told["delay_s"]),
+        _decimation(every),
+        _extent(told),
+    )
+    return " · ".join(word for word in words if word)
+
+
+def _line(pair: PairSoFar, told: Mapping[str, Any], every: int) -> str:
+    name, counts = f"{pair.flight} {pair.name}", told["pulses"]
+    if told["image"] is None:
+        return f"{name}: no image yet, {counts['recorded']} pulses recorded{told['waits'] and '; '}{told['waits']}"
+    words = (
+        f"{counts['added']} of {counts['recorded']} pulses",
+        _behind(told["delay_s"]),
+        _decimation(every),
+        _extent(told),
+        told["verdict"],
+        f"peak at {told['peak']['x_m']:.2f}, {told['peak']['y_m']:.2f}",
+        ", ".join(flag for flag in told["flags"] if flag != told["verdict"]),
+    )
+    return f"{name}: {'; '.join(word for word in words if word)}"
+
+
+def _page(status: Mapping[str, Any], *, refresh_s: int) -> str:
+    """Return a page of pictures and words that needs no net, and reads itself again while the campaign flies."""
+    again = f'<meta http-equiv="refresh" content="{refresh_s}">' if refresh_s else ""
+    title = html.escape(f"{status['campaign']}, so far")
+    parts = []
+    for name, told in status["pairs"].items():
+        picture = f'<img src="{html.escape(told["image"])}" alt="">' if told["image"] else "<p>no image yet</p>"
+        rows = "".join(
+            f"<tr><th>{html.escape(key)}</th><td>{html.escape(_cell(value))}</td></tr>"
+            for key, value in told.items()
+            if key != "image" and value not in (None, "", {})
+        )
+        parts.append(f"<section><h2>{html.escape(name)}</h2>{picture}<table>{rows}</table></section>")
+    style = "body{font-family:sans-serif;margin:1em}section{display:inline-block;vertical-align:top;max-width:48em}"
+    style += "img{max-width:100%}th{text-align:left;vertical-align:top;padding-right:1em;font-weight:normal;color:#555}"
+    state = html.escape(f"{status['state']}, shown {status['shown']}, 1 pulse in {status['one_pulse_in']} taken")
+    return (
+        f'<!doctype html><html lang="en"><head><meta charset="utf-8">{again}<title>{title}</title>'
+        f"<style>{style}</style></head><body><h1>{title}</h1><p>{state}</p>{''.join(parts)}</body></html>\n"
+    )
+
+
+def _cell(value: object) -> str:
+    if isinstance(value, Mapping):
+        return "; ".join(f"{key}: {one}" for key, one in value.items())
+    return str(value)

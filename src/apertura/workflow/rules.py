@@ -1,0 +1,641 @@
+"""The rules of the workflow, one row each: what a rule makes, of what, by which module, at what cost.
+
+Lineage, resources, the time left, `apertura step` and the headers of the rules in `workflow/` follow from the rows.
+They name modules as text, since the command line reads them, too: what a row needs is imported when it is asked.
+"""
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+from apertura.workflow import rule_inputs as inputs
+from apertura.workflow.rule_inputs import Scope
+
+INTERFEROMETRY = "interferometry"
+"""Folder of the results: pairs of images compared in phase."""
+
+STUDY = "study"
+"""Folder of the results: measurements that are made on demand."""
+
+EVERY = "*"
+"""Source of a result that describes all results that are not made on demand."""
+
+
+@dataclass(frozen=True)
+class Demand:
+    """What a job takes of a cluster: a constant, and what grows with its work, from measured runs.
+
+    Attributes
+    ----------
+    base_mb
+        Resident memory whatever the work; what was measured on small work, and half as much again.
+    pulse_bytes, pixel_bytes, tile_bytes, image_bytes
+        Memory per pulse, per pixel in memory at once, per tile to be formed, and per image that is described.
+    profile_share
+        Memory per byte of range profiles in memory at once.
+    threads
+        As many as it can use.
+    recorded_s
+        Seconds per GB recorded.
+    pixel_s
+        Seconds per million pixels and image.
+    sum_s
+        Seconds of one thread per 1e9 pixels times pulses.
+    """
+
+    base_mb: float
+    pulse_bytes: float = 0.0
+    pixel_bytes: float = 0.0
+    tile_bytes: float = 0.0
+    image_bytes: float = 0.0
+    profile_share: float = 0.0
+    threads: int = 1
+    recorded_s: float = 0.0
+    pixel_s: float = 0.0
+    sum_s: float = 0.0
+
+
+@dataclass(frozen=True)
+class Cost:
+    """How long a job is expected to take on two cores of 2025, begun by a fork: a run tells it by its own steps.
+
+    Attributes
+    ----------
+    begin_s
+        Seconds whatever the work.
+    mb_s, mpx_s, mb_mpx_s
+        Seconds per MB recorded, per million pixels, and per both.
+    all_cores
+        Whether a job takes all cores.
+    last
+        Whether no other rule waits for it, or hardly.
+    """
+
+    begin_s: float = 0.4
+    mb_s: float = 0.0
+    mpx_s: float = 0.0
+    mb_mpx_s: float = 0.0
+    all_cores: bool = False
+    last: bool = False
+
+    @property
+    def of_imaging(self) -> bool:
+        """Whether a job sums pulses over pixels: what that takes the plan decides, by orders of magnitude."""
+        return bool(self.mb_mpx_s)
+
+    @property
+    def of_rasters(self) -> bool:
+        """Whether a job reads and writes rasters and does little else: such jobs are alike."""
+        return bool(self.mpx_s) and not self.mb_s and not self.mb_mpx_s
+
+
+@dataclass(frozen=True)
+class Rule:
+    """One rule of the workflow.
+
+    Attributes
+    ----------
+    name
+        As the workflow calls it.
+    of
+        What each of its jobs runs on.
+    help
+        What it does, in a sentence; `apertura step` shows it.
+    step
+        ``module:function`` that does it.
+    sources
+        What it reads: names of results, of the same place or of all places that belong to it, and functions of a place
+        that return further manifests and files, relative to the campaign folder.
+    settings
+        What of the config matters to it: dotted keys, and functions of a place that return further values by name.
+    demand
+        What a job takes of a cluster; None where Snakemake itself does the work.
+    cost
+        How long a job is expected to take.
+    result
+        Name of what it makes; empty: as the rule.
+    products
+        Files beside the manifest that people open.
+    documents
+        Files beside the manifest that other rules read.
+    exports
+        Kind of the rows of `apertura.formats.export` that it writes.
+    styles
+        Whether it writes the styles of all rows.
+    manifest
+        Path below the results, without ``.manifest.json``; empty: by the place and the name of the result.
+    kinds
+        Kinds of flights that it is made of.
+    needed
+        Whether a place has it at all.
+    on_demand
+        Whether it is made when it is asked for, and not with the images.
+    shares
+        Whether it only does a share of the work behind `result`, which another rule completes.
+    forms
+        Whether its step reads transfer functions of its pairs, which are formed from the recordings of receivers.
+    reads
+        Which readers of what was recorded count as its code, where its step reads: of recordings, of logs.
+    command
+        As `apertura step` calls it; empty: as the rule.
+    arguments, options
+        Of that command; no arguments: the wildcards.
+    last_words
+        Words that follow the wildcards, where the command serves several rules.
+    """
+
+    name: str
+    of: Scope
+    help: str
+    step: str
+    sources: tuple[inputs.SourceSpec, ...]
+    settings: tuple[inputs.SettingSpec, ...] = ()
+    demand: Demand | None = None
+    cost: Cost = Cost()
+    result: str = ""
+    products: tuple[str, ...] = ()
+    documents: tuple[str, ...] = ()
+    exports: str = ""
+    styles: bool = False
+    manifest: str = ""
+    kinds: tuple[str, ...] = ("image",)
+    needed: Callable[[inputs.JobPlace], bool] = lambda _: True
+    on_demand: bool = False
+    shares: bool = False
+    forms: bool = False
+    reads: tuple[str, ...] = ("recordings", "logs")
+    command: str = ""
+    arguments: tuple[str, ...] = ()
+    options: tuple[str, ...] = ()
+    last_words: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Fill in what follows from the name and the place."""
+        folder = "/".join(f"{{{word}}}" for word in self.of.wildcards)
+        follows = {
+            "result": self.name,
+            "manifest": f"{folder}/{self.result or self.name}".removeprefix("/"),
+            "command": self.name.replace("_", "-"),
+            "arguments": self.of.wildcards,
+        }
+        for field, value in follows.items():
+            if not getattr(self, field):
+                object.__setattr__(self, field, value)
+
+    @property
+    def module(self) -> str:
+        """Dotted name of the module of its step."""
+        return self.step.partition(":")[0]
+
+    @property
+    def folder(self) -> str:
+        """Folder of what it makes, below the results, with wildcards in braces."""
+        return self.manifest.rpartition("/")[0]
+
+    @property
+    def log(self) -> str:
+        """Where its log and its benchmark lie below their folders, without suffix.
+
+        Examples
+        --------
+        >>> RULES["echo"].log, RULES["calibrate"].log, RULES["cube"].log
+        ('{flight}/{pair}.echo', '{flight}/calibrate', 'cube')
+        """
+        above, _, place = self.folder.rpartition("/")
+        if not self.of.wildcards:
+            return self.name
+        return f"{above}/{place}.{self.name}" if above else f"{place}/{self.name}"
+
+    def command_line(self, where: Iterable[str]) -> str:
+        """Return the command that a person can paste.
+
+        Parameters
+        ----------
+        where
+            Values of the wildcards.
+
+        Examples
+        --------
+        >>> RULES["ingest"].command_line(("f01", "uav1")), RULES["export_fused"].command_line(["f01"])
+        ('apertura step ingest f01 uav1', 'apertura step export f01 fused')
+        """
+        return " ".join(["apertura step", self.command, *where, *self.last_words])
+
+
+def _workflow(_: inputs.JobPlace) -> Mapping[str, Any]:
+    from apertura.common.paths import shipped
+    from apertura.common.provenance import canonical_json, sha256_text, sha256_tree
+
+    commands = {rule.name: rule.command_line(rule.of.wildcards) for rule in RULES.values()}
+    return {"workflow": sha256_text(canonical_json([sha256_tree(shipped() / "workflow"), commands]))}
+
+
+_STEPS = "apertura.stages"
+_GROUND = ("scene", "terrain")
+_FORMED = ("echo", "profile", *_GROUND, inputs.patterns)
+_IMAGE_SETTINGS = (inputs.imaging, inputs.antennas)
+
+_INGEST = Rule(
+    "ingest",
+    Scope.NODE,
+    "Read a node's recording and flight log into raw.zarr and track.zarr.",
+    f"{_STEPS}.ingest:ingest",
+    result="raw",
+    sources=(inputs.recording,),
+    settings=("waveform", "processing.false_alarms_per_s"),
+    reads=("recordings",),
+    kinds=("calibration", "image"),
+    needed=inputs.of_samples,
+    demand=Demand(250, pulse_bytes=100, recorded_s=60),
+    cost=Cost(0.3, mb_s=0.003),
+)
+
+_IMAGE = Rule(
+    "image",
+    Scope.PAIR,
+    "Focus a pair's image, image.zarr.",
+    f"{_STEPS}.image:image",
+    sources=(*_FORMED, "refined_track"),
+    settings=_IMAGE_SETTINGS,
+    forms=True,
+    demand=Demand(
+        900,
+        pulse_bytes=1000,
+        pixel_bytes=30,
+        tile_bytes=15_000,
+        profile_share=3.0,
+        threads=4,
+        recorded_s=30,
+        pixel_s=5,
+        sum_s=3,
+    ),
+    cost=Cost(0.6, mpx_s=1.2, mb_mpx_s=0.00001, all_cores=True),
+    options=("threads",),
+)
+
+_ROWS = (
+    _INGEST,
+    replace(
+        _INGEST, result="track", manifest="", sources=(inputs.log,), settings=(inputs.log_settings,), reads=("logs",)
+    ),
+    Rule(
+        "bench",
+        Scope.FLIGHT,
+        "Measure channels, clocks and links of a radar that stands still, bench.json, bench.html and bench.png.",
+        "apertura.tools.bench.report:bench",
+        sources=(inputs.recorded_on_the_bench,),
+        settings=("campaign", "waveform", "bench", "processing.sidelink", inputs.stated_paths),
+        products=("bench.json", "bench.html", "bench.png"),
+        reads=("recordings",),
+        kinds=("bench",),
+        demand=Demand(500, pulse_bytes=1000, recorded_s=240),
+        cost=Cost(0.5, mb_s=0.05, last=True),
+    ),
+    Rule(
+        "echo",
+        Scope.PAIR,
+        "Measure pulses, phase centres, clock and sidelink of a pair, echo.zarr.",
+        f"{_STEPS}.echo:echo",
+        sources=("raw", "track", inputs.transmitted_and_received, inputs.ground_under_air),
+        settings=(
+            "waveform",
+            "processing.sidelink",
+            "processing.accuracy_db",
+            inputs.pair_settings,
+            inputs.air,
+        ),
+        kinds=("calibration", "image"),
+        demand=Demand(400, pulse_bytes=400, recorded_s=120),
+        cost=Cost(0.3, mb_s=0.0011),
+    ),
+    Rule(
+        "transfer",
+        Scope.PAIR,
+        "Keep the transfer functions of a pair, transfer.zarr, for when the recording is no longer there.",
+        f"{_STEPS}.transfer:transfer",
+        sources=("echo", inputs.received),
+        reads=("recordings",),
+        kinds=("calibration", "image"),
+        needed=inputs.of_samples,
+        on_demand=True,
+        demand=Demand(400, pulse_bytes=400, recorded_s=120),
+        cost=Cost(0.3, mb_s=0.001, last=True),
+    ),
+    Rule(
+        "calibrate",
+        Scope.FLIGHT,
+        "Estimate the path offsets of a calibration flight's pairs, calibration.json.",
+        f"{_STEPS}.calibration:calibrate",
+        result="calibration",
+        sources=("echo",),
+        settings=("calibration", "scene.crs"),
+        documents=("calibration.json",),
+        forms=True,
+        kinds=("calibration",),
+        demand=Demand(500, pulse_bytes=1000, recorded_s=60),
+    ),
+    Rule(
+        "scene",
+        Scope.CAMPAIGN,
+        "Choose the campaign's grid, scene.json.",
+        f"{_STEPS}.scene:scene",
+        sources=(inputs.echoes_that_bound_the_scene, inputs.heights),
+        settings=("campaign", inputs.grid),
+        documents=("scene.json",),
+        demand=Demand(400, pulse_bytes=500),
+        cost=Cost(last=True),
+    ),
+    Rule(
+        "terrain",
+        Scope.CAMPAIGN,
+        "Resample the DEM to the campaign's grid, terrain.zarr.",
+        f"{_STEPS}.scene:terrain",
+        sources=("scene", inputs.heights),
+        settings=("scene.dem", "scene.dem_datum", "scene.geoid"),
+        needed=lambda place: bool(place.campaign.settings.scene.dem),
+        demand=Demand(500, pixel_bytes=50, pixel_s=10),
+    ),
+    Rule(
+        "profile",
+        Scope.PAIR,
+        "Compress a pair in range over the scene, profile.zarr.",
+        f"{_STEPS}.profile:profile",
+        sources=("echo", *_GROUND, inputs.patterns),
+        settings=("processing.window", "processing.integration", inputs.antennas),
+        forms=True,
+        demand=Demand(500, pulse_bytes=500, recorded_s=120),
+        cost=Cost(0.3, mb_s=0.001),
+    ),
+    Rule(
+        "refine",
+        Scope.FLIGHT,
+        "Estimate errors of a flight's tracks from its images, where that pays, refined_track.zarr.",
+        f"{_STEPS}.refine:refine",
+        result="refined_track",
+        sources=(inputs.autofocused, *_GROUND),
+        settings=("processing.autofocus", "processing.autofocus_method", "scene.reference_points"),
+        demand=Demand(600, pulse_bytes=40_000, pixel_bytes=30, pixel_s=10, recorded_s=120),
+        cost=Cost(0.3, mb_s=0.02, mpx_s=0.5),
+    ),
+    Rule(
+        "tracks",
+        Scope.FLIGHT,
+        "Write the logs of a flight as refined, tracks/<node>.pos and .csv, and what was moved, tracks.png.",
+        f"{_STEPS}.tracks:tracks",
+        sources=("refined_track", "track", inputs.unstaged_positions),
+        settings=("campaign", inputs.stated_errors, inputs.unstaged_log_settings),
+        products=("tracks.png",),
+        manifest="{flight}/tracks/tracks",
+        reads=("logs",),
+        demand=Demand(500, recorded_s=5),
+        cost=Cost(0.5, last=True),
+    ),
+    replace(
+        _IMAGE,
+        name="tiles",
+        help="Form one job's share of a pair's tiles, '2-of-8'; step image finishes them.",
+        step=f"{_STEPS}.image:tiles",
+        result="image",
+        command="tiles",
+        shares=True,
+        arguments=("flight", "pair", "share"),
+        cost=Cost(0.6, mpx_s=0.8, mb_mpx_s=0.00001, all_cores=True),
+    ),
+    _IMAGE,
+    Rule(
+        "layers",
+        Scope.PAIR,
+        "Write incidence, bistatic angle, mask, looks and noise of a pair as GeoTIFFs, and sigma0 where it is known.",
+        f"{_STEPS}.layers:layers",
+        sources=(*_FORMED, inputs.measured_image),
+        settings=("campaign", "processing.integration", inputs.antennas, inputs.radio, inputs.multilook),
+        exports="layers",
+        forms=True,
+        demand=Demand(600, pulse_bytes=500, pixel_bytes=30, pixel_s=5, recorded_s=20, threads=2),
+        cost=Cost(0.4, mpx_s=0.12, last=True),
+        options=("threads",),
+    ),
+    Rule(
+        "assess",
+        Scope.FLIGHT,
+        "Compare the images of a flight with each other, and choose what is added up, assessment.json.",
+        f"{_STEPS}.assess:assess",
+        result="assessment",
+        sources=("echo", "image", "refined_track", *_GROUND),
+        settings=("processing.fusion",),
+        documents=("assessment.json",),
+        demand=Demand(500, pulse_bytes=500, pixel_bytes=30, pixel_s=5),
+        cost=Cost(0.3, mpx_s=0.09),
+    ),
+    Rule(
+        "export",
+        Scope.PAIR,
+        "Write GeoTIFFs and the quicklook of a pair, or of 'fused'.",
+        f"{_STEPS}.export:export",
+        sources=("image", "assessment", "scene", inputs.calibration_of_images),
+        settings=("campaign", "metadata", inputs.polarisations),
+        documents=("image.json",),
+        exports="pair",
+        demand=Demand(500, pixel_bytes=50, pixel_s=30),
+        cost=Cost(0.4, mpx_s=0.3, last=True),
+        options=("threads",),
+    ),
+    Rule(
+        "cphd",
+        Scope.PAIR,
+        "Write the calibrated transfer functions of a pair for other processors, phase_history.cphd.",
+        f"{_STEPS}.cphd:cphd",
+        sources=("echo", "profile", "scene"),
+        settings=("campaign",),
+        products=("phase_history.cphd",),
+        forms=True,
+        reads=("recordings",),
+        on_demand=True,
+        demand=Demand(500, pulse_bytes=500, recorded_s=120),
+        cost=Cost(0.5, mb_s=0.02, last=True),
+    ),
+    Rule(
+        "coverage",
+        Scope.CAMPAIGN,
+        "Draw what every flight and pair covers, coverage.png and coverage.geojson.",
+        f"{_STEPS}.coverage:coverage",
+        sources=("echo", "layers", "scene"),
+        settings=("campaign",),
+        products=("coverage.png", "coverage.geojson"),
+        demand=Demand(600, pulse_bytes=500, pixel_s=1),
+    ),
+    Rule(
+        "cube",
+        Scope.CAMPAIGN,
+        "Stack and add up every image, cube.zarr.",
+        f"{_STEPS}.cube:cube",
+        sources=("image", "assessment", "scene"),
+        settings=("campaign", "processing.tile_px"),
+        demand=Demand(500, pixel_bytes=50, pixel_s=10, threads=2),
+        cost=Cost(0.3, mpx_s=0.65),
+        options=("threads",),
+    ),
+    Rule(
+        "export_fused",
+        Scope.FLIGHT,
+        "Write GeoTIFFs and the quicklook of what the pairs of a flight add up to.",
+        f"{_STEPS}.export:export",
+        result="fused",
+        sources=("image", "assessment", "cube", "scene", inputs.noise_of_sums),
+        settings=("campaign", "metadata", inputs.polarisations, "processing.tile_px", inputs.multilook),
+        documents=("image.json",),
+        exports="fused",
+        manifest="{flight}/fused/export",
+        needed=inputs.adds_up,
+        command="export",
+        last_words=("fused",),
+        demand=Demand(500, pixel_bytes=50, pixel_s=30, threads=2),
+        cost=Cost(0.6, mpx_s=0.5),
+        options=("threads",),
+    ),
+    Rule(
+        "interferogram",
+        Scope.TWO,
+        "Compare two images in phase: coherence, unwrapped phase and heights, by a name of interferometry.pairs.",
+        f"{_STEPS}.interferogram:interferogram",
+        sources=(*_FORMED, "image", "layers"),
+        settings=(
+            "campaign",
+            inputs.two_images,
+            "interferometry.window_px",
+            "scene.reference_points",
+            "processing.integration",
+        ),
+        documents=("interferogram.json",),
+        exports="interferogram",
+        manifest=f"{INTERFEROMETRY}/{{two}}/interferogram",
+        arguments=("name",),
+        demand=Demand(600, pulse_bytes=1000, pixel_bytes=700, pixel_s=60),
+        cost=Cost(1.0, mpx_s=20.0, last=True),
+    ),
+    Rule(
+        "mosaic",
+        Scope.CAMPAIGN,
+        "Write a mosaic of each product of all flights, mosaic/<pair>/<product>.vrt.",
+        f"{_STEPS}.mosaic:mosaic",
+        sources=("layers", "export", "fused"),
+        settings=("campaign", inputs.coefficients),
+        styles=True,
+        manifest="mosaic/mosaic",
+        demand=Demand(500),
+        cost=Cost(mpx_s=0.11),
+    ),
+    Rule(
+        "stac",
+        Scope.CAMPAIGN,
+        "Describe every image in a static STAC catalog, stac/catalog.json.",
+        f"{_STEPS}.stac:stac",
+        sources=("echo", "layers", "export", "fused", "scene"),
+        settings=("campaign", "metadata", inputs.polarisations),
+        products=("stac/catalog.json",),
+        demand=Demand(400, image_bytes=200_000),
+    ),
+    Rule(
+        "pictures",
+        Scope.PAIR,
+        "Draw what the report shows of a pair: geometry, pulses, phase, cuts, range profiles, budget.",
+        "apertura.views.report.pictures:pictures",
+        sources=("echo", "profile", "image", "layers", inputs.transmitter_raw, "refined_track", *_GROUND),
+        settings=("campaign",),
+        on_demand=True,
+        demand=Demand(600, pulse_bytes=2000, pixel_s=5, recorded_s=60),
+        cost=Cost(1.0, mb_s=0.01, last=True),
+    ),
+    Rule(
+        "pictures_fused",
+        Scope.FLIGHT,
+        "Draw what the report shows of the sums of a flight's pairs: beside the pairs, and cuts.",
+        "apertura.views.report.sums:pictures_fused",
+        sources=("export", "image", "cube", "fused", "scene"),
+        settings=("campaign",),
+        products=("panels.png", "sum_cuts.png"),
+        manifest="{flight}/fused/pictures",
+        needed=inputs.adds_up,
+        on_demand=True,
+        demand=Demand(500, pixel_s=5),
+        cost=Cost(0.6, mpx_s=0.5, last=True),
+    ),
+    Rule(
+        "page",
+        Scope.FLIGHT,
+        "Write what the report says of a flight, report.html, which prints.",
+        "apertura.views.report.step:page",
+        sources=("pictures", "pictures_fused", "export", "fused", "scene"),
+        settings=(inputs.everything,),
+        on_demand=True,
+        demand=Demand(500, pixel_s=5),
+        cost=Cost(0.6, mpx_s=0.5),
+    ),
+    Rule(
+        "report",
+        Scope.CAMPAIGN,
+        "Write the first page of Snakemake's report, which `apertura report` asks for.",
+        "apertura.views.report.step:landing",
+        sources=("page", "coverage"),
+        settings=(inputs.everything,),
+        on_demand=True,
+    ),
+    Rule(
+        "map",
+        Scope.CAMPAIGN,
+        "Write what `apertura map` shows of every image in a browser, map/map.json.",
+        "apertura.views.webmap.step:webmap",
+        sources=("layers", "export", "fused", "coverage", "scene", inputs.truth),
+        settings=("campaign", "calibration", "scene.reference_points"),
+        products=("map.json",),
+        manifest="map/map",
+        demand=Demand(500, pixel_s=1),
+        cost=Cost(mpx_s=0.12, last=True),
+    ),
+    Rule(
+        "speed_accuracy",
+        Scope.CHARTED,
+        "Time and measure every engine and setting on a pair, for at most so many seconds.",
+        "apertura.tools.chart.speed_accuracy:speed_accuracy",
+        sources=(*_FORMED, "refined_track"),
+        settings=(inputs.charted_pair, *_IMAGE_SETTINGS),
+        products=("speed_accuracy.csv", "speed_accuracy.png", "speed_accuracy.html"),
+        forms=True,
+        manifest=f"{STUDY}/speed_accuracy",
+        on_demand=True,
+        command="chart",
+        arguments=("flight", "pair"),
+        options=("seconds",),
+        demand=Demand(2000, profile_share=3.0, recorded_s=600),
+    ),
+    Rule(
+        "whole_chart",
+        Scope.CAMPAIGN,
+        "Time and measure the way from raw samples to GeoTIFFs under several settings, whole.csv and .png.",
+        "apertura.tools.chart.whole:whole_chart",
+        result="whole",
+        sources=(inputs.everything_recorded, inputs.heights),
+        settings=(inputs.everything,),
+        products=("whole.csv", "whole.png"),
+        manifest=f"{STUDY}/whole",
+        on_demand=True,
+        options=("repeats",),
+        demand=Demand(2000, profile_share=3.0, recorded_s=1200),
+    ),
+    Rule(
+        "ro_crate",
+        Scope.CAMPAIGN,
+        "Describe the whole run, with every file and command, as an RO-Crate, ro-crate-metadata.json.",
+        f"{_STEPS}.ro_crate:ro_crate",
+        sources=(inputs.config_files, EVERY),
+        settings=("campaign", "metadata", _workflow),
+        products=("ro-crate-metadata.json",),
+        demand=Demand(350, image_bytes=1_000_000),
+    ),
+)
+
+RULES: Mapping[str, Rule] = dict(reversed({row.name: row for row in reversed(_ROWS) if row.demand}.items()))
+"""Rule of the workflow → its row; of a rule that makes several results the row of the first."""
+
+RESULTS: Mapping[str, Rule] = {row.result: row for row in _ROWS if not row.shares}
+"""Result → the row of the rule that makes it, each after those that it is made from."""
