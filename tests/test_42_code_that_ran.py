@@ -70,7 +70,7 @@ CHANGES = [
     ("formats/tracks/csv_track.py", "code", READ - {"raw"}),
     ("formats/recordings/sigmf.py", "code", READ - {"track", "tracks"} | {"cphd"}),
     ("views/webmap/server.py", "code", set()),  # what a browser is shown, of results that are there
-    ("common/flag_table.py", "code", {"page", "report", "map"}),
+    ("common/flag_table.py", "code", set()),
     ("common/errors.py", "code", set()),
     ("campaign/config/nodes.py", "docstring", set()),
     ("core/echo/dechirp.py", "docstring", set()),

@@ -15,6 +15,7 @@ PACKAGE = Path(__file__).parents[1]
 
 WITHOUT_EFFECT = (
     "apertura.common.errors",  # texts of messages: a step that raised one has no result
+    "apertura.common.flag_table",  # texts that explain flags: they decide no value
     "apertura.common.progress",  # lines of a log
     "apertura.common.processes",  # where a process may look for code, and how it ends
     "apertura.workflow.lineage",  # sources, settings and code of a result: a manifest records each, for itself

@@ -1,6 +1,6 @@
 """Every flag that an image may carry: what was measured, what it means, what to look at; docs/flags.md comes of it.
 
-The rows stand in the order in which a recording becomes an image. Only pages and summaries read more than their names.
+The rows stand in the order in which a recording becomes an image. `Flags` reads their names alone.
 """
 
 from dataclasses import dataclass

@@ -1,21 +1,16 @@
-"""Flags that were raised: name → what was measured; one way to merge those of several parts.
+"""Flags that were raised: name → lines of what was measured, and the one way to merge the flags of several parts."""
 
-Apart from `apertura.common.flag_table`, which only pages and summaries import: other words there make no image again.
-"""
-
+import re
 from collections.abc import Iterable, Mapping
-from functools import cache
-from pkgutil import resolve_name
 from typing import Any, Self
 
-
-@cache
-def _rows() -> Any:
-    return resolve_name(f"{__package__}.flag_table:FLAGS")  # by name: their texts are no code of what raises a flag
+from apertura.common.flag_table import FLAGS
 
 
 class Flags(dict[str, str]):
-    """Flags of a stage or an image: name in `apertura.common.flag_table.FLAGS` → one line of what was measured.
+    """Flags of a stage or an image: name in `apertura.common.flag_table.FLAGS` → text of what was measured.
+
+    The text of a flag is its lines, one per part that raised it, joined by "; ". A line may contain "; " itself.
 
     Raises
     ------
@@ -24,10 +19,10 @@ class Flags(dict[str, str]):
 
     Examples
     --------
-    >>> found = Flags.merged({"fix_poor": "3 of 90 pulses of uav1"}, {"fix_poor": "7 of 90 pulses of uav2"})
-    >>> found["fix_poor"]
+    >>> merged = Flags.merged({"fix_poor": "3 of 90 pulses of uav1"}, {"fix_poor": "7 of 90 pulses of uav2"})
+    >>> merged["fix_poor"]
     '3 of 90 pulses of uav1; 7 of 90 pulses of uav2'
-    >>> Flags.merged(found, found) == found
+    >>> Flags.merged(merged, merged) == merged
     True
     >>> Flags({"fix_pour": "9 of 90 pulses of uav1"})
     Traceback (most recent call last):
@@ -36,26 +31,39 @@ class Flags(dict[str, str]):
 
     def __init__(self, flags: Mapping[str, str] | Iterable[tuple[str, str]] = ()) -> None:
         super().__init__()
+        self._lines: dict[str, list[str]] = {}
         for name, line in dict(flags).items():
             self[name] = line
 
     def __setitem__(self, name: str, line: str) -> None:
-        if name not in _rows():
+        self._set(name, [line])
+
+    def _set(self, name: str, lines: list[str]) -> None:
+        if name not in FLAGS:
             raise KeyError(f"{name} is no row of apertura.common.flag_table.FLAGS")
-        super().__setitem__(name, line)
+        self._lines[name] = lines
+        super().__setitem__(name, "; ".join(lines))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (dict(self),)
 
     @classmethod
     def merged(cls, *several: Mapping[str, str]) -> Self:
-        """Return all flags of several parts, in their order; where two raise one, both of their lines stand.
+        """Merge the flags of several parts, in their order: a flag that several raise keeps the lines of each.
 
-        A line that begins with another says the same and more, and takes its place.
+        A line that another line repeats as a whole, with or without an addition behind "; " or " (", is left out.
         """
-        found = cls()
+        merged = cls()
         for flags in several:
-            for name, line in flags.items():
-                known = found.get(name, "")
-                if line.startswith(known):
-                    found[name] = line
-                elif not known.startswith(line) and line not in known.split("; "):
-                    found[name] = f"{known}; {line}"
-        return found
+            for name, text in flags.items():
+                lines = merged._lines.get(name, [])
+                for line in flags._lines[name] if isinstance(flags, Flags) else [text]:
+                    if not any(_repeats(known, line) for known in lines):
+                        lines = [*(known for known in lines if not _repeats(line, known)), line]
+                merged._set(name, lines)
+        return merged
+
+
+def _repeats(line: str, part: str) -> bool:
+    """Test whether a line consists of another one, or contains it between "; "."""
+    return re.search(rf"(?:^|; ){re.escape(part)}(?:$|; | \()", line) is not None

@@ -365,18 +365,15 @@ def _incoherent(measured: InPhase | None) -> dict[str, str]:
 
 def _flags_of_pairs(of_pairs: Mapping[str, Mapping[str, str]]) -> Flags:
     """Merge the flags of all pairs, each line with its pairs unless all carry it."""
-    raised: dict[str, dict[str, list[str]]] = {}
+    raised: dict[tuple[str, str], list[str]] = {}
     for pair, flags in of_pairs.items():
-        for flag, line in flags.items():
-            raised.setdefault(flag, {}).setdefault(line, []).append(pair)
-    return Flags(
-        {
-            flag: "; ".join(
-                line if len(pairs) == len(of_pairs) else f"{' and '.join(pairs)}: {line}"
-                for line, pairs in lines.items()
-            )
-            for flag, lines in raised.items()
-        }
+        for flag in flags.items():
+            raised.setdefault(flag, []).append(pair)
+    return Flags.merged(
+        *(
+            {name: line if len(pairs) == len(of_pairs) else f"{' and '.join(pairs)}: {line}"}
+            for (name, line), pairs in raised.items()
+        )
     )
 
 
