@@ -230,7 +230,7 @@ VACUUM = {
     "methods/autofocus/patches.py": _SIZE,
     "methods/autofocus/path_offsets.py": _SIZE,
     "methods/autofocus/refine.py": _SIZE,
-    "methods/autofocus/speckle.py": _SIZE,
+    "methods/autofocus/ground_coherence.py": _SIZE,
     "methods/synchronisation/links.py": _ELECTRICAL,
     "methods/synchronisation/clock_alignment.py": _ELECTRICAL,
     "methods/interferometry/sensitivity.py": "radians per metre of height, to 0.03 %",

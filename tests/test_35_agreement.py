@@ -13,10 +13,10 @@ from apertura.core.geometry.phase_centres import TrackCorrection
 from apertura.core.imaging.range_profiles import range_compress
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import FlatGround
+from apertura.methods.autofocus.ground_coherence import SpeckleTiles, refined_by_speckle, tiles
 from apertura.methods.autofocus.inputs import NodePrior, PairRecord, Prior, TrackErrors
 from apertura.methods.autofocus.objective import Blocks
 from apertura.methods.autofocus.solve import Gauge, minimise
-from apertura.methods.autofocus.speckle import SpeckleTiles, refined_by_speckle, tiles
 from apertura.simulation.echoes import transfer
 from apertura.simulation.scene import Scatterers
 

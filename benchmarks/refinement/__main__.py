@@ -20,10 +20,10 @@ from apertura_research.autofocus.cases import ERRORS, GRID, AutofocusCase, case
 from apertura_research.autofocus.outcomes import UNCORRECTED, image_seconds, judge
 
 from apertura.core.scene.terrain import FlatGround
+from apertura.methods.autofocus.ground_coherence import SpeckleTiles, refined_by_speckle, tiles
 from apertura.methods.autofocus.inputs import NodePrior, Prior, Refinement
 from apertura.methods.autofocus.objective import Blocks
 from apertura.methods.autofocus.refine import refine
-from apertura.methods.autofocus.speckle import SpeckleTiles, refined_by_speckle, tiles
 
 Key = tuple[str, str, str, str, str, str]
 NAMED = ("scene", "geometry", "pairs", "sigma_cm", "snr_db", "seed")

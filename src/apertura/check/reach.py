@@ -5,7 +5,14 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from apertura.campaign.config import CONFIG, FLIGHTS, Calibration, Flight, LeverArms, SampledWaveform
+from apertura.campaign.config import (
+    CONFIG,
+    FLIGHTS,
+    CalibrationSettings,
+    Flight,
+    LeverArms,
+    SampledWaveform,
+)
 from apertura.check.examination import Examination, Key
 from apertura.check.hints import likely_place
 from apertura.check.times import expected_pulses, recorded_span
@@ -267,7 +274,7 @@ def check_calibration(examined: Examination) -> Iterator[CampaignError]:
     yield from _reflector(examined, flight, stated)
 
 
-def _reflector(examined: Examination, flight: Flight, stated: Calibration) -> Iterator[CampaignError]:
+def _reflector(examined: Examination, flight: Flight, stated: CalibrationSettings) -> Iterator[CampaignError]:
     """Yield a reflector from which no echo arrives while a capture lasts."""
     waveform = examined.waveform
     aperture = waveform and pair_aperture(examined, flight, flight.transmitter, waveform)

@@ -243,11 +243,11 @@ class Shell:
             asked = {"words": words, "log": log, "folder": str(Path.cwd()), "environment": dict(how["env"])}
             data = json.dumps(asked).encode()
             if len(data) < _LONGEST:
-                return Step(self._requests, data)
+                return StepProcess(self._requests, data)
         return subprocess.Popen(command, **how)
 
 
-class Step:
+class StepProcess:
     """A step that was asked for, as `subprocess.Popen` has a process.
 
     Parameters

@@ -4,7 +4,7 @@ A docstring of an experiment says what the paper prints of it and what it does n
 plainly, and not so that a result of the paper comes out; docs/theory/study.md, "Experiments".
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -21,7 +21,7 @@ from apertura.simulation.impairments import (
     UniformPhase,
 )
 from apertura.simulation.scene import Clutter, Line, Origin, PointTarget, Scatterers, Straight, Target, Vector, Wobble
-from apertura.simulation.specification import Bench, CampaignSpecification, ImageGrid, SimulatedFlight, SimulatedNode
+from apertura.simulation.specification import CampaignSpecification, ImageGrid, SimulatedFlight, SimulatedNode
 from apertura.simulation.synthesis import Geometry, straight_pair
 from apertura.simulation.waveform import TransmitWaveform, WaveformSpecification
 
@@ -65,7 +65,7 @@ def paper_lab(*, pulses: int = STATIC_PULSES, snr_db: float = COHERENT_SNR_DB["c
     """
     joint = (PointTarget((0.0, 0.0, 1.0 - _JOINT_M), _JOINT_M**2),)
     cable_m = RADAR_CABLE_M - 2 * _JOINT_M
-    known: Bench = {"radar_m": 2 * _JOINT_M, "sidelink_m": 0.0}
+    known: Mapping[str, float | bool] = {"radar_m": 2 * _JOINT_M, "sidelink_m": 0.0}
     return _standing("paper-lab", joint, (0.0, 0.0, 1.0), cable_m, _per_subcarrier(snr_db), pulses, bench=known)
 
 
@@ -88,7 +88,7 @@ def paper_static(*, pulses: int = STATIC_PULSES) -> CampaignSpecification:
     )
     both_db = 10 * float(np.log10(1 + 10 ** (-weaker_db / 10)))  # of their mean power over that of the first
     snr_db = _per_subcarrier(COHERENT_SNR_DB["first cylinder"]) + both_db
-    known: Bench = {"radar_m": 2 * near_m, "sidelink_m": 0.0, "split": True}
+    known: Mapping[str, float | bool] = {"radar_m": 2 * near_m, "sidelink_m": 0.0, "split": True}
     return _standing("paper-static", cylinders, (0.0, -6.0, antenna_up_m), 0.911, snr_db, pulses, bench=known)
 
 
@@ -158,7 +158,14 @@ def _own_clock(radar_snr_db: float, sidelink_snr_db: float) -> Impairments:
 
 
 def _standing(
-    name: str, targets: tuple[Target, ...], place: Vector, radar_m: float, snr_db: float, pulses: int, *, bench: Bench
+    name: str,
+    targets: tuple[Target, ...],
+    place: Vector,
+    radar_m: float,
+    snr_db: float,
+    pulses: int,
+    *,
+    bench: Mapping[str, float | bool],
 ) -> CampaignSpecification:
     """Return two nodes on a table whose antennas are at one place, the sidelink a cable, SNR that of a subcarrier."""
     wired = SimulatedNode({}, {"radar": radar_m, "sidelink": SIDELINK_CABLE_M}, impairments=_own_clock(snr_db, 40.0))

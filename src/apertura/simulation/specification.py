@@ -32,9 +32,6 @@ from apertura.simulation.impairments import (
 from apertura.simulation.scene import GaussianBeam, Origin, Target, Track, Trajectory, Vector
 from apertura.simulation.waveform import TransmittedSpecification, TransmitWaveform
 
-Bench = Mapping[str, float | bool]
-"""Section `bench` of the config: radar_m, sidelink_m, split."""
-
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.]*$")]
 
 
@@ -156,7 +153,7 @@ class CampaignSpecification:
         description="air that all paths fly through: standard, at the origin's height, 50 % humidity; vacuum; or the "
         "refractivity at the origin, (n - 1)·10⁶, which the config then states; it thins with height",
     )
-    bench: Bench = Field(
+    bench: Mapping[str, float | bool] = Field(
         default_factory=dict, description="what the config says of the set-up of flights of kind bench, as it has it"
     )
     synthesis: Literal["exact", "periodic"] = Field(

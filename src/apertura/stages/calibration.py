@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from apertura.campaign.config import Calibration
+from apertura.campaign.config import CalibrationSettings
 from apertura.campaign.folder import Campaign
 from apertura.campaign.store import open_document, remake, save_document
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
@@ -75,7 +75,7 @@ def _taken(offset: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _settings(campaign: Campaign) -> Calibration:
+def _settings(campaign: Campaign) -> CalibrationSettings:
     if campaign.settings.calibration is None:
         raise CampaignError(
             "no section calibration",
@@ -86,7 +86,7 @@ def _settings(campaign: Campaign) -> Calibration:
     return campaign.settings.calibration
 
 
-def _pair(campaign: Campaign, opened: PairEcho, requested: Calibration, *, where: str) -> dict[str, Any]:
+def _pair(campaign: Campaign, opened: PairEcho, requested: CalibrationSettings, *, where: str) -> dict[str, Any]:
     echo = opened.stage
     reflector = frame_from_map(campaign.settings.scene.crs, *requested.reflector_m)
     path_m = Aperture(echo.tx_position.values, echo.rx_position.values).path(reflector)

@@ -60,7 +60,7 @@ def _peak(tables: Tables, middle_m: Floats, reach_m: tuple[float, float]) -> tup
 
 
 @dataclass(frozen=True)
-class Judgement:
+class CorrectionEffect:
     """What a correction does to a case; NaN of targets where the scene has none.
 
     Attributes
@@ -78,14 +78,14 @@ class Judgement:
     target_shift_cm: float
 
 
-def judge(one: AutofocusCase, correction: TrackCorrection = UNCORRECTED) -> Judgement:
+def judge(one: AutofocusCase, correction: TrackCorrection = UNCORRECTED) -> CorrectionEffect:
     """Return what a correction does to a case; that of the logs themselves by default.
 
     The probes are the honest ones: a fit to noise can lift a target's peak, not theirs.
     """
     probe_loss, probe_shift = _against_truth(one, one.probes, PROBES_M, correction)
     target_loss, target_shift = _against_truth(one, one.records, one.targets_m, correction)
-    return Judgement(
+    return CorrectionEffect(
         _mean(probe_loss), float(probe_loss.min()), _median(probe_shift), _mean(target_loss), _median(target_shift)
     )
 

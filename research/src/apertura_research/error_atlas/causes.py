@@ -28,7 +28,7 @@ _DEM_CORRELATION_M = 3.0
 
 
 @dataclass(frozen=True)
-class Cause:
+class AssumedError:
     """One cause and the sizes at which it is tried, from negligible to destructive.
 
     Attributes
@@ -131,44 +131,44 @@ def _mispaired(flown: TrueFlight, size: float, _: Generator) -> AssumedFlight:
     return replace(flown.truth, apertures={**flown.apertures(), "a-b": moved["a-b"]})
 
 
-CAUSES: Mapping[str, Cause] = {
-    "track_noise": Cause(
+CAUSES: Mapping[str, AssumedError] = {
+    "track_noise": AssumedError(
         "Noise of the tracks, correlated over 1 s, σ per axis", "cm", (0.1, 0.3, 0.6, 1, 1.5, 2, 3, 5),
         lambda flown, size, generator: _wander(flown, LogErrors(wander_m=_CM * size), generator),
         lambda flown, pair, size: positions(flown, pair, *[_noise(size, 1.0)] * 2), "positions", draws=6,
     ),
-    "track_noise_time": Cause(
+    "track_noise_time": AssumedError(
         "Correlation time of track noise of 1.5 cm", "s", (0.1, 0.3, 1, 3, 10, 30),
         lambda flown, size, generator: _wander(flown, LogErrors(wander_m=0.015, correlation_s=size), generator),
         lambda flown, pair, size: positions(flown, pair, *[_noise(1.5, size)] * 2), "positions", draws=6,
     ),
-    "track_gap": Cause(
+    "track_gap": AssumedError(
         "Gap in the transmitter's log", "s", (0.1, 0.3, 0.6, 1, 2, 3, 5, 8),
         lambda flown, size, generator: assumed_from_logs(flown, generator, a=LogErrors(gap_s=size), b=LogErrors()),
         nothing, "missing pulses (no loss)",
     ),
-    "log_rate": Cause(
+    "log_rate": AssumedError(
         "Epochs per second of both logs", "Hz", (50, 20, 10, 5, 2, 1, 0.5, 0.3),
         lambda flown, size, generator: _wander(flown, LogErrors(rate_hz=size), generator),
         lambda flown, pair, size: positions(flown, pair, *[between_epochs(flown, LogErrors(rate_hz=size))] * 2),
         "interpolation_m as positions",
     ),
-    "tags_common": Cause(
+    "tags_common": AssumedError(
         "Tags of both nodes late", "ms", (1, 3, 10, 30, 60, 100, 300, 1000), _late_nodes, _late, "time tags", draws=2,
     ),
-    "tags_of_one": Cause(
+    "tags_of_one": AssumedError(
         "LogErrors of the receiver late", "ms", (0.3, 1, 3, 10, 20, 50, 100, 300), _late_receiver, _only("a-b", _late),
         "time tags", draws=2,
     ),
-    "height": Cause(
+    "height": AssumedError(
         "Ground taken too high", "cm", (0.3, 1, 3, 10, 20, 40, 100),
         lambda flown, size, _: replace(flown.truth, terrain=FlatGround(_CM * size)),
         _higher, "heights", draws=2,
     ),
-    "dem": Cause(
+    "dem": AssumedError(
         "Error of the DEM, correlated over 3 m, rms", "cm", (0.3, 1, 3, 10, 20, 40, 60), _rough, _higher, "heights",
     ),
-    "arm": Cause(
+    "arm": AssumedError(
         "Lever arm of the transmitting node off, in each axis", "cm", (0.1, 0.3, 1, 3, 10, 30, 100),
         lambda flown, size, _: replace(
             flown.truth, apertures=flown.apertures(a=flown.antenna("a", arm_m=(_CM * size,) * 3))
@@ -176,30 +176,30 @@ CAUSES: Mapping[str, Cause] = {
         lambda flown, pair, size: positions(flown, pair, _noise(size, _WHOLE_FLIGHT_S)),
         "positions, one error for the whole flight", draws=2,
     ),
-    "prf": Cause(
+    "prf": AssumedError(
         "One pulse imaged of so many, of 30 per metre", "1", (1, 2, 3, 4, 6, 8, 12, 16), _every, nothing,
         "missing pulses (no loss)", draws=2,
     ),
-    "presum": Cause(
+    "presum": AssumedError(
         "Pulses made one, of 120 per metre", "1", (1, 2, 3, 4, 5, 6, 8),
         lambda flown, size, _: replace(flown.truth, presum=round(size)), nothing, "arithmetic, as measured", draws=1,
         pulses=1200,
     ),
-    "antenna": Cause(
+    "antenna": AssumedError(
         "Boresight off in azimuth, beam of 60°", "deg", (1, 3, 6, 10, 20, 30, 45, 60),
         lambda flown, size, _: replace(flown.truth, beams=flown.beams(size)), nothing, "no line", draws=2, beamed=True,
     ),
-    "calibration": Cause(
+    "calibration": AssumedError(
         "Path offset of the bistatic pair off", "cm", (0.1, 0.3, 1, 2, 3, 6, 10, 30),
         lambda flown, size, _: replace(flown.truth, longer_m={"a-b": _CM * size}),
         _only("a-b", lambda flown, pair, size: offset(flown, pair, lambda p: np.full(len(p.time_s), _CM), size)),
         "calibration", draws=2,
     ),
-    "association": Cause(
+    "association": AssumedError(
         "Receiver's pulses paired late", "pulses", (1, 2, 3, 5, 10, 20, 30), _mispaired,
         _only("a-b", lambda flown, pair, size: _late(flown, pair, size * flown.time_s[1] / _MS)), "time tags", draws=2,
     ),
-    "fusion_phase": Cause(
+    "fusion_phase": AssumedError(
         "Phase between the pairs", "rad", (0.1, 0.3, 0.6, 0.8, 1, 1.3, 1.6, 2.4, 3.1),
         lambda flown, size, _: replace(flown.truth, turned_rad={"a-b": size}),
         lambda _, __, size: Effect(20 * float(np.log10(max(abs(np.cos(size / 2)), 1e-3))), 0.0, size),

@@ -30,7 +30,7 @@ from apertura.campaign.config.nodes import (
     radio_of,
 )
 from apertura.campaign.config.processing import (
-    Calibration,
+    CalibrationSettings,
     Interferometry,
     KnownReflector,
     Processing,
@@ -57,7 +57,7 @@ __all__ = [
     "SEGMENTS",
     "Antenna",
     "Antennas",
-    "Calibration",
+    "CalibrationSettings",
     "ClockRow",
     "Flight",
     "FmcwWaveform",

@@ -6,7 +6,13 @@ from typing import Self
 from pydantic import Field, model_validator
 
 from apertura.campaign.config.nodes import Node
-from apertura.campaign.config.processing import Bench, Calibration, Interferometry, Processing, Scene
+from apertura.campaign.config.processing import (
+    BenchSettings,
+    CalibrationSettings,
+    Interferometry,
+    Processing,
+    Scene,
+)
 from apertura.campaign.config.section import Doi, Licence, Name, RawRoot, Section, Title
 from apertura.campaign.config.waveform import PhaseHistoryWaveform, Waveform
 from apertura.common import documents
@@ -39,10 +45,12 @@ class Settings(Section):
     nodes: dict[Name, Node] = Field(min_length=1, description="one section per UAV, named as in flights.tsv")
     scene: Scene = Field(default_factory=Scene, description="the grid of every raster of the campaign")
     processing: Processing = Field(default_factory=Processing, description="how to compute")
-    calibration: Calibration | None = Field(
+    calibration: CalibrationSettings | None = Field(
         None, description="path offsets from a calibration flight: flight, reflector_m, search_m; null: as stated above"
     )
-    bench: Bench = Field(default_factory=Bench, description="what is known of a set-up on the bench, before a flight")
+    bench: BenchSettings = Field(
+        default_factory=BenchSettings, description="what is known of a set-up on the bench, before a flight"
+    )
     interferometry: Interferometry = Field(
         default_factory=Interferometry, description="images compared in phase, two by two, for coherence and heights"
     )

@@ -91,7 +91,7 @@ class Processing(ImagingChoices):
         return text
 
 
-class Calibration(Section):
+class CalibrationSettings(Section):
     """Which flight the path offsets come from."""
 
     flight: Name = Field(description="flight of kind calibration whose offsets the imaging flights use")
@@ -99,7 +99,7 @@ class Calibration(Section):
     search_m: float = Field(10.0, gt=0, description="offsets of either sign up to this are considered, m")
 
 
-class Bench(Section):
+class BenchSettings(Section):
     """What is known of a set-up that stands still, in flights of kind bench."""
 
     radar_m: float | None = Field(

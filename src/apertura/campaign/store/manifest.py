@@ -103,7 +103,7 @@ class Difference:
     present: str = ""
 
 
-class Expected(Protocol):
+class CurrentInputs(Protocol):
     """What a result would be made from now, `apertura.campaign.digests.Result`."""
 
     @property
@@ -154,7 +154,7 @@ def compare(
 
 
 def compare_origin(
-    document: Mapping[str, Any], expected: Expected, present: Callable[[str], str]
+    document: Mapping[str, Any], expected: CurrentInputs, present: Callable[[str], str]
 ) -> Iterator[Difference]:
     """Compare what a manifest says of where its result comes from with what is there now: sources, settings and code.
 

@@ -22,7 +22,7 @@ from apertura.core.backprojection.job import Job
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.atmosphere import Atmosphere, SceneAir
 from apertura.core.geometry.geodesy import LOCAL, geodetic_from_ecef
-from apertura.core.imaging.choices import Degrees, ImagingChoices, Resolution
+from apertura.core.imaging.choices import ImagingChoices, IntegrationAngle, IntegrationResolution
 from apertura.core.imaging.formation import Formation
 from apertura.core.imaging.job import check_inputs, imaging_job, profiles_job
 from apertura.core.imaging.judgement import Judgement, budget_by_hand, judgement
@@ -55,7 +55,7 @@ def backproject(  # noqa: PLR0913 - each choice is a keyword, so that an editor 
     judge: bool | Literal["auto"] = "auto",
     terrain_model: Literal["auto", "plane", "tilted_plane", "dem"] = "auto",
     window: Literal["hann", "none"] = "hann",
-    integration: "Literal['auto', 'all'] | Degrees | Resolution | Mapping[str, float]" = "auto",
+    integration: "Literal['auto', 'all'] | IntegrationAngle | IntegrationResolution | Mapping[str, float]" = "auto",
     presum: int | Literal["auto"] = "auto",
     pulse_blocks: int | Literal["auto"] = "auto",
     tile_px: int = 256,

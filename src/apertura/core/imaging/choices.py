@@ -7,7 +7,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from apertura.core.backprojection.engines import ENGINES, PATCH_PX, load_engine
 
 
-class Degrees(BaseModel):
+class IntegrationAngle(BaseModel):
     """Integration angle of a straight pass."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
@@ -15,7 +15,7 @@ class Degrees(BaseModel):
     degrees: float = Field(gt=0, le=180, description="integration angle of a straight pass, degrees")
 
 
-class Resolution(BaseModel):
+class IntegrationResolution(BaseModel):
     """Integration by the resolution along the flight."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
@@ -66,7 +66,7 @@ class ImagingChoices(BaseModel):
     pulse_blocks: Annotated[int, Field(ge=1, le=1024)] | Literal["auto"] = Field(
         "auto", description="blocks of pulses whose tables are in memory at once, one after the other; 1 takes them all"
     )
-    integration: Literal["auto", "all"] | Degrees | Resolution = Field(
+    integration: Literal["auto", "all"] | IntegrationAngle | IntegrationResolution = Field(
         "auto",
         description="how much of a pass a pixel is integrated over: auto, what the pixels' spacing carries; all; "
         "{degrees: x} of a straight pass; {resolution_m: x} along the flight",

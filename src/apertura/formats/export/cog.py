@@ -26,7 +26,7 @@ from apertura.formats.export.radiometry import with_radiometry
 from apertura.formats.export.writing import (
     IN_MEMORY_BYTES,
     READ,
-    Block,
+    BlockSlices,
     added,
     blocks_of,
     check_written,
@@ -44,7 +44,7 @@ class NorthUpRaster(Protocol):
     @property
     def shape(self) -> tuple[int, ...]: ...  # noqa: D102
 
-    def __getitem__(self, key: Block, /) -> Any: ...
+    def __getitem__(self, key: BlockSlices, /) -> Any: ...
 
 
 @dataclass(frozen=True)
@@ -281,7 +281,7 @@ def _described(tags: Mapping[str, str], title: str) -> dict[str, str]:
 
 def _fill(
     path: Path,
-    read: Callable[[Block], Pixels],
+    read: Callable[[BlockSlices], Pixels],
     shown: Callable[[Pixels], Pixels],
     band: Band,
     place: Mapping[str, Any],

@@ -27,7 +27,7 @@ IN_MEMORY_BYTES = 1 << 27
 
 _FULL_BYTES = 1 << 20  # less than this free, and the disk counts as full
 
-Block = tuple[slice, slice]
+BlockSlices = tuple[slice, slice]
 
 
 @contextmanager
@@ -65,7 +65,7 @@ def gdal_replacement(path: Path, *, size: int) -> Iterator[Path]:
             raise OSError(number, f"{os.strerror(number)}: GDAL says: {error}", str(path)) from error
 
 
-def blocks_of(shape: tuple[int, ...]) -> Iterator[Block]:
+def blocks_of(shape: tuple[int, ...]) -> Iterator[BlockSlices]:
     """Yield the blocks of a raster that pass through memory one by one.
 
     Examples

@@ -23,6 +23,7 @@ from apertura.methods.autofocus.evidence import (
     remaining,
     unsteady,
 )
+from apertura.methods.autofocus.ground_coherence import SpeckleTiles, refined_by_speckle, tiles
 from apertura.methods.autofocus.inputs import NodePrior, PairRecord, Prior, ReferencePoint, Refinement, TrackErrors
 from apertura.methods.autofocus.objective import Blocks, PatchEcho, PatchImage, Tracks
 from apertura.methods.autofocus.patches import (
@@ -44,7 +45,6 @@ from apertura.methods.autofocus.solve import (
     prominent_point_start,
     unslipped_start,
 )
-from apertura.methods.autofocus.speckle import SpeckleTiles, refined_by_speckle, tiles
 
 # ---- Gauge fixed by points common to pairs and by reference points --------------------------------------------------
 

@@ -92,7 +92,7 @@ def triggers(time_s: Floats, *, prf_hz: float) -> Triggers:
 
 
 @dataclass(frozen=True)
-class Channel:
+class MeasuredChannel:
     """The samples of one channel.
 
     Attributes
@@ -136,7 +136,7 @@ class Channel:
         return flags
 
 
-def measure_channel(name: str, blocks: Iterable[Samples], numerology: Numerology) -> Channel:
+def measure_channel(name: str, blocks: Iterable[Samples], numerology: Numerology) -> MeasuredChannel:
     """Measure the samples of a channel.
 
     Parameters
@@ -180,7 +180,7 @@ def measure_channel(name: str, blocks: Iterable[Samples], numerology: Numerology
     # ones √N are left, and three times as much is no chance.
     floor = 3 / (2 * np.sqrt(numerology.numbers.size)) if mirrored.mean() > 0.5 else 0.0
     power = max(power, 1e-30)
-    return Channel(
+    return MeasuredChannel(
         name,
         float(np.sqrt(power / captures)),
         decibels(mean / power),

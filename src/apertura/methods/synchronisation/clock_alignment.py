@@ -59,7 +59,7 @@ class Alignment:
 
 
 @dataclass(frozen=True, eq=False)
-class PointResponse:
+class PointSharpness:
     """Coherent sum of echoes at one point, by offset and path.
 
     Attributes
@@ -132,7 +132,7 @@ def align_on_point(
     """
     some = echo.moving()[:: -(-len(echo) // MOST_PULSES)]
     low, high = plausible_offsets(echo, log, within_s)
-    response = PointResponse(some, log, point_m)
+    response = PointSharpness(some, log, point_m)
     offsets_s = offset_steps(some, log, low, high)
     searched = [response.powers(offset_s) for offset_s in offsets_s]
     near = np.abs(searched[0][0]) <= max(search_m, 1e-9)
@@ -261,7 +261,7 @@ def estimate_drift(found: Alignment, echo: Recorded, log: Logged, point_m: Float
 
     def power(ppm: float, offset_s: float, path_m: float) -> float:
         times_s = apply_drift(time_s, ppm)
-        return PointResponse(replace(some, time_s=times_s), log, point_m).power(offset_s, path_m)
+        return PointSharpness(replace(some, time_s=times_s), log, point_m).power(offset_s, path_m)
 
     tried = np.arange(-MOST_PPM, MOST_PPM + step_ppm, step_ppm)
     at = found.offset_s, found.path_m

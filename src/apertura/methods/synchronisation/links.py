@@ -148,7 +148,7 @@ class Arrival:
 
 
 @dataclass(frozen=True, eq=False)
-class Link:
+class MeasuredLink:
     """The strongest path of a channel over all its pulses.
 
     Attributes
@@ -357,7 +357,7 @@ def measure_link(
     *,
     divided: bool,
     prefix_cells: int | None = None,
-) -> Link | None:
+) -> MeasuredLink | None:
     """Measure the strongest path of a channel over all its pulses; None where it rises above the noise in none.
 
     Parameters
@@ -437,7 +437,7 @@ def measure_link(
     # 4. The path again, of the mean under a Hann window: sidelobes of other arrivals move it by millimetres without.
     bell = (fft.fft(mean) * np.hanning(subcarriers)).astype(np.complex64)
     path_m = (delay + float(fit_block(bell[None])[0].delay_cells[0])) * cell_m
-    return Link(
+    return MeasuredLink(
         name,
         time_s[locked],
         count,
@@ -500,7 +500,7 @@ def clock_flags(name: str, clock: ClockOffset, numerology: Numerology, pulses: i
 
 
 @dataclass(frozen=True)
-class PathOffset:
+class BenchPathOffset:
     """Electrical path of a link beyond what was set up, metres of total path.
 
     Attributes
@@ -529,7 +529,7 @@ class PathOffset:
         }
 
 
-def reversed_flags(link: Link, expected_m: float | None) -> dict[str, str]:
+def reversed_flags(link: MeasuredLink, expected_m: float | None) -> dict[str, str]:
     """Return a flag where echoes of a link arrive before its sidelink, and nobody expected that."""
     early_m = link.path_m
     if early_m > -APART_CELLS / 2 * link.cell_m or (expected_m is not None and expected_m < 0):
@@ -571,7 +571,7 @@ class SplitAgreement:
         }
 
 
-def split_agreement(first: Link, second: Link) -> SplitAgreement:
+def split_agreement(first: MeasuredLink, second: MeasuredLink) -> SplitAgreement:
     """Compare two links that are fed by one signal; eq. 7 of docs/theory/bench.md.
 
     Examples
@@ -603,7 +603,7 @@ def split_agreement(first: Link, second: Link) -> SplitAgreement:
 _GROUP_NOISE = 0.005  # rad², of the phase of a group of subcarriers: where noise is small, it is what is predicted
 
 
-def _over_the_band(first: Link, second: Link) -> tuple[float, float]:
+def _over_the_band(first: MeasuredLink, second: MeasuredLink) -> tuple[float, float]:
     """Return how phase and amplitude of one link over another change over the band beyond noise, rms, rad and dB.
 
     Of groups of subcarriers, each as many as its noise asks for; zero where fewer than four are left.
@@ -629,6 +629,6 @@ def _over_the_band(first: Link, second: Link) -> tuple[float, float]:
     )
 
 
-def _band_noise(link: Link) -> float:
+def _band_noise(link: MeasuredLink) -> float:
     """Return the variance of the phase of a link's mean transfer function in a subcarrier, by noise, rad²."""
     return link.noise * link.mean.size / len(link.terms) / (2 * float(np.mean(np.abs(link.mean) ** 2)))

@@ -31,7 +31,7 @@ from apertura.methods.synchronisation.channels import (
     FEWEST_COUNTS,
     IMAGE_DB,
     MISSED_SHARE,
-    Channel,
+    MeasuredChannel,
     Triggers,
     measure_channel,
     triggers,
@@ -48,9 +48,9 @@ from apertura.methods.synchronisation.links import (
     TONE_DB,
     UNLOCKED_PPM,
     WEAK_DB,
+    BenchPathOffset,
     Contact,
-    Link,
-    PathOffset,
+    MeasuredLink,
     SplitAgreement,
     clock_flags,
     measure_contact,
@@ -69,7 +69,7 @@ _EVERY_CAPTURE = 4096
 
 
 @dataclass(frozen=True)
-class Line:
+class VerdictLine:
     """One line of the verdict.
 
     Attributes
@@ -115,12 +115,12 @@ class BenchNode:
 
     name: str
     triggers: Triggers
-    channels: tuple[Channel, ...]
+    channels: tuple[MeasuredChannel, ...]
     saturated: Mapping[str, float]
     clock: ClockOffset | None
     sidelink: Mapping[str, Any] | None
     contact: Contact | None
-    link: Link | None
+    link: MeasuredLink | None
     coherence_before: float | None
     flags: Flags
 
@@ -146,7 +146,7 @@ class Bench:
     flight: str
     transmitter: str
     nodes: tuple[BenchNode, ...]
-    offsets: Mapping[str, PathOffset]
+    offsets: Mapping[str, BenchPathOffset]
     splits: Mapping[str, SplitAgreement]
     carrier_hz: float
     interval_s: float
@@ -162,15 +162,15 @@ class Bench:
         return Flags.merged(*(node.flags for node in self.nodes), self.further)
 
     @property
-    def lines(self) -> list[Line]:
+    def lines(self) -> list[VerdictLine]:
         """The verdict, line by line."""
         return [line for node in self.nodes for line in self._lines(node)]
 
-    def _lines(self, node: BenchNode) -> Iterator[Line]:
+    def _lines(self, node: BenchNode) -> Iterator[VerdictLine]:
         raised = [*node.flags, *(name for name, line in self.further.items() if self.pair(node.name) in line)]
 
-        def line(of: str, what: str, measured: str, limit: str, *names: str) -> Line:
-            return Line(of, what, measured, limit, tuple(name for name in names if name in raised))
+        def line(of: str, what: str, measured: str, limit: str, *names: str) -> VerdictLine:
+            return VerdictLine(of, what, measured, limit, tuple(name for name in names if name in raised))
 
         count = node.triggers
         lost, due = count.missed + count.beyond, count.due + count.beyond
@@ -208,7 +208,7 @@ class Bench:
         else:
             yield line(self.pair(node.name), "path", "none above the noise", "one", "link_weak", "sidelink_lost")
 
-    def _received(self, node: BenchNode, line: Any) -> Iterator[Line]:
+    def _received(self, node: BenchNode, line: Any) -> Iterator[VerdictLine]:
         """Yield what a receiver's sidelink and clock say."""
         if node.name == self.transmitter:
             return
@@ -234,12 +234,12 @@ class Bench:
         if node.contact is not None:
             yield self._steady(node.contact, of)
 
-    def _steady(self, contact: Contact, of: str) -> Line:
-        return Line(of, "amplitude", contact.line.removeprefix("amplitude "),
+    def _steady(self, contact: Contact, of: str) -> VerdictLine:
+        return VerdictLine(of, "amplitude", contact.line.removeprefix("amplitude "),
                     f"{AMPLITUDE_DB:g} dB, {100 * DROPOUT_SHARE:g} %",
                     tuple(contact.flags))  # fmt: skip
 
-    def _link(self, node: BenchNode, link: Link, line: Any) -> Iterator[Line]:
+    def _link(self, node: BenchNode, link: MeasuredLink, line: Any) -> Iterator[VerdictLine]:
         pair, drift, moved = self.pair(node.name), link.phase_drift_rad, link.delay_drift_ps
         if node.coherence_before is not None:
             yield line(pair, "coherence Γ without the sidelink", f"{node.coherence_before:.4f}", "none")
@@ -380,7 +380,7 @@ def measure_bench(campaign: Campaign, flight: str) -> Bench:
             paths = campaign.settings.nodes[node.name].path_offset_m
             offset_m = paths.radar if own else paths.radar - paths.sidelink
             link = node.link
-            offsets[node.name] = PathOffset(link.path_m - expected_m, link.path_std_m, offset_m, link.cell_m)
+            offsets[node.name] = BenchPathOffset(link.path_m - expected_m, link.path_std_m, offset_m, link.cell_m)
             further.append(offsets[node.name].flags(link.name))
     first = nodes[0].link if nodes and nodes[0].name == flown.transmitter else None
     splits = {}
@@ -463,7 +463,9 @@ def _node(campaign: Campaign, flight: str, name: str, sent: Transmitted, *, own:
 _OF_FLIGHTS = frozenset({"association_suspect", "phase_unstable"})
 
 
-def _channels(read: Read, present: list[str], captured: Captured, count: int) -> tuple[tuple[Channel, ...], Saturation]:
+def _channels(
+    read: Read, present: list[str], captured: Captured, count: int
+) -> tuple[tuple[MeasuredChannel, ...], Saturation]:
     """Return the state of each channel and how much of it is saturated, by some thousand captures."""
     some = np.unique(np.linspace(0, count - 1, min(count, _EVERY_CAPTURE)).astype(np.int64))
     saturation = Saturation()
@@ -513,7 +515,7 @@ def _clock(read: Read, sent: Transmitted, name: str, count: int) -> tuple[ClockO
     return clock, clock_flags(name, clock, sent.numerology, count)
 
 
-def series(link: Link) -> tuple[Floats, Floats, Floats, Floats]:
+def series(link: MeasuredLink) -> tuple[Floats, Floats, Floats, Floats]:
     """Return (pulse,) time, s, phase, rad, delay, ps, and amplitude, dB of the median, as drawn."""
     size = np.abs(link.terms)
     return link.time_s, link.phase_rad, link.delay_ps, 20 * np.log10(size / np.median(size))

@@ -36,7 +36,7 @@ _REAL_BYTES = 2
 
 
 @dataclass(frozen=True)
-class Recording:
+class ResourceEstimate:
     """What recording and processing take.
 
     Attributes
@@ -66,7 +66,7 @@ class Recording:
     memory_bytes: int
 
     @classmethod
-    def of(cls, opened: OpenPlan) -> "Recording":
+    def of(cls, opened: OpenPlan) -> "ResourceEstimate":
         """Return what a plan takes."""
         campaign, waveform = opened.campaign, opened.campaign.settings.waveform
         prf_hz = float(getattr(waveform, "prf_hz", None) or 0.0)
@@ -132,7 +132,7 @@ class Design:
     images: Mapping[str, PlannedImage]
     refinements: Mapping[str, PlannedRefinement]
     interferograms: Mapping[str, Mapping[str, Layer]]
-    recording: Recording
+    recording: ResourceEstimate
 
     @property
     def judged(self) -> list[PlannedImage]:
@@ -171,7 +171,7 @@ def designed(plan: FlightPlan, root: Path, *, threads: int = 1, coarse: int | No
 
 
 def _computed(opened: OpenPlan, *, threads: int, coarse: int | None) -> Design:
-    plan, recording = opened.plan, Recording.of(opened)
+    plan, recording = opened.plan, ResourceEstimate.of(opened)
     if coarse is not None:
         opened = opened.coarse(coarse)
     images, refinements = dict[str, PlannedImage](), dict[str, PlannedRefinement]()

@@ -95,7 +95,7 @@ PlannedTrack = Annotated[
 ]
 
 
-class Formation(Section):
+class FormationSettings(Section):
     """Where nodes without a track of their own fly: behind, beside or above the leader, at equal separations."""
 
     shape: Literal["column", "row", "vee", "stack"] = Field(
@@ -109,7 +109,7 @@ class Formation(Section):
 
         Examples
         --------
-        >>> Formation(shape="vee", leader="a", spacing_m=3.0).offsets(3)
+        >>> FormationSettings(shape="vee", leader="a", spacing_m=3.0).offsets(3)
         [(-3.0, 3.0, 0.0), (-3.0, -3.0, 0.0), (-6.0, 6.0, 0.0)]
         """
         step, numbers = self.spacing_m, range(1, followers + 1)
@@ -119,7 +119,7 @@ class Formation(Section):
         return [(n * step * way[0] + 0.0, n * step * way[1], n * step * way[2]) for n in numbers]
 
 
-class Wobble(Section):
+class WobbleSettings(Section):
     """Smooth random motion about what is meant to be flown, as wind and a position controller leave it."""
 
     sigma_m: tuple[float, float, float] = Field(
@@ -137,12 +137,14 @@ class PlannedFlight(Section):
     tracks: dict[Name, PlannedTrack] = Field(
         min_length=1, description="node → line, racetrack, circle, mission, beside"
     )
-    formation: Formation | None = Field(None, description="where nodes without a track fly; null: every node has one")
+    formation: FormationSettings | None = Field(
+        None, description="where nodes without a track fly; null: every node has one"
+    )
     separation_m: float = Field(2.0, ge=0, description="least distance between any two nodes, m")
     climb_m_s: Positive = Field(
         2.0, description="vertical speed of take-off and landing, m/s; counts in flight_s of a mission with a home"
     )
-    wobble: Wobble | None = Field(None, description="by wind; null: none")
+    wobble: WobbleSettings | None = Field(None, description="by wind; null: none")
     log_rate_hz: Positive = Field(10.0, description="epochs of the flight logs per second, Hz")
     solution: Literal["fix", "float", "single"] = Field(
         "fix", description="of the receivers: what positions err by where nodes.<n>.position_std_m is null"
@@ -154,7 +156,7 @@ class PlannedFlight(Section):
         return tuple(dict.fromkeys((self.transmitter, *self.receivers)))
 
 
-class Expected(Section):
+class ExpectedScene(Section):
     """What is to be seen."""
 
     sigma0_db: float | None = Field(-15.0, description="backscattering coefficient of the ground, dB; null: not asked")
@@ -219,7 +221,7 @@ class FlightPlan(Settings):
     """PLAN.yaml: the keys of config/config.yaml, and what is to be flown, seen and required."""
 
     flights: dict[Name, PlannedFlight] = Field(min_length=1, description="flights that become images")
-    expect: Expected = Field(default_factory=Expected, description="what is to be seen")
+    expect: ExpectedScene = Field(default_factory=ExpectedScene, description="what is to be seen")
     require: Requirements = Field(default_factory=Requirements, description="what the flight must give")
     moved: Moved = Field(default_factory=Moved, description="tracks moved from where they are drawn")
     bounds: Bounds = Field(default_factory=Bounds, description="of what --optimise tries")

@@ -34,8 +34,7 @@ from apertura.core.scene.terrain import GridHeights
 from apertura.formats.phase_histories.fmcw import sweep_of
 from apertura.formats.tracks.missions import read_mission
 from apertura.formats.tracks.track import FIXES, make_track
-from apertura.simulation.scene import Straight
-from apertura.simulation.scene import Wobble as DrawnWobble
+from apertura.simulation.scene import Straight, Wobble
 from apertura.stages.node_log import NodeLog, shortest_wave
 from apertura.stages.pair import OpenPair, expected_pair
 from apertura.stages.planning import integration_of
@@ -517,7 +516,7 @@ def _log(campaign: Campaign, at: tuple[str, str], flight: PlannedFlight, course:
     local = crs == LOCAL
     place, attitude = course.place_m, np.zeros_like(course.place_m)
     if flight.wobble is not None:
-        drawn = DrawnWobble(**flight.wobble.model_dump())
+        drawn = Wobble(**flight.wobble.model_dump())
         still = Straight((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
         seed = np.random.default_rng([_SEED, *f"{name}/{node}".encode()])
         shaken = drawn.around(still, course.length_s, seed)

@@ -30,7 +30,7 @@ from apertura.stages.pair import open_pair
 from apertura.stages.scene import ConfiguredGround, Flown, settled
 from apertura.stages.transfer import PairEcho, recorded_echo
 from apertura.stages.transmitted import transmitted
-from apertura.tools.look.image import Block
+from apertura.tools.look.image import PulseBlock
 from apertura.tools.look.live_map import LiveMap, placed_on
 from apertura.tools.look.node import NodeSoFar
 from apertura.tools.look.pair import PairSoFar
@@ -104,7 +104,7 @@ class Look:
                     PairSoFar(campaign, flight.name, pair, self._scene, None, tx, rx, sent, threads, plans)
                 )
 
-    def _scene(self, block: Block) -> tuple[SceneGrid, ConfiguredGround]:
+    def _scene(self, block: PulseBlock) -> tuple[SceneGrid, ConfiguredGround]:
         """Return the grid of all pairs and its ground; what is `auto` is settled by all that has come, once.
 
         Of a flight that is followed, whose bounds are stated, by its first block.

@@ -44,7 +44,7 @@ _JUDGED = 1024  # pulses kept for the judgement, evenly spread
 
 
 @dataclass(frozen=True, eq=False)
-class Block:
+class PulseBlock:
     """Some pulses of a pair: transfer functions, body axes and times.
 
     Attributes
@@ -140,7 +140,7 @@ class ImageSoFar:
         self._speed_m_s = 0.0
         self._summed, self._every, self._kept = 0, 1, list[Compressed]()
 
-    def compressed(self, block: Block) -> "Compressed":
+    def compressed(self, block: PulseBlock) -> "Compressed":
         """Return the range profiles of a block, over this image's share of the band, of pulses that may add to it."""
         history, count = block.history, len(block.history.frequency_hz)
         self._speed_m_s = self._speed_m_s or history.wave_speed_m_s  # of all blocks: air changes it by less than 1e-8

@@ -25,7 +25,7 @@ from apertura.stages.positions import inside_segments, place
 from apertura.stages.scene import ConfiguredGround
 from apertura.stages.transfer import PairEcho
 from apertura.stages.transmitted import Transmitted
-from apertura.tools.look.image import Block, Compressed, ImageSoFar
+from apertura.tools.look.image import Compressed, ImageSoFar, PulseBlock
 from apertura.tools.look.node import NodeSoFar
 
 AT_ONCE = 2048
@@ -63,7 +63,7 @@ class PairSoFar:
     campaign: Campaign
     flight: str
     name: str
-    scene: Callable[[Block], tuple[SceneGrid, ConfiguredGround]]
+    scene: Callable[[PulseBlock], tuple[SceneGrid, ConfiguredGround]]
     echo: PairEcho | None = None
     tx: NodeSoFar | None = None
     rx: NodeSoFar | None = None
@@ -170,7 +170,7 @@ class PairSoFar:
             self._queue = self._queue if self._fine else []  # it would never be as far as the coarse one
         return len(block.time)
 
-    def _block(self, tx_index: NDArray[np.int64], rx_index: NDArray[np.int64]) -> Block | None:
+    def _block(self, tx_index: NDArray[np.int64], rx_index: NDArray[np.int64]) -> PulseBlock | None:
         """Return the echo of some captures, as step `echo` forms it of all; None where no pulse is left."""
         campaign, processing = self.campaign, self.campaign.settings.processing
         if self.tx is None or self.rx is None or self.sent is None:
@@ -190,15 +190,15 @@ class PairSoFar:
         echo = pair_echo(tx, rx, self.sent, processing, offset, air, hovers=hovers)
         return self._read(echo, np.arange(echo.dataset.sizes["pulse"]))
 
-    def _read(self, echo: PairEcho, pulses: NDArray[np.int64]) -> Block:
+    def _read(self, echo: PairEcho, pulses: NDArray[np.int64]) -> PulseBlock:
         formed = replace(echo, dataset=echo.dataset.isel(pulse=pulses)).at(slice(None))
         self._blocks += 1
         for name, line in Flags.merged(formed.attrs["flags"], echo.saturation.flags).items():
             self._raised[name] = self._raised.get(name, (0, ""))[0] + 1, line
         history = phase_history_of(formed, self.campaign.settings.processing.window)
-        return Block(history, body_axes(formed), formed.time.values)
+        return PulseBlock(history, body_axes(formed), formed.time.values)
 
-    def _begin(self, block: Block) -> list[ImageSoFar]:
+    def _begin(self, block: PulseBlock) -> list[ImageSoFar]:
         """Return the images, coarse and fine."""
         campaign, (grid, ground) = self.campaign, self.scene(block)
         asked = campaign.settings.processing.accuracy_db

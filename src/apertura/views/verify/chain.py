@@ -41,7 +41,7 @@ _FILES = {"missing": "missing", "altered": "changed", "added": "is new"}
 
 
 @dataclass
-class Link:
+class ChainLink:
     """One link of a chain.
 
     Attributes
@@ -85,16 +85,16 @@ class Links:
 
     def __init__(self, root: Path) -> None:
         self.root = root
-        self._links: dict[str, Link] = {}
+        self._links: dict[str, ChainLink] = {}
         self._digests: dict[str, str] = {}
 
-    def __iter__(self) -> Iterator[Link]:
+    def __iter__(self) -> Iterator[ChainLink]:
         """Yield the links in the order in which they were compared."""
         yield from self._links.values()
 
-    def of(self, name: str) -> Link:
+    def of(self, name: str) -> ChainLink:
         """Return the link of that name."""
-        return self._links.setdefault(name, Link(name))
+        return self._links.setdefault(name, ChainLink(name))
 
     def sha256(self, name: str) -> str:
         """Return the sha256 of a file, relative to the campaign folder; empty: not there; words: why it is not read."""
@@ -326,7 +326,7 @@ class Chain:
             else:
                 self.links.add([one], manifest)
 
-    def _runspec(self, link: Link, stated: Mapping[str, Any], sources: Mapping[str, str]) -> None:
+    def _runspec(self, link: ChainLink, stated: Mapping[str, Any], sources: Mapping[str, str]) -> None:
         """Compare the settings in tags with those of the images they come from."""
         for source in sources:
             folder, _, stage = source.rpartition("/")

@@ -1,4 +1,4 @@
-"""Tracks refined where no point stands out: by speckle that two pairs share at equal spatial frequencies."""
+"""Refinement of tracks by the coherence of the ground: speckle that two pairs share at equal spatial frequencies."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
