@@ -404,17 +404,18 @@ def _adjusted(
         matrix[line, [i, j]] = -1, 1
         measured[line] = _wrapped(one.phase_rad - (start[j] - start[i])), one.shift_east_m, one.shift_north_m
         std[line] = one.phase_std_rad, one.shift_std_m, one.shift_std_m
-    states, misfit, spread = np.zeros((count, 3)), 0.0, np.zeros((count, count))
+    # Weighted least squares of eq. 7: phase, east and north apart, the first pair fixed at 0.
+    states, misfit, covariance = np.zeros((count, 3)), 0.0, np.zeros((count, count))
     for part in range(3):
         weighted = matrix[:, 1:] / std[:, part : part + 1]
         normal = np.linalg.pinv(weighted.T @ weighted)
         states[1:, part] = normal @ weighted.T @ (measured[:, part] / std[:, part])
         misfit += float((((measured - matrix @ states)[:, part] / std[:, part]) ** 2).sum())
         if part == 0:
-            spread[1:, 1:] = normal
+            covariance[1:, 1:] = normal  # of the phases
     states[:, 0] += start
-    variance = np.diag(spread)
-    return states, misfit, np.sqrt(np.maximum(variance[:, None] + variance - 2 * spread, 0.0))
+    variance = np.diag(covariance)
+    return states, misfit, np.sqrt(np.maximum(variance[:, None] + variance - 2 * covariance, 0.0))
 
 
 def _wrapped(phase_rad: float) -> float:

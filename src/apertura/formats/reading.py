@@ -1,7 +1,7 @@
 """Recorders and flight logs: bytes in, `raw`, `track` or `echo` out; one file and one row of `names` per format.
 
-Readers are imported when a file of theirs is read. A result whose code imports this module can read; its code hash
-then holds the readers that its campaign's files name (`modules_that_read`).
+Readers are imported when a file of theirs is read. The code hash of a result whose code imports this module holds the
+readers that the campaign's files name.
 """
 
 import pkgutil

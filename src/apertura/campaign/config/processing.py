@@ -168,7 +168,7 @@ def check_interferometry(requested: Interferometry, known: Sequence[str], *, whe
 
     Parameters
     ----------
-    asked
+    requested
         The section.
     known
         Images of the campaign, flight/pair.

@@ -111,6 +111,7 @@ def illumination_mask(
 def _block_mask(
     beams: Beams, aperture: Aperture, middle_m: NDArray[np.float64], radius_m: NDArray[np.float64], pulses: int
 ) -> NDArray[np.bool_]:
+    # Balls as seen from the middle pulse of each block: as much larger as its other pulses are away from that one.
     starts = np.arange(0, len(aperture), pulses)
     middles = np.minimum(starts + pulses // 2, len(aperture) - 1)
     block = np.arange(len(aperture)) // pulses
@@ -119,6 +120,7 @@ def _block_mask(
         radius_m + np.maximum.reduceat(np.linalg.norm(leg - there[block], axis=1), starts)[:, None]
         for leg, there in zip(aperture.legs, middle.legs, strict=True)
     ]
+    # Outside the integration sector, or outside either antenna's pattern, with the block's rotation as slack.
     mask = np.ones((len(starts), len(middle_m)), bool)
     if beams.sector is not None:
         there = beams.sector[middles]

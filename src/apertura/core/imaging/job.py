@@ -185,7 +185,7 @@ def decide_integration(
         Phase centres in the frame of the pixels; middle of the band.
     grid, level
         The scene, on level ground.
-    antennas, asked
+    antennas, requested
         As of `apertura.core.planning.decisions.integrate`.
     """
     points_m = grid.sample_points(_POINTS, level.height_m)

@@ -186,6 +186,7 @@ def agreement(
     >>> round(result.shift_m, 3), round(result.phase_rad, 3), result.out_of_phase
     (0.0, 1.571, True)
     """
+    # Points of both that are the same, the shift from first to second, and both images halfway between their peaks.
     lists = [[(point.column * spacing_m, -point.row * spacing_m, point.amplitude) for point in some] for some in points]
     matched, spread = _common_points(lists, cell_m, alone=alone)
     if not matched:
@@ -200,6 +201,7 @@ def agreement(
     differ = np.diff(carriers, axis=1)[:, 0]
     slope = np.einsum("pi,ij,pj->p", differ, np.linalg.inv(spectrum), differ)
     place, turn = background / 2 + _POINT**2, background / 2 * (1 + slope / 4) + _POINT_RAD**2
+    # Mean shift and mean phasor, weighted by the inverse of these variances.
     shift, std = _weighted_place(shifts, place, unit)
     along = carriers.mean(axis=(0, 1))
     phasors = np.exp(1j * np.angle(values[:, 1] * values[:, 0].conj()))
@@ -330,7 +332,7 @@ def agreement_of_ground(
 
     Notes
     -----
-    Source: docs/theory/fusion.md, eqs. 5 and 6. Spatial frequencies that one image alone holds add nothing, so neither
+    Source: docs/theory/fusion.md, eq. 6. Spatial frequencies that one image alone holds add nothing, so neither
     carrier has to be taken off; the phase is that at one place of the ground, as by points.
 
     Examples
@@ -353,13 +355,15 @@ def agreement_of_ground(
     first, second = np.fft.fft2(patches, (2 * PATCH_PX,) * 2)  # padded: no correlation around the edges
     scale = float(np.sqrt(powers.prod()))
     looks = _looks(first, second, np.abs(patches), powers)
-    level = np.abs(np.fft.ifft2((second * first.conj()).sum(axis=0))) / scale  # eq. 5, by the lag of the second
+    level = np.abs(np.fft.ifft2((second * first.conj()).sum(axis=0))) / scale  # |R| of eq. 6
     far = max(2, min(PATCH_PX // 2, int(max(REACH_M, 12 * cell_m) / spacing_m)))
+    # Its maximum within reach, if chance does not make it: |R|² > 1 − (0.001/n)^{1/(L−1)} of n cells and L looks.
     lags = np.arange(-far, far + 1)
     near = level[np.ix_(lags, lags)]
     cells = max(1.0, near.size * 12 * float(np.sqrt(max(np.linalg.det(spectrum), 0.0))) * spacing_m**2)
     if looks < _LEAST_LOOKS or near.max() ** 2 <= 1 - (_BY_CHANCE / cells) ** (1 / (looks - 1)):
         return None
+    # Shift by the lag of the maximum, to a fraction of a pixel; phase at lag 0, one place of the ground.
     down, right = (lags[int(at)] for at in np.unravel_index(int(near.argmax()), near.shape))
     shift = spacing_m * np.array([_between_lags(level[down], right), -_between_lags(level[:, right], down)])
     together = complex((patches[1] * patches[0].conj()).sum()) / scale

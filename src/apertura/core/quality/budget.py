@@ -174,12 +174,12 @@ def position_lines(paths: PointPaths, nodes: Sequence[NodePositions], *, sidelin
                 for (slope, _), node in zip(some, taken, strict=True)
             ]
             effect = paths.of_noise(*((size, node.correlation_s) for size, node in zip(sizes, taken, strict=True)))
-            stated = "; ".join(f"{_sizes(node)}, said by the {node.stated_by}" for node in taken)
+            accuracy = "; ".join(f"{_sizes(node)}, said by the {node.stated_by}" for node in taken)
             assumed = "; ".join(f"{_sizes(node)}, {_CLASSES[node.receiver]}" for node in taken if node.receiver)
             lines.append(
                 BudgetLine(
                     "positions",
-                    stated if kind == "stated" else None,
+                    accuracy if kind == "stated" else None,
                     effect,
                     "1 cm in each axis of what nobody stated",
                     assumed=assumed if kind == "assumed" else None,
@@ -258,12 +258,14 @@ def attitude_lines(paths: PointPaths, nodes: Sequence[NodeAttitude | None], *, s
     armed = [(node, growth) for node, growth in zip(nodes, growths, strict=True) if node and np.any(node.arms_m)]
     lines = []
     for cause, name, error in (("attitude", "std_deg", _turned), ("lever arms", "arm_std_m", _other_arms)):
-        for stated in (True, False):
-            some = [error(paths, *one) for one in armed if (getattr(one[0], name) is not None) == stated]
+        for is_stated in (True, False):
+            some = [error(paths, *one) for one in armed if (getattr(one[0], name) is not None) == is_stated]
             if some:
                 said = "; ".join(words for words, _ in some)
                 effect = paths.of_noise(*(part for _, parts in some for part in parts))
-                lines.append(BudgetLine(cause, said if stated else None, effect, assumed=None if stated else said))
+                lines.append(
+                    BudgetLine(cause, said if is_stated else None, effect, assumed=None if is_stated else said)
+                )
     return lines
 
 

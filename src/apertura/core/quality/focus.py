@@ -219,6 +219,7 @@ def point_focus(contributions: NDArray[np.complex128]) -> PointFocus | None:
     True
     """
     pulses = 1
+    # Blocks of 1, 2, 4 … pulses, until v of eq. 1 shows that the point dominates them.
     while len(contributions) // pulses >= LEAST_BLOCKS:
         count = len(contributions) // pulses
         blocks = contributions[: count * pulses].reshape(count, pulses).mean(axis=1)
@@ -229,6 +230,7 @@ def point_focus(contributions: NDArray[np.complex128]) -> PointFocus | None:
                 best = float(np.abs(np.fft.fft(blocks, _PADDING * count)).max())
                 if abs(complex(blocks.sum())) < LEAST_PEAK_SHARE * best:
                     return None
+                # Eq. 1: the spectrum's maximum over f, with the loss by noise and neighbours (v) taken out.
                 loss = (best / amplitude.sum()) ** 2 * (1 + variance * (1 - 2.5 * variance) / 2) ** 2
                 snr_db = _snr_db(contributions)
                 allowed = 1 / (1 + len(contributions) * 10 ** (-snr_db / 10))

@@ -128,8 +128,7 @@ def _receiver(fields: Fields, options: LogOptions, node: str, where: Path) -> tu
     known = sorted({int(number) for number in numbers[np.isfinite(numbers)]})
     if not known:
         raise _error("no GPS message", where)
-    requested = options.body is None or options.body in map(str, known)
-    if not requested:
+    if options.body is not None and options.body not in map(str, known):
         raise CampaignError(
             f"no receiver {quoted(options.body)}",
             where,
@@ -146,10 +145,10 @@ def _accuracy(fields: Fields, receiver: int, time_us: Floats) -> dict[str, Float
     place = np.searchsorted(times, time_us)
     there = place < times.size
     there[there] = times[place[there]] == time_us[there]
-    stated = {name: np.full(time_us.size, np.nan) for name in ("HAcc", "VAcc", "VV", "AEl")}
-    for name, values in stated.items():
+    accuracy = {name: np.full(time_us.size, np.nan) for name in ("HAcc", "VAcc", "VV", "AEl")}
+    for name, values in accuracy.items():
         values[there] = fields[f"GPA/{name}"][own][order][place[there]]
-    return stated
+    return accuracy
 
 
 def _height(

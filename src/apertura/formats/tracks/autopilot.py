@@ -274,12 +274,12 @@ def autopilot_track(
         moved = contradicted(epochs.time_utc, epochs.geodetic, epochs.velocity)
         epochs = without(moved, "not where the receiver's velocity leads")
         angles = None if attitude is None else _angles_deg(attitude, clock.boot_s(epochs.time_utc))
-    stated = np.where((epochs.std_m > 0) & (epochs.std_m < _WORST_STD_M), epochs.std_m, np.nan)
+    std_m = np.where((epochs.std_m > 0) & (epochs.std_m < _WORST_STD_M), epochs.std_m, np.nan)
     return make_track(
         epochs.time_utc,
         epochs.geodetic,
         attitude_deg=angles,
-        position_std_m=stated if np.isfinite(stated).any() else None,
+        position_std_m=std_m if np.isfinite(std_m).any() else None,
         fix=epochs.fix,
         dropped=dropped,
         node=node,
@@ -324,8 +324,8 @@ def _angles_deg(attitude: Attitude, boot_s: Floats) -> Floats | None:
     alone = np.zeros(time.size, bool)
     alone[1:-1] = np.minimum(before[:-1], after[1:]) > across + _TURN_RAD
     time, turns = time[~alone], turns[~alone]
-    clipped = np.clip(boot_s, time[0], time[-1])
-    angles = Slerp(time, turns)(clipped).as_euler("ZYX", degrees=True)[:, ::-1]
-    following = np.clip(np.searchsorted(time, clipped), 1, time.size - 1)
-    unknown = (np.abs(boot_s - clipped) > _EXTRAPOLATED_S) | (time[following] - time[following - 1] > _LONGEST_S)
+    within_s = np.clip(boot_s, time[0], time[-1])
+    angles = Slerp(time, turns)(within_s).as_euler("ZYX", degrees=True)[:, ::-1]
+    following = np.clip(np.searchsorted(time, within_s), 1, time.size - 1)
+    unknown = (np.abs(boot_s - within_s) > _EXTRAPOLATED_S) | (time[following] - time[following - 1] > _LONGEST_S)
     return np.where(unknown[:, None], np.nan, angles)

@@ -300,10 +300,10 @@ def _left_out(table: pd.DataFrame, log: _Log) -> dict[str, "pd.Series[bool]"]:
     """Return why rows are no epochs → which rows."""
     reasons = {}
     if _QUALITY in table and log.options.quality == "gga":
-        stated = _words(table[_QUALITY])
+        quality = _words(table[_QUALITY])
         for number, why in GGA_NOT_MEASURED.items():
             if number:
-                reasons[f"{why} (quality {number})"] = stated == number
+                reasons[f"{why} (quality {number})"] = quality == number
     for name in ("time_utc", "time"):
         if name in table:
             texts = table[name].fillna("").astype(str)
@@ -369,12 +369,12 @@ def _frame(table: pd.DataFrame, log: _Log) -> Literal["geodetic", "ecef", "local
 
 def _time(table: pd.DataFrame, log: _Log) -> NDArray[np.datetime64]:
     """Return UTC; a zone stated by the column's name is not overruled by the config."""
-    stated = [name for name in _TIMES if name in table]
-    if not stated:
+    columns = [name for name in _TIMES if name in table]
+    if not columns:
         raise _lacking("time_utc", table, log)
-    if len(stated) > 1 and stated[0] != "time_utc":
+    if len(columns) > 1 and columns[0] != "time_utc":
         raise ValueError("columns time and time_s")
-    name, system = stated[0], log.options.time_system
+    name, system = columns[0], log.options.time_system
     if name == "time_s":
         return _counted(_scaled(table, ["time_s"], log)[:, 0], log)
     zoned = table[name].dropna().str.strip().str.contains(_ZONE)

@@ -112,9 +112,9 @@ def read_nmea(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -> xr.
 
 def _check_day(first_ns: int, log: _Log) -> None:
     """Raise CampaignError where the config's day is neither that of the first date nor that of the first epoch."""
-    stated = start_time(log.options, "", node=log.node, where=log.path).astype("datetime64[D]")
+    day = start_time(log.options, "", node=log.node, where=log.path).astype("datetime64[D]")
     days = [np.datetime64(time_ns, "ns").astype("datetime64[D]") for time_ns in (first_ns, *log.order[:1])]
-    if stated not in days:
+    if day not in days:
         raise contradicted("start_utc", f"RMC or ZDA date its first epoch {days[-1]}", node=log.node, where=log.path)
 
 
@@ -267,23 +267,24 @@ def _track(log: _Log) -> xr.Dataset:
         raise _error(f"no GGA, but {' and '.join(elsewhere)}", log.path)
     geodetic = np.array([fix.geodetic for fix in fixes]).reshape(-1, 3)
     separation = np.array([fix.separation for fix in fixes])
-    stated = np.isfinite(separation)
-    if not separation[stated].any():  # a receiver without a model of the geoid writes 0 throughout
+    has_separation = np.isfinite(separation)
+    if not separation[has_separation].any():  # a receiver without a model of the geoid writes 0 throughout
         if fixes and log.options.height_offset_m is None:
             found = "altitudes above mean sea level, without geoid separation"
             raise unstated("height_offset_m", found, node=log.node, where=log.path)
-        stated, separation = np.ones(len(fixes), bool), np.full(len(fixes), log.options.height_offset_m or 0.0)
+        has_separation = np.ones(len(fixes), bool)
+        separation = np.full(len(fixes), log.options.height_offset_m or 0.0)
     elif log.options.height_offset_m is not None:
         raise contradicted("height_offset_m", "GGA states the geoid separation", node=log.node, where=log.path)
-    if not stated.all():
-        log.dropped["without geoid separation"] += int((~stated).sum())
+    if not has_separation.all():
+        log.dropped["without geoid separation"] += int((~has_separation).sum())
     geodetic[:, 2] += separation
     std = np.array([log.std.get(now, (np.nan,) * 3) for now in log.order]).reshape(-1, 3)
     track = make_track(
-        np.array(log.order, "datetime64[ns]")[stated],
-        geodetic[stated],
-        position_std_m=std[stated] if log.std else None,
-        fix=np.array([fix.kind for fix in fixes], np.int8)[stated],
+        np.array(log.order, "datetime64[ns]")[has_separation],
+        geodetic[has_separation],
+        position_std_m=std[has_separation] if log.std else None,
+        fix=np.array([fix.kind for fix in fixes], np.int8)[has_separation],
         dropped=dict(log.dropped),
         node=log.node,
         where=log.path,

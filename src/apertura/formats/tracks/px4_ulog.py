@@ -125,8 +125,8 @@ def _with_remarks(
 
 def _fix(fields: Fields, source: str) -> NDArray[np.int8]:
     """Return the kind of solution of each message of a receiver; 0 without a position in three dimensions."""
-    stated = fields.get(f"{source}/fix_type", np.zeros(0, np.uint8))
-    return np.array([_KINDS.get(int(kind), 0) for kind in stated], np.int8)
+    kinds = fields.get(f"{source}/fix_type", np.zeros(0, np.uint8))
+    return np.array([_KINDS.get(int(kind), 0) for kind in kinds], np.int8)
 
 
 def _sources(fields: Fields) -> list[str]:
@@ -137,17 +137,17 @@ def _sources(fields: Fields) -> list[str]:
 
 def _source(fields: Fields, options: LogOptions, node: str, where: Path) -> str:
     known = _sources(fields)
-    bodies = [name for name in known if options.body in (None, name, name.partition(":")[0])]
+    matching = [name for name in known if options.body in (None, name, name.partition(":")[0])]
     if not known:
         raise _error("no message of any of them", where)
-    if not bodies:
+    if not matching:
         raise CampaignError(
             f"no positions of {quoted(options.body)}",
             where,
             f"one of {', '.join(known)}",
             f"Correct nodes.{node}.log.body, or leave it out.",
         )
-    return bodies[0]
+    return matching[0]
 
 
 def _epochs(fields: Fields, source: str, options: LogOptions, node: str, where: Path) -> Epochs:
@@ -160,16 +160,16 @@ def _epochs(fields: Fields, source: str, options: LogOptions, node: str, where: 
     lacking = [name for name in _ALWAYS if f"{source}/{name}" not in fields and not source.startswith(FUSED)]
     if lacking:
         raise _error(f"no {', '.join(lacking)} in {source}", where)
-    fixed = np.ones(latitude.size, bool) if fix is None else fix > 0
+    has_fix = np.ones(latitude.size, bool) if fix is None else fix > 0
     for name, good in _STATES.items():
-        fixed &= np.asarray(fields.get(f"{source}/{name}", good)) == good
+        has_fix &= np.asarray(fields.get(f"{source}/{name}", good)) == good
     boot_s = fields[f"{source}/timestamp"] * 1e-6
     utc = np.full(boot_s.size, np.datetime64("NaT", "ns"), "datetime64[ns]")
     if not source.startswith(FUSED):
         boot_s, utc = _arrived(fields, source), _utc(fields, source)
     unknown = np.full(latitude.size, np.nan)
     across, up = (unknown if one is None else _numbers(one) for one in (of["eph"], of["epv"]))
-    height = _height(fields, source, fixed, options.height_offset_m)
+    height = _height(fields, source, has_fix, options.height_offset_m)
     if height is None:
         raise CampaignError(
             f"{source} holds no heights above the ellipsoid",
@@ -181,7 +181,7 @@ def _epochs(fields: Fields, source: str, options: LogOptions, node: str, where: 
         boot_s,
         utc,
         np.stack([latitude, longitude, height], -1),
-        fixed,
+        has_fix,
         fix,
         np.stack([across, across, up], -1),
         _velocity(fields, source),
@@ -189,14 +189,14 @@ def _epochs(fields: Fields, source: str, options: LogOptions, node: str, where: 
 
 
 def _height(
-    fields: Fields, source: str, fixed: NDArray[np.bool_], offset_m: float | None
+    fields: Fields, source: str, has_fix: NDArray[np.bool_], offset_m: float | None
 ) -> NDArray[np.float64] | None:
     ellipsoidal, sea_level = (_first(fields, source, names) for names in (_ELLIPSOIDAL, _SEA_LEVEL))
-    copied = ellipsoidal is None or not fixed.any()
-    if ellipsoidal is not None and fixed.any():
+    copied = ellipsoidal is None or not has_fix.any()
+    if ellipsoidal is not None and has_fix.any():
         # a driver without the geoid's height writes 0, or one height twice; nowhere is the geoid flat to a millimetre
-        copied = not ellipsoidal[fixed].any()
-        copied |= sea_level is not None and bool(np.abs((ellipsoidal - sea_level)[fixed]).max() < 1e-3)
+        copied = not ellipsoidal[has_fix].any()
+        copied |= sea_level is not None and bool(np.abs((ellipsoidal - sea_level)[has_fix]).max() < 1e-3)
     if not copied:
         return ellipsoidal
     return sea_level + offset_m if sea_level is not None and offset_m is not None else None

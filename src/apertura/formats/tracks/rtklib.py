@@ -155,8 +155,8 @@ def _solutions(
     header: _Header, rows: list[tuple[int, str]], options: LogOptions, *, node: str, where: Path
 ) -> _Solutions:
     _check_stated(header, options, node=node, where=where)
-    times, values, stated = _rows(rows, header, where)
-    quality = stated[:, 0] if "Q" in header.cell_of else np.full(len(times), np.nan)
+    times, values, quality_and_std = _rows(rows, header, where)
+    quality = quality_and_std[:, 0] if "Q" in header.cell_of else np.full(len(times), np.nan)
     time = _utc(_times(times, where), header.system, where)
     solved, leap = quality != 0, np.isnat(time)
     kept = solved & ~leap
@@ -166,7 +166,7 @@ def _solutions(
         position,
         ecef,
         _fix(quality[kept], where) if "Q" in header.cell_of else None,
-        _std(stated[kept, 1:], position),
+        _std(quality_and_std[kept, 1:], position),
         {"Q = 0": int((~solved).sum()), LEAP_SECOND: int((leap & solved).sum())},
     )
 
@@ -190,23 +190,23 @@ def _header(lines: list[str], path: Path, first: int) -> _Header:
     doubled = [name for name in names if names.count(name) > 1]
     if doubled:
         raise _error(f"column {quoted(doubled[0], 40)} a second time", path)
-    heights = _stated_besides(lines, names[0], path, first)
+    height_datum = _stated_besides(lines, names[0], path, first)
     widths = [2, *(3 if name.endswith("(d'\")") else 1 for name in names[1:])]
     ends = list(accumulate(widths))
     base = next((line.partition(":")[2] for line in lines if re.match(r"%\s*ref pos\s*:", line)), "")
     cell_of = {name: end - width for name, end, width in zip(names, ends, widths, strict=True)}
-    return _Header(names[0], kind, cell_of, ends[-1], heights, _CELLS.split(base.strip()) if base.strip() else [])
+    return _Header(names[0], kind, cell_of, ends[-1], height_datum, _CELLS.split(base.strip()) if base.strip() else [])
 
 
 def _stated_besides(lines: list[str], system: str, path: Path, first: int) -> str:
     """Return the datum of heights in the comments of a header; raise CampaignError of what cannot be as they state."""
-    heights = ""
+    height_datum = ""
     for line, text in enumerate(lines, first):
         interval, datum = _INTERVAL.search(text), _DATUM.search(text)
-        stated = (interval[1] or interval[2]).upper() if interval else system
-        if stated != system:
+        other = (interval[1] or interval[2]).upper() if interval else system
+        if other != system:
             raise CampaignError(
-                f"times are {system} by the heading of the columns and {stated} by line {line}, "
+                f"times are {system} by the heading of the columns and {other} by line {line}, "
                 f"{quoted(text.strip(), 80)}",
                 path,
                 "one time system",
@@ -220,8 +220,8 @@ def _stated_besides(lines: list[str], system: str, path: Path, first: int) -> st
                 "Export the solution with out-datum=wgs84, or transform it.",
             )
         if datum and (datum[2] or "").lower() in {"geodetic", "ellipsoidal"}:
-            heights = datum[2].lower()
-    return heights
+            height_datum = datum[2].lower()
+    return height_datum
 
 
 def _check_stated(header: _Header, options: LogOptions, *, node: str, where: Path) -> None:
@@ -251,7 +251,7 @@ def _rows(
     named = _STD_ECEF if header.position == "ecef" else _STD
     whole = [header.cell_of[name] for name in named] if set(named) <= set(header.cell_of) else []
     wanted = [header.cell_of.get("Q"), *whole]
-    times, positions, stated = [], [], []
+    times, positions, quality_and_std = [], [], []
     for line, text in lines:
         cells = _CELLS.split(text.strip())
         if len(cells) != header.cells:
@@ -264,10 +264,10 @@ def _rows(
                     for axis, at in enumerate(angles)
                 ]
             )
-            stated.append([np.nan if at is None else number(cells[at]) for at in wanted])
+            quality_and_std.append([np.nan if at is None else number(cells[at]) for at in wanted])
         except ValueError as error:
             raise _error(f"line {line} is {quoted(' '.join(cells), 60)} ({error})", path) from error
-    return times, np.array(positions).reshape(-1, 3), np.array(stated).reshape(-1, len(wanted))
+    return times, np.array(positions).reshape(-1, 3), np.array(quality_and_std).reshape(-1, len(wanted))
 
 
 def _angle(cells: list[str]) -> float:
@@ -335,13 +335,13 @@ def _base(header: _Header, options: LogOptions, *, node: str, where: Path) -> ND
         angles = whole if len(cells) == 3 else [_angle(cells[:3]), _angle(cells[3:6]), *whole[6:]] if whole else []
     except ValueError as error:
         raise _error(f"ref pos {quoted(' '.join(cells), 60)}", where) from error
-    stated = angles or options.base
-    if not stated:
+    geodetic = angles or options.base
+    if not geodetic:
         found = "baselines without the point that they begin at (ref pos)"
         raise unstated("base", found, node=node, where=where)
-    if len(stated) != 3 or not (abs(stated[0]) <= 90 and abs(stated[1]) <= 360 and abs(stated[2]) < 1e5):
+    if len(geodetic) != 3 or not (abs(geodetic[0]) <= 90 and abs(geodetic[1]) <= 360 and abs(geodetic[2]) < 1e5):
         raise _error(f"ref pos {quoted(' '.join(cells), 60)}", where)
-    base = ecef_from_geodetic(*np.array(stated, np.float64))
+    base = ecef_from_geodetic(*np.array(geodetic, np.float64))
     if options.base and np.linalg.norm(base - ecef_from_geodetic(*np.array(options.base))) > _SAME_BASE_M:
         raise contradicted("base", f"ref pos {' '.join(cells)}", node=node, where=where)
     return base
@@ -363,11 +363,11 @@ def _std(stated: NDArray[np.float64], ecef: NDArray[np.float64]) -> NDArray[np.f
 
 def _fix(quality: NDArray[np.float64], path: Path) -> NDArray[np.int8]:
     """Return kinds of solution, 0 where the log states none."""
-    stated = np.nan_to_num(quality, nan=0.0)
-    wrong = np.flatnonzero(~np.isin(stated, range(10)))
+    kinds = np.nan_to_num(quality, nan=0.0)
+    wrong = np.flatnonzero(~np.isin(kinds, range(10)))
     if wrong.size:
-        raise _error(f"Q {stated[wrong[0]]:g} in solution {int(wrong[0])}", path)
-    return np.asarray(stated, np.int8)
+        raise _error(f"Q {kinds[wrong[0]]:g} in solution {int(wrong[0])}", path)
+    return np.asarray(kinds, np.int8)
 
 
 def _error(found: str, path: Path) -> CampaignError:
@@ -427,14 +427,14 @@ def write_rtklib_pos(
     -----
     Source: RTKLIB manual 2.4.2, appendix B.1 "Positioning solution file".
     """
-    stated = coarsened(gps_from_utc(time_utc) if system == "GPST" else time_utc)
+    written_time = coarsened(gps_from_utc(time_utc) if system == "GPST" else time_utc)
     known = np.where(std_m > 0, std_m.clip(_LEAST_STD_M), 0.0)  # NaN is not above 0
     kinds = np.where(fix == 0, FIXES["single"], fix)
     rest = f"{0:9.4f}{0:9.4f}{0:9.4f}{0:7.2f}{ratio:7.1f}"
     lines = [f"% {line}".rstrip() for line in header]
-    told = "".join(f"% {line}\n" for line in remarks)
-    lines.append(_COLUMNS.format(remarks=told, system=system).rstrip("\n"))
-    texts = (text.replace("-", "/").replace("T", " ") for text in np.datetime_as_string(stated))
+    remark_lines = "".join(f"% {line}\n" for line in remarks)
+    lines.append(_COLUMNS.format(remarks=remark_lines, system=system).rstrip("\n"))
+    texts = (text.replace("-", "/").replace("T", " ") for text in np.datetime_as_string(written_time))
     for text, place, kind, std in zip(texts, geodetic, kinds, known, strict=True):
         latitude, longitude, height = place
         deviations = "".join(f"{one:9.4f}" for one in std)

@@ -85,11 +85,11 @@ def make_track(
     >>> track.position.values[1].round(6)
     array([      0., 6378138.,       0.])
     """
-    fixed = (np.abs(position[:, :2]) >= _NOWHERE_DEG).any(axis=1) | (frame != "geodetic")
-    left_out = {**(dropped or {}), **({"no fix": int((~fixed).sum())} if not fixed.all() else {})}
-    time_utc, position = time_utc[fixed], position[fixed]
-    attitude_deg, position_std_m = (None if one is None else one[fixed] for one in (attitude_deg, position_std_m))
-    fix = None if fix is None else fix[fixed]
+    has_fix = (np.abs(position[:, :2]) >= _NOWHERE_DEG).any(axis=1) | (frame != "geodetic")
+    left_out = {**(dropped or {}), **({"no fix": int((~has_fix).sum())} if not has_fix.all() else {})}
+    time_utc, position = time_utc[has_fix], position[has_fix]
+    attitude_deg, position_std_m = (None if one is None else one[has_fix] for one in (attitude_deg, position_std_m))
+    fix = None if fix is None else fix[has_fix]
     if len(time_utc) < 2:
         without = f" ({', '.join(f'{count} left out: {why}' for why, count in left_out.items())})" if left_out else ""
         raise CampaignError(f"{len(time_utc)} epochs{without}", where, "at least two", "Export the whole log.")
@@ -179,8 +179,8 @@ def receivers_remark(kinds: Mapping[str, NDArray[np.int8]], taken: str, node: st
     listed = []
     for receiver, fix in kinds.items():
         counted = {name: int((fix == number).sum()) for number, name in names.items()}
-        stated = ", ".join(f"{name} {count}" for name, count in counted.items() if count)
-        listed.append(f"{receiver} ({stated or 'no epochs'})")
+        solutions = ", ".join(f"{name} {count}" for name, count in counted.items() if count)
+        listed.append(f"{receiver} ({solutions or 'no epochs'})")
     return f"the log holds {' and '.join(listed)}; {taken} is read: set nodes.{node}.log.body to choose"
 
 

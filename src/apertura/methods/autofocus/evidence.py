@@ -64,9 +64,10 @@ def remaining(problem: Problem, state: State) -> Remaining:
     """
     nodes, knots = problem.prior.nodes, len(problem.knots_s)
     column = {node: slice(3 * number, 3 * number + 3) for number, node in enumerate(nodes)}
-    known = np.zeros((knots, 3 * len(nodes), 3 * len(nodes)))
+    # Information on the errors of all nodes at each knot: of the logs, and of all phases measured while an error lasts.
+    information = np.zeros((knots, 3 * len(nodes), 3 * len(nodes)))
     for node, prior in nodes.items():
-        known[:, column[node], column[node]] += prior.axes.T @ np.diag(1 / prior.std_m**2) @ prior.axes
+        information[:, column[node], column[node]] += prior.axes.T @ np.diag(1 / prior.std_m**2) @ prior.axes
     rows: list[tuple[slice, Floats]] = []
     smooth = max(prior.smooth for prior in nodes.values())
     for patches, statistics in zip(state.cached, state.statistics, strict=True):
@@ -76,9 +77,10 @@ def remaining(problem: Problem, state: State) -> Remaining:
             for node, slope in patch.slopes.items():
                 row[:, column[node]] = patch.wavenumber * slope
             if len(row):
-                known[patch.blocks] += 2 * ratio / len(row) * smooth * row[:, :, None] * row[:, None, :]
+                information[patch.blocks] += 2 * ratio / len(row) * smooth * row[:, :, None] * row[:, None, :]
                 rows.append((patch.blocks, row))
-    covariance = np.linalg.inv(known)
+    # Covariance that is left; the phases that it makes at the patches, and the deviations, with the gauge's own.
+    covariance = np.linalg.inv(information)
     phases = [np.einsum("bi,bij,bj->b", row, covariance[blocks], row).mean() for blocks, row in rows]
     moved = problem.prior.tracks(problem.gauge.modes)
     std_m = {
@@ -441,19 +443,21 @@ def _by_part(
     """Return (part,) float64, metres of total path by which each part's image shows a point farther; NaN if not."""
     nothing = np.full(parts, np.nan)
     place = echo.patch.pixels_m[int(np.abs(image).argmax())]
+    # The line through the point over level ground along which its path grows fastest.
     slope = blocks.aperture.path_gradient(place).mean(axis=0)
     level = axes[:2].T @ (axes[:2] @ slope)
     steep = float(level @ slope)
     if steep < _LEAST_SLOPE or len(echo.profiles) < parts:
         return nothing
-    further = np.linspace(-_REACH_CELLS, _REACH_CELLS, _STEPS) * SPEED_OF_LIGHT_M_S / bandwidth_hz(echo.profiles)
-    line = Patch(echo.patch.place_m, place + further[:, None] / steep * level)
+    extra_path_m = np.linspace(-_REACH_CELLS, _REACH_CELLS, _STEPS) * SPEED_OF_LIGHT_M_S / bandwidth_hz(echo.profiles)
+    line = Patch(echo.patch.place_m, place + extra_path_m[:, None] / steep * level)
+    # Power along it in the image of each part, and its maximum by a parabola.
     values = blocks.contribution(replace(echo, patch=line), blocks.moves(tracks)).values
     ends = np.linspace(0, values.shape[1], parts + 1).astype(np.int64)[:-1]
     power = np.abs(np.add.reduceat(values, ends, axis=1)).astype(np.float64) ** 2
     peak = np.clip(power.argmax(axis=0), 1, _STEPS - 2)
     left, middle, right = (np.take_along_axis(power, (peak + step)[None], 0)[0] for step in (-1, 0, 1))
     curve = np.minimum(left - 2 * middle + right, -1e-300)
-    shift = further[peak] + 0.5 * (left - right) / curve * (further[1] - further[0])
+    shift = extra_path_m[peak] + 0.5 * (left - right) / curve * (extra_path_m[1] - extra_path_m[0])
     inside = (power.argmax(axis=0) == peak) & (middle > _DOMINATES * np.median(power, axis=0))
     return np.where(inside, shift, nothing)

@@ -211,12 +211,15 @@ def _product(tile: SpeckleTile, first: Contribution, second: Contribution) -> "c
     """
     from scipy.sparse import csr_array  # slow to import
 
+    # Spatial frequencies k·g of each block, cycles over the tile's sides, (block, 2). The line through the tile that is
+    # normal to one: `across`; frequencies of other blocks are compared along it.
     cycles = [one.wavenumber / (2 * np.pi) * sum(one.slopes.values()) @ tile.sides_m.T for one in (first, second)]
     across = cycles[0][:, ::-1] * [-1, 1] / np.linalg.norm(cycles[0], axis=1, keepdims=True)
     along = np.sum(across * cycles[0], axis=1)[:, None]
     values, rows, columns = [np.zeros(0, np.complex64)], [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
     for begin in range(0, len(across), _BLOCKS):
         some = slice(begin, begin + _BLOCKS)
+        # O of eq. 21, (1 − |cycles apart|)₊, then O ∘ BᴴB' over the blocks that share any.
         shared = np.maximum(1 - np.abs(along[some] - across[some] @ cycles[1].T), 0).astype(np.float32)
         seen = np.flatnonzero(shared.any(axis=0))
         if seen.size:

@@ -81,11 +81,13 @@ class Blocks:
         from scipy.sparse import csr_array  # slow to import
 
         count, step_s, pulses = len(knots_s), float(knots_s[1] - knots_s[0]), len(record.time_s)
+        # Mean over the pulses of each block, (block, pulse).
         edges = np.searchsorted(record.time_s, np.append(knots_s - step_s / 2, np.inf))
         edges[0] = 0
         block = np.repeat(np.arange(count), np.diff(edges))
         share = 1 / np.diff(edges)[block]
         mean = csr_array((share, (block, np.arange(pulses))), shape=(count, pulses))
+        # Linear interpolation of knots at the pulses, (pulse, knot).
         place = np.clip((record.time_s - knots_s[0]) / step_s, 0, count - 1)
         left = np.minimum(place.astype(np.int64), count - 2)
         rows = np.tile(np.arange(pulses), 2)
@@ -119,6 +121,7 @@ class Blocks:
         starts = [self._offsets(patch) for patch in patches]
         sums = [np.zeros((len(offsets), len(edges) - 1), np.complex64) for offsets in starts]
         first = 0
+        # S_b(δ) of eq. 9, for as many whole blocks at a time as have `_PULSES` pulses.
         while first < len(edges) - 1:
             last = max(first + 1, int(np.searchsorted(edges, edges[first] + _PULSES, side="right")) - 1)
             last = min(last, len(edges) - 1)
@@ -148,8 +151,8 @@ class Blocks:
         return np.asarray(np.arange(-half, half + 1) * step_m, np.float64)
 
     def _echo(self, patch: Patch, offsets: Floats, sums: NDArray[np.complex64]) -> PatchEcho:
-        statistics = np.flatnonzero(np.abs(sums).any(axis=0))
-        blocks = slice(int(statistics[0]), int(statistics[-1]) + 1) if statistics.size else slice(0, 1)
+        illuminating = np.flatnonzero(np.abs(sums).any(axis=0))  # blocks
+        blocks = slice(int(illuminating[0]), int(illuminating[-1]) + 1) if illuminating.size else slice(0, 1)
         whole, aperture = self.record.profiles, self.aperture[blocks]
         middle = aperture.path(patch.place_m)
         turned = sums[:, blocks].T * np.exp(-1j * whole.wavenumber_rad_m * (middle[:, None] + offsets))
@@ -162,20 +165,23 @@ class Blocks:
     def contribution(self, echo: PatchEcho, moved: Tracks) -> "Contribution":
         """Return what each block adds to the pixels of a patch where its nodes have moved by so much."""
         tx, rx = self.record.nodes
+        # Antennas as corrected; by the sidelink path of eq. 3 echoes are delayed by as much as it has grown.
         moves = [moved[node][echo.blocks] for node in (tx, rx)]
         logged = echo.profiles.aperture
         aperture = Aperture(logged.tx_m + moves[0], logged.rx_m + moves[1])
-        further_m, along = np.zeros(len(aperture)), np.zeros((len(aperture), 3))
+        extra_path_m, along = np.zeros(len(aperture)), np.zeros((len(aperture), 3))
         if self.sidelink_m is not None:
             between = self.sidelink_m[echo.blocks]
             corrected = between + moves[0] - moves[1]
             length = np.linalg.norm(corrected, axis=1)
-            further_m = length - np.linalg.norm(between, axis=1)
+            extra_path_m = length - np.linalg.norm(between, axis=1)
             along = corrected / np.maximum(length, 1e-9)[:, None]
+        # Slopes ∂ρ/∂m of eq. 2: unit vectors from the patch to the antennas, ∓s of the sidelink.
         away = [leg - echo.patch.place_m for leg in aperture.legs]
         unit = [one / np.maximum(np.linalg.norm(one, axis=1, keepdims=True), 1e-9) for one in away]
         slopes = {tx: unit[0] + unit[1]} if tx == rx else {tx: unit[0] - along, rx: unit[1] + along}
-        profiles = echo.profiles.moved(aperture, further_m)
+        # B_b(x) of eq. 9 at the pixels.
+        profiles = echo.profiles.moved(aperture, extra_path_m)
         profiles = replace(profiles, samples=np.asarray(profiles.samples))
         values = block_contributions(profiles, echo.patch.pixels_m, edges=np.arange(len(profiles) + 1))
         wavenumber, band = (
@@ -322,11 +328,12 @@ def phases(patch: Contribution, moved: Tracks) -> Floats:
 def _patch(patch: Contribution, now: PatchImage, moved: Tracks) -> tuple[float, Floats]:
     """Return the value of a patch and its derivative by the phase of each block."""
     turn = np.exp(1j * phases(patch, moved)).astype(np.complex64)
-    image = patch.values @ turn
+    image = patch.values @ turn  # I = B e^{jθ}
     power = (image.real**2 + image.imag**2).astype(np.float64)
     fourth = float((power**2).sum())
     if not fourth:
         return 0.0, np.zeros(len(turn))
+    # G and ∂J/∂θ of eq. 12; J of eq. 11, with S² as cached.
     by_image = (-now.weight * power / fourth * image).astype(np.complex64)
     by_phase = -2 * (turn * (by_image.conj() @ patch.values)).imag
     return -0.5 * now.weight * float(np.log(fourth / now.energy**2)), by_phase.astype(np.float64)

@@ -82,6 +82,7 @@ def separated(places_m: Floats, ratio: Floats, axes: Floats, *, apart_m: float) 
     """
     level = (places_m - places_m.mean(axis=0)) @ axes[:2].T
     low, extent = level.min(axis=0), np.maximum(np.ptp(level, axis=0), 1e-9)
+    # The scene in nine parts, of which none may provide more than its share of the places.
     ninth = np.minimum((level - low) / extent * 3, 2.999).astype(int) @ np.array([3, 1])
     taken: list[int] = []
     for number in range(len(places_m)):
@@ -152,6 +153,7 @@ def _spans(place_m: Floats, record: PairRecord, axes: Floats, correlation_s: flo
     if record.beams is not None:
         illuminated = record.beams[some].weight(profiles.aperture[some], place_m[None])[:, 0] > 0
         slope, time_s = (slope[illuminated], time_s[illuminated]) if illuminated.sum() > 2 else (slope, time_s)
+    # Cycles per metre along and across the mean line of sight, over pulses and band: cells are their inverse extents.
     ahead = slope.mean(axis=0)
     ahead = ahead / np.linalg.norm(ahead) if np.linalg.norm(ahead) > 1e-3 else np.array([0.0, 1.0])
     turned = np.stack([ahead, [-ahead[1], ahead[0]]])
@@ -357,6 +359,7 @@ def bright_places(
         (part, terrain.positions_at(grid, *np.meshgrid(rows[part[0]], columns[part[1]], indexing="ij")))
         for part in _parts(len(rows), len(columns))
     ]
+    # Power summed over the looks of each pair, each pair by its mean.
     for one in records:
         image = np.zeros_like(power)
         for power_of in _looks(one, looks, _middle(grid, terrain)):
@@ -364,11 +367,13 @@ def bright_places(
                 image[part] += power_of(pixels)
         power += image / max(float(np.nanmean(image)), 1e-300)
     power = np.nan_to_num(power)
+    # Surroundings: median over some range cells, on a thinned lattice; or sidelobes of the brightest place.
     reach = max(3, round(_ABOUT_CELLS * cell_m / (step * grid.spacing_m)))
     thin = max(1, reach // 3)
     about = median_filter(power[::thin, ::thin], size=7, mode="nearest")
     about = np.repeat(np.repeat(about, thin, 0), thin, 1)[: power.shape[0], : power.shape[1]]
     ratio = power / np.maximum(about, _SIDELOBES * power.max())
+    # Local maxima, by their power over the surroundings.
     top = (maximum_filter(power, 2 * max(1, reach // 6) + 1) == power) & (power > 0)
     down, right = np.nonzero(top)
     order = np.argsort(-ratio[down, right], kind="stable")[:_MOST_PLACES]

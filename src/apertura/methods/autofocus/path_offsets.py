@@ -138,7 +138,7 @@ class _Pair:
         phases = [self.phases(method, fitted) for fitted in (*parts, np.ones_like(parts[0]))]
         gain_db = np.array([gains_db([before], [self.statistics(phase)])[0] for phase in phases])
         phase = phases[int(gain_db.mean(axis=1).argmax())]
-        information = 2 * sum(min(statistics.ratio, MOST_RATIO) for statistics in self.statistics(phase)) / len(phase)
+        information = 2 * sum(min(image.ratio, MOST_RATIO) for image in self.statistics(phase)) / len(phase)
         left_rad2 = _LINEAR * self.grows_rad2 + 1 / information
         # An echo over ∆ turns by -k∆.
         return _Fit(self.name, self.time_s, -phase / self.wavenumber, gain_db[folds, np.arange(len(folds))], left_rad2)
@@ -154,9 +154,10 @@ class _Pair:
             return np.zeros(len(self.time_s))
         phase = METHODS[method]([self.cached[int(number)] for number in np.flatnonzero(used)])
         left, size, _ = np.linalg.svd(self.slope - self.slope.mean(axis=0), full_matrices=False)
-        moves = left[:, size >= _SHIFTS * size[0]]
+        # Projected off a constant and off the directions of eq. 34, which move the image.
+        shifting = left[:, size >= _SHIFTS * size[0]]
         centred = phase - phase.mean()
-        return np.asarray(centred - moves @ (moves.T @ centred))
+        return np.asarray(centred - shifting @ (shifting.T @ centred))
 
     def statistics(self, phase: Floats | None = None) -> list[PatchImage]:
         """Return the statistics of the patches with blocks turned by `phase`; by default along the logs."""

@@ -96,16 +96,23 @@ def fix_gauge(
     step: Floats = np.zeros(modes + len(problem.pairs) - 1)
     report: dict[str, Any] = {}
     for number in range(_ROUNDS):
+        # S/σ and d/σ of eq. 15 about the tracks of the round: between pairs, and against reference points.
         tracks = problem.prior.tracks(unknowns + step[:modes] @ problem.gauge.modes)
         matrix, residuals = _pair_residuals(problem, tracks, axes)
-        rows, errors_sigma, measured = _reference_residuals(problem, points, echoes, tracks, axes)
+        reference_rows, reference_residuals, position_errors = _reference_residuals(
+            problem, points, echoes, tracks, axes
+        )
         if not number:
-            report = {"pairs_apart_sigma": _apart(residuals)} | ({"reference_points": measured} if points else {})
-        matrix, residuals = np.concatenate([matrix, rows]), np.concatenate([residuals, errors_sigma])
+            report = {"pairs_apart_sigma": _apart(residuals)} | (
+                {"reference_points": position_errors} if points else {}
+            )
+        matrix = np.concatenate([matrix, reference_rows])
+        residuals = np.concatenate([residuals, reference_residuals])
+        # Normal equations of eq. 15, with the prior |y|². `residuals` already hold the shift by the modes so far, which
+        # is added back; path lengths are no part of the tracks, so what they explain is still in the residuals.
         normal = matrix.T @ matrix + np.eye(len(step))
-        # Lengths of paths are no part of the tracks: what they explain stays in the residual of the tracks moved.
-        apart = matrix[:, :modes] @ step[:modes] - residuals
-        step = np.asarray(np.linalg.solve(normal, matrix.T @ apart), np.float64)
+        target = matrix[:, :modes] @ step[:modes] - residuals
+        step = np.asarray(np.linalg.solve(normal, matrix.T @ target), np.float64)
     std = np.sqrt(np.diag(np.linalg.inv(normal)))
     report["paths_longer_m"] = {
         blocks.record.pair: [round(float(PATH_STD_M * one[modes + number]), 4) for one in (step, std)]
@@ -155,12 +162,12 @@ def _pair_residuals(problem: Problem, tracks: Tracks, axes: Floats) -> tuple[Flo
     rows, residuals = [np.zeros((0, len(problem.gauge.modes) + len(problem.pairs) - 1))], [np.zeros(0)]
     modes = problem.prior.tracks(problem.gauge.modes)
     for number in range(len(problem.patches)):
-        statistics = [
+        places = [
             _measured_place(blocks, echoes[number], tracks, modes, axes)
             for blocks, echoes in zip(problem.pairs, problem.echoes, strict=True)
         ]
-        first = statistics[0]
-        for at, other in enumerate(statistics[1:], 1):
+        first = places[0]
+        for at, other in enumerate(places[1:], 1):
             if first is not None and other is not None:
                 std_m = float(np.hypot(first.std_m, other.std_m))
                 rows.append(np.hstack([other.shift_m - first.shift_m, _of_pair(other, at, problem)]) / std_m)
@@ -180,12 +187,12 @@ def _reference_residuals(
     modes = problem.prior.tracks(problem.gauge.modes)
     for at, (blocks, of_pair) in enumerate(zip(problem.pairs, echoes, strict=True)):
         for point, echo in zip(points, of_pair, strict=True):
-            statistics = _measured_place(blocks, echo, tracks, modes, axes)
-            if statistics is not None:
-                apart_m = statistics.place_m - axes[:2] @ np.array(point.place_m)
-                rows.append(np.hstack([statistics.shift_m, _of_pair(statistics, at, problem)]) / point.std_m)
-                residuals.append(apart_m / point.std_m)
-                rounded = [round(float(one), 4) for one in apart_m]
+            place = _measured_place(blocks, echo, tracks, modes, axes)
+            if place is not None:
+                error_m = place.place_m - axes[:2] @ np.array(point.place_m)
+                rows.append(np.hstack([place.shift_m, _of_pair(place, at, problem)]) / point.std_m)
+                residuals.append(error_m / point.std_m)
+                rounded = [round(float(one), 4) for one in error_m]
                 report.append({"name": point.name, "pair": blocks.record.pair, "apart_m": rounded})
     return np.concatenate(rows), np.concatenate(residuals), report
 
@@ -208,9 +215,11 @@ def _measured_place(
     ratio = PatchImage.of(image).ratio
     if ratio < _LEAST_RATIO:
         return None
+    # Shift of the point per unit of each mode, S of eq. 14, and per metre of path that is common to all pulses.
     modes_of = {node: blocks.average_of(modes[node]) for node in moved}
     _, shift_m = effects(patch, modes_of, axes)
     _, longer = effects_of_paths(patch, np.ones((patch.values.shape[1], 1)), axes)
+    # Maximum of the image about the brightest pixel, on ever finer lattices.
     place, reach_m = echo.patch.pixels_m[int(np.abs(image).argmax())], _cell_m(echo) / 4
     for _ in range(_ZOOMS):
         side = np.linspace(-reach_m, reach_m, _SIDE)
@@ -509,6 +518,7 @@ class TrackSearch:
         everything, fold = np.ones(len(problem.patches), bool), np.arange(len(problem.patches)) % FOLDS
         few = len(problem.patches) < _FEW
         lowest = self.before if len(problem.patches) > 1 else self._fitted(everything)
+        # Each quarter of the patches is left out of a fit, in turn (eq. 16a); the fit of lowest objective is kept.
         for number in range(min(FOLDS, len(problem.patches)) if len(problem.patches) > 1 else 0):
             fitted = fold != (number + 2) % min(FOLDS, len(problem.patches))
             state = self._fitted(fitted)
@@ -518,15 +528,16 @@ class TrackSearch:
             lowest = self._lowest([state] if lowest is None else [lowest, state], everything)
             if not few and mean_gain(held_out_db[:, np.isfinite(held_out_db[0])]).certain:
                 break
+        # All patches, from the best of these fits; parts a wavelength off are searched again (eq. 16).
         assert lowest is not None  # one place is fitted, of more some are
         state = problem.sharper(lowest, everything, stages=_STAGES - 1 if few else 1)
         state, shifts = self._unslipped(state, everything)
         apart_sigma = self._apart_sigma(state)
-        known = 2 * sum(min(one.ratio, MOST_RATIO) for statistics in state.statistics for one in statistics)
+        information = 2 * sum(min(image.ratio, MOST_RATIO) for images in state.statistics for image in images)
         evidence = Evidence(
             fitted_db=gains_db(initial.statistics, state.statistics),
             held_out_db=held_out_db[:, np.isfinite(held_out_db[0])],
-            settled=problem.gauge.settled(state.unknowns, known=known),
+            settled=problem.gauge.settled(state.unknowns, information=information),
             before=range_shifts(problem, initial, self.axes),
             after=shifts,
             wavelength_m=self.wavelength_m,

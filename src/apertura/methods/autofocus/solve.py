@@ -70,18 +70,18 @@ class Gauge:
             np.zeros((0, unknowns)), np.zeros((0, 1, 2)), np.zeros(0), np.zeros((0, 0)), SmoothMotions([], unknowns)
         )
 
-    def settled(self, unknowns: Floats, *, known: float) -> Floats:
+    def settled(self, unknowns: Floats, *, information: float) -> Floats:
         """Return (mode,) float64, the unknowns that the image alone determines.
 
         Parameters
         ----------
         unknowns
             As solved.
-        known
+        information
             Information of the phases on a mode that turns them by a radian: 2·power of points over their surroundings,
             summed over pairs and patches.
         """
-        return np.asarray(self.shapes[self.blurs_rad2 * known > LEAST_INFORMATION] @ self.smooth.parts(unknowns))
+        return np.asarray(self.shapes[self.blurs_rad2 * information > LEAST_INFORMATION] @ self.smooth.parts(unknowns))
 
 
 def find_gauge(
@@ -91,11 +91,18 @@ def find_gauge(
     knots_s: Floats,
     axes: Floats,
 ) -> Gauge:
-    """Return the gauge of patches over pairs; rows of `axes` are east, north, up."""
+    """Return the gauge of patches over pairs; rows of `axes` are east, north, up.
+
+    Notes
+    -----
+    Source: docs/theory/autofocus.md, eq. 13 and 14.
+    """
     smooth = SmoothMotions.of(pairs, cached, prior, knots_s)
     count = sum(len(patches) for patches in cached)
-    focus, shifts = np.zeros((len(smooth), len(smooth))), []
+    # F and S of eq. 14 over smooth motions: mean blur² of eq. 13 as a quadratic form, and shifts of the patches.
+    blur_form, shifts = np.zeros((len(smooth), len(smooth))), []
     for blocks, patches in zip(pairs, cached, strict=True):
+        # Δρ of every block by each smooth motion, a few motions at a time.
         paths = [np.empty((patch.blocks.stop - patch.blocks.start, len(smooth))) for patch in patches]
         for some, unknowns in smooth.rows():
             tracks = prior.tracks(unknowns)
@@ -104,16 +111,19 @@ def find_gauge(
                 path[:, some] = longer_paths(patch, moved)
         for patch, path in zip(patches, paths, strict=True):
             blur, shift = effects_of_paths(patch, path, axes)
-            focus += blur.T @ blur / count
+            blur_form += blur.T @ blur / count
             shifts.append(shift)
     shift = np.concatenate(shifts) / np.sqrt(count)
-    spread = np.linalg.solve(focus + LEAST_PHASE_RAD**2 * np.eye(len(focus)), shift.T)
-    power, turn = np.linalg.eigh(shift @ spread)
-    keep = power * LEAST_PHASE_RAD**2 > LEAST_SHIFT_M**2
-    inside, _ = np.linalg.qr(spread @ turn[:, keep])
-    moves = np.stack([one @ inside for one in shifts])
-    blurred, shapes = np.linalg.eigh(focus)
-    return Gauge(smooth.sums(inside.T), np.moveaxis(moves, -1, 0), blurred, shapes.T, smooth)
+    # (F + ε²)⁻¹Sᵀ, and the eigenvalues σ_s²/ε² and eigenvectors v of S(F + ε²)⁻¹Sᵀ.
+    conditional = np.linalg.solve(blur_form + LEAST_PHASE_RAD**2 * np.eye(len(blur_form)), shift.T)
+    eigenvalues, eigenvectors = np.linalg.eigh(shift @ conditional)
+    keep = eigenvalues * LEAST_PHASE_RAD**2 > LEAST_SHIFT_M**2
+    # Modes (F + ε²)⁻¹Sᵀv of σ_s > 0.3 mm, made orthonormal, and by how much each moves every patch.
+    modes, _ = np.linalg.qr(conditional @ eigenvectors[:, keep])
+    shift_by_mode = np.stack([one @ modes for one in shifts])
+    # Eigenvectors of F: motions by how much they blur, for the test of the logs' stated errors (17).
+    blurs_rad2, shapes = np.linalg.eigh(blur_form)
+    return Gauge(smooth.sums(modes.T), np.moveaxis(shift_by_mode, -1, 0), blurs_rad2, shapes.T, smooth)
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,8 +150,9 @@ class SmoothMotions:
 
         lengths = [patch.blocks.stop - patch.blocks.start for patches in cached for patch in patches]
         length = max(4, int(np.median([one for one in lengths if one] or [len(knots_s)])) // _PIECES)
-        number = max(1, round(len(knots_s) / length))
-        grid = np.linspace(knots_s[0], knots_s[-1], number + 1)
+        # Cubic B-splines over pieces of `length` knots, (knot, spline).
+        pieces = max(1, round(len(knots_s) / length))
+        grid = np.linspace(knots_s[0], knots_s[-1], pieces + 1)
         step = grid[1] - grid[0]
         ends = np.concatenate([grid[0] - step * np.arange(3, 0, -1), grid, grid[-1] + step * np.arange(1, 4)])
         inside = np.clip(knots_s, grid[0], np.nextafter(grid[-1], grid[0]))
@@ -149,10 +160,11 @@ class SmoothMotions:
         flown = _logged_places(pairs)
         found, first = [], 0
         for node, own in prior.nodes.items():
+            # Splines and the logged shape along each axis, as unknowns of the prior; an SVD makes them orthonormal.
             shape = flown[node] - flown[node].mean(axis=0)
             basis = np.concatenate([splines, shape / max(float(np.abs(shape).max()), 1e-9)], axis=1)
-            fields = np.concatenate([own.adjoint(basis.T[:, :, None] * axis) for axis in np.eye(3)])
-            found.append((first, *np.linalg.svd(fields, full_matrices=False)[1:]))
+            motions = np.concatenate([own.adjoint(basis.T[:, :, None] * axis) for axis in np.eye(3)])
+            found.append((first, *np.linalg.svd(motions, full_matrices=False)[1:]))
             first += own.size
         largest = max(float(size[0]) for _, size, _ in found)
         return cls([(begin, modes[size > 1e-6 * largest]) for begin, size, modes in found], first)
@@ -218,14 +230,16 @@ def effects_of_paths(patch: Contribution, path: Floats, axes: Floats) -> tuple[F
     weight = np.linalg.norm(patch.values, axis=0).astype(np.float64)
     weight = (weight / max(weight.sum(), 1e-300))[:, None]
 
+    # Rows of eq. 13: k(Δρ − mean), then bΔρ, weighted by the blocks' amplitudes.
     def weighted(paths: Floats) -> Floats:
         centred = paths - (weight * paths).sum(axis=0)
         parts = [np.sqrt(weight) * one for one in (patch.wavenumber * centred, patch.band * paths)]
         return np.asarray(np.concatenate(parts), np.float64)
 
-    known, errors = (weighted(np.asarray(one)) for one in (ground, path))
-    shift = np.linalg.pinv(known) @ errors
-    return errors - known @ shift, shift
+    # Least squares in a, the shift over ground; what it leaves blurs.
+    by_shift, errors = (weighted(np.asarray(one)) for one in (ground, path))
+    shift = np.linalg.pinv(by_shift) @ errors
+    return errors - by_shift @ shift, shift
 
 
 # ---- Search for the sharpest tracks within the errors of the logs ---------------------------------------------------
@@ -468,6 +482,7 @@ class _DelayFit:
                 measured = np.isfinite(further_m)
                 if measured.sum() < 2:
                     continue
+                # Mean path of each part of the aperture by the tracks, less the delay measured there, about their mean.
                 path = phases(patch, moved) / patch.wavenumber
                 ends = np.linspace(0, len(path), len(further_m) + 1).astype(np.int64)
                 size = np.diff(ends)
@@ -475,6 +490,7 @@ class _DelayFit:
                 left = np.where(measured, np.add.reduceat(path, ends[:-1]) / size - np.nan_to_num(further_m), 0.0)
                 left = np.where(measured, left - left.sum() / measured.sum(), 0.0) / _DELAY_STD_M
                 total += 0.5 * float(left @ left)
+                # Its derivative: the part's residual, shared by its blocks, along the slope of each node.
                 for node, slope in patch.slopes.items():
                     by_block = np.zeros_like(moved[node])
                     by_block[patch.blocks] = (left / size / _DELAY_STD_M)[part][:, None] * slope

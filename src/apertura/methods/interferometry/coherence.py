@@ -266,8 +266,8 @@ def map_coherence(
             slice(part.start - wide.start, part.stop - wide.start) for part, wide in zip(tile, wider, strict=True)
         )
         one, other = np.asarray(first[wider]), np.asarray(second[wider])
-        magnitude, phase, own = coherence(one, other, window=window)
-        looks.append(own)
+        magnitude, phase, looks_of_tile = coherence(one, other, window=window)
+        looks.append(looks_of_tile)
         planes[0][tile], planes[1][tile] = magnitude[inner], phase[inner]
         planes[2][tile] = _shared(one, other, window)[inner]
     there = [one for one in looks if np.isfinite(one)]

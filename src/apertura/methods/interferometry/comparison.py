@@ -146,7 +146,7 @@ class AssumedGround:
     ----------
     height_m
         (y, x) float64, metres.
-    plain
+    visible
         (y, x) bool, visible to both images, without shadow or layover.
     sensed
         Of the phase to height there.
@@ -223,6 +223,7 @@ def form_interferogram(
     >>> own.measured.coherent, own.measured.sensitive, bool(np.isnan(own.panels["height"]).all())
     (1024, 0, True)
     """
+    # Coherence, phase and looks of every window (eqs. 2 to 6); pixels whose phase gives a height.
     both = map_coherence(first, second, tiles, window=window)
     magnitude, phase, looks = both.magnitude, both.phase, both.looks
     common = ground.visible & np.isfinite(magnitude)
@@ -232,10 +233,12 @@ def form_interferogram(
     valid = (
         common & ~dominated & height_valid(ground.sensed, magnitude, looks) if enough else np.zeros(common.shape, bool)
     )
+    # Phase about its mean, unwrapped.
     centre = float(np.angle(np.exp(1j * phase[valid].astype(np.float64)).sum())) if valid.any() else 0.0
     centred = np.where(valid, np.angle(np.exp(1j * (phase - centre))), np.nan).astype(np.float32)
     unwrapped = unwrap(centred, magnitude, looks=looks)
-    own = np.minimum(looks, 2 * energy)
+    effective_looks = np.minimum(looks, 2 * energy)
+    # The constant between both images by points of known height (eq. 15), else by the median.
     known = [
         replace(
             one,
@@ -249,7 +252,8 @@ def form_interferogram(
     ]
     reference = level(unwrapped, known)
     alone = remove_level(unwrapped, reference) if reference else np.full(common.shape, np.nan, np.float32)
-    scatter = phase_std(unbiased(magnitude, looks), own).astype(np.float64)
+    # σ_φ of eq. 8, with the level's and the tracks' own deviations; heights at the places they belong to (eq. 16).
+    scatter = phase_std(unbiased(magnitude, looks), effective_looks).astype(np.float64)
     if reference:
         scatter = np.hypot(scatter, reference.std_rad or 0.0)
     if reference and ground.track_std:

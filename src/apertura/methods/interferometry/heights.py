@@ -100,7 +100,8 @@ def count_residues(phase: NDArray[np.float32]) -> tuple[int, int, int]:
     (1, 1, 1)
     """
     down, right = np.diff(phase, axis=0), np.diff(phase, axis=1)
-    turns_down, turns_right = (np.round(step / (2 * np.pi)) for step in (down, right))
+    turns_down, turns_right = (np.round(difference / (2 * np.pi)) for difference in (down, right))
+    # Whole turns around each loop of four pixels.
     around = turns_right[:-1] + turns_down[:, 1:] - turns_right[1:] - turns_down[:, :-1]
     there = np.isfinite(around)
     jumps = sum(int(np.count_nonzero(turns[np.isfinite(turns)])) for turns in (turns_down, turns_right))
@@ -230,8 +231,8 @@ def remove_level(phase: Unwrapped, reference: Level) -> NDArray[np.float32]:
     >>> remove_level(phase, Level(-1.0, 1)).round(3)
     array([[-2.283]], dtype=float32)
     """
-    own = np.where(phase.part == reference.part, phase.phase - reference.phase_rad, np.nan).astype(np.float32)
-    return own if phase.by or not phase.jumps else np.angle(np.exp(1j * own)).astype(np.float32)
+    of_height = np.where(phase.part == reference.part, phase.phase - reference.phase_rad, np.nan).astype(np.float32)
+    return of_height if phase.by or not phase.jumps else np.angle(np.exp(1j * of_height)).astype(np.float32)
 
 
 # ---- Valid pixels, accuracy, and places of the heights --------------------------------------------------------------
@@ -348,6 +349,7 @@ def place_heights(ground_m: Floats, rise_m: Floats, std_m: Floats, shift_px: Flo
     if not known.any():
         return PlacedHeights(np.full(rise_m.shape, np.nan), np.full(rise_m.shape, np.nan), 0)
     nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
+    # The pixel that shows each place, eq. 16, by fixed-point iteration.
     moved = np.moveaxis(shift_px, -1, 0) * rise_m[tuple(nearest)]  # a pixel beside all that are known leads on to them
     place = np.stack(np.meshgrid(*map(np.arange, rise_m.shape), indexing="ij")).astype(np.float64)
     shown, error_px = place, np.full(rise_m.shape, np.inf)
@@ -356,6 +358,7 @@ def place_heights(ground_m: Floats, rise_m: Floats, std_m: Floats, shift_px: Flo
         error_px, shown = np.abs(target - shown).max(axis=0), target
         if not (error_px > _TOLERANCE_PX).any():
             break
+    # Places that several pixels show, and places where the iteration has not converged, have no height.
     folds = _covered(place + moved, np.abs(_stretch(moved)) * known) > _MOST_COVERED
     converged = (error_px <= _TOLERANCE_PX) & ~folds
     height, std = (map_coordinates(one, shown, order=1, cval=np.nan) for one in (ground_m + rise_m, std_m))

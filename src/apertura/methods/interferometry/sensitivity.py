@@ -131,6 +131,7 @@ def _moved(places_m: Floats, axes: Floats, images: tuple[Legs, Legs], paths: lis
             left, gradient = -_less(path, moved, legs), _gradient(moved, legs) @ east_north.T
             wrong.append(left)
             turned.append(gradient)
+        # Unknowns east and north: residuals of each image about their mean over pulses, and the mean of both images.
         rows = [left - left.mean(axis=1, keepdims=True) for left in wrong]
         slopes = [one - one.mean(axis=1, keepdims=True) for one in turned]
         rows.append(sum(left.mean(axis=1, keepdims=True) for left in wrong) / 2)

@@ -164,6 +164,7 @@ def measure_channel(name: str, blocks: Iterable[Samples], numerology: Numerology
     window = slice(numerology.prefix_samples, numerology.prefix_samples + numerology.dft_samples)
     captures, power, square, mean, integers = 0, 0.0, 0j, 0.0, True
     ones, zeros = 0, 0  # bits that were 1, and 0, in any sample
+    # Sums over the blocks: mean of I and Q (eq. 1), power and mean of the squares (eq. 2), bits (eq. 1a).
     for block in blocks:
         if integers := block.dtype.kind == "i":
             ones |= int(np.bitwise_or.reduce(block, axis=None))

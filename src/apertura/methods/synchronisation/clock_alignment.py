@@ -132,17 +132,19 @@ def align_on_point(
     """
     some = echo.moving()[:: -(-len(echo) // MOST_PULSES)]
     low, high = plausible_offsets(echo, log, within_s)
-    response = PointSharpness(some, log, point_m)
+    sharpness = PointSharpness(some, log, point_m)
+    # J(δ, b) on a grid of offsets, at all paths of each by one FFT.
     offsets_s = offset_steps(some, log, low, high)
-    searched = [response.powers(offset_s) for offset_s in offsets_s]
+    searched = [sharpness.powers(offset_s) for offset_s in offsets_s]
     near = np.abs(searched[0][0]) <= max(search_m, 1e-9)
     paths_m, power = searched[0][0][near], np.array([one[near] for _, one in searched])
     row, column = np.unravel_index(int(power.argmax()), power.shape)
+    # Its maximum, the widths at a decibel below, and the contrast against all that was searched.
     found = refine_maximum(
-        response.power, float(offsets_s[row]), float(paths_m[column]), _steps(offsets_s, paths_m, search_m)
+        sharpness.power, float(offsets_s[row]), float(paths_m[column]), _steps(offsets_s, paths_m, search_m)
     )
-    peak_width = peak_widths(response.power, *found, _steps(offsets_s, paths_m, search_m))
-    contrast_db = 10 * float(np.log10(response.power(*found) / max(float(np.median(power)), 1e-300)))
+    peak_width = peak_widths(sharpness.power, *found, _steps(offsets_s, paths_m, search_m))
+    contrast_db = 10 * float(np.log10(sharpness.power(*found) / max(float(np.median(power)), 1e-300)))
     flags = alignment_flags(power.max(axis=1), offsets_s, found[0], peak_width[0], contrast_db)
     report = {"method": "point", "plausible_s": [round(low, 3), round(high, 3)], "pulses": len(some)}
     return Alignment(*found, *peak_width, contrast_db, report, flags=flags)
@@ -263,6 +265,7 @@ def estimate_drift(found: Alignment, echo: Recorded, log: Logged, point_m: Float
         times_s = apply_drift(time_s, ppm)
         return PointSharpness(replace(some, time_s=times_s), log, point_m).power(offset_s, path_m)
 
+    # Drift alone on a grid, then with offset and path, those that are free, by the simplex method.
     tried = np.arange(-MOST_PPM, MOST_PPM + step_ppm, step_ppm)
     at = found.offset_s, found.path_m
     best = float(tried[int(np.argmax([power(ppm, *at) for ppm in tried]))])

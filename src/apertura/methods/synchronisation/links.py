@@ -95,11 +95,11 @@ class Contact:
         # of a weak path noise alone falls so far
         lost = pulses - len(amplitude) + (low if snr_db > 2 * WEAK_DB else 0)
         parts = np.array([np.median(part) for part in np.array_split(amplitude, _PARTS) if part.size])
-        spread = float(np.ptp(parts)) / usual
+        relative_range = float(np.ptp(parts)) / usual
         # a median errs by 1.25 times a mean, a difference of two by 1.4 of that
         local = float(np.std(np.diff(amplitude))) / np.sqrt(2) / usual  # scatter without what moves slowly
         chance = SIGMAS * np.sqrt(2) * 1.25 * max(noise, local) / np.sqrt(max(len(amplitude) / _PARTS, 1))
-        moves_db = float(20 * np.log10(1 + spread)) if spread > chance else 0.0
+        moves_db = float(20 * np.log10(1 + relative_range)) if relative_range > chance else 0.0
         return cls(name, float(20 * np.log10(1 + scatter)), moves_db, lost, pulses, float(snr_db))
 
     @property
@@ -280,10 +280,10 @@ class MeasuredLink:
     def _line(self, values: Floats) -> tuple[tuple[float, float], float]:
         """Return slope and level of a straight line, and the standard deviation of the slope."""
         time = self._centred_s
-        spread = float((time**2).sum()) or 1.0
-        slope, level = float(time @ values) / spread, float(values.mean())
+        squares = float((time**2).sum()) or 1.0
+        slope, level = float(time @ values) / squares, float(values.mean())
         scatter = float(np.sqrt(((values - level - slope * time) ** 2).sum() / max(len(values) - 2, 1)))
-        return (slope, level), scatter / np.sqrt(spread)
+        return (slope, level), scatter / np.sqrt(squares)
 
     def deviation(self, interval_s: float) -> list[tuple[float, float]]:
         """Return averaging time, s, and overlapping Allan deviation of the link's delay, by its phase; eq. 6.
@@ -401,9 +401,9 @@ def measure_link(
     off = (paths.delay_cells - first + subcarriers / 2) % subcarriers - subcarriers / 2
     #    Where pulses arrive at several, that of most: a median would lie between them.
     ordered = np.sort(off[locked])
-    held = np.searchsorted(ordered, ordered + 1.0, side="right") - np.arange(ordered.size)
-    most = int(held.argmax())
-    middle = float(np.median(ordered[most : most + held[most]]))
+    in_cell = np.searchsorted(ordered, ordered + 1.0, side="right") - np.arange(ordered.size)  # pulses within a cell
+    most = int(in_cell.argmax())
+    middle = float(np.median(ordered[most : most + in_cell[most]]))
     delay = first + middle
     apart = locked & (np.abs(off - middle) > 1.0)
     jump_m = float(np.median(off[apart] - middle)) * cell_m if apart.any() else 0.0

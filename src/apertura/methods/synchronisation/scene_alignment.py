@@ -132,11 +132,13 @@ def align_on_scene(
     low, high = plausible_offsets(echo, log, within_s)
     bandwidth_hz = float(echo.frequency_hz[-1] - echo.frequency_hz[0])
     cell_m = echo.wave_speed_m_s / (2 * bandwidth_hz)
+    # Sharpness of a coarse image of the scene over offsets and paths.
     coarse = SceneSharpness.of(some, log, _coarse(grid, terrain, cell_m))
     offsets_s = offset_steps(some, log, low, high)[::2]
     paths_m = np.arange(-search_m, search_m + cell_m, 2 * cell_m) if search_m > 0 else np.zeros(1)
     values = np.array([[coarse.value(offset_s, path_m) for path_m in paths_m] for offset_s in offsets_s])
     steps = float(offsets_s[1] - offsets_s[0]), 2 * cell_m if search_m > 0 else 0.0
+    # Its best maxima, each refined about the brightest places of its image; the brightest point decides.
     maxima = []
     for place in np.argsort(-values, axis=None)[:_MAXIMA]:
         row, column = np.unravel_index(int(place), values.shape)
