@@ -13,7 +13,7 @@ from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
 from apertura.core.antenna.beam import Beam, Beams
 from apertura.core.backprojection.engines import native, pieces, reference, tree
 from apertura.core.backprojection.engines.tree_inputs import roughness, weighed
-from apertura.core.backprojection.engines.tree_nodes import nodes, supports, surfaces_of, weights, widest_band
+from apertura.core.backprojection.engines.tree_nodes import nodes, supports, surfaces_of, weights
 from apertura.core.backprojection.engines.tree_view import nodes_for, peak_band, widened_rad
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.sector import Sector, edge
@@ -378,8 +378,23 @@ def test_prepared_pulses_add_up(plain, edges):
 
 
 @pytest.mark.parametrize(("count", "nodes_db"), [(8, -50), (20, -74), (40, -98)])
-def test_the_table_of_supports_is_what_nodes_hold(count, nodes_db):
-    assert supports(nodes_db)[count] == pytest.approx(widest_band(count, nodes_db), abs=0.02)
+def test_the_table_of_supports_is_the_widest_band_that_nodes_support(count, nodes_db):
+    """tree_supports.csv: for each number of nodes the band over which (6) errs by `nodes_db`, by bisection."""
+    gauss, share = np.polynomial.legendre.leggauss(160)
+    at = nodes(count, nodes_db)
+
+    def interpolation_error_db(band_rad):
+        white = [np.sinc(band_rad / np.pi * (a[:, None] - at)) for a in (gauss, at)]
+        weight = weights(count, gauss, nodes_db, band_rad)
+        covariance = white[1] + 10 ** ((nodes_db - 20) / 10) * np.eye(count)
+        error = 1 - 2 * (weight * white[0]).sum(1) + ((weight @ covariance) * weight).sum(1)
+        return 10 * np.log10(max(error @ share / 2, 1e-30))
+
+    low, high = 0.0, np.pi / 2 * count
+    while high - low > 1e-3:
+        middle = (low + high) / 2
+        low, high = (middle, high) if interpolation_error_db(middle) <= nodes_db else (low, middle)
+    assert supports(nodes_db)[count] == pytest.approx(low, abs=0.02)
 
 
 def test_a_slope_that_peaks_in_a_tile_takes_the_nodes_of_its_airy_tail():

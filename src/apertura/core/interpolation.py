@@ -1,4 +1,4 @@
-"""Kaiser's window and the sinc it bounds, the one interpolator of band-limited samples in this package.
+"""Kaiser's window, and the sinc that it bounds as interpolator of band-limited samples.
 
 In numpy alone: scipy.signal has the window at integer samples only, and costs a second to import.
 """

@@ -177,15 +177,15 @@ def choose(state: SidelinkState) -> tuple[str, str]:
     """
     crossed = {method: edges(method, state) for method in METHODS}
     adequate = [method for method in METHODS if not crossed[method]]
-    measured = (
+    summary = (
         f"SNR {state.snr_db:.1f} dB per subcarrier, echoes {'of' if state.echo_cells else 'below'} "
         f"{state.echo_db:.1f} dB, ripple {max(state.ripple_db, state.fine_ripple_db):.1f} dB"
     )
     if adequate:
-        return adequate[0], f"{measured}: cheapest adequate"
+        return adequate[0], f"{summary}: cheapest adequate"
     # every pulse that locks is coherent after two_parameter: it can leave ghosts, it cannot lose the image
     fallback = "wiener" if "wrong_code" in state.flags else "two_parameter"
-    return fallback, f"{measured}: none adequate, least harm ({'; '.join(crossed[fallback].values())})"
+    return fallback, f"{summary}: none adequate, least harm ({'; '.join(crossed[fallback].values())})"
 
 
 def _gain_db(state: SidelinkState, cells: int) -> float:

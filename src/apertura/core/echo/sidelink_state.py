@@ -361,11 +361,11 @@ def second_path_flags(state: SidelinkState, *, cell_m: float) -> dict[str, str]:
     Source: docs/theory/echo_methods.md, "Ripple or echo".
     """
     if state.near_db > ECHO_DB:
-        measured = (
+        arrival = (
             f"an arrival of {state.near_db:.1f} dB within {2 * cell_m:.2f} m of the direct path changes over the flight"
         )
         harm = _effect_of_echo(10 ** (state.near_db / 20), 1, cell_m)
-        return {"sidelink_ripple_or_echo": f"{measured}, as an echo does: {harm}"}
+        return {"sidelink_ripple_or_echo": f"{arrival}, as an echo does: {harm}"}
     if state.echo_db > ECHO_DB and 0 < abs(state.echo_cells) <= GATE_CELLS and state.echo_steady:
         line = (
             f"an arrival of {state.echo_db:.1f} dB {state.echo_cells * cell_m:+.2f} m from the direct path stays over "

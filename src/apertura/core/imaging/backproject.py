@@ -155,7 +155,10 @@ def backproject(  # noqa: PLR0913 - each choice is a keyword, so that an editor 
 
     if not is_number(accuracy_db):
         raise CampaignError(
-            quoted(accuracy_db), "backproject: accuracy_db", "a number, dB of the peak", "Give -60, say."
+            quoted(accuracy_db),
+            "backproject: accuracy_db",
+            "a number, dB relative to the RMS of the exact sum",
+            "Give -60, say.",
         )
     choices = validated(
         ImagingChoices,

@@ -116,9 +116,9 @@ class Formation:
         places = self.positions_at(*pixels.T)
 
         def summed(read: tuple[slice, list[tuple[slice, NDArray[np.bool_]]]]) -> NDArray[np.complex128]:
-            pulses, parts_of = read
+            pulses, parts = read
             some, total = self.summed[pulses], np.zeros(len(places), np.complex128)
-            for part, inside in parts_of:
+            for part, inside in parts:
                 weights = self.beams and self.beams[pulses][part]
                 total[inside] += _exact_sum(some[part], places[inside], weights)
             return total
@@ -181,14 +181,14 @@ class Formation:
         By the sum over a history's subcarriers, or of profiles by their band-limited interpolation.
         """
         places = self.positions_at(np.atleast_1d(row), np.atleast_1d(column))
-        parts: list[list[NDArray[np.complex128]]] = [[np.empty(0, np.complex128)] for _ in places]
-        for pulses, parts_of in self.illuminating_pulses(places):
+        terms_of: list[list[NDArray[np.complex128]]] = [[np.empty(0, np.complex128)] for _ in places]
+        for pulses, parts in self.illuminating_pulses(places):
             some = self.summed[pulses]
-            for part, inside in parts_of:
+            for part, inside in parts:
                 terms = _terms(some[part], places[inside], self.beams and self.beams[pulses][part])
-                for place, column_of in zip(np.flatnonzero(inside), terms.T, strict=True):
-                    parts[place].append(column_of[column_of != 0])
-        return [np.concatenate(part) for part in parts]
+                for place, of_place in zip(np.flatnonzero(inside), terms.T, strict=True):
+                    terms_of[place].append(of_place[of_place != 0])
+        return [np.concatenate(terms) for terms in terms_of]
 
     def illuminating_pulses(
         self, places: NDArray[np.float64]

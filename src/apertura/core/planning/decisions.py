@@ -206,10 +206,10 @@ def integrate(
     points = points_m.reshape(-1, 3)
     some = aperture[aperture.sample(_PULSES)]
     nearest_m = np.linalg.norm(some.middle_m[:, None] - points, axis=-1).min(axis=1)
-    flight = Sector.of(aperture, chord_m=CHORD * float(np.median(nearest_m)), centre=0.0, half=2.0)
-    straight = flight[aperture.sample(_PULSES)]
-    place, squint = straight.place(some, points), _squint(flight, antennas)
-    per_path = _gradient_per_path(some, straight, points)
+    whole = Sector.of(aperture, chord_m=CHORD * float(np.median(nearest_m)), centre=0.0, half=2.0)
+    sampled = whole[aperture.sample(_PULSES)]
+    place, squint = sampled.place(some, points), _squint(whole, antennas)
+    per_path = _gradient_per_path(some, sampled, points)
     half, why = sector_half(requested, wavelength_m, spacing_m, per_path=per_path, squint=squint), "asked for"
     if requested == "auto":
         why = f"pixels of {spacing_m:g} m carry no more"
@@ -218,7 +218,7 @@ def integrate(
             cell_m = wavelength_m / (per_path * flown) if flown else np.inf
             reason = f"every pulse counts: pixels of {spacing_m:g} m carry the {cell_m:.3g} m that was flown"
             return Integration(None, len(aperture), "all", reason)
-    sector = Sector(flight.tx_axis, flight.rx_axis, squint, half).following(aperture, points)
+    sector = Sector(whole.tx_axis, whole.rx_axis, squint, half).following(aperture, points)
     return _integration_of(sector, aperture, points_m, wavelength_m / (2 * per_path * half), why, where)
 
 
@@ -254,22 +254,22 @@ def sector_half(
     return float(np.sin(np.radians(requested["degrees"]) / 2) * np.sqrt(1 - squint**2))
 
 
-def _squint(flight: Sector, antennas: Beams | None) -> float:
+def _squint(whole: Sector, antennas: Beams | None) -> float:
     """Return s along the boresights, median over the pulses; 0 without beams."""
     if antennas is None:
         return 0.0
     stated = [beam.axes[:, 0] for beam in (antennas.transmit, antennas.receive) if beam is not None]
     tx, rx = stated[0], stated[-1]
-    return float(np.median((flight.tx_axis * tx).sum(axis=1) + (flight.rx_axis * rx).sum(axis=1)))
+    return float(np.median((whole.tx_axis * tx).sum(axis=1) + (whole.rx_axis * rx).sum(axis=1)))
 
 
-def _gradient_per_path(aperture: Aperture, flight: Sector, points: NDArray[np.float64]) -> float:
+def _gradient_per_path(aperture: Aperture, sector: Sector, points: NDArray[np.float64]) -> float:
     """Return the change of the path's gradient along the flight per change of s: 2 for antennas flying in parallel."""
-    flown = flight.tx_axis + flight.rx_axis
+    flown = sector.tx_axis + sector.rx_axis
     ahead = flown / np.maximum(np.linalg.norm(flown, axis=1, keepdims=True), 1e-9)
     along = np.einsum("pnx,px->pn", aperture.path_gradient(points), ahead)
-    moved, changed = (np.abs(np.diff(each, axis=0)).sum(axis=0) for each in (flight.place(aperture, points), along))
-    return float(np.median(changed / np.where(moved > 0, moved, np.inf))) or 2.0
+    change_s, change = (np.abs(np.diff(each, axis=0)).sum(axis=0) for each in (sector.place(aperture, points), along))
+    return float(np.median(change / np.where(change_s > 0, change_s, np.inf))) or 2.0
 
 
 def _integration_of(
@@ -277,9 +277,9 @@ def _integration_of(
 ) -> Integration:
     """Return the integration by a sector, with its pulses per place, resolution and flags."""
     points = points_m.reshape(-1, 3)
-    total, pulses = _pulses_per_place(sector, aperture, points)
-    if pulses.max() < _FEWEST:
-        seen = "zero" if not pulses.any() else f"no more than {pulses.max():.0f}"
+    total, counts = _pulses_per_place(sector, aperture, points)
+    if counts.max() < _FEWEST:
+        seen = "zero" if not counts.any() else f"no more than {counts.max():.0f}"
         raise CampaignError(
             f"{seen} pulses see the scene inside the integration angle (s = {sector.centre:.3g} ± {sector.half:.3g})",
             where=f"{where}.integration",
@@ -287,7 +287,7 @@ def _integration_of(
             remedy="Set processing.integration to all or to more, or correct scene.bounds_m.",
         )
     degrees = float(np.degrees(2 * np.arcsin(min(1.0, sector.half))))
-    least, median, most = (round(float(np.quantile(pulses, part))) for part in (0, 0.5, 1))
+    least, median, most = (round(float(np.quantile(counts, part))) for part in (0, 0.5, 1))
     counted = f"of {len(aperture)} pulses a place takes {least} to {most} (median {median})"
     width, sidelobe_db = response()
     squint_deg = np.degrees(np.arcsin(np.quantile(sector.centre_at(points).clip(-1, 1), (0, 0.5, 1)))).round(3)
@@ -301,18 +301,18 @@ def _integration_of(
         "pulses_per_pixel": {"least": least, "median": median, "most": most, "of": len(aperture)},
     }
     flags = {}
-    if not pulses.all():
-        share = f"{100 * float((pulses == 0).mean()):.1f} % of the scene"
-        flags["outside_swath"] = f"{share} is passed by no pulse inside the integration angle of {degrees:.3g}°"
-    under = _aspect_deg(sector, aperture, points[pulses > 0], vertical(points_m))
-    if under > MOST_ASPECT * degrees * (1 + TAPER):
+    if not counts.all():
+        outside = f"{100 * float((counts == 0).mean()):.1f} % of the scene"
+        flags["outside_swath"] = f"{outside} is passed by no pulse inside the integration angle of {degrees:.3g}°"
+    aspect_deg = _aspect_deg(sector, aperture, points[counts > 0], vertical(points_m))
+    if aspect_deg > MOST_ASPECT * degrees * (1 + TAPER):
         flags["integration_turns"] = (
-            f"places are seen under {under:.0f}° in all, {degrees:.3g}° are integrated of a straight pass: the track "
-            "turns, or passes them more than once"
+            f"places are seen under {aspect_deg:.0f}° in all, {degrees:.3g}° are integrated of a straight pass: the "
+            "track turns, or passes them more than once"
         )
     value, count = f"{degrees:.3g}°, {resolution_m:.3g} m", max(1, round(float(total.max())))
-    summed = float(pulses.mean()) / len(aperture)
-    return Integration(sector, count, value, f"{why}; {counted}", summed, report, flags)
+    share = float(counts.mean()) / len(aperture)
+    return Integration(sector, count, value, f"{why}; {counted}", share, report, flags)
 
 
 def _pulses_per_place(
@@ -321,23 +321,23 @@ def _pulses_per_place(
     """Return the sum of the weights and the number of pulses with weight at each point, from a sample if many."""
     every = slice(None, None, -(-len(aperture) // _COUNTED))
     few, some = aperture[every], sector[every]
-    total, pulses = np.zeros((2, len(points)))
+    total, counts = np.zeros((2, len(points)))
     for first in range(0, len(few), _PULSES):
         weight = some[first : first + _PULSES].weight(few[first : first + _PULSES], points)
-        total, pulses = total + weight.sum(axis=0), pulses + (weight > 0).sum(axis=0)
+        total, counts = total + weight.sum(axis=0), counts + (weight > 0).sum(axis=0)
     scale = len(aperture) / len(few)
-    return scale * total, scale * pulses
+    return scale * total, scale * counts
 
 
 def _aspect_deg(sector: Sector, aperture: Aperture, points: NDArray[np.float64], up: NDArray[np.float64]) -> float:
     """Return the aspect angle of a place over the pulses inside the sector, median over places, degrees."""
     some = aperture.sample(4 * _PULSES)
     few, inside = aperture[some], sector[some]
-    counted, gradient = inside.weight(few, points) >= 0.5, few.path_gradient(points)
+    summed, gradient = inside.weight(few, points) >= 0.5, few.path_gradient(points)
     east = np.cross(up, np.eye(3)[np.abs(up).argmin()])
     turn = np.degrees(np.arctan2(gradient @ np.cross(up, east), gradient @ east))
     spans = []
-    for column, within in zip(turn.T, counted.T, strict=True):
+    for column, within in zip(turn.T, summed.T, strict=True):
         angles = np.sort(column[within])
         if len(angles) > 1:
             spans.append(360 - float(np.diff(angles, append=angles[0] + 360).max()))

@@ -137,9 +137,9 @@ def form(
         on_sheets = block(places, np.zeros(places.shape[:2], np.complex64))
         on_sheets.sum(beams, on_sheets.tiles(sheeting.windows))
         image[tile.window] = sheeting.read(on_sheets.image, trees.middle, trees.wavenumber_rad_m)
-        variant = on_sheets.counts // len(sheeting.heights_m)
-        total += variant
-        total[0] += image[tile.window].size * len(trees) - variant.sum()
+        of_tile = on_sheets.counts // len(sheeting.heights_m)
+        total += of_tile
+        total[0] += image[tile.window].size * len(trees) - of_tile.sum()  # what the division dropped
     if counts is not None:
         counts += total
     return image
@@ -201,12 +201,12 @@ class _Block:
         )
         pulses_of = np.minimum(TREE_GROUP, len(trees) - TREE_GROUP * np.arange(-(-len(trees) // TREE_GROUP)))
         left: list[Task] = []
-        for (tile, selected), variant in zip(tasks, chunk.add(tasks), strict=True):
-            direct = selected & (variant == DIRECTLY)
+        for (tile, selected), variants in zip(tasks, chunk.add(tasks), strict=True):
+            direct = selected & (variants == DIRECTLY)
             smaller = self._quartered(tile) if direct.any() else []
             left += [(quarter, direct) for quarter in smaller]
             done = selected & ~direct if smaller else selected
-            self.counts += self.image[tile.window].size * np.bincount(variant[done], pulses_of[done], 3).astype(
+            self.counts += self.image[tile.window].size * np.bincount(variants[done], pulses_of[done], 3).astype(
                 np.int64
             )
             for run in () if smaller else _runs(direct, len(trees)):

@@ -268,8 +268,8 @@ def delay_filter(profile_oversampling: float) -> NDArray[np.float32]:
     omega = np.pi / profile_oversampling * BAND
     basis = np.exp(1j * omega[:, None] * (np.arange(TREE_DELAYS) - TREE_DELAYS // 2 + 1))
     u = 0.5 - 0.5 * np.cos(np.pi * (np.arange(24) + 0.5) / 24)
-    selected = np.exp(1j * omega[:, None] * u)
-    left, right = (np.concatenate([part.real, part.imag]) for part in (basis, selected))
+    ideal = np.exp(1j * omega[:, None] * u)
+    left, right = (np.concatenate([part.real, part.imag]) for part in (basis, ideal))
     taps = np.linalg.lstsq(left, right, rcond=1e-9)[0].T
     return np.ascontiguousarray(np.linalg.lstsq(np.vander(u, _DELAY_DEGREE + 1, increasing=True), taps)[0], np.float32)
 

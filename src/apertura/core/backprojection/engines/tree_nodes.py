@@ -25,8 +25,6 @@ COUNTS = (*range(2, 9), *range(10, 65, 2), *range(68, MOST_NODES + 1, 4))
 
 _NOISE_DB = -20.0  # white noise in the design of weights, relative to the error they are designed for
 
-_GAUSS, _SHARE = np.polynomial.legendre.leggauss(160)
-
 
 @lru_cache(maxsize=4096)
 def nodes(count: int, error_db: int) -> NDArray[np.float64]:
@@ -79,27 +77,13 @@ def weights(count: int, places: NDArray[np.float64], error_db: int, band_rad: fl
     Examples
     --------
     >>> at = np.array([-0.3, 0.8])
-    >>> surfaces = weights(12, at, -62, 6.0) @ np.exp(5j * nodes(12, -62))
-    >>> bool(np.abs(surfaces - np.exp(5j * at)).max() < 1e-3)
+    >>> wave = weights(12, at, -62, 6.0) @ np.exp(5j * nodes(12, -62))
+    >>> bool(np.abs(wave - np.exp(5j * at)).max() < 1e-3)
     True
     """
     here = nodes(count, error_db)
     covariance = _sinc(band_rad, here, here) + 10 ** ((error_db + _NOISE_DB) / 10) * np.eye(count)
     return np.asarray(np.linalg.solve(covariance, _sinc(band_rad, here, places)).T)
-
-
-def interpolation_error_db(count: int, error_db: int, band_rad: float) -> float:
-    """Return the RMS error over the tile and a flat band of white content, dB; as `weights`.
-
-    Examples
-    --------
-    >>> interpolation_error_db(12, -62, 8.0) < -62 < interpolation_error_db(12, -62, 12.0)
-    True
-    """
-    here, weight = nodes(count, error_db), weights(count, _GAUSS, error_db, band_rad)
-    covariance = _sinc(band_rad, here, here) + 10 ** ((error_db + _NOISE_DB) / 10) * np.eye(count)
-    error = 1 - 2 * (weight * _sinc(band_rad, _GAUSS, here)).sum(1) + ((weight @ covariance) * weight).sum(1)
-    return float(10 * np.log10(max(float(error @ _SHARE) / 2, 1e-30)))
 
 
 @lru_cache
@@ -117,20 +101,11 @@ def supports(error_db: int) -> NDArray[np.float64]:
         .splitlines()[1:]
     )
     column = text[0].split(",").index(str(error_db))
-    surfaces = np.zeros(MOST_NODES + 1)
+    band_rad = np.zeros(MOST_NODES + 1)
     for line in text[1:]:
         values = line.split(",")
-        surfaces[int(values[0]) :] = float(values[column])
-    return surfaces
-
-
-def widest_band(count: int, error_db: int) -> float:
-    """Return the widest band that nodes support, rad per half tile, by bisection: tree_supports.csv is made with it."""
-    low, high = 0.0, np.pi / 2 * count
-    while high - low > 1e-3:
-        middle = (low + high) / 2
-        low, high = (middle, high) if interpolation_error_db(count, error_db, middle) <= error_db else (low, middle)
-    return low
+        band_rad[int(values[0]) :] = float(values[column])
+    return band_rad
 
 
 @lru_cache(maxsize=4096)

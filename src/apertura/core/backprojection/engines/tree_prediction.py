@@ -62,9 +62,9 @@ class SampledTiles:
 def sample_tiles(job: Job, pulses: int, side_px: int, chunk: int) -> SampledTiles:
     """Return some tiles, and their views from some chunks."""
     side = min(side_px, job.tile_px, *job.shape)
-    seconds_of_image = [(slice(0, side), slice(0, side))]
-    patches = [np.ascontiguousarray(patch[seconds_of_image[0]]) for patch in _patches(job, side)]
-    surfaces = tuple(surfaces_of(patch, seconds_of_image)[0] for patch in patches)
+    window = slice(0, side), slice(0, side)
+    patches = [np.ascontiguousarray(patch[window]) for patch in _patches(job, side)]
+    surfaces = tuple(surfaces_of(patch, [window])[0] for patch in patches)
     places = np.linspace(0, len(job.aperture) - 1, pulses).astype(int)
     groups = _groups(places)
     k, b = job.signal.wavenumber_rad_m, np.pi / (job.signal.step_m * job.signal.oversampling)
@@ -331,21 +331,18 @@ def _cost(job: Job, pulses: int, options: _Options, direct_s: float) -> _Cost:
     """Return the cost of the image where the direct sum takes `direct_s` per pixel and pulse."""
     side = min(options.side_px, job.tile_px, *job.shape)
     first = part = _by_tree(job, pulses, options, side, direct_s)
-    seconds_of_image = _SURFACE_S * job.pixels + _FORM_S * job.tiles
+    seconds = _SURFACE_S * job.pixels + _FORM_S * job.tiles
     left, presum = 1.0, 0.0  # share that larger tiles did not sum
     while True:
         weighed_s = job.antennas * job.share * job.pixels / side**2 * pulses * _ANTENNA_S
         taken = max(0.0, left - part.directly)
-        seconds_of_image, presum = (
-            seconds_of_image + taken * part.seconds + left * weighed_s,
-            max(presum, part.presum_rad2),
-        )
+        seconds, presum = seconds + taken * part.seconds + left * weighed_s, max(presum, part.presum_rad2)
         left, side = left - taken, side // 2
         if not left or side < LEAST_QUARTER_PX:
             break
         part = _by_tree(job, pulses, options, side, None)
-    seconds_of_image += left * pulses * job.share * job.pixels * direct_s
-    return _Cost(seconds_of_image, left, presum, first.sheets, first.layers)
+    seconds += left * pulses * job.share * job.pixels * direct_s
+    return _Cost(seconds, left, presum, first.sheets, first.layers)
 
 
 def _by_tree(job: Job, pulses: int, options: _Options, side: int, direct_s: float | None) -> _Cost:

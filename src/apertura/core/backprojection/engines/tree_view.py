@@ -75,8 +75,8 @@ def leaf_roughness(one_m: NDArray[np.float64], other_m: NDArray[np.float64]) -> 
     Examples
     --------
     >>> jitter = 1e-3 * np.random.default_rng(1).standard_normal((2, 1, 64, 3))
-    >>> variance, together = (leaf_roughness(jitter[0], other)[0, 0] for other in (jitter[1], jitter[0]))
-    >>> bool(1.2e-3 < variance < 1.8e-3 < together < 2.4e-3)
+    >>> independent, common = (leaf_roughness(jitter[0], other)[0, 0] for other in (jitter[1], jitter[0]))
+    >>> bool(1.2e-3 < independent < 1.8e-3 < common < 2.4e-3)
     True
     """
     variance = _widest(one_m) + _widest(other_m)
@@ -104,8 +104,8 @@ def curve(fewer: int, nodes_db: int) -> NDArray[np.float64]:
     >>> bool(np.abs(smooth[:, 0] - nodes(9, -74) ** 3).max() < 1e-12)
     True
     """
-    samples = np.polynomial.legendre.legvander(nodes(fewer, nodes_db), TREE_TERMS - 1)
-    return np.ascontiguousarray(samples @ _polynomials()[1])
+    legendre = np.polynomial.legendre.legvander(nodes(fewer, nodes_db), TREE_TERMS - 1)
+    return np.ascontiguousarray(legendre @ _polynomials()[1])
 
 
 @cache
