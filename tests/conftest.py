@@ -106,8 +106,7 @@ def finished_tiny(_tiny, all_steps):
 @pytest.fixture(scope="session")
 def run_by_snakemake(_tiny, made_once):
     """The tiny campaign as `snakemake` itself runs it, each step a process, images in two jobs each; read only."""
-    from folders import copy_writable
-    from test_50_workflow import finished, snakemake
+    from folders import copy_writable, finished, snakemake
 
     def run(root):
         code, output = finished(snakemake(copy_writable(_tiny, root), "all", "pages", "--set-scatter", "tiles=2"))

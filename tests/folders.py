@@ -2,7 +2,10 @@
 
 import hashlib
 import json
+import os
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -222,3 +225,18 @@ def recordings_of(specification: CampaignSpecification) -> tuple[dict[str, Obser
 def contents(root: Path) -> dict[str, bytes]:
     """Every file below a folder."""
     return {str(path.relative_to(root)): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
+
+
+def snakemake(campaign: Path, *options: str, **popen: Any) -> "subprocess.Popen[str]":
+    """Start Snakemake itself on a campaign."""
+    environment = {**os.environ, "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"}
+    command = [sys.executable, "-m", "snakemake", "--directory", str(campaign), "--cores", "2", *options]
+    return subprocess.Popen(
+        command, cwd=ROOT, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, **popen
+    )
+
+
+def finished(process: "subprocess.Popen[str]", timeout: float = 600) -> tuple[int, str]:
+    """Return exit status and output of a process that was started."""
+    output, _ = process.communicate(timeout=timeout)
+    return process.returncode, output

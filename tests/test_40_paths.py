@@ -19,7 +19,7 @@ from apertura.common.errors import CampaignError
 from apertura.common.provenance import sha256_file
 from apertura.core.geometry.geodesy import local_crs
 from apertura.stages import ingest
-from apertura.workflow.headers import Headers
+from apertura.workflow.jobs import Headers
 from apertura.workflow.lineage import results_of
 
 

@@ -9,7 +9,6 @@ from apertura.campaign.folder import Campaign
 from apertura.formats.catalog import CATALOG, CRATE
 from apertura.formats.export import COVERAGE, MAP, PHASE_HISTORY
 from apertura.tools.step_commands import app
-from apertura.workflow.headers import Headers
 from apertura.workflow.lineage import places_of
 from apertura.workflow.rules import RESULTS, RULES
 
@@ -38,12 +37,3 @@ def test_every_result_is_made_from_files_and_results_before_it(tiny):
         sources = {source for source in result.sources if source.startswith("results/")}
         assert sources <= made
         made.add(result.manifest)
-
-
-def test_a_rule_writes_the_manifests_of_its_results_last(finished_tiny):
-    headers = Headers(finished_tiny)
-    assert headers["ingest"].output == [f"results/{{flight}}/{{node}}/{of}.manifest.json" for of in ("raw", "track")]
-    assert headers["export_fused"].output[-1] == "results/{flight}/fused/export.manifest.json"
-    assert headers["coverage"].pictured == ["results/coverage.png"]
-    for header in map(headers.__getitem__, RULES):
-        assert not set(header.output) & set(header.pictured)

@@ -11,26 +11,13 @@ from pathlib import Path
 
 import pytest
 import yaml
-from folders import copy_writable
+from folders import copy_writable, finished, snakemake
 
 from apertura.campaign.folder import Campaign
 from apertura.common.processes import hold
 from apertura.workflow.stale import stale_results
 
 ROOT = Path(__file__).parents[1]
-
-
-def snakemake(campaign, *options, **popen):
-    environment = {**os.environ, "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"}
-    command = [sys.executable, "-m", "snakemake", "--directory", str(campaign), "--cores", "2", *options]
-    return subprocess.Popen(
-        command, cwd=ROOT, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, **popen
-    )
-
-
-def finished(process, timeout=600):
-    output, _ = process.communicate(timeout=timeout)
-    return process.returncode, output
 
 
 def contents(root):

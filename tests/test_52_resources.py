@@ -23,8 +23,8 @@ def test_every_rule_has_a_row_and_quotes_it():
     rules = (path for path in (ROOT / "workflow" / "rules").glob("*.smk") if path.name != "study.smk")
     text = "\n".join(path.read_text() for path in rules)
     assert set(re.findall(r"^rule (\w+):", text, re.MULTILINE)) == set(RULES)
-    for what in ("threads: {}.threads", "mem_mb={}.mem_mb", "runtime={}.runtime", "{}.sources", "{}.settings"):
-        assert all(what.format(f'header["{rule}"]') in text for rule in RULES)
+    for what in ("threads: {}.threads", "**{}.resources", "**{}.params"):
+        assert all(what.format(f'job["{rule}"]') in text for rule in RULES)
 
 
 def test_pulses_are_told_from_sizes_alone_and_no_fewer_than_there_are(finished_tiny):

@@ -1,21 +1,24 @@
 rule stac:
     input:
-        header["stac"].sources,
+        echo=each("results/{flight}/{pair}/echo.manifest.json"),
+        layers=each("results/{flight}/{pair}/layers.manifest.json"),
+        export=each("results/{flight}/{pair}/export.manifest.json"),
+        fused=each("results/{flight}/fused/export.manifest.json"),
+        scene="results/scene.manifest.json",
     output:
-        header["stac"].output,
+        "results/stac/catalog.json",
+        "results/stac.manifest.json",
     log:
-        header["stac"].log,
+        "results/logs/stac.log",
     benchmark:
-        header["stac"].benchmark
+        "results/benchmarks/stac.tsv"
     conda:
         "../../environment.yml"
-    threads: header["stac"].threads
+    threads: job["stac"].threads
     resources:
-        mem_mb=header["stac"].mem_mb,
-        runtime=header["stac"].runtime,
+        **job["stac"].resources,
     params:
-        settings=header["stac"].settings,
-        code=header["stac"].code,
+        **job["stac"].params,
     message:
         "describing every image in a catalog"
     shell:
@@ -25,22 +28,22 @@ rule stac:
 # Last of all: it describes every other result.
 rule ro_crate:
     input:
-        header["ro_crate"].sources,
+        config=files(inputs.config_files),
+        results=files(every_result),
     output:
-        header["ro_crate"].output,
+        "results/ro-crate-metadata.json",
+        "results/ro_crate.manifest.json",
     log:
-        header["ro_crate"].log,
+        "results/logs/ro_crate.log",
     benchmark:
-        header["ro_crate"].benchmark
+        "results/benchmarks/ro_crate.tsv"
     conda:
         "../../environment.yml"
-    threads: header["ro_crate"].threads
+    threads: job["ro_crate"].threads
     resources:
-        mem_mb=header["ro_crate"].mem_mb,
-        runtime=header["ro_crate"].runtime,
+        **job["ro_crate"].resources,
     params:
-        settings=header["ro_crate"].settings,
-        code=header["ro_crate"].code,
+        **job["ro_crate"].params,
     message:
         "describing the whole run as an RO-Crate"
     shell:

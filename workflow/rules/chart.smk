@@ -1,26 +1,28 @@
 rule speed_accuracy:
     input:
-        header["speed_accuracy"].sources,
+        echo=each("results/{flight}/{pair}/echo.manifest.json", of=CHARTED),
+        profile=each("results/{flight}/{pair}/profile.manifest.json", of=CHARTED),
+        scene="results/scene.manifest.json",
+        terrain=each("results/terrain.manifest.json", of=CHARTED),
+        patterns=files(inputs.patterns, of=CHARTED),
+        refined_track=each("results/{flight}/refined_track.manifest.json", of=CHARTED),
     output:
-        [
-            report(file, caption="../report/speed_accuracy.rst", category="study")
-            for file in header["speed_accuracy"].pictured
-        ],
-        header["speed_accuracy"].output,
+        "results/study/speed_accuracy.csv",
+        "results/study/speed_accuracy.html",
+        report("results/study/speed_accuracy.png", caption="../report/speed_accuracy.rst", category="study"),
+        "results/study/speed_accuracy.manifest.json",
     log:
-        header["speed_accuracy"].log,
+        "results/logs/speed_accuracy.log",
     benchmark:
-        header["speed_accuracy"].benchmark
+        "results/benchmarks/speed_accuracy.tsv"
     conda:
         "../../environment.yml"
-    threads: header["speed_accuracy"].threads
+    threads: job["speed_accuracy"].threads
     resources:
-        mem_mb=header["speed_accuracy"].mem_mb,
-        runtime=header["speed_accuracy"].runtime,
+        **job["speed_accuracy"].resources,
     params:
-        settings=header["speed_accuracy"].settings,
-        code=header["speed_accuracy"].code,
-        charted=lambda _: " ".join(charted(campaign)),
+        **job["speed_accuracy"].params,
+        charted=lambda _: " ".join(inputs.charted(campaign)),
     message:
         "timing and measuring every engine and setting"
     shell:
@@ -30,23 +32,23 @@ rule speed_accuracy:
 # Everything from raw samples on, under several settings: works in results/study/whole, which it removes.
 rule whole_chart:
     input:
-        header["whole_chart"].sources,
+        recordings=files(inputs.everything_recorded),
+        heights=files(inputs.heights),
     output:
-        [report(file, caption="../report/whole.rst", category="study") for file in header["whole_chart"].pictured],
-        header["whole_chart"].output,
+        "results/study/whole.csv",
+        report("results/study/whole.png", caption="../report/whole.rst", category="study"),
+        "results/study/whole.manifest.json",
     log:
-        header["whole_chart"].log,
+        "results/logs/whole_chart.log",
     benchmark:
-        header["whole_chart"].benchmark
+        "results/benchmarks/whole_chart.tsv"
     conda:
         "../../environment.yml"
-    threads: header["whole_chart"].threads
+    threads: job["whole_chart"].threads
     resources:
-        mem_mb=header["whole_chart"].mem_mb,
-        runtime=header["whole_chart"].runtime,
+        **job["whole_chart"].resources,
     params:
-        settings=header["whole_chart"].settings,
-        code=header["whole_chart"].code,
+        **job["whole_chart"].params,
     message:
         "timing the way from raw samples to GeoTIFFs under several settings"
     shell:

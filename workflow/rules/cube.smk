@@ -1,21 +1,21 @@
 rule cube:
     input:
-        header["cube"].sources,
+        image=each("results/{flight}/{pair}/image.manifest.json"),
+        assessment=each("results/{flight}/assessment.manifest.json"),
+        scene="results/scene.manifest.json",
     output:
-        header["cube"].output,
+        "results/cube.manifest.json",
     log:
-        header["cube"].log,
+        "results/logs/cube.log",
     benchmark:
-        header["cube"].benchmark
+        "results/benchmarks/cube.tsv"
     conda:
         "../../environment.yml"
-    threads: header["cube"].threads
+    threads: job["cube"].threads
     resources:
-        mem_mb=header["cube"].mem_mb,
-        runtime=header["cube"].runtime,
+        **job["cube"].resources,
     params:
-        settings=header["cube"].settings,
-        code=header["cube"].code,
+        **job["cube"].params,
     message:
         "stacking and adding up every image"
     shell:

@@ -1,21 +1,22 @@
 rule echo:
     input:
-        header["echo"].sources,
+        raw=each("results/{flight}/{node}/raw.manifest.json"),
+        track=each("results/{flight}/{node}/track.manifest.json"),
+        recordings=files(inputs.transmitted_and_received),
+        heights=files(inputs.ground_under_air),
     output:
-        header["echo"].output,
+        "results/{flight}/{pair}/echo.manifest.json",
     log:
-        header["echo"].log,
+        "results/logs/{flight}/{pair}.echo.log",
     benchmark:
-        header["echo"].benchmark
+        "results/benchmarks/{flight}/{pair}.echo.tsv"
     conda:
         "../../environment.yml"
-    threads: header["echo"].threads
+    threads: job["echo"].threads
     resources:
-        mem_mb=header["echo"].mem_mb,
-        runtime=header["echo"].runtime,
+        **job["echo"].resources,
     params:
-        settings=header["echo"].settings,
-        code=header["echo"].code,
+        **job["echo"].params,
     message:
         "{wildcards.flight}: calibrating {wildcards.pair}"
     shell:
@@ -24,22 +25,21 @@ rule echo:
 
 rule transfer:
     input:
-        header["transfer"].sources,
+        echo="results/{flight}/{pair}/echo.manifest.json",
+        recordings=files(inputs.received),
     output:
-        header["transfer"].output,
+        "results/{flight}/{pair}/transfer.manifest.json",
     log:
-        header["transfer"].log,
+        "results/logs/{flight}/{pair}.transfer.log",
     benchmark:
-        header["transfer"].benchmark
+        "results/benchmarks/{flight}/{pair}.transfer.tsv"
     conda:
         "../../environment.yml"
-    threads: header["transfer"].threads
+    threads: job["transfer"].threads
     resources:
-        mem_mb=header["transfer"].mem_mb,
-        runtime=header["transfer"].runtime,
+        **job["transfer"].resources,
     params:
-        settings=header["transfer"].settings,
-        code=header["transfer"].code,
+        **job["transfer"].params,
     message:
         "{wildcards.flight}: keeping the transfer functions of {wildcards.pair}"
     shell:
@@ -48,22 +48,21 @@ rule transfer:
 
 rule calibrate:
     input:
-        header["calibrate"].sources,
+        echo=each("results/{flight}/{pair}/echo.manifest.json"),
     output:
-        header["calibrate"].output,
+        "results/{flight}/calibration.json",
+        "results/{flight}/calibration.manifest.json",
     log:
-        header["calibrate"].log,
+        "results/logs/{flight}/calibrate.log",
     benchmark:
-        header["calibrate"].benchmark
+        "results/benchmarks/{flight}/calibrate.tsv"
     conda:
         "../../environment.yml"
-    threads: header["calibrate"].threads
+    threads: job["calibrate"].threads
     resources:
-        mem_mb=header["calibrate"].mem_mb,
-        runtime=header["calibrate"].runtime,
+        **job["calibrate"].resources,
     params:
-        settings=header["calibrate"].settings,
-        code=header["calibrate"].code,
+        **job["calibrate"].params,
     message:
         "{wildcards.flight}: estimating path offsets from the reflector"
     shell:
@@ -72,22 +71,23 @@ rule calibrate:
 
 rule profile:
     input:
-        header["profile"].sources,
+        echo="results/{flight}/{pair}/echo.manifest.json",
+        scene="results/scene.manifest.json",
+        terrain=each("results/terrain.manifest.json"),
+        patterns=files(inputs.patterns),
     output:
-        header["profile"].output,
+        "results/{flight}/{pair}/profile.manifest.json",
     log:
-        header["profile"].log,
+        "results/logs/{flight}/{pair}.profile.log",
     benchmark:
-        header["profile"].benchmark
+        "results/benchmarks/{flight}/{pair}.profile.tsv"
     conda:
         "../../environment.yml"
-    threads: header["profile"].threads
+    threads: job["profile"].threads
     resources:
-        mem_mb=header["profile"].mem_mb,
-        runtime=header["profile"].runtime,
+        **job["profile"].resources,
     params:
-        settings=header["profile"].settings,
-        code=header["profile"].code,
+        **job["profile"].params,
     message:
         "{wildcards.flight}: compressing {wildcards.pair} in range"
     shell:

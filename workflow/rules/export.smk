@@ -1,31 +1,36 @@
-# A row of `apertura.formats.export.EXPORTS` is all that a product needs: the outputs follow from it.
+# The files are those of the rows of `apertura.formats.export.EXPORTS`, which a test compares with this list.
 rule export:
     input:
-        header["export"].sources,
+        image="results/{flight}/{pair}/image.manifest.json",
+        assessment="results/{flight}/assessment.manifest.json",
+        scene="results/scene.manifest.json",
+        layers=files(inputs.calibration_of_images),
     output:
-        [
-            report(
-                file,
-                caption="../report/quicklook.rst",
-                category="{flight}",
-                labels={"image": "{pair}", "shows": "image"},
-            )
-            for file in header["export"].pictured
-        ],
-        header["export"].output,
+        "results/{flight}/{pair}/image.json",
+        "results/{flight}/{pair}/slc.tif",
+        "results/{flight}/{pair}/power.tif",
+        "results/{flight}/{pair}/power.qml",
+        "results/{flight}/{pair}/db.tif",
+        "results/{flight}/{pair}/db.qml",
+        report(
+            "results/{flight}/{pair}/quicklook.png",
+            caption="../report/quicklook.rst",
+            category="{flight}",
+            labels={"image": "{pair}", "shows": "image"},
+        ),
+        added_files("export"),
+        "results/{flight}/{pair}/export.manifest.json",
     log:
-        header["export"].log,
+        "results/logs/{flight}/{pair}.export.log",
     benchmark:
-        header["export"].benchmark
+        "results/benchmarks/{flight}/{pair}.export.tsv"
     conda:
         "../../environment.yml"
-    threads: header["export"].threads
+    threads: job["export"].threads
     resources:
-        mem_mb=header["export"].mem_mb,
-        runtime=header["export"].runtime,
+        **job["export"].resources,
     params:
-        settings=header["export"].settings,
-        code=header["export"].code,
+        **job["export"].params,
     message:
         "{wildcards.flight}: writing the files of {wildcards.pair}"
     shell:
@@ -35,22 +40,23 @@ rule export:
 # As large as the echo: made where somebody asks for it, by its name or by rule phase_history.
 rule cphd:
     input:
-        header["cphd"].sources,
+        echo="results/{flight}/{pair}/echo.manifest.json",
+        profile="results/{flight}/{pair}/profile.manifest.json",
+        scene="results/scene.manifest.json",
     output:
-        header["cphd"].output,
+        "results/{flight}/{pair}/phase_history.cphd",
+        "results/{flight}/{pair}/cphd.manifest.json",
     log:
-        header["cphd"].log,
+        "results/logs/{flight}/{pair}.cphd.log",
     benchmark:
-        header["cphd"].benchmark
+        "results/benchmarks/{flight}/{pair}.cphd.tsv"
     conda:
         "../../environment.yml"
-    threads: header["cphd"].threads
+    threads: job["cphd"].threads
     resources:
-        mem_mb=header["cphd"].mem_mb,
-        runtime=header["cphd"].runtime,
+        **job["cphd"].resources,
     params:
-        settings=header["cphd"].settings,
-        code=header["cphd"].code,
+        **job["cphd"].params,
     message:
         "{wildcards.flight}: writing the phase history of {wildcards.pair}"
     shell:
@@ -59,31 +65,43 @@ rule cphd:
 
 rule export_fused:
     input:
-        header["export_fused"].sources,
+        image=each("results/{flight}/{pair}/image.manifest.json"),
+        assessment="results/{flight}/assessment.manifest.json",
+        cube="results/cube.manifest.json",
+        scene="results/scene.manifest.json",
+        noise=files(inputs.noise_of_sums),
     output:
-        [
-            report(
-                file,
-                caption="../report/quicklook.rst",
-                category="{flight}",
-                labels={"image": "fused", "shows": "image"},
-            )
-            for file in header["export_fused"].pictured
-        ],
-        header["export_fused"].output,
+        "results/{flight}/fused/image.json",
+        "results/{flight}/fused/coherent_slc.tif",
+        "results/{flight}/fused/coherent_power.tif",
+        "results/{flight}/fused/coherent_power.qml",
+        "results/{flight}/fused/coherent_db.tif",
+        "results/{flight}/fused/coherent_db.qml",
+        "results/{flight}/fused/noncoherent_power.tif",
+        "results/{flight}/fused/noncoherent_power.qml",
+        "results/{flight}/fused/noncoherent_db.tif",
+        "results/{flight}/fused/noncoherent_db.qml",
+        "results/{flight}/fused/noncoherent_magnitude.tif",
+        "results/{flight}/fused/noncoherent_magnitude.qml",
+        report(
+            "results/{flight}/fused/quicklook.png",
+            caption="../report/quicklook.rst",
+            category="{flight}",
+            labels={"image": "fused", "shows": "image"},
+        ),
+        added_files("export_fused"),
+        "results/{flight}/fused/export.manifest.json",
     log:
-        header["export_fused"].log,
+        "results/logs/{flight}/fused.export_fused.log",
     benchmark:
-        header["export_fused"].benchmark
+        "results/benchmarks/{flight}/fused.export_fused.tsv"
     conda:
         "../../environment.yml"
-    threads: header["export_fused"].threads
+    threads: job["export_fused"].threads
     resources:
-        mem_mb=header["export_fused"].mem_mb,
-        runtime=header["export_fused"].runtime,
+        **job["export_fused"].resources,
     params:
-        settings=header["export_fused"].settings,
-        code=header["export_fused"].code,
+        **job["export_fused"].params,
     message:
         "{wildcards.flight}: writing what the pairs add up to"
     shell:
@@ -92,23 +110,24 @@ rule export_fused:
 
 rule coverage:
     input:
-        header["coverage"].sources,
+        echo=each("results/{flight}/{pair}/echo.manifest.json"),
+        layers=each("results/{flight}/{pair}/layers.manifest.json"),
+        scene="results/scene.manifest.json",
     output:
-        [report(file, caption="../report/coverage.rst", category="campaign") for file in header["coverage"].pictured],
-        header["coverage"].output,
+        "results/coverage.geojson",
+        report("results/coverage.png", caption="../report/coverage.rst", category="campaign"),
+        "results/coverage.manifest.json",
     log:
-        header["coverage"].log,
+        "results/logs/coverage.log",
     benchmark:
-        header["coverage"].benchmark
+        "results/benchmarks/coverage.tsv"
     conda:
         "../../environment.yml"
-    threads: header["coverage"].threads
+    threads: job["coverage"].threads
     resources:
-        mem_mb=header["coverage"].mem_mb,
-        runtime=header["coverage"].runtime,
+        **job["coverage"].resources,
     params:
-        settings=header["coverage"].settings,
-        code=header["coverage"].code,
+        **job["coverage"].params,
     message:
         "drawing what the flights cover"
     shell:
@@ -117,23 +136,23 @@ rule coverage:
 
 rule mosaic:
     input:
-        header["mosaic"].sources,
+        layers=each("results/{flight}/{pair}/layers.manifest.json"),
+        export=each("results/{flight}/{pair}/export.manifest.json"),
+        fused=each("results/{flight}/fused/export.manifest.json"),
     output:
         [f"results/{file}" for file in mosaic_files(campaign.images, campaign.coefficients)],
-        header["mosaic"].output,
+        "results/mosaic/mosaic.manifest.json",
     log:
-        header["mosaic"].log,
+        "results/logs/mosaic.log",
     benchmark:
-        header["mosaic"].benchmark
+        "results/benchmarks/mosaic.tsv"
     conda:
         "../../environment.yml"
-    threads: header["mosaic"].threads
+    threads: job["mosaic"].threads
     resources:
-        mem_mb=header["mosaic"].mem_mb,
-        runtime=header["mosaic"].runtime,
+        **job["mosaic"].resources,
     params:
-        settings=header["mosaic"].settings,
-        code=header["mosaic"].code,
+        **job["mosaic"].params,
     message:
         "writing mosaics of all flights"
     shell:
@@ -142,22 +161,26 @@ rule mosaic:
 
 rule map:
     input:
-        header["map"].sources,
+        layers=each("results/{flight}/{pair}/layers.manifest.json"),
+        export=each("results/{flight}/{pair}/export.manifest.json"),
+        fused=each("results/{flight}/fused/export.manifest.json"),
+        coverage="results/coverage.manifest.json",
+        scene="results/scene.manifest.json",
+        truth=files(inputs.truth),
     output:
-        header["map"].output,
+        "results/map/map.json",
+        "results/map/map.manifest.json",
     log:
-        header["map"].log,
+        "results/logs/map.log",
     benchmark:
-        header["map"].benchmark
+        "results/benchmarks/map.tsv"
     conda:
         "../../environment.yml"
-    threads: header["map"].threads
+    threads: job["map"].threads
     resources:
-        mem_mb=header["map"].mem_mb,
-        runtime=header["map"].runtime,
+        **job["map"].resources,
     params:
-        settings=header["map"].settings,
-        code=header["map"].code,
+        **job["map"].params,
     message:
         "making the map"
     shell:

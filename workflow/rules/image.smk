@@ -5,22 +5,22 @@ scattergather:
 
 rule scene:
     input:
-        header["scene"].sources,
+        echo=files(inputs.echoes_that_bound_the_scene),
+        heights=files(inputs.heights),
     output:
-        header["scene"].output,
+        "results/scene.json",
+        "results/scene.manifest.json",
     log:
-        header["scene"].log,
+        "results/logs/scene.log",
     benchmark:
-        header["scene"].benchmark
+        "results/benchmarks/scene.tsv"
     conda:
         "../../environment.yml"
-    threads: header["scene"].threads
+    threads: job["scene"].threads
     resources:
-        mem_mb=header["scene"].mem_mb,
-        runtime=header["scene"].runtime,
+        **job["scene"].resources,
     params:
-        settings=header["scene"].settings,
-        code=header["scene"].code,
+        **job["scene"].params,
     message:
         "choosing the campaign's grid"
     shell:
@@ -29,22 +29,21 @@ rule scene:
 
 rule terrain:
     input:
-        header["terrain"].sources,
+        scene="results/scene.manifest.json",
+        heights=files(inputs.heights),
     output:
-        header["terrain"].output,
+        "results/terrain.manifest.json",
     log:
-        header["terrain"].log,
+        "results/logs/terrain.log",
     benchmark:
-        header["terrain"].benchmark
+        "results/benchmarks/terrain.tsv"
     conda:
         "../../environment.yml"
-    threads: header["terrain"].threads
+    threads: job["terrain"].threads
     resources:
-        mem_mb=header["terrain"].mem_mb,
-        runtime=header["terrain"].runtime,
+        **job["terrain"].resources,
     params:
-        settings=header["terrain"].settings,
-        code=header["terrain"].code,
+        **job["terrain"].params,
     message:
         "resampling the DEM to the campaign's grid"
     shell:
@@ -53,23 +52,37 @@ rule terrain:
 
 rule layers:
     input:
-        header["layers"].sources,
+        echo="results/{flight}/{pair}/echo.manifest.json",
+        profile="results/{flight}/{pair}/profile.manifest.json",
+        scene="results/scene.manifest.json",
+        terrain=each("results/terrain.manifest.json"),
+        patterns=files(inputs.patterns),
+        calibrated=files(inputs.measured_image),
     output:
-        header["layers"].output,
+        "results/{flight}/{pair}/incidence.tif",
+        "results/{flight}/{pair}/incidence.qml",
+        "results/{flight}/{pair}/bistatic_angle.tif",
+        "results/{flight}/{pair}/bistatic_angle.qml",
+        "results/{flight}/{pair}/mask.tif",
+        "results/{flight}/{pair}/mask.qml",
+        "results/{flight}/{pair}/looks.tif",
+        "results/{flight}/{pair}/looks.qml",
+        "results/{flight}/{pair}/nesz.tif",
+        "results/{flight}/{pair}/nesz.qml",
+        added_files("layers"),
+        "results/{flight}/{pair}/layers.manifest.json",
     log:
-        header["layers"].log,
+        "results/logs/{flight}/{pair}.layers.log",
     benchmark:
-        header["layers"].benchmark
+        "results/benchmarks/{flight}/{pair}.layers.tsv"
     priority: 1  # before images, which take all cores: what rasters take on this machine is then known early
     conda:
         "../../environment.yml"
-    threads: header["layers"].threads
+    threads: job["layers"].threads
     resources:
-        mem_mb=header["layers"].mem_mb,
-        runtime=header["layers"].runtime,
+        **job["layers"].resources,
     params:
-        settings=header["layers"].settings,
-        code=header["layers"].code,
+        **job["layers"].params,
     message:
         "{wildcards.flight}: angles, mask, looks and noise of {wildcards.pair}"
     shell:
@@ -78,22 +91,22 @@ rule layers:
 
 rule refine:
     input:
-        header["refine"].sources,
+        echo_and_profile=files(inputs.autofocused),
+        scene="results/scene.manifest.json",
+        terrain=each("results/terrain.manifest.json"),
     output:
-        header["refine"].output,
+        "results/{flight}/refined_track.manifest.json",
     log:
-        header["refine"].log,
+        "results/logs/{flight}/refine.log",
     benchmark:
-        header["refine"].benchmark
+        "results/benchmarks/{flight}/refine.tsv"
     conda:
         "../../environment.yml"
-    threads: header["refine"].threads
+    threads: job["refine"].threads
     resources:
-        mem_mb=header["refine"].mem_mb,
-        runtime=header["refine"].runtime,
+        **job["refine"].resources,
     params:
-        settings=header["refine"].settings,
-        code=header["refine"].code,
+        **job["refine"].params,
     message:
         "{wildcards.flight}: refining the tracks of its nodes where that pays"
     shell:
@@ -102,28 +115,28 @@ rule refine:
 
 rule tracks:
     input:
-        header["tracks"].sources,
+        refined_track="results/{flight}/refined_track.manifest.json",
+        track=each("results/{flight}/{node}/track.manifest.json"),
+        positions=files(inputs.unstaged_positions),
     output:
-        [
-            report(
-                file, caption="../report/tracks.rst", category="{flight}", labels={"image": "all", "shows": "tracks"}
-            )
-            for file in header["tracks"].pictured
-        ],
-        header["tracks"].output,
+        report(
+            "results/{flight}/tracks/tracks.png",
+            caption="../report/tracks.rst",
+            category="{flight}",
+            labels={"image": "all", "shows": "tracks"},
+        ),
+        "results/{flight}/tracks/tracks.manifest.json",
     log:
-        header["tracks"].log,
+        "results/logs/{flight}/tracks.tracks.log",
     benchmark:
-        header["tracks"].benchmark
+        "results/benchmarks/{flight}/tracks.tracks.tsv"
     conda:
         "../../environment.yml"
-    threads: header["tracks"].threads
+    threads: job["tracks"].threads
     resources:
-        mem_mb=header["tracks"].mem_mb,
-        runtime=header["tracks"].runtime,
+        **job["tracks"].resources,
     params:
-        settings=header["tracks"].settings,
-        code=header["tracks"].code,
+        **job["tracks"].params,
     message:
         "{wildcards.flight}: writing the tracks as refined"
     shell:
@@ -132,7 +145,12 @@ rule tracks:
 
 rule tiles:
     input:
-        header["tiles"].sources,
+        echo="results/{flight}/{pair}/echo.manifest.json",
+        profile="results/{flight}/{pair}/profile.manifest.json",
+        scene="results/scene.manifest.json",
+        terrain=each("results/terrain.manifest.json"),
+        patterns=files(inputs.patterns),
+        refined_track="results/{flight}/refined_track.manifest.json",
     output:
         temp("results/{flight}/{pair}/tiles/{scatteritem}.json"),
     log:
@@ -141,13 +159,11 @@ rule tiles:
         "results/benchmarks/{flight}/{pair}.tiles.{scatteritem}.tsv"
     conda:
         "../../environment.yml"
-    threads: header["tiles"].threads
+    threads: job["tiles"].threads
     resources:
-        mem_mb=header["tiles"].mem_mb,
-        runtime=header["tiles"].runtime,
+        **job["tiles"].resources,
     params:
-        settings=header["tiles"].settings,
-        code=header["tiles"].code,
+        **job["tiles"].params,
     message:
         "{wildcards.flight}: share {wildcards.scatteritem} of the tiles of {wildcards.pair}"
     shell:
@@ -157,27 +173,30 @@ rule tiles:
 # One job alone forms the tiles and finishes the image; the shares of many are gathered.
 rule image:
     input:
-        header["image"].sources,
-        [
+        echo="results/{flight}/{pair}/echo.manifest.json",
+        profile="results/{flight}/{pair}/profile.manifest.json",
+        scene="results/scene.manifest.json",
+        terrain=each("results/terrain.manifest.json"),
+        patterns=files(inputs.patterns),
+        refined_track="results/{flight}/refined_track.manifest.json",
+        tiles=[
             share
             for share in gather.tiles("results/{{flight}}/{{pair}}/tiles/{scatteritem}.json")
             if "-of-1." not in share
         ],
     output:
-        header["image"].output,
+        "results/{flight}/{pair}/image.manifest.json",
     log:
-        header["image"].log,
+        "results/logs/{flight}/{pair}.image.log",
     benchmark:
-        header["image"].benchmark
+        "results/benchmarks/{flight}/{pair}.image.tsv"
     conda:
         "../../environment.yml"
-    threads: header["image"].threads
+    threads: job["image"].threads
     resources:
-        mem_mb=header["image"].mem_mb,
-        runtime=header["image"].runtime,
+        **job["image"].resources,
     params:
-        settings=header["image"].settings,
-        code=header["image"].code,
+        **job["image"].params,
     message:
         "{wildcards.flight}: focusing {wildcards.pair} with {threads} threads"
     shell:
@@ -186,22 +205,25 @@ rule image:
 
 rule assess:
     input:
-        header["assess"].sources,
+        echo=each("results/{flight}/{pair}/echo.manifest.json"),
+        image=each("results/{flight}/{pair}/image.manifest.json"),
+        refined_track="results/{flight}/refined_track.manifest.json",
+        scene="results/scene.manifest.json",
+        terrain=each("results/terrain.manifest.json"),
     output:
-        header["assess"].output,
+        "results/{flight}/assessment.json",
+        "results/{flight}/assessment.manifest.json",
     log:
-        header["assess"].log,
+        "results/logs/{flight}/assess.log",
     benchmark:
-        header["assess"].benchmark
+        "results/benchmarks/{flight}/assess.tsv"
     conda:
         "../../environment.yml"
-    threads: header["assess"].threads
+    threads: job["assess"].threads
     resources:
-        mem_mb=header["assess"].mem_mb,
-        runtime=header["assess"].runtime,
+        **job["assess"].resources,
     params:
-        settings=header["assess"].settings,
-        code=header["assess"].code,
+        **job["assess"].params,
     message:
         "{wildcards.flight}: comparing the images with each other"
     shell:

@@ -1,21 +1,21 @@
 rule ingest:
     input:
-        header["ingest"].sources,
+        recording=files(inputs.recording),
+        log=files(inputs.log),
     output:
-        header["ingest"].output,
+        "results/{flight}/{node}/raw.manifest.json",
+        "results/{flight}/{node}/track.manifest.json",
     log:
-        header["ingest"].log,
+        "results/logs/{flight}/{node}.ingest.log",
     benchmark:
-        header["ingest"].benchmark
+        "results/benchmarks/{flight}/{node}.ingest.tsv"
     conda:
         "../../environment.yml"
-    threads: header["ingest"].threads
+    threads: job["ingest"].threads
     resources:
-        mem_mb=header["ingest"].mem_mb,
-        runtime=header["ingest"].runtime,
+        **job["ingest"].resources,
     params:
-        settings=header["ingest"].settings,
-        code=header["ingest"].code,
+        **job["ingest"].params,
     message:
         "{wildcards.flight}: reading the recording and flight log of {wildcards.node}"
     shell:
@@ -24,26 +24,28 @@ rule ingest:
 
 rule bench:
     input:
-        header["bench"].sources,
+        recordings=files(inputs.recorded_on_the_bench),
     output:
-        [
-            report(file, caption="../report/bench.rst", category="{flight}", labels={"image": "all", "shows": "bench"})
-            for file in header["bench"].pictured
-        ],
-        header["bench"].output,
+        "results/{flight}/bench.json",
+        "results/{flight}/bench.html",
+        report(
+            "results/{flight}/bench.png",
+            caption="../report/bench.rst",
+            category="{flight}",
+            labels={"image": "all", "shows": "bench"},
+        ),
+        "results/{flight}/bench.manifest.json",
     log:
-        header["bench"].log,
+        "results/logs/{flight}/bench.log",
     benchmark:
-        header["bench"].benchmark
+        "results/benchmarks/{flight}/bench.tsv"
     conda:
         "../../environment.yml"
-    threads: header["bench"].threads
+    threads: job["bench"].threads
     resources:
-        mem_mb=header["bench"].mem_mb,
-        runtime=header["bench"].runtime,
+        **job["bench"].resources,
     params:
-        settings=header["bench"].settings,
-        code=header["bench"].code,
+        **job["bench"].params,
     message:
         "{wildcards.flight}: measuring channels, clocks and links on the bench"
     shell:

@@ -1,31 +1,63 @@
 # What the report shows and says, made where somebody asks for it: `apertura report`, or rule pages.
 rule pictures:
     input:
-        header["pictures"].sources,
+        echo="results/{flight}/{pair}/echo.manifest.json",
+        profile="results/{flight}/{pair}/profile.manifest.json",
+        image="results/{flight}/{pair}/image.manifest.json",
+        layers="results/{flight}/{pair}/layers.manifest.json",
+        raw=files(inputs.transmitter_raw),
+        refined_track="results/{flight}/refined_track.manifest.json",
+        scene="results/scene.manifest.json",
+        terrain=each("results/terrain.manifest.json"),
     output:
-        [
-            report(
-                f"results/{{flight}}/{{pair}}/pictures/{name}.png",
-                caption=f"../report/{name}.rst",
-                category="{flight}",
-                labels={"image": "{pair}", "shows": name.replace("_", " ")},
-            )
-            for name in PICTURES
-        ],
-        header["pictures"].output,
+        report(
+            "results/{flight}/{pair}/pictures/geometry.png",
+            caption="../report/geometry.rst",
+            category="{flight}",
+            labels={"image": "{pair}", "shows": "geometry"},
+        ),
+        report(
+            "results/{flight}/{pair}/pictures/pulses.png",
+            caption="../report/pulses.rst",
+            category="{flight}",
+            labels={"image": "{pair}", "shows": "pulses"},
+        ),
+        report(
+            "results/{flight}/{pair}/pictures/phase.png",
+            caption="../report/phase.rst",
+            category="{flight}",
+            labels={"image": "{pair}", "shows": "phase"},
+        ),
+        report(
+            "results/{flight}/{pair}/pictures/cuts.png",
+            caption="../report/cuts.rst",
+            category="{flight}",
+            labels={"image": "{pair}", "shows": "cuts"},
+        ),
+        report(
+            "results/{flight}/{pair}/pictures/range_profiles.png",
+            caption="../report/range_profiles.rst",
+            category="{flight}",
+            labels={"image": "{pair}", "shows": "range profiles"},
+        ),
+        report(
+            "results/{flight}/{pair}/pictures/budget.png",
+            caption="../report/budget.rst",
+            category="{flight}",
+            labels={"image": "{pair}", "shows": "budget"},
+        ),
+        "results/{flight}/{pair}/pictures.manifest.json",
     log:
-        header["pictures"].log,
+        "results/logs/{flight}/{pair}.pictures.log",
     benchmark:
-        header["pictures"].benchmark
+        "results/benchmarks/{flight}/{pair}.pictures.tsv"
     conda:
         "../../environment.yml"
-    threads: header["pictures"].threads
+    threads: job["pictures"].threads
     resources:
-        mem_mb=header["pictures"].mem_mb,
-        runtime=header["pictures"].runtime,
+        **job["pictures"].resources,
     params:
-        settings=header["pictures"].settings,
-        code=header["pictures"].code,
+        **job["pictures"].params,
     message:
         "{wildcards.flight}: drawing {wildcards.pair} for the report"
     shell:
@@ -34,31 +66,36 @@ rule pictures:
 
 rule pictures_fused:
     input:
-        header["pictures_fused"].sources,
+        export=each("results/{flight}/{pair}/export.manifest.json"),
+        image=each("results/{flight}/{pair}/image.manifest.json"),
+        cube="results/cube.manifest.json",
+        fused=each("results/{flight}/fused/export.manifest.json"),
+        scene="results/scene.manifest.json",
     output:
-        [
-            report(
-                file,
-                caption=f"../report/{Path(file).stem}.rst",
-                category="{flight}",
-                labels={"image": "fused", "shows": Path(file).stem.replace("_", " ")},
-            )
-            for file in header["pictures_fused"].pictured
-        ],
-        header["pictures_fused"].output,
+        report(
+            "results/{flight}/fused/panels.png",
+            caption="../report/panels.rst",
+            category="{flight}",
+            labels={"image": "fused", "shows": "panels"},
+        ),
+        report(
+            "results/{flight}/fused/sum_cuts.png",
+            caption="../report/sum_cuts.rst",
+            category="{flight}",
+            labels={"image": "fused", "shows": "sum cuts"},
+        ),
+        "results/{flight}/fused/pictures.manifest.json",
     log:
-        header["pictures_fused"].log,
+        "results/logs/{flight}/fused.pictures_fused.log",
     benchmark:
-        header["pictures_fused"].benchmark
+        "results/benchmarks/{flight}/fused.pictures_fused.tsv"
     conda:
         "../../environment.yml"
-    threads: header["pictures_fused"].threads
+    threads: job["pictures_fused"].threads
     resources:
-        mem_mb=header["pictures_fused"].mem_mb,
-        runtime=header["pictures_fused"].runtime,
+        **job["pictures_fused"].resources,
     params:
-        settings=header["pictures_fused"].settings,
-        code=header["pictures_fused"].code,
+        **job["pictures_fused"].params,
     message:
         "{wildcards.flight}: drawing what the pairs add up to for the report"
     shell:
@@ -67,28 +104,30 @@ rule pictures_fused:
 
 rule page:
     input:
-        header["page"].sources,
+        pictures=each("results/{flight}/{pair}/pictures.manifest.json"),
+        pictures_fused=each("results/{flight}/fused/pictures.manifest.json"),
+        export=each("results/{flight}/{pair}/export.manifest.json"),
+        fused=each("results/{flight}/fused/export.manifest.json"),
+        scene="results/scene.manifest.json",
     output:
         report(
-            f"results/{{flight}}/{PAGE}",
+            "results/{flight}/report.html",
             caption="../report/page.rst",
             category="{flight}",
             labels={"image": "all", "shows": "results section, to be printed"},
         ),
-        header["page"].output,
+        "results/{flight}/page.manifest.json",
     log:
-        header["page"].log,
+        "results/logs/{flight}/page.log",
     benchmark:
-        header["page"].benchmark
+        "results/benchmarks/{flight}/page.tsv"
     conda:
         "../../environment.yml"
-    threads: header["page"].threads
+    threads: job["page"].threads
     resources:
-        mem_mb=header["page"].mem_mb,
-        runtime=header["page"].runtime,
+        **job["page"].resources,
     params:
-        settings=header["page"].settings,
-        code=header["page"].code,
+        **job["page"].params,
     message:
         "{wildcards.flight}: writing the page of the report"
     shell:

@@ -36,7 +36,7 @@ NAME = "apertura.run.warm"
 AT_ONCE = "--at-once"
 """Argument: steps will be asked for, so import what they need without being asked."""
 
-_BOTH = ("apertura.check", "apertura.workflow.headers", "apertura.workflow.stale")
+_BOTH = ("apertura.check", "apertura.workflow.jobs", "apertura.workflow.stale")
 """What snakemake imports, too."""
 
 _LIBRARIES = (

@@ -155,15 +155,24 @@ def _manifest(rule: Rule, where: Iterable[str]) -> str:
     return f"results/{name}.manifest.json"
 
 
+def manifests_below(place: JobPlace, rule: Rule) -> list[str]:
+    """Return the manifests of a rule's results that belong to what a job runs on, and that the campaign has."""
+    return [_manifest(rule, where) for where in _needed(rule, place.campaign, place.below(rule.of))]
+
+
+def every_result(place: JobPlace) -> list[str]:
+    """Return the manifests of all results but those made on demand, and of those that describe all."""
+    every = _jobs(place.campaign)
+    return [_manifest(rule, where) for rule, where in every if not _describes_all(place.campaign, rule)]
+
+
 def _read(place: JobPlace, source: SourceSpec) -> Iterable[str]:
     """Return what a source of a row names at a place."""
     if callable(source):
         return source(place)
     if source == EVERY:
-        every = _jobs(place.campaign)
-        return [_manifest(rule, where) for rule, where in every if not _describes_all(place.campaign, rule)]
-    rule = RESULTS[source]
-    return [_manifest(rule, where) for where in _needed(rule, place.campaign, place.below(rule.of))]
+        return every_result(place)
+    return manifests_below(place, RESULTS[source])
 
 
 def _on_demand(campaign: Campaign, rule: Rule) -> bool:

@@ -100,6 +100,8 @@ class Export:
         return function
 
 
+_ADDED: tuple[Export, ...] = tuple(point.load() for point in entry_points(group="apertura.exports"))
+
 EXPORTS: tuple[Export, ...] = (
     Export("slc.tif", "image", "apertura.formats.export.cog:write_slc", mosaicked=False),
     Export("power.tif", "image", "apertura.formats.export.cog:write_power"),
@@ -178,7 +180,7 @@ EXPORTS: tuple[Export, ...] = (
     Export("height_std.tif", "height_std", "apertura.formats.export.interferogram:write_height_std"),
     Export("height_std.qml", "height_std", "apertura.formats.export.style:write_layer_style"),
     Export("quicklook.png", "panels", "apertura.formats.export.interferogram:write_panels", pictured=True),
-    *(point.load() for point in entry_points(group="apertura.exports")),
+    *_ADDED,
 )
 """Every product of a pair or of a flight's sums, in the order in which they are written."""
 
@@ -209,6 +211,11 @@ def exports_in(folder: str) -> Iterator[Export]:
     ['incidence.tif', 'incidence.qml', 'bistatic_angle.tif', 'bistatic_angle.qml']
     """
     return (export for export in EXPORTS if SOURCES[export.source] == folder)
+
+
+def added_exports(folder: str) -> list[Export]:
+    """Return the rows of a kind that other packages add."""
+    return [export for export in _ADDED if SOURCES[export.source] == folder]
 
 
 def product(source: str, function: str) -> Export:

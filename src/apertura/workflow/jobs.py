@@ -1,0 +1,81 @@
+"""What the rules in `workflow/` take from the campaign: inputs that follow from its flights, resources, parameters.
+
+Names of files stand in the rules as they are. `apertura.workflow.rules` has the same graph for lineage and staleness;
+a test holds the two together.
+"""
+
+import re
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+from apertura.campaign.folder import Campaign
+from apertura.formats.export import added_exports
+from apertura.workflow.lineage import manifests_below, result_of
+from apertura.workflow.resources import Resources
+from apertura.workflow.rule_inputs import JobPlace, Scope
+from apertura.workflow.rules import RESULTS, RULES, Rule
+
+FilesOfJob = Callable[[Any], list[str]]
+"""Wildcards of a job → files, relative to the campaign folder."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """What the jobs of a rule ask for, as Snakemake takes it: functions of a job's wildcards."""
+
+    threads: Callable[..., int]
+    resources: Mapping[str, Callable[..., int]]
+    params: Mapping[str, Callable[..., Any]]
+
+
+@dataclass(frozen=True)
+class Jobs:
+    """The jobs of a campaign's rules."""
+
+    campaign: Campaign
+
+    @cached_property
+    def _resources(self) -> Resources:
+        return Resources(self.campaign)
+
+    def __getitem__(self, rule: str) -> Job:
+        """Return what the jobs of a rule ask for; its parameters are the settings and code that matter to them."""
+        asked, row = self._resources[rule], RULES[rule]
+        rows = [made for made in RESULTS.values() if made.name == rule] or [RESULTS[row.result]]
+
+        def results(wildcards: Any) -> list[Any]:
+            where = [getattr(wildcards, word) for word in row.of.wildcards]
+            return [result_of(self.campaign, made.result, *where) for made in rows]
+
+        params = {
+            "settings": lambda wildcards: {k: v for one in results(wildcards) for k, v in one.settings.items()},
+            "code": lambda wildcards: [one.code_sha256 for one in results(wildcards)],
+        }
+        return Job(asked.threads, {"mem_mb": asked.mem_mb, "runtime": asked.runtime}, params)
+
+    def each(self, manifest: str, of: Scope | None = None) -> FilesOfJob:
+        """Return the input function of a manifest with wildcards: one for each node, pair or flight of the job.
+
+        Those that the campaign does not have are left out, such as the terrain of a campaign without a DEM.
+        """
+        row = next(row for row in RESULTS.values() if f"results/{row.manifest}.manifest.json" == manifest)
+        return lambda wildcards: manifests_below(self._place(wildcards, of), row)
+
+    def files(self, source: Callable[[JobPlace], Iterable[str]], of: Scope | None = None) -> FilesOfJob:
+        """Return the input function of files that `apertura.workflow.rule_inputs` names."""
+        root = self.campaign.root
+        return lambda wildcards: [str((root / name).location) for name in source(self._place(wildcards, of))]
+
+    def _place(self, wildcards: Any, of: Scope | None) -> JobPlace:
+        """Return what a job runs on: of the kind stated, or by the names of its wildcards."""
+        named = {name for name in ("flight", "node", "pair", "two") if hasattr(wildcards, name)}
+        of = of or next(of for of in Scope if set(of.wildcards) == named)
+        return JobPlace(self.campaign, of, tuple(getattr(wildcards, word) for word in of.wildcards))
+
+
+def added_files(rule: str) -> list[str]:
+    """Return the files of a rule that other packages add by entry points of group ``apertura.exports``."""
+    row: Rule = RULES[rule]
+    return [f"results/{row.folder}/{one.file}" for one in added_exports(row.exports)]
