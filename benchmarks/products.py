@@ -85,7 +85,7 @@ def measured(root: Path, *step: str) -> None:
 
 def run_step(root: str, *step: str) -> None:
     """Run a step here; print its peak memory and seconds of the processor."""
-    from apertura.tools.step_commands import app
+    from apertura.cli import app
 
     app([*step, "--campaign", root], standalone_mode=False)
     used = resource.getrusage(resource.RUSAGE_SELF)

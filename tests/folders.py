@@ -53,7 +53,7 @@ from apertura.stages import (
     stac,
     tracks,
 )
-from apertura.views.webmap import step as webmap
+from apertura.views.webmap import document as webmap
 
 ROOT = Path(__file__).parents[1]
 SHARED = ROOT.parent / "shared" / "data"

@@ -1,4 +1,4 @@
-"""`python tests/snakemake_jobs.py OPTIONS`: snakemake, with every job that it plans as a line of JSON on standard output.
+"""`python tests/snakemake_jobs.py OPTIONS`: snakemake, which prints every job that it plans as a line of JSON.
 
 With a message Snakemake prints that instead of a job's inputs and outputs; a logger plugin is told all of them.
 """

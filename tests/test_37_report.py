@@ -28,7 +28,7 @@ from apertura.views.report.image_drawings import (
     steadiness,
 )
 from apertura.views.report.page import Heading, Paragraph, Picture, Table, page, rst_table, rst_text
-from apertura.views.report.panels import draw_panels
+from apertura.views.report.pictures import draw_panels
 
 HOSTILE = """`a <javascript:alert(1)>`_ |b| *c* {{ 7 * 7 }} <script>alert("1")</script> $\\frac{x$ ../../etc &amp; it's
 .. raw:: html

@@ -10,7 +10,7 @@ from folders import edit_config, edit_track
 from rasterio.transform import from_origin
 
 from apertura.campaign.folder import Campaign
-from apertura.check import as_line, problems, resources
+from apertura.check import as_line, files, problems
 from apertura.check.georeferencing import needles
 from apertura.check.hints import likely_cause
 from apertura.common.confined import ConfinedPath
@@ -425,9 +425,9 @@ def swell(root, size):
 
 def test_memory_must_hold_the_metadata_of_the_longest_recording_and_no_samples(tiny, monkeypatch):
     swell(tiny, 4_000_000_000)
-    monkeypatch.setattr(resources, "free_memory", lambda: 400_000_000)
+    monkeypatch.setattr(files, "free_memory", lambda: 400_000_000)
     assert reported(tiny, without=["disk"]) == []
-    monkeypatch.setattr(resources, "_CAPTURE_BYTES", 400_000_000)
+    monkeypatch.setattr(files, "_CAPTURE_BYTES", 400_000_000)
     line = reported(tiny, without=["disk"])
     assert re.search(
         r"\d+ captures of uav\d in f01 take at least .* GB of memory; expected at most the 0.4 GB", line[0]
@@ -437,7 +437,7 @@ def test_memory_must_hold_the_metadata_of_the_longest_recording_and_no_samples(t
 
 def test_free_memory_is_what_is_available_and_no_more_than_the_limit(tmp_path):
     (tmp_path / "meminfo").write_text("MemTotal: 9 kB\nMemAvailable:    1000 kB\nSwapFree:  24 kB\n")
-    assert resources.free_memory(tmp_path / "meminfo") == 1024 * 1024
+    assert files.free_memory(tmp_path / "meminfo") == 1024 * 1024
 
 
 def test_the_disk_must_hold_what_is_still_to_be_written(tiny, monkeypatch):

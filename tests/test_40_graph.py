@@ -41,8 +41,8 @@ def check(root, *targets):
         rows = [made for made in RESULTS.values() if made.name == rule] or [RESULTS[row.result]]
         made = [result_of(campaign, one.result, *where) for one in rows]
         sources = {str((campaign.root / name).location) for one in made for name in one.sources}
-        inputs = {str((campaign.root / name).location) for name in inputs if "/tiles/" not in name}
-        assert inputs == sources, (rule, where)
+        read = {str((campaign.root / name).location) for name in inputs if "/tiles/" not in name}
+        assert read == sources, (rule, where)
         folder = "/".join(filter(None, ["results", row.folder])).format(**words)
         files = {f"{folder}/{file}" for file in (*row.documents, *products_of(row))} | {one.manifest for one in made}
         if rule == "tiles":

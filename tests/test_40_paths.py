@@ -19,7 +19,8 @@ from apertura.common.errors import CampaignError
 from apertura.common.provenance import sha256_file
 from apertura.core.geometry.geodesy import local_crs
 from apertura.stages import ingest
-from apertura.workflow.jobs import Headers
+from apertura.workflow import rule_inputs
+from apertura.workflow.jobs import Jobs
 from apertura.workflow.lineage import results_of
 
 
@@ -146,7 +147,7 @@ def test_recordings_are_read_where_raw_root_says_and_keep_their_names(tiny, else
     assert recorded["raw/f01/uav1.sigmf-data"] == sha256_file(elsewhere / "f01/uav1.sigmf-data")
     assert not (tiny / "raw").exists()
     wildcards = SimpleNamespace(flight="f01", node="uav1")
-    listed = Headers(replace(campaign, root=Path()))["ingest"].sources(wildcards)
+    listed = Jobs(replace(campaign, root=Path())).files(rule_inputs.recording)(wildcards)
     assert str(elsewhere / "f01/uav1.sigmf-data") in listed  # as Snakemake looks for it
 
 

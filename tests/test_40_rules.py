@@ -6,9 +6,9 @@ from inspect import signature
 import pytest
 
 from apertura.campaign.folder import Campaign
+from apertura.cli import step
 from apertura.formats.catalog import CATALOG, CRATE
 from apertura.formats.export import COVERAGE, MAP, PHASE_HISTORY
-from apertura.tools.step_commands import app
 from apertura.workflow.lineage import places_of
 from apertura.workflow.rules import RESULTS, RULES
 
@@ -22,7 +22,7 @@ def test_the_step_of_a_row_takes_what_its_command_takes(rule):
 
 
 def test_every_rule_has_a_command_and_no_command_is_of_no_rule():
-    assert {one.name for one in app.registered_commands} == {rule.command for rule in RULES.values()}
+    assert {one.name for one in step.registered_commands} == {rule.command for rule in RULES.values()}
 
 
 def test_products_of_rows_are_called_as_their_steps_call_them():

@@ -16,10 +16,10 @@ from apertura.core.geometry.geodesy import geodetic_from_ecef
 from apertura.core.quality.point_targets import find_peak
 from apertura.simulation import PointTarget, SimulatedNode, Straight, WaveformSpecification, preset, simulate
 from apertura.simulation.impairments import Impairments
-from apertura.stages.air import in_air, scene_air
 from apertura.stages.node_log import raw_log
 from apertura.stages.pair import open_pair
 from apertura.stages.planning import air_decision
+from apertura.stages.positions import in_air, scene_air
 
 C = SPEED_OF_LIGHT_M_S
 

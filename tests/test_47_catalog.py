@@ -24,7 +24,7 @@ from apertura.formats.catalog.validation import stac_problems
 from apertura.stages import assess, cube, export
 from apertura.stages.ro_crate import ro_crate
 from apertura.stages.stac import stac
-from apertura.views.verify.crate import changed_files
+from apertura.views.verify.chain import changed_files
 from apertura.workflow.lineage import on_demand, places_of, result_of, results_of
 from apertura.workflow.rules import RESULTS
 

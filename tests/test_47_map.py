@@ -18,8 +18,8 @@ from apertura.campaign.store import record_files
 from apertura.common.errors import CampaignError
 from apertura.common.provenance import sha256_file
 from apertura.formats.export import exports_in, product_files
+from apertura.views.webmap.document import webmap
 from apertura.views.webmap.server import FILES, SHELL, served
-from apertura.views.webmap.step import webmap
 
 
 @pytest.fixture

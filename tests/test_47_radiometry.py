@@ -24,7 +24,7 @@ from apertura.stages.scene import open_scene
 from apertura.stages.stac import stac
 from apertura.views.score import score
 from apertura.views.verify.chain import verify
-from apertura.views.webmap.step import webmap
+from apertura.views.webmap.document import webmap
 from apertura.workflow.lineage import result_of
 
 RCS_M2 = (0.1, 1.0, 10.0)

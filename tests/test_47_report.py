@@ -11,9 +11,8 @@ from apertura.campaign.folder import Campaign
 from apertura.campaign.store import open_document, read_manifest
 from apertura.views.report import PICTURES
 from apertura.views.report.image_drawings import steadiness
-from apertura.views.report.pictures import Shown, pictures
+from apertura.views.report.pictures import Shown, pictures, pictures_fused
 from apertura.views.report.step import landing, page
-from apertura.views.report.sums import pictures_fused
 from apertura.views.verify.products import read_tags
 
 NAME = "`x`_ |y| .. raw:: html {{ 7*7 }} $\u00b5_\u03b1$ ../../etc 'a'"

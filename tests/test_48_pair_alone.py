@@ -12,9 +12,8 @@ from apertura.common.contracts import SUMMED
 from apertura.formats.catalog import CATALOG
 from apertura.formats.export import product_files
 from apertura.stages.export import export_fused
-from apertura.views.report.pictures import pictures
+from apertura.views.report.pictures import pictures, pictures_fused
 from apertura.views.report.step import landing, page
-from apertura.views.report.sums import pictures_fused
 from apertura.views.score import score
 from apertura.views.summary import is_finished, print_summary
 from apertura.workflow.lineage import places_of

@@ -18,8 +18,8 @@ from apertura.core.quality.point_targets import cut_through, find_peak
 from apertura.simulation.scene import PointTarget
 from apertura.stages.scene import open_scene
 from apertura.tools.design import designed
+from apertura.tools.design.computed import rehearse
 from apertura.tools.design.flight_plan import FlightPlan, read_flight_plan
-from apertura.tools.design.rehearsal import rehearse
 
 EAST, NORTH = 570661.0, 5363707.0
 PLAN = {

@@ -8,11 +8,11 @@ from folders import complaint, contents, copy_writable
 
 from apertura.common.processes import hold
 from apertura.run.driver import run_workflow
+from apertura.views.verify.diff import print_reproduced
 from apertura.views.verify.products import manifests
-from apertura.views.verify.reproduce import print_reproduced
 
 PAIR = "results/f01/uav1-uav2"
-RUN = "apertura.views.verify.reproduce.run_workflow"
+RUN = "apertura.views.verify.diff.run_workflow"
 
 
 @pytest.fixture

@@ -28,7 +28,6 @@ from apertura.stages import echo
 from apertura.stages.scene import settled_scene
 from apertura.stages.transfer import PairEcho
 from apertura.stages.transmitted import transmitted
-from apertura.tools.look import image as look_image
 from apertura.tools.look import pair as look_pair
 from apertura.tools.look.follow import Look
 from apertura.tools.look.node import NodeSoFar
@@ -337,7 +336,7 @@ def test_files_that_are_not_there_yet_are_waited_for(tiny):
 
 def test_an_image_of_hardly_any_aperture_is_shown_but_not_judged(tiny, monkeypatch):
     monkeypatch.setattr(look_pair, "AT_ONCE", 16)
-    monkeypatch.setattr(look_image, "LEAST_PULSES", 8)
+    monkeypatch.setattr(look_pair, "LEAST_PULSES", 8)
     look = Look(Campaign.load(tiny), follow=False)
     for node in look.nodes.values():
         node.read()

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 
 from apertura.core.scene.terrain import FlatGround
 from apertura.methods.autofocus.refine import refine
-from apertura.tools.chart.png import save_png
+from apertura.tools.chart.pareto import save_png
 
 Setting = tuple[float, float, int, float]
 """σ (cm), correlation time (s), points, SNR per pulse (dB)."""

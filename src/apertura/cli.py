@@ -4,10 +4,13 @@ Commands import what they run when they run: help and mistakes in the command li
 """
 
 import os
+import pkgutil
 import shlex
 import signal
 import sys
+from collections.abc import Callable
 from contextlib import suppress
+from inspect import Parameter, Signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -26,8 +29,8 @@ from apertura.common.processes import (
     given,
     leave_status,
 )
-from apertura.tools.step_commands import Threads
-from apertura.tools.step_commands import app as step
+from apertura.common.progress import progress_path, reporting_to
+from apertura.workflow.rules import RULES, Rule
 
 if TYPE_CHECKING:
     from apertura.campaign.folder import Campaign
@@ -66,6 +69,54 @@ class Commands(TyperGroup):
                 self.commands[point.name] = group = get_group(point.load())
                 group.name, group.hidden = point.name, True
 
+
+# ---- apertura step: one command per rule, as rows of the rules say ---------------------------------------------------
+
+step = typer.Typer(no_args_is_help=True, help="One step of the pipeline, as the workflow runs it.")
+
+Directory = Annotated[Path, typer.Option("--campaign", help="campaign folder")]
+Threads = Annotated[int, typer.Option(min=1, help="tiles formed at once")]
+
+_OPTIONS: dict[str, tuple[Any, Any]] = {
+    "threads": (Threads, 1),
+    "seconds": (float, 60.0),
+    "repeats": (Annotated[int, typer.Option(min=1)], 3),
+}
+"""Option of a step → its type and its default."""
+
+
+def _command_of(rule: Rule) -> Callable[..., None]:
+    """Return the command of a rule: its arguments, the campaign folder and its options."""
+
+    def command(campaign: Path, **stated: Any) -> None:
+        from apertura.campaign.folder import Campaign
+
+        opened, words = Campaign.load(given(campaign)), [stated.pop(name) for name in rule.arguments]
+        with reporting_to(opened.result(*progress_path([rule.command, *words]))):
+            written = pkgutil.resolve_name(rule.step)(opened, *words, **stated)
+        for path in [written] if isinstance(written, Path) else written:
+            print(as_typed(path))
+
+    kinds: dict[str, tuple[Any, Any]] = dict.fromkeys(rule.arguments, (str, Parameter.empty))
+    kinds |= {"campaign": (Directory, Path()), **{name: _OPTIONS[name] for name in rule.options}}
+    command.__doc__ = rule.help
+    command.__annotations__ = {name: kind for name, (kind, _) in kinds.items()}
+    command.__signature__ = Signature(  # type: ignore[attr-defined]
+        [
+            Parameter(name, Parameter.POSITIONAL_OR_KEYWORD, default=default, annotation=kind)
+            for name, (kind, default) in kinds.items()
+        ]
+    )
+    return command
+
+
+_named: dict[str, Rule] = {}
+for _row in RULES.values():
+    if _named.setdefault(_row.command, _row) is _row:  # `export` serves two rules
+        step.command(_row.command)(_command_of(_row))
+
+
+# ---- The commands ---------------------------------------------------------------------------------------------------
 
 app = typer.Typer(cls=Commands, no_args_is_help=True, help="SAR images from campaign folders.")
 app.add_typer(step, name="step", hidden=True)  # for rules, and to paste what one runs
@@ -451,7 +502,7 @@ def verify(
 ) -> None:
     """Walk from a product to the raw samples; say of each link whether it is the same, changed or missing."""
     if crate:
-        from apertura.views.verify.crate import print_checked
+        from apertura.views.verify.chain import print_checked
 
         raise typer.Exit(print_checked(given(product), quiet=quiet))
     there = None if campaign is None else given(campaign)
@@ -477,7 +528,7 @@ def reproduce(
 ) -> None:
     """Make a product again from the raw samples, in another folder, and compare it byte for byte with what is there."""
     kept = None if keep is None else given(keep)
-    from apertura.views.verify.reproduce import print_reproduced
+    from apertura.views.verify.diff import print_reproduced
 
     raise typer.Exit(print_reproduced(given(product), cores=cores, keep=kept))
 

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from apertura.common.arrays import Floats
 from apertura.common.provenance import code_sha256
 from apertura.common.tables import read_table, write_table
-from apertura.tools.chart.png import save_png
+from apertura.tools.chart.pareto import save_png
 
 Row = TypeVar("Row")
 

@@ -41,7 +41,7 @@ CHECKS: Mapping[str, str] = {
     "raw_root": "apertura.check.files:check_raw_root",
     "links": "apertura.check.files:check_links",
     "modules": "apertura.check.files:check_modules",
-    "results": "apertura.check.resources:check_writable",
+    "results": "apertura.check.files:check_writable",
     "codes": "apertura.check.recordings:check_codes",
     "recordings": "apertura.check.recordings:check_recordings",
     "histories": "apertura.check.recordings:check_histories",
@@ -63,11 +63,11 @@ CHECKS: Mapping[str, str] = {
     "aperture": "apertura.check.reach:check_aperture",
     "ground": "apertura.check.reach:check_ground",
     "calibration": "apertura.check.reach:check_calibration",
-    "memory": "apertura.check.resources:check_memory",
-    "disk": "apertura.check.resources:check_disk",
-    "scheduler": "apertura.check.resources:check_scheduler",
-    "imaging": "apertura.check.imaging:check_imaging",
-    "plan": "apertura.check.imaging:check_plan",
+    "memory": "apertura.check.files:check_memory",
+    "disk": "apertura.check.files:check_disk",
+    "scheduler": "apertura.check.files:check_scheduler",
+    "imaging": "apertura.check.reach:check_imaging",
+    "plan": "apertura.check.reach:check_plan",
 }
 """Name → ``module:function``; a function takes an `Examination` and yields problems, or raises one."""
 

@@ -25,7 +25,6 @@ from apertura.core.quality.agreement import Agreement
 from apertura.core.scene.grid import SceneGrid
 from apertura.stages.acquisition import Acquisition, open_acquisition
 from apertura.stages.agreement import ComparedImage, agreement_of, agreement_report, comparable, shows_points_of
-from apertura.stages.air import scene_air
 from apertura.stages.calibration import calibrated
 from apertura.stages.diagnosis import (
     LEAST_SHARE,
@@ -40,6 +39,7 @@ from apertura.stages.diagnosis import (
     some_pulses,
 )
 from apertura.stages.echo import pair_echo
+from apertura.stages.positions import scene_air
 from apertura.stages.refine import open_refined
 from apertura.stages.scene import OpenScene, open_scene, settled_scene
 from apertura.stages.transfer import PairEcho

@@ -32,9 +32,8 @@ from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.atmosphere import SceneAir
 from apertura.core.quality.budget import strictest_accuracy_db
 from apertura.stages.acquisition import Acquisition, common_pulses, open_acquisition
-from apertura.stages.air import scene_air, stated_air
 from apertura.stages.calibration import calibrated, calibration_spec
-from apertura.stages.positions import PulsePositions, place
+from apertura.stages.positions import PulsePositions, place, scene_air, stated_air
 from apertura.stages.stamping import stamped
 from apertura.stages.transfer import PairEcho, forming_from, recorded_echo, save_transfer
 from apertura.stages.transmitted import Transmitted, transmitted

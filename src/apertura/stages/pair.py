@@ -24,9 +24,8 @@ from apertura.core.quality.budget import NodePositions
 from apertura.core.quality.path_errors import Effect
 from apertura.formats.beam_pattern import read_beam_pattern
 from apertura.formats.reading import open_recording
-from apertura.stages.air import scene_air
 from apertura.stages.node_log import NodeLog, raw_log, shortest_wave
-from apertura.stages.positions import inside_segments, keep_segments, place, position_error
+from apertura.stages.positions import inside_segments, keep_segments, place, position_error, scene_air
 from apertura.stages.scene import Flown, OpenScene
 from apertura.stages.transfer import PairEcho, recorded_echo
 from apertura.stages.transmitted import transmitted

@@ -31,9 +31,9 @@ from apertura.core.echo.transfer import (
 )
 from apertura.core.geometry.geodesy import LOCAL
 from apertura.stages.acquisition import Acquisition, open_acquisition
-from apertura.stages.air import in_air
 from apertura.stages.node_log import raw_log, read_history, shortest_wave
 from apertura.stages.positions import (
+    in_air,
     keep_segments,
     place,
     stated_error,

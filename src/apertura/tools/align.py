@@ -31,8 +31,8 @@ from apertura.formats.times import FIRST
 from apertura.methods.autofocus.motion import Logged, Recorded
 from apertura.methods.synchronisation.clock_alignment import Alignment, align_on_point, estimate_drift
 from apertura.methods.synchronisation.scene_alignment import align_on_scene
-from apertura.stages.air import scene_air
 from apertura.stages.node_log import NodeLog, raw_log, read_history, shortest_wave
+from apertura.stages.positions import scene_air
 from apertura.stages.scene import ConfiguredGround, settled_scene
 from apertura.stages.transfer import PairEcho
 

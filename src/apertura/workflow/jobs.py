@@ -4,7 +4,6 @@ Names of files stand in the rules as they are. `apertura.workflow.rules` has the
 a test holds the two together.
 """
 
-import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property

@@ -15,7 +15,7 @@ from apertura.core.backprojection.engines import native
 from apertura.core.geometry.phase_centres import TrackCorrection
 from apertura.core.scene.grid import SceneGrid
 from apertura.methods.autofocus.inputs import PairRecord, Refinement
-from apertura.tools.chart.png import save_png
+from apertura.tools.chart.pareto import save_png
 from apertura_research.autofocus.cases import GRID, NODES, AutofocusCase
 from apertura_research.autofocus.outcomes import (
     ACCEPTED,

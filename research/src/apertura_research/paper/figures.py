@@ -16,7 +16,7 @@ from apertura.core.imaging.backproject import backproject
 from apertura.core.quality.measures import coherence_factor
 from apertura.core.quality.point_targets import BandLimitedPatch, find_peak
 from apertura.core.scene.grid import SceneGrid
-from apertura.tools.chart.png import save_png
+from apertura.tools.chart.pareto import save_png
 from apertura_research.paper.experiments import (
     BISTATIC,
     MONOSTATIC,

@@ -5,6 +5,7 @@ A stage is written as ``<stage>.zarr.wip`` under a kernel lock, finished by a re
 products have manifests of the same kind. Each names its files with their hashes and what they were made from.
 """
 
+from apertura.campaign.store.chunks import blocks_of_rows, open_stage, save_stage, write_blocks
 from apertura.campaign.store.manifest import (
     check_listed,
     compare,
@@ -30,7 +31,6 @@ from apertura.campaign.store.progress import (
     sharing,
     writing,
 )
-from apertura.campaign.store.stages import blocks_of_rows, open_stage, save_stage, write_blocks
 
 __all__ = [
     "blocks_of_rows",

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from apertura.common.atomic import write_text
+from apertura.common.atomic import replacement, write_text
 from apertura.core.backprojection.engines import ENGINES
-from apertura.tools.chart.png import save_png
 
 _COLOURS = ("#0072b2", "#e69f00", "#000000", "#cc79a7", "#56b4e9", "#009e73")
 _MARKERS = "osD^vP"
@@ -190,3 +190,10 @@ def write_page(points: Sequence[Mapping[str, Any]], path: Path, *, title: str, a
     data = json.dumps(list(points), ensure_ascii=False, allow_nan=False).replace("</", "<\\/")
     page = _PAGE.replace("@TITLE@", html.escape(title)).replace("@ASKED@", f"{accuracy_db:g}")
     write_text(path, page.replace("@ENGINES@", json.dumps(list(ENGINES))).replace("@POINTS@", data))
+
+
+def save_png(figure: Figure, path: Path) -> None:
+    """Write a PNG that is the same for the same figure."""
+    FigureCanvasAgg(figure)
+    with replacement(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=110, metadata={"Software": None})

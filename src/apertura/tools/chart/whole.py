@@ -24,7 +24,7 @@ from apertura.common.errors import CampaignError
 from apertura.common.tables import write_table
 from apertura.core.quality.budget import is_counted
 from apertura.stages import assess, calibration, cube, echo, export, image, ingest, profile, refine, scene
-from apertura.tools.chart.png import save_png
+from apertura.tools.chart.pareto import save_png
 from apertura.workflow.lineage import result_of, with_inputs
 from apertura.workflow.rules import STUDY
 
