@@ -11,7 +11,8 @@ from folders import complaint, run_steps
 from apertura.campaign.folder import Campaign
 from apertura.campaign.store import open_stage
 from apertura.check import problems
-from apertura.formats.tracks.optitrack import body_position
+from apertura.formats.tracks.log_options import LogOptions
+from apertura.formats.tracks.optitrack import read_optitrack
 from apertura.tools.align import align, write_clock
 from apertura.views.score import score
 
@@ -30,7 +31,9 @@ def rail_pass(shared, tmp_path):
 
 
 def reflector(root):
-    return body_position(root / "raw/passA/radar.track.csv", "Corner Reflector")
+    options = LogOptions(body="Corner Reflector", start_utc="2023-07-23")
+    track = read_optitrack(root / "raw/passA/radar.track.csv", node="radar", options=options)
+    return np.median(track.position.values, axis=0)
 
 
 def response(root, point):

@@ -158,9 +158,9 @@ EXPORTS: tuple[Export, ...] = (
         Export(f"{source}{end}", source, f"apertura.formats.export.{function}")
         for source in (source for source, kind in SOURCES.items() if kind.startswith("multilook"))
         for end, function in (
-            ("_power.tif", "multilook:write_mean_power"),
+            ("_power.tif", "cog:write_mean_power"),
             ("_power.qml", "style:write_linear_style"),
-            ("_db.tif", "multilook:write_mean_db"),
+            ("_db.tif", "db:write_mean_db"),
             ("_db.qml", "style:write_backscatter_style"),
         )
     ),

@@ -4,10 +4,11 @@ Pixels pass through in blocks, so that an image far larger than memory can come 
 zarr or dask. Nothing here reads a clock: identical inputs give identical bytes.
 """
 
+import json
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import ceil, log2
 from pathlib import Path
 from typing import Any, Literal, Protocol
@@ -22,7 +23,8 @@ from rasterio.errors import CRSError, NotGeoreferencedWarning
 from rasterio.windows import Window
 
 from apertura.common.errors import CampaignError, ContractError
-from apertura.formats.export.radiometry import with_radiometry
+from apertura.common.provenance import canonical_json
+from apertura.formats.export.radiometry import TAG
 from apertura.formats.export.writing import (
     IN_MEMORY_BYTES,
     READ,
@@ -56,7 +58,7 @@ class Band:
     dtype, nodata
         Type on disk, and the value of a pixel that holds nothing.
     unit, meaning
-        Written beside the band and as a tag; see `apertura.formats.export.radiometry.with_radiometry`.
+        Written beside the band and as a tag; see `with_radiometry`.
     overviews
         What an overview makes of two by two pixels: see `halved`.
     colours
@@ -123,7 +125,7 @@ def write_slc(
     ...         raster.read(1)[0, 0].item(), tuple(raster.bounds)
     (1j, (5.0, 7.0, 8.0, 9.0))
     """
-    write_cog(path, image, SLC, transform=transform, crs=crs, tags=tags, title=title, value=complex_only)
+    write_cog(path, image, SLC, transform=transform, crs=crs, tags=tags, title=title, value=only("complex64"))
 
 
 def write_power(
@@ -138,6 +140,16 @@ def write_magnitude(
 ) -> None:
     """Write a real raster of magnitudes as a float32 COG. Parameters and errors as `write_slc`."""
     write_cog(path, image, MAGNITUDE, transform=transform, crs=crs, tags=tags, title=title)
+
+
+def write_mean_power(
+    path: Path, power: NorthUpRaster, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
+) -> None:
+    """Write the mean power of squares of pixels, (y, x) float32: below zero where the noise subtracted exceeds it.
+
+    Parameters and errors as `write_slc`.
+    """
+    write_cog(path, power, POWER, transform=transform, crs=crs, tags=tags, title=title, value=only("float32"))
 
 
 def write_cog(
@@ -191,16 +203,46 @@ def power(image: Pixels) -> NDArray[np.float32]:
     >>> power(np.array([3 + 4j], "c8"))
     array([25.], dtype=float32)
     """
-    complex_only(image)
+    only("complex64")(image)
     squared: NDArray[np.float32] = image.real**2 + image.imag**2
     return squared
 
 
-def complex_only(image: Pixels) -> Pixels:
-    """Return `image` if it is complex64."""
-    if image.dtype != np.complex64:
-        raise ContractError(f"image to export is {image.dtype}, not complex64")
-    return image
+def only(dtype: str) -> Callable[[Pixels], Pixels]:
+    """Return a function that returns its block if that is of a dtype, and raises ContractError else."""
+
+    def check(block: Pixels) -> Pixels:
+        if block.dtype != dtype:
+            raise ContractError(f"raster to export is {block.dtype}, not {dtype}")
+        return block
+
+    return check
+
+
+def with_radiometry(band: Band, tags: Mapping[str, str]) -> tuple[Band, dict[str, str]]:
+    """Return a band and tags that state the meaning of its values, from `TAG` of its source raster.
+
+    Parameters
+    ----------
+    band
+        Its meaning may name ``{amplitude}`` or ``{power}``.
+    tags
+        Of the file; without `TAG` the raster is any focused scene.
+
+    Examples
+    --------
+    >>> from apertura.formats.export.radiometry import ECHO
+    >>> with_radiometry(POWER, {TAG: canonical_json(ECHO.report)})[0].meaning
+    'echo power, linear'
+    """
+    raster = {"amplitude": "amplitude of the focused scene", "power": "power of the focused scene"}
+    raster |= json.loads(tags.get(TAG, "{}"))
+    meaning = band.meaning.format(**raster)
+    meanings = {
+        name: value for name, value in raster.items() if name not in {"amplitude", "power"} and value is not None
+    }
+    words = canonical_json({**meanings, "quantity": meaning, "unit": band.unit})
+    return replace(band, meaning=meaning), {**tags, TAG: words}
 
 
 def placed(image: NorthUpRaster, transform: Affine, crs: str) -> dict[str, Any]:

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from rasterio import Affine
 
-from apertura.formats.export.cog import Band, NorthUpRaster, Pixels, power, write_cog
+from apertura.formats.export.cog import Band, NorthUpRaster, Pixels, only, power, write_cog
 
 DB = Band("float32", np.nan, "dB", "{power}, 10 log10", "AVERAGE")
 
@@ -48,11 +48,32 @@ def write_db(
     ...         raster.read(1)
     array([[20., nan]], dtype=float32)
     """
-    write_cog(path, image, DB, transform=transform, crs=crs, tags=tags, title=title, value=value, shown=_exact)
+
+    def shown(linear: Pixels) -> Pixels:
+        return decibels(linear.astype(np.float64)).astype(np.float32)
+
+    write_cog(path, image, DB, transform=transform, crs=crs, tags=tags, title=title, value=value, shown=shown)
 
 
-def _exact(linear: Pixels) -> Pixels:
-    return decibels(linear.astype(np.float64)).astype(np.float32)
+def write_mean_db(
+    path: Path, power: NorthUpRaster, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
+) -> None:
+    """Write 10 log10 of the mean power of squares of pixels, (y, x) float32; NaN where it is not above zero.
+
+    Overviews are the dB of the mean of all, those below zero included. Else as `write_db`.
+
+    Examples
+    --------
+    >>> import rasterio
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     path, power = Path(folder) / "multilook_db.tif", np.array([[100, -1]], "f4")
+    ...     write_mean_db(path, power, transform=Affine(1, 0, 5, 0, -1, 9), crs="EPSG:32632", tags={})
+    ...     with rasterio.open(path) as raster:
+    ...         raster.read(1)
+    array([[20., nan]], dtype=float32)
+    """
+    write_db(path, power, transform=transform, crs=crs, tags=tags, title=title, value=only("float32"))
 
 
 def decibels(linear: Pixels) -> Pixels:

@@ -1,14 +1,13 @@
 """Layers of an image: angles of view, mask of shadow and layover, and number of pulses."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from rasterio import Affine
 
-from apertura.common.errors import ContractError
-from apertura.formats.export.cog import Band, NorthUpRaster, Pixels, write_cog
+from apertura.formats.export.cog import Band, NorthUpRaster, only, write_cog
 from apertura.formats.export.radiometry import TAG
 
 SHADOW, LAYOVER, OUTSIDE = 1, 2, 255
@@ -50,15 +49,14 @@ def write_incidence(
     path: Path, angle_deg: NorthUpRaster, /, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
 ) -> None:
     """Write the incidence angle, (y, x) float32 degrees, NaN outside. Else as `cog.write_slc`."""
-    check = _only("float32")
-    write_cog(path, angle_deg, INCIDENCE, transform=transform, crs=crs, tags=tags, title=title, value=check)
+    write_cog(path, angle_deg, INCIDENCE, transform=transform, crs=crs, tags=tags, title=title, value=only("float32"))
 
 
 def write_bistatic_angle(
     path: Path, angle_deg: NorthUpRaster, /, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
 ) -> None:
     """Write the bistatic angle, (y, x) float32 degrees, NaN outside. Else as `cog.write_slc`."""
-    check = _only("float32")
+    check = only("float32")
     write_cog(path, angle_deg, BISTATIC_ANGLE, transform=transform, crs=crs, tags=tags, title=title, value=check)
 
 
@@ -80,15 +78,14 @@ def write_mask(
     ...         raster.descriptions[0], raster.read(1)[0, 0].item()
     ('0 valid, 1 shadow, 2 layover, 3 both, 255 outside', 1)
     """
-    check = _only("uint8")
-    write_cog(path, bits, MASK, transform=transform, crs=crs, tags=tags, title=title, value=check)
+    write_cog(path, bits, MASK, transform=transform, crs=crs, tags=tags, title=title, value=only("uint8"))
 
 
 def write_looks(
     path: Path, looks: NorthUpRaster, /, *, transform: Affine, crs: str, tags: Mapping[str, str], title: str = ""
 ) -> None:
     """Write how many pulses make a pixel, (y, x) float32, no data 0. Else as `cog.write_slc`."""
-    write_cog(path, looks, LOOKS, transform=transform, crs=crs, tags=tags, title=title, value=_only("float32"))
+    write_cog(path, looks, LOOKS, transform=transform, crs=crs, tags=tags, title=title, value=only("float32"))
 
 
 def write_nesz(
@@ -99,13 +96,4 @@ def write_nesz(
     With the tag `apertura.formats.export.radiometry.TAG` it is the σ⁰ that equals the noise.
     """
     band = replace(NESZ, meaning=NESZ_ABSOLUTE) if TAG in tags else NESZ
-    write_cog(path, noise_db, band, transform=transform, crs=crs, tags=tags, title=title, value=_only("float32"))
-
-
-def _only(dtype: str) -> Callable[[Pixels], Pixels]:
-    def check(block: Pixels) -> Pixels:
-        if block.dtype != dtype:
-            raise ContractError(f"layer to export is {block.dtype}, not {dtype}")
-        return block
-
-    return check
+    write_cog(path, noise_db, band, transform=transform, crs=crs, tags=tags, title=title, value=only("float32"))

@@ -1,16 +1,11 @@
 """Radiometry of a raster: meaning of its values, in words for the band and as JSON for the tag."""
 
-import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from math import isnan, log10
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from apertura.common.contracts import CF_SIGMA0
-from apertura.common.provenance import canonical_json
-
-if TYPE_CHECKING:
-    from apertura.formats.export.cog import Band
 
 TAG = "APERTURA_RADIOMETRY"
 CROSS_SECTIONS = "radiometry.json"
@@ -160,29 +155,3 @@ def of_sums(peaks: Mapping[str, float], phases_rad: Mapping[str, float]) -> dict
         "noncoherent": Radiometry(f"root mean power of {all_of}", f"mean power of {all_of}", best, peaks),
         "magnitude": Radiometry(f"mean magnitude of {all_of}", f"squared mean magnitude of {all_of}", best, peaks),
     }
-
-
-def with_radiometry(band: "Band", tags: Mapping[str, str]) -> tuple["Band", dict[str, str]]:
-    """Return a band and tags that state the meaning of its values, from `TAG` of its source raster.
-
-    Parameters
-    ----------
-    band
-        Its meaning may name ``{amplitude}`` or ``{power}``.
-    tags
-        Of the file; without `TAG` the raster is any focused scene.
-
-    Examples
-    --------
-    >>> from apertura.formats.export.cog import POWER
-    >>> with_radiometry(POWER, {TAG: canonical_json(ECHO.report)})[0].meaning
-    'echo power, linear'
-    """
-    raster = {"amplitude": "amplitude of the focused scene", "power": "power of the focused scene"}
-    raster |= json.loads(tags.get(TAG, "{}"))
-    meaning = band.meaning.format(**raster)
-    meanings = {
-        name: value for name, value in raster.items() if name not in {"amplitude", "power"} and value is not None
-    }
-    words = canonical_json({**meanings, "quantity": meaning, "unit": band.unit})
-    return replace(band, meaning=meaning), {**tags, TAG: words}

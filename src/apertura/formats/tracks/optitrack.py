@@ -69,27 +69,6 @@ def read_optitrack(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -
     )
 
 
-def body_position(path: Path, body: str) -> NDArray[np.float64]:
-    """Return where a body that stands still was, such as a reflector: (3,) float64, m, local east, north and up.
-
-    Parameters
-    ----------
-    path
-        A motion capture.
-    body
-        Name of a rigid body in it. The median over the take is taken.
-
-    Raises
-    ------
-    CampaignError
-        As `read_optitrack`, or if no frame shows the body.
-    """
-    take = _read(path, body, node="")
-    if not len(take.position):
-        raise _error(f"rigid body {quoted(body)} in no frame", path)
-    return np.asarray(np.median(take.position, axis=0))
-
-
 def _read(path: Path, body: str | None, *, node: str) -> _Take:
     text = read_text(path, expected=_EXPECTED, remedy=_REMEDY, largest=LARGEST_LOG // 2)
     lines = text.splitlines()
