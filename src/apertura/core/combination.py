@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.common.units import decibels
 from apertura.core.quality.agreement import OUT_OF_PHASE_RAD, Agreement
 
 # ---- How well the images of a sum add up
@@ -36,7 +37,7 @@ class InPhase:
     @property
     def loss_db(self) -> float:
         """Power that the peaks of the sum lack because its images are not in phase, dB, 0 or less."""
-        return 10 * float(np.log10(max(self.coherence, 1e-6)))
+        return decibels(max(self.coherence, 1e-6))
 
     @property
     def loss_std_db(self) -> float:
@@ -107,7 +108,7 @@ def clutter_reduction_db(single_db: Sequence[float], coherent_db: float) -> floa
     """
     if not single_db:
         raise ValueError("no image: a sum of nothing reduces nothing")
-    return float(10 * np.log10(np.mean(10 ** (np.asarray(single_db) / 10))) - coherent_db)
+    return decibels(float(np.mean(10 ** (np.asarray(single_db) / 10)))) - coherent_db
 
 
 # ---- Choice of the pairs that are added coherently: the largest set that agrees

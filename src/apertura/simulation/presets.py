@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from apertura.common.units import decibels
 from apertura.simulation.continuous import Framing
 from apertura.simulation.impairments import (
     Adc,
@@ -86,7 +87,7 @@ def paper_static(*, pulses: int = STATIC_PULSES) -> CampaignSpecification:
         _cylinder(near_m - 6.0, antenna_up_m, near_m**2),
         _cylinder(far_m - 6.0, antenna_up_m, far_m**2 * 10 ** (-weaker_db / 20)),
     )
-    both_db = 10 * float(np.log10(1 + 10 ** (-weaker_db / 10)))  # of their mean power over that of the first
+    both_db = decibels(1 + 10 ** (-weaker_db / 10))  # of their mean power over that of the first
     snr_db = _per_subcarrier(COHERENT_SNR_DB["first cylinder"]) + both_db
     known: Mapping[str, float | bool] = {"radar_m": 2 * near_m, "sidelink_m": 0.0, "split": True}
     return _standing("paper-static", cylinders, (0.0, -6.0, antenna_up_m), 0.911, snr_db, pulses, bench=known)
@@ -98,7 +99,7 @@ def _cylinder(north_m: float, up_m: float, amplitude: float) -> Line:
 
 def _per_subcarrier(compressed_db: float) -> float:
     """Return the SNR per subcarrier (dB) of that per compressed pulse, whose subcarriers add up in phase."""
-    return compressed_db - 10 * float(np.log10(PAPER_WAVEFORM.subcarriers))
+    return compressed_db - decibels(PAPER_WAVEFORM.subcarriers)
 
 
 def paper_uav(*, pulses: int = 275) -> CampaignSpecification:

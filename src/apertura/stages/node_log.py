@@ -12,6 +12,7 @@ from apertura.campaign.config import Node
 from apertura.campaign.folder import Campaign
 from apertura.common.arrays import Times
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.common.units import seconds_since
 from apertura.core.geometry.geodesy import LOCAL, LOCAL_NED, ned_axes
 from apertura.core.geometry.phase_centres import attitude_axes, phase_centres, position_spline
 from apertura.core.geometry.track_checks import CheckedTrack, YawFault, check_track, check_yaw
@@ -82,7 +83,7 @@ class NodeLog:
 
     def log_seconds(self, at: Times) -> NDArray[np.float64]:
         """Return times as seconds since the log's first epoch, float64."""
-        return np.asarray((at - self.track.time.values[0]) / np.timedelta64(1, "s"))
+        return seconds_since(at, self.track.time.values[0])
 
     def log_time(self, time_s: float) -> str:
         """Return the UTC time of day, to 10 ms, of seconds since the log's first epoch."""

@@ -14,6 +14,7 @@ from apertura.campaign.folder import Campaign
 from apertura.common.arrays import Times
 from apertura.common.errors import CampaignError
 from apertura.common.provenance import sha256_file
+from apertura.common.units import seconds_since
 from apertura.core.antenna.beam import LIMITS_RAD, Beam, Beams, antenna_axes, gaussian_cut, sampled_cut, sampled_phase
 from apertura.core.antenna.illumination import Illumination, illuminate
 from apertura.core.backprojection.inputs import PhaseHistory
@@ -259,7 +260,7 @@ def open_pair(
         history.frequency_hz,
         history.weight,
         echo.path_limit.values,
-        time_s=_seconds(echo.time.values),
+        time_s=seconds_since(echo.time.values, echo.time.values[0]),
         began=echo.time.values[0],
         positions=tuple(_positions(stated.get(leg, {})) for leg in _legs(pair)),
         history=history,
@@ -334,7 +335,7 @@ def expected_pair(
         frequency_hz,
         weight,
         limits_m,
-        time_s=_seconds(times),
+        time_s=seconds_since(times, times[0]),
         began=times[0],
         positions=tuple(known.values()),
         beams=beams_of(campaign, pair, axes),
@@ -371,7 +372,3 @@ def _positions(stated: Mapping[str, Any]) -> NodePositions:
         float(stated.get("drift_m", 0.0)),
         stated.get("receiver"),
     )
-
-
-def _seconds(times: NDArray[np.datetime64]) -> NDArray[np.float64]:
-    return np.asarray((times - times[0]) / np.timedelta64(1, "s"), np.float64)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from apertura.common.arrays import Complexes, Floats
 from apertura.common.errors import CampaignError
+from apertura.common.units import decibels
 from apertura.core.echo.captures import AT_ONCE
 from apertura.core.echo.line_of_sight import LOCK_FALSE_ALARM, LineOfSight, fit_block, joined
 
@@ -139,11 +140,6 @@ def changing_near(average: SidelinkAverage) -> float:
 
 def _peak_to_peak_db(amplitude: float) -> float:
     return float(20 * np.log10((1 + amplitude) / (1 - amplitude)))
-
-
-def decibels(power: float) -> float:
-    """Return 10 log10 of a power; -300 of none."""
-    return float(10 * np.log10(max(power, 1e-30)))
 
 
 # ---- State of a sidelink

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.common.errors import number_of
+from apertura.common.units import decibels
 from apertura.core.quality.measures import coherence_factor, weighted_median
 
 # ---- Subapertures: noise, drift and entropy
@@ -82,7 +83,7 @@ def _snr_of_halves_db(even: NDArray[np.complex64], odd: NDArray[np.complex64]) -
     """Return signal against noise of the sum of two images that share the signal alone."""
     signal = max(float((even * odd.conj()).real.sum()), 0.0)
     noise = float((np.abs(even - odd) ** 2).sum()) / 2
-    return 10 * float(np.log10(max(2 * signal, 1e-30) / max(noise, 1e-30)))
+    return decibels(max(2 * signal, 1e-30) / max(noise, 1e-30))
 
 
 def _drift_px(parts: NDArray[np.complex64]) -> NDArray[np.float64]:
@@ -234,7 +235,7 @@ def point_focus(contributions: NDArray[np.complex128]) -> PointFocus | None:
                 loss = (best / amplitude.sum()) ** 2 * (1 + variance * (1 - 2.5 * variance) / 2) ** 2
                 snr_db = _snr_db(contributions)
                 allowed = 1 / (1 + len(contributions) * 10 ** (-snr_db / 10))
-                loss_db = 10 * float(np.log10(min(1.0, loss)))
+                loss_db = decibels(min(1.0, loss))
                 return PointFocus(loss_db, variance, pulses, snr_db, coherence_factor(contributions), allowed)
         pulses *= 2
     return None
@@ -257,7 +258,7 @@ def _snr_db(contributions: NDArray[np.complex128]) -> float:
     power = abs(complex((even + odd).mean()) / 2) ** 2
     if not power:
         return float("-inf")
-    return 10 * float(np.log10(max(power - noise, 1e-3 * power) / max(noise, 1e-15 * power)))
+    return decibels(max(power - noise, 1e-3 * power) / max(noise, 1e-15 * power))
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from apertura.common.units import decibels
 from apertura.core.quality.measures import BlockRaster
 
 PATCH_PX = 64  # side of a patch, pixels
@@ -238,8 +239,8 @@ def cut_through(
     beyond = np.concatenate([line[: lobe.start], line[lobe.stop :]])
     return Cut(
         half_power_width(line, middle) * float(along[1] - along[0]),
-        10 * float(np.log10(beyond.max() / line[middle])) if beyond.size else float("nan"),
-        10 * float(np.log10(beyond.sum() / line[lobe].sum())) if beyond.size else float("nan"),
+        decibels(beyond.max() / line[middle]) if beyond.size else float("nan"),
+        decibels(beyond.sum() / line[lobe].sum()) if beyond.size else float("nan"),
     )
 
 

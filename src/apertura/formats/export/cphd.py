@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from apertura.common.arrays import Floats
 from apertura.common.atomic import replacement
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.common.units import seconds_since
 from apertura.core.geometry.geodesy import geodetic_from_ecef
 
 # ---- Metadata of a CPHD file, and parameters of each pulse ----------------------------------------------------------
@@ -118,7 +119,7 @@ class CphdCollection:
     @property
     def sent_s(self) -> Floats:
         """(pulse,) float64, seconds from `start`."""
-        return np.asarray((self.time - self.start) / np.timedelta64(1, "s"), np.float64)
+        return seconds_since(self.time, self.start)
 
     @property
     def exposed_s(self) -> Floats:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from apertura.common.arrays import Floats
 from apertura.common.atomic import replacement
+from apertura.common.units import seconds_since
 from apertura.core.geometry.geodesy import LOCAL, LOCAL_NED, geodetic_from_ecef, ned_axes
 from apertura.core.geometry.track_checks import stretches
 from apertura.formats.campaign_files import write_csv_log
@@ -114,7 +115,7 @@ class RefinedLog:
     def time_s(self) -> Floats:
         """(epoch,) float64, seconds since the first epoch."""
         times = self.track.time.values
-        return np.asarray((times - times[0]) / np.timedelta64(1, "s"))
+        return seconds_since(times, times[0])
 
     @property
     def _enu(self) -> Floats:
@@ -237,7 +238,7 @@ def _draw_logged(figure: Figure, logs: Sequence[RefinedLog]) -> tuple[list[Any],
         north, east, down = ((log.track.position.values[some] - first) @ axes_m).T
         (line,) = ground.plot(east, north, linewidth=1.2, label=log.node)
         ground.plot(east[-1:], north[-1:], "o", color=line.get_color(), markersize=4)
-        since_s = (log.track.time.values[some] - logs[0].track.time.values[0]) / np.timedelta64(1, "s")
+        since_s = seconds_since(log.track.time.values[some], logs[0].track.time.values[0])
         height.plot(since_s, -down, linewidth=1.2, color=line.get_color())
     ground.set_aspect("equal", adjustable="datalim")
     began = np.datetime_as_string(logs[0].track.time.values[0], "s")

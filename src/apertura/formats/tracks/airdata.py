@@ -11,6 +11,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from apertura.common.errors import CampaignError, quoted
+from apertura.common.units import seconds_since
 from apertura.formats.times import utc_times
 from apertura.formats.tracks.csv_track import cut_off, numbers, read_table
 from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions
@@ -173,7 +174,7 @@ def _utc(clock_s: NDArray[np.float64], second: NDArray[np.datetime64], unit: str
     if not len(clock_s):
         raise ValueError("no epochs")
     zero = second[0]
-    second_s = (second - zero) / np.timedelta64(1, "s")
+    second_s = seconds_since(second, zero)
     apart = np.abs(np.diff(second_s) - np.diff(clock_s)) > _APART * unit_s
     part = np.concatenate([[0], np.cumsum(apart)])
     offset, resolved, misfit = np.zeros(len(second_s)), np.zeros(len(second_s), bool), 0.0

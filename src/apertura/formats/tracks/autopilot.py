@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from apertura.common.arrays import Floats
 from apertura.common.errors import CampaignError
+from apertura.common.units import seconds_since
 from apertura.core.geometry.geodesy import ecef_from_geodetic, ned_axes
 from apertura.formats.times import utc_times
 from apertura.formats.tracks.log_options import LogOptions
@@ -55,7 +56,7 @@ class BootClock:
 
     def boot_s(self, utc: NDArray[np.datetime64]) -> Floats:
         """Return the autopilot's clock at UTC."""
-        return np.asarray(((utc - self.origin) / np.timedelta64(1, "s") - self.offset_s) / self.rate - self.delay_s)
+        return (seconds_since(utc, self.origin) - self.offset_s) / self.rate - self.delay_s
 
 
 def clock_of(
@@ -85,7 +86,7 @@ def clock_of(
     ('2025-05-14T09:30:01.000000000', True)
     """
     origin, zero = time_utc[0], float(np.median(boot_s))
-    since = (time_utc - origin) / np.timedelta64(1, "s")
+    since = seconds_since(time_utc, origin)
     ahead, beside = since - boot_s, boot_s - zero
     line = np.array([0.0, float(np.median(ahead))])
     reach = _AGREES_S + _FASTEST * float(np.ptp(boot_s)) / 2

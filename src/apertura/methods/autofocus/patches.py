@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from apertura.common.arrays import Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.common.units import decibels
 from apertura.core.antenna.beam import Beams
 from apertura.core.backprojection.engines import load_engine
 from apertura.core.backprojection.inputs import Profiles
@@ -260,7 +261,7 @@ class Candidates:
 
     def rejected(self, errors: Mapping[str, TrackErrors], by_speckle: Refinement | None = None) -> Refinement:
         """Return a rejected refinement: no bright place, and why speckle does not do; no node is moved."""
-        line = f"no place of the scene stands {10 * np.log10(LEAST_RATIO):.0f} dB out of what lies about it"
+        line = f"no place of the scene stands {decibels(LEAST_RATIO):.0f} dB out of what lies about it"
         report: dict[str, Any] = {"patches": self.points}
         if by_speckle is not None:
             line, report = f"{line}; {by_speckle.why}", {**report, "speckle": dict(by_speckle.report)}

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from apertura.common.arrays import Bools, Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.common.units import decibels
 from apertura.core.backprojection.contributions import block_contributions
 from apertura.core.geometry.phase_centres import TrackCorrection
 from apertura.core.quality.budget import NodePositions, position_lines
@@ -213,6 +214,6 @@ def _left(fits: Sequence[_Fit], of_logs: Sequence[Effect]) -> dict[str, float]:
     mean_rad2 = float(np.mean([effect.phase_rad**2 for effect in of_logs]))
     return {
         "left_rad": round(float(np.sqrt(left_rad2 + mean_rad2)), 4),
-        "left_db": round(10 * float(np.log10(np.exp(-left_rad2))), 3),
+        "left_db": round(decibels(np.exp(-left_rad2)), 3),
         "gauge_shift_m": round(max(effect.shift_m for effect in of_logs), 4),
     }

@@ -9,6 +9,7 @@ import numpy as np
 from apertura.common.arrays import Complexes, Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.flags import Flags
+from apertura.common.units import decibels
 from apertura.core.echo.compression import phasors, rotated
 from apertura.methods.autofocus.motion import Logged, Recorded, plausible_offsets
 
@@ -144,7 +145,7 @@ def align_on_point(
         sharpness.power, float(offsets_s[row]), float(paths_m[column]), _steps(offsets_s, paths_m, search_m)
     )
     peak_width = peak_widths(sharpness.power, *found, _steps(offsets_s, paths_m, search_m))
-    contrast_db = 10 * float(np.log10(sharpness.power(*found) / max(float(np.median(power)), 1e-300)))
+    contrast_db = decibels(sharpness.power(*found) / max(float(np.median(power)), 1e-300))
     flags = alignment_flags(power.max(axis=1), offsets_s, found[0], peak_width[0], contrast_db)
     report = {"method": "point", "plausible_s": [round(low, 3), round(high, 3)], "pulses": len(some)}
     return Alignment(*found, *peak_width, contrast_db, report, flags=flags)
@@ -206,7 +207,7 @@ def alignment_flags(power: Floats, offsets_s: Floats, best_s: float, width_s: fl
     second = float(power.max(initial=0.0, where=away)) / float(power.max())
     if second > 10 ** (AMBIGUITY_DB / 10):
         other_s = float(offsets_s[np.where(away, power, 0.0).argmax()])
-        flags["alignment_ambiguous"] = f"an offset of {other_s:.3f} s is only {-10 * np.log10(second):.1f} dB worse"
+        flags["alignment_ambiguous"] = f"an offset of {other_s:.3f} s is only {-decibels(second):.1f} dB worse"
     if 2 * width_s > offsets_s[-1] - offsets_s[0]:
         flags["alignment_ambiguous"] = f"all offsets from {offsets_s[0]:.3f} to {offsets_s[-1]:.3f} s do as well"
     if min(best_s - offsets_s[0], offsets_s[-1] - best_s) < width_s:
@@ -285,7 +286,7 @@ def estimate_drift(found: Alignment, echo: Recorded, log: Logged, point_m: Float
     simplex = np.vstack([np.zeros(free.size), np.eye(free.size)])
     done = minimize(falls, np.zeros(free.size), method="Nelder-Mead", options={"initial_simplex": simplex})
     offset_s, path_m, ppm = moved(done.x)
-    gain_db = 10 * float(np.log10(-done.fun / max(power(0.0, *at), 1e-300)))
+    gain_db = decibels(-done.fun / max(power(0.0, *at), 1e-300))
     first_s = float(apply_drift(time_s, ppm)[0] - time_s[0])
     report = {**found.report, "drift": f"{gain_db:.2f} dB better than without"}
     return replace(found, offset_s=offset_s + first_s, path_m=path_m, drift_ppm=ppm, report=report)

@@ -14,12 +14,12 @@ from scipy import fft
 from apertura.common.arrays import Complexes, Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.flags import Flags
+from apertura.common.units import decibels
 from apertura.core.echo.captures import Pulses, blocks_of
 from apertura.core.echo.clock import ClockOffset
 from apertura.core.echo.compression import phasors
 from apertura.core.echo.demodulate import Numerology
 from apertura.core.echo.line_of_sight import LineOfSight, fit_block, joined
-from apertura.core.echo.sidelink_state import decibels
 from apertura.core.quality.measures import coherence_factor
 from apertura.methods.synchronisation.channels import MISSED_SHARE, SIGMAS
 
@@ -309,7 +309,7 @@ class MeasuredLink:
     @property
     def flags(self) -> dict[str, str]:
         """Flags of limits that are crossed."""
-        flags, snr_db = {}, 10 * np.log10(self.snr)
+        flags, snr_db = {}, decibels(self.snr)
         if snr_db < WEAK_DB:
             flags["link_weak"] = f"{self.name}: {snr_db:.1f} dB in a compressed pulse"
         if self.jumped > MISSED_SHARE * self.pulses and snr_db > WEAK_DB:

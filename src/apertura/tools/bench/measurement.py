@@ -12,6 +12,7 @@ from apertura.campaign.folder import Campaign
 from apertura.common.arrays import Complexes, Floats
 from apertura.common.errors import CampaignError
 from apertura.common.flags import Flags
+from apertura.common.units import seconds_since
 from apertura.core.echo.captures import (
     SATURATED_SHARE,
     Pulses,
@@ -410,7 +411,7 @@ def _node(campaign: Campaign, flight: str, name: str, sent: Transmitted, *, own:
     raw = captures_of(recording, campaign, node=name)
     where = f"raw/{flight}/{name}"
     captured = Captured.of(raw, recording.samples.path, Path(where), where, sent)
-    time_s = np.asarray((raw.time.values - raw.time.values[0]) / np.timedelta64(1, "s"), np.float64)
+    time_s = seconds_since(raw.time.values, raw.time.values[0])
     counted = triggers(time_s, prf_hz=sent.waveform.prf_hz)
     present = [channel for channel in _CHANNELS if channel in recording.channels]
     every = np.arange(len(time_s))
