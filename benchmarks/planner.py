@@ -17,7 +17,7 @@ from apertura.core.backprojection.engines import load_engine, numba, reference
 from apertura.core.backprojection.engines.engine import Setting
 from apertura.core.planning.plan import Plan
 from apertura.core.planning.planner import SettingSearch, make_plan
-from apertura.core.quality.measures import numerical_error
+from apertura.core.quality.measures import numerical_error_db
 
 
 @dataclass
@@ -56,7 +56,7 @@ def compare(drawn: Drawn) -> tuple[str, list[float], float, str]:
     exact = reference.form(drawn.history, drawn.grid.positions(0.0)[*picked])
 
     def error_db(runner: Runner) -> float:
-        return numerical_error(runner.go()[*picked].astype(np.complex64), exact).rms_db
+        return numerical_error_db(runner.go()[*picked].astype(np.complex64), exact)
 
     mine = [Runner(drawn, plan.setting, plan)]
     reached = [error_db(mine[0])]

@@ -26,7 +26,7 @@ from apertura.core.backprojection.engines.native_prediction import NO_BEAMS, Pat
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.geodesy import body_axes
 from apertura.core.planning.planner import make_plan
-from apertura.core.quality.measures import numerical_error
+from apertura.core.quality.measures import numerical_error_db
 
 
 def test_the_axes_of_an_antenna_are_those_of_a_body_turned_by_its_boresight():
@@ -150,4 +150,4 @@ def test_the_certified_error_is_met_whatever_part_of_a_scene_the_beam_lights(see
     )
     some = tuple(np.random.default_rng(1).integers(0, drawn.grid.shape, (200, 2)).T)
     exact = reference.form(drawn.history, places[some], beams=beams)
-    assert numerical_error(image[some].astype(np.complex64), exact).rms_db <= drawn.accuracy_db
+    assert numerical_error_db(image[some].astype(np.complex64), exact) <= drawn.accuracy_db

@@ -13,7 +13,7 @@ from apertura.core.backprojection.engines import PATCH_PX, load_engine, native
 from apertura.core.backprojection.engines.engine import Setting
 from apertura.core.backprojection.engines.native_binding import KERNEL
 from apertura.core.backprojection.tiles import compute_tiles, image_array
-from apertura.core.quality.measures import numerical_error
+from apertura.core.quality.measures import numerical_error_db
 from apertura.core.scene.terrain import FlatGround
 
 
@@ -31,7 +31,7 @@ def test_an_image_from_blocks_of_pulses_is_that_of_all_pulses(engine, form_optio
         image = image_array(drawn.profiles, setting, drawn.grid, FlatGround(0.0), side_px=16)
         images.append(np.zeros(drawn.grid.shape, np.complex64))
         compute_tiles(image, list(drawn.grid.tiles(16)), images[-1], threads=2)
-    assert numerical_error(images[1].ravel(), images[0].ravel().astype(np.complex128)).rms_db < -130
+    assert numerical_error_db(images[1].ravel(), images[0].ravel().astype(np.complex128)) < -130
 
 
 @pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")  # of fork in a process with threads

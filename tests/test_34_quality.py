@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from apertura.core.quality.error_check import Brightness, Certificate, error_bound, random_pixels
-from apertura.core.quality.measures import coherence_factor, held, image_statistics, numerical_error
+from apertura.core.quality.measures import coherence_factor, held, image_statistics, numerical_error_db
 from apertura.core.quality.point_targets import BandLimitedPatch, cut_through, find_peak
 from apertura.core.scene.grid import SceneGrid
 
@@ -28,7 +28,7 @@ def certify(image, exact, seed, *, random=160, bright=112):
     picked = brightness.draw(image, windows, bright, generator)
     certificate = Certificate(windows, pixels, exact[tuple(pixels.T)])
     found = certificate.error(image, brightness, picked, exact[tuple(picked.T)])
-    return found, numerical_error(image.ravel(), exact.ravel()).rms_db
+    return found, numerical_error_db(image.ravel(), exact.ravel())
 
 
 @pytest.mark.quick("speckle")
@@ -67,7 +67,7 @@ def test_an_error_from_drawn_pixels_alone_counts_no_power_that_it_did_not_meet()
             error_bound(i.flat[d], e.flat[d], np.ones(64), power=np.abs(i.flat[d]) ** 2).bound_db
             for (i, e), d in zip(images, draws, strict=True)
         ]
-        above[kind] = np.array(bounds) - [numerical_error(i.ravel(), e.ravel()).rms_db for i, e in images]
+        above[kind] = np.array(bounds) - [numerical_error_db(i.ravel(), e.ravel()) for i, e in images]
         assert np.mean(above[kind] >= 0) >= 0.95
     assert np.median(above["speckle"]) < 3 < np.median(above["targets"])
 

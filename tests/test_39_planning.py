@@ -16,13 +16,13 @@ from apertura.core.backprojection.engines.native_prediction import path_variants
 from apertura.core.backprojection.inputs import Profiles
 from apertura.core.echo.compression import window_weights
 from apertura.core.planning.planner import MARGIN_DB, SettingSearch, make_plan
-from apertura.core.quality.measures import numerical_error
+from apertura.core.quality.measures import numerical_error_db
 
 
 def error_db(drawn, image, where=(...,)):
     """Return the error over all pixels, or those of a window, as eq. (6a) has it."""
     exact = reference.form(drawn.history, drawn.grid.positions(0.0)[where])
-    return numerical_error(image[where].astype(np.complex64), exact).rms_db
+    return numerical_error_db(image[where].astype(np.complex64), exact)
 
 
 def formed(drawn, setting, profiles):
@@ -63,7 +63,7 @@ def test_measured_errors_lie_from_3_5_db_below_to_1_5_db_above_the_predicted(see
     for asked in SETTINGS:
         setting = SettingSearch(job, options=asked).settings(len(job.aperture))[0]
         images = [formed(drawn, setting, drawn.profiles)[::5, ::5].ravel() for drawn in draws]
-        error = numerical_error(np.concatenate(images).astype(np.complex64), exact).rms_db
+        error = numerical_error_db(np.concatenate(images).astype(np.complex64), exact)
         assert setting.error_db - 3.5 <= error <= setting.error_db + 1.5, setting.line
 
 

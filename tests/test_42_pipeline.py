@@ -14,7 +14,7 @@ from apertura.core.backprojection.inputs import PhaseHistory, Profiles
 from apertura.core.echo.compression import compress, range_step, window_weights
 from apertura.core.echo.sidelink import METHODS
 from apertura.core.geometry.aperture import Aperture
-from apertura.core.quality.measures import numerical_error
+from apertura.core.quality.measures import numerical_error_db
 from apertura.core.quality.point_targets import BandLimitedPatch, find_peak
 from apertura.stages import echo
 from apertura.stages.scene import open_scene
@@ -142,7 +142,7 @@ def test_the_table_engine_meets_its_error(finished_sample, window, pair):
     pixels = ground.positions_at(grid, *random_pixels(grid.shape, 256, seed=3))
     engine = load_engine("numba")
     computed = engine.form(engine.prepare(profiles), pixels[None])[0]
-    assert numerical_error(computed, reference.form(spectra, pixels)).rms_db < -50
+    assert numerical_error_db(computed, reference.form(spectra, pixels)) < -50
 
 
 def test_what_the_product_says_of_its_error_is_true(finished_tiny):
@@ -157,7 +157,7 @@ def test_what_the_product_says_of_its_error_is_true(finished_tiny):
     rows, columns = random_pixels(formed.shape, 200, seed=99)
     scene = open_scene(finished_tiny)
     exact = reference.form(spectra, scene.terrain.positions_at(scene.grid, rows, columns))
-    measured = numerical_error(formed[rows, columns], exact).rms_db
+    measured = numerical_error_db(formed[rows, columns], exact)
     assert said["numerical_error_estimate_db"] == pytest.approx(measured, abs=3)
 
 

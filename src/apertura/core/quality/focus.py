@@ -303,7 +303,10 @@ def judge(points: Sequence[tuple[float, PointFocus | None]]) -> Focus:
     if not measured:
         return Focus("cannot tell", float("nan"), float("nan"), 0, "no bright point")
     losses = np.array([focus.loss_db for _, focus in measured])
-    stds = np.array([_std_db(focus) for _, focus in measured])
+    # Standard deviation of each loss by noise and neighbours.
+    stds = np.array(
+        [10 / float(np.log(10)) * focus.interference * float(np.sqrt(2 / LEAST_BLOCKS)) + 0.02 for _, focus in measured]
+    )
     weights = np.array([amplitude for amplitude, _ in measured])
     loss = weighted_median(losses, weights)
     spread = 1.4826 * weighted_median(np.abs(losses - loss), weights)
@@ -384,8 +387,3 @@ def judge_parts(parts: SubApertures, *, cell_m: float) -> Focus:
     if np.isfinite(parts.entropy):
         line += f"; entropy {parts.entropy:.2f}, with random phases {parts.entropy_by_chance:.2f}"
     return Focus("cannot tell", *nothing, line)
-
-
-def _std_db(focus: PointFocus) -> float:
-    """Return the standard deviation of the loss of one point by noise and neighbours, dB."""
-    return 10 / float(np.log(10)) * focus.interference * float(np.sqrt(2 / LEAST_BLOCKS)) + 0.02

@@ -37,21 +37,8 @@ def held(raster: BlockRaster) -> BlockRaster:
     return np.asarray(raster[0:rows, 0:columns])
 
 
-@dataclass(frozen=True)
-class NumericalError:
-    """Difference of an image from `reference` at some pixels, after one complex gain.
-
-    Attributes
-    ----------
-    rms_db
-        RMS of the difference over RMS of the reference at those pixels, dB.
-    """
-
-    rms_db: float
-
-
-def numerical_error(computed: NDArray[np.complex64], reference: NDArray[np.complex128]) -> NumericalError:
-    """Return the error of pixel values against the reference's.
+def numerical_error_db(computed: NDArray[np.complex64], reference: NDArray[np.complex128]) -> float:
+    """Return the RMS error of pixels, after one complex gain, over the RMS of the reference's, dB.
 
     Parameters
     ----------
@@ -65,19 +52,15 @@ def numerical_error(computed: NDArray[np.complex64], reference: NDArray[np.compl
     Examples
     --------
     >>> exact = np.array([1.0 + 0j, 2.0, 2.0])
-    >>> round(numerical_error(2j * (exact + [0, 0, 0.003]), exact).rms_db, 1)
+    >>> round(numerical_error_db(2j * (exact + [0, 0, 0.003]), exact), 1)
     -62.6
     """
     values = computed.astype(np.complex128)
     power = np.vdot(values, values).real
     gain = complex(np.vdot(values, reference) / power) if power else 0j
-    difference = np.abs(gain * values - reference)
-    return NumericalError(_ratio_db(np.sqrt((difference**2).mean()), np.sqrt((np.abs(reference) ** 2).mean())))
-
-
-def _ratio_db(amplitude: float, against: float) -> float:
-    floor = np.finfo(np.float64).eps
-    return float(20 * np.log10(max(amplitude / against, floor))) if against > 0 else 0.0
+    error = np.sqrt((np.abs(gain * values - reference) ** 2).mean())
+    level = np.sqrt((np.abs(reference) ** 2).mean())
+    return float(20 * np.log10(max(error / level, np.finfo(np.float64).eps))) if level > 0 else 0.0
 
 
 @dataclass(frozen=True)

@@ -151,10 +151,11 @@ def crate_document(run: CrateRun) -> dict[str, Any]:
     crate.metadata["conformsTo"] = [{"@id": uri} for uri in (_CRATE_SPEC, _WORKFLOW_CRATE)]
     tops, data = _data(run)
     described = [*_software(run), *_steps(run), *_jobs(run), *data, *map(_input, run.inputs)]
+    unique = {entity["@id"]: entity for entity in described}
     actions = [entity for entity in described if str(entity["@type"]).endswith("Action")]
     for name, value in _root(run, tops, actions).items():
         crate.root_dataset[name] = value
-    crate.add(*(Entity(crate, entity.pop("@id"), properties=entity) for entity in _unique(described)))
+    crate.add(*(Entity(crate, entity.pop("@id"), properties=entity) for entity in unique.values()))
     document: dict[str, Any] = crate.metadata.generate()
     return document
 
@@ -277,7 +278,10 @@ def _jobs(run: CrateRun) -> Iterator[dict[str, Any]]:
     for job in run.jobs:
         parameters = [_parameter(name, value) for name, value in sorted(job.settings.items())]
         yield from parameters
-        sources = [_source(name) for name in job.sources]
+        sources = [
+            quote(name.removeprefix("results/")) if name.startswith("results/") else input_id(name)
+            for name in job.sources
+        ]
         yield {
             "@id": f"#job/{job.path}",
             "@type": "CreateAction",
@@ -339,10 +343,6 @@ def _tool(job: CrateJob) -> str:
     return f"#tool/{job.rule}/{job.code_sha256[:16]}"
 
 
-def _source(name: str) -> str:
-    return quote(name.removeprefix("results/")) if name.startswith("results/") else input_id(name)
-
-
 def _stage(file: Listed) -> str | None:
     """Return the identifier of the stage that a file is a part of."""
     name, inner, _ = file.name.partition(".zarr/")
@@ -357,10 +357,6 @@ def _refs(ids: Iterable[str]) -> dict[str, str] | list[dict[str, str]]:
     """Return references: a list, but of one a single value, as RO-Crate recommends."""
     references = [{"@id": one} for one in dict.fromkeys(ids)]
     return references[0] if len(references) == 1 else references
-
-
-def _unique(entities: Iterable[dict[str, Any]]) -> Iterator[dict[str, Any]]:
-    yield from {entity["@id"]: entity for entity in entities}.values()
 
 
 # ---- The files that a crate names, with the hashes that it states of them ------------------------------------------

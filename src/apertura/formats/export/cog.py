@@ -186,7 +186,8 @@ def write_cog(
     """
     place = placed(image, transform, crs)
     band, tags = with_radiometry(band, tags)
-    words, size = _described(tags, title), int(np.prod(image.shape)) * np.dtype(band.dtype).itemsize
+    words = tags | ({"TIFFTAG_IMAGEDESCRIPTION": title} if title else {})
+    size = int(np.prod(image.shape)) * np.dtype(band.dtype).itemsize
     with gdal_replacement(path, size=size) as temporary:
         source = temporary.with_name("source.tif")
         checksum = _fill(source, lambda block: value(np.asarray(image[block])), shown, band, place, words)
@@ -314,11 +315,6 @@ def _commonest(four: Sequence[Pixels], nodata: float) -> Pixels:
         count = np.sum([one == other for other in four[: number + 1]], axis=0, dtype=np.uint8) * (one != nodata)
         found, most = np.where(count > most, one, found), np.maximum(count, most)
     return found
-
-
-def _described(tags: Mapping[str, str], title: str) -> dict[str, str]:
-    """Return the tags of the file; GDAL sorts them by name."""
-    return dict(tags) | ({"TIFFTAG_IMAGEDESCRIPTION": title} if title else {})
 
 
 def _fill(

@@ -5,7 +5,7 @@ a scene that is mostly noise, and whiten the noise.
 """
 
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from math import ceil, floor, log10
 from pathlib import Path
@@ -90,7 +90,12 @@ def write_mask_style(path: Path, *_: object, **__: object) -> None:
     palette = ET.SubElement(renderer, "colorPalette")
     for value, (name, colour) in CLASSES.items():
         seen_through = value in {0, OUTSIDE}
-        entry = {"value": str(value), "color": _hex(colour), "alpha": "0" if seen_through else "255", "label": name}
+        entry = {
+            "value": str(value),
+            "color": f"#{bytes(colour).hex()}",
+            "alpha": "0" if seen_through else "255",
+            "label": name,
+        }
         ET.SubElement(palette, "paletteEntry", entry)
     _write(path, renderer)
 
@@ -171,10 +176,6 @@ def _beside(path: Path) -> Iterator[rasterio.DatasetReader]:
 def _renderer(kind: str, **attributes: str) -> ET.Element:
     common = {"type": kind, "opacity": "1", "alphaBand": "-1", "nodataColor": ""}
     return ET.Element("rasterrenderer", common | attributes)
-
-
-def _hex(colour: Iterable[int]) -> str:
-    return "#" + "".join(f"{part:02x}" for part in colour)
 
 
 def _write(path: Path, renderer: ET.Element) -> None:

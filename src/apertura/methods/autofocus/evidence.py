@@ -14,7 +14,7 @@ from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.quality.budget import noise_loss
 from apertura.core.quality.focus import LEAST_BLOCKS, MOST_INTERFERENCE, log_amplitude_variance
 from apertura.methods.autofocus.objective import Blocks, PatchEcho, PatchImage, Tracks
-from apertura.methods.autofocus.patches import Patch, bandwidth_hz
+from apertura.methods.autofocus.patches import Patch
 from apertura.methods.autofocus.solve import Problem, State
 
 # ---- Errors that remain after a refinement --------------------------------------------------------------------------
@@ -423,7 +423,7 @@ def range_shifts(problem: Problem, state: State, axes: Floats, *, parts: int = P
         [_by_part(blocks, echo, image, state.tracks, axes, parts) for echo, image in zip(echoes, images, strict=True)]
         for blocks, echoes, images in pairs
     ]
-    cell_m = max(SPEED_OF_LIGHT_M_S / bandwidth_hz(blocks.record.profiles) for blocks in problem.pairs)
+    cell_m = max(SPEED_OF_LIGHT_M_S / blocks.record.profiles.bandwidth_hz for blocks in problem.pairs)
     wavelength_m = SPEED_OF_LIGHT_M_S / problem.pairs[0].record.profiles.centre_frequency_hz
     shifts_m = np.array(by_part).reshape(len(problem.pairs), -1, parts)
     return RangeShifts(shifts_m - _of_most(shifts_m, wavelength_m / 4), cell_m)
@@ -449,7 +449,7 @@ def _by_part(
     steep = float(level @ slope)
     if steep < _LEAST_SLOPE or len(echo.profiles) < parts:
         return nothing
-    extra_path_m = np.linspace(-_REACH_CELLS, _REACH_CELLS, _STEPS) * SPEED_OF_LIGHT_M_S / bandwidth_hz(echo.profiles)
+    extra_path_m = np.linspace(-_REACH_CELLS, _REACH_CELLS, _STEPS) * SPEED_OF_LIGHT_M_S / echo.profiles.bandwidth_hz
     line = Patch(echo.patch.place_m, place + extra_path_m[:, None] / steep * level)
     # Power along it in the image of each part, and its maximum by a parabola.
     values = blocks.contribution(replace(echo, patch=line), blocks.moves(tracks)).values

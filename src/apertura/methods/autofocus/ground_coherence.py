@@ -15,7 +15,7 @@ from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import Terrain
 from apertura.methods.autofocus.inputs import PairRecord, Prior, Refinement
 from apertura.methods.autofocus.objective import Blocks, Contribution, PatchEcho, Tracks, phases
-from apertura.methods.autofocus.patches import Patch, bandwidth_hz
+from apertura.methods.autofocus.patches import Patch
 from apertura.methods.autofocus.solve import Gauge, minimise
 
 if TYPE_CHECKING:
@@ -130,7 +130,7 @@ def _tile(
     sides_m = 2 * np.stack([below - place, right - place])
     cycles = []
     for one in records:
-        aperture, band_hz = one.profiles.aperture, np.array([-0.5, 0.5]) * bandwidth_hz(one.profiles)
+        aperture, band_hz = one.profiles.aperture, np.array([-0.5, 0.5]) * one.profiles.bandwidth_hz
         slope = aperture[aperture.sample(_STEPS)].path_gradient(place) @ sides_m.T
         wavenumbers = (one.profiles.centre_frequency_hz + band_hz) / SPEED_OF_LIGHT_M_S
         cycles.append(np.ptp(np.concatenate([slope * wavenumber for wavenumber in wavenumbers]), axis=0))

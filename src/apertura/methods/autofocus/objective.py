@@ -12,7 +12,7 @@ from apertura.core.backprojection.contributions import block_contributions
 from apertura.core.backprojection.inputs import Profiles
 from apertura.core.geometry.aperture import Aperture
 from apertura.methods.autofocus.inputs import PairRecord
-from apertura.methods.autofocus.patches import Patch, bandwidth_hz
+from apertura.methods.autofocus.patches import Patch
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -186,7 +186,7 @@ class Blocks:
         values = block_contributions(profiles, echo.patch.pixels_m, edges=np.arange(len(profiles) + 1))
         wavenumber, band = (
             2 * np.pi * frequency / profiles.wave_speed_m_s
-            for frequency in (profiles.centre_frequency_hz, bandwidth_hz(profiles) / np.sqrt(12))
+            for frequency in (profiles.centre_frequency_hz, profiles.bandwidth_hz / np.sqrt(12))
         )
         return Contribution(values, echo.blocks, slopes, wavenumber, band)
 

@@ -13,7 +13,6 @@ from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.units import decibels
 from apertura.core.antenna.beam import Beams
 from apertura.core.backprojection.engines import load_engine
-from apertura.core.backprojection.inputs import Profiles
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.geodesy import ned_axes
 from apertura.core.geometry.phase_centres import TrackCorrection
@@ -141,11 +140,6 @@ def count_in_memory(values: Sequence[int]) -> int:
     return max(int((np.cumsum(values) <= MOST_VALUES).sum()), min(1, len(values)))
 
 
-def bandwidth_hz(profiles: Profiles) -> float:
-    """Return the bandwidth of some profiles."""
-    return profiles.bandwidth_hz
-
-
 def _spans(place_m: Floats, record: PairRecord, axes: Floats, correlation_s: float) -> tuple[Floats, Floats, Floats]:
     """Return the directions along and across the line of sight, the cells along both, half a patch in cells."""
     profiles = record.profiles
@@ -159,7 +153,7 @@ def _spans(place_m: Floats, record: PairRecord, axes: Floats, correlation_s: flo
     ahead = ahead / np.linalg.norm(ahead) if np.linalg.norm(ahead) > 1e-3 else np.array([0.0, 1.0])
     turned = np.stack([ahead, [-ahead[1], ahead[0]]])
     by_time = slope @ turned.T
-    band = profiles.centre_frequency_hz + np.array([-0.5, 0.5]) * bandwidth_hz(profiles)
+    band = profiles.centre_frequency_hz + np.array([-0.5, 0.5]) * profiles.bandwidth_hz
     cycles = np.concatenate([by_time * frequency / SPEED_OF_LIGHT_M_S for frequency in band])
     cell = 1 / np.maximum(np.ptp(cycles, axis=0), 1e-9)
     spread = np.clip(_BANDWIDTH * float(np.ptp(time_s)) / correlation_s, _LEAST_CELLS, _MOST_CELLS)
@@ -352,7 +346,7 @@ def bright_places(
     """
     from scipy.ndimage import maximum_filter, median_filter  # slow to import
 
-    cell_m = min(SPEED_OF_LIGHT_M_S / bandwidth_hz(one.profiles) for one in records) / 2
+    cell_m = min(SPEED_OF_LIGHT_M_S / one.profiles.bandwidth_hz for one in records) / 2
     step = _step(records, grid)
     rows, columns = (np.arange(step // 2, size, step) for size in grid.shape)
     power = np.zeros((len(rows), len(columns)))
@@ -398,7 +392,7 @@ def _parts(rows: int, columns: int) -> Iterator[tuple[slice, slice]]:
 
 def _step(records: Sequence[PairRecord], grid: SceneGrid) -> int:
     """Return the distance of pixels that bright places are looked for in, in pixels of the grid: half a range cell."""
-    cell_m = min(SPEED_OF_LIGHT_M_S / bandwidth_hz(one.profiles) for one in records) / 2
+    cell_m = min(SPEED_OF_LIGHT_M_S / one.profiles.bandwidth_hz for one in records) / 2
     return max(1, int(cell_m / 2 / grid.spacing_m))
 
 

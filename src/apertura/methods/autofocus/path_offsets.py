@@ -17,7 +17,7 @@ from apertura.methods.autofocus.evidence import FOLDS, LEAST_GAIN_DB, MOST_RATIO
 from apertura.methods.autofocus.inputs import PairRecord, Refinement, TrackErrors
 from apertura.methods.autofocus.objective import PatchImage
 from apertura.methods.autofocus.one_phase import METHODS, Patches
-from apertura.methods.autofocus.patches import Candidates, Patch, bandwidth_hz, count_in_memory
+from apertura.methods.autofocus.patches import Candidates, Patch, count_in_memory
 
 _APART_CELLS = 2.0  # of range, c/B of total path: patches nearer than that share noise
 _BLOCKS_PER_CORRELATION_TIME = 10  # at least
@@ -126,7 +126,7 @@ class _Pair:
         places = np.array([patch.place_m for patch in patches])
         path_m = profiles.aperture[middle].path(places).mean(axis=0)
         slope = profiles.aperture[middle].path_gradient(places.mean(axis=0))
-        cell_m = SPEED_OF_LIGHT_M_S / bandwidth_hz(profiles)
+        cell_m = SPEED_OF_LIGHT_M_S / profiles.bandwidth_hz
         return cls(record.pair, time_s, 2 * turned**2 * lasts, cached, path_m, cell_m, slope, profiles.wavenumber_rad_m)
 
     def fitted(self, method: str) -> _Fit:

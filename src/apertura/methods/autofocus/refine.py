@@ -31,7 +31,6 @@ from apertura.methods.autofocus.patches import (
     REFINED_LOOKS,
     Candidates,
     Patch,
-    bandwidth_hz,
     count_in_memory,
     patch_at,
 )
@@ -241,7 +240,7 @@ def _patch_of(problem: Problem, point: ReferencePoint, axes: Floats) -> Patch:
 
 def _cell_m(echo: PatchEcho) -> float:
     """Return the resolution c/2B, metres."""
-    return SPEED_OF_LIGHT_M_S / bandwidth_hz(echo.profiles) / 2
+    return SPEED_OF_LIGHT_M_S / echo.profiles.bandwidth_hz / 2
 
 
 def _apart(residuals: Floats) -> float:

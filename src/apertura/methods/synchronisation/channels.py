@@ -181,6 +181,11 @@ def measure_channel(name: str, blocks: Iterable[Samples], numerology: Numerology
     # ones √N are left, and three times as much is no chance.
     floor = 3 / (2 * np.sqrt(numerology.numbers.size)) if mirrored.mean() > 0.5 else 0.0
     power = max(power, 1e-30)
+    # Eq. 1a: bits that stay between bits that change; below the lowest that changes, samples are shifted up.
+    changing = ones & zeros
+    stuck = tuple(
+        bit for bit in range(changing.bit_length()) if changing & ((1 << bit) - 1) != 0 and not changing >> bit & 1
+    )
     return MeasuredChannel(
         name,
         float(np.sqrt(power / captures)),
@@ -188,10 +193,5 @@ def measure_channel(name: str, blocks: Iterable[Samples], numerology: Numerology
         2 * decibels(abs(square) / (2 * power)),
         2 * decibels(floor),
         integers,
-        tuple(bit for bit in range((ones & zeros).bit_length()) if _stuck(ones & zeros, bit)),
+        stuck,
     )
-
-
-def _stuck(changing: int, bit: int) -> bool:
-    """Return whether a bit stays between bits that change; below the lowest of these, samples are shifted up."""
-    return changing & ((1 << bit) - 1) != 0 and not changing >> bit & 1
