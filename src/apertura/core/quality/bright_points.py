@@ -87,10 +87,12 @@ class PointResponse:
             return np.zeros(len(others_m))
         lit, weight = weight > 0, weight[weight > 0, None] / weight.sum()
         flown = self.aperture[some][lit]
+        # δ_m, and the bound (1b), which needs no phases.
         farther_m = flown.path(others_m) - flown.path(place_m[None])
         range_part = self._of_range(farther_m)
         bound = (weight * np.abs(range_part)).sum(axis=0)
         turns = np.ptp(farther_m, axis=0) / self.wavelength_m
+        # (1a); where phase errors may smear the point, within some cells, (1b) counts.
         lobe = np.abs((weight * range_part * np.exp(2j * np.pi / self.wavelength_m * farther_m)).sum(axis=0))
         # where samples do not follow the phase the sum would fold: the envelope of a far sidelobe stands for it
         followed = turns < len(flown) / 4
@@ -317,6 +319,7 @@ def _cell_maxima(magnitude: NDArray[np.float32], window: Window, cell_px: int) -
     Pixels at the block's edges are compared with their neighbours inside it.
     """
     cell_px = min(cell_px, max(magnitude.shape))
+    # Largest of the 3 × 3 neighbours of every pixel, then the largest local maximum of each cell.
     highest = magnitude
     for axis in (0, 1):
         lines, about = np.swapaxes(highest, 0, axis), np.swapaxes(highest.copy(), 0, axis)
@@ -377,6 +380,7 @@ def common_shift(
     difference = b[None, :, :2] - a[:, None, :2]
     weight = np.minimum(a[:, None, 2] / a[:, 2].max(initial=1e-30), b[None, :, 2] / b[:, 2].max(initial=1e-30))
     weight = np.where(np.hypot(difference[..., 0], difference[..., 1]) <= reach, weight, 0.0)
+    # Every difference of two points is a candidate: the weight of the points that match under it, each of them once.
     best, votes = np.zeros(2), 0.0
     for i, j in zip(*np.nonzero(weight), strict=True):
         near = np.hypot(*np.moveaxis(difference - difference[i, j], -1, 0)) <= gate

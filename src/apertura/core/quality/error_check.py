@@ -76,6 +76,7 @@ def error_bound(
     (-60.0, True)
     """
     values = computed.astype(np.complex128)
+    # G of eq. 6a by weighted least squares over the draws; z_k, and Σ|G·I|² as `total`.
     weighed = (np.abs(values) ** 2 / density).sum()
     gain = complex((values.conj() * exact / density).sum() / weighed) if weighed else 0j
     difference = np.abs(gain * values - exact) ** 2
@@ -90,9 +91,9 @@ def error_bound(
     if not error or total <= largest:
         nothing = _db(0.0 if not error else np.inf)
         return ErrorBound(nothing, nothing)
-    spread = np.sqrt(errors.size) * float((errors - error / total * levels).std())
-    # the draws may have missed an error as large as the largest, and may have hit the brightest pixel by chance
-    above = (error + float(errors.max())) / (total - largest) * np.exp(_SIGMAS * spread / error)
+    deviation = np.sqrt(errors.size) * float((errors - error / total * levels).std())  # √K·s
+    # q at 95 %: the draws may have missed an error as large as the largest, and hit the brightest pixel by chance.
+    above = (error + float(errors.max())) / (total - largest) * np.exp(_SIGMAS * deviation / error)
     return ErrorBound(_db(above), _db(error / total))
 
 

@@ -123,6 +123,7 @@ def image_statistics(image: BlockRaster, windows: Iterable[tuple[slice, slice]])
             peak = float(power.flat[best])
             row, column = np.unravel_index(best, power.shape)
             place = (window[0].start + int(row), window[1].start + int(column))
+        # Sums Σp and Σp ln p of the entropy, and a histogram of power by 0.01 dB; pixels without power lie below it.
         present = power[power > 0]
         empty += int(np.isfinite(block).sum()) - present.size
         total += present.sum()
@@ -132,6 +133,7 @@ def image_statistics(image: BlockRaster, windows: Iterable[tuple[slice, slice]])
     if not peak:
         raise ValueError("no pixel of the image has power")
     median_bin = int(np.searchsorted(empty + np.cumsum(counts), (empty + counts.sum()) / 2))
+    # Median power over the peak; −Σ q ln q = ln Σp − Σp ln p/Σp with q = p/Σp.
     floor = _LOWEST_DB + median_bin / _BINS_PER_DB - 10 * np.log10(peak)
     return ImageStatistics(
         float(np.log(total) - weighted / total), min(0.0, round(float(floor), 2)), float(np.sqrt(peak)), *place

@@ -184,6 +184,7 @@ class PointPaths:
         Source: docs/theory/focus.md, eq. 2: the part that fits a shift over ground moves the point, the rest defocuses
         it.
         """
+        # Δx = G⁺e, r = e − GΔx and L of eq. 2.
         ground = self.gradient[:, :2]
         moved = np.linalg.pinv(ground) @ error_m
         rest = error_m - ground @ moved
@@ -205,6 +206,7 @@ class PointPaths:
         -----
         Source: docs/theory/focus.md, eq. 3.
         """
+        # C, and R = PCP with P = 1 − GG⁺.
         lag = np.abs(np.subtract.outer(self.time_s, self.time_s))
         covariance = np.zeros_like(lag)
         for std_m, correlation_s in parts:
@@ -214,6 +216,7 @@ class PointPaths:
         moved = ground @ (inverse @ covariance)  # of a projection onto two columns no square matrix is multiplied
         rest = covariance - moved - moved.T + (moved @ ground) @ inverse
         wavenumber = 2 * np.pi / self.wavelength_m
+        # q, the mean variance about the mean over the pulses; N = (tr R)²/tr R²; L of eq. 3.
         centred = rest - rest.mean(axis=0) - rest.mean(axis=1)[:, None] + rest.mean()
         power = float(np.trace(centred)) / len(rest)
         independent = float(np.trace(centred) ** 2 / max((centred**2).sum(), 1e-300))

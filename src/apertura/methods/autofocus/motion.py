@@ -107,6 +107,7 @@ def plausible_offsets(echo: Recorded, log: Logged, within_s: tuple[float, float]
     and how far the node went meanwhile, up to half a wavelength, beyond which pulses are uncorrelated. Where the
     node moves uniformly nothing is ruled out.
     """
+    # |H_p − H_{p−1}|/|H_p|, between pulses, and the node's speed on a grid of the log's times.
     change = np.linalg.norm(np.diff(echo.transfer, axis=0), axis=1) / np.linalg.norm(echo.transfer[1:], axis=1)
     middle_s, interval_s = (echo.time_s[1:] + echo.time_s[:-1]) / 2, np.diff(echo.time_s)
     step_s = max(float(np.median(interval_s)), (within_s[1] - within_s[0]) / 4096)
@@ -115,6 +116,7 @@ def plausible_offsets(echo: Recorded, log: Logged, within_s: tuple[float, float]
     offsets_s = np.arange(within_s[0], within_s[1] + step_s / 2, step_s)
     alike = np.full(len(offsets_s), -1.0)
     changed = np.log(np.maximum(change, 1e-12))
+    # Its correlation with min(4π·v(t + δ)·Δt/λ, 1) for each offset; −1 where too few pulses lie inside the log.
     for number, offset_s in enumerate(offsets_s):
         kept = log.inside(middle_s + offset_s)
         if kept.mean() < LEAST_COVERED:
@@ -126,6 +128,7 @@ def plausible_offsets(echo: Recorded, log: Logged, within_s: tuple[float, float]
     covered = np.array([log.inside(echo.time_s + offset_s).mean() >= LEAST_COVERED for offset_s in offsets_s])
     if not covered.any():
         raise ValueError("no offset puts half of the pulses inside the log")
+    # Offsets within three deviations, (1 − r²)/√n, of the best correlation r.
     best = float(alike.max())
     independent = max(4.0, len(change) * float(np.median(interval_s)) * 4)  # motion lasts a quarter of a second or more
     std = (1 - max(best, 0.0) ** 2) / np.sqrt(independent)

@@ -137,11 +137,13 @@ def phase_gradient(patches: Patches) -> Floats:
     cycles = np.abs(np.fft.fftfreq(2 * count, 1 / count))
     phase, window = np.zeros(count), float(count)
     for _ in range(_MOST_PASSES):
+        # Window about each line's point, 0.7 of the last and no narrower than the blurred point.
         spectrum = np.fft.fft(_lines(patches, phase), 2 * count, axis=1)
         least = _spread(spectrum, cycles)
         narrow = window <= least
         window = min(window, least) if narrow else max(window * _SHRINK, least)
         windowed = np.fft.ifft(np.where(cycles <= window / 2, spectrum, 0), axis=1)[:, :count]
+        # Eq. 32, summed over m, without mean and slope.
         steps = (windowed[:, 1:] * windowed[:, :-1].conj() / _amplitude_variance(windowed)).sum(axis=0)
         wrong = _level(np.append(0.0, np.cumsum(np.angle(steps))))
         phase = phase - wrong
@@ -205,6 +207,7 @@ def entropy(lines: NDArray[np.complex128], phase: Floats) -> tuple[float, Floats
     >>> round(slope, 6), round(float(entropy(lines, 0 * step)[1][3]), 6)
     (0.114494, 0.114494)
     """
+    # I_i and q of eq. 33, then H and ∂H/∂θ.
     turned = lines * np.exp(1j * phase)
     blocks = turned.shape[1]
     image = np.fft.fft(turned, 2 * blocks, axis=1, norm="ortho")
