@@ -209,9 +209,9 @@ def choose_fusion(
     ({'a-a': 0.0, 'a-b': 0.0}, {'a-b': 'it shares nothing with a-a that tells a phase'})
     """
     pairs = list(rank)
-    vague = {two: one for two, one in between.items() if one is not None}
-    told = {two: one for two, one in vague.items() if one.certain or one.shifted or one.incoherent}
-    best, rivals = _largest(pairs, rank, told, align=align)
+    compared = {two: one for two, one in between.items() if one is not None}
+    measured = {two: one for two, one in compared.items() if one.certain or one.shifted or one.incoherent}
+    best, rivals = _largest(pairs, rank, measured, align=align)
     reference = min(best.pairs, key=lambda pair: (*rank[pair], pairs.index(pair)))
     agreeing = tuple(pair for pair in pairs if pair in best.pairs)
     line = " and ".join(pair for pair in agreeing if pair != reference)
@@ -220,7 +220,7 @@ def choose_fusion(
     for pair in pairs:
         if pair == reference:
             continue
-        found = best.against(pair, told, reference)
+        found = best.against(pair, measured, reference)
         if pair in best.pairs and found is not None:
             removed = found.phase_rad if align else 0.0
             phases[pair] = removed
@@ -231,14 +231,15 @@ def choose_fusion(
         elif blind := [one for one in best.pairs if (one, pair) in hidden]:
             left_out[pair] = f"shows none of the bright points of {_named(blind)}"
         else:
-            phases[pair], guess = 0.0, best.against(pair, vague, reference)
+            phases[pair], guess = 0.0, best.against(pair, compared, reference)
             unmeasured[pair] = (
                 coarse or f"it shares nothing with {_named(agreeing)} that tells a phase"
                 if guess is None
                 else f"{_phase_line(guess, reference)} is not certain enough"
             )
             why[pair] = f"phase not measured: {unmeasured[pair]}"
-    ties = tuple(sorted(tuple(sorted(one.pairs, key=pairs.index)) for one in rivals if one.contradicts(best, told)))
+    opposite = [one.pairs for one in rivals if one.contradicts(best, measured)]
+    ties = tuple(sorted(tuple(sorted(some, key=pairs.index)) for some in opposite))
     ordered = {pair: phases[pair] for pair in pairs if pair in phases}
     return CoherentSum(reference, ordered, left_out, why, agreeing, apart, unmeasured, ties, best.misfit, best.freedom)
 
@@ -283,9 +284,9 @@ class _Set:
     freedom: int
 
     @classmethod
-    def of(cls, pairs: Sequence[str], told: Mapping[tuple[str, str], Agreement], *, align: bool) -> "_Set | None":
+    def of(cls, pairs: Sequence[str], measured: Mapping[tuple[str, str], Agreement], *, align: bool) -> "_Set | None":
         """Return the pairs as a set; None where they contradict each other, or are not all connected."""
-        edges = {two: one for two, one in told.items() if two[0] in pairs and two[1] in pairs}
+        edges = {two: one for two, one in measured.items() if two[0] in pairs and two[1] in pairs}
         if any(one.shifted or one.incoherent for one in edges.values()):
             return None
         start = _along(pairs, edges)
@@ -303,35 +304,35 @@ class _Set:
         )
         return found if align or within else None
 
-    def against(self, pair: str, told: Mapping[tuple[str, str], Agreement], reference: str) -> Agreement | None:
+    def against(self, pair: str, measured: Mapping[tuple[str, str], Agreement], reference: str) -> Agreement | None:
         """Return how a pair lies against the set's reference, by all that was measured between it and the set.
 
         Phase and place are weighted means over the members; None where it was measured against none.
         """
         if pair in self.states and pair != reference:
-            direct = agreement_between(told, reference, pair)
+            direct = agreement_between(measured, reference, pair)
             turned = self.states[pair] - self.states[reference]
-            known = direct or next(one for two, one in told.items() if pair in two and {*two} <= self.pairs)
+            known = direct or next(one for two, one in measured.items() if pair in two and {*two} <= self.pairs)
             return replace(known, phase_rad=_wrapped(float(turned[0])))
-        seen = [
+        of_members = [
             (one, self.states[member] - self.states[reference])
             for member in self.pairs
-            if member != pair and (one := agreement_between(told, member, pair)) is not None
+            if member != pair and (one := agreement_between(measured, member, pair)) is not None
         ]
-        if not seen:
+        if not of_members:
             return None
-        phases = np.array([one.phase_rad + state[0] for one, state in seen])
-        weights = np.array([1 / one.phase_std_rad**2 for one, _ in seen])
+        phases = np.array([one.phase_rad + state[0] for one, state in of_members])
+        weights = np.array([1 / one.phase_std_rad**2 for one, _ in of_members])
         phase = float(np.angle((weights * np.exp(1j * phases)).sum()))
         # Members see the outlier's own noise alike: their mean is taken for no more certain than the best of them.
-        elsewhere = sum(one.shifted for one, _ in seen) > len(seen) / 2
-        nearest = min((one for one, _ in seen if one.shifted == elsewhere), key=lambda one: one.phase_std_rad)
+        elsewhere = sum(one.shifted for one, _ in of_members) > len(of_members) / 2
+        nearest = min((one for one, _ in of_members if one.shifted == elsewhere), key=lambda one: one.phase_std_rad)
         return replace(nearest, phase_rad=phase)
 
-    def contradicts(self, other: "_Set", told: Mapping[tuple[str, str], Agreement]) -> bool:
+    def contradicts(self, other: "_Set", measured: Mapping[tuple[str, str], Agreement]) -> bool:
         """Return whether something was measured between pairs that only one of two sets holds."""
         return any(
-            agreement_between(told, one, two) is not None
+            agreement_between(measured, one, two) is not None
             for one in self.pairs - other.pairs
             for two in other.pairs - self.pairs
         )
@@ -340,25 +341,27 @@ class _Set:
 def _largest(
     pairs: Sequence[str],
     rank: Mapping[str, tuple[float, ...]],
-    told: Mapping[tuple[str, str], Agreement],
+    measured: Mapping[tuple[str, str], Agreement],
     *,
     align: bool,
 ) -> tuple[_Set, list[_Set]]:
     """Return the largest set that agrees, the best focused of several, and the others as large."""
     if len(pairs) > MOST_SETS_OF:
-        pairs = _without_the_worst(pairs, told, align=align)
+        pairs = _without_the_worst(pairs, measured, align=align)
     for size in range(len(pairs), 0, -1):
-        found = [one for some in combinations(pairs, size) if (one := _Set.of(some, told, align=align)) is not None]
+        found = [one for some in combinations(pairs, size) if (one := _Set.of(some, measured, align=align)) is not None]
         if found:
             found.sort(key=lambda one: np.sum([rank[pair] for pair in one.pairs], axis=0).tolist())
             return found[0], found[1:]
     raise ValueError("no pair: there is nothing to add")
 
 
-def _without_the_worst(pairs: Sequence[str], told: Mapping[tuple[str, str], Agreement], *, align: bool) -> list[str]:
+def _without_the_worst(
+    pairs: Sequence[str], measured: Mapping[tuple[str, str], Agreement], *, align: bool
+) -> list[str]:
     """Return `MOST_SETS_OF` pairs: those dropped agree with the fewest others, two by two."""
     agreeing = {
-        pair: sum(_Set.of(two, told, align=align) is not None for two in combinations(pairs, 2) if pair in two)
+        pair: sum(_Set.of(two, measured, align=align) is not None for two in combinations(pairs, 2) if pair in two)
         for pair in pairs
     }
     kept = sorted(pairs, key=lambda pair: -agreeing[pair])[:MOST_SETS_OF]

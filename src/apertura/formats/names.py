@@ -114,15 +114,15 @@ PHASE_HISTORIES: Mapping[str, HistoryFormat] = {
 
 
 def recording_files(folder: Path, node: str) -> tuple[Path, ...]:
-    """Return the files of a node's recording in the format that is begun in a folder, else in the first known one.
+    """Return the files of a node's recording in the format of which a folder holds a file, else in the first known one.
 
     Raises
     ------
     CampaignError
         If metadata that name files cannot be read.
     """
-    begun = (row for row in RECORDERS if any((folder / f"{node}{suffix}").is_file() for suffix in row))
-    row = next(begun, next(iter(RECORDERS)))
+    present = (row for row in RECORDERS if any((folder / f"{node}{suffix}").is_file() for suffix in row))
+    row = next(present, next(iter(RECORDERS)))
     if row in FINDERS:
         found: tuple[Path, ...] = pkgutil.resolve_name(FINDERS[row])(folder, node)
         return found

@@ -160,8 +160,8 @@ def _write_samples(
         blocks = continuous_blocks(
             recording.channels, time_s, adc, generator, framing=framing, first_frame=flight.first_frame
         )
-        begun = np.array([recording_start_s(recording.channels["radar"]) + draw.tag_error_s[0]])
-        captures: list[tuple[int, np.datetime64, int | None]] = [(0, _to_us(_utc(flight, begun))[0], None)]
+        start_s = np.array([recording_start_s(recording.channels["radar"]) + draw.tag_error_s[0]])
+        captures: list[tuple[int, np.datetime64, int | None]] = [(0, _to_us(_utc(flight, start_s))[0], None)]
     else:
         kept = np.flatnonzero(draw.kept)
         tags = _utc(flight, time_s + draw.start_s + draw.tag_error_s)

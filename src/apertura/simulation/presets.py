@@ -297,8 +297,8 @@ def flight(*, pulses: int = 300_000) -> CampaignSpecification:
 
 
 PRESETS: dict[str, Callable[..., CampaignSpecification]] = {
-    made.__name__.replace("_", "-"): made
-    for made in (demo, first_flight, paper, swarm, continuous, flight, paper_lab, paper_static, paper_uav)
+    preset.__name__.replace("_", "-"): preset
+    for preset in (demo, first_flight, paper, swarm, continuous, flight, paper_lab, paper_static, paper_uav)
 }
 
 

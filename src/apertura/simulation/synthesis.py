@@ -127,9 +127,10 @@ def _capture(channel: Channel, pulse: int, count: int) -> Complex:
     capture = np.zeros(count, np.complex128)
     edges = np.unique(np.clip(np.concatenate([first, end]), 0, count))
     for start, stop in pairwise(edges):
-        begun, over = np.searchsorted(first, start, "right"), np.searchsorted(end, start, "right")
-        if begun > over:
-            present = spectra[:, groups[begun]] - spectra[:, groups[over]]
+        # Paths that have arrived less those that have ended, both in the order of their delays.
+        arrived, ended = np.searchsorted(first, start, "right"), np.searchsorted(end, start, "right")
+        if arrived > ended:
+            present = spectra[:, groups[arrived]] - spectra[:, groups[ended]]
             capture[start:stop] = _stretch(channel, pulse, present, start, stop, count)
     return capture
 

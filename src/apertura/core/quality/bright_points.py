@@ -85,8 +85,8 @@ class PointResponse:
         weight = np.ones(len(self.aperture[some])) if self.weigh is None else self.weigh(some, place_m[None])[:, 0]
         if not weight.any():
             return np.zeros(len(others_m))
-        lit, weight = weight > 0, weight[weight > 0, None] / weight.sum()
-        flown = self.aperture[some][lit]
+        illuminates, weight = weight > 0, weight[weight > 0, None] / weight.sum()
+        flown = self.aperture[some][illuminates]
         # δ_m, and the bound (1b), which needs no phases.
         farther_m = flown.path(others_m) - flown.path(place_m[None])
         range_part = self._of_range(farther_m)

@@ -303,11 +303,12 @@ def antenna_line(paths: PointPaths, phase_rad: NDArray[np.float64], weight: NDAr
     -----
     Source: docs/theory/focus.md, eq. 4c.
     """
-    seen = weight >= LEAST_FIELD * weight.max()
-    if weight.max() <= 0 or seen.sum() < _FEWEST_PULSES:
+    illuminating = weight >= LEAST_FIELD * weight.max()
+    if weight.max() <= 0 or illuminating.sum() < _FEWEST_PULSES:
         return BudgetLine("antenna", None, NO_EFFECT, "a pattern that sees the middle of the scene")
-    part = replace(paths, aperture=paths.aperture[np.flatnonzero(seen)], time_s=paths.time_s[seen])
-    phase, mean = phase_rad[seen], float(phase_rad[seen].mean())  # a constant turns the point and moves it nowhere
+    part = replace(paths, aperture=paths.aperture[np.flatnonzero(illuminating)], time_s=paths.time_s[illuminating])
+    # A constant phase turns the point and moves it nowhere.
+    phase, mean = phase_rad[illuminating], float(phase_rad[illuminating].mean())
     effect = replace(part.of_offset(paths.wavelength_m / (2 * np.pi) * (mean - phase)), phase_rad=abs(mean))
     turn = float(np.ptp(phase))
     return BudgetLine("antenna", f"weighed by the beams stated, whose phase turns by {turn:.2g} rad over them", effect)

@@ -235,13 +235,13 @@ class Certificate:
         again, provided the failing tiles are redone last.
         """
         squared, there = np.abs(values_at(image, self.pixels) - self.exact) ** 2, np.abs(self.exact) ** 2
-        asked = 10 ** (accuracy_db / 10)
+        tolerated = 10 ** (accuracy_db / 10)
         empty, worse = [], []
         for window in self.windows:
             inside = _inside(self.pixels, window)
             if not inside.any():
                 empty.append(window)
-            elif not squared[inside].mean() <= asked * max(power, float(there[inside].mean())):
+            elif not squared[inside].mean() <= tolerated * max(power, float(there[inside].mean())):
                 worse.append(window)
         return (empty if worse else []), worse
 

@@ -256,13 +256,13 @@ def _steps(run: CrateRun) -> Iterator[dict[str, Any]]:
 
 def _jobs(run: CrateRun) -> Iterator[dict[str, Any]]:
     """Yield every action, and the parameters that actions share."""
-    made = [_id(file) for job in run.jobs for file in job.files if file.name.endswith(".manifest.json")]
+    manifests = [_id(file) for job in run.jobs for file in job.files if file.name.endswith(".manifest.json")]
     all_of_it = {
         "name": f"apertura run on {run.campaign}",
         "description": "Every rule of the workflow, from recordings to what describes the images.",
         "instrument": {"@id": WORKFLOW},
         "object": _refs(input_id(one.name) for one in run.inputs),
-        "result": _refs(made),
+        "result": _refs(manifests),
         "environment": {"@id": _LOCK},
         "actionStatus": _COMPLETED,
     }

@@ -165,19 +165,19 @@ def cut_line(places: Ring) -> list[Ring]:
 
     Examples
     --------
-    >>> [part.tolist() for part in cut_line(np.array([[179.0, 10.0, 5.0], [-178.0, 13.0, 8.0]]))]
+    >>> [line.tolist() for line in cut_line(np.array([[179.0, 10.0, 5.0], [-178.0, 13.0, 8.0]]))]
     [[[179.0, 10.0, 5.0], [180.0, 11.0, 6.0]], [[-180.0, 11.0, 6.0], [-178.0, 13.0, 8.0]]]
     """
-    parts, begun = [], places[:1]
+    parts, line = [], places[:1]
     for before, after in pairwise(places):
         if abs(after[0] - before[0]) > _HALF_DEG:
             side = np.copysign(_HALF_DEG, before[0])
-            further = after + [2 * side, 0.0, 0.0]
-            crossing = before + (side - before[0]) / (further[0] - before[0]) * (further - before)
-            parts.append(np.concatenate([begun, [crossing]]))
-            begun = np.array([crossing - [2 * side, 0.0, 0.0]])
-        begun = np.concatenate([begun, [after]])
-    return [*parts, begun]
+            unwrapped = after + [2 * side, 0.0, 0.0]
+            crossing = before + (side - before[0]) / (unwrapped[0] - before[0]) * (unwrapped - before)
+            parts.append(np.concatenate([line, [crossing]]))
+            line = np.array([crossing - [2 * side, 0.0, 0.0]])
+        line = np.concatenate([line, [after]])
+    return [*parts, line]
 
 
 def _feature(geometry: Mapping[str, Any] | None, properties: Mapping[str, Any]) -> dict[str, Any]:

@@ -316,10 +316,10 @@ def _layout(pulses: NDArray[Any]) -> dict[str, Any]:
 
 def _dwell(collection: CphdCollection) -> dict[str, Any]:
     """Return centre and length of the exposure of the scene: all pulses illuminate all places."""
-    seen = collection.exposed_s
+    exposed_s = collection.exposed_s
     return {
         "NumCODTimes": 1,
-        "CODTime": [{"Identifier": _CHANNEL, "CODTimePoly": np.array([[(seen[0] + seen[-1]) / 2]])}],
+        "CODTime": [{"Identifier": _CHANNEL, "CODTimePoly": np.array([[(exposed_s[0] + exposed_s[-1]) / 2]])}],
         "NumDwellTimes": 1,
-        "DwellTime": [{"Identifier": _CHANNEL, "DwellTimePoly": np.array([[seen[-1] - seen[0]]])}],
+        "DwellTime": [{"Identifier": _CHANNEL, "DwellTimePoly": np.array([[exposed_s[-1] - exposed_s[0]]])}],
     }

@@ -139,8 +139,8 @@ def write_pos(path: Path, log: RefinedLog, *, outcome: str, version: str) -> Non
     version
         Of apertura.
     """
-    held = int((~log.refined).sum())
-    beyond = f"; {held} of {len(log.refined)} epochs lie beyond the pulses, where the nearest correction is held"
+    unrefined = int((~log.refined).sum())
+    beyond = f"; {unrefined} of {len(log.refined)} epochs lie beyond the pulses, where the nearest correction is held"
     remarks = [
         outcome,
         f"the logged point of {log.node}, no antenna{beyond if log.refined.any() else ''}",

@@ -223,14 +223,14 @@ def _check_frequencies(
 def _flags(fields: dict[str, NDArray[Any]], delay_s: NDArray[np.float64], normal: NDArray[np.bool_]) -> dict[str, str]:
     """Return a flag where a file's times contradict its positions: the one redundancy that it has."""
     known = sum(np.nan_to_num(fields[name]) for name in ("TDTropoSRP", "TDIonoSRP") if name in fields)
-    apart = np.abs(fields["RcvTime"] - fields["TxTime"] - delay_s - known)[normal]
-    worst, number = int(apart.argmax()), np.flatnonzero(normal)
-    if apart[worst] <= _ATMOSPHERE_S:
+    error_s = np.abs(fields["RcvTime"] - fields["TxTime"] - delay_s - known)[normal]
+    worst, number = int(error_s.argmax()), np.flatnonzero(normal)
+    if error_s[worst] <= _ATMOSPHERE_S:
         return {}
     return {
-        "reference_point": f"RcvTime - TxTime of pulse {number[worst]} is {apart[worst]:.3g} s from the "
-        f"delay of its reference point, {apart[worst] * SPEED_OF_LIGHT_M_S:.3g} m of path "
-        f"({int((apart > _ATMOSPHERE_S).sum())} of {len(apart)} pulses)"
+        "reference_point": f"RcvTime - TxTime of pulse {number[worst]} is {error_s[worst]:.3g} s from the "
+        f"delay of its reference point, {error_s[worst] * SPEED_OF_LIGHT_M_S:.3g} m of path "
+        f"({int((error_s > _ATMOSPHERE_S).sum())} of {len(error_s)} pulses)"
     }
 
 

@@ -111,8 +111,9 @@ def _scans(path: Path) -> tuple[NDArray[np.void], NDArray[np.float64], int]:
     numbers = np.unique(messages["id"].astype(np.int64) << 32 | messages["time_ms"])
     _check(whole[:, 0], path)
     samples = whole["scan"].reshape(len(whole), -1)[:, :total].astype(np.float64)
-    begun = cut and messages["index"][-1] == count - 1  # else the message cut off is of a scan that is counted already
-    return whole[:, 0], samples, len(numbers) - len(whole) + int(begun)
+    # A message cut off begins another scan only behind a whole one; else its scan is counted already.
+    begins_scan = cut and messages["index"][-1] == count - 1
+    return whole[:, 0], samples, len(numbers) - len(whole) + int(begins_scan)
 
 
 def _messages(content: bytes) -> tuple[NDArray[np.void], bool]:

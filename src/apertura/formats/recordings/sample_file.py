@@ -381,10 +381,10 @@ class SampleFile:
             yield first * self.sample_bytes, (last - first) * self.sample_bytes
             return
         inner = starts[np.searchsorted(starts, first, "right") : np.searchsorted(starts, last)].tolist()
-        for begun, ended in zip([first, *inner], [*inner, last], strict=True):
-            segment = int(np.searchsorted(starts, begun, "right")) - 1
+        for start, stop in zip([first, *inner], [*inner, last], strict=True):
+            segment = int(np.searchsorted(starts, start, "right")) - 1
             before = int(skipped[segment]) if segment >= 0 else 0
-            yield begun * self.sample_bytes + before, (ended - begun) * self.sample_bytes
+            yield start * self.sample_bytes + before, (stop - start) * self.sample_bytes
 
     def _no_number(self, why: str, spans: Spans, index: int) -> CampaignError:
         sample = index

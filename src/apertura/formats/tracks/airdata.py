@@ -175,8 +175,8 @@ def _utc(clock_s: NDArray[np.float64], second: NDArray[np.datetime64], unit: str
         raise ValueError("no epochs")
     zero = second[0]
     second_s = seconds_since(second, zero)
-    apart = np.abs(np.diff(second_s) - np.diff(clock_s)) > _APART * unit_s
-    part = np.concatenate([[0], np.cumsum(apart)])
+    breaks = np.abs(np.diff(second_s) - np.diff(clock_s)) > _APART * unit_s
+    part = np.concatenate([[0], np.cumsum(breaks)])
     offset, resolved, misfit = np.zeros(len(second_s)), np.zeros(len(second_s), bool), 0.0
     for number in range(part[-1] + 1):
         rows = part == number

@@ -145,9 +145,9 @@ def _numbers(
         except ValueError as error:
             raise _error(f"line {line}: {error}", path) from error
     values = np.array(rows).reshape(-1, len(columns))
-    wild = np.flatnonzero(~(np.abs(values[:, 0]) < 1e6))
-    if wild.size:
-        raise _error(f"a time of {values[wild[0], 0]:g} s", path)
+    beyond = np.flatnonzero(~(np.abs(values[:, 0]) < 1e6))
+    if beyond.size:
+        raise _error(f"a time of {values[beyond[0], 0]:g} s", path)
     return values[:, 0], values[:, 1:]
 
 

@@ -221,9 +221,9 @@ def _product(tile: SpeckleTile, first: Contribution, second: Contribution) -> "c
         some = slice(begin, begin + _BLOCKS)
         # O of eq. 21, (1 − |cycles apart|)₊, then O ∘ BᴴB' over the blocks that share any.
         shared = np.maximum(1 - np.abs(along[some] - across[some] @ cycles[1].T), 0).astype(np.float32)
-        seen = np.flatnonzero(shared.any(axis=0))
-        if seen.size:
-            near = slice(int(seen[0]), int(seen[-1]) + 1)
+        sharing = np.flatnonzero(shared.any(axis=0))
+        if sharing.size:
+            near = slice(int(sharing[0]), int(sharing[-1]) + 1)
             row, column = np.nonzero(shared[:, near])
             product = first.values[:, some].conj().T @ second.values[:, near] * shared[:, near]
             values.append(product[row, column])

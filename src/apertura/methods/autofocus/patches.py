@@ -234,15 +234,15 @@ class Candidates:
         correlation_s = min(one.correlation_s for one in errors.values())
         if looks:
             looks = max(looks, sampled_looks(records, grid, terrain))
-        seen = [
+        by_looks = [
             (
                 *bright_places(records, grid, terrain, looks=some),
                 least_ratio(some * len(records), grid.shape[0] * grid.shape[1]),
             )
             for some in ([looks] if looks else looks_of(records, errors, _middle(grid, terrain)))
         ]
-        clear = [float(np.minimum(ratio[ratio > least], CLEAR).sum()) for _, ratio, least in seen]
-        places_m, ratio, least = next(one for one, sum_ in zip(seen, clear, strict=True) if 2 * sum_ >= max(clear))
+        clear = [float(np.minimum(ratio[ratio > least], CLEAR).sum()) for _, ratio, least in by_looks]
+        places_m, ratio, least = next(one for one, sum_ in zip(by_looks, clear, strict=True) if 2 * sum_ >= max(clear))
         axes = east_north_up(grid, places_m)
         points = int((ratio > least).sum())
         if not points:

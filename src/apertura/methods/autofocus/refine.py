@@ -315,7 +315,7 @@ def refine(
     """
     plain = _Model.of(records, grid, terrain, errors)
     found = plain.refinement(errors, reference_points)
-    cause = plain.begun.cause(grid, terrain, errors, causes)
+    cause = plain.search.cause(grid, terrain, errors, causes)
     if cause is None:
         return found
     other = _Model.of([one.corrected(cause.correction) for one in records], grid, terrain, errors)
@@ -328,7 +328,7 @@ def refine(
 class _Model:
     """Errors of the logs as the only ones, or beside a cause: the search, and where it ended."""
 
-    begun: "TrackSearch"
+    search: "TrackSearch"
     best: "Round | None"
     by_speckle: Refinement | None
 
@@ -336,17 +336,19 @@ class _Model:
     def of(
         cls, records: Sequence[PairRecord], grid: SceneGrid, terrain: Terrain, errors: Mapping[str, TrackErrors]
     ) -> "_Model":
-        begun = TrackSearch.begin(records, grid, terrain, errors)
-        best = begun.rounds(grid, terrain, errors) if begun.problem.patches else None
-        ask = best is None or not (best.evidence.accepted or len(best.search.problem.patches) >= _FEW)
-        return cls(begun, best, begun.by_speckle(grid, terrain, errors) if ask else None)
+        search = TrackSearch.begin(records, grid, terrain, errors)
+        best = search.rounds(grid, terrain, errors) if search.problem.patches else None
+        # Speckle is tried where few bright places give no accepted tracks.
+        if best is not None and (best.evidence.accepted or len(best.search.problem.patches) >= _FEW):
+            return cls(search, best, None)
+        return cls(search, best, search.by_speckle(grid, terrain, errors))
 
     def refinement(self, errors: Mapping[str, TrackErrors], points: Sequence[ReferencePoint]) -> Refinement:
         """Return what becomes of the tracks."""
         if self.by_speckle is not None and self.by_speckle.accepted:
             return self.by_speckle
         if self.best is None:
-            return self.begun.candidates.rejected(errors, self.by_speckle)
+            return self.search.candidates.rejected(errors, self.by_speckle)
         search, state, evidence = self.best.search, self.best.state, self.best.evidence
         left = remaining(search.problem, state)
         unknowns, ties = search.fix_gauge(state, points, apart_sigma=evidence.apart_sigma)
@@ -357,9 +359,9 @@ class _Model:
         correction = search.problem.correction(unknowns)
         flags = dict(evidence.flags)
         longer = ties.get("paths_longer_m", {}) if evidence.accepted else {}
-        apart = [one for one, (longer_m, std_m) in longer.items() if abs(longer_m) > PATH_SIGMAS * std_m]
-        if apart:
-            lines = (f"{one} by {100 * longer[one][0]:+.1f} ± {100 * longer[one][1]:.1f} cm" for one in apart)
+        differing = [one for one, (longer_m, std_m) in longer.items() if abs(longer_m) > PATH_SIGMAS * std_m]
+        if differing:
+            lines = (f"{one} by {100 * longer[one][0]:+.1f} ± {100 * longer[one][1]:.1f} cm" for one in differing)
             flags["paths_differ"] = f"against {search.problem.pairs[0].record.pair}: {', '.join(lines)}"
         return Refinement(correction, left.std_m, evidence.accepted, evidence.why, report, flags)
 
@@ -373,12 +375,13 @@ class _Model:
         """
         if self.best is None or plain.best is None:
             return -np.inf
+        # Tracks of both models over the places of either search: with the cause, and without.
         moved = cause.correction.moved_m
         rest, alone = self.best.state.tracks, plain.best.state.tracks
         both = {node: moved[node] + track for node, track in rest.items()}
         less = {node: track - moved[node] for node, track in alone.items()}
         still = {node: np.zeros_like(track) for node, track in alone.items()}
-        if plain.begun.blur(both) > plain.begun.blur(still):
+        if plain.search.blur(both) > plain.search.blur(still):
             return -np.inf
         searches = ((plain.best.search, alone, both), (self.best.search, less, rest))
         sharper = sum(search.blur(one) - search.blur(other) for search, one, other in searches)
@@ -608,10 +611,10 @@ class TrackSearch:
         for _ in range(MOST_ROUNDS - 1):
             moved = [blocks.record.corrected(found.correction) for blocks in self.problem.pairs]
             again = TrackSearch.begin(moved, grid, terrain, errors)
-            further = more_of(again.problem, found, again.axes) if again.problem.patches else found
-            if further.gain_db - found.gain_db < LEAST_FURTHER_DB:
+            improved = more_of(again.problem, found, again.axes) if again.problem.patches else found
+            if improved.gain_db - found.gain_db < LEAST_FURTHER_DB:
                 break
-            found = further
+            found = improved
         return found
 
     def blur(self, tracks: Tracks) -> float:

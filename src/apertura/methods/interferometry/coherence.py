@@ -41,9 +41,9 @@ def common_band(
     >>> [round(common_band((np.zeros(2), np.array([apart, 0.0])), (flat, flat)), 2) for apart in (0, 0.2, 0.5, 1)]
     [1.0, 0.89, 0.47, 0.05]
     """
-    apart, both = carriers[1] - carriers[0], (spectra[0] + spectra[1]) / 2
+    difference, both = carriers[1] - carriers[0], (spectra[0] + spectra[1]) / 2
     shape = np.linalg.det(spectra[0]) * np.linalg.det(spectra[1]) / np.linalg.det(both) ** 2
-    return float(shape**0.25 * np.exp(-apart @ np.linalg.solve(both, apart) / 4))
+    return float(shape**0.25 * np.exp(-difference @ np.linalg.solve(both, difference) / 4))
 
 
 def window_px(spectrum: NDArray[np.float64], spacing_m: float, *, looks: float = 16, most: int = 65) -> int:

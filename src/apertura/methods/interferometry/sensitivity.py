@@ -157,8 +157,8 @@ def _gradient(places_m: Floats, legs: Legs) -> Floats:
     """Return the gradients of the total paths, (place, pulse, 3)."""
     total = np.zeros_like(legs[0])
     for leg in legs:
-        apart = places_m[:, None] - leg
-        total += apart / np.linalg.norm(apart, axis=-1, keepdims=True)
+        offset_m = places_m[:, None] - leg
+        total += offset_m / np.linalg.norm(offset_m, axis=-1, keepdims=True)
     return total
 
 
@@ -190,8 +190,8 @@ def _correlated(one: Floats, other: Floats, window: Floats) -> Floats:
     count = len(window)
     correlation = np.correlate(window, window, mode="full")[count - 1 :] / (window**2).sum()
     width = np.sqrt((one[:, 1] - one[:, 0]) * (other[:, 1] - other[:, 0]))
-    apart = np.abs(one.mean(axis=1) - other.mean(axis=1)) / np.maximum(width, 1e-12)
-    return np.asarray(np.interp(apart * (count - 1), np.arange(count), correlation, right=0.0))
+    separation = np.abs(one.mean(axis=1) - other.mean(axis=1)) / np.maximum(width, 1e-12)
+    return np.asarray(np.interp(separation * (count - 1), np.arange(count), correlation, right=0.0))
 
 
 # ---- Errors of the tracks -------------------------------------------------------------------------------------------
@@ -287,8 +287,8 @@ class TrackPhase:
             mean = self._per_error(some, chosen, first, width_s).mean(axis=0)
             for start in range(0, count, _NODES):
                 part = np.arange(start, min(start + _NODES, count))
-                apart = self._per_error(some, part, first, width_s) - mean
-                variance[part] += np.einsum("pab,pab->p", apart @ between, apart)
+                difference = self._per_error(some, part, first, width_s) - mean
+                variance[part] += np.einsum("pab,pab->p", difference @ between, difference)
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
     def _per_error(

@@ -405,9 +405,9 @@ def measure_link(
     most = int(in_cell.argmax())
     middle = float(np.median(ordered[most : most + in_cell[most]]))
     delay = first + middle
-    apart = locked & (np.abs(off - middle) > 1.0)
-    jump_m = float(np.median(off[apart] - middle)) * cell_m if apart.any() else 0.0
-    locked = locked & ~apart
+    elsewhere = locked & (np.abs(off - middle) > 1.0)
+    jump_m = float(np.median(off[elsewhere] - middle)) * cell_m if elsewhere.any() else 0.0
+    locked = locked & ~elsewhere
     if locked.sum() < 2:
         return None
     if prefix_cells is not None:
@@ -450,7 +450,7 @@ def measure_link(
         _arrivals(mean, noise / used, cell_m),
         direct,
         fft.fft(mean) * np.conj(align[0]),
-        int(apart.sum()),
+        int(elsewhere.sum()),
         jump_m,
         float(numerology.frequency_hz[tone]),
         decibels(changing[tone] / float(np.median(changing))),
