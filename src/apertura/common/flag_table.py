@@ -188,7 +188,7 @@ _OF_RECORDINGS = {
         "dB and path offset of the second reflector", "a second reflector is nearly as strong", "calibration.search_m",
         "core/echo/calibration.py"),
 }  # fmt: skip
-"""Name → what it says; see `apertura.common.flags.FLAGS`."""
+"""Name → what it says; part of `FLAGS`."""
 
 
 # ---- Flags of scenes, plans, refined tracks, images and sums -------------------------------------------------------
@@ -353,7 +353,7 @@ _OF_IMAGES = {
         "heights count from the terrain; the error of that varies over the scene", "scene.reference_points",
         "methods/interferometry/comparison.py"),
 }  # fmt: skip
-"""Name → what it says; see `apertura.common.flags.FLAGS`."""
+"""Name → what it says; part of `FLAGS`."""
 
 # ---- Flags of a radar that stands still ----------------------------------------------------------------------------
 
@@ -421,7 +421,7 @@ _OF_BENCHES = {
         "gain and phase over the band", "two channels fed by one signal differ",
         "splitter and cables; filters of both channels; path offsets", "methods/synchronisation/links.py"),
 }  # fmt: skip
-"""Name → what it says; see `apertura.common.flags.FLAGS`."""
+"""Name → what it says; part of `FLAGS`."""
 
 FLAGS = _OF_BENCHES | _OF_RECORDINGS | _OF_IMAGES
 """Name → what it says, in the order in which a recording becomes an image; those of a bench first."""

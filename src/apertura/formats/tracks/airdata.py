@@ -3,7 +3,6 @@
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -45,16 +44,6 @@ _SETTING = "Set the date format of the AirData account to YYYY-MM-DD and 24 hour
 _EXPECTED = f"AirData's CSV: {_CLOCK}, {_UTC}, {', '.join(_PLACE)}, altitude_above_seaLevel, {', '.join(_ATTITUDE)}"
 
 
-class _Clock(NamedTuple):
-    """UTC of epochs, and what is known of it."""
-
-    time: NDArray[np.datetime64]
-    resolved: NDArray[np.bool_]
-    misfit_s: float
-    parts: int
-    unit: str
-
-
 def read_airdata(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -> xr.Dataset:
     """Return the `track` stage of a DJI flight as AirData exports it, at 10 Hz.
 
@@ -86,27 +75,25 @@ def read_airdata(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -> 
         cut = cut_off(path)
         table, dropped = _measured(table.iloc[: len(table) - cut])
         time, unit = _dates(table[_UTC].fillna("").str.strip().tolist())
-        clock = _utc(numbers(table[[_CLOCK]])[:, 0] / 1000, time, unit)
+        utc, resolved, misfit_s, parts = _utc(numbers(table[[_CLOCK]])[:, 0] / 1000, time, unit)
         logged = numbers(table[[*_PLACE, height]])
-        attitude = numbers(table[_ATTITUDE])[clock.resolved] if set(_ATTITUDE) <= set(table) else None
+        attitude = numbers(table[_ATTITUDE])[resolved] if set(_ATTITUDE) <= set(table) else None
     except _DateError as error:
         raise CampaignError(f"column {_UTC}: {error}", path, "dates such as 2025-05-14 09:29:58", _SETTING) from error
     except (ValueError, ArithmeticError) as error:
         found = str(error).partition("\n")[0]
         raise CampaignError(found, path, _EXPECTED, "Export the flight from AirData again.") from error
     position = logged * [1.0, 1.0, _HEIGHTS[height]] + [0.0, 0.0, options.height_offset_m]
-    dropped |= {"line cut off": int(cut), "in a part too short to tell its time": int((~clock.resolved).sum())}
+    dropped |= {"line cut off": int(cut), "in a part too short to tell its time": int((~resolved).sum())}
     track = make_track(
-        clock.time[clock.resolved],
-        position[clock.resolved],
+        utc[resolved],
+        position[resolved],
         attitude_deg=attitude,
         dropped={why: count for why, count in dropped.items() if count},
         node=node,
         where=path,
     )
-    remark = (
-        f"{_UTC} holds whole {clock.unit}s, {clock.misfit_s:.2f} s off the clock of milliseconds in {clock.parts} parts"
-    )
+    remark = f"{_UTC} holds whole {unit}s, {misfit_s:.2f} s off the clock of milliseconds in {parts} parts"
     return remarked(track, remark, path)
 
 
@@ -166,8 +153,14 @@ def _order(dates: Sequence[tuple[str, ...]], texts: Sequence[str]) -> tuple[str,
     raise _DateError(f"{quoted(texts[0], 40)} may be month/day or day/month")
 
 
-def _utc(clock_s: NDArray[np.float64], second: NDArray[np.datetime64], unit: str) -> _Clock:
-    """Return UTC of epochs from a clock and from UTC that is cut off; ValueError if they do not agree."""
+def _utc(
+    clock_s: NDArray[np.float64], second: NDArray[np.datetime64], unit: str
+) -> tuple[NDArray[np.datetime64], NDArray[np.bool_], float, int]:
+    """Return UTC of epochs from a clock and from UTC that is cut off; ValueError if they do not agree.
+
+    Beside it, which epochs lie in a part long enough to determine it, the largest misfit in seconds, and the number of
+    parts.
+    """
     unit_s = {"second": 1.0, "minute": 60.0}[unit]
     if not np.isfinite(clock_s).all() or not (np.diff(clock_s) > 0).all():
         raise ValueError(f"column {_CLOCK} does not increase")
@@ -190,4 +183,4 @@ def _utc(clock_s: NDArray[np.float64], second: NDArray[np.datetime64], unit: str
         )
         raise ValueError(f"columns {_CLOCK} and {_UTC}: {found}")
     elapsed = np.round((clock_s + offset) * 1e9).astype("timedelta64[ns]")
-    return _Clock(zero + elapsed, resolved, misfit, int(part[-1]) + 1, unit)
+    return zero + elapsed, resolved, misfit, int(part[-1]) + 1

@@ -2,7 +2,6 @@
 
 import csv
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -28,16 +27,6 @@ _NED_FROM_MOTIVE = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]
 """Rows are north, east and down; of a body forward, right and down: one as it was defined flies level to north."""
 
 
-class _Take(NamedTuple):
-    """One rigid body of a take."""
-
-    time_s: NDArray[np.float64]
-    position: NDArray[np.float64]
-    quaternion: NDArray[np.float64]
-    lost: int
-    cut: int
-
-
 def read_optitrack(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -> xr.Dataset:
     """Return the `track` stage of a rigid body in a motion capture, options.body where there are several.
 
@@ -54,22 +43,6 @@ def read_optitrack(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -
     -----
     Source: equations in docs/theory/logs.md, "Motion capture". Motive's documentation, "Data Export: CSV".
     """
-    take = _read(path, options.body, node=node)
-    found = "seconds since the capture's start, which is a wall clock without zone"
-    start = start_time(options, found, node=node, where=path)
-    counts = {"body not seen": take.lost, "line cut off": take.cut}
-    return make_track(
-        start + np.round(take.time_s * 1e9).astype("timedelta64[ns]"),
-        take.position,
-        frame="local",
-        attitude_deg=_attitude_deg(take.quaternion),
-        dropped={why: count for why, count in counts.items() if count},
-        node=node,
-        where=path,
-    )
-
-
-def _read(path: Path, body: str | None, *, node: str) -> _Take:
     text = read_text(path, expected=_EXPECTED, remedy=_REMEDY, largest=LARGEST_LOG // 2)
     lines = text.splitlines()
     try:
@@ -80,7 +53,7 @@ def _read(path: Path, body: str | None, *, node: str) -> _Take:
     if first is None:
         raise _error("no line that begins with Frame", path)
     scale = _metres(heading[0], path)
-    columns = _columns(heading[: first + 1], body, node=node, where=path)
+    columns = _columns(heading[: first + 1], options.body, node=node, where=path)
     cut = text[-1] not in "\r\n" and len(lines) > first + 1
     time_s, values = _numbers(lines[first + 1 : len(lines) - cut], len(heading[first]), columns, first + 2, path)
     tracked = np.isfinite(values).all(axis=1)
@@ -90,7 +63,18 @@ def _read(path: Path, body: str | None, *, node: str) -> _Take:
     quaternion, position = values[tracked, :4], values[tracked, 4:] * scale
     if (np.abs(np.linalg.norm(quaternion, axis=1) - 1) > _UNIT).any():
         raise _error("a rotation that is no quaternion of length 1", path)
-    return _Take(time_s[tracked], position @ _ENU_FROM_MOTIVE.T, quaternion, int((~tracked).sum()), int(cut))
+    found = "seconds since the capture's start, which is a wall clock without zone"
+    start = start_time(options, found, node=node, where=path)
+    counts = {"body not seen": int((~tracked).sum()), "line cut off": int(cut)}
+    return make_track(
+        start + np.round(time_s[tracked] * 1e9).astype("timedelta64[ns]"),
+        position @ _ENU_FROM_MOTIVE.T,
+        frame="local",
+        attitude_deg=_attitude_deg(quaternion),
+        dropped={why: count for why, count in counts.items() if count},
+        node=node,
+        where=path,
+    )
 
 
 def _metres(cells: list[str], path: Path) -> float:

@@ -1,7 +1,6 @@
 """Coherence and phase of two images of one scene over a window, the common band, and what chance makes of them."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from math import exp, lgamma
 from typing import Any
 
@@ -213,28 +212,9 @@ def _correlation(image: NDArray[np.complex128], window: int) -> NDArray[np.compl
 # ---- Coherence and phase of whole images, tile by tile --------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class CoherenceMap:
-    """Coherence and phase of two images.
-
-    Attributes
-    ----------
-    magnitude, phase, looks
-        As of `coherence.coherence`; looks are the median of the tiles', NaN where none has any.
-    shared
-        (y, x) float32, pixels that a window's energy is spread over, as a share of it: about 1/2 of ground, 1/`looks`
-        of a point (docs/theory/interferometry.md, eq. 6).
-    """
-
-    magnitude: NDArray[np.float32]
-    phase: NDArray[np.float32]
-    shared: NDArray[np.float32]
-    looks: float
-
-
 def map_coherence(
     first: NDArray[np.complex64], second: NDArray[np.complex64], tiles: Iterable[Window], *, window: int
-) -> CoherenceMap:
+) -> tuple[NDArray[np.float32], NDArray[np.float32], float, NDArray[np.float32]]:
     """Return coherence and phase of whole images, tile by tile, as `coherence` has them.
 
     Parameters
@@ -246,12 +226,20 @@ def map_coherence(
     window
         Pixels along a side, odd.
 
+    Returns
+    -------
+    magnitude, phase, looks
+        As of `coherence`; looks are the median of the tiles', NaN where none has any.
+    shared
+        (y, x) float32, pixels that a window's energy is spread over, as a share of it: about 1/2 of ground, 1/`looks`
+        of a point (docs/theory/interferometry.md, eq. 6).
+
     Examples
     --------
     >>> image = np.exp(1j * np.arange(64.0).reshape(8, 8) ** 2).astype(np.complex64)
     >>> halves = [(slice(0, 8), slice(0, 4)), (slice(0, 8), slice(4, 8))]
     >>> apart, whole = map_coherence(image, 1j * image, halves, window=3), coherence(image, 1j * image, window=3)
-    >>> bool((apart.magnitude == whole[0]).all() and (apart.phase == whole[1]).all())
+    >>> bool((apart[0] == whole[0]).all() and (apart[1] == whole[1]).all())
     True
     """
     shape, margin = first.shape, window // 2
@@ -271,7 +259,7 @@ def map_coherence(
         planes[0][tile], planes[1][tile] = magnitude[inner], phase[inner]
         planes[2][tile] = _shared(one, other, window)[inner]
     there = [one for one in looks if np.isfinite(one)]
-    return CoherenceMap(planes[0], planes[1], planes[2], float(np.median(there)) if there else float("nan"))
+    return planes[0], planes[1], float(np.median(there)) if there else float("nan"), planes[2]
 
 
 def _shared(one: NDArray[np.complex64], other: NDArray[np.complex64], window: int) -> NDArray[np.float64]:

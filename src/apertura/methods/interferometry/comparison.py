@@ -224,11 +224,10 @@ def form_interferogram(
     (1024, 0, True)
     """
     # Coherence, phase and looks of every window (eqs. 2 to 6); pixels whose phase gives a height.
-    both = map_coherence(first, second, tiles, window=window)
-    magnitude, phase, looks = both.magnitude, both.phase, both.looks
+    magnitude, phase, looks, shared = map_coherence(first, second, tiles, window=window)
     common = ground.visible & np.isfinite(magnitude)
     enough = looks > 1  # coherence of a single look is 1 whatever the images hold
-    energy = looks * both.shared.astype(np.float64)  # looks that the window's energy is spread over
+    energy = looks * shared.astype(np.float64)  # looks that the window's energy is spread over
     dominated = energy < LEAST_LOOKS
     valid = (
         common & ~dominated & height_valid(ground.sensed, magnitude, looks) if enough else np.zeros(common.shape, bool)
