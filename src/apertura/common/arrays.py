@@ -13,7 +13,7 @@ Times: TypeAlias = NDArray[np.datetime64]
 
 
 def is_number(value: Any) -> bool:
-    """Return whether a value is one finite real number; true and false are none.
+    """Test whether a value is one finite real number; true and false are none.
 
     Examples
     --------

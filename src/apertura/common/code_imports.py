@@ -95,7 +95,7 @@ def _source(name: str, package: Path) -> Path | None:
 
 
 def _source_outside(name: str) -> Path | None:
-    """Return where a module of another distribution lies: a file of exports or engines, or one of a package of such."""
+    """Find the source of a module of another distribution: a file of exports or engines, or one of their package."""
     spec = importlib.util.find_spec(_top(name))
     if spec is None or spec.origin is None:
         return None
@@ -141,7 +141,7 @@ def without_description(source: str) -> str:
 
 
 def built_from(closure: Mapping[str, Path], package: Path) -> list[Path]:
-    """Return what compiled code beside the modules was built from; an editable install keeps it elsewhere."""
+    """List the hashes of the sources of compiled code beside the modules; an editable install keeps them elsewhere."""
     digests: dict[str, Path] = {}
     folders = {name.rpartition(".")[0] for name, path in closure.items() if path.name != "__init__.py"}
     for folder in sorted(filter(_is_ours, folders)):

@@ -173,12 +173,12 @@ class ConfinedPath(PosixPath):
 
     @property
     def location(self) -> Path:
-        """Where the path leads, a folder that lies elsewhere taken into account; to be shown, not to be opened."""
+        """Path that it leads to, a folder that lies elsewhere taken into account; to be shown, not to be opened."""
         first, *rest = self.parts[len(self._top.parts) :] or ("",)
         return self._elsewhere[first].joinpath(*rest) if first in self._elsewhere else Path(self)
 
     def real(self) -> Path:
-        """Return where the path leads on this machine, not confined: to be shown and compared, not to be opened."""
+        """Return the path that it leads to on this machine, not confined: to be shown and compared alone."""
         top, parts = self._way()
         return top.resolve().joinpath(*parts)
 
@@ -356,12 +356,12 @@ class ConfinedPath(PosixPath):
         return stat.S_ISLNK(self._mode(follow_symlinks=False))
 
     def permits(self, mode: int) -> bool:
-        """Return what `os.access` does."""
+        """Test the access to the file, as `os.access` does."""
         with self._within() as (folder, name):
             return os.access(name, mode, dir_fd=folder, follow_symlinks=False)
 
     def free_bytes(self) -> int:
-        """Return how many bytes can still be written below a folder."""
+        """Return the number of bytes that can still be written below a folder."""
         with self.folder() as opened:
             state = os.fstatvfs(opened)
             return state.f_bavail * state.f_frsize

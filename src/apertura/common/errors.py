@@ -73,7 +73,7 @@ def print_remark(where: str, remark: str) -> None:
 
 
 def number_of(count: int, what: str) -> str:
-    """Return how many of something there are, in words.
+    """Return a count of something in words.
 
     Examples
     --------

@@ -29,7 +29,7 @@ def check_shell_name(root: Path) -> None:
 
 
 def shipped() -> Path:
-    """Return where the root Snakefile lies, with profiles and tables: in the installed package, or beside its sources.
+    """Return the folder of the root Snakefile, profiles and tables: in the installed package, or beside its sources.
 
     Examples
     --------

@@ -155,7 +155,7 @@ def _user_folder(variable: str, name: str) -> Path | None:
 
 
 def _is_writable(folder: Path | None) -> bool:
-    """Return whether a folder can be written to, or made."""
+    """Test whether a folder can be written to, or made."""
     while folder is not None and not folder.exists() and folder != folder.parent:
         folder = folder.parent
     return folder is not None and folder.is_dir() and os.access(folder, os.W_OK | os.X_OK)

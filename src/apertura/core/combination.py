@@ -16,7 +16,7 @@ from apertura.core.quality.agreement import OUT_OF_PHASE_RAD, Agreement
 
 @dataclass(frozen=True)
 class InPhase:
-    """How much of the power of its images a coherent sum keeps at bright places.
+    """Share of the power of its images that a coherent sum keeps at bright places.
 
     Attributes
     ----------
@@ -46,7 +46,7 @@ class InPhase:
 
 
 def in_phase(amplitudes: NDArray[np.complex128], background: NDArray[np.float64]) -> InPhase:
-    """Return how far the images of a sum are in phase at some places.
+    """Measure the share of power that the images of a sum have in phase at some places.
 
     Parameters
     ----------
@@ -77,7 +77,7 @@ def in_phase(amplitudes: NDArray[np.complex128], background: NDArray[np.float64]
 
 
 def clutter_reduction_db(single_db: Sequence[float], coherent_db: float) -> float:
-    """Return by how much clutter lies lower, against the peak, in a coherent sum than in its images.
+    """Return the reduction of clutter, against the peak, in a coherent sum relative to its images.
 
     Parameters
     ----------
@@ -182,7 +182,7 @@ def choose_fusion(
     coarse: str = "",
     align: bool,
 ) -> CoherentSum:
-    """Return which pairs add coherently: the largest set that agrees in phase and place.
+    """Choose the pairs that add coherently: the largest set that agrees in phase and place.
 
     Parameters
     ----------
@@ -305,7 +305,7 @@ class _Set:
         return found if align or within else None
 
     def against(self, pair: str, measured: Mapping[tuple[str, str], Agreement], reference: str) -> Agreement | None:
-        """Return how a pair lies against the set's reference, by all that was measured between it and the set.
+        """Return the agreement of a pair with the set's reference, by all that was measured between it and the set.
 
         Phase and place are weighted means over the members; None where it was measured against none.
         """
@@ -330,7 +330,7 @@ class _Set:
         return replace(nearest, phase_rad=phase)
 
     def contradicts(self, other: "_Set", measured: Mapping[tuple[str, str], Agreement]) -> bool:
-        """Return whether something was measured between pairs that only one of two sets holds."""
+        """Test whether something was measured between pairs that only one of two sets holds."""
         return any(
             agreement_between(measured, one, two) is not None
             for one in self.pairs - other.pairs
@@ -369,7 +369,7 @@ def _without_the_worst(
 
 
 def agreement_between(between: Mapping[tuple[str, str], Agreement | None], first: str, second: str) -> Agreement | None:
-    """Return how a second pair lies against a first, in whichever order they were compared; None where nothing tells.
+    """Return the agreement of a second pair with a first, in whichever order they were compared; None: unknown.
 
     Examples
     --------
@@ -427,7 +427,7 @@ def _wrapped(phase_rad: float) -> float:
 
 
 def _chi2_limit(freedom: int) -> float:
-    """Return what χ² exceeds once in 1000, by the cube root that is nearly normal (Wilson and Hilferty)."""
+    """Return the χ² exceeded once in 1000, by the cube root that is nearly normal (Wilson and Hilferty)."""
     part = 2 / (9 * freedom)
     return float(freedom * (1 - part + _SURE * np.sqrt(part)) ** 3)
 

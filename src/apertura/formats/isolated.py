@@ -101,7 +101,7 @@ def read_isolated(
 
 
 def _ended(status: int, stderr: bytes) -> str:
-    """Return what became of the process; empty if all is well."""
+    """Return the reason why the process failed; empty if it succeeded."""
     if status < 0:
         return f"its reader died of {signal.Signals(-status).name}"
     lines = stderr.decode("utf-8", errors="replace").strip().splitlines()

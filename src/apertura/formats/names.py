@@ -31,7 +31,7 @@ GROWING: Mapping[tuple[str, ...], str] = {
 
 
 class LogFormat(NamedTuple):
-    """How a flight log is recognised, and read."""
+    """Recognition and reader of a flight log."""
 
     suffixes: tuple[str, ...]
     """Of <node>.track.*"""
@@ -60,7 +60,7 @@ _HEADING_BYTES = 8192
 
 
 class HistoryFormat(NamedTuple):
-    """How phase history is read."""
+    """Reader of a phase history."""
 
     suffix: str
     """Of <node>.*, or of <node> itself."""
@@ -130,7 +130,7 @@ def recording_files(folder: Path, node: str) -> tuple[Path, ...]:
 
 
 def log_format(path: Path, options: LogOptions = AS_IT_SAYS) -> str:
-    """Return which row of `TRACKS` reads a log: the requested one, else by suffix and heading.
+    """Return the row of `TRACKS` that reads a log: the requested one, else by suffix and heading.
 
     Raises
     ------
@@ -160,7 +160,7 @@ def log_format(path: Path, options: LogOptions = AS_IT_SAYS) -> str:
 
 
 def log_suffixes() -> list[str]:
-    """Return what <node>.track.* may end in, without the dot.
+    """Return the possible endings of <node>.track.*, without the dot.
 
     Examples
     --------

@@ -55,7 +55,7 @@ _LEAP_SECOND = re.compile(r"[T ]\d\d:[25]9:60(?!\d)", re.ASCII)  # minute of any
 
 
 def in_leap_second(texts: Sequence[str]) -> NDArray[np.bool_]:
-    """Return which times written as ISO 8601 are within a leap second.
+    """Return a mask of the times, written as ISO 8601, that are within a leap second.
 
     Examples
     --------

@@ -77,7 +77,7 @@ def _write_config(root: Path, campaign: DrawnCampaign) -> None:
 
 
 def _stated_air(specification: CampaignSpecification) -> dict[str, Any]:
-    """Return what the config says of the air: nothing of the standard atmosphere, which nobody had to measure."""
+    """Return the config's section of the air: none of the standard atmosphere, which nobody had to measure."""
     if specification.atmosphere == "standard":
         return {}
     vacuum = specification.atmosphere == "vacuum"

@@ -23,7 +23,7 @@ Chips = NDArray[np.int8]
 
 @dataclass(frozen=True, config=STRICT_KEYS)
 class Framing:
-    """What goes before the symbol, keyed on the middle subcarrier: a PN preamble and a payload that counts frames.
+    """Frame before the symbol, keyed on the middle subcarrier: a PN preamble and a payload that counts frames.
 
     Examples
     --------

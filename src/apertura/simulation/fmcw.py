@@ -70,7 +70,7 @@ class FmcwFlight:
         return at
 
     def flown(self, node: str, time_s: Floats) -> Floats:
-        """Return where a node is, ECEF, (…, 3) float64 metres: uniform motion on a straight line."""
+        """Return the position of a node, ECEF, (…, 3) float64 metres: uniform motion on a straight line."""
         east, north, up = self.nodes[node]
         here, later = self.place((east, north, up)), self.place((east + self.speed_m_s, north, up))
         at: Floats = here + (time_s - self.start_s.mean())[..., None] * (later - here)
@@ -149,7 +149,7 @@ def _write_log(path: Path, flight: FmcwFlight, node: str, epoch_s: Floats) -> No
 def beat_signal(
     sweep: FrequencySweep, start_s: Floats, paths: Sequence[Callable[[Floats], Floats]], amplitudes: Sequence[float]
 ) -> NDArray[np.number]:
-    """Return what is recorded of some echoes, sample by sample.
+    """Return the beat signal of some echoes, sample by sample.
 
     Parameters
     ----------

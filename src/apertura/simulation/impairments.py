@@ -1,4 +1,4 @@
-"""What may be wrong with a node, and what is drawn of it in one flight.
+"""Impairments of a node, and their draws in one flight.
 
 Every random impairment has its own stream of random numbers, so that switching one on leaves the others as
 they were.
@@ -199,7 +199,7 @@ class Impairments:
 
 @plain_dataclass(frozen=True)
 class ImpairmentDraw:
-    """What was drawn for one node and flight, pulse by pulse.
+    """Impairments drawn for one node and flight, pulse by pulse.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""What nodes observe, as channels without samples yet: of a drawn flight, or of one pair of nodes given as arrays."""
+"""Observations of nodes as channels without samples yet: of a drawn flight, or of one pair of nodes given as arrays."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -47,7 +47,7 @@ class Observation:
 def fly(
     campaign: DrawnCampaign, flight: SimulatedFlight, scatterers: Scatterers, generator: Generator
 ) -> dict[str, Observation]:
-    """Return what each node of a flight records of scatterers in ECEF; what is random of each has its own stream."""
+    """Observe scatterers in ECEF by each node of a flight; what is random of each has its own stream."""
     nodes, time_s = campaign.specification.nodes, campaign.pulse_times(flight)
     sender, draws = flight.transmitter, {}
     for name, stream in zip(flight.tracks, independent_streams(generator, len(flight.tracks)), strict=True):
@@ -160,7 +160,7 @@ def observe(
     transmitter: Impairments | None = None,
     sidelink: bool = True,
 ) -> Observation:
-    """Return what a receiver observes, with its impairments drawn.
+    """Observe a scene by a receiver, with its impairments drawn.
 
     Parameters
     ----------
@@ -196,7 +196,7 @@ def observe(
 
 
 def _true(logged: Geometry, sender: _Node, receiver: _Node) -> Geometry:
-    """Return where the antennas truly are: where the logs say, less the localization error of each node."""
+    """Return the true positions of the antennas: those of the logs, less the localization error of each node."""
 
     def moved(logged_m: Floats, point: AntennaPoint, node: _Node) -> Floats:
         wrong, error_m = node[0].localization, node[1].position_error_m

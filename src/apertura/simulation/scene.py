@@ -1,4 +1,4 @@
-"""What stands in a scene and how nodes fly past it, east, north and up of an origin."""
+"""Targets of a scene and trajectories of nodes past it, east, north and up of an origin."""
 
 from collections.abc import Callable
 from dataclasses import dataclass as plain_dataclass
@@ -260,7 +260,7 @@ class Straight:
         return np.tile([0.0, 0.0, yaw], (np.size(time_s), 1))
 
     def intended(self) -> Trajectory:
-        """Return what was meant to be flown, without the wobble."""
+        """Return the intended trajectory, without the wobble."""
         return self
 
 
@@ -295,7 +295,7 @@ class Waypoints:
         return self
 
     def intended(self) -> Trajectory:
-        """Return what was meant to be flown, without the wobble."""
+        """Return the intended trajectory, without the wobble."""
         time_s, position = np.array(self.time_s), np.array(self.position_m)
         if self.attitude_deg is not None:
             return Sampled(time_s, position, np.radians(self.attitude_deg))

@@ -163,7 +163,7 @@ class CampaignSpecification:
 
     @property
     def air(self) -> TrueAir | None:
-        """What paths between positions in ECEF fly through; None: vacuum."""
+        """True air between positions in ECEF; None: vacuum."""
         if self.atmosphere == "vacuum":
             return None
         ground_m = self.origin.height_m

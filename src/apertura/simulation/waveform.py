@@ -1,4 +1,4 @@
-"""What is transmitted: OFDM symbols and pulses given by their samples, and the sections that specify them."""
+"""Transmitted waveforms: OFDM symbols and pulses given by their samples, and the sections that specify them."""
 
 from dataclasses import dataclass as plain_dataclass
 from typing import Annotated, Any, Literal, Self
@@ -361,7 +361,7 @@ class PulseSpecification:
 
 
 def _with_kind(value: Any) -> Any:
-    """Return what a document says of a waveform, with the kind that it is of where it does not say."""
+    """Return the section of a waveform, with the default kind where it states none."""
     return {"kind": "ofdm", **value} if isinstance(value, dict) else value
 
 

@@ -14,7 +14,7 @@ _AT_ONCE = 64  # pulses, or blocks, evaluated together: bounds memory
 
 @dataclass(frozen=True)
 class Illumination:
-    """How many pulses illuminate each point of a grid over the scene.
+    """Numbers of pulses that illuminate each point of a grid over the scene.
 
     Attributes
     ----------
@@ -52,7 +52,7 @@ class Illumination:
 
 
 def illuminate(beams: Beams, aperture: Aperture, place_m: NDArray[np.float64]) -> Illumination:
-    """Return how many pulses illuminate each place.
+    """Count the pulses that illuminate each place.
 
     Parameters
     ----------
@@ -80,7 +80,7 @@ def illumination_mask(
     *,
     pulses: int,
 ) -> NDArray[np.bool_]:
-    """Return which blocks of pulses may illuminate balls about places.
+    """Return a mask of the blocks of pulses that may illuminate balls about places.
 
     Parameters
     ----------
@@ -140,7 +140,7 @@ def _in_pattern(
     away_m: NDArray[np.float64],
     radius_m: NDArray[np.float64],
 ) -> NDArray[np.bool_]:
-    """Return which balls (block, place) may intersect the pattern's cone and elevations at a pulse of a block."""
+    """Return a mask of balls (block, place) that may intersect the pattern's cone and elevations at some pulse."""
     range_m = np.linalg.norm(away_m, axis=-1)
     near = np.arcsin(np.minimum(1.0, radius_m / range_m)) + 1e-6
     off, above = (np.empty(range_m.shape) for _ in range(2))
@@ -162,7 +162,7 @@ def _angle(cosine: NDArray[np.float64]) -> NDArray[np.float64]:
 def decide_antennas(
     beams: Beams | None, illumination: Illumination | None
 ) -> tuple[list[tuple[str, str]], dict[str, str]]:
-    """Return which antennas have beams with the illumination, and the flag `beam_misses`; empty without beams."""
+    """List the antennas with beams and the illumination, and the flag `beam_misses`; empty without beams."""
     if beams is None or beams.antennas is None or illumination is None:
         return [], {}
     with_beam = [name for name in ("transmit", "receive") if getattr(beams, name) is not None]

@@ -1,1 +1,1 @@
-"""How good an image is: point targets, measures, numerical error."""
+"""Quality of an image: point targets, measures, numerical error."""

@@ -90,7 +90,7 @@ class Agreement:
 
     @property
     def evidence(self) -> str:
-        """How many bright points or looks are common, in words."""
+        """Number of bright points or looks in common, in words."""
         return number_of(self.points, "bright point" if self.by == "bright points" else "look")
 
     @property
@@ -105,32 +105,32 @@ class Agreement:
 
     @property
     def shifted(self) -> bool:
-        """Whether the images show different places, by more than the uncertainty of their points."""
+        """True if the images show different places, by more than the uncertainty of their points."""
         return self.spread or self.shift_units > SHIFTED + 3 * self.shift_std_units or self.cycle_off
 
     @property
     def cycle_off(self) -> bool:
-        """Whether the shift is one that a path wrong by a whole wavelength makes: the phase then shows nothing."""
+        """True if the shift is one that a path wrong by a whole wavelength makes: the phase then shows nothing."""
         return self.shift_units > SHIFTED and abs(self.cycles) > max(_HALF_CYCLE, 3 * self.cycles_std)
 
     @property
     def certain(self) -> bool:
-        """Whether the phase is known well enough to be used."""
+        """True if the phase is known well enough to be used."""
         return self.phase_std_rad < LARGEST_PHASE_STD_RAD
 
     @property
     def incoherent(self) -> bool:
-        """Whether bright points have no common phase; that of patches is significant where it is told at all."""
+        """True if bright points have no common phase; that of patches is significant where it is measured at all."""
         return self.by == "bright points" and self.coherence < LEAST_COHERENCE
 
     @property
     def out_of_phase(self) -> bool:
-        """Whether adding the images would lose power, by more than the uncertainty of their phase."""
+        """True if adding the images would lose power, by more than the uncertainty of their phase."""
         return self.certain and abs(self.phase_rad) > OUT_OF_PHASE_RAD + 2 * self.phase_std_rad
 
     @property
     def alignable(self) -> bool:
-        """Whether a constant phase would bring the second image into phase with the first."""
+        """True if a constant phase would bring the second image into phase with the first."""
         return self.certain and not self.shifted and not self.incoherent
 
     @property

@@ -111,7 +111,7 @@ class PointResponse:
 def separated(
     amplitude: NDArray[np.floating], shown: Callable[[int, NDArray[np.int64]], NDArray[np.float64]], *, most: int
 ) -> list[int]:
-    """Return which of some maxima are points of their own and no sidelobes or skirts of brighter ones.
+    """Select the maxima that are points of their own and no sidelobes or skirts of brighter ones.
 
     Parameters
     ----------
@@ -155,7 +155,7 @@ _CELL_UNITS = 1.8  # a resolution cell in units of docs/theory/focus.md, eq. 6, 
 def near(
     spectrum: NDArray[np.float64], spacing_m: float, cell_m: float
 ) -> Callable[[NDArray[np.int64], NDArray[np.int64]], NDArray[np.float64]]:
-    """Return what a point of an image shows at most, where only the covariance of its spatial spectrum is known.
+    """Bound the response of an image to a point, where only the covariance of its spatial spectrum is known.
 
     Parameters
     ----------
@@ -270,7 +270,7 @@ def bright_points(
 
 
 def has_point(image: BlockRaster, row: int, column: int, *, reach: int) -> bool:
-    """Return whether an image has a pixel 10 dB above its surroundings within `reach` pixels of a place.
+    """Test whether an image has a pixel 10 dB above its surroundings within `reach` pixels of a place.
 
     Examples
     --------
@@ -339,7 +339,7 @@ def _cell_maxima(magnitude: NDArray[np.float32], window: Window, cell_px: int) -
 
 
 def _stands_out(image: BlockRaster, magnitude: float, row: int, column: int) -> bool:
-    """Return whether no pixel about a maximum of its block exceeds it, across the blocks' edges too."""
+    """Test whether no pixel about a maximum of its block exceeds it, across the blocks' edges too."""
     about = image[max(0, row - 1) : row + 2, max(0, column - 1) : column + 2]
     return bool(np.abs(np.nan_to_num(np.asarray(about))).max() <= magnitude)
 

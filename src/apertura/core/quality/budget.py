@@ -80,7 +80,7 @@ class BudgetLine:
 
     @property
     def counts(self) -> bool:
-        """Whether its effect is expected: stated, measured or assumed."""
+        """True if its effect is expected: stated, measured or assumed."""
         return self.stated is not None or self.assumed is not None
 
     @property
@@ -97,7 +97,7 @@ class BudgetLine:
 
 
 def is_stated(report: Mapping[str, Any]) -> bool:
-    """Return whether the size of a cause is stated or measured, from the `report` of its line.
+    """Test whether the size of a cause is stated or measured, from the `report` of its line.
 
     Examples
     --------
@@ -108,7 +108,7 @@ def is_stated(report: Mapping[str, Any]) -> bool:
 
 
 def is_counted(report: Mapping[str, Any]) -> bool:
-    """Return whether the effect of a cause is expected: its size is stated, measured or assumed.
+    """Test whether the effect of a cause is expected: its size is stated, measured or assumed.
 
     Examples
     --------

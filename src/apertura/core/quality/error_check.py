@@ -167,7 +167,7 @@ class Brightness:
     def density(
         self, pixels: NDArray[np.int64], values: NDArray[np.complexfloating], windows: Sequence[Window], *, random: int
     ) -> NDArray[np.float64]:
-        """Return how often `random_pixels` and `draw` together take each of some pixels on average, (pixel,) float64.
+        """Return the mean number of draws of each of some pixels by `random_pixels` and `draw`, (pixel,) float64.
 
         `pixels` are the (pixel, 2) int64 of both draws, those of `random_pixels` (`random` of them) first; `values` the
         image there.

@@ -149,7 +149,7 @@ def locate_maximum(
     rounds: int,
     counts: tuple[int, int] = (9, 9),
 ) -> tuple[tuple[float, float], float]:
-    """Return where a function of two coordinates is largest near a point, and its value there.
+    """Locate the maximum of a function of two coordinates near a point; return its place and value.
 
     Parameters
     ----------

@@ -161,7 +161,7 @@ def crate_document(run: CrateRun) -> dict[str, Any]:
 
 
 def input_id(name: str) -> str:
-    """Return how an input is called in the crate.
+    """Return the identifier of an input in the crate.
 
     Examples
     --------
@@ -303,7 +303,7 @@ def _jobs(run: CrateRun) -> Iterator[dict[str, Any]]:
 
 
 def _data(run: CrateRun) -> tuple[list[str], list[dict[str, Any]]]:
-    """Return what lies directly in the root, and all files and stages of the results."""
+    """Return the entities directly in the root, and all files and stages of the results."""
     stages: dict[str, list[str]] = {}
     tops, entities = [], []
     for listed in [*run.workflow, *(file for job in run.jobs for file in job.files)]:

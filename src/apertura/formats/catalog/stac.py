@@ -101,7 +101,7 @@ class AcquisitionTime:
 
 
 def projection(wkt: str, shape: tuple[int, int], transform: Sequence[float]) -> dict[str, Any]:
-    """Return where the pixels of a north-up raster lie.
+    """Return the properties of the projection extension of a north-up raster.
 
     Parameters
     ----------
@@ -429,7 +429,7 @@ def catalog_files(
 
 
 def _layout() -> CustomLayoutStrategy:
-    """Return where the files lie: catalog.json, beside it what holds the items, images/<flight>/<image>.json."""
+    """Return the layout of the files: catalog.json, beside it the parent of the items, images/<flight>/<image>.json."""
 
     def item(one: pystac.Item, folder: str) -> str:
         flight, _, name = one.id.partition("-")
@@ -443,7 +443,7 @@ def _layout() -> CustomLayoutStrategy:
 
 
 def _parent(campaign: str, images: Sequence[Image], times: tuple[datetime, datetime]) -> pystac.Catalog:
-    """Return what holds the items: a collection, or a catalog where the campaign has no place."""
+    """Return the parent of the items: a collection, or a catalog where the campaign has no place."""
     placed = [image.geometry for image in images if image.geometry is not None]
     title = f"{campaign} · images"
     if not placed:

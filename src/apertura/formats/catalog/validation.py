@@ -38,7 +38,7 @@ def stac_problems(folder: Path) -> list[str]:
 
 
 def document_problem(document: dict[str, Any]) -> str | None:
-    """Return what is wrong with one catalog, collection or item as JSON; None: nothing.
+    """Find the error of one catalog, collection or item as JSON; None: it is valid.
 
     Examples
     --------

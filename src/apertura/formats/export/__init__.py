@@ -90,7 +90,7 @@ class Export:
 
     @property
     def style(self) -> bool:
-        """Whether it is the style in which QGIS shows the raster of its name."""
+        """True if it is the style in which QGIS shows the raster of its name."""
         return self.module == "apertura.formats.export.style"
 
     @property

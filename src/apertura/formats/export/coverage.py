@@ -33,7 +33,7 @@ Ring = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Covered:
-    """What one pair of a flight covers.
+    """Coverage of one pair of a flight.
 
     Attributes
     ----------

@@ -82,7 +82,7 @@ class CphdCollection:
 
     @property
     def monostatic(self) -> bool:
-        """Whether one node sends and receives."""
+        """True if one node sends and receives."""
         tx, rx = self.pair.split("-")
         return tx == rx
 
@@ -93,7 +93,7 @@ class CphdCollection:
 
     @property
     def troposphere_s(self) -> Floats:
-        """What of it is air: (pulse,) float64, seconds beyond the same path in vacuum."""
+        """Part of it by the air: (pulse,) float64, seconds beyond the same path in vacuum."""
         return self.reference_delay_s - self._point_path_m / SPEED_OF_LIGHT_M_S
 
     @property
@@ -305,7 +305,7 @@ def _channel(collection: CphdCollection, pulses: NDArray[Any]) -> dict[str, Any]
 
 
 def _layout(pulses: NDArray[Any]) -> dict[str, Any]:
-    """Return where each parameter lies in a pulse's record, in words of 8 bytes."""
+    """Return the place of each parameter in a pulse's record, in words of 8 bytes."""
     fields = {
         name: {"Offset": place // 8, "Size": kind.itemsize // 8, "dtype": kind}
         for name, (kind, place, *_) in (pulses.dtype.fields or {}).items()

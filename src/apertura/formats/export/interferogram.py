@@ -130,7 +130,7 @@ def write_panels(
 
 
 def _ends(values: NDArray[np.float32]) -> tuple[float, float]:
-    """Return where colours end: at the first and the last hundredth, a glitch left out."""
+    """Return the ends of a colour scale: the first and the last hundredth, a glitch left out."""
     there = values[np.isfinite(values)]
     if not there.size:
         return 0.0, 1.0

@@ -104,7 +104,7 @@ def write_quicklook(
 
 
 def crs_name(crs: str) -> str:
-    """Return what people call a coordinate reference system.
+    """Return the common name of a coordinate reference system.
 
     Examples
     --------

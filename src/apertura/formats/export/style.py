@@ -1,4 +1,4 @@
-"""How QGIS shows a raster: a .qml of the raster's name beside it, which QGIS takes up when it opens the raster.
+"""QGIS styles: a .qml of the raster's name beside it, which QGIS takes up when it opens the raster.
 
 An image spans its own noise floor to its own peak. The usual 2 to 98 % of the pixels would blacken all targets of
 a scene that is mostly noise, and whiten the noise.

@@ -72,7 +72,7 @@ class RefinedLog:
 
     @property
     def local(self) -> bool:
-        """Whether positions have no place on Earth."""
+        """True if positions have no place on Earth."""
         return bool(self.track.attrs["frame"] == LOCAL)
 
     @property

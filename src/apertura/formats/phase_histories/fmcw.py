@@ -44,7 +44,7 @@ _REMEDY = "Correct the file, or waveform in the config."
 
 @dataclass(frozen=True)
 class Sweeps:
-    """What one file holds.
+    """Content of one file.
 
     Attributes
     ----------
@@ -208,7 +208,7 @@ def _check(one: Sweeps, sweep: FrequencySweep, described: Mapping[str, Any]) -> 
 
 
 def _is_by_columns(one: Sweeps, sweep: FrequencySweep, described: Mapping[str, Any]) -> bool:
-    """Return whether columns of an array are sweeps: by its times, its sides, and the interval between sweeps."""
+    """Test whether columns of an array are sweeps: by its times, its sides, and the interval between sweeps."""
     rows, columns = one.beat.shape
     if one.time is not None and rows != columns and len(one.time) in {rows, columns}:
         return bool(len(one.time) == columns)
@@ -264,7 +264,7 @@ def _times(stored: NDArray[Any], path: Path) -> Times:
 
 
 def _are_datenum(time: NDArray[np.float64]) -> bool:
-    """Return whether times are days since the year 0, of 1980 to 2199; as seconds they were of January 1970."""
+    """Test whether times are days since the year 0, of 1980 to 2199; as seconds they were of January 1970."""
     return bool(time.size and (time > _DATENUM[0]).all() and (time < _DATENUM[1]).all() and np.ptp(time) < 1)
 
 
@@ -340,7 +340,7 @@ def cut_sweeps(path: Path, found: Mapping[str, NDArray[Any]], described: Mapping
 
 
 def trigger_starts(sync: NDArray[np.float64], *, threshold: float) -> NDArray[np.float64]:
-    """Return where a channel rises through the middle of its levels, in samples and fractions.
+    """Return the places where a channel rises through the middle of its levels, in samples and fractions.
 
     Parameters
     ----------
@@ -368,7 +368,7 @@ def trigger_starts(sync: NDArray[np.float64], *, threshold: float) -> NDArray[np
 
 
 def _whole(starts: NDArray[np.float64], sweep: FrequencySweep, count: int) -> NDArray[np.bool_]:
-    """Return which sweeps end before the next trigger and the file do."""
+    """Return a mask of sweeps that end before the next trigger and the file do."""
     ends = np.ceil(starts).astype(np.int64) + sweep.sweep_samples
     following = np.append(np.ceil(starts[1:]), count)
     return np.asarray(ends <= following)

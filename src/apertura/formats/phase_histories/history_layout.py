@@ -23,7 +23,7 @@ TIME_UNITS = "nanoseconds since 1970-01-01"
 
 
 class Field(NamedTuple):
-    """What an array of a file must be."""
+    """Required type and shape of an array of a file."""
 
     dims: tuple[str, ...]
     kinds: str

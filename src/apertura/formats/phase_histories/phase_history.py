@@ -44,7 +44,7 @@ class Samples(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class History:
-    """What one file holds.
+    """Content of one file.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""What every recorder's files become: samples to be read, captures in UTC, and what was sent before each symbol."""
+"""Recordings, common to all recorders: samples to be read, captures in UTC, and what was sent before each symbol."""
 
 import hashlib
 from collections.abc import Callable, Mapping

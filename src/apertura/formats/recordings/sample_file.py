@@ -28,7 +28,7 @@ _KAISER = 8.0
 
 @dataclass(frozen=True)
 class Mixing:
-    """How real samples x are mixed: s = (x + j·H{x})·exp(-j2π·if_hz·n/f_s), with H the Hilbert transform.
+    """Mixing of real samples x to baseband: s = (x + j·H{x})·exp(-j2π·if_hz·n/f_s), with H the Hilbert transform.
 
     Attributes
     ----------
@@ -50,7 +50,7 @@ class Mixing:
 
     @property
     def alias_hz(self) -> float:
-        """Where baseband zero lies after aliasing, -f_s/2 to f_s/2."""
+        """Frequency of baseband zero after aliasing, -f_s/2 to f_s/2."""
         half = self.sample_rate_hz / 2
         return (self.if_hz + half) % self.sample_rate_hz - half
 
@@ -148,7 +148,7 @@ def _none() -> NDArray[np.int64]:
 
 @dataclass(frozen=True, eq=False)
 class SampleLayout:
-    """How samples lie in a file.
+    """Layout of samples in a file.
 
     Attributes
     ----------
@@ -239,7 +239,7 @@ Spans = Sequence[tuple[int, int]]
 
 
 def _are_samples(numbers: NDArray[np.floating[Any]]) -> bool:
-    """Return whether floats may be samples of a recorder: finite, of several values and of usual size, or 0."""
+    """Test whether floats may be samples of a recorder: finite, of several values and of usual size, or 0."""
     with np.errstate(invalid="ignore"):  # a NaN that signals
         magnitude = np.abs(numbers[numbers != 0].astype(np.float64))
     if magnitude.size < _FEWEST or not np.isfinite(magnitude).all() or np.unique(magnitude).size <= _DISTINCT:

@@ -53,7 +53,7 @@ Frequency = Annotated[float, Field(ge=-1e12, le=1e12)]
 
 
 class SigmfFraming(BaseModel):
-    """What was sent before each symbol."""
+    """Preamble and payload sent before each symbol."""
 
     preamble: str = Field(min_length=1, max_length=200)
     chip_samples: Annotated[int, Field(ge=1, le=1 << 20, strict=True)]
@@ -377,7 +377,7 @@ def open_sigmf(meta_path: Path, data_path: Path) -> Recording:
 
 
 def _layout(header: Global, captures: StatedCaptures, path: Path) -> SampleLayout:
-    """Return how the samples lie in their file."""
+    """Return the layout of the samples in their file."""
     real, continuous = header.datatype.startswith("r"), header.framing is not None and len(captures.start) == 1
     mixing = None
     if header.if_hz is not None:
@@ -531,7 +531,7 @@ class GrowingSigmf:
 
     @property
     def runs_through(self) -> bool:
-        """Whether its recorder never stops: pulses are then found in all samples at once, and `read` returns none."""
+        """True if its recorder never stops: pulses are then found in all samples at once, and `read` returns none."""
         return self._header is not None and self._header.framing is not None
 
     def _forget(self) -> None:
@@ -627,7 +627,7 @@ class GrowingSigmf:
 
 
 def _at_next(text: str, at: int) -> int:
-    """Return where the next value begins."""
+    """Return the place of the next value."""
     found: Any = _BETWEEN.match(text, at)
     return int(found.end())
 

@@ -138,7 +138,7 @@ def _dates(texts: Sequence[str]) -> tuple[NDArray[np.datetime64], str]:
 
 
 def _order(dates: Sequence[tuple[str, ...]], texts: Sequence[str]) -> tuple[str, str, str]:
-    """Return which parts of dates are year, month and day."""
+    """Return the order of year, month and day in dates."""
     if not dates or all(len(first) == 4 for first, *_ in dates):
         return "first", "second", "third"
     month_first, day_first = ("third", "first", "second"), ("third", "second", "first")

@@ -1,4 +1,4 @@
-"""What autopilots log: a receiver's epochs in UTC, attitude by a clock from start, Doppler velocities."""
+"""Logs of autopilots: a receiver's epochs in UTC, attitude by a clock from start, Doppler velocities."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -119,7 +119,7 @@ _MOST, _FEW = 0.5, 10
 
 
 def contradicted(time_utc: NDArray[np.datetime64], geodetic: Floats, velocity: Floats) -> NDArray[np.bool_]:
-    """Return which epochs are not where their neighbours and the velocities lead.
+    """Return a mask of the epochs that are not where their neighbours and the velocities lead.
 
     A step that starts or ends at an epoch misses by |p_{i+1} − p_i − (v_i + v_{i+1})·Δt/2|; an epoch whose steps all
     miss is contradicted. Where more than half of ten or more steps miss, it is the velocities that are wrong: no epoch
@@ -304,7 +304,7 @@ def _counted(boot_s: Floats, options: LogOptions, node: str, where: Path) -> NDA
 
 
 def _repeated(epochs: Epochs) -> NDArray[np.bool_]:
-    """Return which epochs are the one before once more."""
+    """Return a mask of the epochs that repeat the one before."""
     same = np.zeros(epochs.boot_s.size, bool)
     same[1:] = (np.diff(epochs.geodetic, axis=0) == 0).all(axis=1) & (epochs.time_utc[1:] == epochs.time_utc[:-1])
     return same

@@ -56,7 +56,7 @@ def number(text: str) -> float:
 
 
 def cut_off(path: Path) -> bool:
-    """Return whether a file ends within a line: of the last number digits may be lost.
+    """Test whether a file ends within a line: of the last number digits may be lost.
 
     Parameters
     ----------
@@ -140,7 +140,7 @@ def _named(heading: Sequence[str], known: Sequence[str]) -> list[str]:
 
 
 def _not_utf8(path: Path) -> str:
-    """Return where a file is not UTF-8 text."""
+    """Locate the first bytes of a file that are not UTF-8 text."""
     with path.open("rb") as stream:
         if stream.read(2) in {b"\xff\xfe", b"\xfe\xff"}:
             return 'text in UTF-16, as "Unicode text" of Excel; save the file as UTF-8'

@@ -59,7 +59,7 @@ def foreign_bytes(
 
 
 def _chain(at: int, end: int, message_bytes: Callable[[int], int]) -> bool:
-    """Return whether messages follow each other from an offset on."""
+    """Test whether messages follow each other from an offset on."""
     for _ in range(_CHAIN):
         size = message_bytes(at)
         if not size or at + size > end:
@@ -83,7 +83,7 @@ def without(data: bytes, spans: Sequence[Span]) -> bytes:
 
 
 def damage_of(spans: NDArray[np.int64], unit: str = "bytes") -> str:
-    """Return what of a log is no message, in one line; '' where nothing is.
+    """Describe the parts of a log that are no messages, in one line; '' where there are none.
 
     Parameters
     ----------

@@ -241,7 +241,7 @@ def _utc(fields: Fields, source: str) -> NDArray[np.datetime64]:
 
 
 def _of_receiver(fields: Fields, source: str) -> tuple[NDArray[np.float64], NDArray[np.datetime64]]:
-    """Return where a receiver places the autopilot's clock in UTC."""
+    """Return times of the autopilot's clock and their UTC by a receiver."""
     utc = _utc(fields, source)
     known = ~np.isnat(utc)
     return _arrived(fields, source)[known], utc[known]

@@ -119,7 +119,7 @@ class _Solutions(NamedTuple):
 
 
 def _joined(values: list[Any], unknown: Callable[[int], NDArray[Any]], parts: Sequence[_Solutions]) -> Any:
-    """Return what the headers name of all solutions, or `unknown` of those under another; None where no header does."""
+    """Join what the headers name of all solutions, or `unknown` of those under another; None where no header does."""
     if all(value is None for value in values):
         return None
     there = next(value.dtype for value in values if value is not None)

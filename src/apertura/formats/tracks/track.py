@@ -1,4 +1,4 @@
-"""What every flight log becomes: times in UTC, positions in ECEF, attitude in radians."""
+"""Stage `track`, common to all flight logs: times in UTC, positions in ECEF, attitude in radians."""
 
 import re
 from collections.abc import Mapping

@@ -79,12 +79,12 @@ def read_fields(path: Path) -> dict[str, NDArray[Any]]:
 
 
 def _keyed(data: bytes, at: int, size: int) -> bool:
-    """Return whether a payload begins with the length of a key, and the key."""
+    """Test whether a payload begins with the length of a key, and the key."""
     return 0 < data[at] < size and data[at + 1 : at + 1 + data[at]].isascii()
 
 
 def _levelled(data: bytes, at: int, size: int) -> bool:
-    """Return whether a payload may be a logged text: its level, "0" to "7", its time, the text."""
+    """Test whether a payload may be a logged text: its level, "0" to "7", its time, the text."""
     return size > 9 and 0x30 <= data[at] <= 0x37
 
 
@@ -183,7 +183,7 @@ def _sizes(name: str, formats: dict[str, list[tuple[str, int, str]]], depth: int
 
 
 def _appended(data: bytes) -> list[int]:
-    """Return where data were appended, as the first message states."""
+    """Return the offsets of appended data, as the first message states them."""
     flags = data[_HEADER + _MESSAGE :][:_FLAGS_BYTES]
     if data[_HEADER + 2 : _HEADER + 3] != b"B" or len(flags) < _FLAGS_BYTES or not flags[8] & 1:
         return []

@@ -50,7 +50,7 @@ class Cause:
     moved_m: Mapping[str, Floats]
 
     def line(self, values: Floats) -> str:
-        """Return what is wrong, with its size."""
+        """Describe the wrong constant, with its size."""
         late, above = ("late", "above") if values[0] > 0 else ("early", "below")
         return self.what.format(*values, late=late, above=above, size=abs(float(values[0])))
 
@@ -121,7 +121,7 @@ class CausePrior(Prior):
 
     @property
     def size(self) -> int:
-        """How many unknowns there are."""
+        """Number of unknowns."""
         return len(next(iter(self.shapes_m.values())))
 
     def tracks(self, unknowns: Floats) -> dict[str, Floats]:

@@ -127,7 +127,7 @@ _LEAST_SLOPE = 0.05  # of the path over ground: a point illuminated from all sid
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """What was measured of refined tracks.
+    """Measures of refined tracks.
 
     Attributes
     ----------
@@ -164,18 +164,18 @@ class Evidence:
 
     @property
     def believed(self) -> bool:
-        """Whether what was not fitted, or a place that nothing else can explain, shows that the tracks are better."""
+        """True if places that were not fitted, or a place that nothing else explains, show that tracks are better."""
         points = self.steady <= MOST_INTERFERENCE and float(self.fitted_db.mean()) > LEAST_FITTED_DB
         return self.gain.certain or points
 
     @property
     def accepted(self) -> bool:
-        """Whether the tracks are used."""
+        """True if the tracks are used."""
         return self.believed and not self.slip
 
     @property
     def promising(self) -> bool:
-        """Whether there was anything to gain: where even places that were fitted gained nothing, logs are as good."""
+        """True if there was anything to gain: where even fitted places gained nothing, the logs are as good."""
         return bool(self.slip) or float(self.fitted_db.mean()) > LEAST_GAIN_DB
 
     @property
@@ -219,7 +219,7 @@ class Evidence:
 
     @cached_property
     def inconsistent(self) -> str:
-        """What is wrong with the errors that the logs state; nothing where they fit what was found."""
+        """Contradiction between the errors that the logs state and those found; empty where they fit."""
         from scipy.stats import chi2  # slow to import
 
         count = len(self.settled)
@@ -277,7 +277,7 @@ class MeanGain:
 
     @property
     def certain(self) -> bool:
-        """Whether it exceeds what shows, beyond doubt."""
+        """True if it exceeds `LEAST_GAIN_DB` by `DOUBT` standard deviations."""
         return self.mean_db - DOUBT * self.std_db > LEAST_GAIN_DB
 
 

@@ -387,7 +387,7 @@ class SpeckleEvidence:
 
     @property
     def accepted(self) -> bool:
-        """Whether the tracks are used."""
+        """True if the tracks are used."""
         return self.after >= max(LEAST_COHERENCE, self.before + LEAST_GAIN) and self.even >= LEAST_EVEN
 
     @property

@@ -48,7 +48,7 @@ class PairRecord:
         return tx, rx
 
     def turned(self, errors: Mapping[str, "TrackErrors"]) -> tuple[float, float]:
-        """Return how long the shortest error of its nodes lasts, seconds, and the phase of the largest, radians rms."""
+        """Return the correlation time of its nodes' shortest error, s, and the phase of the largest, radians rms."""
         of_nodes = [errors[node] for node in self.nodes]
         largest_m = max(max(error.std_m) for error in of_nodes)
         return min(error.correlation_s for error in of_nodes), 2 * self.profiles.wavenumber_rad_m * largest_m
@@ -168,7 +168,7 @@ class NodePrior:
 
     @property
     def size(self) -> int:
-        """How many unknowns there are, each of unit variance."""
+        """Number of unknowns, each of unit variance."""
         return 3 * (self.knots + self.smooth - 1 + int(self.slow.shape[1]))
 
     def tracks(self, unknowns: Floats) -> Floats:
@@ -204,7 +204,7 @@ class Prior:
 
     @property
     def size(self) -> int:
-        """How many unknowns all nodes have."""
+        """Number of unknowns of all nodes."""
         return sum(node.size for node in self.nodes.values())
 
     def tracks(self, unknowns: Floats) -> dict[str, Floats]:

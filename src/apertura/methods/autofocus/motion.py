@@ -63,7 +63,7 @@ class Recorded:
 
 @dataclass(frozen=True, eq=False)
 class Logged:
-    """Where the antennas were, by the log's clock.
+    """Positions of the antennas, by the log's clock.
 
     Attributes
     ----------

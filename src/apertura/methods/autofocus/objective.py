@@ -163,7 +163,7 @@ class Blocks:
         )
 
     def contribution(self, echo: PatchEcho, moved: Tracks) -> "Contribution":
-        """Return what each block adds to the pixels of a patch where its nodes have moved by so much."""
+        """Return the contribution of each block to the pixels of a patch where its nodes have moved by so much."""
         tx, rx = self.record.nodes
         # Antennas as corrected; by the sidelink path of eq. 3 echoes are delayed by as much as it has grown.
         moves = [moved[node][echo.blocks] for node in (tx, rx)]
@@ -193,7 +193,7 @@ class Blocks:
 
 @dataclass(frozen=True, eq=False)
 class Contribution:
-    """What the blocks of a pair that illuminate a patch add to it.
+    """Contributions of the blocks of a pair that illuminate a patch.
 
     Attributes
     ----------
@@ -267,7 +267,7 @@ class PatchImage:
 
     @property
     def weight(self) -> float:
-        """How much its sharpness counts: as much as its point stands out."""
+        """Weight of its sharpness, by how far its point stands out (eq. 11)."""
         return min(_WEIGHT_OF_RATIO * self.ratio, MOST_WEIGHT)
 
 

@@ -130,7 +130,7 @@ def patch_at(place_m: Floats, records: Sequence[PairRecord], axes: Floats, *, co
 
 
 def count_in_memory(values: Sequence[int]) -> int:
-    """Return how many patches fit in memory, given the number of complex values of each.
+    """Count the patches that fit in memory, given the number of complex values of each.
 
     Examples
     --------

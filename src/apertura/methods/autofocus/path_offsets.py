@@ -209,7 +209,7 @@ def _of_logs(record: PairRecord, found: Candidates, errors: Mapping[str, TrackEr
 
 
 def _left(fits: Sequence[_Fit], of_logs: Sequence[Effect]) -> dict[str, float]:
-    """Return what is left at the scene's middle: shifts and mean phases are the logs', as offsets hold neither."""
+    """Return the errors left at the scene's middle: shifts and mean phases are the logs', as offsets hold neither."""
     left_rad2 = float(np.mean([fit.left_rad2 for fit in fits]))
     mean_rad2 = float(np.mean([effect.phase_rad**2 for effect in of_logs]))
     return {

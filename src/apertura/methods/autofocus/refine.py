@@ -121,7 +121,7 @@ def fix_gauge(
 
 
 def path_std_m(problem: Problem) -> dict[str, float]:
-    """Return by how much the mean path of each pair but the first may differ from the first's by errors of the logs.
+    """Return the deviation of the mean path of each pair but the first from the first's by errors of the logs.
 
     Standard deviations at the first patch, metres, over draws from the prior.
     """
@@ -244,7 +244,7 @@ def _cell_m(echo: PatchEcho) -> float:
 
 
 def _apart(residuals: Floats) -> float:
-    """Return how far pairs are apart, in standard deviations, from two residuals a point; 0 where there is none.
+    """Return the distance of pairs, in standard deviations, from two residuals a point; 0 where there is none.
 
     By the median over points: two neighbours in a patch, of which either pair shows another, are one point.
     """
@@ -344,7 +344,7 @@ class _Model:
         return cls(search, best, search.by_speckle(grid, terrain, errors))
 
     def refinement(self, errors: Mapping[str, TrackErrors], points: Sequence[ReferencePoint]) -> Refinement:
-        """Return what becomes of the tracks."""
+        """Return the refinement of the tracks, accepted or not."""
         if self.by_speckle is not None and self.by_speckle.accepted:
             return self.by_speckle
         if self.best is None:
@@ -366,7 +366,7 @@ class _Model:
         return Refinement(correction, left.std_m, evidence.accepted, evidence.why, report, flags)
 
     def evidence_against(self, plain: "_Model", cause: Explained) -> float:
-        """Return by how much the objective of the logs' errors alone lies above that of these beside a cause.
+        """Return the objective of the logs' errors alone less that of these beside a cause.
 
         Notes
         -----
@@ -493,7 +493,7 @@ class TrackSearch:
         return best
 
     def _known(self, candidates: Candidates) -> bool:
-        """Return whether some bright places are those of this round: each in a patch of its own."""
+        """Test whether some bright places are those of this round: each in a patch of its own."""
         patches = self.problem.patches
         if len(patches) != len(candidates.patches):
             return False

@@ -60,7 +60,7 @@ class Gauge:
 
     @property
     def std_m(self) -> float:
-        """How far the log alone leaves the image to be moved as a whole, metres: rms over patches."""
+        """Deviation of the whole image that the log alone leaves, metres: rms over patches."""
         return float(np.sqrt((self.shift_m**2).sum(axis=(0, 2)).mean())) if len(self.modes) else 0.0
 
     @classmethod
@@ -208,7 +208,7 @@ def _logged_places(pairs: Sequence[Blocks]) -> Mapping[str, Floats]:
 
 
 def effects(patch: Contribution, moved: Mapping[str, Floats], axes: Floats) -> tuple[Floats, Floats]:
-    """Return what modes do to a patch: blur (row, mode), rad rms in the whole, and shift (2, mode), metres.
+    """Return the effects of modes on a patch: blur (row, mode), rad rms in the whole, and shift (2, mode), metres.
 
     Notes
     -----

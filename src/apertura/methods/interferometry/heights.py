@@ -281,7 +281,7 @@ def phase_std(coherence: NDArray[np.float32], looks: float | NDArray[np.float64]
 
 
 def height_valid(sensed: Sensitivity, coherence: NDArray[np.float32], looks: float) -> NDArray[np.bool_]:
-    """Return which pixels give a height: coherent beyond chance, and sensitive enough to height.
+    """Return a mask of the pixels that give a height: coherent beyond chance, and sensitive enough to height.
 
     Parameters
     ----------
@@ -297,7 +297,7 @@ def height_valid(sensed: Sensitivity, coherence: NDArray[np.float32], looks: flo
 
 
 def height_sensitive(sensed: Sensitivity) -> NDArray[np.bool_]:
-    """Return where one turn of the phase is less height than the range: docs/theory/interferometry.md, section 5."""
+    """Return a mask of a height of ambiguity below the height range: docs/theory/interferometry.md, section 5."""
     return np.asarray(sensed.ambiguity_m < sensed.range_m)
 
 
@@ -367,7 +367,7 @@ def place_heights(ground_m: Floats, rise_m: Floats, std_m: Floats, shift_px: Flo
 
 
 def _covered(to: Floats, area: Floats) -> Floats:
-    """Return how often each place is shown: the mean over 3 × 3 of the areas of the pixels that show it."""
+    """Return the cover of each place: the mean over 3 × 3 of the areas of the pixels that show it."""
     from scipy.ndimage import uniform_filter
 
     inside = np.logical_and.reduce(

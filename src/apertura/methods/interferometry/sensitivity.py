@@ -119,7 +119,7 @@ def sensitivity(
 
 
 def _moved(places_m: Floats, axes: Floats, images: tuple[Legs, Legs], paths: list[Floats], height_m: Floats) -> Floats:
-    """Return where ground that is `height_m` higher lies if it shows at `places_m` in both images.
+    """Locate ground that is `height_m` higher if it shows at `places_m` in both images.
 
     Its path differs by the same from pulse to pulse, else it would be sharp elsewhere along the track, and by nothing
     in the mean of both images, else it would be elsewhere in range (docs/theory/interferometry.md, eq. 10).
@@ -149,7 +149,7 @@ def _path(places_m: Floats, legs: Legs) -> Floats:
 
 
 def _less(path: Floats, moved: Floats, legs: Legs) -> Floats:
-    """Return how much longer the paths are than those to places moved."""
+    """Return the paths to places less those to places moved."""
     return np.asarray(path - _path(moved, legs))
 
 

@@ -112,7 +112,7 @@ class Contact:
 
     @property
     def line(self) -> str:
-        """What was measured."""
+        """Measures in one line."""
         return (
             f"amplitude scatters by {self.scatter_db:.2f} dB rms beyond noise, moves by {self.moves_db:.2f} dB, "
             f"{self.dropouts} of {self.pulses} pulses lost or 6 dB low"
@@ -141,7 +141,7 @@ def measure_contact(name: str, form: Callable[[Pulses], Complexes], pulses: int)
 
 @dataclass(frozen=True)
 class Arrival:
-    """What arrives beside the strongest path: how much later, metres of path, and at which level, dB of it."""
+    """Arrival beside the strongest path: later by metres of path, at a level in dB of it."""
 
     later_m: float
     level_db: float
@@ -270,7 +270,7 @@ class MeasuredLink:
 
     @property
     def contact(self) -> "Contact":
-        """How steady its amplitude is."""
+        """Steadiness of its amplitude."""
         return Contact.of(self.name, np.abs(self.terms), self.noise_rad, self.pulses - self.jumped)
 
     @property
@@ -459,7 +459,7 @@ def measure_link(
 
 
 def _arrivals(mean: NDArray[np.complex128], noise: float, cell_m: float) -> tuple[Arrival, ...]:
-    """Return what stands out of the mean profile beside the path, which lies in cell 0."""
+    """Return the arrivals that stand out of the mean profile beside the path, which lies in cell 0."""
     power, cells = np.abs(mean) ** 2, mean.size
     peaks = (power > np.roll(power, 1)) & (power >= np.roll(power, -1)) & (power > _STANDS_OUT * noise)
     later = np.arange(cells)
@@ -604,7 +604,7 @@ _GROUP_NOISE = 0.005  # rad², of the phase of a group of subcarriers: where noi
 
 
 def _over_the_band(first: MeasuredLink, second: MeasuredLink) -> tuple[float, float]:
-    """Return how phase and amplitude of one link over another change over the band beyond noise, rms, rad and dB.
+    """Return the scatter of phase and amplitude of one link over another over the band beyond noise, rms, rad and dB.
 
     Of groups of subcarriers, each as many as its noise asks for; zero where fewer than four are left.
     """
