@@ -43,7 +43,7 @@ LINK = Link(-10.0, 8.0, 9.0, 40.0, 4.0, COUNTS)
 HEIGHT_M = 8.0
 SLOPED_M = 35.0
 """North of the track where ground on a slope is at height 0."""
-UNTOLD_DB = 10 / np.log(10) * np.sqrt(2 / LEAST_CONTRAST + 1 / LEAST_CONTRAST**2)
+UNDETECTABLE_SCATTER_DB = 10 / np.log(10) * np.sqrt(2 / LEAST_CONTRAST + 1 / LEAST_CONTRAST**2)
 """Scatter of a peak that is hardly above its surroundings."""
 WAVE = TransmitWaveform(
     qpsk_codes(256, np.random.default_rng(0)), 1.2e9, "band_centre", 1.6e6, 0.625e-6, 1.25e-6, 512e6, 100.0
@@ -145,7 +145,7 @@ def points(draws: int) -> None:
             case = cases[int(generator.integers(len(cases)))]
             wrong_db = STATED_STD_DB * generator.standard_normal()  # of the radio, as stated
             error_db, scatter_db = cross_section(*case, apart=apart, seed=draw)
-            if scatter_db > UNTOLD_DB:
+            if scatter_db > UNDETECTABLE_SCATTER_DB:
                 lost += 1
                 continue
             std_db = float(np.hypot(scatter_db, STATED_STD_DB))

@@ -36,7 +36,7 @@ RX_AHEAD_M = 4.7
 
 @dataclass(frozen=True)
 class PaperScene:
-    """What is transmitted, over which targets, from where as the logs say.
+    """Waveform, targets and logged positions of the paper's scene.
 
     In local Cartesian metres: along the track, across it, up.
     """
@@ -83,7 +83,7 @@ NO_IMPAIRMENTS = Impairments()
 
 @dataclass(frozen=True)
 class Disturbance:
-    """What goes wrong in one observation.
+    """Errors of one observation.
 
     Attributes
     ----------

@@ -25,7 +25,7 @@ Row = TypeVar("Row")
 
 @dataclass(frozen=True)
 class Study(Generic[Row]):
-    """What is swept, how a case is run, and what is drawn of it.
+    """Sweep, run of a case, and drawings of a study.
 
     Attributes
     ----------
@@ -105,7 +105,7 @@ class Study(Generic[Row]):
 
 
 def part_path(folder: Path, part: str) -> Path:
-    """Return where the table of a part stands."""
+    """Return the path of the table of a part."""
     return folder / "parts" / f"{part}.csv"
 
 

@@ -155,7 +155,7 @@ _APART_M = 4.7
 
 @dataclass(frozen=True, eq=False)
 class LoggedFlight:
-    """Where the logs have both nodes, metres, east, north, up.
+    """Positions of both nodes by their logs, metres, east, north, up.
 
     Attributes
     ----------
@@ -289,7 +289,7 @@ PROBES_M[:, 0] += np.tile([0.3, -0.4, 0.0, 0.5, -0.2], 3)
 
 @dataclass(frozen=True, eq=False)
 class AutofocusCase:
-    """What a refinement is given, and what it is judged by.
+    """Inputs of a refinement, and the truth that it is judged by.
 
     Attributes
     ----------
@@ -462,7 +462,7 @@ def record(
     snr_db: float | None,
     generator: np.random.Generator,
 ) -> PairRecord:
-    """Return what a pair receives of some scatterers, with the length of the sidelink that the logs have restored.
+    """Record the echoes of some scatterers by a pair, with the length of the sidelink that the logs have restored.
 
     Parameters
     ----------

@@ -91,7 +91,7 @@ def _mark_verdicts(axes: Axes, rows: Sequence[AutofocusRow]) -> None:
 
 
 def tally(rows: Sequence[AutofocusRow]) -> str:
-    """Return how many refinements were accepted, and how many of those did harm.
+    """Count the refinements that were accepted, and those of them that did harm.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""What errors of the tracks cost with and without autofocus: losses and shifts of peaks against the true tracks."""
+"""Costs of track errors with and without autofocus: losses and shifts of peaks against the true tracks."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -61,7 +61,7 @@ def _peak(tables: Tables, middle_m: Floats, reach_m: tuple[float, float]) -> tup
 
 @dataclass(frozen=True)
 class CorrectionEffect:
-    """What a correction does to a case; NaN of targets where the scene has none.
+    """Effect of a correction on a case; NaN of targets where the scene has none.
 
     Attributes
     ----------
@@ -79,7 +79,7 @@ class CorrectionEffect:
 
 
 def judge(one: AutofocusCase, correction: TrackCorrection = UNCORRECTED) -> CorrectionEffect:
-    """Return what a correction does to a case; that of the logs themselves by default.
+    """Return the effect of a correction on a case; that of the logs themselves by default.
 
     The probes are the honest ones: a fit to noise can lift a target's peak, not theirs.
     """
@@ -135,7 +135,7 @@ VERDICTS = (ACCEPTED, FLAGGED, REFUSED, TOO_FEW)
 
 @dataclass(frozen=True)
 class AutofocusRow:
-    """What errors of one size did to one case, mono- and bistatic pair together: a row of the CSV.
+    """Effect of errors of one size on one case, mono- and bistatic pair together: a row of the CSV.
 
     Attributes
     ----------
@@ -179,7 +179,7 @@ def case_of(scene: str, sigma_cm: float, seed: int) -> AutofocusCase:
 
 
 def refine_case(one: AutofocusCase) -> Refinement:
-    """Return what the product makes of a case whose errors are stated as they are."""
+    """Refine a case whose errors are stated as they are."""
     return refine(one.records, GRID, FlatGround(0.0), {node: _stated(known) for node, known in one.errors.items()})
 
 
@@ -189,7 +189,7 @@ def _stated(known: TrackErrors) -> TrackErrors:
 
 
 def outcome_of(one: AutofocusCase, result: Refinement) -> AutofocusRow:
-    """Return what a refinement leaves of a case's loss, and the verdict on it."""
+    """Return the loss of a case that a refinement leaves, and the verdict on it."""
     before, after = (0.0 - judge(one, tracks).probe_loss_db for tracks in (UNCORRECTED, result.correction))
     return AutofocusRow(
         scene=one.name[0],

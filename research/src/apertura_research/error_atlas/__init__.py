@@ -1,1 +1,1 @@
-"""What spoils an image, from negligible to destructive: what it costs, what was expected, which flags came."""
+"""Errors of an image, from negligible to destructive: their cost, the expected cost, and the flags raised."""

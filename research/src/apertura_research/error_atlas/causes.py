@@ -59,7 +59,7 @@ class AssumedError:
     pulses: int = 300
 
     def flight(self) -> TrueFlight:
-        """Return what was flown."""
+        """Return the true flight."""
         return flight(pulses=self.pulses, beamed=self.beamed)
 
 

@@ -43,7 +43,7 @@ _CUTOFF_DB = -20.0
 
 @dataclass(frozen=True)
 class Received:
-    """What a pair truly received.
+    """True echoes of a pair.
 
     Attributes
     ----------
@@ -59,7 +59,7 @@ class Received:
 
 @dataclass(frozen=True, eq=False)
 class AssumedFlight:
-    """What the pipeline assumes of a flight, right or wrong.
+    """Assumptions of the pipeline about a flight, right or wrong.
 
     Attributes
     ----------
@@ -111,7 +111,7 @@ class AssumedFlight:
 
 @dataclass(frozen=True, eq=False)
 class TrueFlight:
-    """What was flown: 10 m at 1 m/s and 10 m above the ground, shaken by the wind as far as `Wobble` says.
+    """True flight: 10 m at 1 m/s and 10 m above the ground, shaken by the wind as far as `Wobble` says.
 
     Attributes
     ----------
@@ -147,7 +147,7 @@ class TrueFlight:
 
     @property
     def truth(self) -> AssumedFlight:
-        """What a pipeline assumes that knows everything."""
+        """Assumptions of a pipeline that knows everything."""
         return AssumedFlight(self.apertures(), beams=self.beams())
 
     def beams(self, off_deg: float = 0.0) -> dict[str, Beams]:
@@ -160,7 +160,7 @@ class TrueFlight:
         return {"a-a": Beams(beam, beam), "a-b": Beams(transmit=beam)}
 
     def receive(self, pair: str, generator: np.random.Generator) -> Received:
-        """Return what a pair received, with 20 dB SNR per subcarrier and 30 dB of the sidelink."""
+        """Return the echoes of a pair, with 20 dB SNR per subcarrier and 30 dB of the sidelink."""
         tx_m, rx_m = self.apertures()[pair].legs
         geometry = Geometry(tx_m, rx_m, tx_m, rx_m, gain=self._gain(pair))
         scene = PaperScene(self.scene.waveform, self.scene.scatterers, geometry)
@@ -220,7 +220,7 @@ _TOLERATED_WAVELENGTHS = 1 / 16
 
 @dataclass(frozen=True)
 class LogErrors:
-    """How a node's log is made.
+    """Errors of a node's log.
 
     Attributes
     ----------
@@ -264,7 +264,7 @@ class LogErrors:
 
 
 def assumed_from_logs(flown: TrueFlight, generator: Generator, **logs: LogErrors) -> AssumedFlight:
-    """Return what a pipeline assumes whose nodes have these logs; nodes without one are where they truly are."""
+    """Return the assumptions of a pipeline whose nodes have these logs; nodes without one are where they truly are."""
     places, used, flags = {}, np.ones(len(flown.time_s), bool), dict[str, str]()
     for node, log in logs.items():
         places[node], checked = log.checked(flown, node, generator)
@@ -277,7 +277,7 @@ def assumed_from_logs(flown: TrueFlight, generator: Generator, **logs: LogErrors
 
 
 def between_epochs(flown: TrueFlight, log: LogErrors) -> NodePositions:
-    """Return what the checks of a log say of the spline between its epochs, as the budget takes positions."""
+    """Return the error of the spline between a log's epochs by its checks, as the budget takes positions."""
     _, checked = log.checked(flown, "a", np.random.default_rng(0))
     std_m = checked.interpolation_m or 0.0
     return NodePositions((std_m,) * 3, 1 / log.rate_hz, "the log's own epochs")

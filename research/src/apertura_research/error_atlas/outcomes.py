@@ -1,4 +1,4 @@
-"""What each size of a cause does to images, what the budget expects of it, and which flags are raised."""
+"""Effect of each size of a cause on images, the effect that the budget expects, and the flags raised."""
 
 import contextlib
 import io

@@ -25,7 +25,7 @@ _MEASURABLE_DB = 0.5
 
 @dataclass(frozen=True)
 class CauseSummary:
-    """What the sweep of one cause came to: a row of summary.csv.
+    """Result of the sweep of one cause: a row of summary.csv.
 
     Attributes
     ----------
@@ -66,7 +66,7 @@ class CauseSummary:
 
 @dataclass(frozen=True)
 class Alarm:
-    """How well one flag warns: a row of flags.csv.
+    """Reliability of one flag as a warning: a row of flags.csv.
 
     Attributes
     ----------
@@ -90,12 +90,12 @@ class Alarm:
 
 
 def is_wrong(one: ErrorAtlasRow) -> bool:
-    """Return whether the image of a draw should have a flag."""
+    """Test whether the image of a draw should have a flag."""
     return one.loss_db > HARMFUL_DB or one.shift_m > HARMFUL_CELLS * one.cell_m
 
 
 def is_right(one: ErrorAtlasRow) -> bool:
-    """Return whether the image of a draw should have none."""
+    """Test whether the image of a draw should have none."""
     return (
         one.loss_db < HARMLESS_DB
         and one.shift_m < HARMLESS_CELLS * one.cell_m
@@ -117,7 +117,7 @@ def mean_of(some: Sequence[ErrorAtlasRow], name: str) -> float:
 
 
 def summary_of(outcomes: Sequence[ErrorAtlasRow]) -> CauseSummary:
-    """Return what the draws of one cause come to.
+    """Summarise the draws of one cause.
 
     Parameters
     ----------
@@ -150,7 +150,7 @@ def summary_of(outcomes: Sequence[ErrorAtlasRow]) -> CauseSummary:
 
 
 def alarms(outcomes: Sequence[ErrorAtlasRow]) -> list[Alarm]:
-    """Return how well each flag warns, over every draw of every cause."""
+    """Return the reliability of each flag as a warning, over every draw of every cause."""
     right = [one for one in outcomes if is_right(one)]
     rows = []
     for flag in sorted({flag for one in outcomes for flag in one.flags.split()}):
@@ -304,7 +304,7 @@ def _texts(row: CauseSummary) -> list[str]:
 
 
 def _colour(row: CauseSummary, column: int) -> float:
-    """Return how good a cell is, 0…1; NaN where it is neither."""
+    """Return the quality of a cell, 0…1; NaN where it is neither good nor bad."""
     ratio = row.expected_over_measured
     if column == 4 and ratio > 0:
         return float(np.clip(1 - abs(np.log(ratio)) / np.log(3), 0, 1))

@@ -99,7 +99,7 @@ def compare(
 
 
 def half_digit(printed: str) -> float:
-    """Return how far a number may lie from one that is printed, and still round to it.
+    """Return the largest distance of a number from a printed one to which it still rounds.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""What the corrections reach: by the sidelink, of clocks, of positions, and for a swarm of receivers."""
+"""Accuracy of the corrections: by the sidelink, of clocks, of positions, and for a swarm of receivers."""
 
 import json
 from dataclasses import replace
@@ -51,7 +51,7 @@ LARGEST_LOSS_DB = 0.01
 
 
 def corrected_claims(*, seed: int = 1) -> list[Claim]:
-    """Return what carrier phase and timing cost after each sidelink correction, as large as the prefix allows."""
+    """Return the cost of carrier phase and timing after each sidelink correction, as large as the prefix allows."""
     scene = reduced_scene(pulses=150, subcarriers=4096, rx_ahead_m=RX_AHEAD_M, qpsk=True)
     clocks = Impairments(carrier_phase=UniformPhase(), timing=Timing(half_width_s=2e-6))
     disturbed = Disturbance(clocks, sampled=True)
@@ -131,7 +131,7 @@ SIGMA_CM = 1.0
 
 
 def position_claims(*, draws: int = DRAWS, seed: int = 3) -> list[Claim]:
-    """Return what λ/10 is and costs, what a bistatic pair needs against a monostatic one, and what cancels."""
+    """Return the value and cost of λ/10, the needs of a bistatic pair against a monostatic one, and what cancels."""
     tenth_cm = 10 * SPEED_OF_LIGHT_M_S / float(paper_waveform().frequency_hz.mean())
     generators = [partial(np.random.default_rng, [seed, draw]) for draw in range(draws)]
     # errors are proportional to their deviation: the same draw as large as the largest error may be
@@ -214,7 +214,7 @@ def _worst_bistatic() -> Claim:
 
 
 def _along_the_sidelink() -> Claim:
-    """Return what an error of 1 cm along the sidelink leaves in the corrected path of a target abreast of the pair."""
+    """Return the error in the corrected path of a target abreast of the pair by 1 cm along the sidelink."""
     half_m, error_m = RX_AHEAD_M / 2, 0.01
     target = np.array([[0.0, 15.0, 0.0]])
     ends = np.array([[-half_m, 0.0, 10.0]]), np.array([[half_m, 0.0, 10.0]])
@@ -243,7 +243,7 @@ SNR_DB = -10.0
 
 
 def swarm_claims(*, pulses: int = 150, seed: int = 1) -> list[Claim]:
-    """Return how a swarm's receivers add up, each corrected by its own sidelink alone, and how pulses are detected."""
+    """Return the gain of a swarm's receivers, each corrected by its own sidelink alone, and the detection of pulses."""
     images = [_receiver(number, pulses, np.random.default_rng([seed, number])) for number in range(1, RECEIVERS + 1)]
     peaks, noises = (np.array([image[part] for image in images]) for part in (0, 1))
     efficiency = float((np.abs(peaks.sum(axis=0)) / np.abs(peaks).sum(axis=0)).min())
@@ -285,7 +285,7 @@ def _places() -> Floats:
 
 
 def trigger_claims(*, pulses: int = 12) -> list[Claim]:
-    """Return what the trigger finds in recordings that ran through, against where the pulses are."""
+    """Compare the pulses that the trigger finds in recordings that ran through with the true ones."""
     with TemporaryDirectory() as folder:
         campaign = Campaign.load(simulate(Path(folder) / "made", preset("continuous", pulses=pulses)))
         nodes = json.loads((campaign.root / "truth.json").read_text(encoding="utf-8"))["flights"]["f01"]["nodes"]

@@ -1,4 +1,4 @@
-"""What the UAV experiment's images add up to: phase, clutter, sidelobes and widths, in the products of the pipeline."""
+"""Fusion of the UAV experiment's images: phase, clutter, sidelobes and widths, in the products of the pipeline."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -76,7 +76,7 @@ def open_images(experiment: Experiment) -> Images:
 
 
 def fusion_claims(folder: Path) -> list[Claim]:
-    """Return what fusing gains and costs in the UAV experiment that lies in a folder of campaigns."""
+    """Return the gain and cost of fusion in the UAV experiment that lies in a folder of campaigns."""
     experiment = open_experiment(folder, "uav")
     images = open_images(experiment)
     return [_phase(experiment), *_widths(images), *_clutter(images), *_sidelobes(images)]

@@ -1,4 +1,4 @@
-"""What each error of the paper does to a range profile and to the peaks, uncorrected."""
+"""Effect of each error of the paper on a range profile and on the peaks, uncorrected."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -43,7 +43,7 @@ class Profile:
 
     @property
     def peak(self) -> int:
-        """Where it is largest."""
+        """Place of its maximum."""
         return int(np.abs(self.values).argmax())
 
     @property
@@ -54,7 +54,7 @@ class Profile:
 
 
 def effect_claims() -> list[Claim]:
-    """Return what timing and carrier phase do to the profile of one target."""
+    """Return the effect of timing and carrier phase on the profile of one target."""
     scene = _one_target()
     still, moved, little, turned = (
         _profile(scene, disturbance)
@@ -186,7 +186,7 @@ class UncorrectedError:
         return reduced_scene(pulses=pulses, subcarriers=self.subcarriers, rx_ahead_m=self.rx_ahead_m, qpsk=qpsk)
 
     def disturbance(self, size: float) -> Disturbance:
-        """Return what goes wrong at one size."""
+        """Return the errors of one size."""
         return self.sweep.disturbance(size, besides=NO_IMPAIRMENTS)
 
 
@@ -265,7 +265,7 @@ def peak_losses_db(error: UncorrectedError, size: float, generator: np.random.Ge
 
 
 def history_of(scene: PaperScene, radar: Complexes, sidelink: Complexes, *, divided: bool) -> PhaseHistory:
-    """Return what is focused: the radar alone, or divided by the sidelink."""
+    """Return the phase history to be focused: the radar alone, or divided by the sidelink."""
     return point_response.phase_history(scene, divide(radar, sidelink) if divided else radar, divided=divided)
 
 

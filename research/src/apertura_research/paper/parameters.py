@@ -179,7 +179,7 @@ STORAGE_MBIT_S = 240.0
 
 
 def _storage() -> list[Claim]:
-    """Return what a node stores, as files of int16 pairs hold what the paper counts as 14 bits, and what it would."""
+    """Return the storage of a node, as files of int16 pairs hold what the paper counts as 14 bits, and by its count."""
     wave = paper_waveform()
     stored = 2 * 16 * wave.capture_samples * float(wave.prf_hz) / 1e6
     counted = 2 * BITS * (wave.symbol_s + wave.cyclic_prefix_s) * wave.sample_rate_hz * float(wave.prf_hz) / 1e6

@@ -1,4 +1,4 @@
-"""What each size of an impairment does to the image under each correction of the sidelink."""
+"""Effect of each size of an impairment on the image under each correction of the sidelink."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -24,7 +24,7 @@ _REACH_M = (0.16, 1.0)
 
 @dataclass(frozen=True)
 class StabilityRow:
-    """What one impairment of one size did to the image under one correction: a row of the CSV.
+    """Effect of one impairment of one size on the image under one correction: a row of the CSV.
 
     Attributes
     ----------
@@ -121,7 +121,7 @@ def _undisturbed(sweep: ImpairmentSweep) -> _Ideal:
 def _draw(
     sweep: ImpairmentSweep, size: float, method: str, ideal: _Ideal, generator: np.random.Generator
 ) -> tuple[_Measured, str]:
-    """Return what is measured of one draw, and the method applied."""
+    """Return the measures of one draw, and the method applied."""
     flown = sweep.flown(size)
     radar, sidelink, observation = receive_pair(flown, sweep.disturbance(size), generator)
     logged = sweep.logged(flown, size, generator)
@@ -135,7 +135,7 @@ def _draw(
 def correct(
     method: str, radar: Complexes, sidelink: Complexes, recorded: NDArray[np.bool_]
 ) -> tuple[NDArray[np.bool_], Complexes, str]:
-    """Return which pulses are kept, their corrected transfer functions, and the method applied.
+    """Return the pulses kept, their corrected transfer functions, and the method applied.
 
     Pulses whose sidelink does not lock are dropped, as the pipeline drops them.
 

@@ -26,7 +26,7 @@ EXPECTED = {
 
 @dataclass(frozen=True)
 class Tolerance:
-    """How much of one impairment one correction tolerates: a row of summary.csv.
+    """Tolerance of one correction to one impairment: a row of summary.csv.
 
     Attributes
     ----------
@@ -48,7 +48,7 @@ class Tolerance:
 
 
 def tolerance_of(outcomes: Sequence[StabilityRow]) -> Tolerance:
-    """Return where the loss of one impairment under one correction passes 1 and 3 dB, or a gain as wrong does."""
+    """Return the sizes at which one impairment under one correction costs 1 and 3 dB, or gains as much wrongly."""
     first, last = outcomes[0], outcomes[-1]
     sizes, losses = (np.array([getattr(one, name) for one in outcomes]) for name in ("size", "loss_db"))
     logarithmic = SWEEPS[first.impairment].logarithmic
@@ -185,7 +185,7 @@ def _draw_tolerances(tolerances: Sequence[Tolerance], path: Path) -> None:
 
 
 def _share(tolerance: Tolerance) -> float:
-    """Return how far along its sweep the impairment gets before the loss passes 1 dB, 0…1."""
+    """Return the share of its sweep that the impairment passes before the loss exceeds 1 dB, 0…1."""
     if np.isnan(tolerance.size_at_1_db):
         return 1.0
     sweep = SWEEPS[tolerance.impairment]

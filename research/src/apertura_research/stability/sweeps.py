@@ -65,7 +65,7 @@ class ImpairmentSweep:
     tagged: bool = False
 
     def disturbance(self, size: float, *, besides: Impairments = ORDINARY) -> Disturbance:
-        """Return what goes wrong at one size, and `besides` in the receiving node."""
+        """Return the errors of one size, and `besides` in the receiving node."""
         receiver = replace(besides, **self.receiver(size))  # type: ignore[arg-type]
         return Disturbance(receiver, self.transmitter(size), self.sampled, self.quantised)
 

@@ -38,7 +38,7 @@ lies somewhere in its antenna."""
 LEAST_FIELD = 0.1
 """Of the strongest pulse: weaker ones do not decide what the phase of a pattern does to a point."""
 
-UNTOLD_DB = 0.2
+UNDETECTABLE_LOSS_DB = 0.2
 """dB that images do not tell of a loss: so much the phase of antenna patterns, or another height, may cost unseen."""
 
 GROUND_STD_M = 3.0
@@ -261,10 +261,10 @@ def attitude_lines(paths: PointPaths, nodes: Sequence[NodeAttitude | None], *, s
         for is_stated in (True, False):
             some = [error(paths, *one) for one in armed if (getattr(one[0], name) is not None) == is_stated]
             if some:
-                said = "; ".join(words for words, _ in some)
+                sizes = "; ".join(words for words, _ in some)
                 effect = paths.of_noise(*(part for _, parts in some for part in parts))
                 lines.append(
-                    BudgetLine(cause, said if is_stated else None, effect, assumed=None if is_stated else said)
+                    BudgetLine(cause, sizes if is_stated else None, effect, assumed=None if is_stated else sizes)
                 )
     return lines
 
@@ -315,10 +315,10 @@ def antenna_line(paths: PointPaths, phase_rad: NDArray[np.float64], weight: NDAr
 
 
 def antenna_flags(lines: Iterable[BudgetLine]) -> Flags:
-    """Return the flag `antenna_phase` where the phase of the patterns costs more than `UNTOLD_DB`."""
+    """Return the flag `antenna_phase` where the phase of the patterns costs more than `UNDETECTABLE_LOSS_DB`."""
     flags = Flags()
     for line in lines:
-        if line.cause == "antenna" and line.effect.loss_db < -UNTOLD_DB:
+        if line.cause == "antenna" and line.effect.loss_db < -UNDETECTABLE_LOSS_DB:
             lost, off = f"{-line.effect.loss_db:.1f} dB", f"{100 * line.effect.shift_m:.2g} cm"
             flags["antenna_phase"] = f"a point loses {lost} and lies {off} off: {line.stated}"
     return flags
@@ -385,11 +385,11 @@ def height_line(paths: PointPaths, std_m: float | None, *, expected_db: float = 
     if std_m is not None:
         return offset_line(paths, "heights", slope, std_m, unit="m", common=True)
     lost_db = -paths.of_offset(_SMALL_M * slope, common=True).loss_db / _SMALL_M**2  # per square metre
-    untold_db = UNTOLD_DB - expected_db
-    shown_m = math.sqrt(untold_db / max(lost_db, 1e-9))
+    undetectable_db = UNDETECTABLE_LOSS_DB - expected_db
+    shown_m = math.sqrt(undetectable_db / max(lost_db, 1e-9))
     taken_m, why = GROUND_STD_M, "along this track no image shows it"
     if shown_m < taken_m:
-        taken_m, why = shown_m, f"more costs {untold_db:.2g} dB, which images show"
+        taken_m, why = shown_m, f"more costs {undetectable_db:.2g} dB, which images show"
     moved = replace(paths.of_offset(taken_m * slope, common=True), loss_db=0.0, loss_std_db=0.0)
     return BudgetLine("heights", None, moved, assumed=f"{taken_m:.2g} m: {why}")
 
