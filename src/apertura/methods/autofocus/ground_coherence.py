@@ -211,8 +211,8 @@ def _product(tile: SpeckleTile, first: Contribution, second: Contribution) -> "c
     """
     from scipy.sparse import csr_array  # slow to import
 
-    # Spatial frequencies k·g of each block, cycles over the tile's sides, (block, 2). The line through the tile that is
-    # normal to one: `across`; frequencies of other blocks are compared along it.
+    # Spatial frequencies k·g of each block, cycles over the tile's sides, (block, 2); `across` is the unit normal of
+    # one, along which those of the other pair are compared with it.
     cycles = [one.wavenumber / (2 * np.pi) * sum(one.slopes.values()) @ tile.sides_m.T for one in (first, second)]
     across = cycles[0][:, ::-1] * [-1, 1] / np.linalg.norm(cycles[0], axis=1, keepdims=True)
     along = np.sum(across * cycles[0], axis=1)[:, None]
