@@ -21,6 +21,7 @@ from apertura.campaign.store import manifest_of
 from apertura.common.atomic import write_text
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
+from apertura.common.units import seconds_since
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.geodesy import frame_from_map
 from apertura.core.imaging.range_profiles import wave_speed_of
@@ -41,9 +42,6 @@ NEAR_S = 5.0
 
 MOST_PULSES = 8192
 """Of a recording, evenly spread: bounds memory; their changes show when the node moved."""
-
-
-_SECOND = np.timedelta64(1, "s")
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,7 +131,7 @@ def unaligned(campaign: Campaign, flight: str, node: str) -> Unaligned:
         np.asarray(history.transfer.values),
         history.frequency.values,
         history.reference_delay.values,
-        _seconds(times, times[0]),
+        seconds_since(times, times[0]),
         speed,
     )
     apart_ns = int((log.track.time.values[0] - times[0]).astype("timedelta64[ns]").astype(np.int64))
@@ -162,12 +160,8 @@ def _logged(log: NodeLog) -> Logged:
         at = began + np.round(at_s * 1e9).astype("timedelta64[ns]")
         return Aperture(log.antenna("radar_tx", at), log.antenna("radar_rx", at))
 
-    first_s, last_s = _seconds(times[[0, -1]], began)
+    first_s, last_s = seconds_since(times[[0, -1]], began)
     return Logged(phase_centres, first_s + 1e-9, last_s - 1e-9)
-
-
-def _seconds(times: NDArray[np.datetime64], began: np.datetime64) -> NDArray[np.float64]:
-    return np.asarray((times - began) / _SECOND, np.float64)
 
 
 def align(

@@ -1,6 +1,6 @@
 """Rules `pictures` and `pictures_fused`: what the report shows of a pair and of the sums of a flight."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -8,27 +8,36 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.gridspec import GridSpec
+from matplotlib.image import AxesImage
+from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 from rasterio import Affine
 
-from apertura.campaign.config import SampledWaveform
+from apertura.campaign.config import FUSED, SampledWaveform
 from apertura.campaign.folder import Campaign
 from apertura.campaign.store import blocks_of_rows, open_stage, record_files
 from apertura.check.times import counted
 from apertura.common.arrays import Floats
 from apertura.common.progress import progress
 from apertura.common.provenance import Provenance
+from apertura.common.raster import opened_raster
 from apertura.common.units import seconds_since
 from apertura.core.backprojection.contributions import block_contributions
 from apertura.core.geometry.geodesy import LOCAL, map_from_frame
 from apertura.core.imaging.range_profiles import aperture_of, profiles_of
+from apertura.formats.export import product
 from apertura.formats.export.coverage import footprint
+from apertura.formats.export.map_layout import number, round_length
+from apertura.formats.export.quicklook import below_peak
+from apertura.stages.agreement import averaged, report_of
 from apertura.stages.coverage import crs_name, few_looks
 from apertura.stages.pair import open_pair
 from apertura.stages.refine import open_refined
-from apertura.stages.scene import OpenScene, open_scene
+from apertura.stages.scene import OpenScene, open_scene, settled_scene
 from apertura.stages.stamping import tags_of
-from apertura.views.report import PICTURES
+from apertura.views.report import PICTURES, SUM_PICTURES
 from apertura.views.report.flight_drawings import (
     FlownGeometry,
     PulseRecord,
@@ -46,7 +55,7 @@ from apertura.views.report.image_drawings import (
     drawn_cuts,
     sidelink_error_rad,
 )
-from apertura.views.report.sheet import thinned
+from apertura.views.report.sheet import GREY, SKY, sheet, thinned
 from apertura.workflow.lineage import result_of
 
 
@@ -219,3 +228,119 @@ class Shown:
                 waterfall.add(part.start, profile.profile[part].values)
                 done(part.stop - part.start)
         return waterfall
+
+
+_RANGE_DB = 40.0
+_COLUMNS = 2
+
+
+def draw_panels(
+    path: Path,
+    powers: Mapping[str, NDArray[np.float64]],
+    *,
+    size_m: tuple[float, float],
+    target_m: tuple[float, float],
+    title: str,
+    tags: Mapping[str, str],
+    local: bool = False,
+) -> None:
+    """Draw images of one scene as a PNG, each in dB below its own peak, all over the same range of dB.
+
+    Parameters
+    ----------
+    path
+        ``….png``; complete or absent.
+    powers
+        What a panel is called → (row, column) float64 mean power, north-up, NaN where nothing was formed.
+    size_m
+        Of the scene, east and north, metres.
+    target_m
+        Brightest target, metres east and north of the lower left corner.
+    title
+        Of the flight.
+    tags
+        Provenance; lies in the file.
+    local
+        Whether the scene has no place on Earth: its axes are x and y.
+    """
+    across, up = ("x", "y") if local else ("east", "north")
+    rows = -(-len(powers) // _COLUMNS)
+    high = 2.75 * min(1.6, max(0.45, size_m[1] / size_m[0]))
+    with sheet(path, 0.5 + rows * (high + 0.45), title=title, tags=tags) as figure:
+        grid = GridSpec(rows, _COLUMNS, figure=figure)
+        drawn = []
+        for place, (name, power) in enumerate(powers.items()):
+            axes = figure.add_subplot(grid[place // _COLUMNS, place % _COLUMNS])
+            drawn.append((axes, _draw(axes, power, size_m)))
+            axes.set_title(f"({'abcdefgh'[place % 8]}) {name}")
+            axes.plot(*target_m, "o", markersize=10, markerfacecolor="none", markeredgecolor=SKY, markeredgewidth=1.2)
+            if place % _COLUMNS == 0:
+                axes.set_ylabel(f"{up} of the corner, m")
+            if place >= len(powers) - _COLUMNS:
+                axes.set_xlabel(f"{across} of the corner, m")
+        _draw_scale(drawn[0][0], size_m, north=not local)
+        bar = figure.colorbar(drawn[0][1], ax=[axes for axes, _ in drawn], extend="both", shrink=0.8, pad=0.02)
+        bar.set_label("power re peak of the panel, dB")
+
+
+def _draw(axes: Axes, power: NDArray[np.float64], size_m: tuple[float, float]) -> AxesImage:
+    decibel, _ = below_peak(power)
+    axes.grid(visible=False)
+    axes.set_facecolor("white")
+    return axes.imshow(
+        np.ma.masked_invalid(decibel),
+        extent=(0, size_m[0], 0, size_m[1]),
+        cmap="inferno",
+        vmin=-_RANGE_DB,
+        vmax=0,
+        interpolation="nearest",
+    )
+
+
+def _draw_scale(axes: Axes, size_m: tuple[float, float], *, north: bool) -> None:
+    metres = round_length(size_m[0] / 4)
+    axes.add_patch(
+        Rectangle((0.05 * size_m[0], 0.05 * size_m[1]), metres, 0.015 * size_m[1], facecolor="white", edgecolor=GREY)
+    )
+    at = 0.05 * size_m[0] + metres / 2, 0.085 * size_m[1]
+    axes.text(*at, f"{number(metres)} m", color="white", ha="center", fontsize=7)
+    if not north:
+        return
+    arrow = {"arrowstyle": "-|>", "color": "white"}
+    axes.annotate("", (0.94, 0.19), (0.94, 0.05), xycoords="axes fraction", arrowprops=arrow)
+    axes.text(0.94, 0.2, "N", transform=axes.transAxes, color="white", ha="center", weight="bold")
+
+
+_DOTS = 480  # of the longer side of a panel
+_MOST_PANELS = 2  # pairs beside their sums
+
+
+def pictures_fused(campaign: Campaign, flight: str) -> Sequence[Path]:
+    """Write the sums of a flight beside its pairs, and cuts through the brightest target; return their paths."""
+    lineage = result_of(campaign, "pictures_fused", flight).begin(campaign.root)
+    written = [campaign.result(flight, FUSED, f"{name}.png") for name in SUM_PICTURES]
+    panels, cuts = written
+    grid, report = settled_scene(campaign).grid, report_of(campaign, flight, FUSED)
+    files = {
+        pair: campaign.result(flight, pair, product("image", "write_power").file)
+        for pair in campaign.flight(flight).pairs[:_MOST_PANELS]
+    }
+    images = [open_stage(campaign.stage("image", flight, pair), "image") for pair in files]
+    for kind in ("coherent", "noncoherent"):
+        files[f"{kind} sum"] = campaign.result(flight, FUSED, product(kind, "write_power").file)
+    powers = {}
+    for name, file in files.items():
+        with opened_raster(file, expected="what step export writes", remedy="Run the workflow again.") as raster:
+            powers[name] = averaged(raster, _DOTS).astype("f8")
+    cube = open_stage(campaign.stage("cube"), "cube")
+    tags = tags_of(Provenance.of(lineage.modules, [*images, cube]), lineage)
+    west, south, east, north = grid.bounds_m
+    brightest = report["brightest"]
+    target_m = brightest["x_m"] - west, brightest["y_m"] - south
+    where: dict[str, Any] = {"size_m": (east - west, north - south), "target_m": target_m, "local": grid.crs == LOCAL}
+    draw_panels(panels, powers, title=f"flight {flight}", tags=tags, **where)
+    coherent = cube.coherent[cube.attrs["flights"].index(flight)]
+    title = f"flight {flight}, coherent sum of {' + '.join(report['fusion']['phases_rad'])}"
+    draw_cuts(cuts, drawn_cuts(coherent, brightest, grid), title=title, tags=tags)
+    record_files(campaign.root / lineage.result.manifest, written, lineage)
+    return written
