@@ -7,6 +7,8 @@ import tomllib
 from functools import cache
 from pathlib import Path
 
+from website.theory_tests import TESTS
+
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = sorted(
     [*ROOT.glob("docs/**/*.md"), ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "config/README.md"]
@@ -70,6 +72,21 @@ def test_every_file_that_a_document_names_is_there():
 def test_every_test_that_a_document_cites_exists():
     written = set(re.findall(r"^\s*def (test_\w+)", "\n".join(map(text_of, ROOT.glob("tests/*.py"))), re.M))
     assert missing(lambda document: set(_TEST.findall(text_of(document))) - written) == {}
+
+
+def test_the_table_of_tests_holds_every_section_of_the_theory_and_no_other():
+    for page, sections in TESTS.items():
+        text = text_of(ROOT / ("docs/theory.md" if page == "theory" else f"docs/theory/{page}.md"))
+        assert re.findall(r"^##? (.+)", text, re.M) == list(sections), page
+        for equations in {label for checked in sections.values() for label in checked} - {""}:
+            for label in equations.split(", "):
+                assert re.search(rf"\({label}\)|eqs?\. {label}\b", text), f"{page}, eq. {label}"
+    assert {path.stem for path in ROOT.glob("docs/theory/*.md")} == {*TESTS, "tests"} - {"theory"}
+
+
+def test_the_theory_names_no_test_in_its_running_text():
+    theory = [ROOT / "docs/theory.md", *ROOT.glob("docs/theory/*.md")]
+    assert [path.name for path in theory if re.search(r"\btest_\w", text_of(path))] == ["tests.md"]
 
 
 def test_every_identifier_that_theory_and_glossary_quote_stands_in_the_code():
