@@ -1,5 +1,6 @@
 """docs/formats.md says what the code reads: every key, column, format and kind, and no other."""
 
+import json
 import re
 from pathlib import Path
 
@@ -18,7 +19,8 @@ from apertura.formats.recordings.sigmf import Capture, Global, SigmfCollection, 
 from apertura.formats.tracks.log_options import LogOptions
 from apertura.formats.tracks.track import FIXES
 
-TEXT = (Path(__file__).parents[1] / "docs/formats.md").read_text(encoding="utf-8")
+ROOT = Path(__file__).parents[1]
+TEXT = (ROOT / "docs/formats.md").read_text(encoding="utf-8")
 
 
 def table(after):
@@ -147,3 +149,30 @@ def test_leap_seconds_and_columns_of_patterns_are_as_told(tmp_path):
     rows = [f"{cut},{angle},0" for cut in ("azimuth", "elevation") for angle in (-9, 0, 9)]
     (tmp_path / "horn.csv").write_text("\n".join([",".join(columns), *rows]) + "\n")
     read_beam_pattern(tmp_path / "horn.csv")
+
+
+def leaves(value, key=""):
+    """Yield the dotted keys of the values of a JSON document, `[]` for each item of a list."""
+    if isinstance(value, dict) and value:
+        for name, each in value.items():
+            yield from leaves(each, f"{key}.{name}" if key else name)
+    elif isinstance(value, list) and value and isinstance(value[0], dict):
+        for each in value:
+            yield from leaves(each, f"{key}[]")
+    else:
+        yield key
+
+
+def test_every_key_of_an_image_json_is_told_and_no_other(finished_tiny):
+    told = {
+        key: re.compile(re.sub(r"<\w+>", r"[^.]+", key.replace(".", r"\.").replace("[]", r"\[\]")))
+        for key in names("## image.json")
+    }
+    files = [finished_tiny.results / f"f01/{image}/image.json" for image in ("uav1-uav1", "uav1-uav2", "fused")]
+    found = {key for path in files for key in leaves(json.loads(path.read_text(encoding="utf-8")))}
+    assert {key for key in found if not any(pattern.fullmatch(key) for pattern in told.values())} == set()
+    code = "\n".join(path.read_text(encoding="utf-8") for path in (ROOT / "src").rglob("*.py"))
+    absent = {key for key, pattern in told.items() if not any(map(pattern.fullmatch, found))}  # of other campaigns
+    written = {re.sub(r"\.<\w+>$", "", key).split(".")[-1] for key in absent}
+    assert {name for name in written if not re.search(rf"\b{re.escape(name)}\b", code)} == set()
+    assert len(absent) < len(told) / 3
