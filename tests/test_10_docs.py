@@ -7,6 +7,7 @@ import tomllib
 from functools import cache
 from pathlib import Path
 
+from apertura.workflow.rules import RESULTS
 from website.theory_tests import TESTS
 
 ROOT = Path(__file__).parents[1]
@@ -25,7 +26,7 @@ _LINK = re.compile(r"\]\(([^)#:]+)\)")
 _TEST = re.compile(r"\btest_\w+(?![\w*]|\.py)")
 _DOTTED = re.compile(r"`((?:apertura|ap)\.[\w.]+(?::\w+)?)(?:\([^`]*)?`")
 _COMMAND = re.compile(r"\bapertura (step |study )?([a-z]+(?:-[a-z]+)*)\b")
-_KEY = re.compile(r"`((?:waveform|nodes|scene|processing|calibration)\.(?!py)[\w.<>]+)`")
+_KEY = re.compile(r"`((?:waveform|nodes|scene|processing|calibration)\.(?!py|json)[\w.<>]+)`")
 
 _CITED = re.compile(r"(docs/[\w/]+\.md)((?:[,;]? (?:and )?(?:eqs?\. [\w]+|\"[^\"]+\"))+)")
 
@@ -144,7 +145,8 @@ def test_every_key_of_the_config_that_a_document_names_exists():
     keys = {key for part in parts for key in part.get("properties", {})} | {"native", "numba", "cuda", "reference"}
 
     def lacking(document):
-        named = {word for key in _KEY.findall(text_of(document)) for word in key.split(".")}
+        config, *_ = text_of(document).split("\n## image.json")  # whose keys are of results
+        named = {word for key in _KEY.findall(config) for word in key.split(".")}
         return {word for word in named if not word.startswith("<")} - keys
 
     assert missing(lacking) == {}
@@ -187,6 +189,18 @@ def test_the_layers_told_to_contributors_are_those_that_imports_are_checked_agai
     for names, (_, packages) in zip([names for names in checked if names - {"cli"}], rows, strict=True):
         for package in re.findall(r"`(\w+)/`", packages):
             assert any((ROOT / "src/apertura" / layer / package).is_dir() for layer in names), package
+
+
+def test_the_page_of_the_data_flow_holds_every_stage_with_its_rules_and_module():
+    text, drawn = text_of(ROOT / "docs/dataflow.md"), text_of(ROOT / "docs/assets/dataflow.svg")
+    rows = [re.findall(r"`([^`]+)`", row) for row in re.findall(r"^\| (`.*)", text.partition("## Stages")[2], re.M)]
+    told = {row[0]: row[1:] for row in rows}
+    assert told.keys() == RESULTS.keys()
+    for result, words in told.items():
+        rule = RESULTS[result]
+        assert {rule.name, rule.module.removeprefix("apertura.stages.")} <= set(words), result
+    boxes = set(re.findall(r'class="stage"[^>]*>(\w+)<', drawn))
+    assert {name for name, rule in RESULTS.items() if not rule.on_demand} - {"bench"} <= boxes <= RESULTS.keys()
 
 
 def test_every_dependency_has_its_reason_among_the_decisions():
