@@ -8,7 +8,7 @@ _HEAD = """# Flags
 
 A flag says that a limit of a method was crossed, and what was measured; it stops no run. It stands in `image.json`,
 `image.attrs["flags"]`, the tag `APERTURA_FLAGS`, below quicklooks and in `apertura summary`. Here: *what was measured*;
-what it means → what to look at first. Limits: [theory](theory.md). Written by `make pages`.
+what it means → what to look at first. All limits on one page: [limitations](limitations.md). Written by `make pages`.
 
 """
 
