@@ -37,7 +37,10 @@ AIM_BYTES, MOST_BYTES = 40_000, 60_000
 WIDTHS, COLOURS = (660, 600, 560), (64, 32, 20)
 """Dots of a picture and its colours: the first that keep to what is aimed at, else the smallest."""
 
-WITHOUT = {"raw_imu": "its recipe runs a library that apertura does not install, and ends in a log"}
+WITHOUT = {
+    "raw_imu": "its recipe runs a library that apertura does not install, and ends in a log",
+    "sizing": "its tables of estimates are all it has",
+}
 """How-to that shows nothing → why."""
 
 Made = Path | Figure

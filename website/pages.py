@@ -7,6 +7,7 @@ from apertura.campaign.config.template import config_schema, config_template, fl
 from website.api import api_page
 from website.cli import cli_page
 from website.flags import flags_page
+from website.sizing import sizing_page
 from website.theory_tests import theory_tests_page
 
 ROOT = Path(__file__).parents[1]
@@ -18,6 +19,7 @@ PAGES: dict[str, Callable[[], str]] = {
     "docs/api.md": api_page,
     "docs/cli.md": cli_page,
     "docs/flags.md": flags_page,
+    "docs/howto/sizing.md": sizing_page,
     "docs/theory/tests.md": theory_tests_page,
 }
 """File → what it must hold."""
