@@ -164,9 +164,10 @@ def leaves(value, key=""):
 
 
 def test_every_key_of_an_image_json_is_told_and_no_other(finished_tiny):
+    rows = re.findall(r"^\| (`[^|]*) \|", TEXT.partition("\n## image.json")[2], re.M)
     told = {
-        key: re.compile(re.sub(r"<\w+>", r"[^.]+", key.replace(".", r"\.").replace("[]", r"\[\]")))
-        for key in names("## image.json")
+        key: re.compile(re.sub(r"<\w+>", r"[^.]+", re.sub(r"([.\[\]])", r"\\\1", key)) + r"(\.[^.]+)?")  # or a map
+        for key in re.findall(r"`([^`]+)`", " ".join(rows))
     }
     files = [finished_tiny.results / f"f01/{image}/image.json" for image in ("uav1-uav1", "uav1-uav2", "fused")]
     found = {key for path in files for key in leaves(json.loads(path.read_text(encoding="utf-8")))}

@@ -26,8 +26,8 @@ two pairs are imaged. Captures are those of `apertura simulate --preset flight` 
 channel, 1024 subcarriers); pixels are {_SPACING_M:g} m wide. All numbers of this table are **estimates**, those
 that the workflow itself uses. `apertura plan CAMPAIGN` estimates the images of your own campaign.
 
-| pulses | pixels | recordings | time | memory, `image` | memory, `refine` | memory, other steps | results |
-|---|---|---|---|---|---|---|---|
+| pulses | pixels | recordings | time | memory: `image` | `refine` | results |
+|---|---|---|---|---|---|---|
 """
 
 _TAIL = f"""
@@ -36,8 +36,8 @@ _TAIL = f"""
   AVX-512 (`cost` of each rule in `src/apertura/workflow/rules.py`), with refinement of the tracks. The time of an image
   depends on its plan, by a factor of up to 18 ([growth](../theory/growth.md)).
 - **Memory**: what a job requests from a cluster (`demand` of each rule), an upper limit; a job that exceeds it is
-  submitted again with twice as much. A test compares requests with the memory that small campaigns use: no less, and
-  at most four times as much.
+  submitted again with twice as much. Other steps request less than 2 GB. A test compares requests with the memory that
+  small campaigns use: no less, and at most four times as much.
 - **Results**: {PIXEL_BYTES} bytes per pixel and pair for images, cube and rasters, and 8 bytes per sample of range
   profiles; an upper limit, since arrays are compressed. `processing: {{keep: [echo]}}` adds 8 KB per pulse and pair.
 
@@ -72,29 +72,15 @@ def _estimated(pulses: int, side: int) -> str:
     settings = campaign.settings.model_copy(update={"waveform": waveform, "scene": scene})
     recorded = {("f01", node): (4 * _CAPTURE * pulses * count, pulses) for node, count in _CHANNELS.items()}
     resources = Resources(replace(campaign, settings=settings), recorded)
-    seconds, memory = 0.0, {"other": 0.0}
-    for name, rule in RULES.items():
-        if rule.on_demand or rule.shares:
-            continue
-        for where in places(campaign, rule):
-            wildcards = SimpleNamespace(**dict(zip(rule.of.wildcards, where, strict=True)))
-            seconds += resources.expected_seconds(name, *where)
-            step = name if name in {"image", "refine"} else "other"
-            memory[step] = max(memory.get(step, 0.0), 1e6 * resources[name].mem_mb(wildcards, 1))
-    work, pairs = resources.work("f01", "uav1-uav2", None), len(campaign.flight("f01").pairs)
-    sizes = [
-        memory["image"],
-        memory["refine"],
-        memory["other"],
-        pairs * (work.profile_bytes + PIXEL_BYTES * work.pixels),
-    ]
-    cells = [
-        f"{pulses:,}",
-        f"{side} × {side}",
-        _gb(sum(size for size, _ in recorded.values())),
-        f"{seconds / 60:.1f} min",
-    ]
-    return f"| {' | '.join([*cells, *map(_gb, sizes)])} |\n"
+    rules = [(name, rule) for name, rule in RULES.items() if not rule.on_demand and not rule.shares]
+    seconds = sum(resources.expected_seconds(name, *where) for name, rule in rules for where in places(campaign, rule))
+    job = SimpleNamespace(flight="f01", pair="uav1-uav2")
+    memory = [1e6 * resources[name].mem_mb(job, 1) for name in ("image", "refine")]
+    work, pairs = resources.work(job.flight, job.pair, None), len(campaign.flight(job.flight).pairs)
+    disk = pairs * (work.profile_bytes + PIXEL_BYTES * work.pixels)
+    samples = sum(size for size, _ in recorded.values())
+    cells = [f"{pulses:,}", f"{side}²", _gb(samples), f"{seconds / 60:.1f} min", *map(_gb, [*memory, disk])]
+    return f"| {' | '.join(cells)} |\n"
 
 
 def _measured() -> list[str]:
@@ -103,7 +89,7 @@ def _measured() -> list[str]:
         if (row["geometry"], row.get("surface"), row.get("aim_db")) == ("bistatic", "flat", -60):
             taken.setdefault((row["size"], row["pulses"]), {})[row["name"]] = f"{row['seconds_from_echoes']:.3g} s"
     return [
-        f"| {size} × {size} | {pulses:,} | {by['tree']} | {by.get('native', 'not measured')} |\n"
+        f"| {size}² | {pulses:,} | {by['tree']} | {by.get('native', 'not measured')} |\n"
         for (size, pulses), by in sorted(taken.items())
         if "tree" in by
     ]
