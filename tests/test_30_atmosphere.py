@@ -182,9 +182,9 @@ def test_profiles_are_of_one_speed_and_no_wave_is_faster_than_light():
 
 
 def test_echoes_over_longer_paths_are_longer_by_that_in_air():
-    aperture, further_m = flight(), np.full(96, 1.7)
+    aperture, extra_path_m = flight(), np.full(96, 1.7)
     given = history(aperture, AIR, wave_speed_m_s=SPEED_OF_LIGHT_M_S / AIR)
-    longer_s = given.moved(aperture, further_m).reference_delay_s - given.reference_delay_s
+    longer_s = given.moved(aperture, extra_path_m).reference_delay_s - given.reference_delay_s
     np.testing.assert_allclose(longer_s, 1.7 * AIR / SPEED_OF_LIGHT_M_S, rtol=1e-12)
 
 

@@ -173,11 +173,11 @@ def test_one_phase_mends_a_far_scene_and_leaves_it_in_place(method, pair):
 def test_offsets_hold_neither_a_constant_nor_a_shift_along_the_track():
     record, _ = seen(FAR, FAR_POINTS_M)
     found = refine_one_phase([record], patches_at(FAR_POINTS_M, 5.0, 0.8), FAR_ERRORS, method="minimum_entropy")
-    further_m = found.correction.further_m["a-a"]
+    extra_path_m = found.correction.extra_path_m["a-a"]
     along = np.interp(found.correction.time_s, FAR[0], record.profiles.aperture.path_gradient(np.zeros(3))[:, 0])
-    assert np.std(further_m) > 0.01
-    assert abs(further_m.mean()) < 1e-9
-    assert abs(np.corrcoef(along, further_m)[0, 1]) < 1e-3
+    assert np.std(extra_path_m) > 0.01
+    assert abs(extra_path_m.mean()) < 1e-9
+    assert abs(np.corrcoef(along, extra_path_m)[0, 1]) < 1e-3
 
 
 def test_one_phase_does_not_mend_a_near_scene():
@@ -223,4 +223,4 @@ def test_without_a_bright_place_there_is_nothing_to_judge_by():
     record, _ = seen(FAR, FAR_POINTS_M[:3])
     found = refine_one_phase([record], Candidates([], 0, np.eye(3)), FAR_ERRORS, method="phase_gradient")
     assert list(found.flags) == ["refinement_no_bright_place"]
-    assert not found.correction.further_m
+    assert not found.correction.extra_path_m

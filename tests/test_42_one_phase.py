@@ -103,12 +103,12 @@ def test_what_was_found_is_what_images_use(campaigns):
     assert track.stage.attrs["pairs"] == list(PAIRS)
     assert not track.stage.correction.values.any()
     for pair, profiles in pairs.items():
-        further_m = found.correction.longer_m(pair.name, clock_s(pair, given.began), pair.sidelink_m)
+        extra_path_m = found.correction.longer_m(pair.name, clock_s(pair, given.began), pair.sidelink_m)
         imaged, moved = track.pair(pair), track.profiles(pair, profiles)
-        assert np.std(further_m) > 0.01
-        np.testing.assert_allclose(moved.start_m - profiles.start_m, further_m, atol=1e-8)
+        assert np.std(extra_path_m) > 0.01
+        np.testing.assert_allclose(moved.start_m - profiles.start_m, extra_path_m, atol=1e-8)
         delayed_s = imaged.history.reference_delay_s - pair.history.reference_delay_s
-        np.testing.assert_allclose(pair.history.wave_speed_m_s * delayed_s, further_m, atol=1e-8)
+        np.testing.assert_allclose(pair.history.wave_speed_m_s * delayed_s, extra_path_m, atol=1e-8)
         np.testing.assert_array_equal(imaged.aperture.tx_m, pair.aperture.tx_m)
 
 

@@ -153,8 +153,8 @@ class RefinedTrack:
         if not stage.attrs["accepted"] or not len(time):
             return cls(stage, None, np.datetime64(0, "ns"))
         moved_m = dict(zip(nodes, stage.correction.values, strict=True))
-        further_m = dict(zip(stage.attrs["pairs"], stage.further.values, strict=True))
-        return cls(stage, TrackCorrection(_seconds(time - time[0]), moved_m, further_m), time[0])
+        extra_path_m = dict(zip(stage.attrs["pairs"], stage.further.values, strict=True))
+        return cls(stage, TrackCorrection(_seconds(time - time[0]), moved_m, extra_path_m), time[0])
 
     @property
     def decisions(self) -> tuple[Decision, ...]:
@@ -180,8 +180,8 @@ class RefinedTrack:
         """Return an open pair as images are formed from it; its errors are those that the refinement leaves."""
         if self.correction is None:
             return logged
-        aperture, further_m = self._moved(self.correction, logged)
-        history = None if logged.history is None else logged.history.moved(aperture, further_m)
+        aperture, extra_path_m = self._moved(self.correction, logged)
+        history = None if logged.history is None else logged.history.moved(aperture, extra_path_m)
         left = self.stage.attrs["left"]
         return replace(logged, aperture=aperture, history=history, left=Effect(**left) if left else None)
 
@@ -215,7 +215,7 @@ class RefinedTrack:
             last, and everywhere if no track was moved.
         """
         left_m, nodes = np.full((len(at), 3), np.nan), self.stage.attrs["nodes"]
-        if self.correction is None or self.correction.further_m or node not in nodes:
+        if self.correction is None or self.correction.extra_path_m or node not in nodes:
             return left_m
         knots_s, at_s = self.correction.time_s, _seconds(at - self.began)
         inside = (at_s >= knots_s[0]) & (at_s <= knots_s[-1])
@@ -255,8 +255,8 @@ def clock_s(pair: OpenPair, began: np.datetime64) -> NDArray[np.float64]:
 
 def _sizes_cm(correction: TrackCorrection, pair: str) -> dict[str, Any]:
     """Return how far the nodes of a pair were moved, or by how much its echoes lie further, rms."""
-    if pair in correction.further_m:
-        return {"further_rms_cm": _rms_cm(correction.further_m[pair][:, None])}
+    if pair in correction.extra_path_m:
+        return {"further_rms_cm": _rms_cm(correction.extra_path_m[pair][:, None])}
     nodes = dict.fromkeys(pair.split("-"))
     return {"rms_cm": {node: _rms_cm(correction.moved_m[node]) for node in nodes if node in correction.moved_m}}
 

@@ -77,7 +77,7 @@ def outcome_of(found: RefinedTrack) -> str:
     why = f"autofocus {decided.value}: {decided.reason}"
     if found.correction is None:
         return f"as logged: {why}"
-    if found.correction.further_m:
+    if found.correction.extra_path_m:
         return f"as logged: one path offset per pulse and pair was refined, which moves no node; {why}"
     return f"refined: {why}"
 

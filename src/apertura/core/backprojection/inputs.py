@@ -137,12 +137,12 @@ class PhaseHistory:
             aperture=self.aperture[pulses],
         )
 
-    def moved(self, aperture: Aperture, further_m: NDArray[np.float64]) -> "PhaseHistory":
-        """Return the same echoes with other phase centres and with paths longer by `further_m`.
+    def moved(self, aperture: Aperture, extra_path_m: NDArray[np.float64]) -> "PhaseHistory":
+        """Return the same echoes with other phase centres and with paths longer by `extra_path_m`.
 
         As `Profiles.moved`.
         """
-        delay_s = self.reference_delay_s + further_m / self.wave_speed_m_s
+        delay_s = self.reference_delay_s + extra_path_m / self.wave_speed_m_s
         return replace(self, reference_delay_s=delay_s, aperture=aperture)
 
     def at_speed(self, wave_speed_m_s: float) -> "PhaseHistory":
@@ -247,14 +247,14 @@ class Profiles:
             raise ValueError("phase centres and starts of the profiles must be finite")
         return np.ascontiguousarray(self.samples, np.complex64), start_m, places
 
-    def moved(self, aperture: Aperture, further_m: NDArray[np.float64]) -> "Profiles":
-        """Return the same echoes with other phase centres and with paths longer by `further_m`.
+    def moved(self, aperture: Aperture, extra_path_m: NDArray[np.float64]) -> "Profiles":
+        """Return the same echoes with other phase centres and with paths longer by `extra_path_m`.
 
         Parameters
         ----------
         aperture
             Of as many pulses.
-        further_m
+        extra_path_m
             (pulse,) float64, metres by which the measured path of every echo of a pulse grows.
 
         Notes
@@ -262,12 +262,12 @@ class Profiles:
         Source: docs/theory/autofocus.md, eq. 3: an echo at path R lies at R + ∆ and has the phase of R + ∆.
         """
         rotated = (
-            PhaseRotated(self.samples, np.exp(-1j * self.wavenumber_rad_m * further_m))
-            if np.any(further_m)
+            PhaseRotated(self.samples, np.exp(-1j * self.wavenumber_rad_m * extra_path_m))
+            if np.any(extra_path_m)
             else self.samples
         )
         samples = cast("NDArray[np.complex64]", rotated)
-        return replace(self, samples=samples, start_m=self.start_m + further_m, aperture=aperture)
+        return replace(self, samples=samples, start_m=self.start_m + extra_path_m, aperture=aperture)
 
     def at_speed(self, wave_speed_m_s: float) -> "Profiles":
         """Return the same delays as those of a wave of another speed, m/s."""

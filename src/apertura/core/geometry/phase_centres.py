@@ -29,7 +29,7 @@ class TrackCorrection:
         constant.
     moved_m
         Node → (knot, 3) float64, metres to be added to each of its points, in the frame of the phase centres.
-    further_m
+    extra_path_m
         Pair → (knot,) float64, metres of total path added to all its echoes, whatever its nodes' positions; none for
         a pair that is not named.
 
@@ -42,7 +42,7 @@ class TrackCorrection:
 
     time_s: NDArray[np.float64]
     moved_m: Mapping[str, NDArray[np.float64]]
-    further_m: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
+    extra_path_m: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
 
     def at(self, node: str, time_s: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the correction of a node's positions at some times, (pulse, 3) float64, metres."""
@@ -54,7 +54,7 @@ class TrackCorrection:
     def with_further(self, later: "TrackCorrection") -> "TrackCorrection":
         """Return this and a correction, at the same knots, of tracks that it corrected."""
         moved_m = {node: self.moved_m.get(node, 0.0) + moved for node, moved in later.moved_m.items()}
-        return TrackCorrection(self.time_s, {**self.moved_m, **moved_m}, {**self.further_m, **later.further_m})
+        return TrackCorrection(self.time_s, {**self.moved_m, **moved_m}, {**self.extra_path_m, **later.extra_path_m})
 
     def aperture(self, logged: Aperture, pair: str, time_s: NDArray[np.float64]) -> Aperture:
         """Return the phase centres of a pair, transmitter-receiver, as corrected at the times of its pulses."""
@@ -92,13 +92,13 @@ class TrackCorrection:
         >>> wider.longer_m("a-b", np.zeros(1), apart), wider.longer_m("a-a", np.zeros(1), None)
         (array([0.6]), array([0.]))
         """
-        own = self.further_m.get(pair)
-        further_m = np.zeros(len(time_s)) if own is None else np.interp(time_s, self.time_s, own)
+        own = self.extra_path_m.get(pair)
+        extra_path_m = np.zeros(len(time_s)) if own is None else np.interp(time_s, self.time_s, own)
         if between_m is None:
-            return further_m
+            return extra_path_m
         tx, rx = pair.split("-")
         corrected = between_m + self.at(tx, time_s) - self.at(rx, time_s)
-        return np.asarray(further_m + np.linalg.norm(corrected, axis=1) - np.linalg.norm(between_m, axis=1))
+        return np.asarray(extra_path_m + np.linalg.norm(corrected, axis=1) - np.linalg.norm(between_m, axis=1))
 
 
 # ---- Positions and attitude from a logged track

@@ -45,8 +45,8 @@ def gradient(
     Returns
     -------
     Gradient
-        `tx_m` and `rx_m`, (pulse, 3), and `path_m`, (pulse,): J's unit per metre. Path: by how much all echoes of a
-        pulse lie further (`Profiles.moved`).
+        `tx_m` and `rx_m`, (pulse, 3), and `path_m`, (pulse,): J's unit per metre. Path: one added to all echoes of a
+        pulse (`Profiles.moved`).
 
     Raises
     ------

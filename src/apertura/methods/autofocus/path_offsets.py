@@ -63,7 +63,7 @@ def refine_one_phase(
     correction = TrackCorrection(
         knots_s,
         {node: np.zeros((len(knots_s), 3)) for node in errors},
-        {fit.pair: np.interp(knots_s, fit.time_s, fit.further_m) for fit in fits},
+        {fit.pair: np.interp(knots_s, fit.time_s, fit.extra_path_m) for fit in fits},
     )
     std_m = {node: np.tile(one.along(found.axes), (len(knots_s), 1)) for node, one in errors.items()}
     report = {
@@ -85,7 +85,7 @@ class _Fit:
     ----------
     pair
         Its name.
-    time_s, further_m
+    time_s, extra_path_m
         (block,) float64, seconds of the flight's clock and metres; between blocks offsets are linear.
     gain_db
         (patch,) float64, of contrast, while the patch was not fitted.
@@ -95,7 +95,7 @@ class _Fit:
 
     pair: str
     time_s: Floats
-    further_m: Floats
+    extra_path_m: Floats
     gain_db: Floats
     left_rad2: float
 
