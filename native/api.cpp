@@ -20,6 +20,7 @@ using apertura::Patch;
   extern "C" void apertura_terms_##isa(const TermsJob*);                                          \
   extern "C" void apertura_rest_tree_##isa(TreeJob*);                                             \
   extern "C" void apertura_weigh_tree_##isa(TreeJob*);                                            \
+  extern "C" void apertura_view_tree_##isa(TreeJob*);                                             \
   extern "C" void apertura_plan_tree_##isa(TreeJob*);                                             \
   extern "C" void apertura_form_tree_##isa(TreeJob*);
 
@@ -42,6 +43,7 @@ struct Isa {
   void (*terms)(const TermsJob*);
   void (*rest_tree)(TreeJob*);
   void (*weigh_tree)(TreeJob*);
+  void (*view_tree)(TreeJob*);
   void (*plan_tree)(TreeJob*);
   void (*form_tree)(TreeJob*);
 };
@@ -57,14 +59,15 @@ const Isa* find(const char* name) {
 #ifdef APERTURA_X86
       {"avx512", has_avx512, apertura_add_avx512, apertura_expand_avx512, apertura_contribute_avx512,
        apertura_differentiate_avx512, apertura_terms_avx512, apertura_rest_tree_avx512, apertura_weigh_tree_avx512,
-       apertura_plan_tree_avx512, apertura_form_tree_avx512},
+       apertura_view_tree_avx512, apertura_plan_tree_avx512, apertura_form_tree_avx512},
       {"avx2", has_avx2, apertura_add_avx2, apertura_expand_avx2, apertura_contribute_avx2, apertura_differentiate_avx2,
-       apertura_terms_avx2, apertura_rest_tree_avx2, apertura_weigh_tree_avx2, apertura_plan_tree_avx2,
-       apertura_form_tree_avx2},
+       apertura_terms_avx2, apertura_rest_tree_avx2, apertura_weigh_tree_avx2, apertura_view_tree_avx2,
+       apertura_plan_tree_avx2, apertura_form_tree_avx2},
 #endif
       {"portable", true, apertura_add_portable, apertura_expand_portable, apertura_contribute_portable,
        apertura_differentiate_portable, apertura_terms_portable, apertura_rest_tree_portable,
-       apertura_weigh_tree_portable, apertura_plan_tree_portable, apertura_form_tree_portable},
+       apertura_weigh_tree_portable, apertura_view_tree_portable, apertura_plan_tree_portable,
+       apertura_form_tree_portable},
   };
   for (const Isa& isa : isas)
     if (isa.runs && (!*name || std::strcmp(name, isa.name) == 0)) return &isa;
@@ -175,6 +178,10 @@ __attribute__((visibility("default"))) int apertura_rest_tree(const char* name, 
 
 __attribute__((visibility("default"))) int apertura_weigh_tree(const char* name, TreeJob* job) {
   return run(name, [job](const Isa& isa) { isa.weigh_tree(job); });
+}
+
+__attribute__((visibility("default"))) int apertura_view_tree(const char* name, TreeJob* job) {
+  return run(name, [job](const Isa& isa) { isa.view_tree(job); });
 }
 
 __attribute__((visibility("default"))) int apertura_plan_tree(const char* name, TreeJob* job) {

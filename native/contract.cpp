@@ -106,14 +106,18 @@ constexpr Field kFields[] = {
     APERTURA_FIELD(TreeTile, pixels),
     APERTURA_FIELD(TreeTile, image),
     APERTURA_FIELD(TreeTile, weight),
-    APERTURA_FIELD(TreeTile, way),
+    APERTURA_FIELD(TreeTile, variant),
     APERTURA_FIELD(TreeTile, nodes),
-    APERTURA_FIELD(TreeTile, fewer),
+    APERTURA_FIELD(TreeTile, n_virtual_pulses),
     APERTURA_FIELD(TreeTile, edge),
     APERTURA_FIELD(TreeTile, slope),
+    APERTURA_FIELD(TreeTile, band),
+    APERTURA_FIELD(TreeTile, turn),
     APERTURA_FIELD(TreeTile, centre),
     APERTURA_FIELD(TreeTile, rest),
     APERTURA_FIELD(TreeTile, first_path),
+    APERTURA_FIELD(TreeTile, span),
+    APERTURA_FIELD(TreeTile, slope_rms),
     APERTURA_FIELD(TreeTile, degree),
     APERTURA_FIELD(TreeTile, rows),
     APERTURA_FIELD(TreeTile, columns),
@@ -126,8 +130,8 @@ constexpr Field kFields[] = {
     APERTURA_FIELD(TreeJob, start),
     APERTURA_FIELD(TreeJob, transmitter),
     APERTURA_FIELD(TreeJob, receiver),
-    APERTURA_FIELD(TreeJob, stray),
-    APERTURA_FIELD(TreeJob, rough),
+    APERTURA_FIELD(TreeJob, max_track_residual),
+    APERTURA_FIELD(TreeJob, rms_track_residual),
     APERTURA_FIELD(TreeJob, track),
     APERTURA_FIELD(TreeJob, taps),
     APERTURA_FIELD(TreeJob, delay),
@@ -150,10 +154,11 @@ constexpr Field kFields[] = {
     APERTURA_FIELD(TreeJob, taps_count),
     APERTURA_FIELD(TreeJob, delay_terms),
     APERTURA_FIELD(TreeJob, sizes),
+    APERTURA_FIELD(TreeJob, curve_degrees),
     APERTURA_FIELD(TreeJob, step),
     APERTURA_FIELD(TreeJob, wavenumber),
     APERTURA_FIELD(TreeJob, band),
-    APERTURA_FIELD(TreeJob, smooth),
+    APERTURA_FIELD(TreeJob, presum_error),
     APERTURA_FIELD(TreeJob, node_error),
     APERTURA_FIELD(TreeJob, beam),
     APERTURA_FIELD(TreeJob, sector),
@@ -183,6 +188,18 @@ constexpr Constant kConstants[] = {
     {"weight_change", apertura::kWeightChange},
     {"weight_curvature", apertura::kWeightCurvature},
     {"sector_bend", apertura::kSectorBend},
+    {"tree_nodes", apertura::kTreeNodes},
+    {"tree_side", apertura::kTreeSide},
+    {"tree_levels", apertura::kTreeLevels},
+    {"tree_slots", apertura::kTreeSlots},
+    {"tree_leaf", apertura::kTreeGroup},
+    {"tree_virtual", apertura::kTreeMostVirtual},
+    {"tree_virtual_margin", apertura::kTreeVirtualMargin},
+    {"tree_terms", apertura::kTreeTerms},
+    {"tree_degree", apertura::kTreeDegree},
+    {"tree_delays", apertura::kTreeDelays},
+    {"tree_weights", apertura::kTreeWeights},
+    {"tree_weighted_rad", apertura::kTreeWeighted},
 };
 
 }  // namespace
@@ -200,7 +217,7 @@ __attribute__((visibility("default"))) const char* apertura_layout() {
   return lines.c_str();
 }
 
-// One line for each constant of bounds.hpp, "name value".
+// One line for each constant of bounds.hpp and tree_job.hpp that Python has, too: "name value".
 __attribute__((visibility("default"))) const char* apertura_constants() {
   static const std::string lines = [] {
     std::string text;

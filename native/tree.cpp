@@ -39,7 +39,7 @@ void climb(const TreeJob& job, TileState& state, int64_t begin, int64_t end, boo
   }
 }
 
-// Sums one leaf of every tile at its nodes: by fewer pulses where they stand for all of them.
+// Sums one leaf of every tile at its nodes: by virtual pulses where the plan has them, else pulse by pulse.
 template <class Phase>
 void sum_leaves(const TreeJob& job, std::vector<std::unique_ptr<TileState>>& states, int64_t begin, int64_t end,
                 Work& work) {
@@ -47,15 +47,15 @@ void sum_leaves(const TreeJob& job, std::vector<std::unique_ptr<TileState>>& sta
   for (auto& state : states) {
     const TreeTile& tile = state->tile;
     const int64_t number = begin / job.sizes[0];
-    if (tile.way[number] != apertura::kByTree) continue;
+    if (tile.variant[number] != apertura::kByTree) continue;
     state->leaf = &leaf_of(job, *state, tile.nodes[2 * number], tile.nodes[2 * number + 1]);
     for (Floats* plane : {&state->re, &state->im}) plane->assign(size_t(state->leaf->at.count + kLanes), 0.0f);
-    if (!tile.fewer[number])
+    if (!tile.n_virtual_pulses[number])
       plain.push_back(state.get());
     else if (job.mono)
-      sum_fewer<Phase, true>(job, *state, *state->leaf, begin, work.leaf);
+      sum_virtual_pulses<Phase, true>(job, *state, *state->leaf, begin, work.leaf);
     else
-      sum_fewer<Phase, false>(job, *state, *state->leaf, begin, work.leaf);
+      sum_virtual_pulses<Phase, false>(job, *state, *state->leaf, begin, work.leaf);
   }
   if (!plain.empty()) sum_each<Phase>(job, plain, begin, end, work.rows);
 }
@@ -71,7 +71,7 @@ void form(const TreeJob& job) {
     const int64_t end = std::min(begin + job.sizes[0], job.pulses);
     sum_leaves<Phase>(job, states, begin, end, work);
     for (auto& state : states) {
-      const bool taken = state->tile.way[begin / job.sizes[0]] == apertura::kByTree;
+      const bool taken = state->tile.variant[begin / job.sizes[0]] == apertura::kByTree;
       if (taken)
         take_reference_off(job, *state, *state->leaf, apertura::middle_of(job, begin, job.sizes[0]),
                            pair_stride(state->leaf->columns), work.leaf);
@@ -82,15 +82,15 @@ void form(const TreeJob& job) {
 
 }  // namespace
 
-// Fills `top`, `way`, `nodes`, `fewer`, the samples of the tiles, and what their weights are.
+// Fills `top`, `variant`, `nodes`, `n_virtual_pulses`, `first_path`, `samples` and the weights of the tiles.
 extern "C" void APERTURA_JOIN(apertura_plan_tree_, APERTURA_ISA)(TreeJob* job) {
   for (int64_t n = 0; n < job->count; n++) plan_tile(*job, job->tiles[n]);
 }
 
-// Fills `way`, `edge`, `slope`, `weight` and, where pulses must go each for itself, `fewer` of the tiles by their
-// weights alone.
+// Fills `variant`, `edge`, `slope`, `weight` of the tiles by their weights alone; `n_virtual_pulses` is 1 where these
+// jump from pulse to pulse.
 extern "C" void APERTURA_JOIN(apertura_weigh_tree_, APERTURA_ISA)(TreeJob* job) {
-  for (int64_t n = 0; n < job->count; n++) weigh_leaves(*job, job->tiles[n], seen_of(*job, job->tiles[n]));
+  for (int64_t n = 0; n < job->count; n++) weigh_leaves(*job, job->tiles[n], lattice_of(*job, job->tiles[n]));
 }
 
 // Fills `rest` of the tiles.

@@ -1,5 +1,5 @@
-// The leaves of a tree: neighbouring pulses made fewer for one tile, and summed at its nodes. docs/theory/tree.md,
-// "Leaves"; equation numbers in brackets are its.
+// The leaves of a tree: pulses presummed to fewer virtual pulses for one tile, and summed at its nodes.
+// docs/theory/tree.md, "Leaves"; equation numbers in brackets are its.
 #pragma once
 #include <algorithm>
 #include <cmath>
@@ -19,7 +19,7 @@ constexpr int64_t kCells = kLanes / kRecord;  // that a vector holds
 
 // What leaves are computed in. Lines are rows of pairs: samples of the pulses over one tile, aligned to its centre.
 struct LeafScratch {
-  Floats taken, lines, fewer, cells, pairs, gain, along_xi[2], along_eta[2];
+  Floats taken, lines, virtual_lines, cells, pairs, gain, along_xi[2], along_eta[2];
 };
 
 // Cells of a pulse about a tile: that at the path of its centre, how far the path lies beyond it, and where they end.
@@ -109,10 +109,10 @@ inline void add_pulse(const TreeJob& job, const LeafNodes& leaf, const Legs& leg
   const Phase phase(job.phase_coefficients);
   const int64_t count = leaf.at.count;
   for (int64_t n = 0; n < count; n += kLanes) {
-    const Lanes further =
+    const Lanes extra_path =
         path<kMono>(legs, load(x + n), load(x + count + n), load(x + 2 * count + n), load(x + 3 * count + n));
     // Held inside the row, whatever the path: no look-up leaves it.
-    const Lanes t = smaller(larger(further * scale + cells.offset, low), high), rounded = t + kRounder;
+    const Lanes t = smaller(larger(extra_path * scale + cells.offset, low), high), rounded = t + kRounder;
     const Lanes u = t - (rounded - kRounder);
     alignas(64) int32_t at[kLanes];
     *reinterpret_cast<IntLanes*>(at) = ((IntLanes)rounded - (IntLanes)splat(kRounder)) * int32_t(kRecord);
@@ -172,18 +172,19 @@ struct Between {
   }
 };
 
-// The pulses that stand for those of a leaf: phase centres on a smooth curve through its own, and their weights.
-struct Virtual {
+// A virtual pulse of a leaf: its phase centres on a smooth curve through those of the leaf, and its weights.
+struct VirtualPulse {
   Look look;
   float weight[kTreeWeights];
 };
 
-// Number n of so many. Of all curves that they hold, the one of highest degree follows the track most closely.
-inline Virtual virtual_pulse(const TreeJob& job, const TreeTile& tile, int64_t begin, int64_t fewer, int64_t n) {
-  Virtual out{};
-  const double *curve = job.curve[fewer] + n * kTreeTerms,
+// Number n of `count`. Of all curves that so many support, the one of highest degree follows the track most closely.
+inline VirtualPulse virtual_pulse(const TreeJob& job, const TreeTile& tile, int64_t begin, int64_t count, int64_t n) {
+  VirtualPulse out{};
+  // b_v of (8) at v: phase centres from the polynomials of the leaf's track.
+  const double *curve = job.curve[count] + n * kTreeTerms,
                *track = job.track + begin / apertura::kTreeGroup * 6 * kTreeTerms;
-  const int64_t terms = std::min(kTreeTerms, fewer - apertura::kTreeMore + 1);
+  const int64_t terms = std::min(kTreeTerms, count - apertura::kTreeVirtualMargin + 1);
   double antenna[2][3] = {};
   for (int64_t leg = 0; leg < 2; leg++, track += 3 * kTreeTerms)
     for (int64_t term = 0; term < terms; term++)
@@ -191,7 +192,8 @@ inline Virtual virtual_pulse(const TreeJob& job, const TreeTile& tile, int64_t b
   out.look.legs = legs_between(tile.centre, antenna[0], antenna[1]);
   const bool edge = tile.edge[begin / apertura::kTreeGroup];
   if (!tile.weight && !edge) return out;
-  const Between between(0.5 * double(apertura::kTreeGroup - 1) * (1 + job.places[fewer][n]));
+  // Axes of the sector and polynomials of the antennas' gain, interpolated between the pulses beside v.
+  const Between between(0.5 * double(apertura::kTreeGroup - 1) * (1 + job.places[count][n]));
   double axis[2][3] = {};
   for (int64_t leg = 0; edge && leg < 2; leg++)
     for (int64_t near = 0; near < 4; near++)
@@ -205,35 +207,36 @@ inline Virtual virtual_pulse(const TreeJob& job, const TreeTile& tile, int64_t b
   return out;
 }
 
-// (8): the lines of the fewer pulses that stand for those of a leaf.
-inline const float* fewer_lines(const TreeJob& job, const TreeTile& tile, int64_t begin, int64_t fewer,
-                                LeafScratch& work) {
-  const int64_t wide = 2 * line_length(job, tile), count = apertura::kTreeGroup;
-  work.taken.resize(size_t(wide + 2 * kTreeDelays)), work.lines.resize(size_t(wide * count));
-  work.fewer.resize(size_t(wide * fewer));
-  for (int64_t p = 0; p < count; p++) align(job, tile, begin + p, work.taken.data(), &work.lines[p * wide]);
-  const float* weight = job.presum[fewer];
+// (8): the lines b_v of the virtual pulses of a leaf, from the aligned lines a_p of its own.
+inline const float* virtual_lines(const TreeJob& job, const TreeTile& tile, int64_t begin, int64_t count,
+                                  LeafScratch& work) {
+  const int64_t wide = 2 * line_length(job, tile), pulses = apertura::kTreeGroup;
+  work.taken.resize(size_t(wide + 2 * kTreeDelays)), work.lines.resize(size_t(wide * pulses));
+  work.virtual_lines.resize(size_t(wide * count));
+  for (int64_t p = 0; p < pulses; p++) align(job, tile, begin + p, work.taken.data(), &work.lines[p * wide]);
+  const float* weight = job.presum[count];
   in_columns(wide, [&](auto vectors, int64_t column) {
-    in_rows(fewer, [&](auto tall, int64_t r) {
-      mix_lines<decltype(tall)::value, decltype(vectors)::value>(weight, count, work.lines.data(), wide, r, column,
-                                                                 &work.fewer[r * wide]);
+    in_rows(count, [&](auto tall, int64_t r) {
+      mix_lines<decltype(tall)::value, decltype(vectors)::value>(weight, pulses, work.lines.data(), wide, r, column,
+                                                                 &work.virtual_lines[r * wide]);
     });
   });
-  return work.fewer.data();
+  return work.virtual_lines.data();
 }
 
-// Sums a leaf by the fewer pulses that stand for its own.
+// Sums a leaf at its nodes by its virtual pulses.
 template <class Phase, bool kMono>
-inline void sum_fewer(const TreeJob& job, TileState& state, const LeafNodes& leaf, int64_t begin, LeafScratch& work) {
+inline void sum_virtual_pulses(const TreeJob& job, TileState& state, const LeafNodes& leaf, int64_t begin,
+                               LeafScratch& work) {
   const TreeTile& tile = state.tile;
-  const int64_t fewer = tile.fewer[begin / apertura::kTreeGroup], wide = 2 * line_length(job, tile);
+  const int64_t count = tile.n_virtual_pulses[begin / apertura::kTreeGroup], wide = 2 * line_length(job, tile);
   const int64_t width = tile.samples * job.up;
   if (state.cosines.empty()) put_carrier(job, tile.first_path, 0, width, state.cosines, state.sines);
-  const float* lines = fewer_lines(job, tile, begin, fewer, work);
+  const float* lines = virtual_lines(job, tile, begin, count, work);
   work.cells.resize(size_t(kRecord * width));
   const Cells cells(work.cells.data(), 0, width, -tile.first_path * double(job.up) / job.step);
-  for (int64_t n = 0; n < fewer; n++) {
-    const Virtual pulse = virtual_pulse(job, tile, begin, fewer, n);
+  for (int64_t n = 0; n < count; n++) {
+    const VirtualPulse pulse = virtual_pulse(job, tile, begin, count, n);
     expand(job, lines + n * wide, tile.samples, state.cosines.data(), state.sines.data(), work.cells.data());
     const float* gain = node_gains(job, leaf, pulse.look, tile.edge[begin / apertura::kTreeGroup],
                                    tile.weight ? pulse.weight : nullptr, work.gain);

@@ -56,10 +56,10 @@ struct Points {
 };
 
 // (2): |w + d| - |w| = q / (|w + d| + |w|), q = 2 w d + d^2: nothing cancels.
-inline Lanes further(Lanes q, float square, float range) { return q * reciprocal(root(q + square) + range); }
+inline Lanes extra_path(Lanes q, float square, float range) { return q * reciprocal(root(q + square) + range); }
 
 inline Lanes leg_path(const float* w, float square, float range, Lanes x, Lanes y, Lanes z, Lanes d2) {
-  return further(x * w[0] + (y * w[1] + (z * w[2] + d2)), square, range);
+  return extra_path(x * w[0] + (y * w[1] + (z * w[2] + d2)), square, range);
 }
 
 // How much longer the path over a place is than that over the centre, metres.

@@ -1,50 +1,51 @@
-// How many nodes each subaperture of a tile needs, and which pulses its tree can take. docs/theory/tree.md, "Support".
+// The plan of a tile's tree: nodes of each subaperture, virtual pulses of each leaf, and pulses that the tree cannot
+// sum. docs/theory/tree.md, "Support" and "Leaves"; equation numbers in brackets are its.
 #pragma once
 #include "tree_weight.hpp"
 
 namespace {
 
 using apertura::kTreeCurves;
-using apertura::kTreeMore;
 using apertura::kTreeNodes;
+using apertura::kTreeVirtualMargin;
 using apertura::kTreeWeighted;
 
-constexpr int64_t kCurves[kTreeCurves] = {5, 9, 14, 20};  // degrees of smooth curves over a leaf
-constexpr float kAiry = 3;                                // units of (4b) beyond which nothing is left
+constexpr float kAiry = 3;  // units of (4b) beyond which nothing is left
 
-// What is known of a leaf before its nodes: how its pulses see the tile.
-struct Sight {
-  Reach reach[3];    // of its first, middle and last pulse
-  double low, high;  // of all of them
-  bool inside = true, outside = true;
+// Paths of a leaf's pulses over the tile.
+struct LeafPaths {
+  Reach reach[3];                      // of its first, middle and last pulse
+  double low, high;                    // of all of them
+  bool inside = true, outside = true;  // of the profiles, whatever the pulse
 };
 
-// Pulses between those looked at may reach as much further as neighbours of them differ.
-inline Sight sight_of(const TreeJob& job, const TreeTile& tile, const Seen& seen, int64_t begin, int64_t end) {
-  Sight sight;
+// Every eighth pulse is evaluated; those between may reach beyond these by half the difference of neighbours.
+inline LeafPaths paths_of_leaf(const TreeJob& job, const TreeTile& tile, const Lattice& lattice, int64_t begin,
+                               int64_t end) {
+  LeafPaths paths;
   const double margin = double(apertura::kTreeMargin + (job.taps_count + apertura::kTreeDelays) / 2);  // of filters
   const double length = double(job.length - 1);
   const int64_t three[3] = {begin, (begin + end - 1) / 2, end - 1};
   double slack = 0;
   Reach last;
-  int64_t seen_to = begin;
+  int64_t checked = begin;  // pulses below it are known to lie inside or outside of their profile
   for (int64_t n = begin; n < end; n += n + 8 < end || n == end - 1 ? 8 : end - 1 - n) {
-    const Reach reach = reach_of(legs_of(job, tile.centre, n), seen);
-    if (n == begin) last = reach, sight.low = reach.low, sight.high = reach.high;
+    const Reach reach = reach_of(legs_of(job, tile.centre, n), lattice);
+    if (n == begin) last = reach, paths.low = reach.low, paths.high = reach.high;
     const double apart = 0.5 * std::max(std::fabs(reach.low - last.low), std::fabs(reach.high - last.high));
-    for (; seen_to <= n; seen_to++) {  // each profile may begin where it likes
-      const double centre = legs_of(job, tile.centre, seen_to).range - job.start[seen_to];
+    for (; checked <= n; checked++) {  // each profile has a start of its own
+      const double centre = legs_of(job, tile.centre, checked).range - job.start[checked];
       const double low = (centre + std::min(reach.low, last.low) - apart) / job.step;
       const double high = (centre + std::max(reach.high, last.high) + apart) / job.step;
-      sight.inside &= low >= margin && high <= length - margin;
-      sight.outside &= high <= -margin || low >= length + margin;
+      paths.inside &= low >= margin && high <= length - margin;
+      paths.outside &= high <= -margin || low >= length + margin;
     }
-    sight.low = std::min(sight.low, reach.low), sight.high = std::max(sight.high, reach.high);
+    paths.low = std::min(paths.low, reach.low), paths.high = std::max(paths.high, reach.high);
     slack = std::max(slack, apart), last = reach;
   }
-  sight.low -= slack, sight.high += slack;
-  for (int64_t n = 0; n < 3; n++) sight.reach[n] = reach_of(legs_of(job, tile.centre, three[n]), seen);
-  return sight;
+  paths.low -= slack, paths.high += slack;
+  for (int64_t n = 0; n < 3; n++) paths.reach[n] = reach_of(legs_of(job, tile.centre, three[n]), lattice);
+  return paths;
 }
 
 // The least number of nodes that holds a band, rad per half tile; more than kTreeNodes where none does.
@@ -53,42 +54,56 @@ inline int64_t nodes_for(const TreeJob& job, double band) {
   return std::max<int64_t>(2, std::lower_bound(job.supports, job.supports + kTreeNodes + 1, band) - job.supports);
 }
 
-// How many pulses stand for those of a leaf: what holds the turn of the carrier at any place against the centre.
-inline uint8_t fewer_of(const TreeJob& job, const TreeTile& tile, const Seen& seen, const Sight& sight, int64_t leaf) {
-  const int64_t begin = leaf * kTreeGroup;
-  if (tile.fewer[leaf] || begin + kTreeGroup > job.pulses) return 0;  // weights that jump
-  const Legs legs = legs_of(job, tile.centre, begin + kTreeGroup / 2);
-  const double turns = (1 / legs.ranges[0] + 1 / legs.ranges[1]) * (job.wavenumber + job.band) * seen.radius;
-  // What a place off the centre sees of a pulse off its curve, RMS over the tile: 1/sqrt 3 of what its corner sees.
-  const double rest = 0.577 * (job.wavenumber + job.band) * seen.radius / std::min(legs.ranges[0], legs.ranges[1]);
-  const float* rough = job.rough + leaf * kTreeCurves;
-  int64_t terms = 0;
-  while (terms < kTreeCurves && !(rough[terms] * rest <= job.smooth)) terms++;
-  if (terms == kTreeCurves) return 0;
-  double most = 0;
-  for (int64_t n = 0; n < seen.count; n++) {
-    const double first = sight.reach[0].further[n], middle = sight.reach[1].further[n],
-                 last = sight.reach[2].further[n];
-    most = std::max(most, 0.5 * std::fabs(last - first) + std::fabs(first + last - 2 * middle));
-  }
-  double band = (job.wavenumber + job.band) * most + job.stray[leaf] * turns + (tile.weight ? kTreeWeighted : 0);
-  if (tile.edge[leaf]) band += widened(job, tile.slope[3 * leaf + 2], band);
-  const int64_t count = std::max(kCurves[terms] + kTreeMore, nodes_for(job, band));
-  return count <= apertura::kTreeFewer ? uint8_t(count) : 0;
+// (8b) per metre of track residual: what the place in a tile's corner sees of it, over sqrt 3 for the RMS over the
+// tile.
+inline double residual_turn(const TreeJob& job, const TreeTile& tile, const Lattice& lattice, int64_t pulse) {
+  const Legs legs = legs_of(job, tile.centre, pulse);
+  return 0.577 * (job.wavenumber + job.band) * lattice.radius / std::min(legs.ranges[0], legs.ranges[1]);
 }
 
-// Looks at each leaf: whether it goes by tree, over which samples, and as how many pulses.
-inline void plan_leaves(const TreeJob& job, TreeTile& tile, const Seen& seen) {
+// Band of (8) along a leaf, rad per half leaf: of any place against the centre, from first, middle and last pulse.
+inline double carrier_turn(const TreeJob& job, const Lattice& lattice, const Reach* reach) {
+  double most = 0;
+  for (int64_t n = 0; n < lattice.count; n++) {
+    const double first = reach[0].extra_path[n], middle = reach[1].extra_path[n], last = reach[2].extra_path[n];
+    most = std::max(most, 0.5 * std::fabs(last - first) + std::fabs(first + last - 2 * middle));
+  }
+  return (job.wavenumber + job.band) * most;
+}
+
+// Number of virtual pulses that replace those of a leaf; 0: none do.
+inline uint8_t virtual_pulses_for(const TreeJob& job, const TreeTile& tile, const Lattice& lattice,
+                                  const LeafPaths& paths, int64_t leaf) {
+  const int64_t begin = leaf * kTreeGroup;
+  if (tile.n_virtual_pulses[leaf] || begin + kTreeGroup > job.pulses) return 0;  // weights jump, or the leaf is short
+  // (8b): the curve of lowest degree that the track follows closely enough.
+  const double per_metre = residual_turn(job, tile, lattice, begin + kTreeGroup / 2);
+  const float* residual = job.rms_track_residual + leaf * kTreeCurves;
+  int64_t curve = 0;
+  while (curve < kTreeCurves && !(residual[curve] * per_metre <= job.presum_error)) curve++;
+  if (curve == kTreeCurves) return 0;
+  // (8): the band of the carrier, of pulses off the parabola through three, of antennas (1.5 rad) and of an edge (13).
+  const Legs legs = legs_of(job, tile.centre, begin + kTreeGroup / 2);
+  const double turns = (1 / legs.ranges[0] + 1 / legs.ranges[1]) * (job.wavenumber + job.band) * lattice.radius;
+  double band = carrier_turn(job, lattice, paths.reach) + job.max_track_residual[leaf] * turns;
+  if (tile.weight) band += kTreeWeighted;
+  if (tile.edge[leaf]) band += widened(job, tile.slope[3 * leaf + 2], band);
+  const int64_t count = std::max(job.curve_degrees[curve] + kTreeVirtualMargin, nodes_for(job, band));
+  return count <= apertura::kTreeMostVirtual ? uint8_t(count) : 0;
+}
+
+// Variant of each leaf, its virtual pulses, and the samples of all leaves by tree.
+inline void plan_leaves(const TreeJob& job, TreeTile& tile, const Lattice& lattice) {
   double low = 0, high = 0;
-  weigh_leaves(job, tile, seen);
+  weigh_leaves(job, tile, lattice);
   for (int64_t leaf = 0; leaf * kTreeGroup < job.pulses; leaf++) {
-    if (tile.way[leaf] != apertura::kByTree) continue;
+    if (tile.variant[leaf] != apertura::kByTree) continue;
     const int64_t begin = leaf * kTreeGroup, end = std::min(begin + kTreeGroup, job.pulses);
-    const Sight sight = sight_of(job, tile, seen, begin, end);
-    tile.way[leaf] = sight.inside ? apertura::kByTree : sight.outside ? kSilently : kDirectly;
-    if (!sight.inside) continue;
-    tile.fewer[leaf] = fewer_of(job, tile, seen, sight, leaf);
-    low = std::min(low, sight.low), high = std::max(high, sight.high);
+    const LeafPaths paths = paths_of_leaf(job, tile, lattice, begin, end);
+    tile.variant[leaf] = paths.inside ? apertura::kByTree : paths.outside ? kNoEcho : kDirectly;
+    if (!paths.inside) continue;
+    tile.n_virtual_pulses[leaf] = virtual_pulses_for(job, tile, lattice, paths, leaf);
+    low = std::min(low, paths.low), high = std::max(high, paths.high);
   }
   tile.first_path = (std::floor(low / job.step) - double(apertura::kTreeMargin)) * job.step;
   tile.samples = int64_t(std::ceil((high - tile.first_path) / job.step)) + apertura::kTreeMargin + 1;
@@ -96,11 +111,11 @@ inline void plan_leaves(const TreeJob& job, TreeTile& tile, const Seen& seen) {
 
 // Slopes of the reference of a subaperture over the tile: those along the axes, and the mixed part.
 struct Reference {
-  alignas(64) float xi[kSeen], eta[kSeen];
-  Reference(const Slopes& middle, const Slopes& mixed, const Seen& seen) {
-    for (int64_t n = 0; n < seen.count; n++) {
-      xi[n] = middle.axis[n % seen.side] + mixed.xi[n];
-      eta[n] = middle.axis[seen.side + n / seen.side] + mixed.eta[n];
+  alignas(64) float xi[kLattice], eta[kLattice];
+  Reference(const Slopes& middle, const Slopes& mixed, const Lattice& lattice) {
+    for (int64_t n = 0; n < lattice.count; n++) {
+      xi[n] = middle.axis[n % lattice.side] + mixed.xi[n];
+      eta[n] = middle.axis[lattice.side + n / lattice.side] + mixed.eta[n];
     }
   }
 };
@@ -117,10 +132,10 @@ struct Peak {
 
 // (4): the band left on a tile by pulses against the reference of their subaperture.
 struct Band {
-  float xi[kSeen] = {}, eta[kSeen] = {};
-  void include(const TreeJob& job, const Slopes& pulse, const Reference& reference, const Seen& seen) {
+  float xi[kLattice] = {}, eta[kLattice] = {};
+  void include(const TreeJob& job, const Slopes& pulse, const Reference& reference, const Lattice& lattice) {
     const float k = float(job.wavenumber), b = float(job.band);
-    for (int64_t n = 0; n < seen.count; n++) {
+    for (int64_t n = 0; n < lattice.count; n++) {
       const float cx = k * magnitude(pulse.xi[n] - reference.xi[n]) + b * magnitude(pulse.xi[n]);
       const float cy = k * magnitude(pulse.eta[n] - reference.eta[n]) + b * magnitude(pulse.eta[n]);
       xi[n] = cx <= xi[n] ? xi[n] : cx, eta[n] = cy <= eta[n] ? eta[n] : cy;  // no number stays
@@ -128,11 +143,11 @@ struct Band {
   }
   // Of any place, `step` the axis along which it is interpolated: where it peaks between places, by parabolas, and what
   // a phase whose slope peaks has beyond that slope (4b).
-  static float most(const float* values, const Seen& seen, int64_t step) {
-    const int64_t side = seen.side, across = step == 1 ? side : 1;
+  static float most(const float* values, const Lattice& lattice, int64_t step) {
+    const int64_t side = lattice.side, across = step == 1 ? side : 1;
     const float bend = float((side - 1) * (side - 1)) / 8;
     float most = 0;
-    for (int64_t n = 0; n < seen.count; n++) {
+    for (int64_t n = 0; n < lattice.count; n++) {
       float value = values[n];
       if (n / across % side % (side - 1)) value += Peak(values + n, across).above;
       if (n / step % side % (side - 1)) {
@@ -145,49 +160,70 @@ struct Band {
   }
 };
 
-// Slopes of the first, middle and last pulse of each leaf, and how much a stray pulse among them may add to the band.
+// Slopes of the first, middle and last pulse of each leaf, and what a pulse off the parabola through them may add to
+// the band.
 struct Leaves {
   std::vector<Slopes> slopes;
-  std::vector<float> stray_xi, stray_eta;
+  std::vector<float> residual_xi, residual_eta;
 };
 
-inline float length_of(const float (*by)[kSeen], const Seen& seen) {
+inline float length_of(const float (*by)[kLattice], const Lattice& lattice) {
   float most = 0;
-  for (int64_t n = 0; n < seen.count; n++)
+  for (int64_t n = 0; n < lattice.count; n++)
     most = std::max(most, by[0][n] * by[0][n] + by[1][n] * by[1][n] + by[2][n] * by[2][n]);
   return std::sqrt(most);
 }
 
-inline Leaves leaves_of(const TreeJob& job, const TreeTile& tile, const Seen& seen) {
+inline Leaves leaves_of(const TreeJob& job, const TreeTile& tile, const Lattice& lattice) {
   const int64_t size = job.sizes[0], count = apertura::subapertures(job, 0);
   Leaves leaves{std::vector<Slopes>(size_t(3 * count)), std::vector<float>(size_t(count)), {}};
-  leaves.stray_eta = leaves.stray_xi;
-  const float xi = length_of(seen.by_xi, seen), eta = length_of(seen.by_eta, seen);
+  leaves.residual_eta = leaves.residual_xi;
+  const float xi = length_of(lattice.by_xi, lattice), eta = length_of(lattice.by_eta, lattice);
   for (int64_t n = 0; n < count; n++) {
     const int64_t begin = n * size, end = std::min(begin + size, job.pulses) - 1;
     const int64_t pulses[3] = {begin, (begin + end) / 2, end};
-    if (tile.way[begin / kTreeGroup] != apertura::kByTree) continue;
+    if (tile.variant[begin / kTreeGroup] != apertura::kByTree) continue;
     for (int64_t i = 0; i < 3; i++) {
       const Legs legs = legs_of(job, tile.centre, pulses[i]);
-      leaves.slopes[3 * n + i] = slopes_at(legs, seen);
+      leaves.slopes[3 * n + i] = slopes_at(legs, lattice);
       if (i != 1) continue;
-      const float turn = float(job.wavenumber) * job.stray[n] * (1 / legs.ranges[0] + 1 / legs.ranges[1]);
-      leaves.stray_xi[n] = turn * xi, leaves.stray_eta[n] = turn * eta;
+      const float turn = float(job.wavenumber) * job.max_track_residual[n] * (1 / legs.ranges[0] + 1 / legs.ranges[1]);
+      leaves.residual_xi[n] = turn * xi, leaves.residual_eta[n] = turn * eta;
     }
   }
   return leaves;
 }
 
+// Slopes of m of (3): those of the chunk's middle pulse, less what they are on the axes.
+inline Slopes mixed_slopes(const TreeJob& job, const TreeTile& tile, const Lattice& lattice) {
+  Slopes mixed = slopes_at(shared_legs(job, tile), lattice);
+  for (int64_t n = 0; n < lattice.count; n++)
+    mixed.xi[n] -= mixed.axis[n % lattice.side], mixed.eta[n] -= mixed.axis[lattice.side + n / lattice.side];
+  return mixed;
+}
+
+// (4) over a subaperture, from its leaves by tree.
+inline Band band_of(const TreeJob& job, const TreeTile& tile, const Lattice& lattice, const Leaves& leaves,
+                    const Slopes& mixed, int64_t begin, int64_t size) {
+  const int64_t middle = apertura::middle_of(job, begin, size), end = std::min(begin + size, job.pulses);
+  const Reference reference(slopes_at(legs_of(job, tile.centre, middle), lattice), mixed, lattice);
+  Band band;
+  for (int64_t n = begin / job.sizes[0]; n * job.sizes[0] < end; n++)
+    for (int64_t i = 0; i < 3 && tile.variant[n * job.sizes[0] / kTreeGroup] == apertura::kByTree; i++)
+      band.include(job, leaves.slopes[3 * n + i], reference, lattice);
+  return band;
+}
+
 // Whether any of some pulses goes by the tree of a tile.
 inline bool any_taken(const TreeJob& job, const TreeTile& tile, int64_t begin, int64_t end) {
   for (int64_t p = begin; p < end && p < job.pulses; p += apertura::kTreeGroup)
-    if (tile.way[p / apertura::kTreeGroup] == apertura::kByTree) return true;
+    if (tile.variant[p / apertura::kTreeGroup] == apertura::kByTree) return true;
   return false;
 }
 
-// Node counts of one level. Returns whether the nodes there are do for all subapertures that any pulse takes.
-inline bool plan_level(const TreeJob& job, TreeTile& tile, const Seen& seen, const Leaves& leaves, const Slopes& mixed,
-                       int64_t level) {
+// Node counts of one level. Returns whether kTreeNodes suffice for all subapertures with a leaf by tree.
+inline bool plan_level(const TreeJob& job, TreeTile& tile, const Lattice& lattice, const Leaves& leaves,
+                       const Slopes& mixed, int64_t level) {
   const int64_t size = job.sizes[level], leaf = job.sizes[0];
   uint8_t* nodes = tile.nodes + apertura::first_of_level(job, level);
   bool holds = true;
@@ -195,25 +231,24 @@ inline bool plan_level(const TreeJob& job, TreeTile& tile, const Seen& seen, con
     const int64_t end = std::min(begin + size, job.pulses);
     nodes[0] = nodes[1] = 2;
     if (!any_taken(job, tile, begin, end)) continue;
-    const Slopes middle = slopes_at(legs_of(job, tile.centre, apertura::middle_of(job, begin, size)), seen);
-    const Reference reference(middle, mixed, seen);
-    Band band;
-    float stray_xi = 0, stray_eta = 0, slope_xi = 0, slope_eta = 0;
+    const Band band = band_of(job, tile, lattice, leaves, mixed, begin, size);
+    float residual_xi = 0, residual_eta = 0, slope_xi = 0, slope_eta = 0;
     bool edge = false;
     for (int64_t n = begin / leaf; n * leaf < end; n++) {
-      if (tile.way[n * leaf / kTreeGroup] != apertura::kByTree) continue;
-      for (int64_t i = 0; i < 3; i++) band.include(job, leaves.slopes[3 * n + i], reference, seen);
-      stray_xi = std::max(stray_xi, leaves.stray_xi[n]), stray_eta = std::max(stray_eta, leaves.stray_eta[n]);
+      if (tile.variant[n * leaf / kTreeGroup] != apertura::kByTree) continue;
+      residual_xi = std::max(residual_xi, leaves.residual_xi[n]);
+      residual_eta = std::max(residual_eta, leaves.residual_eta[n]);
       if (!tile.edge[n]) continue;
       edge = true;
       slope_xi = std::max(slope_xi, tile.slope[3 * n]), slope_eta = std::max(slope_eta, tile.slope[3 * n + 1]);
     }
-    double wide_xi = Band::most(band.xi, seen, 1) + stray_xi + (tile.weight ? kTreeWeighted : 0);
-    double wide_eta = Band::most(band.eta, seen, seen.side) + stray_eta + (tile.weight ? kTreeWeighted : 0);
+    // (4b), pulses off the parabola, antennas (1.5 rad), and the edge of a sector (13).
+    double wide_xi = Band::most(band.xi, lattice, 1) + residual_xi + (tile.weight ? kTreeWeighted : 0);
+    double wide_eta = Band::most(band.eta, lattice, lattice.side) + residual_eta + (tile.weight ? kTreeWeighted : 0);
     if (edge) wide_xi += widened(job, slope_xi, wide_xi), wide_eta += widened(job, slope_eta, wide_eta);
     const int64_t xi = nodes_for(job, wide_xi), eta = nodes_for(job, wide_eta);
     if (level == 0 && edge && (xi > kTreeNodes || eta > kTreeNodes)) {
-      tile.way[begin / kTreeGroup] = kDirectly;  // the rest of the tile need not follow
+      tile.variant[begin / kTreeGroup] = kDirectly;  // this leaf alone: too steep an edge
       continue;
     }
     holds &= xi <= kTreeNodes && eta <= kTreeNodes;
@@ -223,15 +258,13 @@ inline bool plan_level(const TreeJob& job, TreeTile& tile, const Seen& seen, con
 }
 
 inline void plan_tile(const TreeJob& job, TreeTile& tile) {
-  const Seen seen = seen_of(job, tile);
-  plan_leaves(job, tile, seen);
-  Slopes mixed = slopes_at(shared_legs(job, tile), seen);
-  for (int64_t n = 0; n < seen.count; n++)
-    mixed.xi[n] -= mixed.axis[n % seen.side], mixed.eta[n] -= mixed.axis[seen.side + n / seen.side];
-  const Leaves leaves = leaves_of(job, tile, seen);
+  const Lattice lattice = lattice_of(job, tile);
+  plan_leaves(job, tile, lattice);
+  const Slopes mixed = mixed_slopes(job, tile, lattice);
+  const Leaves leaves = leaves_of(job, tile, lattice);
   tile.top = -1;
   for (int64_t level = 0; level < job.levels && tile.top == level - 1; level++)
-    if (plan_level(job, tile, seen, leaves, mixed, level)) tile.top = level;
+    if (plan_level(job, tile, lattice, leaves, mixed, level)) tile.top = level;
 }
 
 }  // namespace

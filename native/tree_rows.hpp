@@ -1,4 +1,5 @@
-// Pulses that go for themselves: expanded to cells once for all tiles that take them so. docs/theory/tree.md, "Leaves".
+// Pulses that no virtual pulse replaces: expanded to cells once for all tiles that sum them so. docs/theory/tree.md,
+// "Leaves".
 #pragma once
 #include "tree_leaf.hpp"
 
@@ -56,7 +57,7 @@ inline void expand_row(const TreeJob& job, int64_t pulse, int64_t row, Rows& row
          &rows.cells[kRecord * row * rows.samples * job.up]);
 }
 
-// Adds pulses begin … end to the leaves of some tiles, each for itself.
+// Adds pulses begin … end to the leaves of some tiles, one by one.
 template <class Phase>
 inline void sum_each(const TreeJob& job, const std::vector<TileState*>& tiles, int64_t begin, int64_t end, Rows& rows) {
   for (int64_t first = begin; first < end; first += kRows) {

@@ -1,14 +1,14 @@
-// Weights of antennas and of the sector over a tile: which leaves they leave as they are, which not at all, and at the
-// nodes of the others. docs/theory/tree.md, "Weights"; equation numbers in brackets are its.
+// Weights of antennas and of the sector over a tile: leaves with weight 1 or 0 all over the tile, and the weights of
+// the others at their nodes. docs/theory/tree.md, "Weights"; equation numbers in brackets are its.
 #pragma once
 #include "centre.hpp"
 #include "pattern.hpp"
-#include "tree_seen.hpp"
+#include "tree_lattice.hpp"
 
 namespace {
 
 using apertura::kDirectly;
-using apertura::kSilently;
+using apertura::kNoEcho;
 using apertura::kTreeGroup;
 using apertura::kTreeWeights;
 
@@ -20,7 +20,7 @@ constexpr int64_t kCurve = 6;            // terms of weights over the pulses of 
 constexpr double kLargest = 3;           // of an error, in its RMS
 constexpr double kPlaceError = 2e-6;     // of s, by float32
 
-// One pulse, or one that stands for others, towards a tile: paths, and its axes of the sector.
+// One pulse, or a virtual pulse, towards a tile: paths, and its axes of the sector.
 struct Look {
   Legs legs;
   float axis[2][3] = {}, along[2] = {};  // a, and a . w in metres
@@ -61,65 +61,76 @@ inline Lanes place_at(const Look& look, Lanes x, Lanes y, Lanes z, Lanes d2) {
 
 // ---- The sector over a tile
 
-// Centres of the sector at the places of a tile, whether they follow one smooth function there, and by how much they
-// may leave what these places tell.
+// Centres c of the sector at the places of a tile's lattice, (4) of integration.md; whether they are one smooth
+// function over the tile; and by how much c may differ from these between them.
 struct Centres {
-  alignas(64) float at[kSeen];
+  alignas(64) float at[kLattice];
   bool smooth = true;
   double slack = 0;
 };
 
-// (12): how far s may leave its values at neighbouring places between these: half the square of their half distance
-// times its second derivative, 2 / sqrt 3 |a| / R^2 at most.
-inline double dip_of(const Seen& seen, double axis, double range) {
-  const double nearest = range - seen.radius;
-  return nearest > 0 ? axis * (0.58 * seen.bend / nearest + seen.relief) / nearest : 2;
+// (12): largest deviation of s between places from its values at these: half the square of their half distance times
+// its second derivative, 2 / sqrt 3 |a| / R^2 at most.
+inline double dip_of(const Lattice& lattice, double axis, double range) {
+  const double nearest = range - lattice.radius;
+  return nearest > 0 ? axis * (0.58 * lattice.bend / nearest + lattice.relief) / nearest : 2;
 }
 
 inline double length_of(const double* v, int64_t step) {
   return std::sqrt(v[0] * v[0] + v[step] * v[step] + v[2 * step] * v[2 * step]);
 }
 
-inline Centres centres_of(const TreeJob& job, const TreeTile& tile, const Seen& seen) {
+// The terms of (4) of integration.md that give c: the sector's own centre s_0, the limit s_1 + S' or s_2 - S' of what
+// was flown past, or their middle m; undecided where two of them are closer than s may vary between places.
+enum CentreTerm { kUndecided, kOwn, kFirstFlown, kLastFlown, kMiddle };
+
+inline CentreTerm centre_term(const SectorJob& sector, const Flown& flown, double margin) {
+  const double lowest = flown.first + sector.outer, highest = flown.last - sector.outer;
+  const double middle = 0.5 * (flown.first + flown.last);
+  if (lowest - margin > middle) return kMiddle;
+  if (highest - margin > middle && highest + margin < sector.centre) return kLastFlown;
+  if (lowest + margin < middle && lowest - margin > sector.centre) return kFirstFlown;
+  if (lowest + margin < middle && lowest + margin < sector.centre && highest - margin > sector.centre) return kOwn;
+  return kUndecided;
+}
+
+inline Centres centres_of(const TreeJob& job, const TreeTile& tile, const Lattice& lattice) {
   Centres out;
   const SectorJob& sector = *job.sector;
-  std::fill(out.at, out.at + kSeen, float(sector.centre));
+  std::fill(out.at, out.at + kLattice, float(sector.centre));
   if (!sector.ends) return out;
-  double steep = 0;
+  // (12) for the ends of what was flown, from which s_1 and s_2 follow: how far s may leave its values at neighbouring
+  // places between these, and by how much it differs from one to the next.
+  double step = 0;
   for (int64_t end = 0; end < sector.ends; end++) {
     double dip = 0, slope = 0;
     for (int64_t leg = 0; leg < 2; leg++) {
       const double *antenna = sector.end[leg] + 3 * end, length = length_of(sector.end_axis[leg] + 3 * end, 1);
       const double w[3] = {tile.centre[0] - antenna[0], tile.centre[1] - antenna[1], tile.centre[2] - antenna[2]};
       const double range = length_of(w, 1);
-      dip += dip_of(seen, length, range);
-      slope += range > seen.radius ? length * std::sqrt(seen.bend) / (range - seen.radius) : 2;
+      dip += dip_of(lattice, length, range);
+      slope += range > lattice.radius ? length * std::sqrt(lattice.bend) / (range - lattice.radius) : 2;
     }
-    out.slack = std::max(out.slack, dip), steep = std::max(steep, slope);
+    out.slack = std::max(out.slack, dip), step = std::max(step, slope);
   }
-  // What each place's centre is made of: the sector's own, the first or the last that was flown, or both. Smooth where
-  // that is the same at all places, by more than they may differ in between.
-  int64_t made = -1;
-  for (int64_t n = 0; n < seen.count; n++) {
+  // c is smooth where one term of (4), of the same two ends, gives it at all places.
+  CentreTerm term_of_tile = kUndecided;
+  int64_t ends_of_tile = 0;
+  for (int64_t n = 0; n < lattice.count; n++) {
     double at[3];
-    for (int64_t axis = 0; axis < 3; axis++) at[axis] = tile.centre[axis] + seen.at[axis][n];
-    const Flown own = flown_past(sector, at, 0);
-    out.at[n] = float(centre_of(sector, own));
-    const double middle = 0.5 * (own.first + own.last), t = 2 * out.slack;
-    const double low = own.first + sector.outer, high = own.last - sector.outer;
-    const int64_t ends = 1 + own.first_end + sector.ends * own.last_end;
-    int64_t here = -2;
-    if (low + t < middle && low + t < sector.centre && high - t > sector.centre) here = 0;
-    if (low + t < middle && low - t > sector.centre) here = 4 * ends + 1;
-    if (high - t > middle && high + t < sector.centre) here = 4 * ends + 2;
-    if (low - t > middle) here = 4 * ends + 3;
-    out.smooth &= here != -2 && (made == -1 || made == here), made = here;
+    for (int64_t axis = 0; axis < 3; axis++) at[axis] = tile.centre[axis] + lattice.at[axis][n];
+    const Flown flown = flown_past(sector, at, 0);
+    out.at[n] = float(centre_of(sector, flown));
+    const CentreTerm term = centre_term(sector, flown, 2 * out.slack);
+    const int64_t ends = term == kOwn ? 0 : 1 + flown.first_end + sector.ends * flown.last_end;
+    if (n == 0) term_of_tile = term, ends_of_tile = ends;
+    out.smooth &= term != kUndecided && term == term_of_tile && ends == ends_of_tile;
   }
-  if (!out.smooth) out.slack = steep;
+  if (!out.smooth) out.slack = step;  // c may follow any term between places
   return out;
 }
 
-// By how much the axes of a leaf's pulses leave the parabola through three of them, both legs together.
+// Largest deviation of the axes of a leaf's pulses from the parabola through three of them, both legs together.
 inline double turning_of(const TreeJob& job, int64_t begin, int64_t end) {
   const int64_t last = end - 1, middle = (begin + last) / 2, n = job.pulses;
   if (last == begin) return 0;
@@ -141,37 +152,40 @@ inline double turning_of(const TreeJob& job, int64_t begin, int64_t end) {
   return most;
 }
 
-// Whether a leaf lies inside the sector all over a tile, outside of it, or at its edge: there how much the depth (3) of
-// integration.md changes along the axes of the tile and over the leaf, per half of them.
-inline void weigh_by_sector(const TreeJob& job, TreeTile& tile, const Seen& seen, const Centres& centres,
+// Classifies a leaf as inside the sector all over a tile, outside of it, or at its edge; there `slope` is the change of
+// the depth (3) of integration.md along the axes of the tile and over the leaf, per half of them.
+inline void weigh_by_sector(const TreeJob& job, TreeTile& tile, const Lattice& lattice, const Centres& centres,
                             int64_t leaf) {
   const SectorJob& sector = *job.sector;
   const int64_t begin = leaf * kTreeGroup, end = std::min(begin + kTreeGroup, job.pulses);
   const int64_t three[3] = {begin, (begin + end - 1) / 2, end - 1};
-  alignas(64) float place[3][kSeen];
+  alignas(64) float place[3][kLattice];
+  // s - c at the lattice for three pulses, and the slack (12) of places and pulses between these.
   double slack = centres.slack + kPlaceError, low = 1e9, high = -1e9, dips = 0, nearest = 1e300;
   for (int64_t i = 0; i < 3; i++) {
     const Look look = look_of(job, tile.centre, three[i]);
-    for (int64_t n = 0; n < seen.count; n += kLanes)
-      store(place[i] + n,
-            place_at(look, load(seen.at[0] + n), load(seen.at[1] + n), load(seen.at[2] + n), load(seen.at[3] + n)) -
-                load(centres.at + n));
+    for (int64_t n = 0; n < lattice.count; n += kLanes)
+      store(place[i] + n, place_at(look, load(lattice.at[0] + n), load(lattice.at[1] + n), load(lattice.at[2] + n),
+                                   load(lattice.at[3] + n)) -
+                              load(centres.at + n));
     double dip = 0;
     for (int64_t leg = 0; leg < 2; leg++) {
       const double axis = length_of(sector.axis[leg] + three[i], job.pulses), range = look.legs.ranges[leg];
-      dip += dip_of(seen, axis, range) + axis * job.stray[leaf] / std::max(range - seen.radius, 1e-3);
+      dip +=
+          dip_of(lattice, axis, range) + axis * job.max_track_residual[leaf] / std::max(range - lattice.radius, 1e-3);
       nearest = std::min(nearest, range);
     }
     dips = std::max(dips, dip);
   }
+  // Range of s - c, and its changes from place to place and over the leaf.
   double along[3] = {};
-  for (int64_t n = 0; n < seen.count; n++) {
-    const int64_t x = n % seen.side, y = n / seen.side;
+  for (int64_t n = 0; n < lattice.count; n++) {
+    const int64_t x = n % lattice.side, y = n / lattice.side;
     for (int64_t i = 0; i < 3; i++) {
       const float s = place[i][n];
       low = s >= low ? low : s, high = s <= high ? high : s;
-      if (x + 1 < seen.side) along[0] = std::max(along[0], double(magnitude(place[i][n + 1] - s)));
-      if (y + 1 < seen.side) along[1] = std::max(along[1], double(magnitude(place[i][n + seen.side] - s)));
+      if (x + 1 < lattice.side) along[0] = std::max(along[0], double(magnitude(place[i][n + 1] - s)));
+      if (y + 1 < lattice.side) along[1] = std::max(along[1], double(magnitude(place[i][n + lattice.side] - s)));
     }
     const float before = place[0][n] - place[1][n], behind = place[2][n] - place[1][n];
     along[2] = std::max(along[2], double(std::max(magnitude(before), magnitude(behind))));
@@ -179,24 +193,25 @@ inline void weigh_by_sector(const TreeJob& job, TreeTile& tile, const Seen& seen
   }
   const double turning = turning_of(job, begin, end);
   slack += dips + turning;
+  // With the slack all of the tile is outside (weight 0), inside (weight 1), or there is an edge.
   const double width = sector.outer - sector.inner;
   if (low - slack >= sector.outer || high + slack <= -sector.outer)
-    tile.way[leaf] = kSilently;
+    tile.variant[leaf] = kNoEcho;
   else if (!(high + slack <= sector.inner && low - slack >= -sector.inner)) {
     float* slope = tile.slope + 3 * leaf;
-    const double steps = 0.5 * double(seen.side - 1);
+    const double steps = 0.5 * double(lattice.side - 1);
     slope[0] = float(steps * along[0] / width), slope[1] = float(steps * along[1] / width);
     slope[2] = float(along[2] / width);
     tile.edge[leaf] = 1;
-    // Depths turn by half more per width at most, where the edge is steepest.
-    if (1.5 * turning / width > kLargest * job.node_error) tile.fewer[leaf] = 1;
-    // Centres that follow first one thing and then another have a kink of their own, which no nodes hold.
-    if (!centres.smooth || nearest < 2 * seen.radius) tile.way[leaf] = kDirectly;
+    // The weight changes by 1.5 per width at most, where the edge is steepest: axes that turn so far from a parabola
+    // leave no smooth weights to virtual pulses.
+    if (1.5 * turning / width > kLargest * job.node_error) tile.n_virtual_pulses[leaf] = 1;
+    // Centres that change from one term of (4) to another have a kink, which no nodes support.
+    if (!centres.smooth || nearest < 2 * lattice.radius) tile.variant[leaf] = kDirectly;
   }
 }
 
-// (13): rad by which an edge widens the band, at axis 0 (xi), 1 (eta) or 2 (the pulses of a leaf), of content up to
-// `band`.
+// (13): rad by which an edge whose depth changes by `slope` per half axis widens a band.
 inline double widened(const TreeJob& job, double slope, double band) {
   const double content = std::max(band, 1.0) * job.node_error * job.node_error;
   return std::max(apertura::kTreeWeighted, slope * std::sqrt(std::sqrt(kKink / content)));
@@ -204,7 +219,7 @@ inline double widened(const TreeJob& job, double slope, double band) {
 
 // ---- Antennas over a tile: polynomials of each pulse
 
-// Places of a tile, offsets from its centre, and what turns gains at kTerms x kTerms of them into a polynomial.
+// Places of a tile, offsets from its centre, and the matrices from gains at kTerms x kTerms of them to a polynomial.
 struct Sampled {
   double at[kTerms * kTerms][3], between[kBetween * kBetween][3];
   double to_terms[kTerms][kTerms], checked[kBetween][kTerms], curve[kCurve][kTreeGroup];
@@ -228,7 +243,7 @@ struct Sampled {
       for (int64_t k = 0; k < kTerms; k++) checked[n][k] = k ? checked[n][k - 1] * places[n] : 1;
     put_curve();
   }
-  // Polynomials over the pulses of a leaf: orthonormal, each less what the ones before it hold.
+  // Polynomials over the pulses of a leaf, orthonormal by Gram and Schmidt.
   void put_curve() {
     for (int64_t term = 0; term < kCurve; term++) {
       for (int64_t p = 0; p < kTreeGroup; p++)
@@ -317,27 +332,30 @@ inline float jumps_of(const Sampled& sampled, const float (*gain)[kTerms * kTerm
   return float(most);
 }
 
-// Polynomials of the gains of a leaf's pulses; where they miss or a beam ends in the tile it goes directly.
-inline void weigh_by_antennas(const TreeJob& job, TreeTile& tile, const Seen& seen, const Sampled& sampled,
+// Polynomials of the gains of a leaf's pulses; where they err by more than kLargest nodes or a beam ends in the tile
+// the leaf is summed directly.
+inline void weigh_by_antennas(const TreeJob& job, TreeTile& tile, const Lattice& lattice, const Sampled& sampled,
                               int64_t leaf) {
   const int64_t begin = leaf * kTreeGroup, count = std::min(begin + kTreeGroup, job.pulses) - begin;
   constexpr int64_t kPlaces = kTerms * kTerms;
   float gain[kTreeGroup][kPlaces], most = 0;
-  const double far = std::sqrt(*std::max_element(seen.at[3], seen.at[3] + seen.count)) + seen.relief;
-  bool lit = false, whole = true;
+  const double far = std::sqrt(*std::max_element(lattice.at[3], lattice.at[3] + lattice.count)) + lattice.relief;
+  // Gains at the kTerms x kTerms places; `whole`: no beam ends between them.
+  bool illuminated = false, whole = true;
   for (int64_t p = 0; p < count; p++) {
     gains_at(job, tile, begin + p, sampled.at, kPlaces, gain[p]);
     int64_t dark = 0;
     for (int64_t n = 0; n < kPlaces; n++) dark += gain[p][n] == 0, most = std::max(most, gain[p][n]);
     whole &= dark == 0 || dark == kPlaces;
-    lit = lit || may_touch(job, tile, far, begin + p);
+    illuminated = illuminated || may_touch(job, tile, far, begin + p);
   }
-  if (!lit) {
-    tile.way[leaf] = kSilently;
+  if (!illuminated) {
+    tile.variant[leaf] = kNoEcho;
     return;
   }
   const float limit = float(kLargest * job.node_error) * most;
-  const bool each = count < kTreeGroup || jumps_of(sampled, gain) > limit;
+  const bool each = count < kTreeGroup || jumps_of(sampled, gain) > limit;  // no virtual pulse has such weights
+  // Polynomials of degree 3 along both axes, and their largest error at kBetween x kBetween places.
   float worst = 0;
   for (int64_t p = 0; p < count; p++) {
     double half[kTerms][kTerms] = {};
@@ -362,19 +380,19 @@ inline void weigh_by_antennas(const TreeJob& job, TreeTile& tile, const Seen& se
       worst = std::max(worst, magnitude(float(value) - there[n]));
     }
   }
-  if (!whole || !(most > 0) || !(worst <= limit)) tile.way[leaf] = kDirectly;
-  if (each) tile.fewer[leaf] = 1;
+  if (!whole || !(most > 0) || !(worst <= limit)) tile.variant[leaf] = kDirectly;
+  if (each) tile.n_virtual_pulses[leaf] = 1;
 }
 
-// What the weights make of each leaf of a tile that would go by tree.
-inline void weigh_leaves(const TreeJob& job, TreeTile& tile, const Seen& seen) {
+// Classifies by their weights the leaves of a tile that are to be summed by tree.
+inline void weigh_leaves(const TreeJob& job, TreeTile& tile, const Lattice& lattice) {
   const bool antennas = job.beam[0] || job.beam[1];
   if (!antennas && !job.sector) return;
   const std::unique_ptr<Sampled> sampled(antennas ? new Sampled(tile) : nullptr);
-  const Centres centres = job.sector ? centres_of(job, tile, seen) : Centres();
+  const Centres centres = job.sector ? centres_of(job, tile, lattice) : Centres();
   for (int64_t leaf = 0; leaf * kTreeGroup < job.pulses; leaf++) {
-    if (tile.way[leaf] == apertura::kByTree && job.sector) weigh_by_sector(job, tile, seen, centres, leaf);
-    if (tile.way[leaf] == apertura::kByTree && antennas) weigh_by_antennas(job, tile, seen, *sampled, leaf);
+    if (tile.variant[leaf] == apertura::kByTree && job.sector) weigh_by_sector(job, tile, lattice, centres, leaf);
+    if (tile.variant[leaf] == apertura::kByTree && antennas) weigh_by_antennas(job, tile, lattice, *sampled, leaf);
   }
 }
 

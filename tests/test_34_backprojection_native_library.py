@@ -12,7 +12,7 @@ from scenes import without_library
 
 from apertura.common.errors import CampaignError
 from apertura.core.backprojection.engines import native, native_binding
-from apertura.core.backprojection.engines.native_binding import KERNEL
+from apertura.core.backprojection.engines.native_binding import KERNEL, TREE
 
 pytestmark = pytest.mark.skipif(not native.available(), reason="apertura was installed without a compiler")
 
@@ -31,7 +31,9 @@ def test_without_the_compiled_library_the_engine_says_so(monkeypatch):
 
 
 def test_python_predicts_with_the_constants_of_the_kernel():
-    assert native_binding.kernel_constants() == pytest.approx(asdict(KERNEL), rel=1e-6)
+    assert native_binding.kernel_constants() == pytest.approx(
+        asdict(KERNEL) | {f"tree_{name}": value for name, value in asdict(TREE).items()}, rel=1e-6
+    )
 
 
 @pytest.mark.parametrize(

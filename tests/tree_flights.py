@@ -9,8 +9,8 @@ from scenes import BANDWIDTH_HZ, SUBCARRIERS, ecef, fly, scatter
 from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
 from apertura.core.backprojection.engines import tree
 from apertura.core.backprojection.engines.engine import Setting
-from apertura.core.backprojection.engines.tree_nodes import surfaces_of
-from apertura.core.backprojection.engines.tree_view import counts_of, subaperture_sizes, view_of_tile
+from apertura.core.backprojection.engines.tree_geometry import subaperture_sizes, surfaces_of
+from apertura.core.backprojection.engines.tree_prediction import counts_of, view_of_tile
 from apertura.core.backprojection.job import Job, Signal
 from apertura.core.geometry.aperture import Aperture
 

@@ -18,7 +18,7 @@ from apertura.core.geometry.sector import Sector
 
 # ---- Sizes and error bounds of the compiled kernel
 #
-# The engine may not be compiled where a plan is made, so they are not read from the library; a test compares the two.
+# A plan is made with them where the engine is not compiled, too; a test compares them with those of the library.
 
 
 @dataclass(frozen=True)
@@ -89,17 +89,58 @@ class KernelConstants:
 KERNEL = KernelConstants()
 
 
+@dataclass(frozen=True)
+class TreeConstants:
+    """Sizes of subaperture trees, as in native/tree_job.hpp.
+
+    Attributes
+    ----------
+    nodes, side, levels
+        Nodes and pixels along an axis of a tile, and levels of a tree, at most.
+    slots
+        Numbers of nodes, and above them the sides of tiles in pixels, to which nodes are interpolated.
+    leaf
+        Pulses of a leaf, all summed by one variant.
+    virtual, virtual_margin
+        Virtual pulses that replace those of a leaf, at most, and how many there are beyond the degree of their curve.
+    terms
+        Polynomials of the track over a leaf: one more than the highest degree of a curve.
+    degree
+        Of a tile's surface that is no plane.
+    delays
+        Taps of the filter that aligns a pulse to a tile.
+    weights
+        Coefficients of the antennas' gain over a tile.
+    weighted_rad
+        Added to the band at a tile's nodes by smooth weights, rad per half tile.
+    """
+
+    nodes: int = 128
+    side: int = 256
+    levels: int = 4
+    slots: int = 136
+    leaf: int = 64
+    virtual: int = 28
+    virtual_margin: int = 4
+    terms: int = 21
+    degree: int = 6
+    delays: int = 12
+    weights: int = 16
+    weighted_rad: float = 1.5
+
+
+TREE = TreeConstants()
+
+
+BY_TREE, DIRECTLY, NO_ECHO = range(3)
+"""Variant by which a group of pulses is summed over a tile: native/tree_job.hpp, TreeVariant."""
+
+
 # ---- Structures of the compiled library
 
 _pointer = ctypes.c_void_p
 _int64 = ctypes.c_int64
 _double = ctypes.c_double
-
-TREE_NODES, TREE_SLOTS, TREE_LEVELS, TREE_GROUP, TREE_SIDE, TREE_DELAYS, TREE_FEWER = 128, 136, 4, 64, 256, 12, 28
-TREE_TERMS, TREE_MORE, TREE_WEIGHTS, TREE_WEIGHTED = 21, 4, 16, 1.5
-"""As in native/tree_job.hpp: nodes along an axis; places of them and of pixels; levels; pulses of
-a leaf; pixels along a tile; taps that align a pulse; pulses that replace those of a leaf, at most; rad that smooth
-weights add to a band."""
 
 
 class BeamJob(ctypes.Structure):
@@ -176,11 +217,11 @@ class TreeTile(ctypes.Structure):
     """native/tree_job.hpp, TreeTile."""
 
     _fields_ = [
-        *((name, _pointer) for name in ("surface", "pixels", "image", "weight", "way", "nodes", "fewer")),
-        *((name, _pointer) for name in ("edge", "slope")),
+        *((name, _pointer) for name in ("surface", "pixels", "image", "weight", "variant", "nodes")),
+        *((name, _pointer) for name in ("n_virtual_pulses", "edge", "slope", "band", "turn")),
         ("centre", _double * 3),
         ("rest", _double),
-        ("first_path", _double),
+        *((name, _double) for name in ("first_path", "span", "slope_rms")),
         *((name, _int64) for name in ("degree", "rows", "columns", "row_slot", "column_slot", "samples", "top")),
     ]
 
@@ -189,13 +230,15 @@ class TreeJob(ctypes.Structure):
     """native/tree_job.hpp, TreeJob."""
 
     _fields_ = [
-        *((name, _pointer) for name in ("samples", "start", "transmitter", "receiver", "stray", "rough", "track")),
+        *((name, _pointer) for name in ("samples", "start", "transmitter", "receiver")),
+        *((name, _pointer) for name in ("max_track_residual", "rms_track_residual", "track")),
         *((name, _pointer) for name in ("taps", "delay", "presum", "curve", "supports", "places", "spread", "mix")),
         ("tiles", _pointer),
         *((name, _int64) for name in ("pulses", "length", "up", "lead", "stride", "count", "levels", "mono")),
         *((name, _int64) for name in ("phase_polynomial", "taps_count", "delay_terms")),
-        ("sizes", _int64 * TREE_LEVELS),
-        *((name, _double) for name in ("step", "wavenumber", "band", "smooth", "node_error")),
+        ("sizes", _int64 * TREE.levels),
+        ("curve_degrees", _int64 * 4),
+        *((name, _double) for name in ("step", "wavenumber", "band", "presum_error", "node_error")),
         ("beam", ctypes.POINTER(BeamJob) * 2),
         ("sector", ctypes.POINTER(SectorJob)),
         ("phase_coefficients", ctypes.c_float * 9),
@@ -364,7 +407,7 @@ def library() -> ctypes.CDLL:
 
 
 def kernel_constants() -> dict[str, float]:
-    """Return the constants that the library was compiled with, by name (native/bounds.hpp).
+    """Return the constants that the library was compiled with, by name (native/bounds.hpp, native/tree_job.hpp).
 
     Examples
     --------

@@ -1,8 +1,22 @@
 """Backprojection by subaperture trees on Cartesian tiles: of lower order of cost for large images.
 
-A tile's tree sums few pulses at few nodes, and merges subapertures on ever more nodes until the pixels themselves are
-the nodes (docs/theory/tree.md). Tiles depend on nothing but their own pixels. Pulses and tiles that a tree cannot sum
-go through the direct kernel.
+Over a tile of up to 256 × 256 pixels the sum of a few neighbouring pulses is band-limited, once the phase φ of a
+reference pulse is removed (docs/theory/tree.md, eq. 3 and 4). It is therefore computed at few nodes, and interpolated:
+
+1. **Surface** (`tree_geometry`). The places of a tile's pixels become Legendre polynomials, plane or of degree 6.
+2. **Plan** (native/tree_plan.hpp). Every subaperture of each level gets the fewest nodes that support its band (4b),
+   every leaf of 64 pulses the fewest virtual pulses that replace its own (8). Levels end where 128 nodes are too few.
+3. **Leaves** (native/tree_leaf.hpp). The pulses of a leaf are aligned to the tile's centre (7), presummed to virtual
+   pulses (8), expanded to cells and summed at the nodes of the leaf, with the weights of antennas and sector (13).
+4. **Merges** (native/tree_merge.hpp). Subapertures of 64, 256 and `chunk` pulses are merged by two small matrix
+   products each, φ of the child removed and that of the parent restored (5); the last merge goes to the pixels.
+5. **Height layers** (`tree_geometry`). Where pixels lie off the surface (9) the tile is formed on several layers
+   parallel to it and interpolated between them (11).
+
+What a tree cannot sum goes to the quarters of its tile, then through the direct kernel (engine `native`): ends of
+profiles inside the tile, weights that are not smooth, more than 128 nodes, tiles below 32 × 32 pixels. Tiles depend on
+nothing but their own pixels. `tree_inputs` has what all tiles share and the jobs for the library, `tree_prediction` the
+error (10) and the cost of a setting.
 """
 
 from collections.abc import Iterator, Mapping
@@ -19,8 +33,18 @@ from apertura.common.contracts import Window
 from apertura.core.antenna.beam import Beams
 from apertura.core.backprojection.engines import native
 from apertura.core.backprojection.engines.engine import EngineOptions, checked_pixels
-from apertura.core.backprojection.engines.native_binding import TREE_GROUP, TREE_SIDE, available, instruction_set
+from apertura.core.backprojection.engines.native_binding import DIRECTLY, TREE, available, instruction_set
 from apertura.core.backprojection.engines.native_tables import Tables
+from apertura.core.backprojection.engines.tree_geometry import (
+    LEAF,
+    MOST_LAYERS,
+    HeightLayers,
+    SurfaceResidual,
+    layers_for,
+    subaperture_sizes,
+    surfaces_of,
+    windows,
+)
 from apertura.core.backprojection.engines.tree_inputs import (
     LEAST_PIXELS,
     LEAST_QUARTER_PX,
@@ -30,15 +54,7 @@ from apertura.core.backprojection.engines.tree_inputs import (
     Trees,
     prepare,
 )
-from apertura.core.backprojection.engines.tree_nodes import DIRECTLY, surfaces_of, windows
 from apertura.core.backprojection.engines.tree_prediction import candidates
-from apertura.core.backprojection.engines.tree_view import (
-    MOST_SHEETS,
-    Sheets,
-    SurfaceResidual,
-    sheets_for,
-    subaperture_sizes,
-)
 
 __all__ = ["READS", "VARIANTS", "available", "candidates", "form", "instruction_set", "pieces", "prepare"]
 
@@ -54,17 +70,17 @@ class Options(EngineOptions):
         None, description="table cells per resolution cell c/B of total path"
     )
     nodes_db: Literal[-50, -56, -62, -68, -74, -80, -86, -92, -98] | None = Field(
-        None, description="what one interpolation between nodes may err by, dB"
+        None, description="tolerated error of one interpolation between nodes, dB"
     )
     presum_db: Annotated[int, Field(ge=-100, le=-38)] | None = Field(
-        None, description="what pulses may err by for which fewer stand, of what their track leaves a smooth curve, dB"
+        None, description="tolerated error by deviations of the track from the curve of virtual pulses, dB"
     )
-    side_px: Annotated[int, Field(ge=16, le=TREE_SIDE)] | None = Field(
+    side_px: Annotated[int, Field(ge=16, le=TREE.side)] | None = Field(
         None, description="largest side of a tree's tile, pixels"
     )
     chunk: Literal[256, 512, 1024, 2048] | None = Field(None, description="pulses of the largest subaperture")
-    sheets: Annotated[int, Field(ge=0, le=MOST_SHEETS)] | None = Field(
-        None, description="between which a tile of rough ground is read, at most"
+    height_layers: Annotated[int, Field(ge=0, le=MOST_LAYERS)] | None = Field(
+        None, description="most height layers between which a tile of rough ground is interpolated"
     )
 
 
@@ -77,7 +93,7 @@ def form(
     presum_db: int = -74,
     side_px: int = 128,
     chunk: int = 1024,
-    sheets: int = 0,
+    height_layers: int = 0,
     counts: NDArray[np.int64] | None = None,
 ) -> NDArray[np.complex64]:
     """Sum the pulses over a block of pixels.
@@ -93,13 +109,14 @@ def form(
     nodes_db
         Tolerated error of one interpolation between nodes, dB.
     presum_db
-        Tolerated error of pulses replaced by fewer, by deviations of their track from a smooth curve, dB RMS.
+        Tolerated error by deviations of the track from the curve of the virtual pulses, dB RMS.
     side_px
         Largest side of the tiles that the block is cut into; the bits of each do not depend on the others.
     chunk
         Pulses of the largest subaperture.
-    sheets
-        Most sheets between which a tile of rough ground is interpolated; where more are needed it is summed directly.
+    height_layers
+        Most height layers between which a tile of rough ground is interpolated; where more are needed it is summed
+        directly.
     counts
         (3,) int64 to which the number of pixels × pulses is added that were summed by tree, directly, or had no echo.
 
@@ -120,8 +137,8 @@ def form(
     -----
     Source: docs/theory/tree.md.
     """
-    requested = {"nodes_db": nodes_db, "presum_db": presum_db, "side_px": side_px, "chunk": chunk, "sheets": sheets}
-    Options.model_validate(requested)
+    given = {"nodes_db": nodes_db, "presum_db": presum_db, "side_px": side_px, "chunk": chunk}
+    Options.model_validate(given | {"height_layers": height_layers})
     if beams is not None and any(b is not None and len(b.axes) != len(trees) for b in (beams.transmit, beams.receive)):
         raise ValueError(f"beams must be of {len(trees)} pulses")
     pixels = checked_pixels(pixels)
@@ -129,15 +146,15 @@ def form(
     block = partial(_Block, trees, nodes_db, presum_db, chunk)
     flat = block(pixels, image)
     tiles = flat.tiles(list(windows(pixels.shape[:2], side_px)))
-    raised = {tile: sheeting for tile in tiles if not tile.by_tree and (sheeting := flat.sheets(tile, sheets))}
-    flat.sum(beams, [tile for tile in tiles if tile not in raised])
+    rough = {tile: layers for tile in tiles if not tile.by_tree and (layers := flat.height_layers(tile, height_layers))}
+    flat.sum(beams, [tile for tile in tiles if tile not in rough])
     total = flat.counts
-    for tile, sheeting in raised.items():
-        places = sheeting.pixels
-        on_sheets = block(places, np.zeros(places.shape[:2], np.complex64))
-        on_sheets.sum(beams, on_sheets.tiles(sheeting.windows))
-        image[tile.window] = sheeting.read(on_sheets.image, trees.middle, trees.wavenumber_rad_m)
-        of_tile = on_sheets.counts // len(sheeting.heights_m)
+    for tile, layers in rough.items():
+        places = layers.pixels
+        on_layers = block(places, np.zeros(places.shape[:2], np.complex64))
+        on_layers.sum(beams, on_layers.tiles(layers.windows))
+        image[tile.window] = layers.read(on_layers.image, trees.middle, trees.wavenumber_rad_m)
+        of_tile = on_layers.counts // len(layers.heights_m)
         total += of_tile
         total[0] += image[tile.window].size * len(trees) - of_tile.sum()  # what the division dropped
     if counts is not None:
@@ -173,8 +190,8 @@ class _Block:
             for part, surface in zip(parts, surfaces_of(self.pixels, parts), strict=True)
         ]
 
-    def sheets(self, tile: JobTile, most: int) -> Sheets | None:
-        """Return the sheets between which a rough tile is interpolated; None where too many are needed."""
+    def height_layers(self, tile: JobTile, most: int) -> HeightLayers | None:
+        """Return the layers between which a rough tile is interpolated; None where too many are needed."""
         trees, limit = self.trees, 10 ** (self.nodes_db / 20)
         pixels = self.pixels[tile.window]
         if not most or not np.isfinite(tile.surface.rough_m) or pixels.size < 3 * LEAST_PIXELS:
@@ -184,13 +201,13 @@ class _Block:
             return None
         wave = {"wavenumber_rad_m": trees.wavenumber_rad_m, "band_rad_m": trees.band_rad_m}
         band = relief.band_rad(trees.profiles.aperture, **wave)
-        return Sheets.of(relief, band, self.nodes_db) if sheets_for(band, self.nodes_db) <= most else None
+        return HeightLayers.of(relief, band, self.nodes_db) if layers_for(band, self.nodes_db) <= most else None
 
     def sum(self, beams: Beams | None, tiles: list[JobTile]) -> None:
         """Add all pulses to tiles."""
         for pulses in self.trees.chunks(self.chunk):
             some = self.trees[pulses]
-            every = np.ones(-(-len(some) // TREE_GROUP), bool)
+            every = np.ones(-(-len(some) // LEAF), bool)
             if tiles:
                 self.add(some, beams and beams[pulses], [(tile, every) for tile in tiles])
 
@@ -199,7 +216,7 @@ class _Block:
         chunk = Chunk(
             trees, beams, self.nodes_db, self.presum_db, subaperture_sizes(self.chunk), self.pixels, self.image
         )
-        pulses_of = np.minimum(TREE_GROUP, len(trees) - TREE_GROUP * np.arange(-(-len(trees) // TREE_GROUP)))
+        pulses_of = np.minimum(LEAF, len(trees) - LEAF * np.arange(-(-len(trees) // LEAF)))
         left: list[Task] = []
         for (tile, selected), variants in zip(tasks, chunk.add(tasks), strict=True):
             direct = selected & (variants == DIRECTLY)
@@ -237,4 +254,4 @@ def _runs(groups: NDArray[np.bool_], pulses: int) -> Iterator[slice]:
     edges = [0, *(np.flatnonzero(np.diff(groups)) + 1).tolist(), len(groups)]
     for first, last in pairwise(edges):
         if groups[first]:
-            yield slice(first * TREE_GROUP, min(pulses, last * TREE_GROUP))
+            yield slice(first * LEAF, min(pulses, last * LEAF))

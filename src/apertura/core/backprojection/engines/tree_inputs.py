@@ -15,34 +15,28 @@ from apertura.common.contracts import Window
 from apertura.core.antenna.beam import Beams
 from apertura.core.backprojection.engines import native
 from apertura.core.backprojection.engines.native_binding import (
-    TREE_DELAYS,
-    TREE_FEWER,
-    TREE_GROUP,
-    TREE_NODES,
-    TREE_SLOTS,
-    TREE_WEIGHTS,
+    BY_TREE,
+    DIRECTLY,
+    NO_ECHO,
+    TREE,
     TreeJob,
     TreeTile,
     call,
     weights_of,
 )
 from apertura.core.backprojection.engines.native_tables import BAND, TableDesign, Tables, design_table
-from apertura.core.backprojection.engines.tree_nodes import (
-    BY_TREE,
-    DIRECTLY,
-    WITHOUT_ECHO,
-    Surface,
-    matrices,
-    nodes,
-    pixel_places,
-    supports,
-)
-from apertura.core.backprojection.engines.tree_view import (
+from apertura.core.backprojection.engines.tree_geometry import (
+    DEGREES,
     LEAF,
+    Surface,
     curve,
     leaf_roughness,
     leaves_of,
+    matrices,
+    nodes,
     parabola_deviation,
+    pixel_places,
+    supports,
     tracks,
 )
 from apertura.core.backprojection.inputs import Profiles
@@ -266,7 +260,7 @@ def delay_filter(profile_oversampling: float) -> NDArray[np.float32]:
     True
     """
     omega = np.pi / profile_oversampling * BAND
-    basis = np.exp(1j * omega[:, None] * (np.arange(TREE_DELAYS) - TREE_DELAYS // 2 + 1))
+    basis = np.exp(1j * omega[:, None] * (np.arange(TREE.delays) - TREE.delays // 2 + 1))
     u = 0.5 - 0.5 * np.cos(np.pi * (np.arange(24) + 0.5) / 24)
     ideal = np.exp(1j * omega[:, None] * u)
     left, right = (np.concatenate([part.real, part.imag]) for part in (basis, ideal))
@@ -317,7 +311,7 @@ def prepare(profiles: Profiles, *, oversampling: int = 24, taps: int = 8) -> Tre
 
 
 class Weighed(NamedTuple):
-    """What weights make of groups of 64 pulses over a tile.
+    """Groups of 64 pulses over a tile, classified by the weights of antennas and sector.
 
     Attributes
     ----------
@@ -326,9 +320,9 @@ class Weighed(NamedTuple):
     edge
         (group,) bool: the sector ends within the tile.
     slope
-        (group, 3) float32: change of the depth in its edge along ξ, along η and over the pulses, per half of them.
+        (group, 3) float32: change of the depth in that edge along ξ, along η and over the pulses, per half of them.
     each
-        (group,) bool: weights jump from pulse to pulse, so that no fewer pulses can replace them.
+        (group,) bool: weights jump from pulse to pulse, so that virtual pulses cannot replace them.
     """
 
     variant: NDArray[np.uint8]
@@ -338,22 +332,25 @@ class Weighed(NamedTuple):
 
 
 def weighed(beams: Beams, aperture: Aperture, surface: Surface, nodes_db: float) -> Weighed:
-    """Return what weights make of the groups of an aperture over a tile with this surface.
+    """Classify the groups of an aperture over a tile by their weights.
 
     Notes
     -----
     Source: docs/theory/tree.md, "Weights".
     """
-    pulses, groups = len(aperture), -(-len(aperture) // TREE_GROUP)
+    pulses, groups = len(aperture), -(-len(aperture) // LEAF)
     tx, rx = (np.ascontiguousarray(leg, np.float64) for leg in aperture.legs)
-    stray = np.ascontiguousarray(sum(parabola_deviation(leaves_of(leg)) for leg in aperture.legs), np.float32)
+    deviation_m = np.ascontiguousarray(sum(parabola_deviation(leaves_of(leg)) for leg in aperture.legs), np.float32)
     variant, each, edge = np.zeros((3, groups), np.uint8)
-    slope, weight = np.zeros((groups, 3), np.float32), np.zeros((pulses, TREE_WEIGHTS), np.float32)
+    slope, weight = np.zeros((groups, 3), np.float32), np.zeros((pulses, TREE.weights), np.float32)
     coefficients = np.ascontiguousarray(surface.coefficients)
     tile = TreeTile(
-        *(coefficients.ctypes.data, None, None, weight.ctypes.data, variant.ctypes.data, None, each.ctypes.data),
-        edge.ctypes.data,
-        slope.ctypes.data,
+        surface=coefficients.ctypes.data,
+        weight=weight.ctypes.data,
+        variant=variant.ctypes.data,
+        n_virtual_pulses=each.ctypes.data,
+        edge=edge.ctypes.data,
+        slope=slope.ctypes.data,
         degree=len(coefficients) - 1,
     )
     tile.centre[:] = surface.centre_m.tolist()
@@ -363,7 +360,7 @@ def weighed(beams: Beams, aperture: Aperture, surface: Surface, nodes_db: float)
         TreeJob(
             transmitter=tx.ctypes.data,
             receiver=rx.ctypes.data,
-            stray=stray.ctypes.data,
+            max_track_residual=deviation_m.ctypes.data,
             tiles=ctypes.addressof(tile),
             pulses=pulses,
             count=1,
@@ -416,12 +413,12 @@ class Chunk:
     image: NDArray[np.complex64]
     _kept: list[NDArray[np.generic]] = field(default_factory=list)  # arrays that the structs point into
     _counts: list[NDArray[np.uint8]] = field(default_factory=list)  # numbers of nodes of each tile
-    _fewer: list[NDArray[np.uint8]] = field(default_factory=list)  # numbers of pulses that replace those of a leaf
+    _n_virtual: list[NDArray[np.uint8]] = field(default_factory=list)  # numbers of virtual pulses of each leaf
 
     def add(self, tasks: list[Task]) -> list[NDArray[np.uint8]]:
         """Add by tree the groups of 64 pulses given for each tile; return the variant of each group."""
         variants = [
-            np.where(selected, BY_TREE if tile.by_tree else DIRECTLY, WITHOUT_ECHO).astype(np.uint8)
+            np.where(selected, BY_TREE if tile.by_tree else DIRECTLY, NO_ECHO).astype(np.uint8)
             for tile, selected in tasks
         ]
         array = (TreeTile * len(tasks))(
@@ -448,17 +445,17 @@ class Chunk:
         surface, at = tile.surface, rows.start * self.image.shape[1] + columns.start
         counts = np.zeros(sum(2 * -(-len(self.trees) // size) for size in self.sizes), np.uint8)
         self._counts.append(counts)
-        fewer, edge = np.zeros((2, len(variant)), np.uint8)
-        self._fewer.append(fewer)
+        n_virtual, edge = np.zeros((2, len(variant)), np.uint8)
+        self._n_virtual.append(n_virtual)
         antennas = self.beams and self.beams.antennas
         struct = TreeTile(
             surface=self._pointer_to(np.ascontiguousarray(surface.coefficients)),
             pixels=self.pixels.ctypes.data + 24 * at,
             image=self.image.ctypes.data + 8 * at,
-            weight=self._pointer_to(np.zeros((len(self.trees), TREE_WEIGHTS), np.float32)) if antennas else None,
-            way=self._pointer_to(variant),
+            weight=self._pointer_to(np.zeros((len(self.trees), TREE.weights), np.float32)) if antennas else None,
+            variant=self._pointer_to(variant),
             nodes=self._pointer_to(counts),
-            fewer=self._pointer_to(fewer),
+            n_virtual_pulses=self._pointer_to(n_virtual),
             edge=self._pointer_to(edge),
             slope=self._pointer_to(np.zeros((len(variant), 3), np.float32)),
             degree=len(surface.coefficients) - 1,
@@ -479,8 +476,8 @@ class Chunk:
             start=self._pointer_to(np.ascontiguousarray(profiles.start_m)),
             transmitter=self._pointer_to(tx),
             receiver=self._pointer_to(rx),
-            stray=self._pointer_to(self.trees.deviation_m),
-            rough=self._pointer_to(self.trees.rough_m),
+            max_track_residual=self._pointer_to(self.trees.deviation_m),
+            rms_track_residual=self._pointer_to(self.trees.rough_m),
             track=self._pointer_to(self.trees.tracks_m),
             delay=self._pointer_to(delay),
             taps=self._pointer_to(np.ascontiguousarray(taps, np.float32)),
@@ -500,49 +497,51 @@ class Chunk:
             step=profiles.step_m,
             wavenumber=self.trees.wavenumber_rad_m,
             band=self.trees.band_rad_m,
-            smooth=10 ** (self.presum_db / 20),
+            presum_error=10 ** (self.presum_db / 20),
             node_error=10 ** (self.nodes_db / 20),
         )
-        job.sizes[: len(self.sizes)] = self.sizes
+        job.sizes[: len(self.sizes)], job.curve_degrees[:] = self.sizes, DEGREES
         job.phase_coefficients[:] = design.phase_coefficients.tolist()
         return job
 
     def _fill(self, job: TreeJob, tiles: "ctypes.Array[TreeTile]") -> None:
-        """Fill in the nodes and matrices that the plan of the job needs."""
-        places = np.zeros(TREE_SLOTS, np.uintp)
-        spread, mix = (np.zeros((TREE_NODES + 1, TREE_SLOTS), np.uintp) for _ in range(2))
+        """Add to a planned job the nodes and the matrices A of (5), (6) and (8) for its numbers of nodes.
+
+        They lie in tables by number of nodes; sides of tiles in pixels, the last target of a merge, have slots above.
+        """
+        # Which A are needed: of a child's number of nodes, at the slot of its parent's nodes or of the pixels.
         slots: dict[int, int] = {}  # pixels along a side → slot
-        steps: set[tuple[int, int]] = set()  # numbers of nodes, of slots that they are interpolated to
+        merges: set[tuple[int, int]] = set()  # number of nodes, slot
         for tile, counts in zip(tiles, self._counts, strict=True):
             sides = tile.columns, tile.rows
-            tile.column_slot, tile.row_slot = (slots.setdefault(n, TREE_NODES + 1 + len(slots)) for n in sides)
+            tile.column_slot, tile.row_slot = (slots.setdefault(n, TREE.nodes + 1 + len(slots)) for n in sides)
             levels = self._levels(counts)[: tile.top + 1]
-            for (below, above), ratio in zip(pairwise(levels), self._ratios, strict=False):
-                parents = above[np.arange(len(below)) // ratio]
-                steps.update(zip(below.ravel().tolist(), parents.ravel().tolist(), strict=True))
+            for (children, parents), (size, wider) in zip(pairwise(levels), pairwise(self.sizes), strict=False):
+                parent_of = parents[np.arange(len(children)) // (wider // size)]
+                merges.update(zip(children.ravel().tolist(), parent_of.ravel().tolist(), strict=True))
             for top in levels[-1:]:
                 for axis, slot in enumerate((tile.column_slot, tile.row_slot)):
-                    steps.update((count, slot) for count in set(top[:, axis].tolist()))
-        sizes = {slot: size for size, slot in slots.items()}
-        for child, slot in steps:
-            one, other = matrices(child, sizes.get(slot, slot), self.nodes_db, pixels=slot in sizes)
-            spread[child, slot], mix[child, slot] = self._pointer_to(one), self._pointer_to(other)
-        for slot in {slot for step in steps for slot in step}:
-            at = pixel_places(sizes[slot]) if slot in sizes else nodes(slot, self.nodes_db)
+                    merges.update((count, slot) for count in set(top[:, axis].tolist()))
+        side_of = {slot: side for side, slot in slots.items()}
+        # (5): both layouts of each A, and the places of nodes and pixels for the phases u, v and m of (3).
+        places = np.zeros(TREE.slots, np.uintp)
+        spread, mix = (np.zeros((TREE.nodes + 1, TREE.slots), np.uintp) for _ in range(2))
+        for count, slot in merges:
+            by_node, by_target = matrices(count, side_of.get(slot, slot), self.nodes_db, pixels=slot in side_of)
+            spread[count, slot], mix[count, slot] = self._pointer_to(by_node), self._pointer_to(by_target)
+        for slot in {slot for merge in merges for slot in merge}:
+            at = pixel_places(side_of[slot]) if slot in side_of else nodes(slot, self.nodes_db)
             places[slot] = self._pointer_to(np.ascontiguousarray(at))
-        presum, curves = (np.zeros(TREE_FEWER + 1, np.uintp) for _ in range(2))
-        for fewer in {int(n) for counts in self._fewer for n in counts if n > 1}:
-            presum[fewer] = self._pointer_to(
-                np.ascontiguousarray(matrices(fewer, LEAF, self.nodes_db, pixels=True)[1].T)
+        # (8): weights A_pv of a leaf's pulses in virtual ones, and the polynomials of the track at these.
+        presum, curves = (np.zeros(TREE.virtual + 1, np.uintp) for _ in range(2))
+        for count in {int(n) for counts in self._n_virtual for n in counts if n > 1}:
+            presum[count] = self._pointer_to(
+                np.ascontiguousarray(matrices(count, LEAF, self.nodes_db, pixels=True)[1].T)
             )
-            places[fewer] = self._pointer_to(np.ascontiguousarray(nodes(fewer, self.nodes_db)))
-            curves[fewer] = self._pointer_to(curve(fewer, self.nodes_db))
+            places[count] = self._pointer_to(np.ascontiguousarray(nodes(count, self.nodes_db)))
+            curves[count] = self._pointer_to(curve(count, self.nodes_db))
         job.places, job.spread, job.mix = map(self._pointer_to, (places, spread, mix))
         job.presum, job.curve = map(self._pointer_to, (presum, curves))
-
-    @property
-    def _ratios(self) -> list[int]:
-        return [above // below for below, above in pairwise(self.sizes)]
 
     def _levels(self, counts: NDArray[np.uint8]) -> list[NDArray[np.uint8]]:
         """Return the numbers of nodes of each level, (subaperture, 2)."""
