@@ -6,8 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from apertura.common.errors import CampaignError
-from apertura.core.echo.association import associate
-from apertura.core.echo.baseline import EXPLAINED_M, baseline_residual, best_baseline, detect_wrong_association
+from apertura.core.echo.association import EXPLAINED_M, associate, baseline_residual, detect_wrong_association
 
 NS = 1_000_000_000
 
@@ -243,22 +242,6 @@ def test_a_slow_movement_is_found_just_above_what_positions_may_explain(size_m, 
     hidden = baseline_residual(5 + 4 * moved + rng.normal(0, 0.15, time.size), np.full(time.size, 5.0))
     assert hidden.excess > 1
     assert hidden.noise_m < 0.03
-
-
-def test_of_several_baselines_the_one_that_is_measured_is_named_and_none_if_the_first_is_right():
-    rng, time = np.random.default_rng(4), np.arange(800) / 20
-    shifted = {
-        f"{late:+d} s": np.hypot(4.7, time + late - 20) + 0.3 * np.sin((time + late) / 3) for late in range(-20, 21)
-    }
-    measured = shifted["-18 s"] + 7 + rng.normal(0, 0.05, time.size)
-    name, residual_m = best_baseline(measured, {"as stated": shifted["+0 s"], **shifted})
-    assert name == "-18 s"
-    assert residual_m < 0.05
-    assert (
-        best_baseline(shifted["+0 s"] + rng.normal(0, 0.05, time.size), {"as stated": shifted["+0 s"], **shifted})
-        is None
-    )
-    assert best_baseline(measured[:20], {name: one[:20] for name, one in shifted.items()}) is None
 
 
 def test_pulses_at_both_ends_are_not_counted_more_than_once():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from apertura.core.echo import transfer
-from apertura.core.echo.baseline import baseline_residual, detect_wrong_association
+from apertura.core.echo.association import baseline_residual, detect_wrong_association
 from apertura.core.echo.captures import Saturation, blocks_of, spread
 from apertura.core.echo.clock import clock_of, estimate_clock
 from apertura.core.echo.demodulate import Numerology, remove_path

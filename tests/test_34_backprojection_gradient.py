@@ -21,8 +21,7 @@ import apertura as ap
 from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
 from apertura.common.errors import CampaignError
 from apertura.core.antenna.beam import Beams
-from apertura.core.backprojection.contributions import Echoes, block_contributions
-from apertura.core.backprojection.gradient import path_gradient
+from apertura.core.backprojection.contributions import Echoes, block_contributions, path_gradient
 
 LOCAL = pixel_grid(40, 40)
 PLACES = ecef(LOCAL).reshape(-1, 3)[::7]

@@ -24,14 +24,14 @@ def is_number(value: Any) -> bool:
 
 
 def decibels(power_ratio: float) -> float:
-    """Return 10·log10 of a ratio of powers.
+    """Return 10·log10 of a ratio of powers; -300 of none.
 
     Examples
     --------
-    >>> decibels(100.0)
-    20.0
+    >>> decibels(100.0), decibels(0.0)
+    (20.0, -300.0)
     """
-    return float(10 * np.log10(power_ratio))
+    return float(10 * np.log10(max(power_ratio, 1e-30)))
 
 
 def seconds_since(times: Times, start: np.datetime64) -> Floats:

@@ -12,7 +12,7 @@ from apertura.common.arrays import Complexes, Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.antenna.beam import Beam, Beams, antenna_axes, gaussian_cut
 from apertura.core.backprojection.inputs import PhaseHistory
-from apertura.core.echo.baseline import baseline_residual, detect_wrong_association
+from apertura.core.echo.association import baseline_residual, detect_wrong_association
 from apertura.core.echo.compression import centre_frequency, window_weights
 from apertura.core.echo.sidelink import METHODS, measure
 from apertura.core.geometry.aperture import Aperture

@@ -1,4 +1,4 @@
-"""Contributions of pulses and of blocks of pulses at single places, in float64: for certificates and autofocus."""
+"""Contributions of pulses and blocks of pulses at single places, and their derivatives: certificates and autofocus."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -144,6 +144,7 @@ def tap_polynomials() -> NDArray[np.float64]:
     >>> bool(abs(weights @ tone - np.exp(0.5j * np.pi * 0.9 * 3.75)) < 1e-3)
     True
     """
+    # (5): frequencies of the band and places between two samples, these weighted for an integral.
     omega = np.pi / 2 * np.cos(np.pi * (np.arange(160) + 0.5) / 160)
     place, share = (part / 2 for part in np.polynomial.legendre.leggauss(24))
     powers = place[:, None] ** np.arange(DEGREE + 1)
@@ -153,6 +154,7 @@ def tap_polynomials() -> NDArray[np.float64]:
         -1, powers[0].size * TAPS
     )
     ideal = (np.exp(1j * omega[:, None] * place) * root).ravel()
+    # Least squares among polynomials whose values and slopes join.
     left, right = (np.concatenate([part.real, part.imag]) for part in (given, ideal))
     free = _joined()
     coefficients = free @ np.linalg.lstsq(left @ free, right, rcond=None)[0]
@@ -407,3 +409,116 @@ def _add(
         values = echoes.at(places_m[tile])[0] * weights[:, None]
         for (block, _part), (begin, end) in zip(pieces, pairwise(borders), strict=True):
             sums[tile, block] += values[begin:end].sum(axis=0)
+
+
+# ---- Gradient of an objective with respect to phase centres and paths: the exact adjoint of the contributions
+
+
+@dataclass(frozen=True, eq=False)
+class Gradient:
+    """Derivatives of a real objective, pulse by pulse; all in the objective's unit per metre.
+
+    Attributes
+    ----------
+    tx_m, rx_m
+        (pulse, 3) float64, with respect to the phase centre of transmitter and receiver, in the frame of the phase
+        centres. Where one node does both, its derivative is their sum.
+    path_m
+        (pulse,) float64, with respect to a path added to all echoes of a pulse (`Profiles.moved`).
+    """
+
+    tx_m: NDArray[np.float64]
+    rx_m: NDArray[np.float64]
+    path_m: NDArray[np.float64]
+
+
+def path_gradient(
+    profiles: Profiles, places_m: NDArray[np.float64], slope: NDArray[np.complexfloating], *, beams: Beams | None = None
+) -> Gradient:
+    """Return the derivatives of an objective of Σ w·s(R)·exp(+j2πf_mid·R/c), the sum over all pulses at each place.
+
+    Parameters
+    ----------
+    profiles
+        At least twice oversampled; they may be read on access.
+    places_m
+        (place, 3) float64, metres, in the frame of the phase centres.
+    slope
+        (place,) complex, G = ∂J/∂Re + j·∂J/∂Im: the objective changes by Re Σ G*·change of the sum.
+    beams
+        Weight of each pulse at each place; that it changes with the phase centres is neglected. None by default.
+
+    Returns
+    -------
+    Gradient
+        Exact for the sum as `block_contributions` forms it, rounded to float32 for each pulse and place.
+
+    Raises
+    ------
+    ValueError
+        If shapes differ, or places or slopes are not finite.
+
+    Notes
+    -----
+    Source: docs/theory/autofocus.md, eq. 6 to 8. Without the compiled library numpy does the same.
+    """
+    if places_m.shape != (*slope.shape, 3) or slope.ndim != 1:
+        raise ValueError(f"{places_m.shape=}, {slope.shape=}: must be (place, 3) and (place,)")
+    if not (np.isfinite(places_m).all() and np.isfinite(slope).all()):
+        raise ValueError("places and the objective's slopes there must be finite")
+    derivatives, largest = np.zeros((7, len(profiles))), float(np.abs(slope).max(initial=0.0))
+    if largest:
+        # The library takes float32: an objective's own unit must not push it out of range.
+        places_m, slope = np.ascontiguousarray(places_m, np.float64), (slope / largest).astype(np.complex64)
+        for first in range(0, len(profiles), pulses_at_once(profiles)):
+            part = slice(first, min(first + pulses_at_once(profiles), len(profiles)))
+            derivatives[:, part] = _derivatives(profiles, part, places_m, slope, beams) * largest
+    return Gradient(derivatives[:3].T.copy(), derivatives[3:6].T.copy(), derivatives[6])
+
+
+def _derivatives(
+    profiles: Profiles,
+    part: slice,
+    places_m: NDArray[np.float64],
+    slope: NDArray[np.complex64],
+    beams: Beams | None,
+) -> NDArray[np.float64]:
+    """Return (7, pulse): of transmitter, receiver and path."""
+    echoes = Echoes.read(profiles, [part])
+    derivatives = np.zeros((7, len(echoes)))
+    add = _differentiate_compiled if available() else _differentiate
+    for tile in [slice(None)] if beams is None else tiles(len(places_m), len(echoes)):
+        weight = np.ones((1, len(echoes)), np.float32)
+        if beams is not None:
+            weight = beams[part].weight(profiles.aperture[part], places_m[tile]).T.astype(np.float32, order="C")
+        add(echoes, places_m[tile], slope[tile], weight, derivatives)
+    return derivatives
+
+
+def _differentiate_compiled(
+    echoes: Echoes,
+    places_m: NDArray[np.float64],
+    slope: NDArray[np.complex64],
+    weight: NDArray[np.float32],
+    derivatives: NDArray[np.float64],
+) -> None:
+    job = job_of(echoes, places_m, weight)
+    job.objective, job.slopes = slope.ctypes.data, derivatives.ctypes.data
+    call("apertura_differentiate", job)
+
+
+def _differentiate(
+    echoes: Echoes,
+    places_m: NDArray[np.float64],
+    slope: NDArray[np.complex64],
+    weight: NDArray[np.float32],
+    derivatives: NDArray[np.float64],
+) -> None:
+    weight = np.broadcast_to(weight, (len(places_m), len(echoes)))
+    for tile in tiles(len(places_m), len(echoes)):
+        of_path = (np.conj(slope[tile]) * echoes.at(places_m[tile])[1]).real * weight[tile].T
+        for axis, leg in ((0, echoes.tx_m), (3, echoes.rx_m)):
+            offset_m = leg.T[:, None] - places_m[tile]
+            direction = offset_m / np.linalg.norm(offset_m, axis=-1, keepdims=True)
+            derivatives[axis : axis + 3] += np.einsum("px,pxa->ap", of_path, direction)
+        derivatives[6] -= of_path.sum(axis=1)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.common.arrays import decibels
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.backprojection.inputs import Profiles
 from apertura.core.geometry.aperture import Aperture
@@ -113,13 +114,10 @@ def presum_error_db(presum: Presum, aperture: Aperture, place_m: NDArray[np.floa
         Upper edge of the band, where phases turn fastest.
     """
     k = 2 * np.pi * highest_hz / SPEED_OF_LIGHT_M_S
-    real, virtual = (_against_middle(one.path(place_m)) for one in (aperture, _virtual(aperture, presum)))
+    paths = (one.path(place_m) for one in (aperture, _virtual(aperture, presum)))
+    real, virtual = (path_m - path_m[:, [path_m.shape[1] // 2]] for path_m in paths)  # against the middle of the scene
     read = presum.weight.T @ np.exp(1j * k * virtual)
-    return float(10 * np.log10((np.abs(read - np.exp(1j * k * real)) ** 2).mean() + 1e-16))
-
-
-def _against_middle(path_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.asarray(path_m - path_m[:, [path_m.shape[1] // 2]])
+    return decibels(float((np.abs(read - np.exp(1j * k * real)) ** 2).mean()) + 1e-16)
 
 
 def _virtual(aperture: Aperture, presum: Presum) -> Aperture:

@@ -254,7 +254,9 @@ def _graph(forming: _Forming, inputs: PhaseHistory | Profiles, places: Collectio
             sums[place] = key
     for place in places:
         graph[name, *place] = (
-            sums[place] if place in sums else (partial(_empty_tile, forming.grid[forming.window(place)]),)
+            sums[place]
+            if place in sums
+            else (partial(np.zeros, forming.grid[forming.window(place)].shape, np.complex64),)
         )
     return graph
 
@@ -295,11 +297,6 @@ def _form(  # noqa: PLR0917
     forming.weighing.variant_counts.update({name: int(counted["counts"][n]) for n, name in enumerate(variants)})
     tile = np.asarray(image / count, np.complex64)
     return tile if sum_before is None else sum_before + tile
-
-
-def _empty_tile(grid: SceneGrid) -> NDArray[np.complex64]:
-    """Return a tile that no pulse illuminates."""
-    return np.zeros(grid.shape, np.complex64)
 
 
 def _nothing(_done: Any) -> None:

@@ -1,4 +1,4 @@
-"""Association of the receiver's captures with the transmitter's pulses, flags of wrong tags, and missing pulses."""
+"""Association of captures with the transmitter's pulses, its checks by tags and by the sidelink, and missing pulses."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -185,7 +185,9 @@ def associate(
     frames, conflicts = (tx_frame, rx_frame), 0
     by_frame = pairs_by_frame(tags, frames, interval_ns, frame_modulus)
     if by_frame is None:
-        pairs = _pairs_by_tags(tags, interval_ns)
+        pairs = nearest_pairs(tags, fit_modulo_interval(tags, interval_ns), interval_ns)
+        if pairs[0].size:  # again by the line through them
+            pairs = nearest_pairs(tags, fit_pairs(tags, pairs, interval_ns), interval_ns)
     else:
         pairs, conflicts = _agreed_pairs(tags, by_frame, frames, interval_ns)
     if pairs[0].size == 0:
@@ -224,11 +226,6 @@ def _no_common_pulse(tags: Pairs, repetition_interval_s: float, where: str) -> C
         expected=f"pairs within half a repetition interval ({repetition_interval_s / 2:.4g} s)",
         remedy="Check that both recordings are of the same flight, and their core:datetime.",
     )
-
-
-def _pairs_by_tags(tags: Pairs, interval_ns: float) -> Pairs:
-    pairs = nearest_pairs(tags, fit_modulo_interval(tags, interval_ns), interval_ns)
-    return nearest_pairs(tags, fit_pairs(tags, pairs, interval_ns), interval_ns) if pairs[0].size else pairs
 
 
 def _agreed_pairs(
@@ -413,6 +410,134 @@ def _unpaired(association: "Association", tags: Pairs, interval_s: float) -> str
     if abs(begin_s - end_s) <= 1.5 * interval_s < abs(begin_s):
         line += f": both recordings are equally long and {begin_s:+.3f} s apart, as if the tags of one were off by that"
     return line
+
+
+# ---- Sidelink delay against the baseline of the tracks: a check of the association
+
+EXPLAINED_M = 0.05
+"""Metres of movement of a sidelink that errors of the logged positions alone may explain."""
+
+SIGMAS = 5.0
+"""Standard deviations of a median's noise that one of a thousand windows reaches by chance once in 3000 flights."""
+
+_MEDIAN_PULSES = 15, 61, 241
+"""Lengths of the running medians that separate movement from jitter, odd: the longer, the less noise and the slower."""
+
+_ENOUGH = 64  # disjoint windows from which their noise is estimated
+
+
+@dataclass(frozen=True)
+class BaselineResidual:
+    """Residual of the measured delay against the baseline, without a constant and a linear drift.
+
+    Attributes
+    ----------
+    residual_m, noise_m
+        RMS of the residual's running median, metres, and the standard deviation of that median by jitter alone.
+    jitter_m
+        Standard deviation of a single pulse, metres: of the trigger, mostly.
+    largest_m, pulse
+        Largest running median, metres, and its pulse.
+    excess
+        `largest_m` relative to what noise and position errors explain, over running medians of several lengths.
+    """
+
+    residual_m: float
+    noise_m: float
+    jitter_m: float
+    largest_m: float
+    pulse: int
+    excess: float
+
+
+def baseline_residual(delay_m: Floats, baseline_m: Floats) -> BaselineResidual | None:
+    """Return the residual of a sidelink's measured path from its geometry; None of less than 30 pulses.
+
+    Parameters
+    ----------
+    delay_m, baseline_m
+        (pulse,) float64, metres: measured delay of the sidelink times c, NaN where it did not lock, and distance
+        between its antennas.
+
+    Notes
+    -----
+    Source: docs/theory/echo_methods.md, "Association". Of each length only full windows count: a window that runs over
+    the end would repeat its last pulse.
+
+    Examples
+    --------
+    >>> distance = 5 + np.sin(np.arange(200) / 20)
+    >>> [baseline_residual(moved, distance).residual_m.__round__(1) for moved in (distance, np.roll(distance, 9))]
+    [0.0, 0.3]
+    """
+    pulse = np.flatnonzero(np.isfinite(delay_m) & np.isfinite(baseline_m))
+    if pulse.size < 2 * _MEDIAN_PULSES[0]:
+        return None
+    residual = delay_m[pulse] - baseline_m[pulse]
+    jitter = 1.4826 * float(np.median(np.abs(np.diff(residual)))) / 2**0.5
+    residuals = [_smoothed(pulse, residual, jitter, width) for width in _MEDIAN_PULSES if 2 * width <= pulse.size]
+    return max(residuals, key=lambda one: one.excess)
+
+
+def _smoothed(pulse: NDArray[np.intp], residual: Floats, jitter_m: float, width: int) -> BaselineResidual:
+    from scipy import ndimage
+
+    inside = slice(width // 2, -(width // 2))  # full windows
+    smooth, middle = ndimage.median_filter(residual, width)[inside], pulse[inside]
+    smooth = smooth - np.polyval(np.polyfit(middle, smooth, 1), middle)
+    noise_m = 1.2533 * jitter_m / np.sqrt(width)  # standard deviation of a median of so many Gaussian samples
+    steps = np.diff(smooth[::width])
+    if steps.size >= _ENOUGH:  # jitter need not be normal: the median of a uniform one is noisier
+        noise_m = max(noise_m, 1.4826 * float(np.median(np.abs(steps))) / 2**0.5)
+    worst = int(np.argmax(np.abs(smooth)))
+    largest_m = float(abs(smooth[worst]))
+    return BaselineResidual(
+        float(np.sqrt(np.mean(smooth**2))),
+        float(noise_m),
+        jitter_m,
+        largest_m,
+        int(middle[worst]),
+        largest_m / max(EXPLAINED_M, sigmas(smooth.size) * float(noise_m)),
+    )
+
+
+def sigmas(windows: int) -> float:
+    """Return the threshold in standard deviations for the highest of so many windows, of equal false alarm per flight.
+
+    Examples
+    --------
+    >>> sigmas(500), round(sigmas(300_000), 2)
+    (5.0, 6.03)
+    """
+    return float(np.sqrt(SIGMAS**2 + 2 * np.log(max(1.0, windows / 1000))))
+
+
+def detect_wrong_association(residual: BaselineResidual | None) -> str | None:
+    """Return one line on where the measured sidelink deviates from the geometry of its pulses, or None.
+
+    A constant and a linear drift are of the clocks. A residual that moves by more than `EXPLAINED_M` and by more than
+    five times its own noise, six of a long flight, cannot come from trigger jitter: pulses have positions of other
+    pulses, or wrong ones.
+
+    Notes
+    -----
+    Source: docs/theory/echo_methods.md, "Association". Two nodes that keep their distance give no evidence either way:
+    the baseline must change for a wrong pair to be detected.
+
+    Examples
+    --------
+    >>> distance = 5 + np.sin(np.arange(200) / 20)
+    >>> detect_wrong_association(baseline_residual(distance + 3.0, distance)) is None
+    True
+    >>> detect_wrong_association(baseline_residual(np.roll(distance, 9), distance))
+    'sidelink leaves its geometry by ... m at pulse ... (noise ... m): pulses or positions are wrongly associated'
+    """
+    if residual is None or residual.excess <= 1:
+        return None
+    return (
+        f"sidelink leaves its geometry by {residual.largest_m:.2f} m at pulse {residual.pulse} "
+        f"(noise {residual.noise_m:.3f} m): pulses or positions are wrongly associated"
+    )
 
 
 # ---- Missing pulses

@@ -10,7 +10,7 @@ import scipy
 from numpy.typing import NDArray
 from scipy.special import gammainccinv, gammaincinv
 
-from apertura.common.arrays import Complexes, Floats
+from apertura.common.arrays import Complexes, Floats, decibels
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
 from apertura.common.flags import Flags
@@ -112,7 +112,7 @@ def estimate_path_offset(
     _require_visible(power, peak, surroundings, len(groups), search_m, where)
     parts = _refine(groups, frequency_hz, offset_m[peak])
     mean_m, std_m = float(parts.mean()), _deviation_of_mean(parts)
-    contrast_db = 10 * float(np.log10(power[peak] / max(surroundings, 1e-30)))
+    contrast_db = decibels(float(power[peak]) / max(surroundings, 1e-30))
     flags = Flags()
     if std_m > NEEDED_STD_M:
         flags["calibration_uncertain"] = f"path offset {mean_m:.3f} ± {std_m:.3f} m; {NEEDED_STD_M} m is needed"
@@ -181,9 +181,7 @@ def _require_visible(power: Floats, peak: int, surroundings: float, groups: int,
     """Raise unless the peak is higher than the highest of as many cells of clutter would be, and inside."""
     cells = power.size / _OVERSAMPLING
     highest = gammainccinv(groups, FALSE_REFLECTOR / cells) / groups
-    ratio_db, needed_db = (
-        10 * float(np.log10(max(r, 1e-30))) for r in (power[peak] / max(surroundings, 1e-30), highest)
-    )
+    ratio_db, needed_db = (decibels(r) for r in (power[peak] / max(surroundings, 1e-30), highest))
     inside = 0 < peak < power.size - 1
     if ratio_db > needed_db and inside:
         return
@@ -225,4 +223,4 @@ def _rival(offset_m: Floats, power: Floats, peak: int, frequency_hz: Floats) -> 
     cell_m = SPEED_OF_LIGHT_M_S / float(frequency_hz[-1] - frequency_hz[0])
     beside = np.where(np.abs(offset_m - offset_m[peak]) > 2.5 * cell_m, power, 0.0)
     second = int(np.argmax(beside))
-    return 10 * float(np.log10(max(beside[second] / power[peak], 1e-30))), float(offset_m[second])
+    return decibels(float(beside[second] / power[peak])), float(offset_m[second])

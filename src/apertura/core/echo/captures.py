@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apertura.common.arrays import Complexes, Floats
+from apertura.common.arrays import Complexes, Floats, decibels
 from apertura.common.flags import Flags
 from apertura.core.echo.demodulate import Numerology
 from apertura.core.interpolation import kaiser_beta, kaiser_sinc
@@ -160,7 +160,7 @@ class Saturation:
         )
         if not limited.any():
             return Flags()
-        found_db, usual_db = (10 * float(np.log10(value)) for value in (np.median(crest[limited]), usual_crest))
+        found_db, usual_db = (decibels(float(value)) for value in (np.median(crest[limited]), usual_crest))
         line = (
             f"{int(limited.sum())} of {len(peak)} captures of channel {channel}: crest factor {found_db:.1f} dB, "
             f"{usual_db:.1f} dB of the others"

@@ -13,7 +13,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from apertura.common.arrays import Complexes, Floats
+from apertura.common.arrays import Complexes, Floats, decibels
 from apertura.core.echo.captures import AT_ONCE, spread
 from apertura.core.echo.demodulate import Numerology
 
@@ -196,7 +196,7 @@ def interference_floor_db(cfo_hz: float, sfo_ppm: float, numerology: Numerology)
     """
     off_bin = (cfo_hz + numerology.numbers * numerology.spacing_hz * sfo_ppm * 1e-6) / numerology.spacing_hz
     lost = float(np.mean(1 - np.sinc(off_bin) ** 2))
-    return float(10 * np.log10(max(2 * lost / numerology.numbers.size, 1e-30)))
+    return decibels(2 * lost / numerology.numbers.size)
 
 
 def _repetition(groups: Iterable[Complexes], numerology: Numerology) -> tuple[Floats, NDArray[np.complex128]]:

@@ -7,6 +7,8 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from apertura.common.arrays import decibels
+
 # ---- Code of a node's own pulses
 
 FALSE_ALARM = 1e-5
@@ -75,7 +77,7 @@ def own_code(transfer: NDArray[np.complex64], *, prefix_cells: int) -> CodeEvide
     for run in [run for run in _COHERENT_PULSES if run <= pulses] or [pulses]:
         level, needed, scatter = _strongest(profile, run, 2 * prefix_cells, beyond)
         scattered = max(scattered, scatter)
-        line = f"the strongest complete echo, {run} pulses added, is {_db(level):.1f} dB above what lies beyond"
+        line = f"the strongest complete echo, {run} pulses added, is {decibels(level):.1f} dB above what lies beyond"
         if level >= needed:
             return CodeEvidence(True, line)
     if scattered > _SPREAD_SIGMAS:
@@ -84,7 +86,7 @@ def own_code(transfer: NDArray[np.complex64], *, prefix_cells: int) -> CodeEvide
             f"{line}; what repeats in all pulses is spread over all delays: the code is wrong, or another transmits",
         )
     return CodeEvidence(
-        None, f"{line}, {_db(needed):.1f} dB needed: no echo rises above the noise, or the code is wrong"
+        None, f"{line}, {decibels(needed):.1f} dB needed: no echo rises above the noise, or the code is wrong"
     )
 
 
@@ -108,10 +110,6 @@ def _strongest(profile: NDArray[np.complex64], run: int, inside: int, beyond: sl
     level = power[:, :inside].max(1) / mean
     best = int((level / needed).argmax())
     return float(level[best]), float(np.broadcast_to(needed, level.shape)[best]), float(sigmas.max())
-
-
-def _db(ratio: float) -> float:
-    return 10 * float(np.log10(ratio))
 
 
 # ---- Phase stability of a node's own pulses

@@ -11,7 +11,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from apertura.common.arrays import Floats
+from apertura.common.arrays import Floats, decibels
 
 BAND_FLOOR_DB = -10.0
 """dB below the highest power of the pulse, at which a band that is not stated ends."""
@@ -131,7 +131,7 @@ def pulse_filter(spectrum: NDArray[np.complexfloating], *, requested: str) -> Pu
     if not mean > 0:
         raise ValueError("the band holds no energy")
     inverse = np.conj(spectrum) / np.maximum(power, mean * 10 ** (NULL_DB / 10))
-    uneven_db, loss_db = float(10 * np.log10(max(power.var() / mean**2, 1e-10))), _loss_db(spectrum, inverse)
+    uneven_db, loss_db = decibels(max(float(power.var() / mean**2), 1e-10)), _loss_db(spectrum, inverse)
     sidelobes_db = _sidelobes_db(spectrum * inverse)
     if requested != "auto":
         name, reason = requested, "asked for"
@@ -187,7 +187,7 @@ def _loss_db(spectrum: NDArray[np.complexfloating], filtered: NDArray[np.complex
     """Return the loss of signal to noise ratio of a filter against the matched one, dB (Schwarz: 0 or more)."""
     gain = abs(np.vdot(np.conj(filtered), spectrum)) ** 2
     kept = gain / ((np.abs(filtered) ** 2).sum() * (np.abs(spectrum) ** 2).sum())
-    return float(-10 * np.log10(min(kept, 1.0))) + 0.0
+    return -decibels(min(kept, 1.0)) + 0.0
 
 
 def _sidelobes_db(response: NDArray[np.complexfloating]) -> float:

@@ -11,7 +11,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from apertura.common.arrays import Complexes
+from apertura.common.arrays import Complexes, decibels
 from apertura.core.echo.line_of_sight import LineOfSight, fit_line_of_sight, phasor
 from apertura.core.echo.sidelink_state import ECHO_DB, GATE_CELLS, NULL_DB, SidelinkState, measure
 
@@ -190,7 +190,7 @@ def choose(state: SidelinkState) -> tuple[str, str]:
 
 def _gain_db(state: SidelinkState, cells: int) -> float:
     """Return the SNR with all but `cells` delay cells removed."""
-    return state.snr_db + 10 * float(np.log10(state.subcarriers / min(cells, state.subcarriers)))
+    return state.snr_db + decibels(state.subcarriers / min(cells, state.subcarriers))
 
 
 def _amplitude(symbols: Complexes, path: LineOfSight) -> NDArray[np.float32]:

@@ -17,7 +17,7 @@ from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
 from apertura.common.flags import Flags
 from apertura.common.progress import progress
-from apertura.core.echo.baseline import BaselineResidual, baseline_residual, detect_wrong_association
+from apertura.core.echo.association import BaselineResidual, baseline_residual, detect_wrong_association
 from apertura.core.echo.captures import (
     Pulses,
     Read,
@@ -236,6 +236,7 @@ def transfer_by_sidelink(
     Source: docs/theory/echo_methods.md. The clock is measured on up to 4096 captures, 16 stretches spread over the
     flight, the state of the sidelink on all.
     """
+    # First pass: the clock on a sample of captures, the state of the sidelink on all.
     demodulator = Demodulator(inverse, numerology, symbol_samples)
     receiver = _Receiver.measured(read, demodulator, len(sidelink_m), accuracy_db)
     with progress("sidelinks", len(sidelink_m)) as done:
@@ -246,6 +247,7 @@ def transfer_by_sidelink(
                 raise
             expected, remedy = "samples I + jQ in the order of the recorder", "Set waveform.iq to swapped or conjugate."
             raise CampaignError(f"{unlocked.found}; {_INVERTED}", f"{where}: sidelink", expected, remedy) from None
+    # Method, and flags of what it does not remove or what is wrong with the recording.
     chosen, reason = choose(state) if method == "auto" else (method, "asked for")
     unclocked = receiver.clock_flags if numerology.repeats or chosen not in DIVIDING else {}
     cell_m = SPEED_OF_LIGHT_M_S / (numerology.numbers.size * numerology.spacing_hz)
@@ -264,6 +266,7 @@ def transfer_by_sidelink(
         {"spectrum_inverted": _INVERTED} if inverted else {},
     )
     quality = {"method": chosen, "reason": reason, **_sidelink_report(state, residual)}
+    # Second pass, block by block when asked for.
     correction = Correction(chosen, state.path, receiver.clock_hz, receiver.sfo_ppm)
     saturation = Saturation()
     formed = forming(read, demodulator, saturation)

@@ -8,7 +8,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from apertura.common.arrays import Complexes
+from apertura.common.arrays import Complexes, decibels
 from apertura.core.echo.captures import Samples
 
 # ---- Framing: preamble and frame counter
@@ -259,7 +259,7 @@ class _PeakSearch:
         self.best, self.open_from = None, sample + self.silence
         # the score of a signal of SNR ρ per sample is about (ρL + 1)/(L·(ρ + 1)), L the length of the preamble
         ratio = max(score * self.reach - 1, 1e-3) / (self.reach * max(1 - score, 1e-9))
-        yield Detection(sample, score, float(10 * np.log10(ratio)))
+        yield Detection(sample, score, decibels(ratio))
 
 
 # ---- Extraction of captures from a continuous recording
@@ -313,10 +313,11 @@ def trigger_captures(
     sample_bits
         Of a sample of one channel as it was recorded.
     """
+    blocks = (samples[start : start + _SAMPLES_AT_ONCE] for start in range(0, len(samples), _SAMPLES_AT_ONCE))
     detections = [
         detection
         for detection in find_preambles(
-            _blocks(samples), framing, symbol_samples=symbol_samples, false_alarms_per_s=false_alarms_per_s
+            blocks, framing, symbol_samples=symbol_samples, false_alarms_per_s=false_alarms_per_s
         )
         if detection.sample + framing.lead_samples + symbol_samples <= len(samples)
     ]
@@ -331,8 +332,3 @@ def trigger_captures(
         "mean_rate_bit_s": framing.sample_rate_hz * sample_bits * duty_cycle,  # of one channel
     }
     return TriggeredCaptures(places + framing.lead_samples, np.array(numbers, np.int64), report)
-
-
-def _blocks(samples: SampleSource) -> Iterator[Samples]:
-    for start in range(0, len(samples), _SAMPLES_AT_ONCE):
-        yield samples[start : start + _SAMPLES_AT_ONCE]

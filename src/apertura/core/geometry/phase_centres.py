@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.common.arrays import seconds_since
 from apertura.common.errors import CampaignError
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.geodesy import LOCAL_NED, body_axes, ned_axes
@@ -157,8 +158,8 @@ def phase_centres(
     (docs/theory.md, "Geometry").
     """
     _check_covered(track_time, at, where)
-    spline = position_spline(_seconds(track_time - track_time[0]), position, smoothing_m=smoothing_m)
-    centres = spline(_seconds(at - track_time[0]))
+    spline = position_spline(seconds_since(track_time, track_time[0]), position, smoothing_m=smoothing_m)
+    centres = spline(seconds_since(at, track_time[0]))
     if not any(lever_arm_m):
         return np.asarray(centres)
     why = f"a lever arm of {list(lever_arm_m)} m"
@@ -190,7 +191,7 @@ def attitude_axes(
         If the track does not cover `at`, or there is no attitude in the log.
     """
     _check_covered(track_time, at, where)
-    spline = position_spline(_seconds(track_time - track_time[0]), position, smoothing_m=smoothing_m)
+    spline = position_spline(seconds_since(track_time, track_time[0]), position, smoothing_m=smoothing_m)
     why = "an antenna's beam"
     ned, body = _turn(
         track_time, attitude, spline, at=at, attitude_from=attitude_from, frame=frame, why=why, where=where
@@ -244,12 +245,12 @@ def _turn(
     where: object,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return NED → `frame` and body → NED at given times; `why` they are needed."""
-    pulses = _seconds(at - track_time[0])
+    pulses = seconds_since(at, track_time[0])
     ned = ned_axes(spline(pulses)) if frame == "ecef" else np.broadcast_to(LOCAL_NED, (len(pulses), 3, 3))
     angles = (
         _course(spline.derivative()(pulses), ned)
         if attitude_from == "course"
-        else _logged(_seconds(track_time - track_time[0]), attitude, pulses)
+        else _logged(seconds_since(track_time, track_time[0]), attitude, pulses)
     )
     if not np.isfinite(angles).all():
         raise CampaignError(
@@ -262,8 +263,8 @@ def _turn(
 
 
 def _check_covered(track_time: NDArray[np.datetime64], at: NDArray[np.datetime64], where: object) -> None:
-    early = float(_seconds(track_time[0] - at.min()))
-    late = float(_seconds(at.max() - track_time[-1]))
+    early = -float(seconds_since(at.min(), track_time[0]))
+    late = float(seconds_since(at.max(), track_time[-1]))
     if max(early, late) > 0:
         ends = [f"begins {early:.3f} s after the first pulse"] if early > 0 else []
         ends += [f"ends {late:.3f} s before the last"] if late > 0 else []
@@ -286,7 +287,3 @@ def _logged(
 ) -> NDArray[np.float64]:
     smooth = np.unwrap(attitude, axis=0)
     return np.stack([np.interp(pulses, epochs, angle) for angle in smooth.T], -1)
-
-
-def _seconds(span: NDArray[np.timedelta64]) -> NDArray[np.float64]:
-    return np.asarray(span / np.timedelta64(1, "s"))

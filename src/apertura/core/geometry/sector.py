@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.common.arrays import decibels
 from apertura.core.geometry.aperture import Aperture, Weigh, distance
 
 TAPER = 0.1
@@ -265,4 +266,4 @@ def response() -> tuple[float, float]:
     power /= power[0]
     first = int(np.argmax(np.diff(power) > 0))
     width = 2 * float(np.interp(-0.5, -power[: first + 1], at[: first + 1]))
-    return width, float(10 * np.log10(power[first:].max()))
+    return width, decibels(float(power[first:].max()))

@@ -246,7 +246,8 @@ def rounded_time_m(time_s: Floats, position_m: Floats) -> float:
     (0.23, 0.0)
     """
     steps = np.diff(time_s)
-    grain = next((g for g in (1.0, 0.5, 0.2, 0.1, 0.05, 0.02, 0.01) if _multiples(time_s, g)), 0.0)
+    grains = (1.0, 0.5, 0.2, 0.1, 0.05, 0.02, 0.01)
+    grain = next((g for g in grains if (np.abs(steps / g - np.round(steps / g)) < 1e-4).all()), 0.0)
     if not grain or np.ptp(steps) < grain / 2 or len(time_s) < 12:
         return 0.0
     velocity = np.gradient(position_m, time_s, axis=0)
@@ -259,11 +260,6 @@ def rounded_time_m(time_s: Floats, position_m: Floats) -> float:
     typical = float(np.median(along))
     believed = typical > max(0.5 * expected, 3 * float(np.median(across)), LEAST_FAULT_M)
     return float(expected) if believed else 0.0
-
-
-def _multiples(time_s: Floats, grain_s: float) -> bool:
-    steps = np.diff(time_s) / grain_s
-    return bool((np.abs(steps - np.round(steps)) < 1e-4).all())
 
 
 def rounded_position_m(time_s: Floats, position_m: Floats, *, least_m: float) -> float:
@@ -424,7 +420,10 @@ def check_track(
         for step in find_steps(time_s[part], place[part])
     ]
     sound = np.flatnonzero(cause == "")
-    faults = {name: _listed(time_s[cause == name], size[cause == name]) for name in ("track_outlier", "track_frozen")}
+    faults = {
+        name: list(zip(time_s[cause == name].tolist(), size[cause == name].tolist(), strict=True))
+        for name in ("track_outlier", "track_frozen")
+    }
     faults["track_outlier"] += [((step.start_s + step.end_s) / 2, step.size_m) for step in steps]
     rounded_m = rounded_time_m(time_s, place)
     if rounded_m > tolerated_m:
@@ -458,10 +457,6 @@ def _parts(time_s: Floats, cause: NDArray[np.str_]) -> list[NDArray[np.intp]]:
         return []
     lengths = np.diff(time_s[sound])
     return np.split(sound, np.flatnonzero(lengths > LONG_GAP * np.median(lengths)) + 1)
-
-
-def _listed(time_s: Floats, size_m: Floats) -> list[tuple[float, float]]:
-    return list(zip(time_s.tolist(), size_m.tolist(), strict=True))
 
 
 def _holes(

@@ -176,6 +176,7 @@ def backproject(  # noqa: PLR0913 - each choice is a keyword, so that an editor 
         where="backproject",
         expected="choices of ImagingChoices",
     )
+    # Inputs and scene, checked.
     inputs = inputs_of(profiles, choices.window)
     inputs = replace(inputs, aperture=inputs.aperture.copied())  # the image is lazy, and the caller's arrays may change
     ground = ground_of(terrain, grid)
@@ -185,11 +186,13 @@ def backproject(  # noqa: PLR0913 - each choice is a keyword, so that an editor 
     _check_calibration(calibration, inputs)
     flags = check_inputs(inputs, grid, ground)
     history = inputs if isinstance(inputs, PhaseHistory) else None
+    # Plan.
     models = GroundModels.of(ground, None, grid)
     job = replace(_job(inputs, grid, models, beams, choices.integrated), tile_px=choices.tile_px)
     compressed = _compressed(inputs, grid, ground, job.beams)
     plan = make_plan(job, accuracy_db=accuracy_db, overrides=choices.planned, where="backproject")
     formation = Formation(history, compressed, grid, plan, choices.tile_px)
+    # Certificate: random pixels against the exact sum, the plan's next setting where they miss the accuracy.
     attributes: dict[str, Any] = {}
     if certified_pixels:
         formation, error = _certified(formation, accuracy_db, certified_pixels)
@@ -203,10 +206,11 @@ def backproject(  # noqa: PLR0913 - each choice is a keyword, so that an editor 
         if error.bound_db > accuracy_db:
             sure = f"up to {error.bound_db:.1f} dB ({CONFIDENCE:.0%} sure)"
             flags["accuracy_missed"] = f"{sure}, {accuracy_db:g} dB asked"
+    # Judgement of focus, and attributes.
     error_db = attributes.get("numerical_error_db")
-    told = _judged(formation, judge, error_db=error_db)
-    flags = Flags.merged(flags, plan.flags, told.flags)
-    focus = focus_with_flags({"verdict": told.verdict, "why": told.why}, flags, error_db=error_db)
+    judged = _judged(formation, judge, error_db=error_db)
+    flags = Flags.merged(flags, plan.flags, judged.flags)
+    focus = focus_with_flags({"verdict": judged.verdict, "why": judged.why}, flags, error_db=error_db)
     attributes |= {
         "units": "1",
         "wave_speed_m_s": inputs.wave_speed_m_s,
@@ -218,7 +222,7 @@ def backproject(  # noqa: PLR0913 - each choice is a keyword, so that an editor 
         "flags": json.dumps(flags, ensure_ascii=False),
         "verdict": focus["verdict"],
         "verdict_why": focus["why"],
-        "budget": json.dumps(told.budget, ensure_ascii=False),
+        "budget": json.dumps(judged.budget, ensure_ascii=False),
     }
     lazy = formation.image
     lazy.dask.layers[lazy.name].origin = formation  # for apertura.judge

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.common.arrays import decibels
 from apertura.common.flags import Flags
 from apertura.core.antenna.beam import Beams
 from apertura.core.antenna.illumination import illumination_mask
@@ -21,7 +22,7 @@ from apertura.core.imaging.formation import PULSES_READ, Formation
 from apertura.core.imaging.range_profiles import GUARD_SAMPLES, OVERSAMPLING, RangeWindow, range_compress
 from apertura.core.imaging.view import ground_axes
 from apertura.core.quality.bright_points import SPECKLE, BrightPoint, PointResponse, bright_points
-from apertura.core.quality.focus import Focus, PointFocus, SubApertures, compare_parts, judge, judge_parts, point_focus
+from apertura.core.quality.focus import PointFocus, SubApertures, compare_parts, judge, judge_parts, point_focus
 from apertura.core.quality.measures import coherence_factor
 from apertura.core.quality.path_errors import Effect
 from apertura.core.scene.grid import SceneGrid
@@ -153,6 +154,7 @@ def echo_elsewhere(
     Source: docs/theory/focus.md, "Echo elsewhere". The direct path between the antennas does not count.
     """
     some = inputs[inputs.aperture.sample(_MOST_PULSES)]
+    # Power of the profiles beyond the scene's paths and a margin, the direct path left out, and inside.
     path_m, power, cell_m, span_m = _profiles(some)
     nearest, farthest = swath(grid, terrain, some.aperture)
     margin = _NEAR_CELLS * cell_m
@@ -165,6 +167,7 @@ def echo_elsewhere(
     within = np.where(beyond, np.nan, power)
     inside = np.nanmax(within, axis=1)
     scene = f"the scene's are {nearest.min():.1f} to {farthest.max():.1f} m"
+    # An echo outside stronger than all inside, and no sidelobe of one that the image focuses.
     above_db = _median_db(outside / np.maximum(inside, 1e-30))
     alone = min(above_db, _median_db(outside / np.maximum(np.median(power, axis=1), 1e-30))) > OUTSIDE_ECHO_DB
     if alone and measured:
@@ -178,6 +181,7 @@ def echo_elsewhere(
         )
     if measured:
         return None
+    # An echo inside, too strong to be speckle, that no point of the image focuses.
     alone_db = _median_db(inside / np.maximum(np.nanmedian(within, axis=1), 1e-30))
     if len(inputs) < LEAST_PULSES or alone_db <= UNFOCUSED_ECHO_DB:
         return None
@@ -221,7 +225,7 @@ def _gathered(points: Sequence[NDArray[np.complex128]], *, pixels: int) -> float
 
 
 def _median_db(ratio: NDArray[np.float64]) -> float:
-    return 10 * float(np.log10(max(float(np.median(ratio)), 1e-30)))
+    return decibels(float(np.median(ratio)))
 
 
 def _profiles(
@@ -436,7 +440,9 @@ def focus_report(formation: Formation, target: Any) -> dict[str, Any]:
     peak = max((point.amplitude for point in points), default=0.0)
     conjugated = elsewhere or verdict.loss_db < _CONJUGATED_LOSS_DB
     return {
-        **_verdict_report(verdict),
+        "verdict": verdict.verdict,
+        **({"loss_db": round(verdict.loss_db, 3), "std_db": round(verdict.std_db, 3)} if verdict.points else {}),
+        "why": verdict.why,
         **({"elsewhere": elsewhere} if elsewhere else {}),
         **({"conjugated": line} if conjugated and (line := _conjugated(formation, peak)) else {}),
         "cell_m": round(cell_m, 4),
@@ -536,11 +542,6 @@ def _places(formation: Formation, point: BrightPoint, step_px: float) -> NDArray
         indexing="ij",
     )
     return formation.positions_at(rows, columns)
-
-
-def _verdict_report(verdict: Focus) -> dict[str, Any]:
-    measured = {} if verdict.points == 0 else {"loss_db": round(verdict.loss_db, 3), "std_db": round(verdict.std_db, 3)}
-    return {"verdict": verdict.verdict, **measured, "why": verdict.why}
 
 
 def _point_report(formation: Formation, point: BrightPoint, focus: PointFocus) -> dict[str, Any]:

@@ -133,7 +133,8 @@ class Formation:
         (pixel,) complex64, and mean |I|² over the pieces formed, (pixel,) float64.
         """
         windows = list(dict.fromkeys(self._piece(*pixel) for pixel in pixels.tolist()))
-        image = dict(zip(windows, self.image_of([_slices(window) for window in windows]), strict=True))
+        images = self.image_of([(slice(*window[:2]), slice(*window[2:])) for window in windows])
+        image = dict(zip(windows, images, strict=True))
         values, power = np.zeros(len(pixels), np.complex64), np.zeros(len(pixels))
         for number, (row, column) in enumerate(pixels.tolist()):
             top, _, left, _ = window = self._piece(row, column)
@@ -232,10 +233,6 @@ class Formation:
             side_px=self.side_px,
             weighing=Weighing(self.beams, summed, self.plan.count, self.variant_counts),
         )
-
-
-def _slices(window: tuple[int, int, int, int]) -> Window:
-    return slice(*window[:2]), slice(*window[2:])
 
 
 def _terms(inputs: PhaseHistory | Profiles, places: NDArray[np.float64], beams: Beams | None) -> NDArray[np.complex128]:

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from apertura.common.errors import CampaignError
 from apertura.core.antenna.beam import Beams
-from apertura.core.backprojection.gradient import Gradient, path_gradient
+from apertura.core.backprojection.contributions import Gradient, path_gradient
 from apertura.core.backprojection.inputs import Profiles
 from apertura.core.imaging.range_profiles import profiles_of
 from apertura.core.scene.grid import SceneGrid

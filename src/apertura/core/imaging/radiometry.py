@@ -296,7 +296,7 @@ class Calibration:
         every = max(1, (reached.stop - reached.start) // _PULSES)
         some, share = slice(reached.start, reached.stop, every), every / self.count
         gradient = self.aperture[some].path_gradient(points)
-        share_of, weight = self._parts(some, points)
+        share_of, weight = point_weights(self.aperture[some], self.beams and self.beams[some], points)
         amplitude = share_of.sum(axis=0) * share
         slant, towards = _directions(gradient, share_of, up)
         level = _spread(gradient.swapaxes(0, 1), share_of.T, up)
@@ -307,9 +307,6 @@ class Calibration:
             self.noise[block] = np.log((weight**2).sum(axis=0) * share / self.count).reshape(shape)
         self.across[block] = _across(gradient, share_of, up).reshape(shape)
         self.directions[block] = np.stack([up, slant, towards], axis=1).reshape(*shape, 3, 3)
-
-    def _parts(self, pulses: slice, points: Floats) -> tuple[Floats, Floats]:
-        return point_weights(self.aperture[pulses], self.beams and self.beams[pulses], points)
 
     def at(self, points: Floats) -> tuple[Floats, Floats]:
         """Return the power of 1 m² in the image, K·A², and of the noise in units of a pulse's, at points.
@@ -484,6 +481,7 @@ def _spread(gradient: Floats, parts: Floats, up: Floats) -> Floats:
     ndarray
         (place,) float64; NaN where fewer than two pulses count, or none moves the spatial frequency.
     """
+    # Spatial frequency of each pulse on level ground: its azimuth about the mean, and its square.
     places, pulses = parts.shape
     size = np.abs(parts)
     counts = size > _LEAST * size.max(axis=1, initial=0.0, keepdims=True)
@@ -497,6 +495,7 @@ def _spread(gradient: Floats, parts: Floats, up: Floats) -> Floats:
     # Pulses that do not count are sorted behind the others, where steps between them are nothing.
     order = np.argsort(np.where(counts, azimuth, np.inf), axis=1, kind="stable")
     parts, azimuth = (np.take_along_axis(one, order, axis=1) for one in (parts, azimuth))
+    # s: ∫|f|² dφ from pulse to pulse.
     squared = np.take_along_axis((level**2).sum(axis=-1), order, axis=1)
     counted = np.arange(pulses) < many[:, None]
     steps = np.diff(azimuth, axis=1) * (squared[:, 1:] + squared[:, :-1]) / 2 * counted[:, 1:]
@@ -504,6 +503,7 @@ def _spread(gradient: Floats, parts: Floats, up: Floats) -> Floats:
     spread, known = np.full(places, np.nan), (many > 1) & (place[:, -1] > 0)
     if not known.any():
         return spread
+    # U(s): the running sum of the parts, from half a step before the first pulse to half a step behind the last.
     place, parts, many = place[known], parts[known], many[known, None]
     length, edge = place[:, -1:], 1 / (2 * (many - 1))  # a pulse stands for half a step on both sides
     place = np.concatenate([-edge, place / length, 1 + edge], axis=1)
@@ -514,6 +514,7 @@ def _spread(gradient: Floats, parts: Floats, up: Floats) -> Floats:
     bins = np.minimum(_BINS, many)
     at = np.minimum(np.arange(_BINS + 1) / bins, 1.0) * (1 + 2 * edge) - edge
     apart = 4.0 * np.arange(len(place))[:, None]
+    # dU/ds in bins, and (5).
     density = np.diff(
         np.interp((at + apart).ravel(), (place + apart).ravel(), summed.ravel()).reshape(at.shape), axis=1
     )

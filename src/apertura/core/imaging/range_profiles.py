@@ -7,6 +7,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from apertura.common.arrays import decibels
 from apertura.common.errors import CampaignError
 from apertura.core.antenna.beam import Beams
 from apertura.core.backprojection.inputs import PhaseHistory, Profiles
@@ -223,7 +224,7 @@ class CompressionError:
     @property
     def decibels(self) -> float:
         """RMS error over RMS of the samples, dB; -300 of nothing."""
-        return 10 * float(np.log10(max(self._wrong / max(self._power, 1e-300), 1e-30)))
+        return decibels(self._wrong / max(self._power, 1e-300))
 
 
 # ---- Stages as inputs of engines

@@ -44,11 +44,13 @@ def view_report(formation: Formation, began: np.datetime64, time_s: NDArray[np.f
         (docs/theory/interferometry.md, eq. 1). `carriers_cycles_m`: the same at three rows times three columns
         from corner to corner (`carrier_at`).
     """
+    # The scene's middle, and the pulses that illuminate it.
     here, (east, north) = ground_axes(formation, *((size - 1) / 2 for size in formation.grid.shape))
     profiles, beams = formation.profiles, formation.beams
     weight = np.ones(len(profiles)) if beams is None else beams.weight(profiles.aperture, here[None])[:, 0]
     counted = np.flatnonzero(weight >= _COUNTS)
     counted = counted if counted.size else np.arange(len(profiles))
+    # Closest approach: the least total path; the carrier is the mean gradient of the path over the wavelength.
     aperture, up = profiles.aperture[counted], np.cross(east, north)
     path, middle = aperture.path(here), aperture.middle_m
     closest = int(path.argmin())

@@ -286,6 +286,7 @@ def _integration_of(
             expected="a scene that the flight passes, or antennas that look at it, and an angle that spans an aperture",
             remedy="Set processing.integration to all or to more, or correct scene.bounds_m.",
         )
+    # Report: angle, response of the smooth edges, squint of the places, pulses of a place.
     degrees = float(np.degrees(2 * np.arcsin(min(1.0, sector.half))))
     least, median, most = (round(float(np.quantile(counts, part))) for part in (0, 0.5, 1))
     counted = f"of {len(aperture)} pulses a place takes {least} to {most} (median {median})"

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.filesize import decimal
 
+from apertura.common.arrays import decibels
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
 from apertura.common.flags import Flags
@@ -122,7 +123,7 @@ def undersampling(job: Job) -> str | None:
     # a ghost walks a wavelength of path per pulse: through the response of a windowed band in twice f/B pulses
     walked = (lowest_hz + highest_hz) / max(highest_hz - lowest_hz, 1.0) / max(pulses, 1)
     ghost_db = 20 * np.log10(max(min(1.0, walked, float(folded.max())), 1e-6))
-    reached, brighter_db = float(np.minimum(folded, 1).mean()), 10 * np.log10(1 + float(folded.mean()))
+    reached, brighter_db = float(np.minimum(folded, 1).mean()), decibels(1 + float(folded.mean()))
     if not (brighter_db > FOLDED_DB or (ghost_db > GHOST_DB and reached > REACHED)):
         return None
     return (

@@ -203,6 +203,7 @@ def make_plan(
     Source: docs/theory/planner.md.
     """
     requested = {name: value for name, value in (overrides or {}).items() if value not in (None, "auto")}
+    # Model of the ground first: engines are predicted on its pixels.
     flags = check_geometry(job)
     terrain = decide_terrain(job, requested=requested.get("terrain"), where=where)
     if job.patches_on is not None:
@@ -210,6 +211,7 @@ def make_plan(
     search = SettingSearch(
         job, requested.get("engine"), requested.get("engine_options", {}), requested.get("pulse_blocks"), where
     )
+    # The cheapest setting for every pulse, and for fewer where a low-pass sum pays; blocks that fit into memory.
     every_pulse = search.cheapest(len(job.aperture), accuracy_db - MARGIN_DB)
     presumming, presum, chosen = _decide_presum(search, every_pulse, accuracy_db, requested.get("presum"))
     antennas, missed = decide_antennas(job.beams, job.illumination)

@@ -469,14 +469,15 @@ def _any(
     left = np.flatnonzero(~illuminated)
     near = illumination_mask(beams[pulses], aperture[pulses], points[left], np.zeros(left.size), pulses=sizes[0])
     for number in np.flatnonzero(near.any(axis=1)):
-        asked = left[near[number] & ~illuminated[left]]
+        undecided = left[near[number] & ~illuminated[left]]
         block = pulses[number * sizes[0] : (number + 1) * sizes[0]]
-        illuminated[asked] = _any(beams, aperture, points[asked], block, sizes[1:])
+        illuminated[undecided] = _any(beams, aperture, points[undecided], block, sizes[1:])
     return np.asarray(illuminated)
 
 
 def _centres(aperture: Aperture, beams: Beams | None, points: Floats, weight: Floats) -> Floats:
     """Return both antennas (point, 2, 3) where each point is passed closest, between pulses too."""
+    # The pulse of least total path, or of the least s of a sector; one without weight only where none has.
     sector = None if beams is None else beams.sector
     distance = aperture.path(points) if sector is None else sector.place(aperture, points) ** 2
     dark = weight == 0
@@ -485,6 +486,7 @@ def _centres(aperture: Aperture, beams: Beams | None, points: Floats, weight: Fl
     legs = np.stack(aperture.legs, axis=1)
     if len(aperture) < 3:
         return np.asarray(legs[best])
+    # A parabola through it and its neighbours, where all three have weight or none.
     inner = np.clip(best, 1, len(aperture) - 2)
     before, here, after = (distance[inner + step, column] for step in (-1, 0, 1))
     same_weighting = (dark[inner - 1, column] == dark[inner, column]) & (dark[inner, column] == dark[inner + 1, column])

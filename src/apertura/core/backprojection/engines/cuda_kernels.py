@@ -6,7 +6,7 @@ import warnings
 import numpy as np
 from numba import cuda
 
-from apertura.core.backprojection.engines.cuda_prediction import (
+from apertura.core.backprojection.engines.cuda import (
     CHUNK,
     FARTHEST,
     FLOAT32_ERROR,
@@ -246,6 +246,7 @@ def _chunk(chunk, mine, shared, given, weighing):  # type: ignore[no-untyped-def
     words, steps, patch = shared
     (antennas, start_m, cells), turn, numbers = given
     weights, weighed = weighing
+    # Sums of this chunk in float32; rows of cells are read once for all pixels of the thread.
     part = cuda.local.array((_EACH, 2), np.float32)
     for n in range(_EACH):
         part[n, 0], part[n, 1] = _NONE, _NONE
@@ -256,7 +257,7 @@ def _chunk(chunk, mine, shared, given, weighing):  # type: ignore[no-untyped-def
             continue
         rows = (cells[p, 0], cells[p, 1], cells[p, 2], cells[p, 3], cells[p, 4], cells[p, 5])
         if steps[c, _WAY] == _SERIES:
-            w = words[c]
+            w = words[c]  # (8), the pulse's series about the patch
             word = (w[0], w[1], w[2], w[3], w[4], w[5], w[6], w[7], w[8], w[9], w[10])
             for n in range(_EACH):
                 at, u, legs = _by_series(word, steps[c, _ORIGIN], near[n, 0], near[n, 1], (near[n, 2], near[n, 3]))

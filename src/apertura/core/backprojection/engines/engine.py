@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
+from apertura.common.arrays import decibels
 from apertura.core.backprojection.job import Job
 
 BEAM_S = 1.2e-7
@@ -158,7 +159,7 @@ def power_sum_db(*parts_db: float) -> float:
     >>> round(power_sum_db(-60.0, -60.0), 1)
     -57.0
     """
-    return float(10 * np.log10(sum(10 ** (part / 10) for part in parts_db)))
+    return decibels(sum(10 ** (part / 10) for part in parts_db))
 
 
 def option_values(requested: Mapping[str, Any], name: str, offered: Iterable[Any]) -> tuple[Any, ...]:

@@ -68,14 +68,17 @@ def patch_weights(
     -----
     Source: docs/theory/engine.md, "Antennas", (7) and the errors below it.
     """
+    # The 3 × 3 nodes of a patch about each place.
     half_patch = (KERNEL.patch_side - 1) / 2  # pixels
     across = half_patch * np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1], indexing="ij"), -1).reshape(9, 2)
     nodes = place_m + np.einsum("ns,spc->npc", across, steps_m)
+    # Share at the edge of the sector, of the pulses not outside of it.
     weight = None if beams.sector is None else beams.sector.weight(aperture, place_m)
     illuminated = np.array([]) if weight is None else weight > 0
     edge = float((weight[illuminated] < 1).mean()) if weight is not None and illuminated.any() else 0.0
     if beams.antennas is None:
         return PatchWeights(edge=edge)
+    # (7): a polynomial where first and second differences between the nodes are small.
     gain = beams.antennas.weight(aperture, nodes.reshape(-1, 3)).reshape(len(aperture), 3, 3, len(place_m))
     curvature = [np.abs(np.diff(gain, 2, axis=axis)).max(axis=(1, 2)) for axis in (1, 2)]
     change = [np.abs(np.diff(gain.take([0, 2], axis), axis=axis)).max(axis=(1, 2)) for axis in (1, 2)]
@@ -90,7 +93,8 @@ def patch_weights(
             smooth[illuminated],
             dark[illuminated],
         )
-    error = np.hypot((3 / 16) ** 2 / 2 * beta, 1.4 / (9 * np.sqrt(3)) * beta**1.5)  # inside a block, between nodes
+    # Error of the polynomial inside a block, and of the surface between nodes, relative to the RMS weight.
+    error = np.hypot((3 / 16) ** 2 / 2 * beta, 1.4 / (9 * np.sqrt(3)) * beta**1.5)
     strength = float((gain**2).mean())
     return PatchWeights(
         float(smooth.mean()),
@@ -218,17 +222,21 @@ def path_variants(
     >>> path_variants(near, **limits)[0], path_variants(far, **limits)[0]
     ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0))
     """
+    # Error bounds of one leg, D = reach and δ = inner: terms that both series neglect, and those of shared and own
+    # curvature (native/bounds.hpp).
     reach, inner = _BLOCK_REACH * view.spacing_m, _PIXEL_REACH * view.spacing_m
     inverse = (1 / view.range_m) ** 2
     base = inverse * (KERNEL.third_order * inner**3 + inverse * reach**4 * (KERNEL.fifth_order * reach + inner))
     shared = base + KERNEL.shared_curvature_error * reach * inner**2 * inverse
     own = base + KERNEL.own_curvature_error * reach**2 * inner**2 * inverse**1.5
     shared_rad, own_rad = (wavenumber_rad_m * path_m.sum(axis=0) for path_m in (shared, own))
+    # Cells that a block of pixels spans, and the 2 × 2 blocks of a narrow window.
     step = np.abs(view.slope).sum(axis=0)
     curvature = KERNEL.curvature_span * view.spacing_m**2 * (1 / view.range_m).sum(axis=0)
     block_cells = ((KERNEL.block_side - 1) * step + 2 * curvature) / cell_m + 1
     group_cells = block_cells + KERNEL.block_side * step / cell_m  # of the 2 × 2 blocks that a narrow window serves
     window_cells = KERNEL.window - KERNEL.window_margin
+    # The cheapest variant whose bound meets the tolerance; exact paths where none does.
     has_shared_curvature = (block_cells <= window_cells) & (shared_rad <= tolerance_rad)
     has_own_curvature = (block_cells <= window_cells) & (shared_rad > tolerance_rad) & (own_rad <= tolerance_rad)
     narrow = has_shared_curvature & (group_cells <= window_cells)
@@ -254,6 +262,7 @@ def candidates(job: Job, *, pulses: int, requested: Mapping[str, Any]) -> Iterat
 def _setting(  # noqa: PLR0917
     job: Job, view: View, pulses: int, degree: int, oversampling: int, tolerance_rad: float, accumulate: str | None
 ) -> Setting:
+    # Errors of tables (planner.md, eq. 1), paths and polynomials of weights add as independent ones.
     signal, k = job.signal, job.signal.wavenumber_rad_m
     up, down = ratio(signal.oversampling, oversampling)
     design = design_table(signal.oversampling, k * signal.step_m, oversampling=oversampling, degree=degree)

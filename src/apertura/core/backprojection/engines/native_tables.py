@@ -10,6 +10,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.common.arrays import decibels
 from apertura.core.backprojection.engines.native_binding import KERNEL
 
 TAPS = KERNEL.taps
@@ -133,7 +134,7 @@ def band_error_db(squared_error: NDArray[np.float64], window: NDArray[np.float64
     count = len(window)
     power = np.interp(BAND, (np.arange(count) - count // 2) * 2 / count, window**2)
     power *= np.sqrt(1 - BAND**2)  # Chebyshev nodes → even over the band
-    return float(10 * np.log10((squared_error * power).sum() / power.sum()))
+    return decibels(float((squared_error * power).sum() / power.sum()))
 
 
 def ratio(profile_oversampling: float, oversampling: float) -> tuple[int, int]:
@@ -178,15 +179,18 @@ def design_table(
     >>> design.up, design.down, design.error_db(np.ones(1)) < -74
     (3, 1, True)
     """
+    # Positions of the `up` cells within `down` samples, and the band that profiles occupy.
     up, down = ratio(profile_oversampling, oversampling)
     starts = np.arange(up) * down / up
     first_sample = np.floor(starts)
     omega = np.pi / profile_oversampling * BAND
+    # Coefficients that each frequency has in each cell, and the taps that give them, by least squares.
     ideal = np.exp(1j * omega * (starts - first_sample)[:, None])[:, None] * _coefficients(omega * down / up, degree)
     before = taps // 2 - 1
     basis = np.exp(1j * omega[:, None] * (np.arange(taps) - before))
     target = ideal.reshape(-1, omega.size).T
     filters = np.linalg.lstsq(_stacked(basis), _stacked(target), rcond=1e-9)[0].T.reshape(up, degree + 1, taps)
+    # Their error, with the carrier inside a cell as a short polynomial.
     given = np.einsum("pkt,wt->pkw", filters, basis)
     carrier_rad_per_cell = carrier_rad_per_sample * down / up
     polynomial, phase = _phase(carrier_rad_per_cell)

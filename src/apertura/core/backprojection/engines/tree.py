@@ -34,7 +34,6 @@ from apertura.core.antenna.beam import Beams
 from apertura.core.backprojection.engines import native
 from apertura.core.backprojection.engines.engine import EngineOptions, checked_pixels
 from apertura.core.backprojection.engines.native_binding import DIRECTLY, TREE, available, instruction_set
-from apertura.core.backprojection.engines.native_tables import Tables
 from apertura.core.backprojection.engines.tree_geometry import (
     LEAF,
     MOST_LAYERS,
@@ -227,7 +226,12 @@ class _Block:
                 np.int64
             )
             for run in () if smaller else _runs(direct, len(trees)):
-                self._add_directly(trees.direct_tables(self.nodes_db)[run], beams and beams[run], tile.window)
+                self.image[tile.window] += native.form(
+                    trees.direct_tables(self.nodes_db)[run],
+                    self.pixels[tile.window],
+                    beams=beams and beams[run],
+                    tolerance_rad=self.trees.direct_setting(self.nodes_db).tolerance_rad,
+                )
         if left:
             self.add(trees, beams, left)
 
@@ -243,10 +247,6 @@ class _Block:
             )
             self._quarters[tile] = self.tiles(list(product(tops, lefts)))
         return self._quarters[tile]
-
-    def _add_directly(self, tables: Tables, beams: Beams | None, window: Window) -> None:
-        tolerance_rad = self.trees.direct_setting(self.nodes_db).tolerance_rad
-        self.image[window] += native.form(tables, self.pixels[window], beams=beams, tolerance_rad=tolerance_rad)
 
 
 def _runs(groups: NDArray[np.bool_], pulses: int) -> Iterator[slice]:

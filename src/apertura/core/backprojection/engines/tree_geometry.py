@@ -235,7 +235,8 @@ def surfaces_of(pixels: NDArray[np.float64], parts: list[Window]) -> list[Surfac
         rests = _residuals(pixels, [parts[number] for number in left], fitted)
         for number, coefficients, rest in zip(left, fitted, rests, strict=True):
             if np.isfinite(rest):
-                centre = _value(coefficients, 0.0)
+                at_0 = np.polynomial.legendre.legvander(np.zeros(1), degree)[0]
+                centre = np.einsum("a,abk,b->k", at_0, coefficients, at_0)
                 surfaces[number] = Surface(coefficients, centre, _across(coefficients), float(np.sqrt(rest)))
         left = [number for number in left if _PLANE_M < surfaces[number].rough_m < np.inf]
         if not left:
@@ -274,11 +275,6 @@ def _fitting(size: int, degree: int) -> tuple[NDArray[np.int64], NDArray[np.floa
         np.round(np.linspace(0, size - 1, min(size, 4 if degree == 1 else _THIN))).astype(np.int64)
     )
     return some, np.asarray(np.linalg.pinv(np.polynomial.legendre.legvander(place[some], degree)))
-
-
-def _value(coefficients: NDArray[np.float64], place: float) -> NDArray[np.float64]:
-    basis = np.polynomial.legendre.legvander(np.array([place]), len(coefficients) - 1)[0]
-    return np.asarray(np.einsum("a,abk,b->k", basis, coefficients, basis))
 
 
 def _across(coefficients: NDArray[np.float64]) -> NDArray[np.float64]:

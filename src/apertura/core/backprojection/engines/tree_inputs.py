@@ -512,10 +512,11 @@ class Chunk:
         # Which A are needed: of a child's number of nodes, at the slot of its parent's nodes or of the pixels.
         slots: dict[int, int] = {}  # pixels along a side → slot
         merges: set[tuple[int, int]] = set()  # number of nodes, slot
+        ends = np.cumsum([-(-len(self.trees) // size) for size in self.sizes])
         for tile, counts in zip(tiles, self._counts, strict=True):
             sides = tile.columns, tile.rows
             tile.column_slot, tile.row_slot = (slots.setdefault(n, TREE.nodes + 1 + len(slots)) for n in sides)
-            levels = self._levels(counts)[: tile.top + 1]
+            levels = np.split(counts.reshape(-1, 2), ends[:-1])[: tile.top + 1]  # of each level, (subaperture, 2)
             for (children, parents), (size, wider) in zip(pairwise(levels), pairwise(self.sizes), strict=False):
                 parent_of = parents[np.arange(len(children)) // (wider // size)]
                 merges.update(zip(children.ravel().tolist(), parent_of.ravel().tolist(), strict=True))
@@ -542,8 +543,3 @@ class Chunk:
             curves[count] = self._pointer_to(curve(count, self.nodes_db))
         job.places, job.spread, job.mix = map(self._pointer_to, (places, spread, mix))
         job.presum, job.curve = map(self._pointer_to, (presum, curves))
-
-    def _levels(self, counts: NDArray[np.uint8]) -> list[NDArray[np.uint8]]:
-        """Return the numbers of nodes of each level, (subaperture, 2)."""
-        ends = np.cumsum([-(-len(self.trees) // size) for size in self.sizes])
-        return np.split(counts.reshape(-1, 2), ends[:-1])
