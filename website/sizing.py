@@ -7,7 +7,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 from apertura.campaign.folder import Campaign
-from apertura.check.resources import PIXEL_BYTES
+from apertura.check.files import PIXEL_BYTES
 from apertura.workflow.lineage import places
 from apertura.workflow.resources import Resources
 from apertura.workflow.rules import RULES

@@ -221,7 +221,7 @@ _BASE_BYTES = 120_000_000  # the interpreter and its libraries
 _CAPTURE_BYTES = 1100  # of the metadata of a capture while they are read; samples are read in blocks
 _RAW_BYTES = 10  # of a capture in the stage raw, compressed
 _ECHO_SHARE = 0.95  # of 8 bytes per pulse and subcarrier, which are not compressed; the rest for pulses that drop out
-_PIXEL_BYTES = 36  # per pixel and pair: image, its part of the cube, three rasters, compressed; 76 before
+PIXEL_BYTES = 36  # per pixel and pair: image, its part of the cube, three rasters, compressed; 76 before
 MEMINFO = Path("/proc/meminfo")
 
 
@@ -305,7 +305,7 @@ def disk_bytes(examined: Examination) -> dict[str, int]:
             if transmitted and not _made(examined, "echo", flight.name, pair):
                 echo += round(_ECHO_SHARE * 8 * pulses * transmitted.numerology.numbers.size)
             if flight.kind == "image" and not _made(examined, "image", flight.name, pair):
-                images += _PIXEL_BYTES * pixels
+                images += PIXEL_BYTES * pixels
     return {"raw": raw, "echo": echo, "images": images}
 
 

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apertura.common.arrays import decibels
 from apertura.common.units import decibels
 from apertura.core.quality.agreement import OUT_OF_PHASE_RAD, Agreement
 

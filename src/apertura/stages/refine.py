@@ -411,7 +411,7 @@ def refined_stage(
         The campaign's.
     """
     knots_s, nodes = found.correction.time_s, list(found.correction.moved_m)
-    further_m = found.correction.further_m
+    extra_path_m = found.correction.extra_path_m
     began = np.datetime64(0, "ns") if given is None else given.began.astype("datetime64[ns]")
     logged = _logged(() if given is None else given.records, knots_s)
     moved_m, std_m = (np.stack([values[node] for node in nodes]) for values in (found.correction.moved_m, found.std_m))
@@ -421,7 +421,7 @@ def refined_stage(
         {
             "time": ("knot", began + np.rint(1e9 * knots_s).astype("timedelta64[ns]")),
             "correction": (by_node, moved_m),
-            "further": (("pair", "knot"), np.reshape([*further_m.values()], (len(further_m), len(knots_s)))),
+            "further": (("pair", "knot"), np.reshape([*extra_path_m.values()], (len(extra_path_m), len(knots_s)))),
             "std": (by_node, std_m),
             "position": (by_node, position_m),
         },
@@ -429,7 +429,7 @@ def refined_stage(
             "frame": scene.grid.frame,
             "flags": Flags(found.flags),
             "nodes": nodes,
-            "pairs": list(further_m),
+            "pairs": list(extra_path_m),
             "decisions": {one.name: {"value": one.value, "reason": one.reason} for one in decisions},
             "accepted": found.accepted,
             "why": found.why,

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from apertura.common.arrays import decibels
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.common.units import decibels
 from apertura.core.backprojection.inputs import Profiles
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.interpolation import kaiser_beta, kaiser_sinc, kaiser_window

@@ -10,10 +10,11 @@ import scipy
 from numpy.typing import NDArray
 from scipy.special import gammainccinv, gammaincinv
 
-from apertura.common.arrays import Complexes, Floats, decibels
+from apertura.common.arrays import Complexes, Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
 from apertura.common.flags import Flags
+from apertura.common.units import decibels
 from apertura.core.echo.captures import AT_ONCE
 
 FALSE_REFLECTOR = 1e-3

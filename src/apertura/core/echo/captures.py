@@ -6,8 +6,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apertura.common.arrays import Complexes, Floats, decibels
+from apertura.common.arrays import Complexes, Floats
 from apertura.common.flags import Flags
+from apertura.common.units import decibels
 from apertura.core.echo.demodulate import Numerology
 from apertura.core.interpolation import kaiser_beta, kaiser_sinc
 

@@ -13,7 +13,8 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from apertura.common.arrays import Complexes, Floats, decibels
+from apertura.common.arrays import Complexes, Floats
+from apertura.common.units import decibels
 from apertura.core.echo.captures import AT_ONCE, spread
 from apertura.core.echo.demodulate import Numerology
 

@@ -7,7 +7,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from apertura.common.arrays import decibels
+from apertura.common.units import decibels
 
 # ---- Code of a node's own pulses
 

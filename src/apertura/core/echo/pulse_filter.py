@@ -11,7 +11,8 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from apertura.common.arrays import Floats, decibels
+from apertura.common.arrays import Floats
+from apertura.common.units import decibels
 
 BAND_FLOOR_DB = -10.0
 """dB below the highest power of the pulse, at which a band that is not stated ends."""

@@ -11,7 +11,8 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from apertura.common.arrays import Complexes, decibels
+from apertura.common.arrays import Complexes
+from apertura.common.units import decibels
 from apertura.core.echo.line_of_sight import LineOfSight, fit_line_of_sight, phasor
 from apertura.core.echo.sidelink_state import ECHO_DB, GATE_CELLS, NULL_DB, SidelinkState, measure
 

@@ -8,7 +8,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from apertura.common.arrays import Complexes, Floats, decibels
+from apertura.common.arrays import Complexes, Floats
 from apertura.common.errors import CampaignError
 from apertura.common.units import decibels
 from apertura.core.echo.captures import AT_ONCE

@@ -8,7 +8,8 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from apertura.common.arrays import Complexes, decibels
+from apertura.common.arrays import Complexes
+from apertura.common.units import decibels
 from apertura.core.echo.captures import Samples
 
 # ---- Framing: preamble and frame counter

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from apertura.common.arrays import seconds_since
 from apertura.common.errors import CampaignError
+from apertura.common.units import seconds_since
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.geodesy import LOCAL_NED, body_axes, ned_axes
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from apertura.common.arrays import decibels
+from apertura.common.units import decibels
 from apertura.core.geometry.aperture import Aperture, Weigh, distance
 
 TAPER = 0.1

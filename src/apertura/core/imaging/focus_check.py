@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apertura.common.arrays import decibels
 from apertura.common.flags import Flags
+from apertura.common.units import decibels
 from apertura.core.antenna.beam import Beams
 from apertura.core.antenna.illumination import illumination_mask
 from apertura.core.backprojection.engines import ENGINES, load_engine

@@ -7,8 +7,8 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from apertura.common.arrays import decibels
 from apertura.common.errors import CampaignError
+from apertura.common.units import decibels
 from apertura.core.antenna.beam import Beams
 from apertura.core.backprojection.inputs import PhaseHistory, Profiles
 from apertura.core.echo.compression import centre_frequency, compress, range_step, window_weights

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.filesize import decimal
 
-from apertura.common.arrays import decibels
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
 from apertura.common.flags import Flags
+from apertura.common.units import decibels
 from apertura.core.antenna.beam import Beams
 from apertura.core.antenna.illumination import Illumination
 from apertura.core.backprojection.engines.engine import Setting

@@ -180,6 +180,7 @@ class Blocks:
         away = [leg - echo.patch.place_m for leg in aperture.legs]
         unit = [one / np.maximum(np.linalg.norm(one, axis=1, keepdims=True), 1e-9) for one in away]
         slopes = {tx: unit[0] + unit[1]} if tx == rx else {tx: unit[0] - along, rx: unit[1] + along}
+        # B_b(x) of eq. 9 at the pixels.
         profiles = echo.profiles.moved(aperture, extra_path_m)
         profiles = replace(profiles, samples=np.asarray(profiles.samples))
         values = block_contributions(profiles, echo.patch.pixels_m, edges=np.arange(len(profiles) + 1))

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from apertura.common.arrays import Floats, decibels
+from apertura.common.arrays import Floats
 from apertura.common.units import decibels
 from apertura.core.echo.captures import Samples
 from apertura.core.echo.demodulate import Numerology

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
-from apertura.common.arrays import decibels
+from apertura.common.units import decibels
 from apertura.core.backprojection.job import Job
 
 BEAM_S = 1.2e-7

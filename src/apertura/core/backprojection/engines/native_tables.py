@@ -10,7 +10,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from apertura.common.arrays import decibels
+from apertura.common.units import decibels
 from apertura.core.backprojection.engines.native_binding import KERNEL
 
 TAPS = KERNEL.taps

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from apertura.common.arrays import decibels
+from apertura.common.units import decibels
 from apertura.core.backprojection.engines import native_prediction
 from apertura.core.backprojection.engines.engine import Setting, option_values, power_sum_db
 from apertura.core.backprojection.engines.native_binding import (
