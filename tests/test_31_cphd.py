@@ -12,6 +12,7 @@ from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.contracts import check
 from apertura.common.errors import CampaignError
 from apertura.formats.isolated import read_isolated
+from apertura.formats.phase_histories import cphd_fields
 from apertura.formats.reading import read_phase_history
 
 pytestmark = pytest.mark.usefixtures("reader")
@@ -260,7 +261,7 @@ def test_a_file_outside_the_campaign_is_not_read_into_it(tmp_path):
     now = size + len(xml) - len('<CPHD xmlns="') - len("BISTATIC") + len("&x;")
     path.write_bytes(grown.replace(b"XML_BLOCK_SIZE := %d" % size, b"XML_BLOCK_SIZE := %d" % now))
     try:
-        fields = read_isolated("apertura.formats.phase_histories.cphd_fields:read_fields", [path])[0]
+        fields = read_isolated(cphd_fields.read_fields, [path])[0]
     except ValueError:
         return
     assert str(fields["collect_type"]) != "BISTATIC"

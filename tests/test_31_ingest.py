@@ -365,7 +365,7 @@ def test_captures_hold_their_own_samples_whatever_lies_between_them(tmp_path_fac
 
 def test_a_new_log_format_is_one_function_and_one_row(tmp_path, monkeypatch):
     """Read through the table, and named in the message about a node without a log."""
-    monkeypatch.setitem(TRACKS, "toy", LogFormat((".toy",), f"{__name__}:read_toy_track"))
+    monkeypatch.setitem(TRACKS, "toy", LogFormat((".toy",), read_toy_track))
     (tmp_path / "a.track.toy").write_text("48 9 600\n48 9 601\n")
     track = read_track(tmp_path / "a.track.toy", node="a")
     np.testing.assert_allclose(geodetic_from_ecef(track.position.values[1]), [48, 9, 601], atol=1e-8)
@@ -381,7 +381,7 @@ def read_toy_track(path, *, node, options):
 
 def test_a_recorder_of_one_file_is_one_function_and_one_row(tmp_path, monkeypatch):
     """Found in its folder, opened, its hash checked, its captures cut; messages name its one file."""
-    monkeypatch.setitem(RECORDERS, (".toy",), f"{__name__}:open_toy_recording")
+    monkeypatch.setitem(RECORDERS, (".toy",), open_toy_recording)
     path = tmp_path / "raw" / "f01" / "a.toy"
     path.parent.mkdir(parents=True)
     np.arange(1, 13, dtype="<i2").tofile(path)

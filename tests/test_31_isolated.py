@@ -10,6 +10,7 @@ import pytest
 from folders import ROOT, complaint
 from scipy.io import savemat
 
+from apertura.common.lazy import Lazy
 from apertura.formats.isolated import UnreadableError, read_isolated
 from apertura.formats.reading import read_phase_history
 
@@ -87,7 +88,7 @@ def test_a_reader_that_crashes_is_one_message_that_names_the_signal(tmp_path, mo
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     (tmp_path / "a.mat").write_bytes(b"x")
     with pytest.raises(UnreadableError, match="its reader died of SIGSEGV") as caught:
-        read_isolated("broken:read", [tmp_path / "a.mat"])
+        read_isolated(Lazy("broken").read, [tmp_path / "a.mat"])
     assert caught.value.path == tmp_path / "a.mat"
 
 
@@ -102,7 +103,7 @@ def test_a_reader_that_never_ends_is_stopped(tmp_path):
     os.mkfifo(tmp_path / "a.mat")
     begun = time.monotonic()
     with pytest.raises(UnreadableError, match="took more than 1 s"):
-        read_isolated("builtins:open", [tmp_path / "a.mat"], seconds=1.0)
+        read_isolated(Lazy("builtins").open, [tmp_path / "a.mat"], seconds=1.0)
     assert time.monotonic() - begun < 3
 
 
@@ -110,7 +111,7 @@ def test_a_reader_that_asks_for_too_much_memory_is_refused(tmp_path):
     (tmp_path / "a.mat").touch()
     os.truncate(tmp_path / "a.mat", 3 << 30)
     with pytest.raises(UnreadableError, match="its reader ran out of memory"):
-        read_isolated("numpy:fromfile", [tmp_path / "a.mat"], memory_bytes=1 << 30)
+        read_isolated(Lazy("numpy").fromfile, [tmp_path / "a.mat"], memory_bytes=1 << 30)
 
 
 @pytest.mark.usefixtures("reader")

@@ -15,7 +15,7 @@ from apertura.workflow.rules import RESULTS, RULES
 
 @pytest.mark.parametrize("rule", RULES.values(), ids=list(RULES))
 def test_the_step_of_a_row_takes_what_its_command_takes(rule):
-    campaign, *words = signature(pkgutil.resolve_name(rule.step)).parameters
+    campaign, *words = signature(pkgutil.resolve_name(rule.step.path)).parameters
     assert campaign == "campaign"
     assert len(words) == len(rule.arguments) + len(rule.last_words) + len(rule.options)
     assert set(rule.options) <= set(words)

@@ -52,7 +52,7 @@ def test_every_module_that_a_step_calls_is_code_of_its_result(tiny):
             known = set(import_closure(result.modules))
             if name == "raw":  # one step makes both
                 known |= set(import_closure(result_of(campaign, "track", *where).modules))
-            step = pkgutil.resolve_name(RESULTS[name].step)
+            step = pkgutil.resolve_name(RESULTS[name].step.path)
             further = called(step, campaign, *where, *RESULTS[name].last_words) - known
             if further:
                 missing[name, *where] = sorted(further)

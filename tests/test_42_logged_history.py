@@ -48,7 +48,7 @@ def read_toy_history(paths, *, pair):
 @pytest.fixture
 def campaign(tmp_path, monkeypatch):
     """Twelve metres flown in twelve seconds, unevenly, past one target; 1.5 m of cable."""
-    monkeypatch.setitem(PHASE_HISTORIES, "toy", HistoryFormat(".npz", f"{__name__}:read_toy_history"))
+    monkeypatch.setitem(PHASE_HISTORIES, "toy", HistoryFormat(".npz", read_toy_history))
     root = tmp_path / "campaign"
     (root / "raw" / "f01").mkdir(parents=True)
     (root / "config").mkdir()

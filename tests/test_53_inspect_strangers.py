@@ -1,6 +1,7 @@
 """`apertura inspect` on what strangers may have written: broken files, hostile names, other people's files."""
 
 import json
+import operator
 import os
 import re
 import subprocess
@@ -45,14 +46,14 @@ def test_a_broken_file_of_any_suffix_is_a_report_with_a_reason(tmp_path, suffix,
 
 
 def test_what_a_reader_fails_of_is_reported_and_no_traceback(shared, monkeypatch):
-    monkeypatch.setitem(TRACKS, "csv", LogFormat((".csv",), "operator:truediv"))
+    monkeypatch.setitem(TRACKS, "csv", LogFormat((".csv",), operator.truediv))
     report = look(F01 / "uav1.track.csv")
     assert report.problem.found.startswith("its reader failed: TypeError")
 
 
 def test_samples_that_only_a_config_describes_are_asked_to_lie_in_a_campaign(tmp_path, monkeypatch):
     monkeypatch.setitem(
-        PHASE_HISTORIES, "beat", HistoryFormat(".beat", "operator:truediv", described=True, waveform="fmcw")
+        PHASE_HISTORIES, "beat", HistoryFormat(".beat", operator.truediv, described=True, waveform="fmcw")
     )
     (tmp_path / "a.beat").write_bytes(b"x")
     assert "waveform.format: beat" in look(tmp_path / "a.beat").problem.expected

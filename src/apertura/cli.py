@@ -4,7 +4,6 @@ Commands import what they run when they run: help and mistakes in the command li
 """
 
 import os
-import pkgutil
 import shlex
 import signal
 import sys
@@ -93,7 +92,7 @@ def _command_of(rule: Rule) -> Callable[..., None]:
 
         opened, words = Campaign.load(given(campaign)), [stated.pop(name) for name in rule.arguments]
         with reporting_to(opened.result(*progress_path([rule.command, *words]))):
-            written = pkgutil.resolve_name(rule.step)(opened, *words, **stated)
+            written = rule.step(opened, *words, **stated)
         for path in [written] if isinstance(written, Path) else written:
             print(as_typed(path))
 

@@ -92,7 +92,7 @@ def _campaign_of_faults(asked: argparse.Namespace) -> int:
         importlib.import_module(module)
     for rule in RULES.values():
         if rule.step:
-            importlib.import_module(rule.step.partition(":")[0])
+            importlib.import_module(rule.module)
     with tempfile.TemporaryDirectory() as folder:
         bench, began = Bench(make_campaign(Path(folder).resolve()), shared_page()), time.perf_counter()
         bench.prepare(tuple(asked.steps))

@@ -3,7 +3,6 @@
 A problem is what cannot be imaged at all; what makes an image worse is measured by a step, and is a flag.
 """
 
-import pkgutil
 import shlex
 import sys
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
@@ -27,6 +26,7 @@ from apertura.campaign.config.section import table_rows
 from apertura.campaign.folder import Campaign, check_name
 from apertura.common.confined import ConfinedPath
 from apertura.common.errors import CampaignError, number_of
+from apertura.common.lazy import Lazy
 from apertura.common.processes import as_typed
 
 if TYPE_CHECKING:
@@ -35,41 +35,43 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 Check = Callable[["Examination"], Iterable[CampaignError]]
 
-CHECKS: Mapping[str, str] = {
-    "flights": "apertura.check.files:check_flights",
-    "files": "apertura.check.files:check_files",
-    "raw_root": "apertura.check.files:check_raw_root",
-    "links": "apertura.check.files:check_links",
-    "modules": "apertura.check.files:check_modules",
-    "results": "apertura.check.files:check_writable",
-    "codes": "apertura.check.recordings:check_codes",
-    "recordings": "apertura.check.recordings:check_recordings",
-    "histories": "apertura.check.recordings:check_histories",
-    "channels": "apertura.check.recordings:check_receivers",
-    "intervals": "apertura.check.recordings:check_intervals",
-    "overlap": "apertura.check.recordings:check_overlap",
-    "segments": "apertura.check.recordings:check_segments",
-    "tracks": "apertura.check.tracks:check_tracks",
-    "attitude": "apertura.check.tracks:check_attitude",
-    "coverage": "apertura.check.tracks:check_coverage",
-    "patterns": "apertura.check.reach:check_patterns",
-    "constants": "apertura.check.reach:check_constants",
-    "crs": "apertura.check.georeferencing:check_scene_crs",
-    "reference_points": "apertura.check.georeferencing:check_reference_points",
-    "dem": "apertura.check.georeferencing:check_dem",
-    "spikes": "apertura.check.georeferencing:check_spikes",
-    "apart": "apertura.check.reach:check_nodes_apart",
-    "distance": "apertura.check.reach:check_distance",
-    "aperture": "apertura.check.reach:check_aperture",
-    "ground": "apertura.check.reach:check_ground",
-    "calibration": "apertura.check.reach:check_calibration",
-    "memory": "apertura.check.files:check_memory",
-    "disk": "apertura.check.files:check_disk",
-    "scheduler": "apertura.check.files:check_scheduler",
-    "imaging": "apertura.check.reach:check_imaging",
-    "plan": "apertura.check.reach:check_plan",
+_CHECKS_OF = Lazy("apertura.check")
+
+CHECKS: Mapping[str, Check] = {
+    "flights": _CHECKS_OF.files.check_flights,
+    "files": _CHECKS_OF.files.check_files,
+    "raw_root": _CHECKS_OF.files.check_raw_root,
+    "links": _CHECKS_OF.files.check_links,
+    "modules": _CHECKS_OF.files.check_modules,
+    "results": _CHECKS_OF.files.check_writable,
+    "codes": _CHECKS_OF.recordings.check_codes,
+    "recordings": _CHECKS_OF.recordings.check_recordings,
+    "histories": _CHECKS_OF.recordings.check_histories,
+    "channels": _CHECKS_OF.recordings.check_receivers,
+    "intervals": _CHECKS_OF.recordings.check_intervals,
+    "overlap": _CHECKS_OF.recordings.check_overlap,
+    "segments": _CHECKS_OF.recordings.check_segments,
+    "tracks": _CHECKS_OF.tracks.check_tracks,
+    "attitude": _CHECKS_OF.tracks.check_attitude,
+    "coverage": _CHECKS_OF.tracks.check_coverage,
+    "patterns": _CHECKS_OF.reach.check_patterns,
+    "constants": _CHECKS_OF.reach.check_constants,
+    "crs": _CHECKS_OF.georeferencing.check_scene_crs,
+    "reference_points": _CHECKS_OF.georeferencing.check_reference_points,
+    "dem": _CHECKS_OF.georeferencing.check_dem,
+    "spikes": _CHECKS_OF.georeferencing.check_spikes,
+    "apart": _CHECKS_OF.reach.check_nodes_apart,
+    "distance": _CHECKS_OF.reach.check_distance,
+    "aperture": _CHECKS_OF.reach.check_aperture,
+    "ground": _CHECKS_OF.reach.check_ground,
+    "calibration": _CHECKS_OF.reach.check_calibration,
+    "memory": _CHECKS_OF.files.check_memory,
+    "disk": _CHECKS_OF.files.check_disk,
+    "scheduler": _CHECKS_OF.files.check_scheduler,
+    "imaging": _CHECKS_OF.reach.check_imaging,
+    "plan": _CHECKS_OF.reach.check_plan,
 }
-"""Name → ``module:function``; a function takes an `Examination` and yields problems, or raises one."""
+"""Name → function of an `Examination` that yields problems, or raises one."""
 
 LAST = frozenset({"imaging", "plan"})
 """Of these, what is asked where nothing else is wrong: it opens pairs as steps do, and would say the same again."""
@@ -103,7 +105,7 @@ def problems_of(examined: "Examination", *, without: Collection[str] = ()) -> li
     wrong: list[CampaignError] = []
     for name, function in CHECKS.items():
         if name not in without and not (name in LAST and wrong):
-            wrong += _each(pkgutil.resolve_name(function), examined)
+            wrong += _each(function, examined)
     return list({str(problem): problem for problem in wrong}.values())
 
 

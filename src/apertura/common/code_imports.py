@@ -4,12 +4,18 @@ An import counts wherever it stands, also inside a function. What only describes
 count, nor do modules that decide no value of a result (`WITHOUT_EFFECT`).
 """
 
+import ast
+import atexit
 import functools
 import importlib.util
+import json
+import os
 import re
 import sysconfig
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 PACKAGE = Path(__file__).parents[1]
 
@@ -25,10 +31,6 @@ WITHOUT_EFFECT = (
 )
 """Modules, with those below them, excluded from code hashes: nothing that they compute is in a result."""
 
-_IMPORT = re.compile(r"^[ \t]*(?:from[ \t]+([\w.]+)[ \t]+import[ \t]+(\([^)]*\)|.*)|import[ \t]+(.*))$", re.MULTILINE)
-_NAME = re.compile(r"[\w.]+")
-_TYPING = re.compile(r"^if TYPE_CHECKING:\n(?:[ \t]+.*\n|\n)+", re.MULTILINE)  # never run
-_CALLED = re.compile(r"\(\s*[\"'](apertura(?:\.\w+)+):\w+[\"']")  # f("module:function"): f imports and calls it
 _TEXT_OR_COMMENT = re.compile(
     r'(?P<text>[A-Za-z]{0,2}(?:"""(?:\\.|[^\\])*?"""|"(?:\\.|[^"\\\n])*"|\'(?:\\.|[^\'\\\n])*\'))|(?P<comment>#[^\n]*)',
     re.DOTALL,
@@ -57,7 +59,7 @@ def import_closure(modules: Iterable[str], *, package: Path = PACKAGE) -> dict[s
         path = _source(name, package) if _is_ours(name) else _source_outside(name)
         if path is not None:
             closure[name] = path
-            waiting += _imports(source_of(path))
+            waiting += _imports(name, path)
     return closure
 
 
@@ -103,13 +105,55 @@ def _source_outside(name: str) -> Path | None:
 
 
 @functools.cache
-def _imports(source: str) -> tuple[str, ...]:
-    """Return the dotted names that a source may import; a parser would take ten times as long."""
+def _imports(name: str, path: Path) -> tuple[str, ...]:
+    """Return the dotted names that a module may import, wherever the statement stands."""
+    state, kept = [path.stat().st_mtime_ns, path.stat().st_size], _kept()
+    if path.is_relative_to(PACKAGE) and kept.get(name, [])[:2] == state:
+        return tuple(kept[name][2])
+    package = name if path.name == "__init__.py" else name.rpartition(".")[0]
     names: list[str] = []
-    for module, members, modules in _IMPORT.findall(_TYPING.sub("", source)):
-        names += [module, *(f"{module}.{member}" for member in _NAME.findall(members))] if module else []
-        names += _NAME.findall(modules)
-    return tuple(name for name in [*names, *_CALLED.findall(source)] if "." in name or _is_ours(name))
+    waiting: list[ast.stmt] = list(ast.parse(source_of(path)).body)
+    while waiting:
+        statement = waiting.pop()
+        if isinstance(statement, ast.Import):
+            names += [alias.name for alias in statement.names]
+        elif isinstance(statement, ast.ImportFrom):
+            above = package.split(".")[: len(package.split(".")) - statement.level + 1] if statement.level else []
+            module = ".".join(filter(None, [*above, statement.module or ""]))
+            names += [module, *(f"{module}.{alias.name}" for alias in statement.names)]
+        elif isinstance(statement, ast.If) and ast.unparse(statement.test) == "TYPE_CHECKING":  # never run
+            waiting += statement.orelse
+        else:
+            bodies = (getattr(statement, field, []) for field in ("body", "orelse", "finalbody"))
+            handlers = (part.body for field in ("handlers", "cases") for part in getattr(statement, field, []))
+            waiting += [one for body in (*bodies, *handlers) for one in body]
+    found = [one for one in names if "." in one or _is_ours(one)]
+    if path.is_relative_to(PACKAGE):
+        kept[name] = [*state, found]
+    return tuple(found)
+
+
+_KEPT = PACKAGE / "__pycache__" / "imports.json"
+"""Imports of each module with time and size of its source: parsing all of them takes half a second of every process."""
+
+
+@functools.cache
+def _kept() -> dict[str, list[Any]]:
+    """Return the imports that an earlier process found; those of this one are added, and written when it ends."""
+    kept: dict[str, list[Any]] = {}
+    with suppress(OSError, ValueError):
+        kept = json.loads(_KEPT.read_text(encoding="utf-8"))
+    before = json.dumps(kept)
+
+    def keep() -> None:
+        if (now := json.dumps(kept)) != before:
+            with suppress(OSError):  # a package that is read only: each process parses
+                part = _KEPT.with_suffix(f".{os.getpid()}")
+                part.write_text(now, encoding="utf-8")
+                part.replace(_KEPT)
+
+    atexit.register(keep)
+    return kept
 
 
 @functools.cache

@@ -10,7 +10,7 @@ import resource
 import signal
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from apertura.common.confined import ConfinedPath, on_disk
 from apertura.common.errors import shown
+from apertura.common.lazy import module_of, name_of
 
 SPARE_BYTES = 1 << 30
 """Address space that a reader may have besides `BYTES_PER_BYTE` of its largest file."""
@@ -49,14 +50,18 @@ class UnreadableError(ValueError):
 
 
 def read_isolated(
-    function: str, paths: Sequence[Path], *, seconds: float | None = None, memory_bytes: int | None = None
+    function: Callable[[Path], Any],
+    paths: Sequence[Path],
+    *,
+    seconds: float | None = None,
+    memory_bytes: int | None = None,
 ) -> list[dict[str, NDArray[Any]]]:
     """Return the result of a reader for each file, in one process for all.
 
     Parameters
     ----------
     function
-        ``module:function`` of path → name → array; a ValueError of it is the reason why a file is refused.
+        Of a module: path → name → array; a ValueError of it is the reason why a file is refused.
     paths
         The files.
     seconds, memory_bytes
@@ -78,7 +83,16 @@ def read_isolated(
     with TemporaryDirectory(prefix="apertura-") as name, ExitStack() as stack:
         folder = Path(name)
         # -P: a module that lies in the campaign folder is not what is imported
-        command = [sys.executable, "-P", "-m", __name__, function, str(memory_bytes), str(int(seconds) + 1), name]
+        command = [
+            sys.executable,
+            "-P",
+            "-m",
+            __name__,
+            f"{module_of(function)}:{name_of(function)}",
+            str(memory_bytes),
+            str(int(seconds) + 1),
+            name,
+        ]
         files = [str(stack.enter_context(on_disk(path.absolute()))) for path in paths]
         confined = [file for file, path in zip(files, paths, strict=True) if isinstance(path, ConfinedPath)]
         try:

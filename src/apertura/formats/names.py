@@ -5,27 +5,29 @@ result (`apertura.workflow.lineage`) holds the readers of its own campaign alone
 its reader, one row here.
 """
 
-import pkgutil
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from apertura.common.atomic import naming
 from apertura.common.errors import CampaignError, quoted
+from apertura.common.lazy import Lazy
 from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions
 
-RECORDERS: Mapping[tuple[str, ...], str] = {
-    (".sigmf-meta", ".sigmf-data"): "apertura.formats.recordings.sigmf:open_sigmf"
-}
+_RECORDINGS = Lazy("apertura.formats.recordings")
+_TRACKS = Lazy("apertura.formats.tracks")
+_HISTORIES = Lazy("apertura.formats.phase_histories")
+
+RECORDERS: Mapping[tuple[str, ...], Callable[..., Any]] = {(".sigmf-meta", ".sigmf-data"): _RECORDINGS.sigmf.open_sigmf}
 """Suffixes of the files of a recording, <node><suffix>, metadata first, samples last → opener(*files) → `Recording`."""
 
-FINDERS: Mapping[tuple[str, ...], str] = {
-    (".sigmf-meta", ".sigmf-data"): "apertura.formats.recordings.sigmf:find_sigmf",
+FINDERS: Mapping[tuple[str, ...], Callable[..., Any]] = {
+    (".sigmf-meta", ".sigmf-data"): _RECORDINGS.sigmf.find_sigmf,
 }
 """Row of `RECORDERS` → finder(folder, node) → files, where metadata may give them other names than <node><suffix>."""
 
-GROWING: Mapping[tuple[str, ...], str] = {
-    (".sigmf-meta", ".sigmf-data"): "apertura.formats.recordings.sigmf:GrowingSigmf",
+GROWING: Mapping[tuple[str, ...], Callable[..., Any]] = {
+    (".sigmf-meta", ".sigmf-data"): _RECORDINGS.sigmf.GrowingSigmf,
 }
 """Row of `RECORDERS` that can be read while it is written → class(*files) whose read() returns what is whole."""
 
@@ -35,7 +37,7 @@ class LogFormat(NamedTuple):
 
     suffixes: tuple[str, ...]
     """Of <node>.track.*"""
-    reader: str
+    reader: Callable[..., Any]
     """reader(path, node=, options=) → `track`."""
     heading: str = ""
     """What its first 8 KiB hold, where others have the same suffix; none: any."""
@@ -44,15 +46,13 @@ class LogFormat(NamedTuple):
 
 
 TRACKS: Mapping[str, LogFormat] = {
-    "airdata": LogFormat(
-        (".csv",), "apertura.formats.tracks.airdata:read_airdata", "time(millisecond),datetime(utc)", True
-    ),
-    "optitrack": LogFormat((".csv",), "apertura.formats.tracks.optitrack:read_optitrack", "Format Version,1.", True),
-    "csv": LogFormat((".csv",), "apertura.formats.tracks.csv_track:read_csv_track", by_lines=True),
-    "nmea": LogFormat((".nmea", ".txt"), "apertura.formats.tracks.nmea:read_nmea", "$", True),
-    "px4": LogFormat((".ulg",), "apertura.formats.tracks.px4_ulog:read_px4_ulog"),
-    "ardupilot": LogFormat((".bin", ".log"), "apertura.formats.tracks.ardupilot:read_ardupilot", heading="FMT"),
-    "rtklib": LogFormat((".pos",), "apertura.formats.tracks.rtklib:read_rtklib_pos", by_lines=True),
+    "airdata": LogFormat((".csv",), _TRACKS.airdata.read_airdata, "time(millisecond),datetime(utc)", True),
+    "optitrack": LogFormat((".csv",), _TRACKS.optitrack.read_optitrack, "Format Version,1.", True),
+    "csv": LogFormat((".csv",), _TRACKS.csv_track.read_csv_track, by_lines=True),
+    "nmea": LogFormat((".nmea", ".txt"), _TRACKS.nmea.read_nmea, "$", True),
+    "px4": LogFormat((".ulg",), _TRACKS.px4_ulog.read_px4_ulog),
+    "ardupilot": LogFormat((".bin", ".log"), _TRACKS.ardupilot.read_ardupilot, heading="FMT"),
+    "rtklib": LogFormat((".pos",), _TRACKS.rtklib.read_rtklib_pos, by_lines=True),
 }
 """Name of a format → how it is recognised and read; of those that fit a file the first is taken."""
 
@@ -64,7 +64,7 @@ class HistoryFormat(NamedTuple):
 
     suffix: str
     """Of <node>.*, or of <node> itself."""
-    reader: str
+    reader: Callable[..., Any]
     """reader(paths, pair=) → `echo`; without tx_position and rx_position where those are in flight logs.
 
     Of a folder paths are all its files.
@@ -89,26 +89,20 @@ class HistoryFormat(NamedTuple):
 
 
 PHASE_HISTORIES: Mapping[str, HistoryFormat] = {
-    "afrl_mat": HistoryFormat(
-        ".mat", "apertura.formats.phase_histories.afrl:read_afrl_mat", described=True, frame="local"
-    ),
-    "pulson": HistoryFormat(".out", "apertura.formats.phase_histories.pulson:read_pulson"),
-    "cphd": HistoryFormat(".cphd", "apertura.formats.phase_histories.cphd:read_cphd", described=True),
-    "hdf5": HistoryFormat(".h5", "apertura.formats.phase_histories.hdf5_history:read_hdf5_history"),
-    "zarr": HistoryFormat(".zarr", "apertura.formats.phase_histories.zarr_history:read_zarr_history"),
+    "afrl_mat": HistoryFormat(".mat", _HISTORIES.afrl.read_afrl_mat, described=True, frame="local"),
+    "pulson": HistoryFormat(".out", _HISTORIES.pulson.read_pulson),
+    "cphd": HistoryFormat(".cphd", _HISTORIES.cphd.read_cphd, described=True),
+    "hdf5": HistoryFormat(".h5", _HISTORIES.hdf5_history.read_hdf5_history),
+    "zarr": HistoryFormat(".zarr", _HISTORIES.zarr_history.read_zarr_history),
     "beat_npy": HistoryFormat(
         ".npy",
-        "apertura.formats.phase_histories.fmcw:read_beat_npy",
+        _HISTORIES.fmcw.read_beat_npy,
         described=True,
         waveform="fmcw",
         beside=".time.npy",
     ),
-    "beat_mat": HistoryFormat(
-        ".mat", "apertura.formats.phase_histories.fmcw:read_beat_mat", described=True, waveform="fmcw"
-    ),
-    "beat_wav": HistoryFormat(
-        ".wav", "apertura.formats.phase_histories.fmcw:read_beat_wav", described=True, waveform="fmcw"
-    ),
+    "beat_mat": HistoryFormat(".mat", _HISTORIES.fmcw.read_beat_mat, described=True, waveform="fmcw"),
+    "beat_wav": HistoryFormat(".wav", _HISTORIES.fmcw.read_beat_wav, described=True, waveform="fmcw"),
 }
 """waveform.format → how it is read."""
 
@@ -124,7 +118,7 @@ def recording_files(folder: Path, node: str) -> tuple[Path, ...]:
     present = (row for row in RECORDERS if any((folder / f"{node}{suffix}").is_file() for suffix in row))
     row = next(present, next(iter(RECORDERS)))
     if row in FINDERS:
-        found: tuple[Path, ...] = pkgutil.resolve_name(FINDERS[row])(folder, node)
+        found: tuple[Path, ...] = FINDERS[row](folder, node)
         return found
     return tuple(folder / f"{node}{suffix}" for suffix in row)
 

@@ -4,7 +4,6 @@ Readers are imported when a file of theirs is read. The code hash of a result wh
 readers that the campaign's files name.
 """
 
-import pkgutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
@@ -29,7 +28,7 @@ def open_recording(files: Sequence[Path]) -> "Recording":
     """
     names = [file.name for file in files]
     row = next(row for row in RECORDERS if len(row) == len(names) and names[0].endswith(row[0]))
-    opened: Recording = pkgutil.resolve_name(RECORDERS[row])(*files)
+    opened: Recording = RECORDERS[row](*files)
     return opened
 
 
@@ -41,7 +40,7 @@ def read_track(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -> "x
     CampaignError
         If no reader knows the file, or the log is not what its format promises.
     """
-    track: xr.Dataset = pkgutil.resolve_name(TRACKS[log_format(path, options)].reader)(path, node=node, options=options)
+    track: xr.Dataset = TRACKS[log_format(path, options)].reader(path, node=node, options=options)
     return track
 
 
@@ -63,5 +62,5 @@ def read_phase_history(
     """
     row = PHASE_HISTORIES[kind]
     further = {"described": described} if row.described else {}
-    echo: xr.Dataset = pkgutil.resolve_name(row.reader)(paths, pair=pair, **further)
+    echo: xr.Dataset = row.reader(paths, pair=pair, **further)
     return echo

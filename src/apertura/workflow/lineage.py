@@ -14,6 +14,7 @@ from apertura.campaign.digests import Result
 from apertura.campaign.folder import Campaign
 from apertura.common.code_imports import import_closure
 from apertura.common.errors import CampaignError
+from apertura.common.lazy import module_of
 from apertura.common.provenance import code_sha256
 from apertura.core.backprojection.engines import ENGINES
 from apertura.formats.export import EXPORTS, export_modules, exports_in
@@ -234,11 +235,11 @@ def _readers(campaign: Campaign, rule: Rule, where: tuple[str, ...]) -> Iterator
     for flight in flights:
         for node in named & {*flight.participants} or flight.participants:
             if not is_sampled(campaign):
-                yield _module(PHASE_HISTORIES[campaign.settings.waveform.format].reader)  # type: ignore[union-attr]
+                yield module_of(PHASE_HISTORIES[campaign.settings.waveform.format].reader)  # type: ignore[union-attr]
             elif "recordings" in rule.reads:
                 first = campaign.promised_files(flight.name, node)[0].name
                 rows = [row for row in RECORDERS if first.endswith(row[0])]
-                yield from (_module(table[row]) for table in (RECORDERS, FINDERS) for row in rows if row in table)
+                yield from (module_of(table[row]) for table in (RECORDERS, FINDERS) for row in rows if row in table)
             if "logs" in rule.reads and campaign.logged(flight.name, node):
                 yield _log_reader(campaign, flight.name, node)
 
@@ -247,17 +248,13 @@ def _log_reader(campaign: Campaign, flight: str, node: str) -> str:
     """Return the module that reads a log; of one that is not there, by its suffix, the module that has read it."""
     path, options = campaign.track_file(flight, node), campaign.settings.nodes[node].log.options
     manifest = campaign.root / campaign.manifest("track", flight, node)
-    readers = [_module(row.reader) for row in TRACKS.values() if path.suffix.lower() in row.suffixes]
+    readers = [module_of(row.reader) for row in TRACKS.values() if path.suffix.lower() in row.suffixes]
     if path.is_file() or options.format in TRACKS or not readers or not manifest.is_file():
-        return _module(TRACKS[log_format(path, options)].reader)
+        return module_of(TRACKS[log_format(path, options)].reader)
     from apertura.campaign.store import read_manifest  # loads arrays
 
     code = read_manifest(manifest)["code"]
     return next((one for one in readers if code_sha256(RESULTS["track"].module, one) == code), readers[0])
-
-
-def _module(function: str) -> str:
-    return function.partition(":")[0]
 
 
 def with_inputs(campaign: Campaign, target: Path, *, link: bool) -> Path:

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
+from apertura.common.lazy import Lazy, module_of
 from apertura.workflow import rule_inputs as inputs
 from apertura.workflow.rule_inputs import Scope
 
@@ -102,7 +103,7 @@ class Rule:
     help
         What it does, in a sentence; `apertura step` shows it.
     step
-        ``module:function`` that does it.
+        Function that does it, of a campaign and the values of the wildcards; it returns what it wrote.
     sources
         What it reads: names of results, of the same place or of all places that belong to it, and functions of a place
         that return further manifests and files, relative to the campaign folder.
@@ -147,7 +148,7 @@ class Rule:
     name: str
     of: Scope
     help: str
-    step: str
+    step: Callable[..., Any]
     sources: tuple[inputs.SourceSpec, ...]
     settings: tuple[inputs.SettingSpec, ...] = ()
     demand: Demand | None = None
@@ -185,7 +186,7 @@ class Rule:
     @property
     def module(self) -> str:
         """Dotted name of the module of its step."""
-        return self.step.partition(":")[0]
+        return module_of(self.step)
 
     @property
     def folder(self) -> str:
@@ -230,7 +231,7 @@ def _workflow(_: inputs.JobPlace) -> Mapping[str, Any]:
     return {"workflow": sha256_text(canonical_json([sha256_tree(shipped() / "workflow"), commands]))}
 
 
-_STEPS = "apertura.stages"
+_STAGES, _VIEWS, _TOOLS = Lazy("apertura.stages"), Lazy("apertura.views"), Lazy("apertura.tools")
 _GROUND = ("scene", "terrain")
 _FORMED = ("echo", "profile", *_GROUND, inputs.patterns)
 _IMAGE_SETTINGS = (inputs.imaging, inputs.antennas)
@@ -239,7 +240,7 @@ _INGEST = Rule(
     "ingest",
     Scope.NODE,
     "Read a node's recording and flight log into raw.zarr and track.zarr.",
-    f"{_STEPS}.ingest:ingest",
+    _STAGES.ingest.ingest,
     result="raw",
     sources=(inputs.recording,),
     settings=("waveform", "processing.false_alarms_per_s"),
@@ -254,7 +255,7 @@ _IMAGE = Rule(
     "image",
     Scope.PAIR,
     "Focus a pair's image, image.zarr.",
-    f"{_STEPS}.image:image",
+    _STAGES.image.image,
     sources=(*_FORMED, "refined_track"),
     settings=_IMAGE_SETTINGS,
     forms=True,
@@ -282,7 +283,7 @@ _ROWS = (
         "bench",
         Scope.FLIGHT,
         "Measure channels, clocks and links of a radar that stands still, bench.json, bench.html and bench.png.",
-        "apertura.tools.bench.report:bench",
+        _TOOLS.bench.report.bench,
         sources=(inputs.recorded_on_the_bench,),
         settings=("campaign", "waveform", "bench", "processing.sidelink", inputs.stated_paths),
         products=("bench.json", "bench.html", "bench.png"),
@@ -295,7 +296,7 @@ _ROWS = (
         "echo",
         Scope.PAIR,
         "Measure pulses, phase centres, clock and sidelink of a pair, echo.zarr.",
-        f"{_STEPS}.echo:echo",
+        _STAGES.echo.echo,
         sources=("raw", "track", inputs.transmitted_and_received, inputs.ground_under_air),
         settings=(
             "waveform",
@@ -312,7 +313,7 @@ _ROWS = (
         "transfer",
         Scope.PAIR,
         "Keep the transfer functions of a pair, transfer.zarr, for when the recording is no longer there.",
-        f"{_STEPS}.transfer:transfer",
+        _STAGES.transfer.transfer,
         sources=("echo", inputs.received),
         reads=("recordings",),
         kinds=("calibration", "image"),
@@ -325,7 +326,7 @@ _ROWS = (
         "calibrate",
         Scope.FLIGHT,
         "Estimate the path offsets of a calibration flight's pairs, calibration.json.",
-        f"{_STEPS}.calibration:calibrate",
+        _STAGES.calibration.calibrate,
         result="calibration",
         sources=("echo",),
         settings=("calibration", "scene.crs"),
@@ -338,7 +339,7 @@ _ROWS = (
         "scene",
         Scope.CAMPAIGN,
         "Choose the campaign's grid, scene.json.",
-        f"{_STEPS}.scene:scene",
+        _STAGES.scene.scene,
         sources=(inputs.echoes_that_bound_the_scene, inputs.heights),
         settings=("campaign", inputs.grid),
         documents=("scene.json",),
@@ -349,7 +350,7 @@ _ROWS = (
         "terrain",
         Scope.CAMPAIGN,
         "Resample the DEM to the campaign's grid, terrain.zarr.",
-        f"{_STEPS}.scene:terrain",
+        _STAGES.scene.terrain,
         sources=("scene", inputs.heights),
         settings=("scene.dem", "scene.dem_datum", "scene.geoid"),
         needed=lambda place: bool(place.campaign.settings.scene.dem),
@@ -359,7 +360,7 @@ _ROWS = (
         "profile",
         Scope.PAIR,
         "Compress a pair in range over the scene, profile.zarr.",
-        f"{_STEPS}.profile:profile",
+        _STAGES.profile.profile,
         sources=("echo", *_GROUND, inputs.patterns),
         settings=("processing.window", "processing.integration", inputs.antennas),
         forms=True,
@@ -370,7 +371,7 @@ _ROWS = (
         "refine",
         Scope.FLIGHT,
         "Estimate errors of a flight's tracks from its images, where that pays, refined_track.zarr.",
-        f"{_STEPS}.refine:refine",
+        _STAGES.refine.refine,
         result="refined_track",
         sources=(inputs.autofocused, *_GROUND),
         settings=("processing.autofocus", "processing.autofocus_method", "scene.reference_points"),
@@ -381,7 +382,7 @@ _ROWS = (
         "tracks",
         Scope.FLIGHT,
         "Write the logs of a flight as refined, tracks/<node>.pos and .csv, and what was moved, tracks.png.",
-        f"{_STEPS}.tracks:tracks",
+        _STAGES.tracks.tracks,
         sources=("refined_track", "track", inputs.unstaged_positions),
         settings=("campaign", inputs.stated_errors, inputs.unstaged_log_settings),
         products=("tracks.png",),
@@ -394,7 +395,7 @@ _ROWS = (
         _IMAGE,
         name="tiles",
         help="Form one job's share of a pair's tiles, '2-of-8'; step image finishes them.",
-        step=f"{_STEPS}.image:tiles",
+        step=_STAGES.image.tiles,
         result="image",
         command="tiles",
         shares=True,
@@ -406,7 +407,7 @@ _ROWS = (
         "layers",
         Scope.PAIR,
         "Write incidence, bistatic angle, mask, looks and noise of a pair as GeoTIFFs, and sigma0 where it is known.",
-        f"{_STEPS}.layers:layers",
+        _STAGES.layers.layers,
         sources=(*_FORMED, inputs.measured_image),
         settings=("campaign", "processing.integration", inputs.antennas, inputs.radio, inputs.multilook),
         exports="layers",
@@ -419,7 +420,7 @@ _ROWS = (
         "assess",
         Scope.FLIGHT,
         "Compare the images of a flight with each other, and choose what is added up, assessment.json.",
-        f"{_STEPS}.assess:assess",
+        _STAGES.assess.assess,
         result="assessment",
         sources=("echo", "image", "refined_track", *_GROUND),
         settings=("processing.fusion",),
@@ -431,7 +432,7 @@ _ROWS = (
         "export",
         Scope.PAIR,
         "Write GeoTIFFs and the quicklook of a pair, or of 'fused'.",
-        f"{_STEPS}.export:export",
+        _STAGES.export.export,
         sources=("image", "assessment", "scene", inputs.calibration_of_images),
         settings=("campaign", "metadata", inputs.polarisations),
         documents=("image.json",),
@@ -444,7 +445,7 @@ _ROWS = (
         "cphd",
         Scope.PAIR,
         "Write the calibrated transfer functions of a pair for other processors, phase_history.cphd.",
-        f"{_STEPS}.cphd:cphd",
+        _STAGES.cphd.cphd,
         sources=("echo", "profile", "scene"),
         settings=("campaign",),
         products=("phase_history.cphd",),
@@ -458,7 +459,7 @@ _ROWS = (
         "coverage",
         Scope.CAMPAIGN,
         "Draw what every flight and pair covers, coverage.png and coverage.geojson.",
-        f"{_STEPS}.coverage:coverage",
+        _STAGES.coverage.coverage,
         sources=("echo", "layers", "scene"),
         settings=("campaign",),
         products=("coverage.png", "coverage.geojson"),
@@ -468,7 +469,7 @@ _ROWS = (
         "cube",
         Scope.CAMPAIGN,
         "Stack and add up every image, cube.zarr.",
-        f"{_STEPS}.cube:cube",
+        _STAGES.cube.cube,
         sources=("image", "assessment", "scene"),
         settings=("campaign", "processing.tile_px"),
         demand=Demand(500, pixel_bytes=50, pixel_s=10, threads=2),
@@ -479,7 +480,7 @@ _ROWS = (
         "export_fused",
         Scope.FLIGHT,
         "Write GeoTIFFs and the quicklook of what the pairs of a flight add up to.",
-        f"{_STEPS}.export:export",
+        _STAGES.export.export,
         result="fused",
         sources=("image", "assessment", "cube", "scene", inputs.noise_of_sums),
         settings=("campaign", "metadata", inputs.polarisations, "processing.tile_px", inputs.multilook),
@@ -497,7 +498,7 @@ _ROWS = (
         "interferogram",
         Scope.TWO,
         "Compare two images in phase: coherence, unwrapped phase and heights, by a name of interferometry.pairs.",
-        f"{_STEPS}.interferogram:interferogram",
+        _STAGES.interferogram.interferogram,
         sources=(*_FORMED, "image", "layers"),
         settings=(
             "campaign",
@@ -517,7 +518,7 @@ _ROWS = (
         "mosaic",
         Scope.CAMPAIGN,
         "Write a mosaic of each product of all flights, mosaic/<pair>/<product>.vrt.",
-        f"{_STEPS}.mosaic:mosaic",
+        _STAGES.mosaic.mosaic,
         sources=("layers", "export", "fused"),
         settings=("campaign", inputs.coefficients),
         styles=True,
@@ -529,7 +530,7 @@ _ROWS = (
         "stac",
         Scope.CAMPAIGN,
         "Describe every image in a static STAC catalog, stac/catalog.json.",
-        f"{_STEPS}.stac:stac",
+        _STAGES.stac.stac,
         sources=("echo", "layers", "export", "fused", "scene"),
         settings=("campaign", "metadata", inputs.polarisations),
         products=("stac/catalog.json",),
@@ -539,7 +540,7 @@ _ROWS = (
         "pictures",
         Scope.PAIR,
         "Draw what the report shows of a pair: geometry, pulses, phase, cuts, range profiles, budget.",
-        "apertura.views.report.pictures:pictures",
+        _VIEWS.report.pictures.pictures,
         sources=("echo", "profile", "image", "layers", inputs.transmitter_raw, "refined_track", *_GROUND),
         settings=("campaign",),
         on_demand=True,
@@ -550,7 +551,7 @@ _ROWS = (
         "pictures_fused",
         Scope.FLIGHT,
         "Draw what the report shows of the sums of a flight's pairs: beside the pairs, and cuts.",
-        "apertura.views.report.pictures:pictures_fused",
+        _VIEWS.report.pictures.pictures_fused,
         sources=("export", "image", "cube", "fused", "scene"),
         settings=("campaign",),
         products=("panels.png", "sum_cuts.png"),
@@ -564,7 +565,7 @@ _ROWS = (
         "page",
         Scope.FLIGHT,
         "Write what the report says of a flight, report.html, which prints.",
-        "apertura.views.report.step:page",
+        _VIEWS.report.step.page,
         sources=("pictures", "pictures_fused", "export", "fused", "scene"),
         settings=(inputs.everything,),
         on_demand=True,
@@ -575,7 +576,7 @@ _ROWS = (
         "report",
         Scope.CAMPAIGN,
         "Write the first page of Snakemake's report, which `apertura report` asks for.",
-        "apertura.views.report.step:landing",
+        _VIEWS.report.step.landing,
         sources=("page", "coverage"),
         settings=(inputs.everything,),
         on_demand=True,
@@ -584,7 +585,7 @@ _ROWS = (
         "map",
         Scope.CAMPAIGN,
         "Write what `apertura map` shows of every image in a browser, map/map.json.",
-        "apertura.views.webmap.document:webmap",
+        _VIEWS.webmap.document.webmap,
         sources=("layers", "export", "fused", "coverage", "scene", inputs.truth),
         settings=("campaign", "calibration", "scene.reference_points"),
         products=("map.json",),
@@ -596,7 +597,7 @@ _ROWS = (
         "speed_accuracy",
         Scope.CHARTED,
         "Time and measure every engine and setting on a pair, for at most so many seconds.",
-        "apertura.tools.chart.speed_accuracy:speed_accuracy",
+        _TOOLS.chart.speed_accuracy.speed_accuracy,
         sources=(*_FORMED, "refined_track"),
         settings=(inputs.charted_pair, *_IMAGE_SETTINGS),
         products=("speed_accuracy.csv", "speed_accuracy.png", "speed_accuracy.html"),
@@ -612,7 +613,7 @@ _ROWS = (
         "whole_chart",
         Scope.CAMPAIGN,
         "Time and measure the way from raw samples to GeoTIFFs under several settings, whole.csv and .png.",
-        "apertura.tools.chart.whole:whole_chart",
+        _TOOLS.chart.whole.whole_chart,
         result="whole",
         sources=(inputs.everything_recorded, inputs.heights),
         settings=(inputs.everything,),
@@ -626,7 +627,7 @@ _ROWS = (
         "ro_crate",
         Scope.CAMPAIGN,
         "Describe the whole run, with every file and command, as an RO-Crate, ro-crate-metadata.json.",
-        f"{_STEPS}.ro_crate:ro_crate",
+        _STAGES.ro_crate.ro_crate,
         sources=(inputs.config_files, EVERY),
         settings=("campaign", "metadata", _workflow),
         products=("ro-crate-metadata.json",),

@@ -6,7 +6,6 @@ the steps and the tests; nothing else names a product. To add one, write a funct
 as entry point of group ``apertura.exports``. Importing this module imports no format.
 """
 
-import pkgutil
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import entry_points
@@ -14,6 +13,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+from apertura.common.lazy import Lazy, module_of, name_of
 from apertura.common.provenance import canonical_json
 from apertura.formats.export.radiometry import CROSS_SECTIONS, TAG
 
@@ -65,9 +65,9 @@ class Export:
         Its name in the folder of the pair or of the fused images.
     source
         A key of `SOURCES`.
-    function
-        ``package.module:function``, imported when a file is written; called as
-        ``function(path, raster, transform=…, crs=…, tags=…, title=…)``, see `apertura.formats.export.cog.write_slc`.
+    write
+        Writes the file, as ``write(path, raster, transform=…, crs=…, tags=…, title=…)``; see
+        `apertura.formats.export.cog.write_slc`.
     pictured
         Whether the workflow's report shows it.
     opened
@@ -78,7 +78,7 @@ class Export:
 
     file: str
     source: str
-    function: str
+    write: Callable[..., None]
     pictured: bool = False
     mosaicked: bool = True
     opened: str = ""
@@ -86,100 +86,96 @@ class Export:
     @property
     def module(self) -> str:
         """Dotted name of the module that writes the file."""
-        return self.function.partition(":")[0]
+        return module_of(self.write)
 
     @property
     def style(self) -> bool:
         """True if it is the style in which QGIS shows the raster of its name."""
         return self.module == "apertura.formats.export.style"
 
-    @property
-    def write(self) -> Callable[..., None]:
-        """The function that writes the file."""
-        function: Callable[..., None] = pkgutil.resolve_name(self.function)
-        return function
 
+_WRITERS = Lazy("apertura.formats.export")
 
 _ADDED: tuple[Export, ...] = tuple(point.load() for point in entry_points(group="apertura.exports"))
 
 EXPORTS: tuple[Export, ...] = (
-    Export("slc.tif", "image", "apertura.formats.export.cog:write_slc", mosaicked=False),
-    Export("power.tif", "image", "apertura.formats.export.cog:write_power"),
-    Export("power.qml", "image", "apertura.formats.export.style:write_linear_style"),
-    Export("db.tif", "image", "apertura.formats.export.db:write_db", opened="in a GIS"),
-    Export("db.qml", "image", "apertura.formats.export.style:write_db_style"),
+    Export("slc.tif", "image", _WRITERS.cog.write_slc, mosaicked=False),
+    Export("power.tif", "image", _WRITERS.cog.write_power),
+    Export("power.qml", "image", _WRITERS.style.write_linear_style),
+    Export("db.tif", "image", _WRITERS.db.write_db, opened="in a GIS"),
+    Export("db.qml", "image", _WRITERS.style.write_db_style),
     Export(
         "quicklook.png",
         "image",
-        "apertura.formats.export.quicklook:write_quicklook",
+        _WRITERS.quicklook.write_quicklook,
         pictured=True,
         opened="with the quality of the image",
     ),
-    Export("coherent_slc.tif", "coherent", "apertura.formats.export.cog:write_slc", mosaicked=False),
-    Export("coherent_power.tif", "coherent", "apertura.formats.export.cog:write_power"),
-    Export("coherent_power.qml", "coherent", "apertura.formats.export.style:write_linear_style"),
-    Export("coherent_db.tif", "coherent", "apertura.formats.export.db:write_db", opened="in a GIS"),
-    Export("coherent_db.qml", "coherent", "apertura.formats.export.style:write_db_style"),
+    Export("coherent_slc.tif", "coherent", _WRITERS.cog.write_slc, mosaicked=False),
+    Export("coherent_power.tif", "coherent", _WRITERS.cog.write_power),
+    Export("coherent_power.qml", "coherent", _WRITERS.style.write_linear_style),
+    Export("coherent_db.tif", "coherent", _WRITERS.db.write_db, opened="in a GIS"),
+    Export("coherent_db.qml", "coherent", _WRITERS.style.write_db_style),
     Export(
         "quicklook.png",
         "coherent",
-        "apertura.formats.export.quicklook:write_quicklook",
+        _WRITERS.quicklook.write_quicklook,
         pictured=True,
         opened="with the quality of the image",
     ),
-    Export("noncoherent_power.tif", "noncoherent", "apertura.formats.export.cog:write_power"),
-    Export("noncoherent_power.qml", "noncoherent", "apertura.formats.export.style:write_linear_style"),
+    Export("noncoherent_power.tif", "noncoherent", _WRITERS.cog.write_power),
+    Export("noncoherent_power.qml", "noncoherent", _WRITERS.style.write_linear_style),
     Export(
         "noncoherent_db.tif",
         "noncoherent",
-        "apertura.formats.export.db:write_db",
+        _WRITERS.db.write_db,
         opened="in a GIS, the incoherent sum",
     ),
-    Export("noncoherent_db.qml", "noncoherent", "apertura.formats.export.style:write_db_style"),
-    Export("noncoherent_magnitude.tif", "magnitude", "apertura.formats.export.cog:write_magnitude"),
-    Export("noncoherent_magnitude.qml", "magnitude", "apertura.formats.export.style:write_linear_style"),
-    Export("incidence.tif", "incidence", "apertura.formats.export.layers:write_incidence"),
-    Export("incidence.qml", "incidence", "apertura.formats.export.style:write_layer_style"),
-    Export("bistatic_angle.tif", "bistatic_angle", "apertura.formats.export.layers:write_bistatic_angle"),
-    Export("bistatic_angle.qml", "bistatic_angle", "apertura.formats.export.style:write_layer_style"),
-    Export("mask.tif", "mask", "apertura.formats.export.layers:write_mask"),
-    Export("mask.qml", "mask", "apertura.formats.export.style:write_mask_style"),
-    Export("looks.tif", "looks", "apertura.formats.export.layers:write_looks"),
-    Export("looks.qml", "looks", "apertura.formats.export.style:write_layer_style"),
-    Export("nesz.tif", "nesz", "apertura.formats.export.layers:write_nesz"),
-    Export("nesz.qml", "nesz", "apertura.formats.export.style:write_layer_style"),
-    Export("sigma0_db.tif", "sigma0", "apertura.formats.export.db:write_db"),
-    Export("sigma0_db.qml", "sigma0", "apertura.formats.export.style:write_backscatter_style"),
-    Export("gamma0_db.tif", "gamma0", "apertura.formats.export.db:write_db"),
-    Export("gamma0_db.qml", "gamma0", "apertura.formats.export.style:write_backscatter_style"),
-    Export("beta0_db.tif", "beta0", "apertura.formats.export.db:write_db"),
-    Export("beta0_db.qml", "beta0", "apertura.formats.export.style:write_backscatter_style"),
+    Export("noncoherent_db.qml", "noncoherent", _WRITERS.style.write_db_style),
+    Export("noncoherent_magnitude.tif", "magnitude", _WRITERS.cog.write_magnitude),
+    Export("noncoherent_magnitude.qml", "magnitude", _WRITERS.style.write_linear_style),
+    Export("incidence.tif", "incidence", _WRITERS.layers.write_incidence),
+    Export("incidence.qml", "incidence", _WRITERS.style.write_layer_style),
+    Export("bistatic_angle.tif", "bistatic_angle", _WRITERS.layers.write_bistatic_angle),
+    Export("bistatic_angle.qml", "bistatic_angle", _WRITERS.style.write_layer_style),
+    Export("mask.tif", "mask", _WRITERS.layers.write_mask),
+    Export("mask.qml", "mask", _WRITERS.style.write_mask_style),
+    Export("looks.tif", "looks", _WRITERS.layers.write_looks),
+    Export("looks.qml", "looks", _WRITERS.style.write_layer_style),
+    Export("nesz.tif", "nesz", _WRITERS.layers.write_nesz),
+    Export("nesz.qml", "nesz", _WRITERS.style.write_layer_style),
+    Export("sigma0_db.tif", "sigma0", _WRITERS.db.write_db),
+    Export("sigma0_db.qml", "sigma0", _WRITERS.style.write_backscatter_style),
+    Export("gamma0_db.tif", "gamma0", _WRITERS.db.write_db),
+    Export("gamma0_db.qml", "gamma0", _WRITERS.style.write_backscatter_style),
+    Export("beta0_db.tif", "beta0", _WRITERS.db.write_db),
+    Export("beta0_db.qml", "beta0", _WRITERS.style.write_backscatter_style),
     *(
-        Export(f"{source}{end}", source, f"apertura.formats.export.{function}")
+        Export(f"{source}{end}", source, write)
         for source in (source for source, kind in SOURCES.items() if kind.startswith("multilook"))
-        for end, function in (
-            ("_power.tif", "cog:write_mean_power"),
-            ("_power.qml", "style:write_linear_style"),
-            ("_db.tif", "db:write_mean_db"),
-            ("_db.qml", "style:write_backscatter_style"),
+        for end, write in (
+            ("_power.tif", _WRITERS.cog.write_mean_power),
+            ("_power.qml", _WRITERS.style.write_linear_style),
+            ("_db.tif", _WRITERS.db.write_mean_db),
+            ("_db.qml", _WRITERS.style.write_backscatter_style),
         )
     ),
-    Export("phase.tif", "phase", "apertura.formats.export.interferogram:write_phase"),
-    Export("phase.qml", "phase", "apertura.formats.export.style:write_layer_style"),
-    Export("coherence.tif", "coherence", "apertura.formats.export.interferogram:write_coherence"),
-    Export("coherence.qml", "coherence", "apertura.formats.export.style:write_layer_style"),
-    Export("unwrapped.tif", "unwrapped", "apertura.formats.export.interferogram:write_unwrapped"),
-    Export("unwrapped.qml", "unwrapped", "apertura.formats.export.style:write_layer_style"),
+    Export("phase.tif", "phase", _WRITERS.interferogram.write_phase),
+    Export("phase.qml", "phase", _WRITERS.style.write_layer_style),
+    Export("coherence.tif", "coherence", _WRITERS.interferogram.write_coherence),
+    Export("coherence.qml", "coherence", _WRITERS.style.write_layer_style),
+    Export("unwrapped.tif", "unwrapped", _WRITERS.interferogram.write_unwrapped),
+    Export("unwrapped.qml", "unwrapped", _WRITERS.style.write_layer_style),
     Export(
         "height.tif",
         "height",
-        "apertura.formats.export.interferogram:write_height",
+        _WRITERS.interferogram.write_height,
         opened="in a GIS, with its deviation beside it",
     ),
-    Export("height.qml", "height", "apertura.formats.export.style:write_layer_style"),
-    Export("height_std.tif", "height_std", "apertura.formats.export.interferogram:write_height_std"),
-    Export("height_std.qml", "height_std", "apertura.formats.export.style:write_layer_style"),
-    Export("quicklook.png", "panels", "apertura.formats.export.interferogram:write_panels", pictured=True),
+    Export("height.qml", "height", _WRITERS.style.write_layer_style),
+    Export("height_std.tif", "height_std", _WRITERS.interferogram.write_height_std),
+    Export("height_std.qml", "height_std", _WRITERS.style.write_layer_style),
+    Export("quicklook.png", "panels", _WRITERS.interferogram.write_panels, pictured=True),
     *_ADDED,
 )
 """Every product of a pair or of a flight's sums, in the order in which they are written."""
@@ -226,7 +222,7 @@ def product(source: str, function: str) -> Export:
     >>> product("coherent", "write_slc").file
     'coherent_slc.tif'
     """
-    return next(row for row in EXPORTS if row.source == source and row.function.endswith(f":{function}"))
+    return next(row for row in EXPORTS if row.source == source and name_of(row.write) == function)
 
 
 def export_modules(folder: str) -> list[str]:

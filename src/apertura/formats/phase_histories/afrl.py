@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError, print_remark
 from apertura.formats.isolated import UnreadableError, read_isolated
-from apertura.formats.phase_histories import phase_history
+from apertura.formats.phase_histories import mat_fields, phase_history
 from apertura.formats.phase_histories.mat_fields import CORRECTIONS
 from apertura.formats.phase_histories.phase_history import LARGEST, History, largest_by_row, refused
 
@@ -54,7 +54,7 @@ def read_afrl_mat(
     """
     paths = sorted(paths)
     try:
-        passes = read_isolated("apertura.formats.phase_histories.mat_fields:read_fields", paths)
+        passes = read_isolated(mat_fields.read_fields, paths)
     except UnreadableError as error:
         raise _error(f"not readable ({error})", error.path) from error
     return joined(paths, passes, pair=pair, corrected=described.get("corrections") == "stored")

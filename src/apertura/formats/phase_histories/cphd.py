@@ -17,6 +17,7 @@ from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError, quoted
 from apertura.core.geometry.geodesy import LOCAL
 from apertura.formats.isolated import UnreadableError, read_isolated
+from apertura.formats.phase_histories import cphd_fields
 from apertura.formats.phase_histories.cphd_fields import PATH_LIMIT, PULSE_FIELDS
 from apertura.formats.phase_histories.phase_history import LARGEST, History, joined, largest_by_row, refused
 
@@ -66,7 +67,7 @@ def read_cphd(paths: Sequence[Path], *, pair: str, described: Mapping[str, Any])
     """
     paths = sorted(paths)
     try:
-        files = read_isolated("apertura.formats.phase_histories.cphd_fields:read_fields", paths)
+        files = read_isolated(cphd_fields.read_fields, paths)
     except UnreadableError as error:
         raise _error(f"not readable ({error})", error.path) from error
     histories = [

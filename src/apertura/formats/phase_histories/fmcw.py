@@ -1,6 +1,6 @@
 """Beat signals of FMCW radars as arrays (.npy, .mat) or sound (.wav): they enter at `echo`, placed by flight logs."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from apertura.common.errors import CampaignError
 from apertura.core.echo.dechirp import FrequencySweep, transfer_of
 from apertura.formats.isolated import UnreadableError, read_isolated
 from apertura.formats.npy import read_npy
+from apertura.formats.phase_histories import fmcw_fields
 from apertura.formats.times import utc_times
 
 # ---- Beat signals of FMCW radars as arrays (.npy, .mat) -------------------------------------------------------------
@@ -99,11 +100,13 @@ def read_beat_mat(paths: Sequence[Path], *, pair: str, described: Mapping[str, A
     CampaignError
         As `read_beat_npy`.
     """
-    read = read_fields("apertura.formats.phase_histories.fmcw_fields:read_beat_fields", paths)
+    read = read_fields(fmcw_fields.read_beat_fields, paths)
     return joined_sweeps([sweeps_of(path, one) for path, one in read], pair=pair, described=described)
 
 
-def read_fields(function: str, paths: Sequence[Path]) -> Iterable[tuple[Path, dict[str, NDArray[Any]]]]:
+def read_fields(
+    function: Callable[[Path], Any], paths: Sequence[Path]
+) -> Iterable[tuple[Path, dict[str, NDArray[Any]]]]:
     """Return each file, in the order of names, and what a function in a process of its own makes of it.
 
     Raises
@@ -296,7 +299,7 @@ def read_beat_wav(paths: Sequence[Path], *, pair: str, described: Mapping[str, A
     """
     if len(paths) != 1:
         raise _bad(f"{len(paths)} files", paths[1], "one .wav file of a node and flight", "Make one file of them.")
-    path, found = next(iter(read_fields("apertura.formats.phase_histories.fmcw_fields:read_wav", paths)))
+    path, found = next(iter(read_fields(fmcw_fields.read_wav, paths)))
     return joined_sweeps([cut_sweeps(path, found, described)], pair=pair, described=described)
 
 

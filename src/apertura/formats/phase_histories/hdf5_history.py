@@ -27,7 +27,7 @@ def read_hdf5_history(paths: Sequence[Path], *, pair: str) -> "xr.Dataset":
     """
     paths = sorted(paths)
     try:
-        files = read_isolated(f"{__name__}:read_fields", paths)
+        files = read_isolated(read_fields, paths)
     except UnreadableError as error:
         raise refused(f"not readable ({error})", error.path, _EXPECTED) from error
     return joined([history(*one) for one in zip(paths, files, strict=True)], pair=pair, expected=_EXPECTED)

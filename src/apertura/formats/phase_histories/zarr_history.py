@@ -42,7 +42,7 @@ def read_zarr_history(paths: Sequence[Path], *, pair: str) -> "xr.Dataset":
     sizes = [path.stat().st_size for path in paths]
     limits: dict[str, Any] = {"memory_bytes": _SPARE_BYTES + BYTES_PER_BYTE * sum(sizes)}
     try:
-        read = read_isolated(f"{__name__}:read_fields", folders, **limits)
+        read = read_isolated(read_fields, folders, **limits)
     except UnreadableError as error:
         raise refused(f"not readable ({error})", error.path, _EXPECTED) from error
     return joined([history(*one) for one in zip(folders, read, strict=True)], pair=pair, expected=_EXPECTED)

@@ -12,6 +12,7 @@ from apertura.common.arrays import Floats
 from apertura.common.errors import CampaignError, quoted
 from apertura.common.leap_seconds import gps_from_weeks, utc_from_gps
 from apertura.formats.isolated import UnreadableError, read_isolated
+from apertura.formats.tracks import dataflash_fields
 from apertura.formats.tracks.autopilot import Attitude, Epochs, autopilot_track
 from apertura.formats.tracks.damage import damage_of
 from apertura.formats.tracks.dataflash_fields import COLUMNS, DAMAGE, NEEDED
@@ -59,7 +60,7 @@ def read_ardupilot(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -
     GPS1_DELAY_MS, GPS1_TYPE.
     """
     try:
-        fields = read_isolated("apertura.formats.tracks.dataflash_fields:read_fields", [path])[0]
+        fields = read_isolated(dataflash_fields.read_fields, [path])[0]
     except UnreadableError as error:
         raise _error(f"not readable ({error})", path) from error
     return track_of(fields, node=node, options=options, where=path)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from apertura.common.errors import CampaignError, quoted
 from apertura.formats.isolated import UnreadableError, read_isolated
+from apertura.formats.tracks import ulog_fields
 from apertura.formats.tracks.autopilot import Attitude, Epochs, autopilot_track, clock_of
 from apertura.formats.tracks.damage import damage_of
 from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions
@@ -66,7 +67,7 @@ def read_px4_ulog(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) ->
     Source: PX4 user guide, "ULog file format"; messages SensorGps, VehicleGlobalPosition and VehicleAttitude of PX4.
     """
     try:
-        fields = read_isolated("apertura.formats.tracks.ulog_fields:read_fields", [path])[0]
+        fields = read_isolated(ulog_fields.read_fields, [path])[0]
     except UnreadableError as error:
         raise _error(f"not readable ({error})", path) from error
     return track_of(fields, node=node, options=options, where=path)

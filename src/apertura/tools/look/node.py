@@ -1,6 +1,5 @@
 """What a node has recorded and logged so far: captures and lines that are whole, read once."""
 
-import pkgutil
 import time
 import zlib
 from pathlib import Path
@@ -96,7 +95,7 @@ class NodeSoFar:
         files = self._campaign.recording_files(self._flight, self.name)
         if self._growing is None:
             row = next(row for row in GROWING if files[0].name.endswith(row[0]))
-            self._growing = pkgutil.resolve_name(GROWING[row])(*files)
+            self._growing = GROWING[row](*files)
         growing = self._growing.read()
         if self._growing.runs_through and not self._follow:
             whole = open_recording(files)
