@@ -1,4 +1,4 @@
-// Sizes and error bounds of the kernel, each once. `core/backprojection/engines/native_prediction.py` predicts with the
+// Sizes and error bounds of the kernel, each once. `core/backprojection/engines/native.py` predicts with the
 // same numbers; contract.cpp exports them and a test compares the two. docs/theory/engine.md derives them.
 #pragma once
 #include <cstdint>

@@ -22,7 +22,7 @@ from scenes import (
 from apertura.core.antenna.beam import Beam, Beams, antenna_axes, gaussian_cut, sampled_cut
 from apertura.core.antenna.illumination import illuminate
 from apertura.core.backprojection.engines import load_engine, native, reference
-from apertura.core.backprojection.engines.native_prediction import NO_BEAMS, PatchWeights, patch_weights, pixel_seconds
+from apertura.core.backprojection.engines.native import NO_BEAMS, PatchWeights, patch_weights, pixel_seconds
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.geodesy import body_axes
 from apertura.core.planning.planner import make_plan

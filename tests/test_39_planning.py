@@ -12,7 +12,7 @@ from scenes import WAVELENGTH, compiled, ground_points, monostatic, plan, planni
 from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
 from apertura.common.errors import CampaignError
 from apertura.core.backprojection.engines import load_engine, native, reference
-from apertura.core.backprojection.engines.native_prediction import path_variants, view_of
+from apertura.core.backprojection.engines.native import path_variants, view_of
 from apertura.core.backprojection.inputs import Profiles
 from apertura.core.echo.compression import window_weights
 from apertura.core.planning.planner import MARGIN_DB, SettingSearch, make_plan

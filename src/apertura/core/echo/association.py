@@ -346,6 +346,8 @@ def association_flags(
 
     Parameters
     ----------
+    association
+        Of the pulses.
     tags
         (pulse,) int64 tags of transmitter and receiver, nanoseconds.
     interval_s

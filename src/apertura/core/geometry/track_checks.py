@@ -231,6 +231,8 @@ def rounded_time_m(time_s: Floats, position_m: Floats) -> float:
     ----------
     time_s
         (epoch,) float64, seconds, integer multiples of the grain they were written with.
+    position_m
+        (epoch, 3) float64, metres.
 
     Notes
     -----

@@ -30,8 +30,8 @@ from apertura.core.backprojection.engines.engine import (
     option_values,
     power_sum_db,
 )
+from apertura.core.backprojection.engines.native import OVERSAMPLINGS, TOLERANCES_RAD, View, view_of
 from apertura.core.backprojection.engines.native_binding import KERNEL
-from apertura.core.backprojection.engines.native_prediction import OVERSAMPLINGS, TOLERANCES_RAD, View, view_of
 from apertura.core.backprojection.engines.native_tables import PHASE_POLYNOMIALS, TableDesign, design_table, ratio
 from apertura.core.backprojection.inputs import Profiles
 from apertura.core.backprojection.job import Job

@@ -15,8 +15,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from apertura.common.arrays import decibels
 from apertura.common.units import decibels
-from apertura.core.backprojection.engines import native_prediction
+from apertura.core.backprojection.engines import native
 from apertura.core.backprojection.engines.engine import Setting, option_values, power_sum_db
 from apertura.core.backprojection.engines.native_binding import (
     BY_TREE,
@@ -27,7 +28,6 @@ from apertura.core.backprojection.engines.native_binding import (
     TreeTile,
     call,
 )
-from apertura.core.backprojection.engines.native_prediction import pixel_steps
 from apertura.core.backprojection.engines.tree_geometry import (
     DEGREES,
     LEAF,
@@ -153,6 +153,8 @@ def widened_rad(slope: float, band_rad: NDArray[np.floating], nodes_db: float) -
         Change of the depth in the edge per half tile.
     band_rad
         Without it, rad per half tile.
+    nodes_db
+        Tolerated error of one interpolation, ε.
 
     Notes
     -----
@@ -297,7 +299,7 @@ def _patches(job: Job, side: int) -> list[NDArray[np.float64]]:
     if job.patches_m:
         return list(job.patches_m)
     count = len(job.points_m)
-    right, down = (pixel_steps(job.ground_m, axis, job.spacing_m).reshape(-1, 3) for axis in (1, 0))
+    right, down = (native.pixel_steps(job.ground_m, axis, job.spacing_m).reshape(-1, 3) for axis in (1, 0))
     at = np.arange(side) - (side - 1) / 2
     return [
         job.points_m[n] + at[:, None, None] * down[n] + at[None, :, None] * right[n]
@@ -382,7 +384,7 @@ SIDES_PX, CHUNKS = (64, 128, 256), (256, 1024, 2048)
 _FLOAT32_DB = -92.0  # error of float32 sums
 _FLOAT32 = 2e-7  # of a phase of so many radians: path lengths, and places of cells
 
-# Seconds on one core, of the same machine as the direct kernel's in native_prediction.py.
+# Seconds on one core, of the same machine as the direct kernel's in native.py.
 _NODE_S = 7e-10  # a look-up of a pulse at a node
 _EXPAND_S = 2.6e-9  # sixteen taps of a cell's filters
 _EACH_EXPAND_S = 4.6e-9  # of pulses that no virtual pulse replaces, whose cells neighbouring tiles share
@@ -450,7 +452,7 @@ def _setting(job: Job, pulses: int, options: _Options) -> Setting:
     # What no tree sums: the direct kernel, tile by tile.
     carrier_rad = signal.wavenumber_rad_m * signal.step_m
     requested = {"degree": 2, **direct_setting(nodes_db, signal.oversampling, carrier_rad)._asdict()}
-    direct = next(iter(native_prediction.candidates(job, pulses=pulses, requested=requested)))
+    direct = next(iter(native.candidates(job, pulses=pulses, requested=requested)))
     direct_s = _PIECEWISE * direct.form_seconds / (job.pixels * pulses * job.share)
     cost = _cost(job, pulses, options, direct_s)
     # (10), with float32 sums and phases; errors of trees and of direct sums add by their shares.
