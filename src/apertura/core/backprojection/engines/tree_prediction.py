@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from apertura.common.arrays import decibels
 from apertura.common.units import decibels
 from apertura.core.backprojection.engines import native
 from apertura.core.backprojection.engines.engine import Setting, option_values, power_sum_db
