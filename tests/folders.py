@@ -12,7 +12,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+import rasterio
 import yaml
+from rasterio.transform import from_origin
 
 from apertura.campaign.config import FUSED, SampledWaveform
 from apertura.campaign.folder import Campaign
@@ -20,6 +22,7 @@ from apertura.campaign.store import open_stage
 from apertura.check.examination import Examination
 from apertura.check.files import check_files
 from apertura.common.errors import CampaignError
+from apertura.core.geometry.geodesy import projected_from_ecef
 from apertura.simulation import (
     CampaignSpecification,
     Framing,
@@ -33,6 +36,7 @@ from apertura.simulation import (
     WaveformSpecification,
 )
 from apertura.simulation.observation import Observation, fly
+from apertura.simulation.presets import DEMO_ORIGIN
 from apertura.simulation.scene import scatterers
 from apertura.simulation.specification import DrawnCampaign, draw_campaign
 from apertura.stages import (
@@ -57,6 +61,9 @@ from apertura.views.webmap import document as webmap
 
 ROOT = Path(__file__).parents[1]
 SHARED = ROOT.parent / "shared" / "data"
+SLOPE = np.tan(np.radians(20.0))
+ALONG = np.array([np.sin(np.radians(40.0)), np.cos(np.radians(40.0))])
+UPHILL = np.array([ALONG[1], -ALONG[0]]) * 0.8 + ALONG * 0.6  # away from the track and along it
 
 
 def copy_writable(source: Path, target: Path) -> Path:
@@ -227,8 +234,34 @@ def contents(root: Path) -> dict[str, bytes]:
     return {str(path.relative_to(root)): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
 
 
-def snakemake(campaign: Path, *options: str, **popen: Any) -> "subprocess.Popen[str]":
-    """Start Snakemake itself on a campaign."""
+def write_plane(
+    root: Path,
+    *,
+    slope: float = SLOPE,
+    height_m: float = 620.0,
+    name: str = "dem.tif",
+    void: float | None = None,
+    keep: Any = slice(None),
+) -> Path:
+    """A DEM of the plane through the demo's origin, posts every metre, 20 m around; `keep` rows and columns of it."""
+    east, north, _ = projected_from_ecef("EPSG:32632", DEMO_ORIGIN.ecef(np.zeros(3)))
+    west, top = np.floor(east) - 20, np.ceil(north) + 20
+    x, y = np.meshgrid(west + 0.5 + np.arange(40), top - 0.5 - np.arange(40))
+    heights = height_m + slope * ((x - east) * UPHILL[0] + (y - north) * UPHILL[1])
+    if void is not None:
+        heights[20, 20] = void
+    down, right = keep if isinstance(keep, tuple) else (keep, keep)
+    heights, corner = heights[down, right], (west + (right.start or 0), top - (down.start or 0))
+    with rasterio.open(
+        root / name, "w", "GTiff", width=heights.shape[1], height=heights.shape[0], count=1, dtype="float64",
+        crs="EPSG:32632", transform=from_origin(*corner, 1, 1),
+    ) as raster:  # fmt: skip
+        raster.write(heights, 1)
+    return root / name
+
+
+def snakemake(campaign: Path, *options: str, **popen: Any) -> subprocess.Popen[str]:
+    """Start Snakemake itself on a campaign, without the driver of `apertura run`."""
     environment = {**os.environ, "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"}
     command = [sys.executable, "-m", "snakemake", "--directory", str(campaign), "--cores", "2", *options]
     return subprocess.Popen(
@@ -236,7 +269,13 @@ def snakemake(campaign: Path, *options: str, **popen: Any) -> "subprocess.Popen[
     )
 
 
-def finished(process: "subprocess.Popen[str]", timeout: float = 600) -> tuple[int, str]:
-    """Return exit status and output of a process that was started."""
+def finished(process: subprocess.Popen[str], timeout: float = 600) -> tuple[int, str]:
+    """Wait for a process; return its exit status and its output."""
     output, _ = process.communicate(timeout=timeout)
     return process.returncode, output
+
+
+def apertura(*words: object, **popen: Any) -> subprocess.Popen[str]:
+    """Start the command line in a process of its own."""
+    command = [str(Path(sys.executable).parent / "apertura"), *map(str, words)]
+    return subprocess.Popen(command, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, **popen)

@@ -11,8 +11,7 @@ import pytest
 import rasterio
 import xarray as xr
 import yaml
-from folders import complaint, copy_writable, require_files, run_steps, settle_ground
-from rasterio.transform import from_origin
+from folders import ALONG, SLOPE, UPHILL, complaint, copy_writable, require_files, run_steps, settle_ground, write_plane
 
 from apertura.campaign.folder import Campaign
 from apertura.campaign.store import open_stage
@@ -35,9 +34,6 @@ from apertura.views.score import score
 
 UNDULATION_M = 47.392  # of EGM96 at the demo's origin, read from egm96_15.gtx with rasterio
 PAIR = ("f01", "uav1-uav2")
-SLOPE = np.tan(np.radians(20.0))
-ALONG = np.array([np.sin(np.radians(40.0)), np.cos(np.radians(40.0))])
-UPHILL = np.array([ALONG[1], -ALONG[0]]) * 0.8 + ALONG * 0.6  # away from the track and along it
 
 
 def edit_scene(root, **keys):
@@ -46,24 +42,6 @@ def edit_scene(root, **keys):
     document["scene"] |= keys
     path.write_text(yaml.safe_dump(document))
     return Campaign.load(root)
-
-
-def write_plane(root, *, slope=SLOPE, height_m=620.0, name="dem.tif", void=None, keep=slice(None)):
-    """A DEM of the plane through the demo's origin, posts every metre, 20 m around; `keep` rows and columns of it."""
-    east, north, _ = projected_from_ecef("EPSG:32632", DEMO_ORIGIN.ecef(np.zeros(3)))
-    west, top = np.floor(east) - 20, np.ceil(north) + 20
-    x, y = np.meshgrid(west + 0.5 + np.arange(40), top - 0.5 - np.arange(40))
-    heights = height_m + slope * ((x - east) * UPHILL[0] + (y - north) * UPHILL[1])
-    if void is not None:
-        heights[20, 20] = void
-    down, right = keep if isinstance(keep, tuple) else (keep, keep)
-    heights, corner = heights[down, right], (west + (right.start or 0), top - (down.start or 0))
-    with rasterio.open(
-        root / name, "w", "GTiff", width=heights.shape[1], height=heights.shape[0], count=1, dtype="float64",
-        crs="EPSG:32632", transform=from_origin(*corner, 1, 1),
-    ) as raster:  # fmt: skip
-        raster.write(heights, 1)
-    return root / name
 
 
 @pytest.fixture(scope="module")

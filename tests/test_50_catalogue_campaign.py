@@ -5,7 +5,7 @@ import shutil
 from pathlib import Path
 
 import pytest
-from test_50_workflow import apertura, finished
+from folders import apertura, finished
 
 CAMPAIGN = Path(__file__).parents[1] / ".test"
 

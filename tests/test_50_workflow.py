@@ -4,20 +4,16 @@ import contextlib
 import os
 import shutil
 import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 
 import pytest
 import yaml
-from folders import copy_writable, finished, snakemake
+from folders import apertura, copy_writable, finished, snakemake
 
 from apertura.campaign.folder import Campaign
 from apertura.common.processes import hold
 from apertura.workflow.stale import stale_results
-
-ROOT = Path(__file__).parents[1]
 
 
 def contents(root):
@@ -192,11 +188,6 @@ def test_what_headers_tell_ends_a_run_before_any_step(tiny):
         assert "Traceback" not in output
     assert code == 2
     assert not (tiny / "results").exists()
-
-
-def apertura(*words, **popen):
-    command = [str(Path(sys.executable).parent / "apertura"), *map(str, words)]
-    return subprocess.Popen(command, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, **popen)
 
 
 def replaced_keeping_times(path):

@@ -16,8 +16,7 @@ import google_crc32c
 import pytest
 import yaml
 from attack.planted import SNAKEMAKES_OWN, Code, hostile_texts, plant
-from folders import copy_writable, edit_config, run_steps
-from test_43_terrain import write_plane
+from folders import copy_writable, edit_config, run_steps, write_plane
 from typer.main import get_command
 
 from apertura.campaign.config.template import config_schema
