@@ -144,6 +144,7 @@ def test_the_air_of_a_scene_is_a_keyword_from_python_for_transfer_functions_and_
         ap.backproject(given, GRID, atmosphere="dry")
 
 
+@pytest.mark.quick("native", "reference")
 @pytest.mark.parametrize("engine", [name for name in ENGINES if name not in {"cuda"}])
 def test_an_image_in_air_is_that_of_a_larger_world_in_vacuum(engine):
     """docs/theory/atmosphere.md, eq. 4, pixel by pixel; every engine against itself, and against the double sum.

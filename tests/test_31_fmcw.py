@@ -65,6 +65,7 @@ def beats_from(sweep, late_s, start_s):
 STARTS_S = 0.05 + 0.040004 * np.arange(8)
 
 
+@pytest.mark.quick("*-beat_npy-times-*", "*-beat_mat-none-5")
 @pytest.mark.parametrize("count", [5, 900, 3000])
 @pytest.mark.parametrize("stated", ["times", "prf", "none"])
 @pytest.mark.parametrize("form", ["beat_npy", "beat_mat"])

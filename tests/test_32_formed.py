@@ -43,6 +43,7 @@ def formed(root, tmp_path, name, **processing):
     return campaign
 
 
+@pytest.mark.quick("two_parameter")
 @pytest.mark.parametrize("method", ["divide", "wiener", "gated", "two_parameter"])
 def test_what_is_formed_is_what_a_stage_keeps_to_the_bit(drifting, tmp_path, method):
     campaign = formed(drifting, tmp_path, "a", sidelink=method)
@@ -60,6 +61,7 @@ def kept_of(campaign, pair):
     return campaign.stage("transfer", "f01", pair)
 
 
+@pytest.mark.quick("divide")
 @pytest.mark.parametrize("method", ["divide", "two_parameter"])
 def test_what_a_stage_says_of_its_pulses_forms_what_was_measured(drifting, tmp_path, method):
     """Clock, direct path and path taken off go through the stage and back."""
@@ -118,6 +120,7 @@ def test_pulses_come_in_the_order_they_are_asked_for(drifting, tmp_path):
     assert transfer[:0].values.shape == (0, whole.shape[1])
 
 
+@pytest.mark.quick("False")
 @pytest.mark.parametrize("lost", [True, False])
 def test_a_recording_that_is_gone_or_another_is_told_where_a_pulse_is_read(drifting, tmp_path, lost):
     campaign = formed(drifting, tmp_path, "a")

@@ -49,6 +49,7 @@ def test_echoes_too_weak_to_show_before_an_image_is_formed_raise_no_flag(image_s
         assert found.flags == {}
 
 
+@pytest.mark.quick("20.0", "80.0")
 @pytest.mark.parametrize("image_snr_db", [20.0, 40.0, 50.0, 80.0])
 def test_a_wrong_code_is_never_confirmed_and_flagged_where_echoes_are_strong(image_snr_db):
     for seed in range(12):
@@ -85,7 +86,7 @@ def test_random_phase_of_own_pulses_is_seen_on_points_and_on_clutter(targets, ph
             assert found.rms_rad == pytest.approx(np.sqrt(6) * 0.3, rel=0.2)
 
 
-@pytest.mark.quick("3-*", "60-0.3")
+@pytest.mark.quick("3-*")
 @pytest.mark.parametrize("step_m", [0.06, 0.15, 0.3])
 @pytest.mark.parametrize("targets", [3, 60])
 def test_a_sparsely_sampled_flight_is_not_taken_for_an_unstable_one(step_m, targets):

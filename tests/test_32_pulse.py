@@ -103,6 +103,7 @@ def test_a_band_that_nobody_states_is_where_the_pulse_is(name, widest):
     assert 0.23 * LENGTH < last < widest * LENGTH
 
 
+@pytest.mark.quick("inverse-chirp", "matched-golay")
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("requested", ["inverse", "matched"])
 def test_the_filter_loses_what_it_says(name, requested):

@@ -189,6 +189,7 @@ def test_a_height_that_no_land_has_is_counted_where_it_counts(tmp_path, wild):
     assert np.isfinite(local.heights(SceneGrid("local", 500020.0, 5400060.0, 0.5, (70, 90)))).all()
 
 
+@pytest.mark.quick("EPSG:31467-EPSG:31287", "EPSG:4326-EPSG:32632")
 @pytest.mark.parametrize("crs", ["EPSG:31467", "EPSG:31287", "EPSG:25832", "EPSG:32632"])
 @pytest.mark.parametrize("dem_crs", ["EPSG:31467", "EPSG:32632", "EPSG:4326"])
 def test_heights_of_a_scene_count_from_wgs_84_whatever_its_crs(tmp_path, crs, dem_crs):

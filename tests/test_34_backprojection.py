@@ -45,6 +45,7 @@ def formed(name, profiles, grid=GRID, **options):
     return engine.form(engine.prepare(profiles), grid.positions(0.0), **options)
 
 
+@pytest.mark.quick("False-hann-*", "True-none-*")
 @pytest.mark.parametrize("name", TABLE_ENGINES)
 @pytest.mark.parametrize("window", ["hann", "none"])
 @pytest.mark.parametrize("bistatic", [False, True])

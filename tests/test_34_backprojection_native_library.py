@@ -36,6 +36,7 @@ def test_python_predicts_with_the_constants_of_the_kernel():
     )
 
 
+@pytest.mark.quick("int32_t*")
 @pytest.mark.parametrize(
     ("was", "becomes", "named"),
     [

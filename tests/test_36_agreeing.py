@@ -74,6 +74,7 @@ RIGHT = {pair: seen(number) for number, pair in enumerate(PAIRS)}
 TWENTY_ONE = [*combinations(PAIRS, 1), *combinations(PAIRS, 2)]
 
 
+@pytest.mark.quick("a-c-*", "a-b+a-e-phase", "a-a+a-f-place", "a-d+a-e-code")
 @pytest.mark.parametrize("what", WRONG)
 @pytest.mark.parametrize("wrong", TWENTY_ONE, ids="+".join)
 def test_whichever_one_or_two_of_six_pairs_are_wrong_the_others_add_up(what, wrong):

@@ -227,7 +227,7 @@ def test_what_has_changed_between_the_flights_lowers_coherence_and_widens_the_de
     assert list(interferogram_flags(changed.measured)) == ["height_relative"]
 
 
-@pytest.mark.quick("4.0-False", "4.0-True")
+@pytest.mark.quick("4.0-True")
 @pytest.mark.parametrize("same", [False, True])
 @pytest.mark.parametrize("correlation_s", [0.5, 4.0, 1e4])
 def test_errors_of_the_tracks_turn_the_phase_as_much_as_told(same, correlation_s):

@@ -204,6 +204,7 @@ def test_the_trigger_finds_every_pulse_where_it_is():
     assert (found.computed, found.verdict, error.verdict) == ("1", AGREES, AGREES)
 
 
+@pytest.mark.quick("timing*")
 @pytest.mark.parametrize(
     ("name", "size", "case"),
     [

@@ -51,6 +51,7 @@ def test_the_certificate_is_what_a_comparison_with_the_double_sum_measures():
     assert measured < -60
 
 
+@pytest.mark.quick("871")
 @compiled
 @pytest.mark.parametrize("seed", [860, 863, 871])
 def test_the_bound_at_pixels_drawn_blindly_is_no_lower_than_the_error_predicted(seed):

@@ -64,6 +64,7 @@ def test_points_that_share_a_range_cell_are_no_echo_from_elsewhere():
     assert "no place of the image gathers it" in echo_elsewhere(history, GRID, GROUND, points=elsewhere)
 
 
+@pytest.mark.quick("30.0")
 @pytest.mark.parametrize("noise", [1e-3, 30.0])
 def test_speckle_and_noise_are_no_echo_of_a_point(noise):
     generator = np.random.default_rng(2)

@@ -201,6 +201,7 @@ FLAGGED = {
 }
 
 
+@pytest.mark.quick("conjugated", "track 5 cm wrong at random", "starts in km", "conjugated profiles", "pulses shuffled")
 @pytest.mark.parametrize("name", FLAGGED)
 def test_what_forms_an_image_of_nothing_is_flagged(name):
     given, flag = FLAGGED[name]

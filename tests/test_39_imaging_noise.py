@@ -93,6 +93,7 @@ def test_too_few_pulses_tell_nothing():
     assert np.isfinite(noise_power(replace(profiles(1.0)[:40]), PLACES).power)
 
 
+@pytest.mark.quick("wiener", "two_parameter")
 @pytest.mark.parametrize("method", ["divide", "wiener", "gated", "two_parameter"])
 def test_the_noise_of_a_sidelink_lies_on_the_echoes_as_its_correction_leaves_it(method):
     """Eq. 8a: divided by a sidelink of 13 dB, echoes far above their receiver's noise bring noise of their own."""

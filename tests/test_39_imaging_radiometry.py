@@ -222,6 +222,7 @@ def test_the_link_is_the_radar_equation():
     assert noise == pytest.approx(1.380649e-23 * 290 * 10**0.3 * 1e5 * 1e8 / 64)
 
 
+@pytest.mark.quick("terrain1")
 @pytest.mark.parametrize("terrain", [LEVEL, Plane(0.0, 20.0, 0.0, 0.0, -0.3)])
 def test_a_calibrated_image_from_python_has_sigma0_and_cross_section_of_every_pixel(terrain):
     """A point of 0.1 m² at the corner of four pixels, K = 7; σ⁰ is the cross-section over the cell's area."""

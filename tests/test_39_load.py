@@ -111,6 +111,7 @@ def test_the_plan_of_every_pair_lies_on_the_one_grid_that_the_workflow_settles(t
     assert settled_scene(campaign).grid == expected
 
 
+@pytest.mark.quick("uav1-uav2")
 @pytest.mark.parametrize("pair", ["uav1-uav1", "uav1-uav2"])
 def test_the_prefix_ends_where_the_plan_expects_it(tiny, pair):
     """Automatic bounds may end there: path offsets and the sidelink's length count before the echo is formed."""

@@ -115,6 +115,7 @@ def test_predictions_fall_as_more_is_asked_and_cost_does_not():
     assert seconds == sorted(seconds)
 
 
+@pytest.mark.quick("609")
 @pytest.mark.parametrize("seed", [609, 625, 636])
 def test_predictions_hold_over_all_pixels_whatever_the_scene_holds(seed):
     """One to 24 targets in noise; errors weigh 10 dB more in a quarter of the first that is dark beside them."""
@@ -145,6 +146,7 @@ def test_the_compiled_engine_is_chosen_where_it_was_built_and_numba_where_it_was
         plan(overrides={"engine": "native"})
 
 
+@pytest.mark.quick("engine-*", "accumulate-*", "presum-1")
 @compiled
 @pytest.mark.parametrize(
     ("key", "value"),

@@ -167,6 +167,7 @@ def test_latitude_and_longitude_swapped_in_one_log_puts_the_earth_between_nodes(
     assert "expected nodes in sight of each other" in "\n".join(lines)
 
 
+@pytest.mark.quick("*swapped in the logs?", "*check heights*")
 @pytest.mark.parametrize(
     ("change", "remedy"),
     [
@@ -251,6 +252,7 @@ def test_a_zone_that_the_track_is_not_in_is_reported_where_bounds_are_auto(tiny)
     assert "EPSG:32635 (WGS 84 / UTM zone 35N) is not made for where the track lies" in only(tiny)
 
 
+@pytest.mark.quick("{'crs': 'auto', 'bounds_m': 'auto', 'spacing_m': 'auto'}", "{'crs': 'EPSG:25832'}")
 @pytest.mark.parametrize(
     "keys",
     [
@@ -318,6 +320,7 @@ def with_post(height_m, row=30, column=30):
     return np.where((np.arange(60)[:, None] == row) & (np.arange(60) == column), height_m, FLAT)
 
 
+@pytest.mark.quick("flat", "cliff", "spike")
 @pytest.mark.parametrize(
     ("heights", "spike"),
     [

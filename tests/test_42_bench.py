@@ -56,6 +56,7 @@ def test_a_right_set_up_is_never_flagged(seed: int, tmp_path):
     assert not measured(of(snr_db), tmp_path / "bench", seed).flags
 
 
+@pytest.mark.quick("18.5-0.986")
 @pytest.mark.parametrize(("snr_db", "printed"), [(18.5, 0.986), (33.0, 0.9995), (40.0, 0.9999)])
 def test_coherence_over_a_cable_is_what_its_snr_allows(snr_db: float, printed: float, tmp_path):
     """Γ of both pairs as the source paper prints it for its three recordings, within what chance and print leave."""

@@ -119,6 +119,7 @@ def measured_by_toy(part, seconds):
     return next(point for point in points if point.engine == "toy")
 
 
+@pytest.mark.quick("0.6-80")
 @pytest.mark.parametrize(("seconds", "rows"), [(1e-6, 160), (0.6, 80), (1e6, LEAST_ROWS)])
 def test_whatever_engine_is_predicted_to_be_slow_is_timed_on_fewer_rows(part, toy, monkeypatch, seconds, rows):
     shapes, form = set(), toy_engine.form

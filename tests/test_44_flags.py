@@ -166,6 +166,7 @@ def conjugate(samples):
     np.negative(samples[1::2], out=samples[1::2])
 
 
+@pytest.mark.quick("swap-swapped")
 @pytest.mark.parametrize(("change", "order"), [(swap, "swapped"), (conjugate, "conjugate")])
 def test_i_and_q_in_another_order_are_named_and_taken_by_the_key(tmp_path, change, order):
     campaign = flown(tmp_path)

@@ -176,6 +176,7 @@ def test_a_log_that_repeats_positions_is_read_through_those_that_are_new(tmp_pat
     np.testing.assert_allclose(dataset.rx_position.values, clean, atol=1e-3)
 
 
+@pytest.mark.quick("0.2-True")
 @pytest.mark.parametrize(("grain_s", "flagged"), [(0.1, False), (0.2, True)])
 def test_a_log_with_rounded_times_is_flagged_with_how_far_that_moves_its_positions(tmp_path, grain_s, flagged):
     """Epochs every 0.3 s at 5 m/s: 5 m/s · 0.2 s/√12 = 0.29 m."""
@@ -248,6 +249,7 @@ def test_an_offset_between_the_nodes_tags_does_not_turn_the_bistatic_phase(tmp_p
     assert abs(np.angle(np.exp(1j * (phases[1] - phases[0])))) < 0.05
 
 
+@pytest.mark.quick("b")
 @pytest.mark.parametrize("node", ["a", "b"])
 def test_captures_that_repeat_earlier_ones_are_left_out(tmp_path, node):
     """Eight captures hold the samples of the eight before them: those are of other positions, and make a ghost."""

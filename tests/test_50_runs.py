@@ -276,6 +276,7 @@ def test_a_step_that_tells_how_far_it_is_is_believed_over_what_was_expected(tmp_
     assert whole.left_s == pytest.approx(270, rel=0.01)
 
 
+@pytest.mark.quick("report0", "report5")
 @pytest.mark.parametrize(
     "report",
     [
@@ -504,6 +505,7 @@ def test_clean_asks_and_without_anyone_to_ask_removes_nothing(finished, monkeypa
     assert before <= files(finished.results)
 
 
+@pytest.mark.quick("../raw/codes.npy", "out/secret")
 @pytest.mark.parametrize("name", ["../../config/config.yaml", "../raw/codes.npy", "/etc/hostname", "out/secret"])
 def test_clean_follows_no_manifest_and_no_link_out_of_its_folder(finished, tmp_path, name):
     outside = tmp_path / "outside"

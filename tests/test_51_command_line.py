@@ -58,6 +58,7 @@ def test_a_full_disk_under_the_output_is_one_message(finished_tiny):
     assert done.stderr.count("\n") == 1
 
 
+@pytest.mark.quick("15")
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
 def test_a_step_that_is_asked_to_end_says_so_and_ends_with_130(tiny, number):
     code = "import time; from apertura import cli; cli.app = lambda: time.sleep(60); print('up', flush=True)"
@@ -85,6 +86,7 @@ def test_memory_that_runs_out_is_one_message():
     assert done.stderr.count("\n") == 1
 
 
+@pytest.mark.quick("words0")
 @pytest.mark.parametrize("words", [(), ("paper-part", "effects"), ("sweep", "stability", "--folder", "x"), ("--help",)])
 def test_a_study_without_its_distribution_says_what_to_install(words):
     """As where apertura alone is installed: no other distribution has commands."""

@@ -165,7 +165,7 @@ def test_an_image_that_was_overtaken_is_not_finished_although_its_report_is_ther
     assert "not there yet: f01 uav1-uav2; apertura run" in " ".join(out.split())
 
 
-@pytest.mark.quick("samples-summary", "all-list", "samples-verify -q")
+@pytest.mark.quick("samples-summary", "samples-verify -q")
 @pytest.mark.parametrize("words", ["check", "summary", "list", "status", "score", "verify -q", "run -n"])
 @pytest.mark.parametrize("lost", ["samples", "all"])
 def test_results_are_read_where_their_recordings_are_not(finished_tiny, tmp_path, typed, words, lost):

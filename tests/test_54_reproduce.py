@@ -92,6 +92,7 @@ def test_only_what_the_product_needs_is_asked_for(root, again, capsys):
     assert again[1][2] == ("all",)
 
 
+@pytest.mark.quick("db.tif")
 @pytest.mark.parametrize("name", ["db.tif", "image.json", "export.manifest.json"])
 def test_a_file_that_was_edited_is_not_the_same(root, again, capsys, name):
     data = bytearray((root / PAIR / name).read_bytes())

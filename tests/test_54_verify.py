@@ -56,6 +56,7 @@ def test_one_byte_is_reported_at_its_link(root, touched):
     assert found.keys() <= spoilt | {f"tags of {touched}"}
 
 
+@pytest.mark.quick("image/c/0/0")
 @pytest.mark.parametrize("file", ["image/c/0/0", "image/zarr.json", "x/c/0"])
 def test_one_byte_of_a_stage_is_reported_at_the_stage(root, file):
     flip(root / IMAGE / file)
@@ -73,6 +74,7 @@ def test_any_byte_of_the_last_manifest_is_noticed(root):
     assert wrong(root, EXPORT) == {}
 
 
+@pytest.mark.quick("SOURCES-<lambda>0", "RUNSPEC-*")
 @pytest.mark.parametrize(
     ("name", "change"),
     [
@@ -132,7 +134,7 @@ def test_code_that_changed_is_reported_where_it_ran(root, tmp_path):
     assert verified() == (1, [f"changed  code of {EXPORT}"])
 
 
-@pytest.mark.quick("raw/f01/uav2.sigmf-data", "results/f01/uav1-uav2/export.manifest.json")
+@pytest.mark.quick("raw*")
 @pytest.mark.parametrize("gone", [RAW, DB, EXPORT, "results/f01/uav1/raw.manifest.json", "results/scene.json"])
 def test_a_file_that_is_gone_is_missing(root, gone):
     (root / gone).unlink()

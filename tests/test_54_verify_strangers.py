@@ -19,6 +19,7 @@ def root(finished_tiny, tmp_path):
     return copy_writable(finished_tiny.root, tmp_path / "finished")
 
 
+@pytest.mark.quick("{", "text3")
 @pytest.mark.parametrize("text", ["{", "[1]", '{"a": 3}', "[" * 100_000, "\x1b[31m", "NaN"])
 def test_a_tag_that_is_no_document_is_reported(root, capsys, text):
     retag(root / DB, SOURCES=text)
@@ -36,6 +37,7 @@ def test_a_chunk_that_is_a_link_is_reported_and_not_followed(root, tmp_path):
     assert wrong(root) == {IMAGE: "changed"}
 
 
+@pytest.mark.quick("../../../etc/passwd", "x.zarr*")
 @pytest.mark.parametrize("name", ["../../../etc/passwd", "/etc/passwd", "a\x1b[31m", "x.zarr/../../../../etc/passwd"])
 def test_a_manifest_that_leads_out_of_the_campaign_is_refused(root, capsys, name):
     edited(root / EXPORT, lambda document: document["files"].update({name: "0" * 64}))
