@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from folders import complaint, edit_config, edit_data, ingest_all, quality_of
+from folders import complaint, copy_writable, edit_config, edit_data, ingest_all, quality_of
 
 from apertura.campaign.folder import Campaign
 from apertura.campaign.store import open_stage
@@ -30,19 +30,31 @@ def echo_of(campaign, pair="uav1-uav2"):
     return PairEcho.opened(campaign, "f01", pair).stage
 
 
-def test_an_undisturbed_flight_raises_no_flag(tmp_path):
-    campaign = flown(tmp_path)
+@pytest.fixture(scope="module")
+def _undisturbed(tmp_path_factory):
+    campaign = flown(tmp_path_factory.mktemp("undisturbed"))
     for pair in ("uav1-uav1", "uav1-uav2"):
-        dataset = echo_of(campaign, pair)
+        echo.echo(campaign, "f01", pair)
+    return campaign
+
+
+@pytest.fixture
+def undisturbed(_undisturbed, tmp_path):
+    """A flight without further impairments, with its echo stages, to be spoilt at will."""
+    return Campaign.load(copy_writable(_undisturbed.root, tmp_path / "campaign"))
+
+
+def test_an_undisturbed_flight_raises_no_flag(undisturbed):
+    for pair in ("uav1-uav1", "uav1-uav2"):
+        dataset = PairEcho.opened(undisturbed, "f01", pair).stage
         assert dataset.attrs["flags"] == {}
     assert dataset.attrs["sidelink"]["method"] == "divide"
     assert dataset.attrs["sidelink"]["lock_rate"] == 1.0
     assert dataset.attrs["clock"]["corrected"] is False
 
 
-def test_an_echo_stage_says_what_its_sidelink_its_clock_and_its_code_are(tmp_path):
-    campaign = flown(tmp_path)
-    own, secondary = (echo_of(campaign, pair) for pair in ("uav1-uav1", "uav1-uav2"))
+def test_an_echo_stage_says_what_its_sidelink_its_clock_and_its_code_are(undisturbed):
+    own, secondary = (PairEcho.opened(undisturbed, "f01", pair).stage for pair in ("uav1-uav1", "uav1-uav2"))
     assert set(secondary.attrs["sidelink"]) >= {"method", "snr_db", "echo_db", "ripple_db", "lock_rate"}
     assert secondary.attrs["sidelink"]["snr_db"] == pytest.approx(30, abs=0.5)
     assert secondary.attrs["sidelink"]["delay_residual_m"] < 5 * secondary.attrs["sidelink"]["delay_noise_m"]
@@ -146,10 +158,10 @@ def test_a_clock_is_corrected_in_the_samples_only_where_it_matters(tmp_path, ppm
     assert float(attrs["clock"]["reason"].split()[1]) == pytest.approx(ppm, abs=0.1)
 
 
-def test_a_wrong_code_is_flagged_in_a_monostatic_image(tmp_path):
-    campaign = flown(tmp_path)
+def test_a_wrong_code_is_flagged_in_a_monostatic_image(undisturbed):
+    campaign = undisturbed
     codes = np.load(str(campaign.root / "raw" / "codes.npy"))
-    assert "code_unconfirmed" not in echo_of(campaign, "uav1-uav1").attrs["flags"]
+    assert "code_unconfirmed" not in PairEcho.opened(campaign, "f01", "uav1-uav1").stage.attrs["flags"]
     np.save(str(campaign.root / "raw" / "codes.npy"), np.random.default_rng(3).permutation(codes))
     own, secondary = (echo_of(campaign, pair).attrs for pair in ("uav1-uav1", "uav1-uav2"))
     assert "code_unconfirmed" in own["flags"]
@@ -168,9 +180,9 @@ def conjugate(samples):
 
 @pytest.mark.quick("swap-swapped")
 @pytest.mark.parametrize(("change", "order"), [(swap, "swapped"), (conjugate, "conjugate")])
-def test_i_and_q_in_another_order_are_named_and_taken_by_the_key(tmp_path, change, order):
-    campaign = flown(tmp_path)
-    right = {pair: echo_of(campaign, pair).transfer.values for pair in ("uav1-uav1", "uav1-uav2")}
+def test_i_and_q_in_another_order_are_named_and_taken_by_the_key(undisturbed, change, order):
+    campaign, pairs = undisturbed, ("uav1-uav1", "uav1-uav2")
+    right = {pair: PairEcho.opened(campaign, "f01", pair).stage.transfer.values for pair in pairs}
     for node in ("uav1", "uav2"):
         edit_data(campaign.root.real(), node, change)
     ingest_all(campaign)
