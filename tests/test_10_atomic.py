@@ -49,6 +49,7 @@ for turn in range(40):
 """
 
 
+@pytest.mark.slow
 def test_many_writers_at_once_leave_one_complete_file(tmp_path):
     path = tmp_path / "note.txt"
     writers = [subprocess.Popen([sys.executable, "-c", MANY, path, letter]) for letter in "abc"]

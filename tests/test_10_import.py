@@ -35,6 +35,7 @@ def test_reading_a_config_loads_no_arrays():
     assert not (HEAVY - {"pydantic"}) & loaded_by("import apertura.campaign.folder")
 
 
+@pytest.mark.slow
 def test_a_step_over_level_ground_loads_neither_a_compiler_nor_transforms():
     """Each costs a tenth of a second of every job."""
     heavy = {"numba", "scipy.fft", "scipy.ndimage", "scipy.special"}

@@ -65,7 +65,7 @@ def test_tiles_under_way_tell_how_many_of_their_parts_are_done(tmp_path, monkeyp
     from apertura.core.backprojection.tiles import compute_tiles
 
     monkeypatch.setattr("apertura.common.progress._BETWEEN_S", 0.0)
-    seen, path, target = [], tmp_path / "image.json", np.zeros((4, 6))
+    seen, path, target = [], tmp_path / "image.json", np.zeros((4, 6), complex)
 
     class Watched:
         def __setitem__(self, window, block):

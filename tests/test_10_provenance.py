@@ -118,7 +118,7 @@ def is_text(statement):
     return isinstance(value, ast.Constant) and isinstance(value.value, str | EllipsisType)
 
 
-@pytest.mark.quick("common", "formats")
+@pytest.mark.quick("common")
 @pytest.mark.parametrize(
     "layer", sorted(path.name for path in PACKAGE.iterdir() if path.is_dir() and path.name[0] != "_")
 )

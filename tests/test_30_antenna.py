@@ -110,6 +110,7 @@ def test_how_native_applies_weights_is_predicted(width_deg):
     )
 
 
+@pytest.mark.slow
 @compiled
 def test_an_accuracy_that_smooth_weights_cannot_give_is_left_to_exact_ones():
     beams = Beams(side_beam((8.0, 16.0)), side_beam((8.0, 16.0)))
@@ -131,7 +132,7 @@ def aimed(position_m, middle_m, width_deg):
     return Beam(axes, angle, gain, angle, gain)
 
 
-@pytest.mark.quick("0.5-2", "2.0-1")
+@pytest.mark.quick("2.0-1")
 @pytest.mark.parametrize("seed", [0, 1, 2, 5])
 @pytest.mark.parametrize("widths", [0.5, 2.0, 10.0])
 def test_the_certified_error_is_met_whatever_part_of_a_scene_the_beam_lights(seed, widths):

@@ -115,6 +115,7 @@ def peak_m(image):
     return float(image.x[column]), float(image.y[row])
 
 
+@pytest.mark.slow
 def test_a_target_seen_through_air_lies_where_it_stands_by_the_speed_in_air_and_beyond_it_in_vacuum():
     aperture, fine = flight(), ap.SceneGrid("local", 0.25, 0.25, 0.02, (100, 100))
     for speed, off_m in ((SPEED_OF_LIGHT_M_S / AIR, 0.0), (SPEED_OF_LIGHT_M_S, 282e-6 * 600 / 0.8)):
@@ -123,6 +124,7 @@ def test_a_target_seen_through_air_lies_where_it_stands_by_the_speed_in_air_and_
         assert (x, y) == pytest.approx((1.25, -0.75 + off_m), abs=0.05 * off_m + 0.021)
 
 
+@pytest.mark.slow
 def test_the_air_of_a_scene_is_a_keyword_from_python_for_transfer_functions_and_profiles():
     """N at the ground, an Atmosphere, the standard one, vacuum: the speed of waves between ground and antennas."""
     aperture, given = flight(), history(flight(), AIR)
@@ -144,7 +146,7 @@ def test_the_air_of_a_scene_is_a_keyword_from_python_for_transfer_functions_and_
         ap.backproject(given, GRID, atmosphere="dry")
 
 
-@pytest.mark.quick("native", "reference")
+@pytest.mark.quick("numba", "reference")
 @pytest.mark.parametrize("engine", [name for name in ENGINES if name not in {"cuda"}])
 def test_an_image_in_air_is_that_of_a_larger_world_in_vacuum(engine):
     """docs/theory/atmosphere.md, eq. 4, pixel by pixel; every engine against itself, and against the double sum.

@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from properties import tried
 from scenes import WAVELENGTH, ground_points, monostatic, straight_track
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
@@ -23,11 +24,13 @@ def at(places):
 # Paths
 
 
+@tried(100, derandomize=False)
 @given(legs=LEGS, points=POINTS)
 def test_the_path_is_the_same_when_transmitter_and_receiver_change_places(legs, points):
     np.testing.assert_array_equal(Aperture(*legs).path(points), Aperture(*reversed(legs)).path(points))
 
 
+@tried(100, derandomize=False)
 @given(legs=LEGS, points=POINTS)
 def test_no_path_is_shorter_than_the_baseline_and_none_changes_faster_than_twice_the_way_to_the_next_point(
     legs, points
@@ -39,6 +42,7 @@ def test_no_path_is_shorter_than_the_baseline_and_none_changes_faster_than_twice
     assert (np.abs(np.diff(path, axis=1)) <= 2 * way + NANOMETRES).all()
 
 
+@tried(100, derandomize=False)
 @given(legs=LEGS, points=POINTS, shift=arrays(np.float64, 3, elements=COORDINATES), seed=st.integers(0, 2**32 - 1))
 def test_paths_do_not_change_when_everything_is_turned_and_moved(legs, points, shift, seed):
     turn = np.linalg.qr(np.random.default_rng(seed).standard_normal((3, 3)))[0]
@@ -84,6 +88,7 @@ def test_phase_centres_of_different_shapes_are_refused():
 # Pulses
 
 
+@tried(100, derandomize=False)
 @given(pulses=st.integers(0, 400), count=st.integers(1, 60))
 def test_blocks_hold_each_pulse_once_in_order_and_differ_by_one_pulse_at_most(pulses, count):
     track = np.zeros((pulses, 3))
@@ -94,6 +99,7 @@ def test_blocks_hold_each_pulse_once_in_order_and_differ_by_one_pulse_at_most(pu
     assert max(lengths) - min(lengths) <= 1
 
 
+@tried(100, derandomize=False)
 @given(pulses=st.integers(1, 2000), most=st.integers(1, 300))
 def test_a_sample_is_spread_evenly_over_the_aperture(pulses, most):
     track = straight_track(pulses)
@@ -184,6 +190,7 @@ def test_the_finer_of_both_cells_counts_and_twice_the_aperture_resolves_about_tw
 # Straightness
 
 
+@tried(100, derandomize=False)
 @given(start=arrays(np.float64, 3, elements=COORDINATES), heading=st.floats(0, 6.28), climb=st.floats(-1, 1))
 def test_a_straight_flight_has_no_wobble(start, heading, climb):
     along = np.linspace(0, 30, 50)[:, None] * [np.cos(heading), np.sin(heading), climb]

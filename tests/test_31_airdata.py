@@ -4,8 +4,9 @@ import numpy as np
 import pandas as pd
 import pytest
 from folders import complaint
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from properties import tried
 
 from apertura.common.contracts import check
 from apertura.core.geometry.geodesy import geodetic_from_ecef, ned_axes
@@ -30,7 +31,7 @@ def test_an_export_becomes_positions_attitude_and_times_to_the_interval(tmp_path
     np.testing.assert_array_equal(np.diff(track.time.values), np.diff(TIMES))
 
 
-@settings(max_examples=30, deadline=None, derandomize=True)
+@tried(30)
 @given(begins_ms=st.integers(0, 5000))
 def test_the_fraction_of_a_second_is_found_to_half_an_interval(tmp_path_factory, begins_ms):
     times = TIMES + np.timedelta64(begins_ms, "ms")

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from autopilot_logs import N_M, START, dataflash, dataflash_rows, dataflash_text, flight, utc_of
 from folders import complaint
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from properties import tried
 
 from apertura.common.contracts import check
 from apertura.common.errors import CampaignError
@@ -264,7 +265,7 @@ def test_what_is_no_log_of_a_flight_is_refused(tmp_path, suffix, data, found):
 # A damaged log: DataFlash holds no checksums
 
 LOGS = {suffix: write(dataflash_rows()) for suffix, write in KINDS.items()}
-DAMAGED = settings(max_examples=120, deadline=None, derandomize=True)
+DAMAGED = tried(120)
 PLACES = st.integers(0, 10**6)
 
 

@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from properties import tried
 
 from apertura.common.errors import CampaignError
 from apertura.formats.reading import read_track
@@ -27,7 +28,7 @@ HEADING = {"csv": 1, "rtklib": 2, "nmea": 0, "airdata": 1, "optitrack": 7}
 SHIFT = {"airdata": np.timedelta64(150, "ms")}
 """By how much the fraction of a second may be taken otherwise where fewer epochs tell it."""
 
-PROPERTY = settings(max_examples=60, deadline=None, derandomize=True)
+PROPERTY = tried(60)
 
 
 def read(folder, kind, data):

@@ -6,8 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from properties import tried
 from scipy.io import savemat
 
 from apertura.campaign.folder import Campaign
@@ -23,7 +24,7 @@ from apertura.formats.recordings.sample_file import SampleFile
 from apertura.formats.tracks.log_options import LogOptions
 from apertura.formats.tracks.track import make_track
 
-QUICK = settings(max_examples=30, deadline=None, derandomize=True)
+QUICK = tried(30)
 EPOCHS = st.lists(
     st.tuples(st.floats(0.001, 89.9), st.floats(-179.9, 179.9), st.floats(-400, 9000), st.integers(1, 10**9)),
     min_size=2,
@@ -257,6 +258,7 @@ def test_corrections_of_passes_are_applied_where_the_config_says_so(tmp_path):
         read_phase_history("afrl_mat", [bare], pair="a-a", described={"corrections": "stored"})
 
 
+@pytest.mark.slow
 def test_corrections_that_gotcha_stores_keep_its_trihedrals_sharp(shared):
     """By the signs above: the other ones lose 18 dB and more."""
     files = sorted((shared / "gotcha_afrl").glob("*.mat"))

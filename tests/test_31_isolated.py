@@ -92,6 +92,7 @@ def test_a_reader_that_crashes_is_one_message_that_names_the_signal(tmp_path, mo
     assert caught.value.path == tmp_path / "a.mat"
 
 
+@pytest.mark.slow
 def test_a_matlab_file_that_crashes_scipy_is_refused(tmp_path):
     """Found by the fuzzer; where scipy no longer dies of it, it says what is wrong, or the fields do."""
     for path in sorted((ROOT / "tests/attack/regressions/afrl.mat").glob("segv-*")):
@@ -121,6 +122,7 @@ def test_the_file_at_which_a_pass_ends_is_the_one_that_is_named(tmp_path):
     assert complaint(lambda: read(*paths)).startswith(str(paths[1]))
 
 
+@pytest.mark.slow
 def test_a_module_that_lies_in_the_campaign_is_not_imported(tmp_path, monkeypatch):
     for name in ("numpy", "scipy", "json", "apertura"):
         (tmp_path / f"{name}.py").write_text("import pathlib\npathlib.Path('marker').touch()\n")

@@ -5,8 +5,9 @@ import re
 import numpy as np
 import pytest
 from folders import complaint
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from properties import tried
 
 from apertura.common.contracts import check
 from apertura.core.geometry.geodesy import ecef_from_geodetic, geodetic_from_ecef
@@ -188,7 +189,7 @@ def test_a_sentence_that_no_receiver_sends_is_one_message(tmp_path, old, new):
 
 
 @pytest.mark.slow
-@settings(max_examples=200, deadline=None, derandomize=True)
+@tried(200)
 @given(data=st.data())
 def test_no_flipped_bit_moves_an_epoch(tmp_path_factory, data):
     """One bit: a sentence less, or a date less, never another position or time."""

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 from folders import complaint
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from properties import tried
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
@@ -67,7 +68,7 @@ def test_another_file_is_refused(tmp_path, content):
     assert "MRM_SCAN_INFO" in complaint(lambda: written(tmp_path / "a.out", content))
 
 
-@settings(max_examples=60, deadline=None)
+@tried(60, derandomize=False)
 @given(at=st.integers(0, 32 + 6 * MESSAGES * MESSAGE.itemsize - 1), bit=st.integers(0, 7), last=st.integers(40, 20_000))
 def test_flipped_bits_and_lost_ends_move_no_scan_in_time(tmp_path_factory, at, bit, last):
     paths_m = 8 + 0.1 * np.arange(6)

@@ -101,7 +101,7 @@ def test_a_datatype_that_holds_every_count_gives_the_same_bits(campaign, plain, 
         np.testing.assert_array_equal(transfer, plain[pair])
 
 
-@pytest.mark.quick("32768.0")
+@pytest.mark.slow
 @pytest.mark.parametrize("unit", [2.0**-40, 2.0**15])
 def test_the_unit_of_floats_is_that_of_the_echo_and_changes_nothing_else(campaign, plain, unit):
     """Volts or counts: by powers of two, to the last bit of what a node hears of itself."""
@@ -112,7 +112,7 @@ def test_the_unit_of_floats_is_that_of_the_echo_and_changes_nothing_else(campaig
     assert apart_db(scaled["a-b"], plain["a-b"] * unit) < -120
 
 
-@pytest.mark.quick("ci8")
+@pytest.mark.slow
 @pytest.mark.parametrize("datatype", ["ci8", "cu8"])
 def test_eight_bits_add_the_noise_of_their_steps_and_nothing_else(campaign, plain, datatype):
     """A step of Δ has Δ²/12 in I and in Q, which a DFT of N samples spreads over N subcarriers: Δ²/6N on each."""
@@ -144,7 +144,7 @@ def test_real_samples_at_an_intermediate_frequency_give_the_same_echo(campaign, 
         assert apart_db(transfer, plain[pair]) < -70, pair
 
 
-@pytest.mark.quick("rf16_le")
+@pytest.mark.slow
 @pytest.mark.parametrize("datatype", ["ri16_le", "ri16_be", "rf16_le"])
 def test_real_counts_add_the_noise_of_their_steps(campaign, plain, datatype):
     """Rounded to whole counts, Δ²/12 at the real sample: H gives as much to the quadrature, within the band."""
@@ -155,6 +155,7 @@ def test_real_counts_add_the_noise_of_their_steps(campaign, plain, datatype):
     assert noise == pytest.approx(16**2 / 12 * 4 / DFT, rel=0.1)
 
 
+@pytest.mark.slow
 def test_the_wrong_sign_of_the_intermediate_frequency_is_another_echo(campaign, plain):
     real = as_real(counts_of(campaign, "a"), 8e6)
     rewrite(campaign, "a", real.astype("<f4"), "rf32_le", **{"apertura:if_hz": -24e6})

@@ -19,8 +19,9 @@ from autopilot_logs import (
     utc_of,
 )
 from folders import ROOT, complaint
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from properties import tried
 
 from apertura.common.contracts import check
 from apertura.common.errors import CampaignError
@@ -333,7 +334,7 @@ def test_what_is_no_log_of_a_flight_is_refused(tmp_path, data, found):
 # A damaged log: ULog holds no checksums, so what is changed shows only by what else the log says
 
 MESSAGES = ulog((GPS, 0, ulog_receiver()), (ATTITUDE, 0, ulog_attitude(rate_hz=10.0)))
-DAMAGED = settings(max_examples=300, deadline=None, derandomize=True)
+DAMAGED = tried(300)
 
 
 def split(data):
@@ -438,6 +439,7 @@ def test_a_real_log_is_whole(flown):
     assert "remarks" not in flown.attrs
 
 
+@pytest.mark.slow
 def test_foreign_bytes_anywhere_in_a_real_log_are_found(tmp_path):
     """At 40 places: its other epochs stay as they are."""
     if not REAL.is_file():

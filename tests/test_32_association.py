@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from properties import tried
 
 from apertura.common.errors import CampaignError
 from apertura.core.echo.association import EXPLAINED_M, associate, baseline_residual, detect_wrong_association
@@ -251,7 +252,7 @@ def test_pulses_at_both_ends_are_not_counted_more_than_once():
     assert detect_wrong_association(baseline_residual(measured, np.full(60, 5.0))) is None
 
 
-@settings(max_examples=50, deadline=None, derandomize=True)
+@tried(50)
 @given(
     seed=st.integers(0, 2**32 - 1),
     offset=st.floats(-0.4, 0.4),

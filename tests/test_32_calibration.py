@@ -71,6 +71,7 @@ def test_a_reflector_that_does_not_stand_out_is_refused(level, visible):
         estimate_path_offset(transfer, FREQUENCY, path_m=predicted, where="f01")
 
 
+@pytest.mark.slow
 def test_noise_alone_is_rarely_taken_for_a_reflector():
     seen = 0
     for seed in range(100):

@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from properties import tried
 from scipy.signal.windows import hann
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
@@ -220,7 +221,7 @@ def test_a_track_must_cover_the_pulses():
         )
 
 
-@settings(max_examples=50, deadline=None, derandomize=True)
+@tried(50)
 @given(latitude=st.floats(-80, 80), longitude=st.floats(6, 12), height_m=st.floats(-400, 9000))
 def test_every_place_comes_back_from_ecef_to_a_micrometre(latitude, longitude, height_m):
     """Geodetic and UTM zone 32 both ways; up is where the height grows."""

@@ -85,6 +85,7 @@ def test_what_a_stage_says_of_its_pulses_forms_what_was_measured(drifting, tmp_p
     np.testing.assert_allclose(stage.transfer[some].values, wanted, rtol=1e-5, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_profiles_and_images_of_what_was_kept_are_those_of_the_recording_to_the_byte(drifting, tmp_path):
     """With other windows than those of the run before: as whoever images again without the recordings would."""
     made = []
@@ -111,6 +112,7 @@ def test_what_was_kept_of_another_echo_is_not_read(drifting, tmp_path):
     assert "uav2.sigmf-data: no such file" in complaint(lambda: stage.transfer[0].values)
 
 
+@pytest.mark.slow
 def test_pulses_come_in_the_order_they_are_asked_for(drifting, tmp_path):
     transfer = PairEcho.opened(formed(drifting, tmp_path, "a"), "f01", "uav1-uav2").stage.transfer
     whole = transfer.values

@@ -201,6 +201,7 @@ def test_pulses_of_a_blockage_do_not_lock_and_are_counted():
     assert state.snr_db == pytest.approx(whole.snr_db, abs=0.3)
 
 
+@pytest.mark.slow
 def test_noise_locks_no_more_often_than_promised():
     noise = complex_noise(np.random.default_rng(13), (6000, 512)).astype(np.complex64)
     locks = fit_line_of_sight(noise).locked.sum()

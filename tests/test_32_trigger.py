@@ -67,7 +67,7 @@ def test_a_clock_of_10_khz_off_does_not_hide_a_preamble():
     assert [detection.sample for detection in detections] == pytest.approx(starts, abs=1)
 
 
-@pytest.mark.quick("1000.0")
+@pytest.mark.slow
 @pytest.mark.parametrize("sigma", [3.0, 1000.0])
 def test_noise_triggers_at_the_set_rate_at_any_level(sigma):
     rng = np.random.default_rng(4)

@@ -277,6 +277,7 @@ def test_a_file_that_is_no_dem_is_refused(tmp_path):
 # From Python
 
 
+@pytest.mark.slow
 def test_from_python_a_target_on_a_slope_is_imaged_where_it_stands_by_its_dem(tmp_path):
     """1.8 m lower flat ground puts it elsewhere; the raster lies in geographic coordinates, the scene in UTM."""
     grid = ap.SceneGrid("EPSG:32632", 500059.0, 5400041.0, 0.1, (40, 40))

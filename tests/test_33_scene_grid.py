@@ -4,8 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from properties import tried
 from pyproj import Geod, Transformer
 from scenes import UTM_GRID
 
@@ -53,7 +54,7 @@ def test_tiles_cover_the_grid_once_and_slicing_keeps_the_places():
     side=st.integers(40, 300),
     data=st.data(),
 )
-@settings(max_examples=40, deadline=None)
+@tried(40, derandomize=False)
 def test_map_frame_and_pixel_are_one_another_undone_and_windows_have_the_coordinates_of_the_whole(
     crs, spacing_m, shape, side, data
 ):

@@ -140,6 +140,7 @@ def test_weights_are_priced_and_their_error_is_in_the_prediction():
     assert "weights" not in plain.reasons["oversampling"]
 
 
+@pytest.mark.slow
 def test_a_weighed_image_is_formed_by_name_and_never_by_auto(monkeypatch):
     monkeypatch.setattr(cuda, "available", lambda: True)
     seen = {"beams": Beams(beam_of(), beam_of())}
@@ -148,6 +149,7 @@ def test_a_weighed_image_is_formed_by_name_and_never_by_auto(monkeypatch):
         assert plan(overrides=requested, **seen).engine == "cuda"
 
 
+@pytest.mark.slow
 def test_an_engine_that_nobody_has_timed_is_taken_by_name_alone(monkeypatch):
     """However large the image and however few the seconds predicted; not as a fallback either."""
     monkeypatch.setattr(cuda, "available", lambda: True)
@@ -189,6 +191,7 @@ def test_without_a_device_the_engine_is_refused_with_one_message(plain):
     assert plan().engine != "cuda"
 
 
+@pytest.mark.slow
 def test_looking_for_a_device_imports_nothing_where_there_is_no_driver():
     program = (
         "import sys; from apertura.core.backprojection.engines import load_engine\nload_engine('cuda').available()"

@@ -79,7 +79,7 @@ def test_the_objectives_here_change_as_they_say():
         assert gained == pytest.approx((objective(image)[1].conj() * change).real.sum(), rel=1e-6)
 
 
-@pytest.mark.quick("compiled-peaks", "numpy-entropy")
+@pytest.mark.quick("compiled-peaks")
 @pytest.mark.usefixtures("way")
 @pytest.mark.parametrize("objective", [peaks, entropy])
 def test_every_component_is_the_finite_difference_of_the_image(objective):
@@ -134,6 +134,7 @@ def test_an_objective_may_have_any_unit():
     assert not path_gradient(PROFILES, PLACES, 0 * slope).path_m.any()
 
 
+@pytest.mark.slow
 def test_a_change_of_the_exact_image_is_foretold():
     """The double sum over pulses and subcarriers, all phase centres moved at once."""
     history, patch = point_history(), TARGET_GRID[40:120, 40:120]

@@ -12,7 +12,7 @@ from apertura.core.backprojection.presum import design, presum_error_db, presumm
 from apertura.core.quality.measures import numerical_error_db
 
 
-@pytest.mark.quick("0.1-False")
+@pytest.mark.slow
 @pytest.mark.parametrize(("step_m", "summed"), [(0.002, True), (0.1, False)])
 def test_pulses_are_summed_only_where_the_aperture_is_oversampled(step_m, summed):
     tx = straight_track(2000, length_m=2000 * step_m)

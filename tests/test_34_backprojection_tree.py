@@ -96,7 +96,7 @@ def test_tiles_beyond_all_profiles_cost_nothing(plain):
     assert not image.any()
 
 
-@pytest.mark.quick("0.001")
+@pytest.mark.slow
 @pytest.mark.parametrize("jitter_m", [0.0, 1e-3, 1e-2])
 def test_pulses_off_a_smooth_track_are_taken_each_for_itself(plain, jitter_m):
     """A smooth track's 64 pulses become few; white noise of a millimetre on it is not smooth at 12 m, and is kept."""
@@ -142,6 +142,7 @@ def test_rough_ground_is_interpolated_between_height_layers(height_m, nodes_db, 
     assert needed == layers
 
 
+@pytest.mark.slow
 def test_rough_ground_goes_directly():
     rough = pixel_grid(70, 90)
     rough[..., 2] += 0.02 * np.random.default_rng(6).standard_normal(rough.shape[:2])
@@ -160,7 +161,7 @@ def test_rolling_ground_goes_by_tree():
     assert error_db(flight.scene, rolling, image) <= setting(flight, nodes_db=-74).error_db + 3
 
 
-@pytest.mark.quick("10000000000.0-0.01-0.0005")
+@pytest.mark.slow
 @pytest.mark.parametrize(("carrier_hz", "spacing_m", "rough_m"), [(1.2e9, 0.05, 6e-4), (10e9, 0.01, 5e-4)])
 def test_pixels_off_their_surface_err_as_predicted(carrier_hz, spacing_m, rough_m):
     """Eq. 9: noise on the ground that the tree takes at -50 dB; what it adds is delay at 1 GHz, phase at 10 GHz."""
@@ -229,7 +230,7 @@ def test_the_edges_of_a_sector_go_by_tree(isa, plain, centre, half, nodes_db):
     assert decibels(image - formed(plain, nodes_db=nodes_db)[0], image) > -25  # the sector matters
 
 
-@pytest.mark.quick("True-0.4")
+@pytest.mark.slow
 @pytest.mark.parametrize("relief_m", [0.0, 0.4])
 @pytest.mark.parametrize("antenna", [False, True])
 def test_what_counts_as_a_whole_or_not_at_all_does_so_at_every_pixel(antenna, relief_m):

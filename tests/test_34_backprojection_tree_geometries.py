@@ -8,7 +8,7 @@ from scenes import compiled
 pytestmark = compiled
 
 
-@pytest.mark.quick("9")
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [5, 9, 50, 58])
 def test_a_random_geometry_is_certified_as_asked(seed):
     """Among them tiles inside a circle, tiles as large as the range (9), a track that wobbles within a leaf (58)."""

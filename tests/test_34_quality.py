@@ -31,7 +31,7 @@ def certify(image, exact, seed, *, random=160, bright=112):
     return found, numerical_error_db(image.ravel(), exact.ravel())
 
 
-@pytest.mark.quick("speckle")
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["speckle", "targets", "errors of bright targets"])
 def test_the_bound_holds_over_all_pixels_in_95_of_100_images_and_lies_close(kind):
     generator, above = np.random.default_rng(4), []
@@ -155,6 +155,7 @@ def test_every_tile_gets_a_pixel_as_long_as_there_are_as_many(count, seen):
     assert len(np.unique(pixels // 32, axis=0)) == seen
 
 
+@pytest.mark.slow
 def test_draws_follow_brightness_and_their_density_is_what_was_drawn():
     """Half by power, half by magnitude, random ones besides: over many draws each pixel is taken as often as said."""
     generator = np.random.default_rng(8)

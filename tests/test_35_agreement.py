@@ -122,6 +122,7 @@ def blur_m(moved_m):
     return float(np.std(path - shift @ np.linalg.lstsq(shift, path)[0]))
 
 
+@pytest.mark.slow
 def test_one_pair_has_nothing_to_agree_with():
     records, unknowns = seen(1)
     ground = ground_of(records[:1])

@@ -190,7 +190,7 @@ def test_one_phase_does_not_mend_a_near_scene():
     assert before_db.mean() < after_db.mean() < -0.5
 
 
-@pytest.mark.quick("phase_gradient")
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 def test_phases_of_noise_are_not_believed(method):
     """Three points to a range, whose noise is the same: what sharpens it for one sharpens it for the others."""

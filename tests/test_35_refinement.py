@@ -76,6 +76,7 @@ def search(two_centimetres):
     return searched(two_centimetres)
 
 
+@pytest.mark.slow
 def test_points_are_found_where_they_are_whatever_blurs_them():
     one = case("five", "straight", "joint", 0.03, 10.0, 2)
     places, ratio = bright_places(
@@ -256,7 +257,7 @@ def test_speckle_is_refused(two_centimetres):
     assert not any(moved.any() for moved in rejected.correction.moved_m.values())
 
 
-@pytest.mark.quick("2-bi-0.02")
+@pytest.mark.slow
 @pytest.mark.parametrize(("points", "pairs", "sigma_m"), [(1, "mono", 0.02), (2, "bi", 0.02), (3, "joint", 0.04)])
 def test_a_first_flight_past_few_points_is_mended(points, pairs, sigma_m):
     """150 pulses in 7.5 s: places are judged by others, or, where there are none, by steady amplitudes."""

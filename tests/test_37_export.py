@@ -106,7 +106,7 @@ def test_every_raster_is_a_cog_in_the_strict_sense(tmp_path, name, shape):
         assert raster.overviews(1) == [factor for factor in (2, 4) if max(shape) > 256 * factor]
 
 
-@pytest.mark.quick("AVERAGE-nan", "MODE-255")
+@pytest.mark.quick("MODE-255")
 @pytest.mark.parametrize("band", [POWER, SLC, MASK, LOOKS, PHASE], ids=lambda band: f"{band.overviews}-{band.nodata}")
 def test_overviews_are_those_that_gdal_builds(tmp_path, band):
     """Beyond the blocks that pass through memory, too, and beside places that hold nothing."""
@@ -229,7 +229,7 @@ class Blocks:
         return (np.add.outer(np.array(rows) * 1j, columns) + 1).astype(np.complex64)
 
 
-@pytest.mark.quick("quicklook.png", "power.tif")
+@pytest.mark.quick("power.tif")
 @pytest.mark.parametrize("name", IMAGES)
 def test_an_image_is_never_held_whole(tmp_path, name):
     image = Blocks(READ + 300, READ + 500)

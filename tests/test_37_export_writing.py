@@ -36,7 +36,7 @@ def test_a_large_image_and_a_small_one_are_written_to_the_same_bytes(tmp_path, r
     assert [path.name for path in tmp_path.iterdir()] == ["x.tif"]
 
 
-@pytest.mark.quick("write_slc")
+@pytest.mark.quick("write_power")
 @pytest.mark.parametrize("write", [write_slc, write_power, write_db])
 def test_threads_of_gdal_change_no_byte(tmp_path, write):
     several = np.tile(image(), (3, 3))

@@ -71,6 +71,7 @@ def test_a_layer_is_coloured_from_its_smallest_to_its_largest_value(tmp_path, va
     assert items[-1].get("label") == f"{ends[1]} deg"
 
 
+@pytest.mark.slow
 def test_places_without_data_count_nothing_in_the_colours_of_a_file_and_of_a_mosaic(tmp_path):
     looks = np.zeros((2050, 2100), np.float32)
     looks[3:1000, 5:900], looks[1003:2000, 1001:2003] = 4, 25

@@ -17,6 +17,8 @@ from typer.testing import CliRunner
 from apertura.common.errors import CampaignError
 from apertura.common.tables import read_table, write_table
 
+pytestmark = pytest.mark.slow  # of the research, not of the product
+
 CELL_M = 0.1
 
 
@@ -31,7 +33,6 @@ def swept(monkeypatch, name, *sizes, draws=1):
     return list(STUDY.rows(name))
 
 
-@pytest.mark.slow
 def test_noise_of_two_centimetres_is_flagged_and_next_to_none_is_not(monkeypatch):
     small, large = swept(monkeypatch, "track_noise", 1e-3, 2.0)
     assert small.flags == ""
@@ -40,7 +41,6 @@ def test_noise_of_two_centimetres_is_flagged_and_next_to_none_is_not(monkeypatch
     assert large.loss_db > 2
 
 
-@pytest.mark.slow
 def test_the_budget_expects_what_track_noise_costs(monkeypatch):
     rows = swept(monkeypatch, "track_noise", 1.0, 2.0, draws=8)
     for size in (1.0, 2.0):
@@ -49,7 +49,6 @@ def test_the_budget_expects_what_track_noise_costs(monkeypatch):
         assert expected == pytest.approx(measured, rel=0.3)
 
 
-@pytest.mark.slow
 def test_a_path_offset_of_one_pair_turns_its_phase_as_expected_and_half_a_turn_is_flagged(monkeypatch):
     small, large = swept(monkeypatch, "calibration", 0.3, 6.0)
     assert small.phase_rad == pytest.approx(small.expected_phase_rad, abs=0.03)
@@ -57,7 +56,6 @@ def test_a_path_offset_of_one_pair_turns_its_phase_as_expected_and_half_a_turn_i
     assert (small.flags, "pairs_out_of_phase" in large.flags) == ("", True)
 
 
-@pytest.mark.slow
 def test_what_is_refused_is_neither_wrong_nor_right(monkeypatch):
     (row,) = swept(monkeypatch, "presum", 64)
     assert row.flags == "refused"
@@ -124,7 +122,6 @@ def test_a_flag_is_counted_over_the_causes_that_raise_it():
     assert (rows["pairs_apart"].missed, rows["pairs_apart"].false) == (0.25, 0.0)
 
 
-@pytest.mark.slow
 def test_pictures_are_the_same_bytes_for_the_same_rows(tmp_path):
     for name in CAUSES:
         rows = [replace(row, cause=name) for row in SWEEP] + [outcome(2000.0, loss_db=np.nan, flags="refused")]

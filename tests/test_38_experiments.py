@@ -29,6 +29,8 @@ from apertura.simulation import preset, simulate
 from apertura.simulation.presets import GAP_M, SEGMENT_M
 from apertura.stages import echo, ingest
 
+pytestmark = pytest.mark.slow  # of the research, not of the product
+
 PULSES = 16
 
 
@@ -45,7 +47,6 @@ def campaigns(tmp_path_factory):
     return folder
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ["lab", "static"])
 def test_the_sidelink_makes_random_phases_coherent_through_cable_and_air(campaigns, name):
     experiment = open_experiment(campaigns, name)
@@ -54,7 +55,6 @@ def test_the_sidelink_makes_random_phases_coherent_through_cable_and_air(campaig
     assert coherence_factor(terms_at(experiment.history(BISTATIC), place)) > 0.95
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ["lab", "static"])
 @pytest.mark.parametrize("pair", [MONOSTATIC, BISTATIC])
 def test_a_target_stands_in_the_profile_where_it_was_put(campaigns, name, pair):
@@ -90,7 +90,6 @@ def test_one_receive_signal_is_split_to_both_nodes_of_the_static_recording():
     assert 20 * np.log10(first / second) == pytest.approx(7.0, abs=0.1)
 
 
-@pytest.mark.slow
 def test_coherence_is_that_of_the_printed_recordings_and_of_the_noise_of_echo_free_ranges(campaigns):
     claims = {claim.claim: claim for claim in coherence_claims(campaigns)}
     assert {claim.verdict for claim in claims.values()} <= set(VERDICTS)
@@ -114,7 +113,6 @@ def test_coherence_is_that_of_the_printed_recordings_and_of_the_noise_of_echo_fr
     assert all("by construction" in claim.note for claim in alike)
 
 
-@pytest.mark.slow
 def test_a_profile_is_the_inner_sum_of_the_image(campaigns):
     experiment = open_experiment(campaigns, "static")
     history = experiment.history(BISTATIC)
@@ -123,7 +121,6 @@ def test_a_profile_is_the_inner_sum_of_the_image(campaigns):
     np.testing.assert_allclose(profiles_at(history, np.array([half_m]))[:, 0], expected, rtol=2e-3)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ["lab_profile", "lab_phase", "static_profile", "static_phase"])
 def test_figures_of_the_experiments_are_drawn_from_their_campaigns(campaigns, tmp_path, name):
     path = figures.DRAWN[name](campaigns, tmp_path / f"{name}.png")
@@ -180,7 +177,6 @@ def test_clutter_is_measured_away_from_every_target():
     assert mask.mean() == pytest.approx(1 - 2 * np.pi * 15**2 / 1e4, abs=0.01)
 
 
-@pytest.mark.slow
 def test_the_flight_through_the_pipeline_fuses_as_its_segments_say(tmp_path):
     run_steps(simulate(tmp_path / "uav", "paper-uav"), exports=False)
     claims = {claim.claim: claim for claim in fusion_claims(tmp_path)}

@@ -33,6 +33,8 @@ from apertura.common.tables import read_table, write_table
 from apertura.core.geometry.phase_centres import TrackCorrection
 from apertura.methods.autofocus.inputs import Refinement
 
+pytestmark = pytest.mark.slow  # of the research, not of the product
+
 QUARTER_OF_A_CELL_CM = 100 * np.sqrt(CELL_M2) / 4
 
 
@@ -60,7 +62,6 @@ def test_every_kind_of_scene_is_one_of_the_cases_and_sizes_begin_at_none():
     assert len(SEEDS) > 1
 
 
-@pytest.mark.slow
 @compiled
 def test_a_refused_refinement_leaves_the_loss_of_the_logs_and_an_accepted_one_its_own():
     one = case_of("five", 1.0, 1)
@@ -71,7 +72,6 @@ def test_a_refused_refinement_leaves_the_loss_of_the_logs_and_an_accepted_one_it
     assert (accepted.scene, accepted.sigma_cm, accepted.seed, accepted.flags) == ("five", 1.0, 1, "f")
 
 
-@pytest.mark.slow
 @compiled
 def test_logs_without_error_are_refined_as_if_they_had_some_and_lose_nothing(monkeypatch):
     stated = []
@@ -88,7 +88,6 @@ def test_logs_without_error_are_refined_as_if_they_had_some_and_lose_nothing(mon
 
 
 @compiled
-@pytest.mark.slow
 def test_speckle_is_not_made_worse():
     (one,) = run_case("dense", (2.0, 1))
     assert one.loss_db > 3
@@ -96,7 +95,6 @@ def test_speckle_is_not_made_worse():
 
 
 @compiled
-@pytest.mark.slow
 @pytest.mark.parametrize("scene", ["five", "forty"])
 def test_where_there_are_points_little_is_left_of_two_centimetres(scene):
     rows = [run_case(scene, (2.0, seed))[0] for seed in (1, 2)]
@@ -105,7 +103,6 @@ def test_where_there_are_points_little_is_left_of_two_centimetres(scene):
 
 
 @compiled
-@pytest.mark.slow
 @pytest.mark.parametrize("sigma_m", [0.02, 0.04])
 def test_among_thirty_points_in_clutter_no_place_is_made_worse(sigma_m):
     for seed in (1, 2):
@@ -121,7 +118,6 @@ def marks(axes, said):
     return line.get_xydata()
 
 
-@pytest.mark.slow
 def test_a_chart_tells_apart_what_was_said(monkeypatch, tmp_path):
     rows = [row(1.0, ACCEPTED), row(2.0, FLAGGED), row(3.0, REFUSED, product_db=6.0), row(5.0, TOO_FEW, product_db=10)]
     rows += [replace(one, scene="dense", verdict=TOO_FEW) for one in rows]
@@ -141,7 +137,6 @@ def test_the_tally_counts_what_was_accepted_and_did_harm():
     assert charts.tally(rows) == "1 of 2 accepted, 1 of them worse than the logs"
 
 
-@pytest.mark.slow
 def test_sweep_and_chart_are_one_command_each(monkeypatch, tmp_path):
     one_case = replace(charts.STUDY, cases=lambda _: [None], run=lambda scene, _: [row(1.0, ACCEPTED, scene=scene)])
     monkeypatch.setattr(charts, "STUDY", one_case)
@@ -175,7 +170,6 @@ def linear_path_error(one, place_m):
     return ((to_tx - sidelink) * tx).sum(axis=1) + ((to_rx + sidelink) * rx).sum(axis=1)
 
 
-@pytest.mark.slow
 @compiled
 def test_a_picture_shows_three_images_on_one_scale_and_errors_that_refinement_takes_away(monkeypatch, tmp_path):
     one = case_of("five", 2.0, 1)
@@ -201,7 +195,6 @@ def test_a_picture_shows_three_images_on_one_scale_and_errors_that_refinement_ta
     assert "accepted: because; no flag" in figures[0].get_suptitle()
 
 
-@pytest.mark.slow
 @compiled
 def test_a_picture_of_what_was_refused_says_so_and_shows_the_logs(monkeypatch, tmp_path):
     one = case_of("five", 2.0, 1)

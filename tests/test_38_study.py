@@ -62,6 +62,8 @@ from apertura.simulation.impairments import Clock, Impairments, Localization, Ti
 from apertura.simulation.observation import observe
 from apertura.simulation.synthesis import samples
 
+pytestmark = pytest.mark.slow  # of the research, not of the product
+
 
 def by_claim(claims):
     return {claim.claim: claim for claim in claims}
@@ -148,7 +150,6 @@ def test_uav_flight_is_as_wide_as_the_paper_says_and_fusion_with_the_fitted_segm
     assert rows["UAV flight: ground-range width, Hann, mono"].verdict == AGREES
 
 
-@pytest.mark.slow
 def test_timing_shifts_and_turns_a_profile_and_a_carrier_phase_leaves_its_magnitude():
     shift, phase, small, magnitude = effect_claims()
     assert float(shift.computed) == pytest.approx(0.4096, rel=0.01)
@@ -183,7 +184,6 @@ def test_an_error_as_large_as_it_may_be_is_that_of_one_pulse_towards_one_target(
     assert 2.5 < large_cm < 5.0  # standard deviations, of some thirty independent moments and five directions
 
 
-@pytest.mark.slow
 def test_a_tenth_of_a_wavelength_is_enough_as_the_largest_range_error():
     tenth, bounded, equal, worst, _ = position_claims()
     assert (tenth.paper, tenth.verdict, bounded.verdict, equal.verdict) == ("2", AGREES, AGREES, EXPLAINED)
@@ -192,7 +192,6 @@ def test_a_tenth_of_a_wavelength_is_enough_as_the_largest_range_error():
     assert worst.verdict == EXPLAINED
 
 
-@pytest.mark.slow
 def test_receivers_of_a_swarm_add_up_in_phase_and_gain_ten_lg_n():
     efficiency, gain, *_ = swarm_claims()
     assert float(efficiency.computed) > 0.99
@@ -204,7 +203,6 @@ def test_the_trigger_finds_every_pulse_where_it_is():
     assert (found.computed, found.verdict, error.verdict) == ("1", AGREES, AGREES)
 
 
-@pytest.mark.quick("timing*")
 @pytest.mark.parametrize(
     ("name", "size", "case"),
     [
@@ -234,7 +232,6 @@ def test_localization_costs_what_the_independent_model_says(monkeypatch):
     assert "±1 dB allowed here; mean of 6 draws, spread" in claim.note
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ERRORS)
 def test_every_row_of_the_loss_table_is_met(name):
     ignored = [claim for claim in loss_claims(name) if claim.about == PAPER]
@@ -246,7 +243,6 @@ def test_every_row_of_the_loss_table_is_met(name):
     assert all("destroyed" in claim.note for claim in deep)
 
 
-@pytest.mark.slow
 def test_phase_and_timing_inside_the_prefix_cost_nothing_after_any_correction():
     claims = corrected_claims()
     assert len(claims) == 4
@@ -254,7 +250,6 @@ def test_phase_and_timing_inside_the_prefix_cost_nothing_after_any_correction():
     assert all(claim.verdict == AGREES for claim in claims)
 
 
-@pytest.mark.slow
 def test_an_8_ppm_clock_corrected_in_noisy_samples_leaves_the_floor_of_a_perfect_one():
     (claim,) = clock_claims(pulses=20)
     assert float(claim.computed) < 0.5
@@ -404,7 +399,6 @@ def short(monkeypatch, name, *sizes):
     monkeypatch.setitem(SWEEPS, name, replace(SWEEPS[name], sizes=sizes, draws=1, subcarriers=512))
 
 
-@pytest.mark.slow
 def test_random_phases_destroy_the_image_and_every_correction_restores_it(monkeypatch):
     short(monkeypatch, "carrier_phase", 1.0)
     losses = {method: next(STUDY.rows(f"carrier_phase.{method}")).loss_db for method in CHOICES}
@@ -412,7 +406,6 @@ def test_random_phases_destroy_the_image_and_every_correction_restores_it(monkey
     assert max(map(abs, losses.values())) < 0.05
 
 
-@pytest.mark.slow
 def test_moving_while_the_pulse_lasts_costs_nothing_below_10_m_s_and_something_at_3000(monkeypatch):
     monkeypatch.setitem(SWEEPS, "doppler", replace(SWEEPS["doppler"], sizes=(10.0, 3000.0), subcarriers=512))
     slow, fast = STUDY.rows("doppler.none")
@@ -446,7 +439,6 @@ def test_blocked_pulses_are_dropped_by_every_method():
     assert correct("none", radar, sidelink, everything)[0].all()
 
 
-@pytest.mark.slow
 def test_auto_is_within_a_fifth_of_a_decibel_of_the_best_at_every_snr(monkeypatch):
     monkeypatch.setitem(
         SWEEPS, "sidelink_noise", replace(SWEEPS["sidelink_noise"], sizes=(30, 10, 5, 0, -10, -20), draws=1)
@@ -469,7 +461,6 @@ def test_outcomes_survive_their_file_and_give_a_tolerance(tmp_path):
     assert gained.size_at_1_db == tolerance.size_at_1_db
 
 
-@pytest.mark.slow
 def test_a_chart_is_the_same_bytes_for_the_same_rows(tmp_path):
     for method in CHOICES:
         write_table(part_path(tmp_path, f"timing.{method}"), [outcome(s, s, method=method) for s in (0.1, 1.0, 10.0)])

@@ -42,6 +42,7 @@ def test_the_error_is_that_after_one_complex_gain(small):
     assert small.error_db(wrong) == pytest.approx(20 * np.log10(ratio), abs=0.2)
 
 
+@pytest.mark.slow
 def test_a_part_of_the_tiles_gives_the_same_pixels_and_counts_for_all(monkeypatch):
     monkeypatch.setattr(scene, "TILE_PX", 128)
     monkeypatch.setattr(contestants, "TILE_PX", 128)

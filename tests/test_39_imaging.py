@@ -108,6 +108,7 @@ def test_one_tile_alone_is_that_of_the_whole_image(image):
     np.testing.assert_array_equal(image[64:128, 128:160].compute().values, image.values[64:128, 128:160])
 
 
+@pytest.mark.slow
 def test_a_toy_engine_is_planned_where_it_is_exact_enough(toy):
     rough = ap.backproject(point_history(), TARGET_GRID, accuracy_db=-20.0)
     assert rough.attrs["setting"].startswith("toy refine=")
@@ -174,6 +175,7 @@ def test_profiles_that_end_within_the_scene_are_flagged():
         replace(profiles, samples=profiles.samples[:50])
 
 
+@pytest.mark.slow
 def test_the_window_over_subcarriers_that_is_asked_for_is_taken(finished_tiny):
     campaign = ap.open_campaign(finished_tiny.root)
     flight, pairs = next(iter(campaign.pairs.items()))

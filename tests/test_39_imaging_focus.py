@@ -64,7 +64,7 @@ def test_points_that_share_a_range_cell_are_no_echo_from_elsewhere():
     assert "no place of the image gathers it" in echo_elsewhere(history, GRID, GROUND, points=elsewhere)
 
 
-@pytest.mark.quick("30.0")
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", [1e-3, 30.0])
 def test_speckle_and_noise_are_no_echo_of_a_point(noise):
     generator = np.random.default_rng(2)
@@ -72,6 +72,7 @@ def test_speckle_and_noise_are_no_echo_of_a_point(noise):
     assert echo_elsewhere(echo_of(places, noise=noise), GRID, GROUND) is None
 
 
+@pytest.mark.slow
 def test_the_direct_path_between_two_antennas_is_not_an_echo():
     generator = np.random.default_rng(3)
     places = np.column_stack([generator.uniform(-3.2, 3.2, (400, 2)), np.zeros(400)])
@@ -141,7 +142,6 @@ def coarse_report(targets, *, seed, bow_m=0.0):
 
 
 @pytest.mark.quick("1-5")
-@pytest.mark.quick("1-5", "2-30")
 @pytest.mark.parametrize("targets", [5, 12, 30])
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_sidelobes_along_a_coarse_range_cell_are_no_points(targets, seed):
@@ -155,7 +155,7 @@ def test_sidelobes_along_a_coarse_range_cell_are_no_points(targets, seed):
     assert report["loss_db"] == pytest.approx(0.0, abs=0.2)
 
 
-@pytest.mark.quick("5")
+@pytest.mark.slow
 @pytest.mark.parametrize("targets", [5, 12])
 def test_the_loss_of_points_along_a_coarse_range_cell_is_told(targets):
     """Truth: the phases between the paths flown to a target and those of the log to where the image has it."""

@@ -339,7 +339,7 @@ def test_one_height_is_flat_ground_for_every_door():
 @pytest.mark.parametrize(
     "as_given",
     [
-        pytest.param(np.matrix, id="matrix"),
+        pytest.param(np.matrix, id="matrix", marks=pytest.mark.filterwarnings("ignore:the matrix subclass")),
         pytest.param(np.ma.masked_array, id="masked nowhere"),
         pytest.param(lambda values: values.astype(values.dtype.newbyteorder(">")), id="other byte order"),
         pytest.param(
@@ -364,6 +364,7 @@ def test_an_image_of_one_pixel_is_judged():
     assert ap.backproject(HISTORY, one, judge=True).attrs["verdict"] == "cannot tell"
 
 
+@pytest.mark.slow
 def test_arrays_of_xarray_and_dask_are_arrays():
     given = replace(HISTORY, transfer=xr.DataArray(ECHO), aperture=ap.Aperture(*map(xr.DataArray, APERTURE.legs)))
     lazy = replace(HISTORY, transfer=xr.DataArray(ECHO).chunk().data)

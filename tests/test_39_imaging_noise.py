@@ -69,6 +69,7 @@ def test_where_pulses_are_sparse_the_deviation_holds_what_echoes_leak_into_the_n
     assert abs(10 * np.log10(found.power / noise)) < max(0.35, 2 * found.std_db)
 
 
+@pytest.mark.slow
 def test_the_deviation_told_is_that_of_many_recordings():
     """Also where 64 places lie in a few resolution cells and are hardly more than one."""
     drawn = [profiles(1.0, echo=0.0, seed=seed, pulses=128) for seed in range(24)]

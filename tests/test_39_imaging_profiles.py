@@ -4,8 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from properties import tried
 from scenes import TARGET, TARGET_GRID, point_history
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
@@ -47,7 +48,7 @@ def test_a_reference_delay_taken_off_the_echo_changes_no_profile():
     middle=st.tuples(st.floats(-40, 40), st.floats(-40, 40)),
     seed=st.integers(0, 99),
 )
-@settings(max_examples=25, deadline=None)
+@tried(25, derandomize=False)
 def test_the_window_covers_every_pixel_with_all_its_guard_samples(shape, relief_m, middle, seed):
     generator = np.random.default_rng(seed)
     grid = SceneGrid("local", middle[0], middle[1], 0.5, shape)

@@ -50,7 +50,7 @@ SETTINGS = (
 )
 
 
-@pytest.mark.quick("1-hann")
+@pytest.mark.slow
 @compiled
 @pytest.mark.parametrize("window", ["none", "hann"])
 @pytest.mark.parametrize("seed", [1, 3, 9])
@@ -98,6 +98,7 @@ def test_over_30_random_campaigns_the_certified_error_is_met():
     assert redone <= 1
 
 
+@pytest.mark.slow
 def test_the_same_job_gives_the_same_plan():
     first, second = plan(), plan()
     assert first.setting == second.setting
@@ -105,6 +106,7 @@ def test_the_same_job_gives_the_same_plan():
     assert plan(threads=4).setting == first.setting  # what is chosen may not depend on who computes
 
 
+@pytest.mark.slow
 def test_predictions_fall_as_more_is_asked_and_cost_does_not():
     plans = [plan(accuracy) for accuracy in (-40.0, -50.0, -60.0, -70.0, -80.0, -90.0)]
     errors, seconds = [p.predicted_error_db for p in plans], [p.predicted_seconds for p in plans]
@@ -185,6 +187,7 @@ def test_an_engine_that_compiles_itself_first_is_taken_by_name_alone_where_anoth
     assert {setting.engine for setting in SettingSearch(job, "numba").settings(300)} == {"numba"}
 
 
+@pytest.mark.slow
 @compiled
 def test_every_setting_that_is_offered_may_be_asked_for():
     """Down to the coarsest: what the planner may choose an engine takes."""

@@ -18,6 +18,7 @@ def test_a_spacing_coarser_than_the_cell_is_flagged_with_the_number():
     assert f"{cell_m:.3g} m" in coarser["spacing_coarse"]
 
 
+@pytest.mark.slow
 def test_a_platform_over_the_scene_is_flagged():
     over = straight_track() + np.array([0.0, 25.0, 0.0])
     assert "300 of 300 pulses" in plan(aperture=monostatic(over)).flags["platform_inside_scene"]
@@ -58,6 +59,7 @@ def test_an_aperture_is_flagged_where_its_ambiguities_show(spread, bandwidth_hz,
     assert ("pulses_sparse" in check_geometry(job)) == flagged
 
 
+@pytest.mark.slow
 def test_the_ghost_of_a_point_walks_through_its_range_cell():
     """150 of the 300 pulses a scene needs; the best of all places half the scene away shows 2f/BM of the peak."""
     track, half = straight_track(150, length_m=30.0), 8.0

@@ -84,6 +84,7 @@ def test_the_width_of_a_target_is_the_resolution_that_was_asked(fixed):
         assert width == pytest.approx(0.884 * 0.6, rel=0.06)
 
 
+@pytest.mark.slow
 @compiled
 def test_a_target_inside_the_swath_has_the_amplitude_of_its_echo():
     """And the bound of the error holds with the sector: engine and double sum weigh alike."""

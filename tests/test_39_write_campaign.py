@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import sigmf
 from folders import complaint, contents
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from properties import tried
 
 import apertura as ap
 from apertura.campaign.folder import Campaign
@@ -86,7 +87,8 @@ def test_a_track_in_degrees_beside_the_gulf_s_origin_is_taken(tmp_path, speed_m_
     assert write(tmp_path / "c", along(0.83, 0.16, speed_m_s), config=config).is_dir()
 
 
-@settings(max_examples=20, deadline=None, derandomize=True)
+@pytest.mark.slow
+@tried(20)
 @given(gaps=st.lists(st.integers(1, 10**12), min_size=1, max_size=9), between=st.integers(0, 5))
 def test_captures_come_back_to_the_nanosecond_whatever_lies_between_them(tmp_path_factory, gaps, between):
     time = np.datetime64("2025-05-14T09:30:00", "ns") + np.cumsum(gaps).astype("timedelta64[ns]")

@@ -53,7 +53,7 @@ def renumber(first, node):
     return lambda root: edit_meta(root, node, change)
 
 
-@pytest.mark.quick("demo", "flight")
+@pytest.mark.quick("continuous", "flight")
 @pytest.mark.parametrize("name", list(PRESETS))
 def test_every_preset_is_without_problems(tmp_path, name):
     short = simulate(tmp_path / "campaign", preset(name, pulses=8))

@@ -269,6 +269,7 @@ def test_what_is_auto_and_what_is_near_is_no_problem(tiny, keys):
     assert reported(tiny) == []
 
 
+@pytest.mark.slow
 def test_gotcha_is_without_problems_in_its_own_frame_alone(shared, tmp_path):
     (tmp_path / "config").mkdir()
     (tmp_path / "raw/f01").mkdir(parents=True)

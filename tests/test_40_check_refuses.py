@@ -98,7 +98,7 @@ SPOILT = {
 }
 
 
-@pytest.mark.quick("wide scene", "an engine that is not here", "a log with a hole")
+@pytest.mark.quick("a log with a hole")
 @pytest.mark.parametrize("name", list(SPOILT))
 def test_what_a_run_refuses_is_refused_before_it_in_the_same_words(tiny, name, monkeypatch):
     monkeypatch.delenv("DASK_SCHEDULER_ADDRESS", raising=False)

@@ -309,6 +309,7 @@ def test_results_are_told_from_stale_ones_where_all_of_raw_was_left_behind(finis
     assert {*SAMPLES, LOG, "raw/f01/uav1.track.csv", "raw/codes.npy"} < set(absent_files(campaign))
 
 
+@pytest.mark.slow
 def test_an_image_is_made_again_of_what_was_kept_of_a_recording_and_of_nothing_else(finished):
     campaign = Campaign.load(finished)
     for pair in ("uav1-uav1", "uav1-uav2"):
@@ -343,6 +344,7 @@ def planned_spacing_m(campaign):
     return expected_scene(without_outdated(campaign), lambda: first_flight(campaign)).grid.spacing_m
 
 
+@pytest.mark.slow
 def test_a_plan_follows_the_config_and_not_results_that_are_out_of_date(tiny, capsys):
     """A finished grid with an automatic CRS: after an edit of the spacing the plan is of the new one, and says so."""
     campaign = state(tiny, "scene", crs="auto")

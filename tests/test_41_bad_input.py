@@ -256,6 +256,7 @@ def test_echoes_beyond_the_cyclic_prefix_are_refused_with_the_worst_pulse(tiny):
     assert not (tiny / "results/f01/uav1-uav1/profile.manifest.json").exists()
 
 
+@pytest.mark.slow
 def test_path_offsets_alone_can_push_echoes_out_of_the_prefix(tiny):
     edit_config(tiny, lambda document: document["nodes"]["uav1"]["path_offset_m"].update(radar=230.0))
     campaign = Campaign.load(tiny)

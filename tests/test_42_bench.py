@@ -115,6 +115,7 @@ def test_one_signal_in_two_channels_agrees_whatever_the_noise(tmp_path):
     assert not measure_bench(Campaign.load(root), FLIGHT).flags
 
 
+@pytest.mark.slow
 def test_no_path_of_a_link_that_carries_a_flag_goes_into_the_config(tmp_path, capsys):
     root = SPOILT["clocks of the two channels apart"].write(tmp_path / "bench", 1)
     edit_config(root, lambda config: config["nodes"]["uav2"]["path_offset_m"].update(radar=0.5))
@@ -187,6 +188,7 @@ def test_a_hover_inside_a_flight_is_left_out_unless_segments_say_what_images(tmp
     assert "hover" not in quality["flags"]
 
 
+@pytest.mark.slow
 def test_an_image_without_an_aperture_cannot_tell_its_focus():
     """Antennas that stand: an echo per range, told by no aperture and by nothing else."""
     frequency, still = 1.2e9 + 1e6 * np.arange(128), np.tile([0.0, -20.0, 10.0], (64, 1))

@@ -108,6 +108,7 @@ def test_a_target_is_where_it_stands_by_the_log_and_its_clock(campaign):
     assert echo.attrs["frame"] == "ecef"
 
 
+@pytest.mark.slow
 def test_refined_tracks_of_a_phase_history_are_written_for_its_log(campaign):
     keep_time(campaign)
     edit_config(campaign, lambda document: document.update(processing={"autofocus": "off"}))
@@ -191,6 +192,7 @@ def test_samples_without_any_positions_are_refused(campaign):
     assert "samples without positions" in message
 
 
+@pytest.mark.slow
 def test_it_is_looked_at_as_it_is_but_not_followed(campaign):
     keep_time(campaign)
     Look(Campaign.load(campaign), follow=False).run()

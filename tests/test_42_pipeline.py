@@ -59,6 +59,7 @@ def test_mono_and_bistatic_phases_agree_at_the_targets(finished_sample):
         assert abs(np.angle(mono * np.conj(bistatic))) < 0.1
 
 
+@pytest.mark.slow
 def test_without_the_sidelink_the_bistatic_image_falls_apart(finished_sample, monkeypatch, tmp_path):
     """Both phase histories scaled to equal RMS; the peak drops by at least 15 dB."""
     pair = ("f01", "uav1-uav2")

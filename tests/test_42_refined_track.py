@@ -178,6 +178,7 @@ def test_a_campaign_that_is_given_its_refined_logs_makes_the_same_images(spoilt,
         assert abs(np.vdot(refined, from_files)) > 0.9999
 
 
+@pytest.mark.slow
 def test_hypotheses_begin_where_the_images_do(spoilt):
     campaign, found = spoilt
     write_track(campaign, *found)

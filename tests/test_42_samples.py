@@ -38,7 +38,7 @@ PULSES = {
 }
 
 
-@pytest.fixture(scope="module", params=[pytest.param("chirp", marks=pytest.mark.slow), "pn"])
+@pytest.fixture(scope="module", params=[pytest.param(name, marks=pytest.mark.slow) for name in PULSES])
 def imaged(request, tmp_path_factory):
     """Two nodes with noise, clocks of their own, missed triggers, random phases and starts; three targets."""
     root = tmp_path_factory.mktemp(request.param) / "campaign"
@@ -113,6 +113,7 @@ def test_the_echo_says_which_filter_and_why(imaged):
         assert attrs["flags"] == {}
 
 
+@pytest.mark.slow
 def test_what_the_logs_promise_is_what_the_echo_has(tiny):
     campaign = Campaign.load(tiny)
     promised = [open_pair(campaign, "f01", pair) for pair in PAIRS]

@@ -186,6 +186,7 @@ def test_a_campaign_whose_tracks_are_left_alone_has_its_logs_as_they_are(finishe
         assert "f01" in picture.text["APERTURA_SOURCES"]
 
 
+@pytest.mark.slow
 def test_the_picture_shows_a_column_for_each_node(log, tmp_path):
     for count in (1, 4):
         write_picture(tmp_path / f"{count}.png", [log] * count, title="a flight", outcome="refined: as told", tags={})

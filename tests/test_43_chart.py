@@ -30,7 +30,7 @@ def charted(finished_tiny, tmp_path_factory):
     """Files of a chart that had a second for its measurements, and its rows."""
     root = copy_writable(finished_tiny.root, tmp_path_factory.mktemp("charted") / "campaign")
     paths = speed_accuracy(Campaign.load(root), "f01", "uav1-uav2", seconds=1.0)
-    return paths, list(csv.DictReader(paths[0].open(encoding="utf-8")))
+    return paths, list(csv.DictReader(paths[0].read_text(encoding="utf-8").splitlines()))
 
 
 def error_db(row):

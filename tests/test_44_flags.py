@@ -127,6 +127,7 @@ def test_auto_avoids_ghosts_of_an_echo_in_the_sidelink(tmp_path):
     assert attrs["sidelink"]["method"] == "two_parameter"
 
 
+@pytest.mark.slow
 def test_ripple_of_the_transmitter_keeps_the_division(tmp_path):
     attrs = echo_of(flown(tmp_path, "uav1", transmit_ripple=Ripple(1.0, 5e-9))).attrs
     assert attrs["sidelink"]["method"] == "divide"

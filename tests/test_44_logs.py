@@ -219,7 +219,7 @@ def test_a_damaged_log_is_flagged():
     assert logged_flags(flown, damage=found) == {"track_log_damaged": f"a: {found}"}
 
 
-@pytest.mark.quick("-0.004")
+@pytest.mark.slow
 @pytest.mark.parametrize("offset_s", [0.0, 1e-3, -4e-3])
 def test_an_offset_between_the_nodes_tags_does_not_turn_the_bistatic_phase(tmp_path, offset_s):
     """12 m/s, 9.5 GHz, receiver 4.7 m ahead: placed at its own tag, 1 ms late, R_sl would err by 1.2 cm, -2.27 rad.
@@ -265,6 +265,7 @@ def test_captures_that_repeat_earlier_ones_are_left_out(tmp_path, node):
     assert attrs["flags"]["captures_repeated"] == f"8 of 40 captures of {node}, the first is number 20"
 
 
+@pytest.mark.slow
 def test_a_single_wrong_tag_is_left_out(tmp_path):
     campaign = small_campaign(tmp_path)
     from folders import edit_meta

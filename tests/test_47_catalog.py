@@ -211,6 +211,7 @@ def test_catalog_and_crate_have_the_same_bytes_from_another_folder(finished_tiny
     assert [name for name in some if made.get(name) != expected[name]] == []
 
 
+@pytest.mark.slow
 def test_hostile_campaign_names_stay_text(finished):
     name = "../../x $(id) %2F {0} 'quoted'"
     config = finished / "config" / "config.yaml"

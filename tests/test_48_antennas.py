@@ -124,6 +124,7 @@ def both(_beamed, tmp_path_factory):
     return [imaged(stated(root, antenna)) for antenna in (None, BEAM)]
 
 
+@pytest.mark.slow
 def test_knowing_the_beam_gains_what_a_matched_filter_gains(both):
     (plain, without), (weighed, report) = both
     w = weights()
@@ -135,6 +136,7 @@ def test_knowing_the_beam_gains_what_a_matched_filter_gains(both):
     assert report["flags"] == without["flags"]
 
 
+@pytest.mark.slow
 def test_an_image_is_the_mean_over_all_pulses_of_weight_times_echo(both):
     (plain, _), (weighed, _) = both
     w = weights()
@@ -208,7 +210,7 @@ def test_a_boresight_to_the_wrong_side_is_refused_before_and_after_the_echo(beam
     assert not (beamed / "results/f01/uav1-uav1/image.manifest.json").exists()
 
 
-@pytest.mark.quick("0.0-False")
+@pytest.mark.slow
 @pytest.mark.parametrize(("turn_deg", "misses"), [(0.0, False), (28.0, True)])
 def test_a_scene_partly_outside_the_beam_is_flagged_with_its_share(beamed, turn_deg, misses):
     turned = BEAM | {"boresight_deg": [90.0 + turn_deg, -DEPRESSION_DEG]}
@@ -237,6 +239,7 @@ def test_only_the_image_depends_on_what_the_beam_is(beamed):
     assert "antennas" not in yaml.safe_dump(settings(none, "echo"))
 
 
+@pytest.mark.slow
 def test_the_echo_carries_the_body_s_axes_only_where_a_beam_needs_them(beamed):
     def axes(campaign):
         ingest.ingest(campaign, "f01", "uav1")

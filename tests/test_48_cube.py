@@ -204,6 +204,7 @@ def test_images_of_an_older_version_end_in_one_message(campaign, tmp_path):
     assert "Run the workflow again" in said
 
 
+@pytest.mark.slow
 def test_every_block_of_the_how_to_runs_and_prints_what_it_shows(campaign, tmp_path, monkeypatch):
     copy_writable(campaign.root, tmp_path / "campaign")
     monkeypatch.chdir(tmp_path)

@@ -64,6 +64,7 @@ def test_the_side_is_that_of_the_scene_and_no_straight_track_observes_it():
         assert view["side_mirror_rad"] < 1e-6
 
 
+@pytest.mark.slow
 def test_a_track_that_bends_sideways_observes_its_side_and_one_that_bobs_does_not():
     """4π/λ·2w sin θ of a lateral rms w: a mirrored point is out of phase by it."""
     bend = 0.05 * np.sin(np.linspace(-9, 9, 101))

@@ -38,6 +38,7 @@ def test_every_problem_is_a_line_of_its_own(tiny):
     ]
 
 
+@pytest.mark.slow
 def test_a_reader_that_has_gone_ends_a_command_as_others_without_a_message(finished_tiny):
     """`apertura summary | true`: 128 and the number of SIGPIPE"""
     reading, writing = os.pipe()
@@ -48,6 +49,7 @@ def test_a_reader_that_has_gone_ends_a_command_as_others_without_a_message(finis
     assert (done.returncode, done.stderr) == (141, "")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
 def test_a_full_disk_under_the_output_is_one_message(finished_tiny):
     with Path("/dev/full").open("w") as full:
@@ -104,6 +106,7 @@ def test_a_study_without_its_distribution_says_what_to_install(words):
     assert "pip install ./research" in done.stderr
 
 
+@pytest.mark.slow
 def test_a_study_is_a_group_of_commands_where_its_distribution_is_installed():
     done = run("study", "--help")
     assert done.returncode == 0

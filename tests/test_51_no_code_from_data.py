@@ -189,6 +189,7 @@ def finished(_finished, tmp_path):
     return copy_writable(_finished, tmp_path / "campaign")
 
 
+@pytest.mark.slow
 def test_a_marker_that_is_run_or_opened_is_seen(unfinished, monkeypatch):
     """What the other tests rest on: Python started in the folder, and a file outside that is read."""
     monkeypatch.delenv(SAFE_PATH, raising=False)  # whatever ran in this process before
@@ -322,6 +323,7 @@ def test_a_profile_of_the_campaigns_own_is_refused(unfinished, tmp_path, monkeyp
     assert [words for words in OWN if not told(words)] == []
 
 
+@pytest.mark.slow
 def test_nothing_of_a_profile_that_is_refused_runs(unfinished):
     planted = plant(unfinished)
     with planted.fires() as fired:
@@ -339,6 +341,7 @@ def test_a_profile_of_the_environment_is_one_of_the_command_line(unfinished):
     assert "SNAKEMAKE_PROFILE ./profiles/slurm lies in the campaign folder" in said
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("option", ["--trust-io-cache", *slow("--tr")])
 def test_what_snakemake_pickled_of_the_folder_is_not_read(unfinished, option):
     planted, cache = plant(unfinished), unfinished / ".snakemake" / "iocache"
@@ -525,6 +528,7 @@ def test_text_that_is_only_a_title_is_only_a_title_in_every_product(unfinished):
     assert status in {0, 2}, said
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", ["PROJ nadgrids", *slow("PROJ init", "PROJ geoidgrids", "PROJ text", "a code of PROJ")]
 )

@@ -173,6 +173,7 @@ def test_the_scans_of_a_radar_with_a_clock_of_its_own_ask_for_a_log_and_for_alig
     assert any("a flight log" in sentence for sentence in report.missing)
 
 
+@pytest.mark.slow
 def test_a_log_above_sea_level_is_refused_with_the_key_and_read_once_that_is_set(shared):
     path = next((SHARED / "dji_rtk_ansfl").glob("*Airdata.csv"))
     refused = look(path)
@@ -221,6 +222,7 @@ def test_a_campaign_is_reported_node_by_node(shared):
     assert reported["uav2"]["fix"] == {"fix": 108}
 
 
+@pytest.mark.slow
 def test_a_campaign_of_phase_history_is_reported_by_the_clock_that_was_aligned(shared, tmp_path):
     root = copy_writable(EXAMPLES / "rail_pass", tmp_path / "rail")
     flight, node = (root / "config/flights.tsv").read_text().splitlines()[1].split("\t")[::3]
@@ -418,6 +420,7 @@ def test_a_track_across_180_degrees_has_bounds_from_west_to_east_and_a_middle_on
     assert abs(facts.middle_geodetic[1]) == pytest.approx(179.99995, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_a_named_pipe_in_place_of_the_log_is_not_waited_for(tiny):
     log = tiny / "raw/f01/uav1.track.csv"
     log.unlink()

@@ -176,6 +176,7 @@ def test_lines_are_bounded_and_printable(tmp_path, capsys):
     assert all(line.isprintable() and len(line) < 420 for line in lines)
 
 
+@pytest.mark.slow
 def test_a_large_raster_is_compared_block_by_block(tmp_path, monkeypatch):
     """No more than one block of each is held."""
     side = 2100

@@ -64,6 +64,7 @@ def test_one_byte_of_a_stage_is_reported_at_the_stage(root, file):
     assert file in "".join(next(link for link in verify(root / DB).links if link.name == IMAGE).why)
 
 
+@pytest.mark.slow
 def test_any_byte_of_the_last_manifest_is_noticed(root):
     """Nothing has recorded its hash: what it says is compared with all that it speaks of, and how it is written."""
     whole = (root / EXPORT).read_bytes()
@@ -74,7 +75,7 @@ def test_any_byte_of_the_last_manifest_is_noticed(root):
     assert wrong(root, EXPORT) == {}
 
 
-@pytest.mark.quick("SOURCES-<lambda>0", "RUNSPEC-*")
+@pytest.mark.quick("INPUTS-*", "RUNSPEC-*")
 @pytest.mark.parametrize(
     ("name", "change"),
     [
@@ -157,6 +158,7 @@ def test_what_is_new_in_a_stage_is_reported(root):
     assert wrong(root) == {IMAGE: "changed"}
 
 
+@pytest.mark.slow
 def test_verifying_writes_nothing(root):
     before = {path: path.stat().st_mtime_ns for path in root.rglob("*")}
     for path in root.rglob("*"):

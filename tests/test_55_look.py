@@ -99,6 +99,7 @@ def test_an_image_added_in_blocks_is_that_of_all_pulses_at_once(finished_tiny, t
         assert coarse.grid.spacing_m == 2 * fine.grid.spacing_m
 
 
+@pytest.mark.slow
 def test_a_secondary_in_blocks_shows_the_same_points_in_focus(finished_tiny, tmp_path, monkeypatch):
     pair = in_blocks(copy_writable(finished_tiny.root, tmp_path / "campaign"), 16, monkeypatch)[1]
     image = open_stage(finished_tiny.stage("image", "f01", pair.name), "image").image.values
@@ -312,6 +313,7 @@ def test_a_recording_that_rests_is_ended_and_what_it_lacks_is_said(tiny, capsys)
     assert "the log of uav2 ends before its last capture" in told
 
 
+@pytest.mark.slow
 def test_the_last_picture_is_the_fine_one(tiny):
     look = Look(Campaign.load(tiny), follow=True, every_s=1.0, end_after_s=1.0)
     look.run()
@@ -360,6 +362,7 @@ def test_what_the_first_pulses_could_not_tell_later_ones_do(tmp_path, monkeypatc
     assert told["judged_by"].endswith("fine")
 
 
+@pytest.mark.slow
 def test_a_scene_left_to_auto_is_that_of_the_run(tiny, tmp_path):
     state(tiny, "scene", bounds_m="auto", spacing_m=0.5)
     other = Campaign.load(copy_writable(tiny, tmp_path / "other"))
@@ -386,6 +389,7 @@ def test_a_recording_has_ended_only_where_its_log_has(tiny):
     assert node.complete
 
 
+@pytest.mark.slow
 def test_a_pair_that_falls_behind_takes_every_other_pulse_and_says_so(tiny):
     look = Look(Campaign.load(tiny), follow=False)
     look.decimated = 2
@@ -398,6 +402,7 @@ def test_a_pair_that_falls_behind_takes_every_other_pulse_and_says_so(tiny):
     assert "1 pulse in 2 taken" in (tiny / "results/look/index.html").read_text()
 
 
+@pytest.mark.slow
 def test_pulses_stand_for_those_left_out_beside_them(finished_tiny, tmp_path, monkeypatch):
     root = copy_writable(finished_tiny.root, tmp_path / "campaign")
     (whole, _), look = in_blocks(root, 20, monkeypatch), Look(Campaign.load(root), follow=False)
@@ -425,6 +430,7 @@ def test_a_delay_doubles_the_decimation_and_ease_halves_it(tiny, monkeypatch):
     assert told == [1, 2, 2, 4, 2, 1]  # not at first, when it still plans, nor while it catches up
 
 
+@pytest.mark.slow
 def test_a_map_of_a_look_serves_the_last_pictures_and_nothing_else(tiny, capsys):
     """It waits for the first; two of a pair stay, the image is on the scene's grid whatever it was formed on."""
     look, waiting = Look(Campaign.load(tiny), follow=True, every_s=2.0, end_after_s=1e6), threading.Event()
@@ -473,6 +479,7 @@ def test_a_look_writes_beside_the_results_and_nowhere_else(finished_tiny, tmp_pa
     assert told["share"] == 1
 
 
+@pytest.mark.slow
 def test_what_a_look_wrote_goes_with_what_a_run_wrote(tiny):
     campaign = Campaign.load(tiny)
     Look(campaign, follow=False).run()

@@ -119,6 +119,7 @@ def test_targets_seen_from_a_real_px4_flight_are_within_a_centimetre(shared, tmp
     assert max(row.error_m for row in found) < 0.01
 
 
+@pytest.mark.slow
 def test_gotcha_is_without_problems(shared, tmp_path):
     root = tmp_path / "gotcha"
     shutil.copytree(EXAMPLES / "gotcha", root)
