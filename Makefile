@@ -72,6 +72,7 @@ wheel: $(SETUP)
 
 # What pytest makes of the asserts is kept for the next run, also where Python is told to write no bytecode.
 test test-slow: export PYTHONDONTWRITEBYTECODE :=
+test-slow: export EXAMPLES := all
 test: $(SETUP)
 	$(BIN)/python -m pytest -q -n 2 -m "not slow" $(TESTS)
 

@@ -18,11 +18,17 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 collect_ignore = ["crate/contexts.py", "crate/profile", "in_qgis.py"]
 
 
+COMPILING = {"apertura.core.imaging.backproject.backproject", "apertura.core.imaging.judgement.judge"}
+"""Doctests that are slow: the compiler of numba starts for them."""
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config, items):
     """Of tests that are marked ``quick(*ids)``, rows of other ids are slow; an id may hold stars."""
     named, met = {}, set()
     for item in items:
+        if item.name in COMPILING:
+            item.add_marker(pytest.mark.slow)
         marker = item.get_closest_marker("quick")
         if marker:
             function, row = item.nodeid.partition("[")[0], item.callspec.id

@@ -208,7 +208,7 @@ def test_every_command_is_tried():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("command", leaves())
+@pytest.mark.parametrize("command", list(leaves()))
 def test_nothing_fires_when_a_command_is_typed_in_a_finished_campaign(finished, command):
     planted = plant(finished)
     words = [str(BIN / "apertura"), *shlex.split(TYPED.get(command, command))]

@@ -60,11 +60,11 @@ def read_fields(path: Path) -> dict[str, NDArray[Any]]:
                 file.flush()
                 name = file.name
             unit, size = "bytes", len(data)
-            log = DFReader_binary(name)
+            log = stack.enter_context(DFReader_binary(name))
         else:
             spans, size = _wrong_lines(data)
             unit = "lines"
-            log = DFReader_text(name)
+            log = stack.enter_context(DFReader_text(name))
         arrays = _columns(log)
     return {**arrays, DAMAGE[unit]: np.array([*spans, (0, size)], np.int64)}
 
