@@ -1,81 +1,113 @@
 """What the process that steps are forks of is asked for: steps, by their whole command, and nothing else."""
 
+import csv
 import json
-import os
+import queue
 import socket
-import subprocess
-import threading
+import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+from snakemake.benchmark import BenchmarkRecord
 
-from apertura.run.warm import Shell
+from apertura.run.executor import Executor
+from apertura.run.warm import _benchmark
 
-STEP = "set -euo pipefail;  apertura step image f01 uav1-uav2 --threads 2 > results/logs/f01/uav1-uav2.image.log 2>&1"
+STEP = "apertura step image f01 uav1-uav2 --threads 2 > results/logs/f01/uav1-uav2.image.log 2>&1"
+
+
+class Workflow(SimpleNamespace):
+    """Of Snakemake, as far as an executor sees of it; keeps what becomes of jobs."""
+
+    def __init__(self, requests):
+        self.ends = queue.Queue()
+        super().__init__(
+            dag=None,
+            main_snakefile="Snakefile",
+            executor_settings=SimpleNamespace(requests=requests.detach()),
+            execution_settings=SimpleNamespace(use_threads=False, keep_incomplete=False),
+            resource_settings=SimpleNamespace(cores=2),
+            async_run=lambda *_, **__: None,
+            scheduler=SimpleNamespace(
+                submit_callback=lambda *_, **__: None,
+                finish_callback=lambda job: self.ends.put((job.jobid, "finished")),
+                error_callback=lambda job: self.ends.put((job.jobid, "failed")),
+            ),
+        )
+
+
+def job(command, jobid=1, **said):
+    return SimpleNamespace(
+        **{"is_shadow": False, "benchmark": "results/benchmarks/f01/uav1-uav2.image.tsv", **said},
+        jobid=jobid,
+        shellcmd=command,
+        threads=2,
+        is_group=lambda: False,
+        prepare=lambda: None,
+        register=lambda *_, **__: None,
+        log_error=lambda *_, **__: None,
+    )
 
 
 @pytest.fixture
-def ends():
-    """Both ends of where steps are asked for."""
-    with (pair := socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET))[0], pair[1]:
-        yield pair
+def asked():
+    """An executor, and the other end of where it asks."""
+    theirs, ours = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with ours:
+        ours.settimeout(10)
+        yield Executor(Workflow(theirs), None), ours
 
 
-def test_a_step_is_asked_for_with_its_words_log_folder_and_environment_and_ends_with_its_status(ends):
-    asked, begun = {}, []
-
-    def serve():
-        data, (file,), _, _ = socket.recv_fds(ends[1], 1 << 17, 1)
-        asked.update(json.loads(data))
-        with socket.socket(fileno=file) as answer:
-            answer.send(b"4711")
-            begun.append(answer.recv(2))
-            answer.send(b"130")
-
-    server = threading.Thread(target=serve)
-    server.start()
-    step = Shell(ends[0]).Popen(STEP, shell=True, env={"OPENBLAS_NUM_THREADS": "2"})
-    assert step.pid == 4711
-    assert begun == []  # whoever measures the process has to find it
-    assert step.wait() == 130
-    server.join()
-    assert begun == [b"go"]
-    assert asked == {
+def test_steps_are_asked_for_with_all_that_their_commands_say_and_reported_as_they_end(asked):
+    executor, server = asked
+    executor.run_job(job(STEP))
+    executor.run_job(job(STEP, jobid=2))
+    step, second = (json.loads(server.recv(1 << 16)) for _ in range(2))
+    assert second == {**step, "job": 2}
+    assert set(step.pop("environment").values()) == {"2"}
+    assert step == {
+        "job": 1,
         "words": ["step", "image", "f01", "uav1-uav2", "--threads", "2"],
         "log": "results/logs/f01/uav1-uav2.image.log",
+        "benchmark": "results/benchmarks/f01/uav1-uav2.image.tsv",
         "folder": str(Path.cwd()),
-        "environment": {"OPENBLAS_NUM_THREADS": "2"},
     }
-
-
-def test_a_process_that_has_ended_is_told_and_not_waited_for(ends):
-    threading.Thread(target=lambda: os.close(socket.recv_fds(ends[1], 1 << 17, 1)[1][0])).start()
-    with pytest.raises(OSError, match="has ended"):
-        Shell(ends[0]).Popen(STEP, shell=True, env={})
+    for end in (b"[2, 130]", b"[1, 0]"):
+        server.send(end)
+    assert [executor.workflow.ends.get(timeout=10) for _ in range(2)] == [(2, "failed"), (1, "finished")]
 
 
 @pytest.mark.parametrize(
-    "command",
+    ("command", "said"),
     [
-        "set -euo pipefail;  apertura summary 2> /dev/null || true",
-        "source activate env; set -euo pipefail;  apertura step scene > a.log 2>&1",
-        "set -euo pipefail;  apertura step scene; touch x > a.log 2>&1",
-        "set -euo pipefail;  apertura step echo f01 $(touch x) > a.log 2>&1",
-        "set -euo pipefail;  apertura step echo 'f01' > a.log 2>&1",
-        "set -euo pipefail;  apertura step scene > a.log 2>&1 && touch x",
-        "set -euo pipefail;  apertura step scene > a b.log 2>&1",
+        (None, {}),
+        ("apertura summary 2> /dev/null || true", {}),
+        ("source activate env; apertura step scene > a.log 2>&1", {}),
+        ("apertura step scene; touch x > a.log 2>&1", {}),
+        ("apertura step echo f01 $(touch x) > a.log 2>&1", {}),
+        ("apertura step echo 'f01' > a.log 2>&1", {}),
+        ("apertura step scene > a.log 2>&1 && touch x", {}),
+        ("apertura step scene > a b.log 2>&1", {}),
+        (STEP, {"is_shadow": True}),
     ],
 )
-def test_any_other_command_goes_to_a_shell_as_it_stands(ends, monkeypatch, command):
-    started = []
-    monkeypatch.setattr(subprocess, "Popen", lambda words, **how: started.append((words, how)))
-    Shell(ends[0]).Popen(command, shell=True, env={})
-    assert started == [(command, {"shell": True, "env": {}})]
-    ends[1].setblocking(False)
+def test_any_other_job_goes_to_snakemakes_own_executor(asked, monkeypatch, command, said):
+    executor, server = asked
+    given = []
+    monkeypatch.setattr(executor._local, "run_job", given.append)
+    other = job(command, **said)
+    executor.run_job(other)
+    assert given == [other]
+    server.setblocking(False)
     with pytest.raises(BlockingIOError):
-        ends[1].recv(1)
+        server.recv(1)
 
 
-def test_a_step_whose_output_snakemake_wants_to_read_goes_to_a_shell(ends):
-    with Shell(ends[0]).Popen("exit 3", shell=True, stdout=subprocess.PIPE, env=os.environ) as process:
-        assert process.wait() == 3
+def test_what_a_step_took_is_told_in_the_columns_of_snakemake():
+    header, row = csv.reader(_benchmark(90061.5).splitlines(), delimiter="\t")
+    assert header == BenchmarkRecord.get_header()
+    told = dict(zip(header, row, strict=True))
+    assert (told["s"], told["h:m:s"], told["max_pss"]) == ("90061.50", "1 day, 1:01:01", "NA")
+    assert float(told["max_rss"]) > 10  # MiB, of this process
+    assert 0 < float(told["cpu_time"]) <= time.process_time() + 60

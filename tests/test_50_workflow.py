@@ -253,14 +253,19 @@ def test_a_signal_ends_a_run_with_all_its_steps_within_five_seconds(tiny, number
     hold(tiny).close()
 
 
+def state_and_parent(pid):
+    state, parent = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[:2]
+    return state, int(parent)
+
+
 def below(pid):
     """Return the process numbers of what a process has started, directly or not, with their command lines."""
     parents = {}
     for path in Path("/proc").glob("[0-9]*/stat"):
         with contextlib.suppress(OSError):
-            state, parent = path.read_text().rpartition(")")[2].split()[:2]
+            state, parent = state_and_parent(path.parent.name)
             if state != "Z":
-                parents[int(path.parent.name)] = int(parent)
+                parents[int(path.parent.name)] = parent
     found = {pid}
     while more := {child for child, parent in parents.items() if parent in found} - found:
         found |= more
@@ -269,7 +274,7 @@ def below(pid):
 
 def lives(pid):
     try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+        return state_and_parent(pid)[0] != "Z"
     except OSError:
         return False
 
@@ -284,6 +289,9 @@ def test_steps_are_forks_that_end_with_the_run_whatever_is_killed_outright(tiny,
     assert all(b"apertura.run.warm" in command for command in processes.values())
     warm, snakemake_itself, *steps = processes
     assert steps
+    assert {state_and_parent(one)[1] for one in (snakemake_itself, *steps)} == {
+        warm
+    }  # no process of snakemake is in between
     os.kill({"the run": run.pid, "snakemake": snakemake_itself}.get(killed, warm), signal.SIGKILL)
     code, output = finished(run, timeout=60)
     assert code == (-signal.SIGKILL if killed == "the run" else 1)
@@ -331,7 +339,8 @@ def test_a_run_from_any_folder_tells_each_step_and_ends_with_what_its_images_say
     assert {
         tiny / "results/logs" / path.relative_to(tiny / "results/benchmarks").with_suffix("") for path in timed
     } < logs
-    assert all(float(path.read_text().splitlines()[1].split()[0]) > 0 for path in timed)
+    rows = [dict(zip(*(line.split("\t") for line in path.read_text().splitlines()), strict=True)) for path in timed]
+    assert all(float(row[column]) > 0 for row in rows for column in ("s", "max_rss", "cpu_time"))
     assert "f01 uav1-uav2" in output
     assert "results/f01/fused/coherent_db.tif" in output
     assert "\x1b" not in output

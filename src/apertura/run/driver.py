@@ -61,6 +61,8 @@ _DRY_RUN = re.compile(r"-n|-np|--dry-?run")
 _SCATTER = "--set-scatter"
 _DEPLOYS = ("--sd", "--so", "--use-c", "--use-s", "--use-a", "--conda")
 """Beginnings of options with which Snakemake installs software, wherever that is kept: its changes are not confined."""
+_BY_SHELL = (*_DEPLOYS, "--cac", "--be")
+"""Beginnings of options that concern commands of shells: software, caching between workflows, extended benchmarks."""
 _UNTIL = ("--until", "-U")
 _TARGETS = ("all", "pages", "phase_history")
 """Rules of the workflow that only gather results of others."""
@@ -157,7 +159,9 @@ def run_workflow(root: Path, cores: int, *arguments: str, paranoid: bool = False
                 print(line, file=sys.stderr, flush=True)
         overtaken = [manifest for manifest in stale if not on_demand(campaign, manifest)]
         forced = ["--forcerun", *overtaken] if overtaken else []  # in time for a dry run; the workflow says why
-        words = _words(root, cores, [*_without_inner_steps(campaign, options), *forced])
+        forks = warm and not any(argument.startswith(_BY_SHELL) for argument in arguments)
+        executor = ["--executor", NAME] if forks else []
+        words = _words(root, cores, [*executor, *_without_inner_steps(campaign, options), *forced])
         if forms:
             deploys = any(argument.startswith(_DEPLOYS) for argument in arguments)
             files = _Files.of(campaign, confined=not (elsewhere or deploys))
@@ -453,7 +457,7 @@ def _whole(root: Path, option: str, name: str) -> str:
 
 def _runs_elsewhere(arguments: Sequence[str]) -> bool:
     """Return whether steps run on other machines than this one."""
-    named = any(argument.startswith(("--exec", "--prof", "-e")) for argument in arguments)
+    named = any(argument.startswith(("--exec", "--prof", "--wo", "-e")) for argument in arguments)
     return named or _PROFILE in os.environ
 
 

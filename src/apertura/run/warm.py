@@ -1,7 +1,7 @@
 """Steps as forks of one process that has imported what they need: what `apertura run` starts on this machine.
 
 ``python -m apertura.run.warm`` reads what to run, forks snakemake, with a journal, and then a process for
-each step that snakemake's shell asks for; it has no thread of its own. Log, benchmark, variables, signals and exit
+each step that its executor asks for; it has no thread of its own. Log, benchmark, variables, signals and exit
 status of a step are those of the command in its rule, which plain snakemake and other machines start as it stands.
 """
 
@@ -11,24 +11,24 @@ import json
 import multiprocessing
 import os
 import pkgutil
-import re
+import resource
 import select
 import signal
 import socket
-import subprocess
 import sys
-import tempfile
+import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from datetime import timedelta
 from multiprocessing.connection import wait
 from multiprocessing.process import BaseProcess
-from pathlib import Path
 from typing import IO, Any
 
 from apertura.common.confined import ConfinedPath
 from apertura.common.errors import CampaignError
-from apertura.common.processes import ALGEBRA_THREADS, ENDING, SIGNALLED, TEMPORARY, die_with_parent, leave_status
+from apertura.common.processes import ALGEBRA_THREADS, CONFINED, ENDING, SIGNALLED, die_with_parent, leave_status
+from apertura.run.journal import NAME as PLUGIN
 from apertura.workflow.rules import RULES
 
 NAME = "apertura.run.warm"
@@ -44,7 +44,7 @@ _LIBRARIES = (
     "email.policy",
     "ijson",
     "matplotlib.backends.backend_agg",
-    "numba.core.caching",
+    "numba",
     "PIL.PngImagePlugin",
     "scipy.fft",
     "scipy.interpolate",
@@ -56,10 +56,7 @@ _LIBRARIES = (
 )
 """What most steps import in functions."""
 
-_COMMAND = re.compile(r"(?:set -euo pipefail; +)?apertura (step(?: [\w.-]+)+) > ([\w./-]+) 2>&1")
-"""What snakemake hands to a shell for a step; any other command goes to a shell."""
-
-_LONGEST = 1 << 17  # bytes of a request; the environment is most of it
+_LONGEST = 1 << 16  # bytes of a request
 _GRACE_S = 2.0
 _fork = multiprocessing.get_context("fork").Process
 
@@ -124,43 +121,24 @@ def _begun(requests: socket.socket) -> BaseProcess:
 
 def _serve(requests: socket.socket, snakemake: BaseProcess) -> None:
     """Fork a process for each request until snakemake has ended; tell what became of each."""
-    running: dict[int, tuple[BaseProcess, socket.socket]] = {}
-    while snakemake.exitcode is None:
+    running: dict[int, tuple[BaseProcess, int]] = {}
+    while snakemake.is_alive():
         for ready in wait([requests, snakemake.sentinel, *running]):
-            if ready is requests:
-                step, answer = _asked(requests)
-                if step:
-                    running[step.sentinel] = step, answer
+            if ready is requests and (said := requests.recv(_LONGEST)):
+                _import()
+                asked = json.loads(said)
+                begun = _fork(target=_child, args=(_step, asked))
+                begun.start()
+                running[begun.sentinel] = begun, asked["job"]
             elif ready in running:
-                step, answer = running.pop(ready)
-                step.join()
-                _tell(answer, _status(step))
-                answer.close()
-        if not snakemake.is_alive():
-            break
-    for step, _ in running.values():  # snakemake was killed alone
+                step, job = running.pop(ready)
+                with suppress(OSError):  # snakemake has ended
+                    requests.send(json.dumps([job, _status(step)]).encode())
+    for step, _ in running.values():
         step.terminate()
     for step, _ in running.values():
         step.join(_GRACE_S)
         step.kill()
-
-
-def _asked(requests: socket.socket) -> tuple[BaseProcess | None, Any]:
-    """Start the step of a request; return it and where its end is told."""
-    data, files, _, _ = socket.recv_fds(requests, _LONGEST, 1)
-    if not data:  # snakemake has ended
-        return None, None
-    _import()
-    answer = socket.socket(fileno=files[0])
-    step = _fork(target=_child, args=(_step, json.loads(data), answer))
-    step.start()
-    _tell(answer, step.pid or 0)
-    return step, answer
-
-
-def _tell(answer: socket.socket, number: int) -> None:
-    with suppress(OSError):  # nobody listens any more
-        answer.send(str(number).encode())
 
 
 def _status(process: BaseProcess) -> int:
@@ -181,12 +159,13 @@ def _import() -> None:
         return
     for name in _modules():
         importlib.import_module(name)
-    from numba.core.registry import cpu_target
+    import numpy as np
 
     from apertura.common.provenance import code_sha256, software
+    from apertura.core.backprojection.engines.reference import polynomial
 
-    cpu_target.typing_context.refresh()
-    cpu_target.target_context.refresh()
+    zero = np.zeros((1, 1), np.complex128)
+    polynomial(zero, zero)  # the first call of compiled Python in a process fills numba's tables, in 0.2 s
     software()
     code_sha256(*(rule.module for rule in RULES.values()))
     gc.collect()
@@ -213,98 +192,55 @@ def _child(work: Callable[..., None], *arguments: Any) -> None:
 
 
 def _snakemake(requests: socket.socket, arguments: Sequence[str]) -> None:
-    """Be snakemake with a journal, whose shell asks for steps."""
-    sys.argv[1:] = arguments
-    module: Any = importlib.import_module("snakemake.shell")  # of which the package has a class of that name
-    module.sp = Shell(requests)
+    """Be snakemake with a journal, whose executor asks for steps."""
+    from snakemake_interface_executor_plugins.registry import ExecutorPluginRegistry
+
+    executor = importlib.import_module("apertura.run.executor")
+    ExecutorPluginRegistry().register_plugin(f"snakemake_executor_plugin_{PLUGIN}", executor)
+    sys.argv[1:] = [f"--{PLUGIN}-requests={requests.fileno()}", *arguments]
     importlib.import_module("apertura.run.recorder").record()
-
-
-class Shell:
-    """Stands for the module `subprocess` in snakemake's shell: steps are asked for, all else is started.
-
-    Parameters
-    ----------
-    requests
-        Where to ask.
-    """
-
-    def __init__(self, requests: socket.socket) -> None:
-        self._requests = requests
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(subprocess, name)
-
-    def Popen(self, command: str, **how: Any) -> Any:  # noqa: N802 - as subprocess calls it
-        """Return the process of a command, as `subprocess.Popen` does; it begins no later than it is waited for."""
-        found = _COMMAND.fullmatch(command)
-        if found and how.get("stdout") != subprocess.PIPE:
-            words, log = found[1].split(), found[2]
-            asked = {"words": words, "log": log, "folder": str(Path.cwd()), "environment": dict(how["env"])}
-            data = json.dumps(asked).encode()
-            if len(data) < _LONGEST:
-                return StepProcess(self._requests, data)
-        return subprocess.Popen(command, **how)
-
-
-class StepProcess:
-    """A step that was asked for, as `subprocess.Popen` has a process.
-
-    Parameters
-    ----------
-    requests
-        Where to ask.
-    asked
-        What for.
-    """
-
-    def __init__(self, requests: socket.socket, asked: bytes) -> None:
-        self._answer, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        socket.send_fds(requests, [asked], [theirs.fileno()])
-        theirs.close()
-        self.pid = self._told()
-
-    def _told(self) -> int:
-        said = self._answer.recv(32)
-        if not said:
-            raise OSError("the process that runs steps has ended")
-        return int(said)
-
-    def wait(self) -> int:
-        """Let it begin; return its exit status when it has ended."""
-        with self._answer:
-            self._answer.send(b"go")  # not before: who measures it has to find it
-            return self._told()
-
-    def terminate(self) -> None:
-        """Ask it to end."""
-        os.kill(self.pid, signal.SIGTERM)
-
-    def kill(self) -> None:
-        """End it."""
-        os.kill(self.pid, signal.SIGKILL)
 
 
 # ---- In the process of a step ---------------------------------------------------------------------------------------
 
 
-def _step(asked: Mapping[str, Any], answer: socket.socket) -> None:
-    """Be the command of a step, as if a shell had started it."""
-    with answer:
-        if answer.recv(2) != b"go":
-            sys.exit(SIGNALLED)
-    own = {name: os.environ[name] for name in TEMPORARY if name in os.environ}
-    os.environ.clear()
-    os.environ.update({name: value for name, value in asked["environment"].items() if name not in TEMPORARY} | own)
-    tempfile.tempdir = None  # the environment says where
+def _step(asked: Mapping[str, Any]) -> None:
+    """Be the command of a step, as if a shell had started it; write what it took where it ends well."""
+    began_s = time.monotonic()
+    os.environ.update(asked["environment"])
+    os.environ.pop(CONFINED, None)  # said to snakemake
     os.chdir(asked["folder"])
+    sys.argv = ["apertura", *asked["words"]]
+    folder = ConfinedPath.at(asked["folder"])
     try:
-        _redirect(ConfinedPath.at(asked["folder"]) / asked["log"])
+        _redirect(folder / asked["log"])
+        try:
+            pkgutil.resolve_name("apertura.__main__:main")()
+        except SystemExit as ended:
+            if ended.code:
+                raise
+        if asked["benchmark"]:
+            (folder / asked["benchmark"]).write_text(_benchmark(time.monotonic() - began_s), encoding="ascii")
     except CampaignError as error:
         leave_status(2)
         sys.exit(f"error: {error}")
-    sys.argv = ["apertura", *asked["words"]]
-    pkgutil.resolve_name("apertura.__main__:main")()
+
+
+def _benchmark(wall_s: float) -> str:
+    """Return what this process and those that it waited for took, as Snakemake's table of a job."""
+    used = [resource.getrusage(whose) for whose in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    cpu_s = sum(one.ru_utime + one.ru_stime for one in used)
+    row = {
+        "s": f"{wall_s:.2f}",
+        "h:m:s": str(timedelta(seconds=int(wall_s))),
+        "max_rss": f"{max(one.ru_maxrss for one in used) / 1024:.2f}",  # MiB, of the largest process
+        **dict.fromkeys(("max_vms", "max_uss", "max_pss"), "NA"),
+        "io_in": f"{sum(one.ru_inblock for one in used) / 2048:.2f}",  # blocks of 512 bytes as MiB
+        "io_out": f"{sum(one.ru_oublock for one in used) / 2048:.2f}",
+        "mean_load": f"{100 * cpu_s / wall_s:.2f}",
+        "cpu_time": f"{cpu_s:.2f}",
+    }
+    return "\t".join(row) + "\n" + "\t".join(row.values()) + "\n"
 
 
 if __name__ == "__main__":

@@ -103,7 +103,7 @@ def terms(history: PhaseHistory, pixels: NDArray[np.float64], beams: Beams | Non
     step = float(frequency[-1] - frequency[0]) / (len(frequency) - 1)
     weighted = history.transfer * history.weight
     delay = history.aperture.path(pixels) / history.wave_speed_m_s - history.reference_delay_s[:, None]
-    total = _polynomial(weighted.astype(np.complex128, copy=False), np.exp(2j * np.pi * (step * delay % 1.0)))
+    total = polynomial(weighted.astype(np.complex128, copy=False), np.exp(2j * np.pi * (step * delay % 1.0)))
     total *= np.exp(2j * np.pi * (frequency[0] * delay % 1.0))
     if beams is not None:
         total *= beams.weight(history.aperture, pixels)
@@ -111,7 +111,7 @@ def terms(history: PhaseHistory, pixels: NDArray[np.float64], beams: Beams | Non
 
 
 @numba.njit(cache=True, nogil=True)
-def _polynomial(coefficients, argument):  # type: ignore[no-untyped-def]
+def polynomial(coefficients, argument):  # type: ignore[no-untyped-def]
     """Return Σ_n coefficients[p, n]·argument[p, i]**n, (pulse, pixel): Horner, all pixels of a pulse side by side."""
     pulses, count = argument.shape
     real, imag = np.zeros((pulses, count)), np.zeros((pulses, count))

@@ -1,0 +1,95 @@
+"""Snakemake's executor `apertura`: asks for steps at `apertura.run.warm`, the process that they are forks of.
+
+Jobs that are no steps go to Snakemake's own local executor.
+"""
+
+import json
+import re
+import socket
+import threading
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from snakemake_interface_executor_plugins.executors.base import AbstractExecutor, SubmittedJobInfo
+from snakemake_interface_executor_plugins.registry import ExecutorPluginRegistry
+from snakemake_interface_executor_plugins.settings import CommonSettings, ExecutorSettingsBase
+
+common_settings = CommonSettings(non_local_exec=False, implies_no_shared_fs=False, job_deploy_sources=False)
+
+_COMMAND = re.compile(r"apertura (step(?: [\w.-]+)+) > ([\w./-]+) 2>&1")
+"""The command of a step; a shell does the same with it."""
+
+_THREADS = (
+    "OMP_NUM_THREADS",
+    "GOTO_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "VECLIB_MAXIMUM_THREADS",
+    "NUMEXPR_NUM_THREADS",
+)
+"""Environment variables: a job's threads, as Snakemake states them to a shell."""
+
+
+@dataclass
+class ExecutorSettings(ExecutorSettingsBase):  # type: ignore[misc]  # the interface has no types
+    """Options of the executor."""
+
+    requests: int | None = field(default=None, metadata={"help": "descriptor to ask for steps at", "type": int})
+
+
+class Executor(AbstractExecutor):  # type: ignore[misc]
+    """Runs the jobs of a workflow: asks for steps, and reports each end as it is told.
+
+    Parameters
+    ----------
+    workflow, logger
+        Of Snakemake.
+    """
+
+    def __init__(self, workflow: Any, logger: Any) -> None:
+        super().__init__(workflow, logger)
+        self._local = ExecutorPluginRegistry().get_plugin("local").executor(workflow, logger)
+        self._requests = socket.socket(fileno=workflow.executor_settings.requests)
+        self._running: dict[int, SubmittedJobInfo] = {}
+        threading.Thread(target=self._report, daemon=True).start()
+
+    def run_job(self, job: Any) -> None:
+        """Begin a job."""
+        step = None if job.is_group() or job.is_shadow else _COMMAND.fullmatch(job.shellcmd or "")
+        if not step:
+            self._local.run_job(job)
+            return
+        self.workflow.async_run(job.prepare())
+        self._running[job.jobid] = info = SubmittedJobInfo(job)
+        self._local.report_job_submission(info)  # which marks its results as incomplete
+        asked = {
+            "job": job.jobid,
+            "words": step[1].split(),
+            "folder": str(Path.cwd()),
+            "log": step[2],
+            "benchmark": str(job.benchmark or ""),
+            "environment": dict.fromkeys(_THREADS, str(job.threads)),
+        }
+        self._requests.send(json.dumps(asked).encode())
+
+    def _report(self) -> None:
+        """Tell Snakemake of each step that has ended."""
+        while said := self._requests.recv(64):
+            job, status = json.loads(said)
+            info = self._running.pop(job)
+            if status:
+                self.report_job_error(info, msg=f"exit status {status}")
+            else:
+                self.report_job_success(info)
+
+    def shutdown(self) -> None:
+        """Wait for the jobs that are no steps; steps end with Snakemake's process."""
+        self._local.shutdown()
+
+    cancel = shutdown
+
+    def handle_job_success(self, job: Any) -> None:
+        """Do nothing more: Snakemake has been told."""
+
+    handle_job_error = handle_job_success
