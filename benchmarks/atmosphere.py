@@ -1,6 +1,6 @@
 """Campaigns flown in air, focused with it and without: where targets are found, at 30 m, 300 m and 3 km.
 
-Each leg of each path is simulated by the air at the heights of its own ends (`apertura.simulation.echoes.TrueAir`);
+Each leg of each path is simulated by the air at the heights of its own ends (`apertura.simulation.scatterers.TrueAir`);
 by
 `--weather` it is 10 °C warmer, 20 hPa denser and wetter than the standard atmosphere. The pipeline knows but one N
 for each pair. Run: `.venv/bin/python benchmarks/atmosphere.py [--weather] [HEIGHT …]`; a table on the screen.

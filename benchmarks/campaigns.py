@@ -15,8 +15,8 @@ from apertura.core.imaging.range_profiles import GUARD_SAMPLES, OVERSAMPLING, ra
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.swath import swath
 from apertura.core.scene.terrain import FlatGround, GroundModels
-from apertura.simulation.echoes import transfer
-from apertura.simulation.scene import Scatterers
+from apertura.simulation.scatterers import transfer
+from apertura.simulation.targets import Scatterers
 
 FLAT = FlatGround(0.0)
 

@@ -23,7 +23,7 @@ from apertura.campaign.store import open_stage
 from apertura.core.geometry.geodesy import frame_from_map, geodetic_from_ecef
 from apertura.core.quality.point_targets import cut_through, find_peak
 from apertura.core.scene.angles import surface
-from apertura.simulation.scene import Clutter, Origin, PointTarget
+from apertura.simulation.targets import Clutter, Origin, PointTarget
 from apertura.stages import interferogram, layers
 from apertura.stages.pair import open_pair
 from apertura.stages.radiometry import calibrated_pair

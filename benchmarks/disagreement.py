@@ -21,7 +21,7 @@ from spoiling.folder import RX, Captures, Folder
 
 import apertura as ap
 from apertura.simulation import CampaignSpecification, ImageGrid, SimulatedFlight, Straight, preset
-from apertura.simulation.scene import PointTarget
+from apertura.simulation.targets import PointTarget
 
 _TARGETS = ((0.0, 0.0), (-3.85, -2.8), (4.2, 3.15), (2.1, -4.34), (-4.2, 4.2))
 """Metres east and north of the scene's middle, 16 m beside the track."""

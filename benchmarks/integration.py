@@ -14,8 +14,8 @@ from apertura import PhaseHistory, SceneGrid, backproject
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.imaging.job import decide_integration
 from apertura.core.scene.terrain import FlatGround
-from apertura.simulation.echoes import transfer
-from apertura.simulation.scene import Scatterers
+from apertura.simulation.scatterers import transfer
+from apertura.simulation.targets import Scatterers
 
 FREQUENCY = 1.2e9 + 1e6 * np.arange(96)
 SIDE, TARGETS, PULSES = 40, 4, 150

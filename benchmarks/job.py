@@ -16,8 +16,8 @@ from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
 from apertura.core.antenna.beam import Beams
 from apertura.core.backprojection.inputs import Profiles
 from apertura.core.geometry.aperture import Aperture
-from apertura.simulation.echoes import transfer
-from apertura.simulation.scene import Scatterers
+from apertura.simulation.scatterers import transfer
+from apertura.simulation.targets import Scatterers
 
 SUBCARRIERS, SPACING_HZ, CENTRE_HZ = 4096, 100e3, 1.2e9
 GUARD = 16

@@ -35,8 +35,8 @@ from apertura.core.quality.agreement import agreement
 from apertura.core.quality.bright_points import BrightPoint
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import FlatGround, GroundModels
-from apertura.simulation.echoes import transfer
-from apertura.simulation.scene import Scatterers
+from apertura.simulation.scatterers import transfer
+from apertura.simulation.targets import Scatterers
 
 BANDWIDTH_HZ, CENTRE_HZ, SPACING_M, TILE = 409.6e6, 1.2e9, 0.1, 256
 

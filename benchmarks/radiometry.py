@@ -28,11 +28,11 @@ from apertura.core.imaging.speckle import Multilook, Speckle
 from apertura.core.quality.bright_points import bright_point
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import FlatGround, Plane, Terrain
-from apertura.simulation.echoes import transfer
 from apertura.simulation.impairments import Impairments, Radio, draw_impairments
 from apertura.simulation.observation import physical
-from apertura.simulation.scene import Scatterers
+from apertura.simulation.scatterers import transfer
 from apertura.simulation.synthesis import Geometry, receive, transfer_functions
+from apertura.simulation.targets import Scatterers
 from apertura.simulation.waveform import TransmitWaveform, qpsk_codes
 from apertura.stages.radiometry import LEAST_CONTRAST
 

@@ -39,8 +39,8 @@ from apertura.core.imaging.range_profiles import RangeWindow, Rows, range_compre
 from apertura.core.planning.planner import make_plan
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import FlatGround, GroundModels
-from apertura.simulation.echoes import transfer
-from apertura.simulation.scene import Scatterers
+from apertura.simulation.scatterers import transfer
+from apertura.simulation.targets import Scatterers
 
 FLAT = FlatGround(0.0)
 SPEED_M, HEIGHT_M = 0.02, 40.0

@@ -19,7 +19,7 @@ from apertura.core.echo.compression import window_weights
 from apertura.core.geometry.geodesy import frame_from_map
 from apertura.core.quality.point_targets import cut_through, find_peak
 from apertura.simulation import Impairments, PulseSpecification, WaveformSpecification, preset, simulate
-from apertura.simulation.scene import PointTarget
+from apertura.simulation.targets import PointTarget
 from apertura.stages import echo, image, ingest, profile, refine, scene
 from apertura.stages.scene import open_scene
 

@@ -37,8 +37,8 @@ from apertura.simulation import (
 )
 from apertura.simulation.observation import Observation, fly
 from apertura.simulation.presets import DEMO_ORIGIN
-from apertura.simulation.scene import scatterers
 from apertura.simulation.specification import DrawnCampaign, draw_campaign
+from apertura.simulation.targets import scatterers
 from apertura.stages import (
     assess,
     coverage,

@@ -19,8 +19,8 @@ from apertura.core.planning.plan import Plan
 from apertura.core.planning.planner import make_plan
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import FlatGround, GridHeights, GroundModels
-from apertura.simulation.echoes import transfer
-from apertura.simulation.scene import Scatterers
+from apertura.simulation.scatterers import transfer
+from apertura.simulation.targets import Scatterers
 
 compiled = pytest.mark.skipif(not native.available(), reason="apertura was installed without a compiler")
 WAVELENGTH = C / 1.2e9

@@ -23,7 +23,7 @@ from apertura.formats.recordings.sample_file import EDGE, SETTLING, Mixing, Samp
 from apertura.simulation.campaign import write_campaign
 from apertura.stages import echo, ingest
 from apertura.stages.transfer import PairEcho
-from apertura.views.inspect.look import look
+from apertura.views.inspect.path import look
 
 RATE_HZ, DFT = 64e6, 256
 NODES = {"a": 1, "b": 2}

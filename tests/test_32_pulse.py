@@ -11,7 +11,7 @@ from apertura.core.echo.captures import blocks_of
 from apertura.core.echo.demodulate import Numerology, demodulate
 from apertura.core.echo.pulse_filter import occupied_band, pulse_filter, pulse_spectrum, truncation_flags
 from apertura.core.echo.transfer import transfer_by_sidelink
-from apertura.simulation.echoes import Paths
+from apertura.simulation.scatterers import Paths
 from apertura.simulation.synthesis import Channel, samples
 from apertura.simulation.waveform import TransmitPulse, pulse_samples
 from apertura.stages.transmitted import read_pulse, transmitted

@@ -17,8 +17,8 @@ from apertura.methods.autofocus.ground_coherence import SpeckleTiles, refined_by
 from apertura.methods.autofocus.inputs import NodePrior, PairRecord, Prior, TrackErrors
 from apertura.methods.autofocus.objective import Blocks
 from apertura.methods.autofocus.solve import Gauge, minimise
-from apertura.simulation.echoes import transfer
-from apertura.simulation.scene import Scatterers
+from apertura.simulation.scatterers import transfer
+from apertura.simulation.targets import Scatterers
 
 FREQUENCY_HZ = 1.2e9 + 3.2e6 * np.arange(128)
 TIME_S = 0.05 * np.arange(600)

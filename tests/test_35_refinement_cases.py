@@ -9,8 +9,8 @@ from scenes import compiled
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.geometry.aperture import Aperture
 from apertura.methods.autofocus.inputs import TrackErrors
-from apertura.simulation.echoes import transfer
-from apertura.simulation.scene import Scatterers
+from apertura.simulation.scatterers import transfer
+from apertura.simulation.targets import Scatterers
 
 FREQUENCY_HZ = 1.2e9 + 3.2e6 * np.arange(128)
 

@@ -15,7 +15,10 @@ from apertura.common.errors import CampaignError
 from apertura.core.geometry.geodesy import ecef_from_geodetic, ecef_from_projected
 from apertura.simulation import preset, simulate
 from apertura.simulation.impairments import Impairments, Localization
-from apertura.simulation.scene import (
+from apertura.simulation.specification import (
+    SimulatedNode,
+)
+from apertura.simulation.targets import (
     Clutter,
     GaussianBeam,
     Line,
@@ -27,9 +30,6 @@ from apertura.simulation.scene import (
     Wobble,
     phase_centre,
     scatterers,
-)
-from apertura.simulation.specification import (
-    SimulatedNode,
 )
 
 C = 299_792_458.0

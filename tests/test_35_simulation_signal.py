@@ -7,7 +7,6 @@ import pytest
 from numpy.testing import assert_allclose
 
 from apertura.simulation.continuous import Framing
-from apertura.simulation.echoes import Paths
 from apertura.simulation.impairments import (
     Adc,
     Blockage,
@@ -24,7 +23,7 @@ from apertura.simulation.impairments import (
 )
 from apertura.simulation.observation import observe
 from apertura.simulation.presets import paper_scene, paper_waveform
-from apertura.simulation.scene import Scatterers
+from apertura.simulation.scatterers import Paths
 from apertura.simulation.synthesis import (
     Channel,
     Geometry,
@@ -34,6 +33,7 @@ from apertura.simulation.synthesis import (
     samples,
     transfer_functions,
 )
+from apertura.simulation.targets import Scatterers
 from apertura.simulation.waveform import TransmitWaveform, qpsk_codes
 
 C = 299_792_458.0

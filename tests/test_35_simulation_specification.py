@@ -15,13 +15,13 @@ from apertura.core.geometry.geodesy import projected_from_ecef
 from apertura.simulation import preset, read_specification, simulate, specification_text
 from apertura.simulation.impairments import Impairments, TimeTag, UniformPhase
 from apertura.simulation.presets import PRESETS
-from apertura.simulation.scene import Clutter, Origin, PointTarget, Straight, Waypoints, Wobble, scatterers
 from apertura.simulation.specification import (
     CampaignSpecification,
     ImageGrid,
     SimulatedFlight,
     SimulatedNode,
 )
+from apertura.simulation.targets import Clutter, Origin, PointTarget, Straight, Waypoints, Wobble, scatterers
 from apertura.simulation.waveform import WaveformSpecification
 
 

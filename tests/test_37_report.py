@@ -10,15 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
-from apertura.views.report.flight_drawings import (
-    FlownGeometry,
-    PulseRecord,
-    Waterfall,
-    draw_geometry,
-    draw_pulses,
-    draw_waterfall,
-)
-from apertura.views.report.image_drawings import (
+from apertura.views.report.cuts_and_profiles import (
     DrawnCut,
     Measured,
     draw_budget,
@@ -26,6 +18,14 @@ from apertura.views.report.image_drawings import (
     draw_phase,
     sidelink_error_rad,
     steadiness,
+)
+from apertura.views.report.geometry_and_pulses import (
+    FlownGeometry,
+    PulseRecord,
+    Waterfall,
+    draw_geometry,
+    draw_pulses,
+    draw_waterfall,
 )
 from apertura.views.report.page import Heading, Paragraph, Picture, Table, page, rst_table, rst_text
 from apertura.views.report.pictures import draw_panels

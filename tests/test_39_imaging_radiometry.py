@@ -18,8 +18,8 @@ from apertura.core.imaging.radiometry import Calibration, Link, cell_constant, p
 from apertura.core.scene.angles import surface
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import FlatGround, Plane
-from apertura.simulation.echoes import transfer
-from apertura.simulation.scene import Scatterers
+from apertura.simulation.scatterers import transfer
+from apertura.simulation.targets import Scatterers
 
 FREQUENCY = 1.3e9 + 1.6e6 * (np.arange(128) - 64)
 GRID = SceneGrid("local", -3.0, 23.0, 0.125, (48, 48))

@@ -22,7 +22,7 @@ from apertura.methods.synchronisation.channels import measure_channel
 from apertura.methods.synchronisation.links import measure_link
 from apertura.simulation import Impairments, preset
 from apertura.simulation.campaign import write_campaign
-from apertura.simulation.scene import Waypoints
+from apertura.simulation.targets import Waypoints
 from apertura.stages import echo, ingest
 from apertura.tools.bench.measurement import Bench, measure_bench
 from apertura.tools.bench.report import PAGE, PICTURE, REPORT, print_bench

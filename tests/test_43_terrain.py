@@ -23,7 +23,7 @@ from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import FlatGround
 from apertura.simulation import ImageGrid, preset, simulate
 from apertura.simulation.presets import DEMO_ORIGIN
-from apertura.simulation.scene import PointTarget
+from apertura.simulation.targets import PointTarget
 from apertura.stages import profile, scene
 from apertura.stages.pair import open_pair
 from apertura.stages.planning import job_of, plan_pair

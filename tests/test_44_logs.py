@@ -15,7 +15,7 @@ from apertura.core.geometry.geodesy import ecef_from_geodetic
 from apertura.formats.tracks.track import damaged, make_track
 from apertura.simulation import Impairments, PointTarget, Straight, simulate
 from apertura.simulation.impairments import TimeTag
-from apertura.simulation.scene import Wobble
+from apertura.simulation.targets import Wobble
 from apertura.stages import echo, ingest
 from apertura.stages.node_log import NodeLog, raw_log
 from apertura.stages.pair import open_pair

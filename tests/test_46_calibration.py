@@ -10,7 +10,7 @@ from folders import complaint, edit_config
 
 from apertura.campaign.folder import Campaign
 from apertura.simulation import ImageGrid, preset, simulate
-from apertura.simulation.scene import PointTarget
+from apertura.simulation.targets import PointTarget
 from apertura.stages import calibration, echo, ingest
 from apertura.stages.transfer import PairEcho
 from apertura.workflow.lineage import result_of

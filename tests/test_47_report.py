@@ -10,7 +10,7 @@ from folders import complaint, copy_writable, edit_config
 from apertura.campaign.folder import Campaign
 from apertura.campaign.store import open_document, read_manifest
 from apertura.views.report import PICTURES
-from apertura.views.report.image_drawings import steadiness
+from apertura.views.report.cuts_and_profiles import steadiness
 from apertura.views.report.pictures import Shown, pictures, pictures_fused
 from apertura.views.report.step import landing, page
 from apertura.views.verify.products import read_tags

@@ -15,7 +15,7 @@ from apertura.campaign.folder import Campaign
 from apertura.campaign.store import open_stage
 from apertura.common.documents import read_json
 from apertura.core.quality.point_targets import cut_through, find_peak
-from apertura.simulation.scene import PointTarget
+from apertura.simulation.targets import PointTarget
 from apertura.stages.scene import open_scene
 from apertura.tools.design import designed
 from apertura.tools.design.computed import rehearse

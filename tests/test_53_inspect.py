@@ -27,7 +27,7 @@ from apertura.formats.export.cog import write_power, write_slc
 from apertura.formats.reading import read_track
 from apertura.formats.tracks.track import make_track
 from apertura.simulation.fmcw import FmcwFlight, write_fmcw_campaign
-from apertura.views.inspect.look import inspect_path, look
+from apertura.views.inspect.path import inspect_path, look
 from apertura.views.inspect.pictures import draw_history, draw_log
 
 APERTURA = Path(sys.executable).parent / "apertura"

@@ -13,7 +13,7 @@ from folders import SHARED, copy_writable
 
 from apertura.common.errors import CampaignError
 from apertura.formats.names import PHASE_HISTORIES, RECORDERS, TRACKS, HistoryFormat, LogFormat, log_suffixes
-from apertura.views.inspect.look import inspect_path, look
+from apertura.views.inspect.path import inspect_path, look
 
 APERTURA = Path(sys.executable).parent / "apertura"
 F01 = SHARED / "campaign-sample/raw/f01"

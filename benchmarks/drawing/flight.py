@@ -7,7 +7,7 @@ import numpy as np
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
 from apertura.simulation import Straight, Waypoints, Wobble
-from apertura.simulation.scene import Track, Vector
+from apertura.simulation.targets import Track, Vector
 from drawing.dice import CHANCE_OF_A_FLAW, Dice
 
 KINDS = ("straight", "circular", "squinted", "climbing")

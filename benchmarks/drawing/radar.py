@@ -8,7 +8,7 @@ import numpy as np
 from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
 from apertura.simulation import Impairments, SimulatedNode, WaveformSpecification
 from apertura.simulation.impairments import Clock, TimeTag, Timing, UniformPhase
-from apertura.simulation.scene import Track
+from apertura.simulation.targets import Track
 from drawing.dice import CHANCE_OF_A_FLAW, Dice
 from drawing.flight import MOST_SUBCARRIERS, Geometry, track
 

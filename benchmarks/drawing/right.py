@@ -15,7 +15,7 @@ from apertura.simulation import (
     SimulatedFlight,
     WaveformSpecification,
 )
-from apertura.simulation.scene import Target
+from apertura.simulation.targets import Target
 from drawing.dice import CHANCE_OF_A_FLAW, Dice
 from drawing.flight import Geometry, draw_geometry
 from drawing.radar import draw_nodes, draw_waveform

@@ -22,8 +22,8 @@ from apertura.core.backprojection.inputs import PhaseHistory
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import FlatGround, GridHeights, Terrain
-from apertura.simulation.echoes import transfer
-from apertura.simulation.scene import Scatterers
+from apertura.simulation.scatterers import transfer
+from apertura.simulation.targets import Scatterers
 
 Geometry = Literal["monostatic", "bistatic", "low", "spotlight"]
 Surface = Literal["flat", "smooth", "rough"]

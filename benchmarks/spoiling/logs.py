@@ -10,7 +10,7 @@ from apertura.common.arrays import Floats
 from apertura.common.leap_seconds import gps_from_utc, utc_from_gps
 from apertura.core.geometry.geodesy import ecef_from_geodetic, geodetic_from_ecef
 from apertura.formats.campaign_files import write_csv_log
-from apertura.simulation.scene import Origin
+from apertura.simulation.targets import Origin
 
 
 @dataclass(frozen=True)

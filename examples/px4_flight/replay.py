@@ -12,7 +12,7 @@ import numpy as np
 from apertura.core.geometry.geodesy import geodetic_from_ecef, ned_axes
 from apertura.formats.reading import read_track
 from apertura.simulation import simulate
-from apertura.simulation.scene import Origin, PointTarget, Waypoints
+from apertura.simulation.targets import Origin, PointTarget, Waypoints
 from apertura.simulation.specification import (
     CampaignSpecification,
     ImageGrid,

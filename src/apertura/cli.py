@@ -231,7 +231,7 @@ def inspect(
 ) -> None:
     """Tell what a file or folder is, its times, rates, gaps, fix and bounds, and what is missing for an image."""
     picture = None if plot is None else given(plot)
-    from apertura.views.inspect.look import inspect_path
+    from apertura.views.inspect.path import inspect_path
 
     raise typer.Exit(inspect_path(given(path), settings or (), name=path, plot=picture, as_json=as_json))
 

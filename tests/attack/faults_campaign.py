@@ -10,7 +10,7 @@ import yaml
 from rasterio.transform import from_origin
 
 from apertura.simulation import ImageGrid, preset, simulate
-from apertura.simulation.scene import PointTarget
+from apertura.simulation.targets import PointTarget
 
 STEPS = (
     "ingest c01 uav1",

@@ -11,11 +11,10 @@ from scipy.signal import CZT
 
 from apertura.common.arrays import Complexes
 from apertura.core.echo.demodulate import subcarrier_numbers
-from apertura.simulation.echoes import spectrum
 from apertura.simulation.impairments import Impairments
 from apertura.simulation.observation import Observation, observe
 from apertura.simulation.presets import paper_scene, paper_waveform
-from apertura.simulation.scene import Scatterers
+from apertura.simulation.scatterers import spectrum
 from apertura.simulation.synthesis import (
     Channel,
     Geometry,
@@ -25,6 +24,7 @@ from apertura.simulation.synthesis import (
     sampling_rate,
     transfer_functions,
 )
+from apertura.simulation.targets import Scatterers
 from apertura.simulation.waveform import TransmitWaveform, newman_codes, qpsk_codes
 
 LENGTH_M = 30.0

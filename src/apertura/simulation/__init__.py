@@ -13,7 +13,15 @@ from apertura.simulation.campaign import write_campaign
 from apertura.simulation.continuous import Framing
 from apertura.simulation.impairments import Impairments, Radio
 from apertura.simulation.presets import PRESETS
-from apertura.simulation.scene import (
+from apertura.simulation.specification import (
+    CampaignSpecification,
+    ImageGrid,
+    SimulatedFlight,
+    SimulatedNode,
+    read_specification,
+    specification_text,
+)
+from apertura.simulation.targets import (
     Clutter,
     GaussianBeam,
     Line,
@@ -25,14 +33,6 @@ from apertura.simulation.scene import (
     Track,
     Waypoints,
     Wobble,
-)
-from apertura.simulation.specification import (
-    CampaignSpecification,
-    ImageGrid,
-    SimulatedFlight,
-    SimulatedNode,
-    read_specification,
-    specification_text,
 )
 from apertura.simulation.waveform import PulseSpecification, WaveformSpecification
 

@@ -18,7 +18,6 @@ from apertura.formats.tracks.track import FIXES
 from apertura.simulation.continuous import continuous_blocks, pulse_samples, recording_start_s
 from apertura.simulation.impairments import Adc, independent_streams
 from apertura.simulation.observation import Observation, fly
-from apertura.simulation.scene import Origin, PointTarget, Target, phase_centre, scatterers
 from apertura.simulation.specification import (
     CampaignSpecification,
     DrawnCampaign,
@@ -27,6 +26,7 @@ from apertura.simulation.specification import (
     draw_campaign,
 )
 from apertura.simulation.synthesis import digitize, full_scale, periodic_samples, samples
+from apertura.simulation.targets import Origin, PointTarget, Target, phase_centre, scatterers
 
 _LOG_MARGIN_S = 2.0
 _RTK_STD_M = 0.005, 0.005, 0.01  # north, east, up: what a receiver states of a fixed solution

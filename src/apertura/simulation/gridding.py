@@ -28,7 +28,7 @@ def gridded_sum(
     *,
     spreading: bool,
 ) -> NDArray[np.complex128]:
-    """Return (pulse, subcarrier) complex128, as `apertura.simulation.echoes.transfer` defines it.
+    """Return (pulse, subcarrier) complex128, as `apertura.simulation.scatterers.transfer` defines it.
 
     Parameters
     ----------

@@ -18,9 +18,9 @@ from apertura.simulation.impairments import (
     draw_impairments,
     independent_streams,
 )
-from apertura.simulation.scene import Scatterers, body_turn, logged_velocity, phase_centre
 from apertura.simulation.specification import DrawnCampaign, SimulatedFlight
 from apertura.simulation.synthesis import Channel, Geometry, receive
+from apertura.simulation.targets import Scatterers, body_turn, logged_velocity, phase_centre
 from apertura.simulation.waveform import TransmitWaveform
 
 _Node = tuple[Impairments, ImpairmentDraw]

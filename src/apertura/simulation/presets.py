@@ -21,9 +21,9 @@ from apertura.simulation.impairments import (
     Timing,
     UniformPhase,
 )
-from apertura.simulation.scene import Clutter, Line, Origin, PointTarget, Scatterers, Straight, Target, Vector, Wobble
 from apertura.simulation.specification import CampaignSpecification, ImageGrid, SimulatedFlight, SimulatedNode
 from apertura.simulation.synthesis import Geometry, straight_pair
+from apertura.simulation.targets import Clutter, Line, Origin, PointTarget, Scatterers, Straight, Target, Vector, Wobble
 from apertura.simulation.waveform import TransmitWaveform, WaveformSpecification
 
 PAPER_WAVEFORM = WaveformSpecification(4096, 1.2e9, 100e3, 12.5e-6, 3.125e-6, 1.024e9, 100.0, code="newman")

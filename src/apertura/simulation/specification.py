@@ -19,7 +19,6 @@ from apertura.common.documents import read_yaml, validated
 from apertura.core.geometry.atmosphere import Atmosphere
 from apertura.core.geometry.geodesy import geodetic_from_ecef, projected_from_ecef
 from apertura.simulation.continuous import Framing
-from apertura.simulation.echoes import TrueAir
 from apertura.simulation.impairments import (
     STRICT_KEYS,
     AntennaPoint,
@@ -29,7 +28,8 @@ from apertura.simulation.impairments import (
     Radio,
     independent_streams,
 )
-from apertura.simulation.scene import GaussianBeam, Origin, Target, Track, Trajectory, Vector
+from apertura.simulation.scatterers import TrueAir
+from apertura.simulation.targets import GaussianBeam, Origin, Target, Track, Trajectory, Vector
 from apertura.simulation.waveform import TransmittedSpecification, TransmitWaveform
 
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.]*$")]

@@ -20,9 +20,9 @@ from scipy import fft
 from apertura.common.arrays import Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.echo.compression import unit_phasor
-from apertura.simulation.echoes import Paths, TrueAir, direct_path, echo_paths, spectrum
 from apertura.simulation.impairments import Adc, ChannelName, ImpairmentDraw, Impairments, Ripple
-from apertura.simulation.scene import Scatterers
+from apertura.simulation.scatterers import Paths, TrueAir, direct_path, echo_paths, spectrum
+from apertura.simulation.targets import Scatterers
 from apertura.simulation.waveform import TransmitWaveform
 
 Complex = NDArray[np.complex128]
@@ -227,7 +227,7 @@ def periodic_samples(channel: Channel, generator: Generator | None, pulses: NDAr
 
     Examples
     --------
-    >>> from apertura.simulation.echoes import Paths
+    >>> from apertura.simulation.scatterers import Paths
     >>> from apertura.simulation.waveform import TransmitWaveform
     >>> wave = TransmitWaveform(np.ones(4), 1e9, "band_start", 1e6, 1e-6, 0.5e-6, 8e6, 1.0)
     >>> path = Paths(np.array([[0.25e-6]]), np.array([[1.0 + 0j]]), np.zeros((1, 1)))

@@ -11,7 +11,7 @@ from apertura.common.documents import undamaged
 from apertura.common.errors import number_of, shown
 from apertura.formats.export import MAP, exports_in
 from apertura.run.results import counted, states
-from apertura.views.image_report import (
+from apertura.views.quality import (
     ImageValues,
     Report,
     decibels,

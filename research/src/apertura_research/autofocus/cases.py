@@ -17,8 +17,8 @@ from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import FlatGround
 from apertura.methods.autofocus.causes import Cause, late_logs, other_arm, other_height
 from apertura.methods.autofocus.inputs import PairRecord, TrackErrors
-from apertura.simulation.echoes import transfer
-from apertura.simulation.scene import Scatterers
+from apertura.simulation.scatterers import transfer
+from apertura.simulation.targets import Scatterers
 
 AREA_M = (-9.0, 5.0, 9.0, 25.0)
 GRID = SceneGrid("local", -10.0, 26.0, 0.05, (440, 400))

@@ -24,8 +24,8 @@ from apertura.core.quality.path_errors import PointPaths
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import FlatGround, Terrain
 from apertura.simulation.impairments import Impairments
-from apertura.simulation.scene import GaussianBeam, Sampled, Straight, Wobble
 from apertura.simulation.synthesis import Geometry
+from apertura.simulation.targets import GaussianBeam, Sampled, Straight, Wobble
 from apertura_research.paper_scene import RX_AHEAD_M, Disturbance, PaperScene, receive_pair, reduced_scene
 
 PAIRS = ("a-a", "a-b")

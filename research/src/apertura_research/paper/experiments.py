@@ -17,7 +17,7 @@ from apertura.core.echo.transfer import transfer_by_code
 from apertura.core.imaging.range_profiles import phase_history_of
 from apertura.core.quality.measures import coherence_factor
 from apertura.simulation import CampaignSpecification, Line, PointTarget, preset
-from apertura.simulation.scene import Clutter, Target, Vector
+from apertura.simulation.targets import Clutter, Target, Vector
 from apertura.stages.acquisition import open_acquisition
 from apertura.stages.transmitted import transmitted
 from apertura.tools.open_campaign import OpenCampaign, open_campaign

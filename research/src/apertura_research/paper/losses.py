@@ -12,8 +12,8 @@ from apertura.core.backprojection.inputs import PhaseHistory
 from apertura.core.echo.sidelink import divide
 from apertura.simulation.impairments import Clock, Impairments, Timing, UniformPhase
 from apertura.simulation.presets import paper_waveform
-from apertura.simulation.scene import Scatterers
 from apertura.simulation.synthesis import straight_pair
+from apertura.simulation.targets import Scatterers
 from apertura_research import point_response
 from apertura_research.paper.claims import Claim, compare, require
 from apertura_research.paper.experiments import profiles_at

@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 
 from apertura.common.arrays import Complexes, Floats
-from apertura.simulation.scene import Scatterers
 from apertura.simulation.synthesis import straight_pair
+from apertura.simulation.targets import Scatterers
 from apertura_research.paper.claims import Claim, compare, fitted_to
 from apertura_research.paper.parameters import (
     HALF_POWER_OF_HANN,

@@ -19,8 +19,8 @@ from apertura.formats.phase_histories.fmcw import sweep_of
 from apertura.methods.autofocus.expected import expected_remainder
 from apertura.simulation.campaign import write_campaign
 from apertura.simulation.impairments import Adc, Impairments, Localization, RadarPoint, Radio
-from apertura.simulation.scene import GaussianBeam, Origin, Target, Waypoints
 from apertura.simulation.specification import CampaignSpecification, ImageGrid, SimulatedFlight, SimulatedNode
+from apertura.simulation.targets import GaussianBeam, Origin, Target, Waypoints
 from apertura.simulation.waveform import WaveformSpecification
 from apertura.stages.pair import OpenPair
 from apertura.stages.refine import autofocus_of, errors_of

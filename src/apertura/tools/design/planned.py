@@ -34,7 +34,7 @@ from apertura.core.scene.terrain import GridHeights
 from apertura.formats.phase_histories.fmcw import sweep_of
 from apertura.formats.tracks.missions import read_mission
 from apertura.formats.tracks.track import FIXES, make_track
-from apertura.simulation.scene import Straight, Wobble
+from apertura.simulation.targets import Straight, Wobble
 from apertura.stages.node_log import NodeLog, shortest_wave
 from apertura.stages.pair import OpenPair, expected_pair
 from apertura.stages.planning import integration_of

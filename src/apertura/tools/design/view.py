@@ -35,8 +35,8 @@ from apertura.tools.design.judgement import (
 )
 from apertura.tools.design.layers import UNITS, PlannedImage, planned_image
 from apertura.tools.design.writing import PICTURE_TAGS, copy_named, plan_text, write_design
-from apertura.views.image_report import read_report
 from apertura.views.plan import first_flight
+from apertura.views.quality import read_report
 from apertura.views.report.page import Block, Heading, Paragraph, Picture, Table, page
 from apertura.views.report.sheet import BLUE, GREY, ORANGE, RED, sheet
 from apertura.workflow.stale import outdated_lines, without_outdated

@@ -40,7 +40,7 @@ from apertura.stages.transfer import PairEcho, recorded_echo
 from apertura.stages.transmitted import transmitted
 from apertura.tools.look.node import NodeSoFar
 from apertura.tools.look.pair import PairSoFar, PulseBlock
-from apertura.views.image_report import explained_flags
+from apertura.views.quality import explained_flags
 from apertura.views.webmap.document import Layer, Place, crs_of, map_document, stated_places, true_places, url_of
 
 _POLLS = 2  # looks at the files for each picture

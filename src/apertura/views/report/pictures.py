@@ -38,15 +38,7 @@ from apertura.stages.refine import open_refined
 from apertura.stages.scene import OpenScene, open_scene, settled_scene
 from apertura.stages.stamping import tags_of
 from apertura.views.report import PICTURES, SUM_PICTURES
-from apertura.views.report.flight_drawings import (
-    FlownGeometry,
-    PulseRecord,
-    Waterfall,
-    draw_geometry,
-    draw_pulses,
-    draw_waterfall,
-)
-from apertura.views.report.image_drawings import (
+from apertura.views.report.cuts_and_profiles import (
     DrawnCut,
     Measured,
     draw_budget,
@@ -54,6 +46,14 @@ from apertura.views.report.image_drawings import (
     draw_phase,
     drawn_cuts,
     sidelink_error_rad,
+)
+from apertura.views.report.geometry_and_pulses import (
+    FlownGeometry,
+    PulseRecord,
+    Waterfall,
+    draw_geometry,
+    draw_pulses,
+    draw_waterfall,
 )
 from apertura.views.report.sheet import GREY, SKY, sheet, thinned
 from apertura.workflow.lineage import result_of

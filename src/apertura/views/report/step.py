@@ -16,7 +16,7 @@ from apertura.common.paths import shipped
 from apertura.core.geometry.geodesy import LOCAL, geodetic_from_ecef
 from apertura.formats.export import exports_in
 from apertura.stages.scene import OpenScene, settled_scene
-from apertura.views.image_report import (
+from apertura.views.quality import (
     BUDGET,
     DECISIONS,
     FLAGGED,

@@ -21,7 +21,7 @@ from apertura.core.geometry.geodesy import LOCAL, frame_from_map, geodetic_from_
 from apertura.core.scene.grid import SceneGrid
 from apertura.formats.export import COVERAGE, MAP, Export, exports_in
 from apertura.stages.scene import settled_scene
-from apertura.views.image_report import ImageValues, explained_flags, read_report
+from apertura.views.quality import ImageValues, explained_flags, read_report
 from apertura.workflow.lineage import result_of
 
 FORMAT = 1

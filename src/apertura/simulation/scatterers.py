@@ -13,7 +13,7 @@ from apertura.common.arrays import Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.geometry.aperture import Aperture, distance
 from apertura.core.geometry.atmosphere import Atmosphere
-from apertura.simulation.scene import Scatterers
+from apertura.simulation.targets import Scatterers
 
 _BLOCK = 64  # subcarriers that share one exponential
 _TERMS = 2**22  # exponentials at once in the exact sum
