@@ -289,9 +289,9 @@ def test_steps_are_forks_that_end_with_the_run_whatever_is_killed_outright(tiny,
     assert all(b"apertura.run.warm" in command for command in processes.values())
     warm, snakemake_itself, *steps = processes
     assert steps
-    assert {state_and_parent(one)[1] for one in (snakemake_itself, *steps)} == {
-        warm
-    }  # no process of snakemake is in between
+    for one in (snakemake_itself, *steps):
+        with contextlib.suppress(OSError):  # a step may have ended by now
+            assert state_and_parent(one)[1] == warm  # no process of snakemake is in between
     os.kill({"the run": run.pid, "snakemake": snakemake_itself}.get(killed, warm), signal.SIGKILL)
     code, output = finished(run, timeout=60)
     assert code == (-signal.SIGKILL if killed == "the run" else 1)

@@ -114,7 +114,7 @@ def _begun(requests: socket.socket) -> BaseProcess:
     order = Order(**json.loads(said))
     os.environ.update(order.environment)
     _redirect(ConfinedPath.referenced(order.output))
-    snakemake = _fork(target=_child, args=(_snakemake, requests, order.arguments))
+    snakemake = _fork(target=_child, args=(os.getpid(), _snakemake, requests, order.arguments))
     snakemake.start()
     return snakemake
 
@@ -127,7 +127,7 @@ def _serve(requests: socket.socket, snakemake: BaseProcess) -> None:
             if ready is requests and (said := requests.recv(_LONGEST)):
                 _import()
                 asked = json.loads(said)
-                begun = _fork(target=_child, args=(_step, asked))
+                begun = _fork(target=_child, args=(os.getpid(), _step, asked))
                 begun.start()
                 running[begun.sentinel] = begun, asked["job"]
             elif ready in running:
@@ -180,9 +180,9 @@ def _redirect(file: ConfinedPath) -> None:
     os.close(output)
 
 
-def _child(work: Callable[..., None], *arguments: Any) -> None:
+def _child(parent: int, work: Callable[..., None], *arguments: Any) -> None:
     """Do some work in a process that ends with its parent, and upon signals."""
-    die_with_parent(os.getppid())
+    die_with_parent(parent)
     for number in ENDING:
         signal.signal(number, signal.SIG_DFL)
     work(*arguments)
