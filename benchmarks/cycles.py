@@ -29,7 +29,7 @@ from job import CENTRE_HZ, Job, build, echoes, error_db
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
 from apertura.core.backprojection.engines import native, native_binding
-from apertura.core.backprojection.engines.native_tables import Tables
+from apertura.core.backprojection.engines.range_interpolation import Tables
 
 STEPS, CYCLES_PER_STEP = 2_000_000, 4
 

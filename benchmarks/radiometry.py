@@ -21,10 +21,10 @@ from apertura.core.echo.compression import centre_frequency, window_weights
 from apertura.core.echo.sidelink import METHODS
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.imaging.backproject import backproject
+from apertura.core.imaging.multilook import Multilook, Speckle
 from apertura.core.imaging.noise import noise_places, noise_power, sidelink_noise
 from apertura.core.imaging.radiometry import Calibration, Link, cell_constant
 from apertura.core.imaging.range_profiles import range_compress
-from apertura.core.imaging.speckle import Multilook, Speckle
 from apertura.core.quality.bright_points import bright_point
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import FlatGround, Plane, Terrain

@@ -23,7 +23,7 @@ import zarr
 from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
 from apertura.core.backprojection.engines import PATCH_PX, native
 from apertura.core.backprojection.engines.engine import Setting
-from apertura.core.backprojection.engines.native_tables import Tables
+from apertura.core.backprojection.engines.range_interpolation import Tables
 from apertura.core.backprojection.inputs import Profiles
 from apertura.core.backprojection.tiles import compute_tiles, image_array
 from apertura.core.geometry.aperture import Aperture

@@ -34,7 +34,7 @@ from apertura.campaign.store.manifest import check_stage
 from apertura.common.contracts import STAGES, check
 from apertura.common.errors import CampaignError, ContractError
 from apertura.common.provenance import sha256_tree
-from apertura.stages.stamping import stamp
+from apertura.stages.tags import stamp
 
 NOTHING = {"runspec": {}, "inputs": {}, "code_sha256": "0"}
 

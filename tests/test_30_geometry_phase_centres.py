@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from apertura.core.geometry.phase_centres import phase_centres, position_spline
+from apertura.core.geometry.lever_arms import phase_centres, position_spline
 
 BEGAN = np.datetime64("2025-05-14T09:30", "ns")
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from apertura.core.geometry.geodesy import ecef_from_geodetic
-from apertura.core.geometry.phase_centres import position_spline
+from apertura.core.geometry.lever_arms import position_spline
 from apertura.core.geometry.track_checks import (
     check_track,
     check_yaw,

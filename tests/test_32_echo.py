@@ -18,7 +18,7 @@ from apertura.core.geometry.geodesy import (
     ned_axes,
     projected_from_ecef,
 )
-from apertura.core.geometry.phase_centres import phase_centres
+from apertura.core.geometry.lever_arms import phase_centres
 
 RATE, SPACING, COUNT, PREFIX = 64e6, 1e6, 32, 16
 

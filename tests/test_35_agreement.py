@@ -9,7 +9,7 @@ import pytest
 from apertura.core.backprojection.inputs import PhaseHistory
 from apertura.core.echo.compression import window_weights
 from apertura.core.geometry.aperture import Aperture
-from apertura.core.geometry.phase_centres import TrackCorrection
+from apertura.core.geometry.lever_arms import TrackCorrection
 from apertura.core.imaging.range_profiles import range_compress
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import FlatGround

@@ -7,9 +7,9 @@ from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import FlatGround
+from apertura.methods.alignment.on_ground import align_on_scene
+from apertura.methods.alignment.on_point import align_on_point, estimate_drift
 from apertura.methods.autofocus.motion import Logged, Recorded, plausible_offsets
-from apertura.methods.synchronisation.clock_alignment import align_on_point, estimate_drift
-from apertura.methods.synchronisation.scene_alignment import align_on_scene
 
 BEHIND_S, PATH_M = 3.217, 1.43
 FREQUENCY = 3.0e9 + 10e6 * np.arange(100)

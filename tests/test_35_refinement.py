@@ -15,7 +15,7 @@ from apertura.core.backprojection.contributions import block_contributions
 from apertura.core.backprojection.engines import reference
 from apertura.core.backprojection.inputs import PhaseHistory, Profiles
 from apertura.core.geometry.aperture import Aperture
-from apertura.core.geometry.phase_centres import TrackCorrection
+from apertura.core.geometry.lever_arms import TrackCorrection
 from apertura.core.geometry.sector import Sector
 from apertura.core.quality.focus import MOST_INTERFERENCE
 from apertura.core.quality.path_errors import autocorrelation

@@ -30,7 +30,7 @@ from typer.testing import CliRunner
 
 from apertura.common.errors import CampaignError
 from apertura.common.tables import read_table, write_table
-from apertura.core.geometry.phase_centres import TrackCorrection
+from apertura.core.geometry.lever_arms import TrackCorrection
 from apertura.methods.autofocus.inputs import Refinement
 
 pytestmark = pytest.mark.slow  # of the research, not of the product

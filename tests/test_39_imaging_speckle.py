@@ -6,7 +6,7 @@ from itertools import product
 import numpy as np
 import pytest
 
-from apertura.core.imaging.speckle import Multilook, Speckle, block_means, found_looks, lee
+from apertura.core.imaging.multilook import Multilook, Speckle, block_means, found_looks, lee
 
 SIZE, SIDE = 384, 4
 

@@ -18,8 +18,8 @@ from apertura.common.flag_table import FLAGS
 from apertura.core.echo.demodulate import Numerology
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.planning.plan import no_aperture
-from apertura.methods.synchronisation.channels import measure_channel
-from apertura.methods.synchronisation.links import measure_link
+from apertura.methods.bench.channels import measure_channel
+from apertura.methods.bench.links import measure_link
 from apertura.simulation import Impairments, preset
 from apertura.simulation.campaign import write_campaign
 from apertura.simulation.targets import Waypoints

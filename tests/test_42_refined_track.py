@@ -17,7 +17,7 @@ from apertura.campaign.store import open_stage, save_stage
 from apertura.check import as_line, problems
 from apertura.common.errors import CampaignError
 from apertura.core.geometry.geodesy import ecef_from_geodetic, ned_axes
-from apertura.core.geometry.phase_centres import TrackCorrection
+from apertura.core.geometry.lever_arms import TrackCorrection
 from apertura.core.imaging.range_profiles import profiles_of
 from apertura.core.planning.decisions import TOLERATED_LOSS_DB, decide_autofocus
 from apertura.core.planning.plan import Decision
@@ -29,7 +29,7 @@ from apertura.stages.diagnosis import evidence_of, moved_evidence
 from apertura.stages.pair import open_pair
 from apertura.stages.refine import RefinedTrack, RefinementInputs, clock_s, open_refined, reference_points
 from apertura.stages.scene import open_scene
-from apertura.stages.stamping import stamped
+from apertura.stages.tags import stamped
 from apertura.stages.transfer import PairEcho
 from apertura.stages.transmitted import transmitted
 from apertura.tools.open_campaign import open_campaign

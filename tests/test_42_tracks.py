@@ -10,7 +10,7 @@ from PIL import Image
 
 from apertura.campaign.store import open_stage, read_manifest
 from apertura.core.geometry.geodesy import ecef_from_geodetic, geodetic_from_ecef, ned_axes
-from apertura.core.geometry.phase_centres import TrackCorrection
+from apertura.core.geometry.lever_arms import TrackCorrection
 from apertura.formats.export.tracks import RefinedLog, write_csv, write_picture, write_pos
 from apertura.formats.tracks.csv_track import read_csv_track
 from apertura.formats.tracks.rtklib import read_rtklib_pos

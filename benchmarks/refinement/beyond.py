@@ -21,7 +21,7 @@ from apertura_research.autofocus.cases import (
 )
 from apertura_research.autofocus.outcomes import judge
 
-from apertura.core.geometry.phase_centres import TrackCorrection
+from apertura.core.geometry.lever_arms import TrackCorrection
 from apertura.core.scene.terrain import FlatGround
 from apertura.methods.autofocus.inputs import TrackErrors
 from apertura.methods.autofocus.refine import refine

@@ -59,13 +59,13 @@ _OF_RECORDINGS = {
         "stages/positions.py"),
     "alignment_ambiguous": Flag(
         "the other offset, dB that it is worse", "another clock offset focuses nearly as well, or all do",
-        "a reflector (apertura align --point); changes of speed", "methods/synchronisation/clock_alignment.py"),
+        "a reflector (apertura align --point); changes of speed", "methods/alignment/on_point.py"),
     "alignment_at_edge": Flag(
         "the offset, the range tried", "the best clock offset lies at an end of those tried", "--search-s",
-        "methods/synchronisation/clock_alignment.py"),
+        "methods/alignment/on_point.py"),
     "alignment_uncertain": Flag(
         "dB of the best offset above the others", "the best clock offset hardly stands out",
-        "place of the point; path; which log belongs to the recording", "methods/synchronisation/clock_alignment.py"),
+        "place of the point; path; which log belongs to the recording", "methods/alignment/on_point.py"),
     "scans_incomplete": Flag(
         "scans left out", "messages of scans are missing, damaged or cut off", "the recorder, or the copy",
         "formats/phase_histories/pulson.py"),
@@ -360,66 +360,66 @@ _OF_IMAGES = {
 _OF_BENCHES = {
     "triggers_missed": Flag(
         "pulses not recorded, of those due", "more than 1 % of the pulses started no capture",
-        "trigger level and cable; the recorder's disk", "methods/synchronisation/channels.py"),
+        "trigger level and cable; the recorder's disk", "methods/bench/channels.py"),
     "triggers_false": Flag(
         "captures between two pulses", "something other than the radar's pulses triggered the recorder",
-        "trigger level; interference; waveform.prf_hz", "methods/synchronisation/channels.py"),
+        "trigger level; interference; waveform.prf_hz", "methods/bench/channels.py"),
     "channel_weak": Flag(
         "counts rms of a channel", "the converter hardly sees a signal: quantisation adds noise",
-        "gain, attenuators, the channel's cable", "methods/synchronisation/channels.py"),
+        "gain, attenuators, the channel's cable", "methods/bench/channels.py"),
     "channel_dc": Flag(
         "mean of I and Q, dB of the signal", "a constant in the samples spoils one subcarrier, and so all ranges",
-        "offset of the converter, leakage of the local oscillator", "methods/synchronisation/channels.py"),
+        "offset of the converter, leakage of the local oscillator", "methods/bench/channels.py"),
     "channel_image": Flag(
         "dB of the mirror image", "I and Q are unequal, or not at 90°: subcarriers leak into their mirror images",
-        "balance of the mixer; clipping of I or Q", "methods/synchronisation/channels.py"),
+        "balance of the mixer; clipping of I or Q", "methods/bench/channels.py"),
     "channel_bits_stuck": Flag(
         "bits that never change", "the converter or its bus holds a bit",
-        "data lines of the converter; the recorder's format", "methods/synchronisation/channels.py"),
+        "data lines of the converter; the recorder's format", "methods/bench/channels.py"),
     "spectrum_inverted": Flag(
         "the node", "I and Q are swapped, or the mixer's oscillator is above the band",
         "order of I and Q in the recorder; the local oscillator's side: waveform.iq", "core/echo/transfer.py"),
     "link_weak": Flag(
         "dB of a compressed pulse", "the path hardly stands out of the noise",
-        "attenuators, cables, gain; which channel is which", "methods/synchronisation/links.py"),
+        "attenuators, cables, gain; which channel is which", "methods/bench/links.py"),
     "link_incoherent": Flag(
         "Γ, what noise allows, phase noise beyond",
         "the phase of the path scatters by more than noise: images lose as much",
-        "clock of both channels; sidelink; connectors", "methods/synchronisation/links.py"),
+        "clock of both channels; sidelink; connectors", "methods/bench/links.py"),
     "link_drifts": Flag(
         "phase and delay over the recording", "path or delay changes while nothing moves",
-        "warm-up of cables, amplifiers, filters: wait, or calibrate again", "methods/synchronisation/links.py"),
+        "warm-up of cables, amplifiers, filters: wait, or calibrate again", "methods/bench/links.py"),
     "delay_jumps": Flag(
         "pulses at another delay, how far off",
         "delays jump while nothing moves: captures begin elsewhere, or another path",
-        "trigger of the transmitter; cables; two equal reflectors", "methods/synchronisation/links.py"),
+        "trigger of the transmitter; cables; two equal reflectors", "methods/bench/links.py"),
     "interference": Flag(
         "dB of a subcarrier's change above the others', its frequency",
         "a narrow signal in the band adds noise to every range", "other transmitters; spurs of the node's clocks",
-        "methods/synchronisation/links.py"),
+        "methods/bench/links.py"),
     "contact_loose": Flag(
         "change of amplitude beyond noise; pulses lost or 6 dB low", "amplitude is not steady while nothing moves",
-        "connectors of that channel; supply of the amplifiers", "methods/synchronisation/links.py"),
+        "connectors of that channel; supply of the amplifiers", "methods/bench/links.py"),
     "channel_leaks": Flag(
         "dB of the sidelink against the strongest path",
         "the radar channel hears the sidelink: a false echo at short range",
-        "shielding, parallel cables, isolation of the channels", "methods/synchronisation/links.py"),
+        "shielding, parallel cables, isolation of the channels", "methods/bench/links.py"),
     "channels_swapped": Flag(
         "m that the echo precedes the sidelink", "the strongest echo comes before the direct path",
-        "order of the channels; bench.radar_m, bench.sidelink_m", "methods/synchronisation/links.py"),
+        "order of the channels; bench.radar_m, bench.sidelink_m", "methods/bench/links.py"),
     "clock_unlocked": Flag(
         "ppm against the transmitter's clock",
         "the clocks share no reference: samples are corrected by the offset measured",
-        "lock of the node's reference (GNSS, 10 MHz)", "methods/synchronisation/links.py"),
+        "lock of the node's reference (GNSS, 10 MHz)", "methods/bench/links.py"),
     "clock_drifts": Flag(
         "ppm over the recording", "the clock moves during the recording", "warm-up; lock of the node's reference",
-        "methods/synchronisation/links.py"),
+        "methods/bench/links.py"),
     "path_disagrees": Flag(
         "path beyond the set-up, the config's", "the config's path offset is not what was measured",
-        "nodes.<n>.path_offset_m; bench.radar_m, bench.sidelink_m", "methods/synchronisation/links.py"),
+        "nodes.<n>.path_offset_m; bench.radar_m, bench.sidelink_m", "methods/bench/links.py"),
     "split_disagrees": Flag(
         "gain and phase over the band", "two channels fed by one signal differ",
-        "splitter and cables; filters of both channels; path offsets", "methods/synchronisation/links.py"),
+        "splitter and cables; filters of both channels; path offsets", "methods/bench/links.py"),
 }  # fmt: skip
 """Name → what it says; part of `FLAGS`."""
 

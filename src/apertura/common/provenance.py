@@ -85,7 +85,7 @@ _READ_BYTES = 1 << 22
 
 
 class StampedStage(Protocol):
-    """A dataset stamped by `apertura.stages.stamping.stamp`: its attributes state its provenance."""
+    """A dataset stamped by `apertura.stages.tags.stamp`: its attributes state its provenance."""
 
     @property
     def attrs(self) -> Mapping[str, Any]: ...  # noqa: D102

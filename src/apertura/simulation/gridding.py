@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from apertura.common.arrays import Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
-from apertura.core.interpolation import kaiser_window
+from apertura.core.windowed_sinc import kaiser_window
 
 _TAPS = 8
 _OVERSAMPLING = 2

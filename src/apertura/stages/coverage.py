@@ -19,7 +19,7 @@ from apertura.formats.export import COVERAGE
 from apertura.formats.export.coverage import Covered, feature_collection, write_coverage
 from apertura.stages.agreement import averaged, opened_layer
 from apertura.stages.scene import OpenScene, settled_scene
-from apertura.stages.stamping import tags_of
+from apertura.stages.tags import tags_of
 from apertura.workflow.lineage import result_of
 
 _DOTS = 480  # of the longer side of the scene

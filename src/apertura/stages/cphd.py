@@ -19,7 +19,7 @@ from apertura.core.imaging.range_profiles import wave_speed_of
 from apertura.formats.export import PHASE_HISTORY
 from apertura.formats.export.cphd import CphdCollection, write_cphd
 from apertura.stages.scene import OpenScene, settled_scene
-from apertura.stages.stamping import tags_of
+from apertura.stages.tags import tags_of
 from apertura.stages.transfer import PairEcho
 from apertura.workflow.lineage import result_of
 

@@ -23,7 +23,7 @@ from apertura.core.scene.grid import SceneGrid
 from apertura.methods.interferometry.coherence import chance, coherence, common_band, window_px
 from apertura.stages.agreement import ComparedImage, agreement_of, agreement_report, assessment_of
 from apertura.stages.scene import settled_scene
-from apertura.stages.stamping import stamped
+from apertura.stages.tags import stamped
 from apertura.workflow.lineage import result_of
 
 # ---- Coordinates and quality of each flight and pair ----------------------------------------------------------------

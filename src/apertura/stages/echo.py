@@ -34,7 +34,7 @@ from apertura.core.quality.budget import strictest_accuracy_db
 from apertura.stages.acquisition import Acquisition, common_pulses, open_acquisition
 from apertura.stages.calibration import calibrated, calibration_spec
 from apertura.stages.positions import PulsePositions, place, scene_air, stated_air
-from apertura.stages.stamping import stamped
+from apertura.stages.tags import stamped
 from apertura.stages.transfer import PairEcho, forming_from, recorded_echo, save_transfer
 from apertura.stages.transmitted import Transmitted, transmitted
 from apertura.workflow.lineage import result_of

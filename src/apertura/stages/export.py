@@ -11,18 +11,17 @@ import rasterio.windows
 import xarray as xr
 from rasterio import Affine
 
-from apertura.campaign.config import FUSED, polarisation_of
+from apertura.campaign.config import FUSED
 from apertura.campaign.config.processing import Multilooking
 from apertura.campaign.digests import Lineage
 from apertura.campaign.folder import Campaign
 from apertura.campaign.store import open_listed, open_stage, record_files
 from apertura.common.arrays import Floats
 from apertura.common.atomic import write_json
-from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.contracts import Window
 from apertura.common.errors import number_of
 from apertura.common.flags import Flags
-from apertura.common.provenance import Provenance, canonical_json, chained_sha256
+from apertura.common.provenance import Provenance, chained_sha256
 from apertura.common.raster import opened_raster
 from apertura.core.combination import InPhase, in_phase
 from apertura.core.quality.budget import NO_EFFECT, BudgetLine
@@ -35,7 +34,7 @@ from apertura.formats.export.radiometry import CROSS_SECTIONS, ECHO, Radiometry,
 from apertura.stages.agreement import ComparedImage, assessment_of, bright_places
 from apertura.stages.layers import LazyLayer, coarse, multilook_of, said_of
 from apertura.stages.scene import settled_scene
-from apertura.stages.stamping import tags_of
+from apertura.stages.tags import acquisition_tags, quality_tags, tags_of
 from apertura.workflow.lineage import result_of
 
 
@@ -70,7 +69,7 @@ def export_pair(campaign: Campaign, flight: str, pair: str) -> list[Path]:
         {"image": held(image.image)},
         radiometry=report["radiometry"],
         titles={"image": f"{campaign.settings.campaign} · flight {flight} · {pair}"},
-        tags=tags_of(origin, lineage) | _quality_tags(report) | _acquisition_tags(campaign, {pair: quality["view"]}),
+        tags=tags_of(origin, lineage) | quality_tags(report) | acquisition_tags(campaign, {pair: quality["view"]}),
         **_georeference(settled_scene(campaign).grid),
     )
     return _finish(folder, written, {"flight": flight, "pair": pair, **report}, lineage)
@@ -132,8 +131,8 @@ def export_fused(campaign: Campaign, flight: str) -> list[Path]:
         "noncoherent": f"non-coherent sum of {' + '.join(pairs)}",
         "magnitude": f"sum of magnitudes of {' + '.join(pairs)}",
     }
-    tags = tags_of(_fused_provenance(lineage, cube, images, assessed), lineage) | _quality_tags(report)
-    tags |= _acquisition_tags(campaign, {pair: image.attrs["quality"]["view"] for pair, image in images.items()})
+    tags = tags_of(_fused_provenance(lineage, cube, images, assessed), lineage) | quality_tags(report)
+    tags |= acquisition_tags(campaign, {pair: image.attrs["quality"]["view"] for pair, image in images.items()})
     written = write_exports(
         "fused",
         folder,
@@ -410,50 +409,4 @@ def _worst(images: Mapping[str, xr.Dataset], fusion: Mapping[str, Any]) -> dict[
         "numerical_error_estimate_db": worst["numerical_error_estimate_db"],
         "instruction_set": ", ".join(sorted({quality["instruction_set"] for quality in qualities})),
         "redone": [one for quality in qualities for one in quality["redone"]],
-    }
-
-
-_FIRST_CLOCK = np.datetime64("1980-01-06")  # a recording without a clock counts from 1970
-
-
-def _acquisition_tags(campaign: Campaign, views: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
-    """Return time, frequency, side and author of an image as tags; of a sum, those of its pairs together."""
-    each = list(views.values())
-    first, last = min(one["first_utc"] for one in each), max(one["last_utc"] for one in each)
-    centres = {one["centre_hz"] for one in each}
-    low, high = (f(one["centre_hz"] + sign * one["band_hz"] / 2 for one in each) for f, sign in ((min, -1), (max, 1)))
-    centre_hz = centres.pop() if len(centres) == 1 else (low + high) / 2
-    sides = {one["side"] for one in each}
-    side = sides.pop() if len(sides) == 1 else "both"
-    seen = any(one["side_observable"] for one in each)
-    labels = {label for pair in views if (label := polarisation_of(campaign.settings.nodes, pair))}
-    incidence = [one["incidence_deg"] for one in each]
-    stated, clock = campaign.settings.metadata, np.datetime64(first) >= _FIRST_CLOCK
-    found = {
-        "APERTURA_ACQUISITION_START": f"{first[:26]}Z" if clock else None,
-        "APERTURA_ACQUISITION_END": f"{last[:26]}Z" if clock else None,
-        "APERTURA_CENTRE_FREQUENCY_HZ": f"{centre_hz:.12g}",
-        "APERTURA_BANDWIDTH_HZ": f"{high - low:.12g}",
-        "APERTURA_WAVELENGTH_M": f"{SPEED_OF_LIGHT_M_S / centre_hz:.6g}",
-        "APERTURA_LOOK_SIDE": side if side == "both" or seen else f"{side}, assumed",
-        "APERTURA_INCIDENCE_DEG": f"{np.mean(incidence):.2f}",
-        "APERTURA_POLARISATION": ", ".join(sorted(labels)) or None,
-        "APERTURA_PLATFORM": stated.platform,
-        "APERTURA_DOI": stated.doi,
-        "TIFFTAG_DATETIME": f"{first[:19].replace('-', ':').replace('T', ' ')}" if clock else None,
-        "TIFFTAG_ARTIST": stated.author,
-        "TIFFTAG_COPYRIGHT": stated.licence,
-    }
-    return {name: value for name, value in found.items() if value is not None}
-
-
-def _quality_tags(report: Mapping[str, Any]) -> dict[str, str]:
-    reports = {name: report[name] for name in ("budget", "budgets", "focus", "fusion", "redone") if report.get(name)}
-    return {
-        "APERTURA_INSTRUCTION_SET": report["instruction_set"],
-        "APERTURA_ERROR_DB": f"{report['numerical_error_db']:.2f}",
-        "APERTURA_ERROR_CONFIDENCE": f"{report['numerical_error_confidence']:.2f}",
-        "APERTURA_FLAGS": canonical_json(report["flags"]),
-        "APERTURA_MODELS": canonical_json(report["models"]),
-        **{f"APERTURA_{name.upper()}": canonical_json(value) for name, value in reports.items()},
     }

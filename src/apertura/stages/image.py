@@ -35,7 +35,7 @@ from apertura.stages.pair import OpenPair, antennas_report, open_pair, pattern_d
 from apertura.stages.planning import budget_of, plan_pair
 from apertura.stages.refine import RefinedTrack, open_refined
 from apertura.stages.scene import OpenScene, open_scene
-from apertura.stages.stamping import stamped
+from apertura.stages.tags import stamped
 from apertura.stages.transfer import PairEcho
 from apertura.workflow.lineage import result_of
 

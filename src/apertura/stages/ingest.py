@@ -15,7 +15,7 @@ from apertura.core.echo.trigger import PulseFraming, trigger_captures
 from apertura.formats.reading import open_recording
 from apertura.formats.recordings.recording import Recording
 from apertura.stages.node_log import read_log
-from apertura.stages.stamping import stamped
+from apertura.stages.tags import stamped
 from apertura.stages.transmitted import read_framing
 from apertura.workflow.lineage import result_of
 

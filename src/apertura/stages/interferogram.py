@@ -35,7 +35,7 @@ from apertura.stages.pair import OpenPair, open_pair
 from apertura.stages.planning import weighing
 from apertura.stages.refine import clock_s, open_refined
 from apertura.stages.scene import OpenScene, open_scene
-from apertura.stages.stamping import tags_of
+from apertura.stages.tags import tags_of
 from apertura.stages.transfer import PairEcho
 from apertura.workflow.lineage import result_of
 from apertura.workflow.rules import INTERFEROMETRY

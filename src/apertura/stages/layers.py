@@ -23,10 +23,10 @@ from apertura.common.contracts import Window
 from apertura.common.flags import Flags
 from apertura.common.provenance import Provenance
 from apertura.common.raster import opened_raster
+from apertura.core.imaging.multilook import Multilook
 from apertura.core.imaging.noise import PulseNoise, noise_places, noise_power
 from apertura.core.imaging.radiometry import Quantity
 from apertura.core.imaging.range_profiles import profiles_of
-from apertura.core.imaging.speckle import Multilook
 from apertura.core.scene.angles import surface
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.looks import BLOCK_PX, Looks
@@ -38,7 +38,7 @@ from apertura.stages.pair import open_pair, pattern_digests
 from apertura.stages.planning import integration_of, weighing
 from apertura.stages.radiometry import POINTS_LISTED, CalibratedPair, calibrated_pair, points_of
 from apertura.stages.scene import OpenScene, open_scene
-from apertura.stages.stamping import tags_of
+from apertura.stages.tags import tags_of
 from apertura.stages.transfer import PairEcho
 from apertura.workflow.lineage import result_of
 

@@ -14,7 +14,7 @@ from apertura.common.arrays import Times
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.units import seconds_since
 from apertura.core.geometry.geodesy import LOCAL, LOCAL_NED, ned_axes
-from apertura.core.geometry.phase_centres import attitude_axes, phase_centres, position_spline
+from apertura.core.geometry.lever_arms import attitude_axes, phase_centres, position_spline
 from apertura.core.geometry.track_checks import CheckedTrack, YawFault, check_track, check_yaw
 from apertura.formats.reading import read_phase_history, read_track
 from apertura.formats.tracks.track import FIXES

@@ -17,7 +17,7 @@ from apertura.core.imaging.range_profiles import CompressionError, RangeWindow, 
 from apertura.stages.pair import open_pair, pattern_digests
 from apertura.stages.planning import ranges_of
 from apertura.stages.scene import OpenScene, open_scene
-from apertura.stages.stamping import stamped
+from apertura.stages.tags import stamped
 from apertura.stages.transfer import PairEcho
 from apertura.workflow.lineage import result_of
 

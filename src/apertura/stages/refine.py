@@ -17,7 +17,7 @@ from apertura.common.provenance import merged
 from apertura.core.backprojection.inputs import Profiles
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.geodesy import frame_from_map
-from apertura.core.geometry.phase_centres import TrackCorrection
+from apertura.core.geometry.lever_arms import TrackCorrection
 from apertura.core.imaging.range_profiles import profiles_of
 from apertura.core.planning.decisions import decide_autofocus
 from apertura.core.planning.plan import Decision
@@ -35,7 +35,7 @@ from apertura.stages.node_log import raw_log
 from apertura.stages.pair import OpenPair, open_pair, pattern_digests
 from apertura.stages.planning import paths_to, positions_loss_db, weighing
 from apertura.stages.scene import OpenScene, open_scene
-from apertura.stages.stamping import stamped
+from apertura.stages.tags import stamped
 from apertura.workflow.lineage import result_of
 
 # ---- Decision whether and how the tracks of a flight are refined ----------------------------------------------------

@@ -35,7 +35,7 @@ from apertura.core.scene.dem import COVER_NODES, Dem, UncheckedDem, height_range
 from apertura.core.scene.geoid import geoid_file, undulation
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import FlatGround, GridHeights, Terrain
-from apertura.stages.stamping import stamped
+from apertura.stages.tags import stamped
 from apertura.workflow.lineage import result_of
 
 # ---- Ground of the config: flat at a height, or a DEM ---------------------------------------------------------------

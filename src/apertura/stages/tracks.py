@@ -14,7 +14,7 @@ from apertura.common.provenance import Provenance
 from apertura.formats.export.tracks import RefinedLog, write_csv, write_picture, write_pos
 from apertura.stages.node_log import read_log
 from apertura.stages.refine import RefinedTrack, open_refined
-from apertura.stages.stamping import tags_of
+from apertura.stages.tags import tags_of
 from apertura.workflow.lineage import result_of
 from apertura.workflow.rule_inputs import is_sampled
 

@@ -38,7 +38,7 @@ from apertura.stages.positions import (
     place,
     stated_error,
 )
-from apertura.stages.stamping import stamped
+from apertura.stages.tags import stamped
 from apertura.stages.transmitted import Transmitted, transmitted
 from apertura.workflow.lineage import reads_kept, result_of
 

@@ -29,9 +29,9 @@ from apertura.core.scene.auto_grid import utm_crs
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import FlatGround
 from apertura.formats.times import FIRST
+from apertura.methods.alignment.on_ground import align_on_scene
+from apertura.methods.alignment.on_point import Alignment, align_on_point, estimate_drift
 from apertura.methods.autofocus.motion import Logged, Recorded
-from apertura.methods.synchronisation.clock_alignment import Alignment, align_on_point, estimate_drift
-from apertura.methods.synchronisation.scene_alignment import align_on_scene
 from apertura.stages.node_log import NodeLog, raw_log, read_history, shortest_wave
 from apertura.stages.positions import scene_air
 from apertura.stages.scene import ConfiguredGround, settled_scene
@@ -51,7 +51,7 @@ class Unaligned:
     Attributes
     ----------
     echo, log
-        As `apertura.methods.synchronisation` takes them: each by seconds of its own, from its first pulse and epoch.
+        As `apertura.methods.alignment` takes them: each by seconds of its own, from its first pulse and epoch.
     apart_ns
         Delay of the log's first epoch against the recorder's first pulse, nanoseconds.
     applied_ns

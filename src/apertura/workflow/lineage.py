@@ -29,7 +29,7 @@ _FOCUSES = frozenset(
     {
         "apertura.core.backprojection.tiles",
         "apertura.methods.autofocus.patches",
-        "apertura.methods.synchronisation.scene_alignment",
+        "apertura.methods.alignment.on_ground",
     }
 )
 """Call engines: a result whose step imports one of them may stand on pixels that any engine has formed."""

@@ -12,7 +12,7 @@ from matplotlib.image import AxesImage
 
 from apertura.common.arrays import Floats
 from apertura.core.backprojection.engines import native
-from apertura.core.geometry.phase_centres import TrackCorrection
+from apertura.core.geometry.lever_arms import TrackCorrection
 from apertura.core.scene.grid import SceneGrid
 from apertura.methods.autofocus.inputs import PairRecord, Refinement
 from apertura.tools.chart.pareto import save_png

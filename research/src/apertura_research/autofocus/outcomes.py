@@ -8,8 +8,8 @@ import numpy as np
 
 from apertura.common.arrays import Floats
 from apertura.core.backprojection.engines import native
-from apertura.core.backprojection.engines.native_tables import Tables
-from apertura.core.geometry.phase_centres import TrackCorrection
+from apertura.core.backprojection.engines.range_interpolation import Tables
+from apertura.core.geometry.lever_arms import TrackCorrection
 from apertura.core.scene.terrain import FlatGround
 from apertura.methods.autofocus.inputs import PairRecord, Refinement, TrackErrors
 from apertura.methods.autofocus.refine import refine
@@ -210,7 +210,7 @@ def verdict_of(result: Refinement) -> str:
     Examples
     --------
     >>> import numpy as np
-    >>> from apertura.core.geometry.phase_centres import TrackCorrection
+    >>> from apertura.core.geometry.lever_arms import TrackCorrection
     >>> nothing = TrackCorrection(np.zeros(1), {})
     >>> verdict_of(Refinement(nothing, {}, True, "", flags={"prior_inconsistent": "twice as large"}))
     'accepted with a flag'

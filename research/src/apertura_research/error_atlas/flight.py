@@ -17,7 +17,7 @@ from apertura.core.echo.compression import centre_frequency, window_weights
 from apertura.core.echo.sidelink import METHODS, measure
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.geodesy import body_axes
-from apertura.core.geometry.phase_centres import position_spline
+from apertura.core.geometry.lever_arms import position_spline
 from apertura.core.geometry.track_checks import CheckedTrack, check_track
 from apertura.core.quality.budget import NodePositions
 from apertura.core.quality.path_errors import PointPaths

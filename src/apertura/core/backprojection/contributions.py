@@ -13,7 +13,7 @@ from apertura.core.antenna.beam import Beams
 from apertura.core.backprojection.engines.native_binding import KERNEL, EchoJob, TermsJob, available, call
 from apertura.core.backprojection.inputs import Profiles
 from apertura.core.geometry.aperture import distance
-from apertura.core.interpolation import kaiser_sinc
+from apertura.core.windowed_sinc import kaiser_sinc
 
 # ---- Contributions of profiles by band-limited interpolation in float64
 

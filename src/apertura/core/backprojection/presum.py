@@ -15,7 +15,7 @@ from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.units import decibels
 from apertura.core.backprojection.inputs import Profiles
 from apertura.core.geometry.aperture import Aperture
-from apertura.core.interpolation import kaiser_beta, kaiser_sinc, kaiser_window
+from apertura.core.windowed_sinc import kaiser_beta, kaiser_sinc, kaiser_window
 
 if TYPE_CHECKING:
     from scipy import sparse

@@ -10,7 +10,7 @@ from apertura.common.arrays import Complexes, Floats
 from apertura.common.flags import Flags
 from apertura.common.units import decibels
 from apertura.core.echo.demodulate import Numerology
-from apertura.core.interpolation import kaiser_beta, kaiser_sinc
+from apertura.core.windowed_sinc import kaiser_beta, kaiser_sinc
 
 # ---- Blocks of captures, and saturation
 

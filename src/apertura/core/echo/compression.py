@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
-from apertura.core.interpolation import kaiser_window
+from apertura.core.windowed_sinc import kaiser_window
 
 # ---- Phasors along a band of equal steps
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from apertura.common.arrays import Floats
 from apertura.core.geometry.geodesy import geodetic_from_ecef
-from apertura.core.geometry.phase_centres import position_spline
+from apertura.core.geometry.lever_arms import position_spline
 
 # ---- Spikes and steps
 #

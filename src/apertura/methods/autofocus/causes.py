@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 
 from apertura.common.arrays import Floats
-from apertura.core.geometry.phase_centres import TrackCorrection
+from apertura.core.geometry.lever_arms import TrackCorrection
 from apertura.methods.autofocus.inputs import Prior, Refinement
 from apertura.methods.autofocus.solve import Gauge, Problem, State, prominent_point_start
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from apertura.common.arrays import Bools, Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
-from apertura.core.geometry.phase_centres import TrackCorrection
+from apertura.core.geometry.lever_arms import TrackCorrection
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import Terrain
 from apertura.methods.autofocus.inputs import PairRecord, Prior, Refinement

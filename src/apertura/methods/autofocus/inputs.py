@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from apertura.common.arrays import Floats
 from apertura.core.antenna.beam import Beams
 from apertura.core.backprojection.inputs import Profiles
-from apertura.core.geometry.phase_centres import TrackCorrection
+from apertura.core.geometry.lever_arms import TrackCorrection
 
 # ---- Inputs: data of each pair, errors of the logs, reference points ------------------------------------------------
 

@@ -15,7 +15,7 @@ from apertura.core.antenna.beam import Beams
 from apertura.core.backprojection.engines import load_engine
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.geodesy import ned_axes
-from apertura.core.geometry.phase_centres import TrackCorrection
+from apertura.core.geometry.lever_arms import TrackCorrection
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import Terrain
 from apertura.methods.autofocus.inputs import PairRecord, Refinement, TrackErrors

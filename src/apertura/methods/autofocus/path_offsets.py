@@ -10,7 +10,7 @@ from apertura.common.arrays import Bools, Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.units import decibels
 from apertura.core.backprojection.contributions import block_contributions
-from apertura.core.geometry.phase_centres import TrackCorrection
+from apertura.core.geometry.lever_arms import TrackCorrection
 from apertura.core.quality.budget import NodePositions, position_lines
 from apertura.core.quality.path_errors import Effect, PointPaths
 from apertura.methods.autofocus.evidence import FOLDS, LEAST_GAIN_DB, MOST_RATIO, gains_db, mean_gain

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.common.arrays import Bools, Floats
-from apertura.core.geometry.phase_centres import TrackCorrection
+from apertura.core.geometry.lever_arms import TrackCorrection
 from apertura.methods.autofocus.inputs import Prior
 from apertura.methods.autofocus.objective import Blocks, Contribution, PatchEcho, PatchImage, Sharpness, Tracks, phases
 from apertura.methods.autofocus.patches import Patch

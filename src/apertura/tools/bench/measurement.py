@@ -27,7 +27,7 @@ from apertura.core.echo.clock import GROUPS, ClockOffset, clock_of
 from apertura.core.echo.demodulate import demodulate
 from apertura.core.echo.transfer import Transfer, as_complex, transfer_by_code, transfer_by_sidelink
 from apertura.core.quality.budget import strictest_accuracy_db
-from apertura.methods.synchronisation.channels import (
+from apertura.methods.bench.channels import (
     DC_DB,
     FEWEST_COUNTS,
     IMAGE_DB,
@@ -37,7 +37,7 @@ from apertura.methods.synchronisation.channels import (
     measure_channel,
     triggers,
 )
-from apertura.methods.synchronisation.links import (
+from apertura.methods.bench.links import (
     AMPLITUDE_DB,
     DRIFT_PPM,
     DROPOUT_SHARE,

@@ -14,8 +14,8 @@ from apertura.common.atomic import write_json, write_text
 from apertura.common.errors import CampaignError, number_of
 from apertura.common.flag_table import FLAGS
 from apertura.common.provenance import Provenance
-from apertura.methods.synchronisation.channels import SIGMAS
-from apertura.stages.stamping import tags_of
+from apertura.methods.bench.channels import SIGMAS
+from apertura.stages.tags import tags_of
 from apertura.tools.bench.measurement import Bench, measure_bench, series
 from apertura.views.report.page import Block, Heading, Paragraph, Picture, Table, page
 from apertura.views.report.sheet import BLUE, GREEN, ORANGE, RED, SKY, sheet, thinned

@@ -36,7 +36,7 @@ from apertura.stages.coverage import crs_name, few_looks
 from apertura.stages.pair import open_pair
 from apertura.stages.refine import open_refined
 from apertura.stages.scene import OpenScene, open_scene, settled_scene
-from apertura.stages.stamping import tags_of
+from apertura.stages.tags import tags_of
 from apertura.views.report import PICTURES, SUM_PICTURES
 from apertura.views.report.cuts_and_profiles import (
     DrawnCut,

@@ -32,7 +32,7 @@ from apertura.core.backprojection.engines.engine import (
 )
 from apertura.core.backprojection.engines.native import OVERSAMPLINGS, TOLERANCES_RAD, View, view_of
 from apertura.core.backprojection.engines.native_binding import KERNEL
-from apertura.core.backprojection.engines.native_tables import PHASE_POLYNOMIALS, TableDesign, design_table, ratio
+from apertura.core.backprojection.engines.range_interpolation import PHASE_POLYNOMIALS, TableDesign, design_table, ratio
 from apertura.core.backprojection.inputs import Profiles
 from apertura.core.backprojection.job import Job
 

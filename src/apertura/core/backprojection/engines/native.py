@@ -40,7 +40,14 @@ from apertura.core.backprojection.engines.native_binding import (
     instruction_set,
     weights_of,
 )
-from apertura.core.backprojection.engines.native_tables import MARGIN, TAPS, TableDesign, Tables, design_table, ratio
+from apertura.core.backprojection.engines.range_interpolation import (
+    MARGIN,
+    TAPS,
+    TableDesign,
+    Tables,
+    design_table,
+    ratio,
+)
 from apertura.core.backprojection.inputs import Profiles
 from apertura.core.backprojection.job import Job
 from apertura.core.geometry.aperture import Aperture, distance

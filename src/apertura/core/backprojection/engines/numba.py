@@ -18,11 +18,11 @@ from apertura.core.backprojection.engines.engine import (
     option_values,
     power_sum_db,
 )
-from apertura.core.backprojection.engines.native_tables import BAND, band_error_db
+from apertura.core.backprojection.engines.range_interpolation import BAND, band_error_db
 from apertura.core.backprojection.inputs import Profiles
 from apertura.core.backprojection.job import Job
 from apertura.core.geometry.aperture import Aperture
-from apertura.core.interpolation import kaiser_sinc
+from apertura.core.windowed_sinc import kaiser_sinc
 
 instruction_set = compiled_for
 READS: Literal["profiles"] = "profiles"

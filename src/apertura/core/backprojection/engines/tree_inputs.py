@@ -24,7 +24,7 @@ from apertura.core.backprojection.engines.native_binding import (
     call,
     weights_of,
 )
-from apertura.core.backprojection.engines.native_tables import BAND, TableDesign, Tables, design_table
+from apertura.core.backprojection.engines.range_interpolation import BAND, TableDesign, Tables, design_table
 from apertura.core.backprojection.engines.tree_geometry import (
     DEGREES,
     LEAF,

@@ -1,15 +1,26 @@
-"""Provenance of a step's result: its own settings, inputs and code, and those of the stages before it."""
+"""Attributes of stages and tags of GeoTIFFs: settings, inputs, code, those of the stages before, time and quality."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import xarray as xr
 
 from apertura import __version__
+from apertura.campaign.config import polarisation_of
 from apertura.campaign.digests import Lineage
+from apertura.campaign.folder import Campaign
+from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.contracts import STAGES, STANDARD_NAMES, check
-from apertura.common.provenance import Provenance, canonical_json, joined, lock_sha256, packages, software
+from apertura.common.provenance import (
+    Provenance,
+    canonical_json,
+    joined,
+    lock_sha256,
+    packages,
+    software,
+)
 
 
 def stamped(
@@ -109,3 +120,50 @@ def stamp(
         "software": dict(software or {}),
     }
     return stamped
+
+
+_FIRST_CLOCK = np.datetime64("1980-01-06")  # a recording without a clock counts from 1970
+
+
+def acquisition_tags(campaign: Campaign, views: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
+    """Return time, frequency, side and author of an image as tags; of a sum, those of its pairs together."""
+    each = list(views.values())
+    first, last = min(one["first_utc"] for one in each), max(one["last_utc"] for one in each)
+    centres = {one["centre_hz"] for one in each}
+    low, high = (f(one["centre_hz"] + sign * one["band_hz"] / 2 for one in each) for f, sign in ((min, -1), (max, 1)))
+    centre_hz = centres.pop() if len(centres) == 1 else (low + high) / 2
+    sides = {one["side"] for one in each}
+    side = sides.pop() if len(sides) == 1 else "both"
+    seen = any(one["side_observable"] for one in each)
+    labels = {label for pair in views if (label := polarisation_of(campaign.settings.nodes, pair))}
+    incidence = [one["incidence_deg"] for one in each]
+    stated, clock = campaign.settings.metadata, np.datetime64(first) >= _FIRST_CLOCK
+    found = {
+        "APERTURA_ACQUISITION_START": f"{first[:26]}Z" if clock else None,
+        "APERTURA_ACQUISITION_END": f"{last[:26]}Z" if clock else None,
+        "APERTURA_CENTRE_FREQUENCY_HZ": f"{centre_hz:.12g}",
+        "APERTURA_BANDWIDTH_HZ": f"{high - low:.12g}",
+        "APERTURA_WAVELENGTH_M": f"{SPEED_OF_LIGHT_M_S / centre_hz:.6g}",
+        "APERTURA_LOOK_SIDE": side if side == "both" or seen else f"{side}, assumed",
+        "APERTURA_INCIDENCE_DEG": f"{np.mean(incidence):.2f}",
+        "APERTURA_POLARISATION": ", ".join(sorted(labels)) or None,
+        "APERTURA_PLATFORM": stated.platform,
+        "APERTURA_DOI": stated.doi,
+        "TIFFTAG_DATETIME": f"{first[:19].replace('-', ':').replace('T', ' ')}" if clock else None,
+        "TIFFTAG_ARTIST": stated.author,
+        "TIFFTAG_COPYRIGHT": stated.licence,
+    }
+    return {name: value for name, value in found.items() if value is not None}
+
+
+def quality_tags(report: Mapping[str, Any]) -> dict[str, str]:
+    """Return engine, error bound, flags, models and budget of an image as tags."""
+    reports = {name: report[name] for name in ("budget", "budgets", "focus", "fusion", "redone") if report.get(name)}
+    return {
+        "APERTURA_INSTRUCTION_SET": report["instruction_set"],
+        "APERTURA_ERROR_DB": f"{report['numerical_error_db']:.2f}",
+        "APERTURA_ERROR_CONFIDENCE": f"{report['numerical_error_confidence']:.2f}",
+        "APERTURA_FLAGS": canonical_json(report["flags"]),
+        "APERTURA_MODELS": canonical_json(report["models"]),
+        **{f"APERTURA_{name.upper()}": canonical_json(value) for name, value in reports.items()},
+    }

@@ -11,8 +11,7 @@ from apertura.core.backprojection.inputs import Profiles
 from apertura.core.echo.compression import centre_frequency, compress, range_step
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import Terrain
-from apertura.methods.autofocus.motion import Logged, Recorded, plausible_offsets
-from apertura.methods.synchronisation.clock_alignment import (
+from apertura.methods.alignment.on_point import (
     MOST_PULSES,
     Alignment,
     alignment_flags,
@@ -20,6 +19,7 @@ from apertura.methods.synchronisation.clock_alignment import (
     peak_widths,
     refine_maximum,
 )
+from apertura.methods.autofocus.motion import Logged, Recorded, plausible_offsets
 
 MOST_PIXELS = 96
 """Along a side of the coarse image on which offsets are tried."""

@@ -21,7 +21,7 @@ from apertura.core.echo.compression import phasors
 from apertura.core.echo.demodulate import Numerology
 from apertura.core.echo.line_of_sight import LineOfSight, fit_block, joined
 from apertura.core.quality.measures import coherence_factor
-from apertura.methods.synchronisation.channels import MISSED_SHARE, SIGMAS
+from apertura.methods.bench.channels import MISSED_SHARE, SIGMAS
 
 # ---- Limits ---------------------------------------------------------------------------------------------------------
 

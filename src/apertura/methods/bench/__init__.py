@@ -1,0 +1,1 @@
+"""Channels, clocks and links of a radar that stands still, measured on its recordings."""

@@ -1,1 +1,0 @@
-"""Clocks of recorders and logs: offset and drift, estimated by a known point or by the sharpness of the scene."""
