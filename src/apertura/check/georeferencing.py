@@ -33,7 +33,12 @@ def check_scene_crs(examined: Examination) -> Iterator[CampaignError]:
     """Yield a CRS that is not projected in metres, is not the frame of the recordings, or is not made for the place."""
     crs = examined.campaign.settings.scene.crs
     if examined.other_frame:
-        yield _other_frame(crs)
+        local = crs == LOCAL
+        data = (
+            "positions on Earth, in latitude and longitude" if local else "positions in metres of a frame of their own"
+        )
+        expected = "an EPSG code, or auto" if local else LOCAL
+        yield CampaignError(f"{crs} for {data}", where=_WHERE, expected=expected, remedy="Correct scene.crs.")
     elif examined.history_problems:
         return  # which frame they are in is not known
     elif crs not in {LOCAL, "auto"} and examined.crs is None:
@@ -100,13 +105,6 @@ def _elsewhere(examined: Examination, crs: str) -> Iterator[CampaignError]:
                 expected="a CRS that is of use there, such as the UTM zone of the place",
                 remedy=f"Set scene.crs to {zone}, or to auto.",
             )
-
-
-def _other_frame(crs: str) -> CampaignError:
-    local = crs == LOCAL
-    data = "positions on Earth, in latitude and longitude" if local else "positions in metres of a frame of their own"
-    expected = "an EPSG code, or auto" if local else LOCAL
-    return CampaignError(f"{crs} for {data}", where=_WHERE, expected=expected, remedy="Correct scene.crs.")
 
 
 def _not_in_metres(examined: Examination, crs: str) -> CampaignError:

@@ -13,7 +13,6 @@ from apertura.campaign.config import (
     FLIGHTS,
     CalibrationSettings,
     Flight,
-    LeverArms,
     SampledWaveform,
 )
 from apertura.check.examination import Examination, Key
@@ -105,14 +104,11 @@ def _too_high(examined: Examination, distance_m: float) -> str:
     above_m = float(geodetic_from_ecef(examined.middle_m)[2]) - examined.level_m
     if abs(above_m) < _MOSTLY * distance_m:
         return ""
+    default = ", which is 0 m, as by default" if examined.campaign.settings.scene.height_is_default else ""
     return (
         f"The track is {above_m:.0f} m above the ground: check heights in the logs (metres, not feet, above the "
-        f"ellipsoid) and scene.height_m{_default(examined)}."
+        f"ellipsoid) and scene.height_m{default}."
     )
-
-
-def _default(examined: Examination) -> str:
-    return ", which is 0 m, as by default" if examined.campaign.settings.scene.height_is_default else ""
 
 
 def _reach(
@@ -135,14 +131,10 @@ def _reach(
     if node != flight.transmitter:
         beyond_m -= stated.sidelink + float(np.linalg.norm(tx_m - rx_m, axis=1).max())
     arms = [examined.campaign.settings.nodes[name].lever_arms_m for name in (flight.transmitter, node)]
-    arms_m = sum(float(np.linalg.norm(list(point), axis=1).max()) for point in (_points(arm) for arm in arms))
+    arms_m = sum(float(np.linalg.norm([arm.radar_tx, arm.radar_rx, arm.sidelink], axis=1).max()) for arm in arms)
     calibration = examined.campaign.settings.calibration
     search_m = calibration.search_m if calibration else 0.0
     return distance_m, float(paths), SPEED_OF_LIGHT_M_S * waveform.longest_delay_s - beyond_m + 2 * arms_m + search_m
-
-
-def _points(arms: LeverArms) -> list[tuple[float, float, float]]:
-    return [arms.radar_tx, arms.radar_rx, arms.sidelink]
 
 
 def pair_aperture(examined: Examination, flight: Flight, node: str, waveform: SampledWaveform) -> Aperture | None:

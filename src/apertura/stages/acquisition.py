@@ -177,14 +177,6 @@ def open_acquisition(campaign: Campaign, flight: str, node: str, sent: Transmitt
     recording, log = (_read_from(stage, files) for stage in (raw, track))
     path = campaign.root.named(raw.attrs["samples"], where=campaign.stage("raw", flight, node))
     captured = Captured.of(raw, path, files, recording, sent)
-    _check_same(campaign, raw)
-    wave_m = shortest_wave(sent.numerology.frequency_hz)
-    own = {field.name: getattr(captured, field.name) for field in fields(captured)}
-    return Acquisition(node, campaign.node(flight, node), track, log, wave_m, **own)
-
-
-def _check_same(campaign: Campaign, raw: xr.Dataset) -> None:
-    """Raise CampaignError where the recorder's file is there and not the one that the stage describes."""
     name = raw.attrs["samples"]
     if (campaign.root / name).is_file() and digest_of(campaign.root, name) != raw.attrs["inputs"][name]:
         raise CampaignError(
@@ -193,6 +185,9 @@ def _check_same(campaign: Campaign, raw: xr.Dataset) -> None:
             expected="the file that the raw stage describes",
             remedy="Run the workflow again: it ingests the recording first.",
         )
+    wave_m = shortest_wave(sent.numerology.frequency_hz)
+    own = {field.name: getattr(captured, field.name) for field in fields(captured)}
+    return Acquisition(node, campaign.node(flight, node), track, log, wave_m, **own)
 
 
 def _read_from(stage: xr.Dataset, files: Path) -> str:

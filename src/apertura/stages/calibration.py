@@ -30,7 +30,15 @@ def calibrate(campaign: Campaign, flight: str) -> Path:
     CampaignError
         If config/config.yaml has no calibration section, or no reflector stands out.
     """
-    requested, lineage = _settings(campaign), result_of(campaign, "calibration", flight).begin(campaign.root)
+    requested = campaign.settings.calibration
+    if requested is None:
+        raise CampaignError(
+            "no section calibration",
+            where="config/config.yaml",
+            expected="calibration.flight and calibration.reflector_m for a flight of kind calibration",
+            remedy="State the place of the reflector.",
+        )
+    lineage = result_of(campaign, "calibration", flight).begin(campaign.root)
     report: dict[str, Any] = {"flight": flight, "reflector_m": list(requested.reflector_m), "pairs": {}}
     codes = []
     for pair in campaign.flight(flight).pairs:
@@ -73,17 +81,6 @@ def _taken(offset: dict[str, Any]) -> dict[str, Any]:
         "inputs": {str(role): str(digest) for role, digest in offset["inputs"].items()},
         "flags": {str(name): str(text) for name, text in offset["flags"].items()},
     }
-
-
-def _settings(campaign: Campaign) -> CalibrationSettings:
-    if campaign.settings.calibration is None:
-        raise CampaignError(
-            "no section calibration",
-            where="config/config.yaml",
-            expected="calibration.flight and calibration.reflector_m for a flight of kind calibration",
-            remedy="State the place of the reflector.",
-        )
-    return campaign.settings.calibration
 
 
 def _pair(campaign: Campaign, opened: PairEcho, requested: CalibrationSettings, *, where: str) -> dict[str, Any]:

@@ -52,7 +52,11 @@ def labels(images: Images, assessed: Mapping[str, Mapping[str, Any]], sums: Sums
     pairs
         Every pair of the campaign.
     """
-    values = {name: _filled(dtype, (len(assessed), len(pairs))) for name, (_, dtype, _, _) in QUOTED.items()}
+    shape = len(assessed), len(pairs)
+    values: dict[str, Any] = {
+        name: np.full(shape, "", _TEXTS) if dtype == "T" else np.full(shape, np.nan)
+        for name, (_, dtype, _, _) in QUOTED.items()
+    }
     for place, (flight, one) in enumerate(assessed.items()):
         for pair in pairs:
             if (flight, pair) in images:
@@ -76,10 +80,6 @@ def labels(images: Images, assessed: Mapping[str, Mapping[str, Any]], sums: Sums
 def reference_flights(images: Images, pairs: Sequence[str]) -> dict[str, str]:
     """Return pair → the first flight that flew it."""
     return {pair: next(flight for flight, other in images if other == pair) for pair in pairs}
-
-
-def _filled(dtype: str, shape: tuple[int, int]) -> Any:
-    return np.full(shape, "", _TEXTS) if dtype == "T" else np.full(shape, np.nan)
 
 
 def _middle(images: Images, flight: str) -> Any:

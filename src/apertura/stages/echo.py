@@ -94,11 +94,21 @@ def pair_echo(
     at = tx.raw.time.values[pulses.tx_index[paired]]
     measured, sidelink_m = _transfer((tx, rx), pulses.rx_index[paired], at, sent, processing, air)
     at = at[measured.kept]
-    offset_m = calibration["offset_m"] if calibration else _stated_offset_m(rx, monostatic=tx.name == rx.name)
+    stated = rx.settings.path_offset_m
+    stated_m = stated.radar if tx.name == rx.name else stated.radar - stated.sidelink
+    offset_m = calibration["offset_m"] if calibration else stated_m
     beyond_m = offset_m - sidelink_m  # electrical path of an echo beyond tx → scene → rx
     aperture = Aperture(tx.antenna("radar_tx", at), rx.antenna("radar_rx", at))
     flown = air.over(aperture)
     delay_s = beyond_m / SPEED_OF_LIGHT_M_S
+    # body axes of the nodes whose attitude counts
+    turning = {"tx_axes": tx.turns("radar_tx") and tx, "rx_axes": rx.turns("radar_rx") and rx}
+    geometry: dict[str, tuple[tuple[str, ...], NDArray[np.float64]]] = {
+        name: (("pulse", "axis", "body"), node.body_axes(at)) for name, node in turning.items() if node
+    }
+    if tx.name != rx.name:  # b of docs/theory/autofocus.md, eq. 2: the sidelink's length was added to the echo
+        sidelink_m = tx.antenna("sidelink", at) - rx.antenna("sidelink", at)
+        geometry["sidelink_vector"] = (("pulse", "axis"), sidelink_m)
     dataset = xr.Dataset(
         {
             "time": ("pulse", at),
@@ -110,8 +120,7 @@ def pair_echo(
             "reference_delay": ("pulse", np.zeros(len(beyond_m))),
             "path_limit": ("pulse", flown.wave_speed_m_s * (sent.waveform.longest_delay_s - delay_s)),
             **_sidelink(measured),
-            **_axes((tx, rx), at),
-            **_sidelink_vector((tx, rx), at),
+            **geometry,
         },
         attrs=_attributes((tx, rx), pulses, positions, measured, repeats, at=at, calibration=calibration)
         | {"stated_offset_m": offset_m, **stated_air(flown)},
@@ -131,22 +140,27 @@ def _attributes(
     calibration: dict[str, Any] | None,
 ) -> dict[str, Any]:
     """Return the attributes of an echo whose pulses were sent `at`: flags, counts of pulses left out, reports."""
+    tx, rx = nodes
     missing = missing_flags(at.astype("datetime64[ns]").astype(np.int64))
     attrs = {
         "frame": "ecef",
-        "pair": "-".join(node.name for node in nodes),
+        "pair": f"{tx.name}-{rx.name}",
         **measured.report,
         "positions": positions.report,
-        "time_tags": _time_tags(nodes[0], pulses),
+        "time_tags": {
+            **{name: getattr(pulses, name) for name in ("offset_s", "drift_ppm", "residual_s", "method")},
+            "std_s": tx.settings.time_tag_std_s,
+            "jitter_s": tag_jitter_s(tx.raw.time.values.astype("datetime64[ns]").astype(np.int64)),
+        },
         "flags": Flags.merged(
             pulses.flags,
-            _repeated(nodes[1], pulses, repeats),
+            _repeated(rx, pulses, repeats),
             positions.flags,
             measured.flags,
             missing,
             calibration["flags"] if calibration else {},
         ),
-        "pulses": _counted(len(nodes[0].raw.time), pulses, repeats, positions, measured),
+        "pulses": _counted(len(tx.raw.time), pulses, repeats, positions, measured),
     }
     if calibration:
         attrs["calibration"] = {name: calibration[name] for name in ("flight", "offset_m", "std_m")}
@@ -213,15 +227,6 @@ def _of_what_was_sent(measured: Transfer, sent: Transmitted) -> Transfer:
     return replace(measured, flags=Flags.merged(measured.flags, flags), report=report)
 
 
-def _time_tags(tx: Acquisition, pulses: Association) -> dict[str, Any]:
-    """Return how the nodes' tags lie to each other, and what is known of the transmitter's own errors."""
-    return {
-        **{name: getattr(pulses, name) for name in ("offset_s", "drift_ppm", "residual_s", "method")},
-        "std_s": tx.settings.time_tag_std_s,
-        "jitter_s": tag_jitter_s(tx.raw.time.values.astype("datetime64[ns]").astype(np.int64)),
-    }
-
-
 def _repeated(rx: Acquisition, pulses: Association, repeats: NDArray[np.bool_]) -> Flags:
     """Raise a flag where captures of the receiver repeat earlier ones bit for bit; they are left out."""
     if not repeats.any():
@@ -244,23 +249,3 @@ def _counted(
         "sidelink_lost": int((~measured.kept).sum()),
     }
     return {"used": used, "dropped": sent - used, "reasons": {why: count for why, count in reasons.items() if count}}
-
-
-def _axes(nodes: tuple[Acquisition, Acquisition], at: Times) -> dict[str, tuple[tuple[str, ...], NDArray[np.float64]]]:
-    """Return the body axes of the nodes whose attitude counts."""
-    tx, rx = nodes
-    turning = {"tx_axes": tx.turns("radar_tx") and tx, "rx_axes": rx.turns("radar_rx") and rx}
-    return {name: (("pulse", "axis", "body"), node.body_axes(at)) for name, node in turning.items() if node}
-
-
-def _sidelink_vector(nodes: tuple[Acquisition, Acquisition], at: Times) -> dict[str, tuple[tuple[str, ...], Any]]:
-    """Return b of docs/theory/autofocus.md, eq. 2, where the echo was given back its length."""
-    tx, rx = nodes
-    if tx.name == rx.name:
-        return {}
-    return {"sidelink_vector": (("pulse", "axis"), tx.antenna("sidelink", at) - rx.antenna("sidelink", at))}
-
-
-def _stated_offset_m(rx: Acquisition, *, monostatic: bool) -> float:
-    stated = rx.settings.path_offset_m
-    return stated.radar if monostatic else stated.radar - stated.sidelink

@@ -30,7 +30,7 @@ from apertura.core.quality.measures import Amplitude, BlockRaster, held, image_s
 from apertura.core.quality.point_targets import CUT_REACH_M, cuts_report, find_peak
 from apertura.core.scene.grid import SceneGrid
 from apertura.formats.export import product, remove_outdated, write_exports
-from apertura.formats.export.radiometry import CROSS_SECTIONS, ECHO, Radiometry, of_sums
+from apertura.formats.export.radiometry import CROSS_SECTIONS, ECHO, of_sums
 from apertura.stages.agreement import ComparedImage, assessment_of, bright_places
 from apertura.stages.layers import LazyLayer, coarse, multilook_of, said_of
 from apertura.stages.scene import settled_scene
@@ -61,7 +61,8 @@ def export_pair(campaign: Campaign, flight: str, pair: str) -> list[Path]:
     if campaign.calibrated:
         report |= _calibrated(campaign, flight, pair, report)
     report["focus"] = focus_with_flags(quality["focus"], report["flags"], error_db=report["numerical_error_db"])
-    origin = _with_code(Provenance.of(lineage.modules, [image]), assessed)
+    origin = Provenance.of(lineage.modules, [image])
+    origin = replace(origin, code_sha256=chained_sha256(origin.code_sha256, [assessed["code_sha256"]]))
     folder = campaign.result(flight, pair)
     written = write_exports(
         "pair",
@@ -131,8 +132,11 @@ def export_fused(campaign: Campaign, flight: str) -> list[Path]:
         "noncoherent": f"non-coherent sum of {' + '.join(pairs)}",
         "magnitude": f"sum of magnitudes of {' + '.join(pairs)}",
     }
-    tags = tags_of(_fused_provenance(lineage, cube, images, assessed), lineage) | quality_tags(report)
-    tags |= acquisition_tags(campaign, {pair: image.attrs["quality"]["view"] for pair, image in images.items()})
+    # the cube depends on every flight, its files of one flight on that flight's pairs alone
+    origin = Provenance.of(lineage.modules, images, settings={"fusion": assessed["fusion"]})
+    code_sha256 = chained_sha256(lineage.result.code_sha256, [cube.attrs["code_sha256"]])
+    tags = tags_of(replace(origin, code_sha256=code_sha256), lineage) | _quality_tags(report)
+    tags |= _acquisition_tags(campaign, {pair: image.attrs["quality"]["view"] for pair, image in images.items()})
     written = write_exports(
         "fused",
         folder,
@@ -213,28 +217,6 @@ def _georeference(grid: SceneGrid) -> dict[str, Any]:
     return {"transform": Affine(*grid.transform), "crs": grid.crs_wkt}
 
 
-def _with_code(origin: Provenance, assessed: Mapping[str, Any]) -> Provenance:
-    """Return the provenance of a file, with the code that assessed its flight."""
-    return replace(origin, code_sha256=chained_sha256(origin.code_sha256, [assessed["code_sha256"]]))
-
-
-def _fused_provenance(
-    lineage: Lineage, cube: xr.Dataset, images: Mapping[str, xr.Dataset], assessed: Mapping[str, Any]
-) -> Provenance:
-    """Return settings and inputs of the flight's own pairs, each apart, and the code that made the cube and its files.
-
-    The cube stands on every flight; a file of one flight does not.
-    """
-    origin = Provenance.of(lineage.modules, images, settings={"fusion": assessed["fusion"]})
-    return replace(origin, code_sha256=chained_sha256(lineage.result.code_sha256, [cube.attrs["code_sha256"]]))
-
-
-def _divided(images: Mapping[str, xr.Dataset], fusion: Mapping[str, Any]) -> dict[str, Radiometry]:
-    """Return the radiometry of the sums: the divisor of each pair."""
-    peaks = {pair: image.attrs["quality"]["brightest"]["amplitude"] for pair, image in images.items()}
-    return of_sums(peaks, fusion["phases_rad"])
-
-
 def _measures(
     grid: SceneGrid,
     windows: Sequence[Window],
@@ -244,7 +226,8 @@ def _measures(
 ) -> dict[str, Any]:
     """Return the image statistics of the sums, cuts through the brightest target, and what is gained over one pair."""
     statistics = {source: image_statistics(layer, windows) for source, layer in sums.items()}
-    radiometry, top = _divided(images, assessed["fusion"]), statistics["coherent"]
+    peaks = {pair: image.attrs["quality"]["brightest"]["amplitude"] for pair, image in images.items()}
+    radiometry, top = of_sums(peaks, assessed["fusion"]["phases_rad"]), statistics["coherent"]
     peak = find_peak(sums["coherent"], top.row, top.column)
     x, y = map(float, grid.map_at(peak.row, peak.column))
     peaks = {source: one.peak for source, one in statistics.items()} | {"coherent": float(abs(peak.value))}

@@ -101,7 +101,11 @@ def open_two(campaign: Campaign, name: str, scene: OpenScene) -> TwoImages:
     stages = [open_stage(campaign.stage("image", *image), "image") for image in images]
     sensed = sensed_heights(scene, looks[0], legs, bands[0])
     visible = np.logical_and(*(_plain(campaign, *image) for image in images))
-    ground = _ground(campaign, scene, sensed, visible)
+    height_m = np.broadcast_to(np.asarray(scene.terrain.heights(scene.grid), np.float64), scene.grid.shape)
+    shift_px = np.stack([-sensed.shift[..., 1], sensed.shift[..., 0]], axis=-1) / scene.grid.spacing_m
+    points = [point.model_dump() for point in campaign.settings.scene.reference_points]
+    known = [one for point in points if (one := _shown(point, scene, sensed, height_m, shift_px)) is not None]
+    ground = AssumedGround(height_m, visible, sensed, shift_px, known)
     if antennas:
         wavenumber = np.pi * sum(bands[0]) / opened.wave_speed_m_s
         phase = TrackPhase(_nodes(scene, looks[0]), scene.axes, antennas, wavenumber)
@@ -192,15 +196,6 @@ def _plain(campaign: Campaign, flight: str, pair: str) -> NDArray[np.bool_]:
     with opened_layer(campaign, flight, pair, "mask.tif") as raster:
         visible: NDArray[np.bool_] = raster.read(1) == 0
     return visible
-
-
-def _ground(campaign: Campaign, scene: OpenScene, sensed: Sensitivity, visible: NDArray[np.bool_]) -> AssumedGround:
-    """Return what is assumed of the ground, and the points of known height as the images show them."""
-    height_m = np.broadcast_to(np.asarray(scene.terrain.heights(scene.grid), np.float64), scene.grid.shape)
-    shift_px = np.stack([-sensed.shift[..., 1], sensed.shift[..., 0]], axis=-1) / scene.grid.spacing_m
-    points = [point.model_dump() for point in campaign.settings.scene.reference_points]
-    known = [one for point in points if (one := _shown(point, scene, sensed, height_m, shift_px)) is not None]
-    return AssumedGround(height_m, visible, sensed, shift_px, known)
 
 
 def _shown(

@@ -1,6 +1,6 @@
 """Rule `mosaic`: each product of all flights as one raster for a GIS, on the campaign's grid."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from apertura.campaign.folder import Campaign
@@ -18,13 +18,24 @@ def mosaic(campaign: Campaign) -> Sequence[Path]:
     Flights lie upon one another in the order of config/flights.tsv, the last uppermost.
     """
     lineage = result_of(campaign, "mosaic").begin(campaign.root)
-    made = _made(campaign.root, lineage.result.sources)
+    # product → the manifest that describes it, and its hash there
+    paths = [campaign.root / manifest for manifest in lineage.result.sources]
+    described = {
+        path.parent / name: (path, digest) for path in paths for name, digest in read_manifest(path)["files"].items()
+    }
     styles = {row.file: row for row in EXPORTS if row.style}
     written = []
     for name, files in mosaics(campaign.images, campaign.coefficients).items():
         path, sources = campaign.result(MOSAICS, name), [campaign.result(file) for file in files]
         for source in sources:
-            _check(source, made)
+            manifest, digest = described.get(source, (source, ""))
+            if not source.is_file() or sha256_file(source) != digest:
+                raise CampaignError(
+                    "not as it was written" if source.is_file() else "no such file",
+                    where=source,
+                    expected=f"what {manifest.name} describes",
+                    remedy=f"Delete {manifest} and run the workflow again.",
+                )
         flown = f"{len(sources)} flight{'s' * (len(sources) > 1)}"
         title = f"{campaign.settings.campaign} · {name.removesuffix('.vrt')} of {flown}"
         write_mosaic(path, sources, title=title)
@@ -36,21 +47,3 @@ def mosaic(campaign: Campaign) -> Sequence[Path]:
         remove_outdated(folder, written)
     record_files(campaign.root / lineage.result.manifest, written, lineage)
     return written
-
-
-def _made(root: Path, manifests: Iterable[str]) -> dict[Path, tuple[Path, str]]:
-    """Return product → the manifest that describes it, and its hash there."""
-    paths = [root / manifest for manifest in manifests]
-    hashes = [(path, name, digest) for path in paths for name, digest in read_manifest(path)["files"].items()]
-    return {path.parent / name: (path, digest) for path, name, digest in hashes}
-
-
-def _check(product: Path, made: Mapping[Path, tuple[Path, str]]) -> None:
-    manifest, digest = made.get(product, (product, ""))
-    if not product.is_file() or sha256_file(product) != digest:
-        raise CampaignError(
-            "not as it was written" if product.is_file() else "no such file",
-            where=product,
-            expected=f"what {manifest.name} describes",
-            remedy=f"Delete {manifest} and run the workflow again.",
-        )

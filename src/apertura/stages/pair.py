@@ -253,6 +253,7 @@ def open_pair(
     history = phase_history_of(echo, campaign.settings.processing.window, lazy=True)
     axes = body_axes(echo)
     stated = echo.attrs.get("positions", {})
+    legs = ("tx",) if len(set(pair.split("-"))) == 1 else ("tx", "rx")  # one node has one position
     return OpenPair(
         flight,
         pair,
@@ -262,7 +263,7 @@ def open_pair(
         echo.path_limit.values,
         time_s=seconds_since(echo.time.values, echo.time.values[0]),
         began=echo.time.values[0],
-        positions=tuple(_positions(stated.get(leg, {})) for leg in _legs(pair)),
+        positions=tuple(_positions(stated.get(leg, {})) for leg in legs),
         history=history,
         beams=beams_of(campaign, pair, axes),
         axes=axes,
@@ -284,7 +285,10 @@ def _expected(
     if recorded is None:
         recorded = open_recording(campaign.recording_files(flight, tx.name)).captures.time
         recorded = campaign.clock(flight, tx.name).utc(recorded)
-    times = _pulse_times(recorded, first, last, waveform.prf_hz)
+    if len(recorded) < 2:
+        count = int((last - first) / np.timedelta64(1, "s") * waveform.prf_hz) + 1
+        recorded = first + (1e9 / waveform.prf_hz * np.arange(count)).astype("timedelta64[ns]")
+    times = recorded[(recorded >= first) & (recorded <= last)]
     times = times[inside_segments(campaign, flight, pair, times)]
     times = times[place(tx, rx, times, hovers=bool(campaign.segments_of(flight, pair))).good]
     return expected_pair(campaign, flight, (tx, rx), times, frequency_hz=frequency, delay_s=waveform.longest_delay_s)
@@ -343,22 +347,6 @@ def expected_pair(
         wave_speed_m_s=flown.wave_speed_m_s,
         air=flown.report,
     )
-
-
-def _pulse_times(
-    recorded: NDArray[np.datetime64], first: np.datetime64, last: np.datetime64, prf_hz: float
-) -> NDArray[np.datetime64]:
-    """Return the recorded capture times inside the logs, or a regular series where the recorder ran through."""
-    if len(recorded) < 2:
-        count = int((last - first) / np.timedelta64(1, "s") * prf_hz) + 1
-        recorded = first + (1e9 / prf_hz * np.arange(count)).astype("timedelta64[ns]")
-    return recorded[(recorded >= first) & (recorded <= last)]
-
-
-def _legs(pair: str) -> tuple[str, ...]:
-    """Return which legs of a pair have positions of their own: one where one node sends and receives."""
-    tx, rx = pair.split("-")
-    return ("tx",) if tx == rx else ("tx", "rx")
 
 
 def _positions(stated: Mapping[str, Any]) -> NodePositions:

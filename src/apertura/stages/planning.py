@@ -67,6 +67,9 @@ def budget_of(
     paths = paths_to(pair, scene, scene.middle_m if place_m is None else place_m)
     monostatic, sidelink = pair.monostatic, pair.report.get("sidelink", {})
     flown = [*_positions(campaign, pair, paths), *_attitude(campaign, pair, paths)]
+    pulses = pair.report.get("pulses", {})
+    used, dropped = pulses.get("used"), pulses.get("dropped", 0)
+    stated = None if used is None else f"{dropped} of {used + dropped} pulses missing"
     lines = [
         *flown,
         height_line(paths, campaign.settings.scene.height_std_m, expected_db=expected(flown).loss_db),
@@ -86,14 +89,23 @@ def budget_of(
             unit="cm of path",
         ),
         _air(campaign, pair, paths),
-        _sampling(pair.report.get("pulses", {})),
+        BudgetLine("missing pulses", stated, NO_EFFECT),
         _antenna(pair, paths),
     ]
     if not monostatic:
         total = paths.aperture.path(paths.point_m)
         lines.append(offset_line(paths, "clock", _PPM * total, _scaled(pair.report, "clock", "std_ppm", 1), unit="ppm"))
         if "snr_db" in sidelink:
-            lines += _sidelink(sidelink, subcarriers=len(pair.frequency_hz))
+            noise = noise_loss(10 ** (-sidelink["snr_db"] / 10) / (2 * len(pair.frequency_hz)))
+            echo = 10 ** (sidelink["echo_db"] / 20)
+            lines += [
+                BudgetLine("sidelink noise", f"{sidelink['snr_db']:.1f} dB per subcarrier", noise),
+                BudgetLine(
+                    "sidelink echo",
+                    f"at most {sidelink['echo_db']:.1f} dB",
+                    Effect(0.0, 0.0, float(np.arcsin(min(1.0, echo)))),
+                ),
+            ]
     if isinstance(campaign.settings.waveform, SampledWaveform):
         effect = paths.of_offset(campaign.settings.waveform.middle_s * paths.rate_m_s)
         lines.append(BudgetLine("stop and go", f"{np.abs(paths.rate_m_s).max():.2g} m/s of path at most", effect))
@@ -215,12 +227,6 @@ def _stated_tags_ms(campaign: Campaign, pair: OpenPair) -> float | None:
     return node.time_tag_std_s / _MS if "time_tag_std_s" in node.model_fields_set else None
 
 
-def _sampling(pulses: Mapping[str, Any]) -> BudgetLine:
-    used, dropped = pulses.get("used"), pulses.get("dropped", 0)
-    stated = None if used is None else f"{dropped} of {used + dropped} pulses missing"
-    return BudgetLine("missing pulses", stated, NO_EFFECT)
-
-
 def _antenna(pair: OpenPair, paths: PointPaths) -> BudgetLine:
     """Return the line of the antennas: beams weigh the pulses; what phase their patterns have is not taken out."""
     if pair.beams is None:
@@ -230,18 +236,6 @@ def _antenna(pair: OpenPair, paths: PointPaths) -> BudgetLine:
     if phase is None:
         return BudgetLine("antenna", "weighed by the beams stated", NO_EFFECT)
     return antenna_line(paths, phase[:, 0], some.weight(paths.aperture, point)[:, 0])
-
-
-def _sidelink(report: Mapping[str, Any], *, subcarriers: int) -> list[BudgetLine]:
-    """Return noise of the sidelink as phase noise of each pulse, and what an echo in it turns the phase by at most."""
-    noise = noise_loss(10 ** (-report["snr_db"] / 10) / (2 * subcarriers))
-    echo = 10 ** (report["echo_db"] / 20)
-    return [
-        BudgetLine("sidelink noise", f"{report['snr_db']:.1f} dB per subcarrier", noise),
-        BudgetLine(
-            "sidelink echo", f"at most {report['echo_db']:.1f} dB", Effect(0.0, 0.0, float(np.arcsin(min(1.0, echo))))
-        ),
-    ]
 
 
 # ---- Plan of each pair, from its echo or before that from the flight logs -------------------------------------------

@@ -120,7 +120,12 @@ def place(tx: NodeLog, rx: NodeLog, at: Times, *, hovers: bool = False) -> Pulse
         standing[good] = hovering(tx.log_seconds(at[good]), legs)
     if standing.any():
         reasons["hover"] = int(standing.sum())
-        flags["hover"] = _hover(tx, at, standing)
+        time_s = tx.log_seconds(at)
+        first, last = max(stretches(standing), key=lambda edge: time_s[edge[1] - 1] - time_s[edge[0]])
+        flags["hover"] = (
+            f"{int(standing.sum())} of {len(at)} pulses left out: the antennas stood, longest "
+            f"{time_s[last - 1] - time_s[first]:.0f} s from {tx.log_time(float(time_s[first]))}"
+        )
         good &= ~standing
     report = {
         leg: position_error(node.track, node.settings, at[good])
@@ -215,16 +220,6 @@ def _flags(node: NodeLog, at: Times, barred: dict[str, NDArray[np.bool_]]) -> di
     if node.yaw_fault is not None:
         lines["attitude_suspect"] = f"{node.name}: {node.yaw_fault.line}"
     return lines
-
-
-def _hover(tx: NodeLog, at: Times, standing: NDArray[np.bool_]) -> str:
-    """Return how many pulses of hovers are left out, and when the longest was."""
-    time_s = tx.log_seconds(at)
-    first, last = max(stretches(standing), key=lambda edge: time_s[edge[1] - 1] - time_s[edge[0]])
-    return (
-        f"{int(standing.sum())} of {len(at)} pulses left out: the antennas stood, longest "
-        f"{time_s[last - 1] - time_s[first]:.0f} s from {tx.log_time(float(time_s[first]))}"
-    )
 
 
 def _worst(node: NodeLog, faults: list[tuple[float, float]]) -> str:

@@ -367,7 +367,9 @@ def refine(campaign: Campaign, flight: str) -> Path:
         found = _searched(given, scene, str(decisions[1].value))
         stage = refined_stage(found, decisions, given, scene)
     else:
-        found = _unrefined(node for pair in names for node in pair.split("-"))
+        nothing = {node: np.zeros((0, 3)) for pair in names for node in pair.split("-")}
+        why = "images are formed from the logs as they are"
+        found = Refinement(TrackCorrection(np.zeros(0), nothing), nothing, accepted=False, why=why)
         stages, stage = {}, refined_stage(found, decisions, None, scene)
     print("; ".join([*(f"{one.name} {one.value}: {one.reason}" for one in decisions), found.why]), flush=True)
     patterns = [pattern_digests(campaign, pair) for pair in names]
@@ -387,13 +389,6 @@ def _searched(given: RefinementInputs, scene: OpenScene, method: str) -> Refinem
         points, causes = given.points, given.causes
         return refine_tracks(records, scene.grid, scene.terrain, errors, reference_points=points, causes=causes)
     return refine_one_phase(records, found, errors, method=method)
-
-
-def _unrefined(nodes: Any) -> Refinement:
-    """Return the refinement that leaves the tracks of some nodes as logged."""
-    nothing = {node: np.zeros((0, 3)) for node in dict.fromkeys(nodes)}
-    why = "images are formed from the logs as they are"
-    return Refinement(TrackCorrection(np.zeros(0), nothing), nothing, accepted=False, why=why)
 
 
 def refined_stage(
@@ -417,6 +412,8 @@ def refined_stage(
     moved_m, std_m = (np.stack([values[node] for node in nodes]) for values in (found.correction.moved_m, found.std_m))
     position_m = np.stack([logged.get(node, np.zeros((0, 3))) for node in nodes])
     by_node = ("node", "knot", "axis")
+    named = {"loss_db": "left_db", "shift_m": "gauge_shift_m", "phase_rad": "left_rad"}
+    known = {*named.values()} <= found.report.keys()
     return xr.Dataset(
         {
             "time": ("knot", began + np.rint(1e9 * knots_s).astype("timedelta64[ns]")),
@@ -434,7 +431,8 @@ def refined_stage(
             "accepted": found.accepted,
             "why": found.why,
             "report": dict(found.report),
-            "left": _left(found.report),
+            # the effect of the remaining errors by the fields of `Effect`, where it is known
+            "left": {effect: found.report[name] for effect, name in named.items() if known},
         },
     )
 
@@ -446,9 +444,3 @@ def _logged(records: Collection[PairRecord], knots_s: NDArray[np.float64]) -> Ma
         for node, leg in zip(one.nodes, one.profiles.aperture.legs, strict=True):
             places.setdefault(node, np.stack([np.interp(knots_s, one.time_s, axis) for axis in leg.T], axis=-1))
     return places
-
-
-def _left(report: Mapping[str, Any]) -> dict[str, float]:
-    """Return the effect of the remaining errors on an image, by the names of `Effect`; {} where unknown."""
-    named = {"loss_db": "left_db", "shift_m": "gauge_shift_m", "phase_rad": "left_rad"}
-    return {effect: report[name] for effect, name in named.items()} if {*named.values()} <= report.keys() else {}

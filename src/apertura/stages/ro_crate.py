@@ -21,20 +21,30 @@ from apertura.workflow.rules import RESULTS, RULES
 def ro_crate(campaign: Campaign) -> Sequence[Path]:
     """Write results/ro-crate-metadata.json, and the workflow beside it; return their paths."""
     lineage = result_of(campaign, "ro_crate").begin(campaign.root)
-    manifest, workflow = campaign.root / lineage.result.manifest, _workflow()
+    folder = shipped() / "workflow"
+    paths = [folder / "Snakefile", *sorted((folder / "rules").glob("*.smk"))]
+    workflow = {f"workflow/{path.relative_to(folder).as_posix()}": path.read_text("utf-8") for path in paths}
+    manifest = campaign.root / lineage.result.manifest
     manifest.unlink(missing_ok=True)
     for name, text in workflow.items():
         write_text(campaign.result(name), text)
     made = list(_results(campaign))
     read = {name: sha256 for one in reversed(made) for name, sha256 in one.recorded["sources"].items()}
     known = {**read, **lineage.sources.digests}
+    # recordings as they were when they were read, and the config as it is
+    inputs = sorted(name for name in known if not name.startswith("results/"))
+    catalog, expected = campaign.result("stac", CATALOG), "the catalog that step stac writes"
+    remedy = remake(campaign.result("stac"))
+    document = read_json(catalog, expected=expected, remedy=remedy)
+    with undamaged(catalog, expected=expected, remedy=remedy):
+        recorded_until = str(document[RECORDED][1])
     run = CrateRun(
         campaign.settings.campaign,
-        _recorded_until(campaign),
+        recorded_until,
         software(),
         lock_sha256(),
         list(_jobs(campaign, made, known)),
-        _inputs(campaign, known),
+        [Listed(name, known[name], _size(campaign.root.named(name, where=campaign.root))) for name in inputs],
         [Listed(name, sha256_text(text), len(text.encode())) for name, text in workflow.items()],
         author=campaign.settings.metadata.author,
         licence=campaign.settings.metadata.licence,
@@ -44,13 +54,6 @@ def ro_crate(campaign: Campaign) -> Sequence[Path]:
     write_json(written[0], crate_document(run))
     record_files(manifest, written, lineage)
     return written
-
-
-def _workflow() -> dict[str, str]:
-    """Return name in the results → text of each file of the workflow."""
-    folder = shipped() / "workflow"
-    paths = [folder / "Snakefile", *sorted((folder / "rules").glob("*.smk"))]
-    return {f"workflow/{path.relative_to(folder).as_posix()}": path.read_text("utf-8") for path in paths}
 
 
 class _Made(NamedTuple):
@@ -122,20 +125,5 @@ def _files(campaign: Campaign, one: _Made, known: Mapping[str, str]) -> list[Lis
     return [Listed(name, sha256, _size(campaign.results.named(name, where=where))) for name, sha256 in files.items()]
 
 
-def _inputs(campaign: Campaign, known: Mapping[str, str]) -> list[Listed]:
-    """Return the recordings, as they were when they were read, and the config, as it is."""
-    names = sorted(name for name in known if not name.startswith("results/"))
-    return [Listed(name, known[name], _size(campaign.root.named(name, where=campaign.root))) for name in names]
-
-
 def _size(path: Path) -> int | None:
     return path.stat().st_size if path.is_file() else None
-
-
-def _recorded_until(campaign: Campaign) -> str:
-    """Return the time of the last pulse, as the catalog has it."""
-    path = campaign.result("stac", CATALOG)
-    remedy = remake(campaign.result("stac"))
-    document = read_json(path, expected="the catalog that step stac writes", remedy=remedy)
-    with undamaged(path, expected="the catalog that step stac writes", remedy=remedy):
-        return str(document[RECORDED][1])

@@ -320,7 +320,9 @@ def settled(campaign: Campaign, flown: Callable[[], Flown]) -> tuple[SceneGrid, 
                 f"{megapixels:.3g} Mpx, more than the {most / 1e6:.3g} Mpx that this pass fills: state scene.bounds_m"
             )
     if "auto" in {requested.bounds_m, requested.spacing_m}:
-        bounds = _whole_pixels(bounds, spacing)
+        xmin, ymin, xmax, ymax = bounds
+        columns, rows = (int(np.ceil(extent / spacing - 1e-9)) for extent in (xmax - xmin, ymax - ymin))
+        bounds = (xmin, ymax - rows * spacing, xmin + columns * spacing, ymax)
     grid = SceneGrid.from_bounds(crs, bounds, spacing_m=spacing, name=campaign.settings.campaign)
     return grid, ground, chosen | ground.reason
 
@@ -345,12 +347,6 @@ def _spacing(flown: Flown, ground: ConfiguredGround, bounds: Bounds, height_m: f
 
 def _middle(flown: Flown) -> NDArray[np.float64]:
     return np.asarray(np.median(np.concatenate(flown.aperture.legs), axis=0))
-
-
-def _whole_pixels(bounds: Bounds, spacing: float) -> Bounds:
-    xmin, ymin, xmax, ymax = bounds
-    columns, rows = (int(np.ceil(extent / spacing - 1e-9)) for extent in (xmax - xmin, ymax - ymin))
-    return (xmin, ymax - rows * spacing, xmin + columns * spacing, ymax)
 
 
 # ---- Rule `scene`: the campaign's one grid, every `auto` decided once -----------------------------------------------

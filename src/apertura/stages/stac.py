@@ -73,7 +73,7 @@ class _Described:
     def _pair(self, flight: str, pair: str, looks: NDArray[np.float32]) -> Image:
         files = self._listed(flight, pair, "export") | self._listed(flight, pair, "layers")
         facts: dict[str, Any] = {
-            "sar:instrument_mode": _mode(pair),
+            "sar:instrument_mode": "monostatic" if len(set(pair.split("-"))) == 1 else "bistatic",
             "product:type": "SLC",
             "sar:looks_range": 1,
             "sar:looks_azimuth": 1,
@@ -192,8 +192,3 @@ def _view(view: Mapping[str, Any]) -> dict[str, Any]:
     directions = {"sar:observation_direction": view["side"], "view:azimuth": view["look_deg"]}
     known = {name: value for name, value in directions.items() if value not in {"both", None}}
     return known | {"view:incidence_angle": float(view["incidence_deg"])}
-
-
-def _mode(pair: str) -> str:
-    """Return monostatic or bistatic, in the terms of the extension sar."""
-    return "monostatic" if len(set(pair.split("-"))) == 1 else "bistatic"

@@ -190,7 +190,9 @@ def _correction(stage: xr.Dataset) -> Correction | None:
     """Return what the pulses of a stage are corrected by; None where a node hears itself."""
     if "sidelink_amplitude" not in stage:
         return None
-    amplitude, cell_m = stage.sidelink_amplitude.values, SPEED_OF_LIGHT_M_S / _bandwidth_hz(stage)
+    frequency, amplitude = stage.frequency.values, stage.sidelink_amplitude.values
+    bandwidth_hz = float((frequency[-1] - frequency[0]) * len(frequency) / (len(frequency) - 1))
+    cell_m = SPEED_OF_LIGHT_M_S / bandwidth_hz
     noise = amplitude**2 / 10 ** (stage.sidelink_snr.values / 10)
     locked = np.isfinite(amplitude)
     delay, phase = stage.sidelink_delay.values / cell_m, stage.sidelink_phase.values
@@ -198,11 +200,6 @@ def _correction(stage: xr.Dataset) -> Correction | None:
     path = LineOfSight(known[0], known[1], known[2], known[3], locked)
     clock_hz = stage.clock_offset.values if "clock_offset" in stage else None
     return Correction(stage.attrs["sidelink"]["method"], path, clock_hz, stage.attrs["clock"].get("sfo_ppm", 0.0))
-
-
-def _bandwidth_hz(stage: xr.Dataset) -> float:
-    frequency = stage.frequency.values
-    return float((frequency[-1] - frequency[0]) * len(frequency) / (len(frequency) - 1))
 
 
 # ---- Recorders that store transfer functions: FMCW, phase history ---------------------------------------------------
@@ -231,15 +228,8 @@ def recorded_echo(campaign: Campaign, flight: str, pair: str) -> xr.Dataset:
         raise CampaignError(found, where, expected, remedy)
     if logged:
         return in_air(campaign, _placed_by_logs(campaign, flight, (tx, rx), history))
-    _check_frame(campaign.settings.scene.crs, history.attrs["frame"])
-    history = in_air(campaign, history)
-    nodes = campaign.settings.nodes
-    known = {leg: stated_error(nodes[node]) | {"node": node} for leg, node in (("tx", tx), ("rx", rx))}
-    return history.assign_attrs(positions=known)
-
-
-def _check_frame(crs: str, frame: str) -> None:
-    local = frame == LOCAL
+    crs = campaign.settings.scene.crs
+    local = history.attrs["frame"] == LOCAL
     if local != (crs == LOCAL):
         raise CampaignError(
             f"{crs} for phase history with positions {'in metres of a frame of its own' if local else 'on Earth'}",
@@ -247,6 +237,10 @@ def _check_frame(crs: str, frame: str) -> None:
             expected=LOCAL if local else "an EPSG code, or auto",
             remedy="Correct scene.crs.",
         )
+    history = in_air(campaign, history)
+    nodes = campaign.settings.nodes
+    known = {leg: stated_error(nodes[node]) | {"node": node} for leg, node in (("tx", tx), ("rx", rx))}
+    return history.assign_attrs(positions=known)
 
 
 def _placed_by_logs(campaign: Campaign, flight: str, nodes: tuple[str, str], history: xr.Dataset) -> xr.Dataset:

@@ -142,12 +142,14 @@ def measured_constants(campaign: Campaign) -> tuple[Constants, list[str]]:
         pair: _of_pair(pair, radars[pair], found, reference, campaign)
         for pair in dict.fromkeys(one.pair for one in found)
     }
+    path = campaign.calibration_file
+    before = None if path is None else read_constants(path)
     constants = Constants(
         software=__version__,
         campaign=campaign.settings.campaign,
         flights=began,
         reference=reference,
-        pairs=_since(campaign, pairs),
+        pairs=dict(_drifted(pairs, before)) if before else dict(pairs),
         measurements=tuple(one.report for one in found),
         images=images,
     )
@@ -375,13 +377,6 @@ def _flags(mean: Mean, unit: str) -> dict[str, str]:
         first, second, apart, std = mean.drift
         flags["constant_drifts"] = f"{apart:+.2f} ± {std:.2f} {unit} from {first} to {second}"
     return flags
-
-
-def _since(campaign: Campaign, pairs: Mapping[str, PairConstant]) -> dict[str, PairConstant]:
-    """Return the constants with what they drifted by since those that the campaign takes up."""
-    path = campaign.calibration_file
-    before = None if path is None else read_constants(path)
-    return dict(_drifted(pairs, before)) if before else dict(pairs)
 
 
 def _drifted(pairs: Mapping[str, PairConstant], before: Constants) -> Iterator[tuple[str, PairConstant]]:

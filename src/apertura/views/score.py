@@ -16,7 +16,6 @@ from apertura.common.errors import CampaignError
 from apertura.common.raster import opened_raster
 from apertura.core.quality.bright_points import BrightPoint, bright_point, brightest_near
 from apertura.core.quality.point_targets import cut_through, find_peak
-from apertura.core.scene.grid import SceneGrid
 from apertura.formats.export import product, product_files
 from apertura.formats.export.radiometry import CROSS_SECTIONS
 from apertura.stages.pair import open_pair
@@ -68,7 +67,10 @@ def score(campaign: Campaign) -> list[Finding]:
 
 def _flight(campaign: Campaign, flight: Flight, targets: list[dict[str, float]]) -> Iterator[Finding]:
     grid = settled_scene(campaign).grid
-    along = _along_track(campaign, flight, grid)
+    echo = open_stage(campaign.stage("echo", flight.name, flight.pairs[0]), "echo")
+    ends = echo.tx_position.values[[0, -1]]
+    down, right, _ = np.diff(grid.pixel_below(ends), axis=0)[0]
+    along = (float(right), float(-down))
     sources = {name: "coherent" if name == FUSED else "image" for name in flight.images}
     files = {name: campaign.result(flight.name, name, product(of, "write_slc").file) for name, of in sources.items()}
     for name, file in files.items():
@@ -120,14 +122,6 @@ def _cross_sections(
         return {"rcs_dbsm": one["rcs_dbsm"], "rcs_std_db": one["std_db"], "rcs_put_dbsm": put}
 
     return found
-
-
-def _along_track(campaign: Campaign, flight: Flight, grid: SceneGrid) -> tuple[float, float]:
-    """Return the transmitter's direction over ground as (east, north)."""
-    echo = open_stage(campaign.stage("echo", flight.name, flight.pairs[0]), "echo")
-    ends = echo.tx_position.values[[0, -1]]
-    down, right, _ = np.diff(grid.pixel_below(ends), axis=0)[0]
-    return float(right), float(-down)
 
 
 def print_findings(campaign: Campaign, *, paths: bool) -> None:

@@ -177,7 +177,17 @@ def whole_chart(campaign: Campaign, *, repeats: int = 3) -> Sequence[Path]:
     rows = [_whole(name, some) for name, some in runs.items() if name not in refused]
     paths = [campaign.result(STUDY) / f"whole.{suffix}" for suffix in ("csv", "png")]
     write_table(paths[0], rows, digits=6)
-    draw_whole(rows, paths[1], title=_title(campaign, rows, repeats), refused=refused)
+    load = f"load {min(row.load for row in rows):.1f} to {max(row.load for row in rows):.1f} on {os.cpu_count()} cores"
+    flight = campaign.image_flights[0]
+    draw_whole(
+        rows,
+        paths[1],
+        title=(
+            f"{campaign.settings.campaign}, {flight.name}, {', '.join(flight.pairs)}: from raw samples to GeoTIFFs\n"
+            f"{_processor()}, {load}; mean, least and most of {repeats} runs, one thread"
+        ),
+        refused=refused,
+    )
     record_files(campaign.root / lineage.result.manifest, paths, lineage)
     return paths
 
@@ -246,25 +256,11 @@ def _whole(name: str, runs: list[_Run]) -> Whole:
         float(np.mean([run.wall_seconds for run in runs])),
         len(runs),
         float(np.mean([run.load for run in runs])),
-        min(_expected_db(report) for report in reports),
+        min(float(sum(line["loss_db"] for line in report["budget"] if is_counted(line))) for report in reports),
         worst.get("loss_db", float("nan")),
         worst.get("std_db", float("nan")),
         max(report["numerical_error_db"] for report in reports),
         " ".join(sorted({flag for report in reports for flag in report["flags"]})),
-    )
-
-
-def _expected_db(report: Mapping[str, Any]) -> float:
-    """Return the loss of all causes that are expected, unrounded."""
-    return float(sum(line["loss_db"] for line in report["budget"] if is_counted(line)))
-
-
-def _title(campaign: Campaign, rows: list[Whole], repeats: int) -> str:
-    load = f"load {min(row.load for row in rows):.1f} to {max(row.load for row in rows):.1f} on {os.cpu_count()} cores"
-    flight = campaign.image_flights[0]
-    return (
-        f"{campaign.settings.campaign}, {flight.name}, {', '.join(flight.pairs)}: from raw samples to GeoTIFFs\n"
-        f"{_processor()}, {load}; mean, least and most of {repeats} runs, one thread"
     )
 
 

@@ -155,7 +155,10 @@ def planned_image(
     if rcs_dbsm is not None:
         layers["point_snr"] = _point_snr(calibrated, noise, rcs_dbsm, grid.shape)
     seen = _seen_from(pair, beams, scene.middle_m)
-    refined = seen if refinement is None else _refined(campaign, seen, scene, refinement)
+    refined = seen
+    if refinement is not None:  # the loss that it leaves, and the shifts of the logs, which no refinement observes
+        logged = summed(line.effect for line in budget_of(campaign, seen, scene) if line.cause == "positions")
+        refined = replace(seen, left=replace(logged, loss_db=refinement.remainder_db, loss_std_db=0.0))
     layers |= _coarse_layers(campaign, pair, scene, beams, None if refinement is None else refined.left)
     outside = layers["mask"] == OUTSIDE
     layers["mask"] = np.where((layers["path_margin"] < 0) | outside, OUTSIDE, layers["mask"]).astype(np.uint8)
@@ -264,12 +267,6 @@ def planned_job(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> tuple[J
         illumination=scene_illumination(campaign, pair.name, beams, scene, pair.aperture),
     )
     return job, integration, beams
-
-
-def _refined(campaign: Campaign, pair: OpenPair, scene: OpenScene, refinement: PlannedRefinement) -> OpenPair:
-    """Return a pair with the loss that a refinement leaves, and the shifts of the logs, which no refinement sees."""
-    logged = summed(line.effect for line in budget_of(campaign, pair, scene) if line.cause == "positions")
-    return replace(pair, left=replace(logged, loss_db=refinement.remainder_db, loss_std_db=0.0))
 
 
 def _noise(calibrated: CalibratedPair | None) -> float:

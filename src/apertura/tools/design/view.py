@@ -484,7 +484,10 @@ def comparison_rows(plan: FlightPlan, root: Path, campaign: Campaign, *, threads
             planned_pair = next(one for one in design.opened.pairs if (one.flight, one.name) == (flight.name, pair))
             numbers = [_numbers(planned), _numbers(flown)]
             pulses = [float(len(one.time_s)) for one in (planned_pair, opened)]
-            speeds = [_speed_m_s(one.aperture.middle_m, one.time_s) for one in (planned_pair, opened)]
+            speeds = [
+                float(np.median(np.linalg.norm(np.diff(one.aperture.middle_m, axis=0), axis=1) / np.diff(one.time_s)))
+                for one in (planned_pair, opened)
+            ]
             numbers[0] |= {"pulses": pulses[0], "speed, m/s": speeds[0]}
             numbers[1] |= {"pulses": pulses[1], "speed, m/s": speeds[1]}
             for name, value in numbers[0].items():
@@ -499,10 +502,6 @@ def comparison_rows(plan: FlightPlan, root: Path, campaign: Campaign, *, threads
             "Name flights and nodes as in the campaign.",
         )
     return rows
-
-
-def _speed_m_s(place_m: NDArray[np.float64], time_s: NDArray[np.float64]) -> float:
-    return float(np.median(np.linalg.norm(np.diff(place_m, axis=0), axis=1) / np.diff(time_s)))
 
 
 def _numbers(image: PlannedImage) -> dict[str, float]:

@@ -62,7 +62,8 @@ def write_design(design: Design, folder: Path, tried: Sequence[Tried] = ()) -> l
             style = path.with_suffix(".qml")
             (write_mask_style if layer == "mask" else write_layer_style)(style)
             written += [path, style]
-    return [*written, *_write_tracks(design, folder), _write_report(design, folder, tried)]
+    write_json(folder / "design.json", report_of(design) | ({"plans": tried_report(tried)} if tried else {}))
+    return [*written, *_write_tracks(design, folder), folder / "design.json"]
 
 
 PICTURE_TAGS = {"APERTURA_VERSION": __version__, "APERTURA_PLANNED": "true"}
@@ -73,11 +74,6 @@ def tags_of(design: Design) -> dict[str, str]:
     """Return what rasters of a design say of where they come from."""
     plan = design.opened.plan.model_dump(mode="json", exclude_unset=True)
     return PICTURE_TAGS | {"APERTURA_PLAN": canonical_json(plan)}
-
-
-def _write_report(design: Design, folder: Path, tried: Sequence[Tried]) -> Path:
-    write_json(folder / "design.json", report_of(design) | ({"plans": tried_report(tried)} if tried else {}))
-    return folder / "design.json"
 
 
 def _write_tracks(design: Design, folder: Path) -> list[Path]:

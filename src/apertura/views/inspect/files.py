@@ -282,7 +282,15 @@ def recording_report(files: Sequence[Path], beside: Surroundings) -> Report:
     """
     recording = open_recording(files)
     facts, samples = recording_facts(recording), first_samples(recording)
-    rows = _recording_rows(recording, facts) | {"first_captures": _levels(recording.channels, samples)}
+    parts = samples.view(np.float32)
+    peaks = np.abs(parts.reshape(-1, len(recording.channels), 2)).max(axis=(0, 2))
+    rms = np.sqrt(np.mean(np.abs(samples.astype(np.complex128)) ** 2, axis=(0, 1)))
+    rows = _recording_rows(recording, facts) | {
+        "first_captures": {
+            name: {"rms": float(one), "largest": float(peak)}
+            for name, one, peak in zip(recording.channels, rms, peaks, strict=True)
+        }
+    }
     from apertura.views.inspect.pictures import draw_recording
 
     node = files[0].name.removesuffix(files[0].suffix)
@@ -326,16 +334,6 @@ def first_samples(recording: "Recording") -> NDArray[np.complex64]:
     count = max(1, min(FIRST, len(captures.start), _MOST_SAMPLES // max(each, 1)))
     iq = recording.samples.captures(captures.start[:count], each).astype(np.float32)
     return np.asarray(iq[..., 0] + 1j * iq[..., 1], np.complex64)
-
-
-def _levels(channels: Sequence[str], samples: NDArray[np.complex64]) -> dict[str, dict[str, float]]:
-    """Return channel → RMS amplitude and the largest of either component, in counts of the recorder."""
-    parts = samples.view(np.float32)
-    peaks = np.abs(parts.reshape(-1, len(channels), 2)).max(axis=(0, 2))
-    rms = np.sqrt(np.mean(np.abs(samples.astype(np.complex128)) ** 2, axis=(0, 1)))
-    return {
-        name: {"rms": float(one), "largest": float(peak)} for name, one, peak in zip(channels, rms, peaks, strict=True)
-    }
 
 
 def _recording_lacks(recording: "Recording", facts: RecordingFacts, beside: Surroundings) -> list[str]:

@@ -144,19 +144,15 @@ def draw_history(echo: "xr.Dataset", name: str) -> Figure:
     _image(profiles, _decibels(profile), (-reach_m, reach_m), "dB under the largest", rows=count)
     _named(profiles, "path beyond the reference, m", f"pulse, {len(pulses)} of {count} are drawn")
     if placed:
-        _antennas(figure.add_subplot(grid[1]), echo)
+        plan = figure.add_subplot(grid[1])
+        frame, middle = echo.attrs["frame"], np.median(echo.tx_position.values, axis=0)
+        for leg, style, size in (("tx", "k.", 5), ("rx", "r.", 2)):
+            place = east_north_up(echo[f"{leg}_position"].values, frame, middle)
+            plan.plot(place[:, 0], place[:, 1], style, markersize=size, label=leg)
+        _named(plan, *(("east of the middle, m", "north of the middle, m") if frame == "ecef" else ("x, m", "y, m")))
+        plan.set_aspect("equal", adjustable="datalim")
+        plan.legend(loc="best", fontsize="small")
     return figure
-
-
-def _antennas(plan: "Axes", echo: "xr.Dataset") -> None:
-    """Draw where both antennas were, about the middle of the transmitting one."""
-    frame, middle = echo.attrs["frame"], np.median(echo.tx_position.values, axis=0)
-    for leg, style, size in (("tx", "k.", 5), ("rx", "r.", 2)):
-        place = east_north_up(echo[f"{leg}_position"].values, frame, middle)
-        plan.plot(place[:, 0], place[:, 1], style, markersize=size, label=leg)
-    _named(plan, *(("east of the middle, m", "north of the middle, m") if frame == "ecef" else ("x, m", "y, m")))
-    plan.set_aspect("equal", adjustable="datalim")
-    plan.legend(loc="best", fontsize="small")
 
 
 def draw_heights(heights: NDArray[np.float32], extent: tuple[float, ...], name: str, *, unit: str) -> Figure:

@@ -265,7 +265,19 @@ def draw_budget(
             _draw_causes(axes, lines, measure)
             axes.tick_params(labelleft=place == 0)
             if measure == "loss_db":
-                _draw_measured(axes, measured)
+                if measured.expected_db is not None:
+                    expected = max(abs(measured.expected_db), _LEAST["loss_db"])
+                    axes.axvline(expected, color=BLUE, linestyle=":", label="expected")
+                if measured.loss_db is not None:
+                    loss = max(abs(measured.loss_db), _LEAST["loss_db"])
+                    axes.axvline(loss, color=RED, linewidth=1.4, label="measured at bright points")
+                    if measured.std_db:
+                        axes.axvspan(
+                            max(loss - measured.std_db, _LEAST["loss_db"]),
+                            loss + measured.std_db,
+                            color=RED,
+                            alpha=0.15,
+                        )
         lines_of, _ = figure.axes[0].get_legend_handles_labels()
         bars = [Patch(**style) for style in _STYLES.values()]  # also of a kind that this image has none of
         handles = [*(one for one in lines_of if not isinstance(one, Container)), *bars]
@@ -317,14 +329,3 @@ def _power_of_ten(value: float) -> str:
     ['10⁻⁴', '10⁻²', '0.1', '10']
     """
     return f"{value:g}" if value >= _SHORT else f"10{str(round(np.log10(value))).translate(_RAISED)}"
-
-
-def _draw_measured(axes: Axes, measured: Measured) -> None:
-    if measured.expected_db is not None:
-        expected = max(abs(measured.expected_db), _LEAST["loss_db"])
-        axes.axvline(expected, color=BLUE, linestyle=":", label="expected")
-    if measured.loss_db is not None:
-        loss = max(abs(measured.loss_db), _LEAST["loss_db"])
-        axes.axvline(loss, color=RED, linewidth=1.4, label="measured at bright points")
-        if measured.std_db:
-            axes.axvspan(max(loss - measured.std_db, _LEAST["loss_db"]), loss + measured.std_db, color=RED, alpha=0.15)

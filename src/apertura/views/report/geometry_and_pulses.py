@@ -95,7 +95,15 @@ def draw_geometry(path: Path, flown: FlownGeometry, *, title: str, tags: Mapping
         grid = GridSpec(2, 2, figure=figure, height_ratios=(2.2, 1))
         _draw_plan(figure.add_subplot(grid[0, 0]), flown)
         _draw_side(figure.add_subplot(grid[0, 1]), flown)
-        _draw_heights(figure.add_subplot(grid[1, :]), flown)
+        axes = figure.add_subplot(grid[1, :])
+        for name, track in flown.tracks_m.items():
+            axes.plot(flown.time_s, track[:, 2] - flown.ground_m, label=name, **_STYLES[name])
+        axes.set(
+            title=f"height above the scene, whose ground lies at {number(round(flown.ground_m, 2))} m",
+            xlabel=over(counted=flown.counted),
+            ylabel="height, m",
+        )
+        axes.margins(x=0)
         handles, labels = figure.axes[0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside upper center", ncols=5, frameon=False)
 
@@ -158,17 +166,6 @@ def _draw_side(axes: Axes, flown: FlownGeometry) -> None:
     axes.xaxis.set_major_locator(MaxNLocator(5))
 
 
-def _draw_heights(axes: Axes, flown: FlownGeometry) -> None:
-    for name, track in flown.tracks_m.items():
-        axes.plot(flown.time_s, track[:, 2] - flown.ground_m, label=name, **_STYLES[name])
-    axes.set(
-        title=f"height above the scene, whose ground lies at {number(round(flown.ground_m, 2))} m",
-        xlabel=over(counted=flown.counted),
-        ylabel="height, m",
-    )
-    axes.margins(x=0)
-
-
 _BINS = 60
 
 
@@ -229,7 +226,15 @@ def draw_pulses(path: Path, record: PulseRecord, *, title: str, tags: Mapping[st
         first, *others = column_of(figure, 1 + len(series))
         _draw_counts(first, record)
         for axes, (values, label, heading) in zip(others, series, strict=True):
-            _draw_series(axes, record.time_s, values, label, heading)
+            some = thinned(len(values))
+            median = float(np.nanmedian(values))
+            axes.plot(record.time_s[some], values[some], ".", color=BLUE, markersize=2, rasterized=True)
+            axes.axhline(median, color=GREY, linewidth=0.8, linestyle="--")
+            spread = 1.4826 * float(np.nanmedian(np.abs(values - median)))
+            unlocked = int(np.isnan(values).sum())
+            lost = f"; {number_of(unlocked, 'pulse')} without lock" if unlocked else ""
+            unit = label.rpartition(", ")[2]
+            axes.set(title=f"{heading}: median {median:.3g} {unit}, spread {spread:.2g} {unit}{lost}", ylabel=label)
         [first, *others][-1].set_xlabel(over(counted=record.counted, first="first pulse sent"))
         first.set_xlim(0.0, max(float(record.sent_s.max(initial=0.0)), 1e-3))
 
@@ -280,18 +285,6 @@ def _why(reasons: Mapping[str, int]) -> str:
     """
     counts = ", ".join(f"{count} {why.replace('_', ' ')}" for why, count in reasons.items())
     return f" ({counts})" if counts else ""
-
-
-def _draw_series(axes: Axes, time_s: Floats, values: Floats, label: str, heading: str) -> None:
-    some = thinned(len(values))
-    median = float(np.nanmedian(values))
-    axes.plot(time_s[some], values[some], ".", color=BLUE, markersize=2, rasterized=True)
-    axes.axhline(median, color=GREY, linewidth=0.8, linestyle="--")
-    spread = 1.4826 * float(np.nanmedian(np.abs(values - median)))
-    unlocked = int(np.isnan(values).sum())
-    lost = f"; {number_of(unlocked, 'pulse')} without lock" if unlocked else ""
-    unit = label.rpartition(", ")[2]
-    axes.set(title=f"{heading}: median {median:.3g} {unit}, spread {spread:.2g} {unit}{lost}", ylabel=label)
 
 
 TIMES, PATHS = 560, 700

@@ -90,12 +90,8 @@ def _pictures(folder: Path, shown: Mapping[str, str]) -> Iterator[Block]:
     """Yield the pictures of a folder, file → the result that lists it, with what the workflow's report says of them."""
     for name, of in shown.items():
         check_listed(folder / name, folder / f"{of}.manifest.json")
-        yield Picture((folder / name).read_bytes(), _caption(Path(name).stem))
-
-
-def _caption(name: str) -> str:
-    """Return what the workflow's report says below a picture."""
-    return " ".join((shipped() / "workflow" / "report" / f"{name}.rst").read_text(encoding="utf-8").split())
+        caption = (shipped() / "workflow" / "report" / f"{Path(name).stem}.rst").read_text(encoding="utf-8")
+        yield Picture((folder / name).read_bytes(), " ".join(caption.split()))
 
 
 def flight_rows(campaign: Campaign, flight: str, reports: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, str]]:
