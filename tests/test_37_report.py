@@ -208,7 +208,7 @@ def test_text_of_strangers_stays_text_on_the_page():
     assert html.count("<img") == html.count("<table>") == html.count("<h1>") == 1
     assert "default-src 'none'" in html
     assert 'alt="Figure 1. `a &lt;javascript' in html
-    assert "&amp;amp; it&#x27;s" in html
+    assert "&amp;amp; it&#39;s" in html
 
 
 def test_text_of_strangers_stays_text_on_the_landing_page():

@@ -171,26 +171,6 @@ def _fixes(track: "xr.Dataset") -> dict[str, int] | None:
     }
 
 
-@dataclass(frozen=True)
-class FrameNumbers:
-    """The frame numbers of a recording.
-
-    Attributes
-    ----------
-    first, last
-        As recorded.
-    missing
-        Numbers that are left out between neighbours.
-    restarts
-        How often the counter starts again.
-    """
-
-    first: int
-    last: int
-    missing: int
-    restarts: int
-
-
 @dataclass(frozen=True, eq=False)
 class RecordingFacts:
     """What the header of a recording says.
@@ -223,7 +203,7 @@ class RecordingFacts:
     capture_samples: int
     span: Span
     times: TimeFacts | None
-    frames: FrameNumbers | None
+    frames: dict[str, int] | None
 
     @property
     def runs_through(self) -> bool:
@@ -247,12 +227,16 @@ def recording_facts(recording: Recording) -> RecordingFacts:
     )
 
 
-def _frames(numbers: NDArray[np.int64]) -> FrameNumbers | None:
+def _frames(numbers: NDArray[np.int64]) -> dict[str, int] | None:
     if not numbers.size:
         return None
     steps = np.diff(numbers)
-    missing = int((steps[steps > 1] - 1).sum())
-    return FrameNumbers(int(numbers[0]), int(numbers[-1]), missing, int((steps <= 0).sum()))
+    return {
+        "first": int(numbers[0]),
+        "last": int(numbers[-1]),
+        "missing": int((steps[steps > 1] - 1).sum()),
+        "restarts": int((steps <= 0).sum()),
+    }
 
 
 @dataclass(frozen=True, eq=False)

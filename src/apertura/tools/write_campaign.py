@@ -1,7 +1,7 @@
 """A campaign folder from plain arrays and files, opened once before it gets its name."""
 
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -158,7 +158,7 @@ def _write_node(stem: Path, recorded: RecordedNode, waveform: SampledWaveform) -
     flat = samples.reshape(-1, *samples.shape[-2:])
     write_recording(
         stem,
-        _blocks(flat),
+        (flat[first : first + _AT_ONCE] for first in range(0, len(flat), _AT_ONCE)),
         zip(start.tolist(), time, frame, strict=True),
         channels=recorded.channels,
         sample_rate_hz=waveform.sample_rate_hz,
@@ -265,11 +265,6 @@ def _times(given: ArrayLike | None, stem: Path, name: str) -> NDArray[np.datetim
     except ValueError as error:
         raise _wrong(stem, f"{name}: {error}", "datetime64 or ISO 8601, UTC") from error
     return times.astype("datetime64[ns]")
-
-
-def _blocks(samples: NDArray[Any]) -> Iterator[NDArray[Any]]:
-    for first in range(0, len(samples), _AT_ONCE):
-        yield samples[first : first + _AT_ONCE]
 
 
 def _check_opens(campaign: Campaign, flights: Mapping[str, RecordedFlight]) -> None:

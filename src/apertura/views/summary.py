@@ -58,7 +58,11 @@ def print_summary(campaign: Campaign) -> None:
     if not console.is_terminal:
         console = Console(highlight=False, width=max(_WIDE, console.width))
     console.print(_table(values))
-    for why, images in _undecided(values).items():
+    undecided = dict[str, list[str]]()  # reason → images whose verdict is not `focused` although no flag explains it
+    for name, one in values.items():
+        if one.verdict not in ("", "focused") and not one.flags:
+            undecided.setdefault(f"{one.verdict}: {one.why}", []).append(name)
+    for why, images in undecided.items():
         console.print(f"{_some(images)}: {why}", soft_wrap=True)
     unsure = max(values.values(), key=lambda one: one.place_m, default=None)
     if unsure and unsure.place_m:
@@ -75,15 +79,6 @@ def print_summary(campaign: Campaign) -> None:
     if missing := [" ".join(image) for image in names if image not in there]:
         console.print(f"not there yet: {_some(missing)}; apertura run makes what is missing", soft_wrap=True)
     print_products(campaign)
-
-
-def _undecided(values: Mapping[str, ImageValues]) -> dict[str, list[str]]:
-    """Return reason → images whose verdict is not `focused` although no flag of theirs says why."""
-    reasons = dict[str, list[str]]()
-    for name, one in values.items():
-        if one.verdict not in ("", "focused") and not one.flags:
-            reasons.setdefault(f"{one.verdict}: {one.why}", []).append(name)
-    return reasons
 
 
 def print_stale(campaign: Campaign) -> None:
@@ -141,8 +136,12 @@ def _interferograms(campaign: Campaign) -> Iterator[tuple[str, dict[str, Any]]]:
             yield f"{INTERFEROMETRY} {name}", says
 
 
+def _some(names: Sequence[str], most: int = 3) -> str:
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+
+
 def _print_flags(console: "Console", reports: Mapping[str, Report]) -> None:
-    """Print each flag with what it means and what to look at first, and below it what was measured of which images."""
+    """Print each flag with its meaning and advice, and below it what was measured of which images."""
     from rich.padding import Padding
     from rich.text import Text
 
@@ -151,10 +150,6 @@ def _print_flags(console: "Console", reports: Mapping[str, Report]) -> None:
         measured = [f"{_some(images)}: {line}" for line, images in flag.measured.items()]
         for line in [*measured, *([f"look at: {flag.look}"] if flag.look else [])]:
             console.print(Padding(Text(line), (0, 0, 0, 4)))
-
-
-def _some(names: Sequence[str], most: int = 3) -> str:
-    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 def _table(images: Mapping[str, ImageValues]) -> "Table":

@@ -73,7 +73,12 @@ def _section(model: type[BaseModel], depth: int, examples: Mapping[str, Any] = M
         indent = "  " * depth
         lines.append(f"{indent}# {field.description}{_choices(field)}")
         if name == "engine_options":
-            lines += [f"{indent}#   {line}" for line in _options_of_each_engine()]
+            engines = {name: load_engine(name).Options.model_fields for name in ENGINES}
+            lines += [
+                f"{indent}#   {engine}.{key}: {option.description}{_choices(option)}"
+                for engine, options in engines.items()
+                for key, option in options.items()
+            ]
         value = examples[name] if name in examples else _value(field)
         if isinstance(value, type) and issubclass(value, BaseModel):
             lines += [f"{indent}{name}:", *_section(value, depth + 1)]
@@ -82,17 +87,10 @@ def _section(model: type[BaseModel], depth: int, examples: Mapping[str, Any] = M
             for key, inner in value.items():
                 lines += [f"{indent}  {key}:", *_section(inner, depth + 2)]
         else:
-            lines.append(f"{indent}{name}: {_scalar(value)}")
+            plain = list(value) if isinstance(value, tuple) else value
+            scalar = yaml.safe_dump(plain, default_flow_style=True).removesuffix("\n").removesuffix("\n...")
+            lines.append(f"{indent}{name}: {scalar}")
     return lines
-
-
-def _options_of_each_engine() -> list[str]:
-    engines = {name: load_engine(name).Options.model_fields for name in ENGINES}
-    return [
-        f"{name}.{key}: {field.description}{_choices(field)}"
-        for name, fields in engines.items()
-        for key, field in fields.items()
-    ]
 
 
 def _value(field: FieldInfo) -> Any:
@@ -125,8 +123,3 @@ def _choices(field: FieldInfo) -> str:
     ends = [getattr(limit, end) for end in ("gt", "ge", "lt", "le") for limit in limits if hasattr(limit, end)]
     above = any(hasattr(limit, "gt") for limit in limits)
     return f" ({'above ' if above else ''}{ends[0]:g} to {ends[1]:g})" if len(ends) == 2 else ""
-
-
-def _scalar(value: Any) -> str:
-    plain = list(value) if isinstance(value, tuple) else value
-    return yaml.safe_dump(plain, default_flow_style=True).removesuffix("\n").removesuffix("\n...")

@@ -221,16 +221,14 @@ def check_stage(folder: Path) -> dict[str, str]:
     recorded, inside = _files_of(folder), f"{folder.name}/"
     names = [path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()]
     present = {
-        f"{inside}{name}": recorded.get(f"{inside}{name}", "") if _is_chunk(name) else sha256_file(folder / name)
+        # zarr version 3 keeps values in files below a folder `c`
+        f"{inside}{name}": recorded.get(f"{inside}{name}", "")
+        if "c" in name.split("/")[1:]
+        else sha256_file(folder / name)
         for name in names
     }
     _check(manifest_of(folder), recorded, present)
     return {name.removeprefix(inside): digest for name, digest in recorded.items()}
-
-
-def _is_chunk(name: str) -> bool:
-    """Return whether a file of a zarr folder, relative to it, holds values: version 3 keeps them below a folder `c`."""
-    return "c" in name.split("/")[1:]
 
 
 def _files_of(result: Path) -> dict[str, str]:

@@ -368,11 +368,18 @@ def measure_bench(campaign: Campaign, flight: str) -> Bench:
     names = [name for name in flown.participants if name in flown.nodes]
     nodes = tuple(_node(campaign, flight, name, sent, own=name == flown.transmitter) for name in names)
     due = max((node.triggers.due for node in nodes), default=0)
-    nodes = tuple(_with_ends(node, due) for node in nodes)
+    # pulses that other nodes recorded before a node began or after it stopped
+    counts = [replace(node.triggers, beyond=due - node.triggers.due) for node in nodes]
+    nodes = tuple(
+        replace(node, triggers=triggers, flags=Flags.merged(node.flags, triggers.flags))
+        for node, triggers in zip(nodes, counts, strict=True)
+    )
     stated, offsets, further = campaign.settings.bench, {}, []
     for node in nodes:
         own = node.name == flown.transmitter
-        expected_m = stated.radar_m if own or stated.radar_m is None else _less(stated.radar_m, stated.sidelink_m)
+        expected_m = stated.radar_m
+        if not own and expected_m is not None:
+            expected_m = None if stated.sidelink_m is None else expected_m - stated.sidelink_m
         if node.link is None:
             continue
         if not own:
@@ -394,16 +401,6 @@ def measure_bench(campaign: Campaign, flight: str) -> Bench:
         flight, flown.transmitter, nodes, offsets, splits, waveform.carrier_hz, 1 / waveform.prf_hz,
         Flags.merged(*further),
     )  # fmt: skip
-
-
-def _with_ends(node: BenchNode, due: int) -> BenchNode:
-    """Return a node with the pulses that others recorded before it began or after it stopped."""
-    counted = replace(node.triggers, beyond=due - node.triggers.due)
-    return replace(node, triggers=counted, flags=Flags.merged(node.flags, counted.flags))
-
-
-def _less(radar_m: float, sidelink_m: float | None) -> float | None:
-    return None if sidelink_m is None else radar_m - sidelink_m
 
 
 def _node(campaign: Campaign, flight: str, name: str, sent: Transmitted, *, own: bool) -> BenchNode:

@@ -147,18 +147,14 @@ def draw_bench(path: Path, measured: Bench, *, title: str, tags: Mapping[str, st
         over_time[-1].set(xlabel="time, s")
         profile.set(xlabel="total path, m; of a receiver beyond its sidelink", ylabel="mean profile, dB")
         if links:
-            profile.set(xlim=_around([link.path_m for link in links], links[0].cell_m), ylim=(-80, 3))
+            paths_m, margin_m = [0.0, *(link.path_m for link in links)], 40 * links[0].cell_m
+            profile.set(xlim=(min(paths_m) - margin_m, max(paths_m) + margin_m), ylim=(-80, 3))
         allan.set(ylabel="Allan deviation", xlabel="averaging time, s")
         for axis in (allan.xaxis, allan.yaxis):
             axis.set_major_formatter(lambda value, _: f"{value:g}")
         over_time[0].set_title(title)
         if links:
             over_time[0].legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), markerscale=4)
-
-
-def _around(paths_m: list[float], cell_m: float) -> tuple[float, float]:
-    """Return the part of a profile that is drawn: the strongest paths and zero, and forty cells on both sides."""
-    return min(0.0, *paths_m) - 40 * cell_m, max(0.0, *paths_m) + 40 * cell_m
 
 
 # ---- Measured paths into the config ---------------------------------------------------------------------------------

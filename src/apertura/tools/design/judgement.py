@@ -89,7 +89,19 @@ class Verdict:
 
 def judge(design: Design, *, every: bool = False) -> list[Verdict]:
     """Return a verdict on each requirement that the plan states, worst image first; `every`: on all there are."""
-    found = [*_of_images(design), *_of_interferograms(design), *_of_recording(design)]
+    found = [*_of_images(design)]
+    for name, layers in design.interferograms.items():
+        values = layers["coherence"][np.isfinite(layers["coherence"])]
+        value = float(np.percentile(values, 100 - SHARE)) if values.size else float("nan")
+        first, second = design.opened.campaign.settings.interferometry.pairs[name]
+        cause = f"spectra that {first} and {second} have in common, and their noise"
+        found.append(("coherence", value, name, cause))
+    recording = design.recording
+    flight, duration_s = max(recording.flight_s.items(), key=lambda item: item[1])
+    before = " with take-off, transit and landing" if recording.transfer_s[flight] else ""
+    found.append(("flight_s", duration_s, flight, f"length of the tracks over their speed{before}"))
+    pulses = f"{sum(recording.pulses.values())} pulses of all flights, by each node"
+    found.append(("recorded_gb", recording.recorded_bytes / 1e9, "all", pulses))
     required = design.opened.plan.require
     verdicts = []
     for name in type(required).model_fields:
@@ -118,10 +130,8 @@ def report_of(design: Design) -> dict[str, Any]:
     }
 
 
-_Found = tuple[str, float, str, str]
-
-
-def _of_images(design: Design) -> Iterator[_Found]:
+def _of_images(design: Design) -> Iterator[tuple[str, float, str, str]]:
+    """Yield requirement, value, image and largest contribution of the images."""
     for image in design.judged:
         seen = image.layers["mask"] == 0
         applied = design.refinements[image.name.split("/")[0]].applied
@@ -134,23 +144,6 @@ def _of_images(design: Design) -> Iterator[_Found]:
                 value = float(np.percentile(values, at, method="nearest")) if values.size else float("nan")
                 yield name, value, image.name, _cause(name, design, image, seen, value)
         yield "coverage", float(seen.mean()), image.name, _unseen(image)
-
-
-def _of_interferograms(design: Design) -> Iterator[_Found]:
-    for name, layers in design.interferograms.items():
-        values = layers["coherence"][np.isfinite(layers["coherence"])]
-        value = float(np.percentile(values, 100 - SHARE)) if values.size else float("nan")
-        one, other = design.opened.campaign.settings.interferometry.pairs[name]
-        yield "coherence", value, name, f"spectra that {one} and {other} have in common, and their noise"
-
-
-def _of_recording(design: Design) -> Iterator[_Found]:
-    recording = design.recording
-    flight, lasting_s = max(recording.flight_s.items(), key=lambda item: item[1])
-    before = " with take-off, transit and landing" if recording.transfer_s[flight] else ""
-    yield "flight_s", lasting_s, flight, f"length of the tracks over their speed{before}"
-    pulses = sum(recording.pulses.values())
-    yield "recorded_gb", recording.recorded_bytes / 1e9, "all", f"{pulses} pulses of all flights, by each node"
 
 
 def _cause(name: str, design: Design, image: PlannedImage, seen: np.ndarray, value: float) -> str:
@@ -291,7 +284,8 @@ def _candidates(plan: FlightPlan) -> Iterator[tuple[str, _Changing]]:
     several = any(len(flight.participants) > 1 for flight in plan.flights.values())
     lines = any(isinstance(track, LineTrack) for flight in plan.flights.values() for track in flight.tracks.values())
     for factor in (0.5, 0.75, 1.5):
-        yield f"fly at {factor:g} times the speed (speed_m_s)", partial(_faster, factor=factor)
+        change = partial(_scaled_speed, factor=factor)
+        yield f"fly at {factor:g} times the speed (speed_m_s)", partial(_tracks, change=change)
     for height_m in (-10.0, 10.0, 20.0):
         way = "higher" if height_m > 0 else "lower"
         now_m = plan.moved.height_m + height_m
@@ -303,7 +297,7 @@ def _candidates(plan: FlightPlan) -> Iterator[tuple[str, _Changing]]:
     for factor in (0.5, 2.0) if several else ():
         yield f"separations times {factor:g} (moved.spacing)", partial(moved, spacing=plan.moved.spacing * factor)
     if lines:
-        yield "lines longer by half (start_m, end_m)", partial(_longer, factor=1.5)
+        yield "lines longer by half (start_m, end_m)", partial(_tracks, change=partial(_lengthened, factor=1.5))
     prf_hz = getattr(plan.waveform, "prf_hz", None)
     if prf_hz:
         yield "twice the pulse rate (waveform.prf_hz)", partial(_radar, prf_hz=2 * prf_hz)
@@ -322,21 +316,16 @@ def moved(plan: FlightPlan, **changes: float) -> FlightPlan:
     return plan.model_copy(update={"moved": plan.moved.model_copy(update=values)})
 
 
-def _faster(plan: FlightPlan, factor: float) -> FlightPlan:
-    return _tracks(
-        plan, lambda track: {"speed_m_s": factor * track.speed_m_s} if getattr(track, "speed_m_s", None) else {}
-    )
+def _scaled_speed(track: Any, factor: float) -> dict[str, Any]:
+    return {"speed_m_s": factor * track.speed_m_s} if getattr(track, "speed_m_s", None) else {}
 
 
-def _longer(plan: FlightPlan, factor: float) -> FlightPlan:
-    def stretched(track: Any) -> dict[str, Any]:
-        if not isinstance(track, LineTrack):
-            return {}
-        ends = np.array([track.start_m, track.end_m])
-        start, end = ends.mean(axis=0) + factor * (ends - ends.mean(axis=0))
-        return {"start_m": tuple(start.tolist()), "end_m": tuple(end.tolist())}
-
-    return _tracks(plan, stretched)
+def _lengthened(track: Any, factor: float) -> dict[str, Any]:
+    if not isinstance(track, LineTrack):
+        return {}
+    ends = np.array([track.start_m, track.end_m])
+    start, end = ends.mean(axis=0) + factor * (ends - ends.mean(axis=0))
+    return {"start_m": tuple(start.tolist()), "end_m": tuple(end.tolist())}
 
 
 def _tracks(plan: FlightPlan, change: Callable[[Any], dict[str, Any]]) -> FlightPlan:

@@ -281,7 +281,13 @@ def _crs(plan: FlightPlan, campaign: Campaign) -> str:
 def _courses(plan: FlightPlan, campaign: Campaign, name: str, ground: ConfiguredGround) -> dict[str, Course]:
     """Return what each node of a flight is meant to fly, as drawn."""
     flight = plan.flights[name]
-    level_m = _level_m(plan, ground)
+    if plan.scene.bounds_m == "auto":
+        level_m = ground.flat_m
+    else:  # height of the scene's mean ground
+        xmin, ymin, xmax, ymax = plan.scene.bounds_m
+        side_m = min(xmax - xmin, ymax - ymin) / 33
+        grid = SceneGrid.from_bounds(ground.crs, plan.scene.bounds_m, spacing_m=side_m)
+        level_m = ground.level(grid).height_m
     tracks = dict(flight.tracks)
     if flight.formation is not None:
         followers = [node for node in flight.participants if node not in tracks]
@@ -302,15 +308,6 @@ def _courses(plan: FlightPlan, campaign: Campaign, name: str, ground: Configured
             below = _below(ground, course.place_m[:, :2], course.time_s) if track.above == "terrain" else base
             courses[node] = replace(course, place_m=course.place_m + np.multiply.outer(below, [0.0, 0.0, 1.0]))
     return courses
-
-
-def _level_m(plan: FlightPlan, ground: ConfiguredGround) -> float:
-    """Return the height of the scene's mean ground; of level ground where the scene is not stated."""
-    if plan.scene.bounds_m == "auto":
-        return ground.flat_m
-    xmin, ymin, xmax, ymax = plan.scene.bounds_m
-    side_m = min(xmax - xmin, ymax - ymin) / 33
-    return ground.level(SceneGrid.from_bounds(ground.crs, plan.scene.bounds_m, spacing_m=side_m)).height_m
 
 
 def _below(ground: ConfiguredGround, place_m: Floats, time_s: Floats) -> Floats:

@@ -1,6 +1,5 @@
 """A campaign shown while it flies: pictures, verdicts, a page and a map in results/look, until its recordings end."""
 
-import html
 import json
 import signal
 import threading
@@ -346,32 +345,32 @@ def _line(pair: PairSoFar, told: Mapping[str, Any], every: int) -> str:
     return f"{name}: {'; '.join(word for word in words if word)}"
 
 
+_PAGE = """<!doctype html><html lang="en"><head><meta charset="utf-8">
+{%- if refresh_s %}<meta http-equiv="refresh" content="{{ refresh_s }}">{% endif -%}
+<title>{{ status.campaign }}, so far</title><style>
+body{font-family:sans-serif;margin:1em}section{display:inline-block;vertical-align:top;max-width:48em}
+img{max-width:100%}th{text-align:left;vertical-align:top;padding-right:1em;font-weight:normal;color:#555}
+</style></head><body><h1>{{ status.campaign }}, so far</h1>
+<p>{{ status.state }}, shown {{ status.shown }}, 1 pulse in {{ status.one_pulse_in }} taken</p>
+{% for name, pair in status.pairs.items() -%}
+<section><h2>{{ name }}</h2>
+{%- if pair.image %}<img src="{{ pair.image }}" alt="">{% else %}<p>no image yet</p>{% endif %}<table>
+{%- for key, value in pair.items() if key != "image" and value not in (none, "", {}) -%}
+<tr><th>{{ key }}</th><td>
+{%- if value is mapping %}{% for name, part in value.items() %}{{ "; " if not loop.first }}{{ name }}: {{ part }}
+{%- endfor %}{% else %}{{ value }}{% endif -%}
+</td></tr>
+{%- endfor %}</table></section>
+{% endfor %}</body></html>
+"""
+
+
 def _page(status: Mapping[str, Any], *, refresh_s: int) -> str:
-    """Return a page of pictures and words that needs no net, and reads itself again while the campaign flies."""
-    again = f'<meta http-equiv="refresh" content="{refresh_s}">' if refresh_s else ""
-    title = html.escape(f"{status['campaign']}, so far")
-    parts = []
-    for name, told in status["pairs"].items():
-        picture = f'<img src="{html.escape(told["image"])}" alt="">' if told["image"] else "<p>no image yet</p>"
-        rows = "".join(
-            f"<tr><th>{html.escape(key)}</th><td>{html.escape(_cell(value))}</td></tr>"
-            for key, value in told.items()
-            if key != "image" and value not in (None, "", {})
-        )
-        parts.append(f"<section><h2>{html.escape(name)}</h2>{picture}<table>{rows}</table></section>")
-    style = "body{font-family:sans-serif;margin:1em}section{display:inline-block;vertical-align:top;max-width:48em}"
-    style += "img{max-width:100%}th{text-align:left;vertical-align:top;padding-right:1em;font-weight:normal;color:#555}"
-    state = html.escape(f"{status['state']}, shown {status['shown']}, 1 pulse in {status['one_pulse_in']} taken")
-    return (
-        f'<!doctype html><html lang="en"><head><meta charset="utf-8">{again}<title>{title}</title>'
-        f"<style>{style}</style></head><body><h1>{title}</h1><p>{state}</p>{''.join(parts)}</body></html>\n"
-    )
+    """Render a page of pictures and text that needs no network, and reloads itself while the campaign flies."""
+    from jinja2 import Environment
 
-
-def _cell(value: object) -> str:
-    if isinstance(value, Mapping):
-        return "; ".join(f"{key}: {one}" for key, one in value.items())
-    return str(value)
+    page = Environment(autoescape=True, keep_trailing_newline=True).from_string(_PAGE)
+    return page.render(status=status, refresh_s=refresh_s)
 
 
 _KEPT = 2

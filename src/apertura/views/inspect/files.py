@@ -3,7 +3,7 @@
 import json
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -203,14 +203,18 @@ def log_report(path: Path, beside: Surroundings) -> Report:
     """
     track = read_track(path, node=beside.node, options=beside.options)
     facts = log_facts(track)
+    lacks = _log_lacks(path, facts, beside)
+    from apertura.stages.node_log import yaw_fault_of
     from apertura.views.inspect.pictures import draw_log
 
+    if (fault := yaw_fault_of(track)) is not None:
+        lacks.append(f"an attitude in degrees, yaw clockwise from north: {fault.line}")
     return Report(
         path,
         "flight log",
         log_format(path, beside.options),
         _log_rows(facts, track),
-        (*_log_lacks(path, facts, beside), *_attitude_lacks(track)),
+        tuple(lacks),
         picture=lambda: draw_log(track, path.name),
     )
 
@@ -256,13 +260,6 @@ def _log_lacks(path: Path, log: LogFacts, beside: Surroundings) -> list[str]:
     if log.fixes is None and log.stated_std_m is None:
         lacks.append(f"how far it errs: the log does not say; state nodes.{NODE}.position_std_m")
     return lacks
-
-
-def _attitude_lacks(track: "xr.Dataset") -> list[str]:
-    from apertura.stages.node_log import yaw_fault_of
-
-    fault = yaw_fault_of(track)
-    return [] if fault is None else [f"an attitude in degrees, yaw clockwise from north: {fault.line}"]
 
 
 def recording_report(files: Sequence[Path], beside: Surroundings) -> Report:
@@ -324,7 +321,7 @@ def _recording_rows(recording: "Recording", facts: RecordingFacts) -> dict[str, 
     if facts.times is None:
         length_s = facts.samples / facts.sample_rate_hz
         return rows | {"runs_through": True, "first_utc": utc(facts.span[0]), "duration_s": length_s}
-    return rows | time_rows(facts.times) | {"frame_numbers": facts.frames and asdict(facts.frames)}
+    return rows | time_rows(facts.times) | {"frame_numbers": facts.frames}
 
 
 def first_samples(recording: "Recording") -> NDArray[np.complex64]:

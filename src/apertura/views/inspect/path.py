@@ -15,7 +15,6 @@ import numpy as np
 from apertura.campaign.folder import Campaign
 from apertura.check import as_line, load, problems_of
 from apertura.check.examination import Examination, Key
-from apertura.check.facts import LogFacts
 from apertura.check.times import LOST_CAPTURE, Span, TimeFacts, inside, time_facts
 from apertura.common.arrays import Times
 from apertura.common.errors import CampaignError, explained, quoted, shown
@@ -63,7 +62,11 @@ def inspect_path(
     CampaignError
         If the path is not there, a setting is none, or the preview would not be a .png file of its own.
     """
-    if plot is not None and (plot.suffix.lower() != ".png" or plot == path or (plot.exists() and not _is_png(plot))):
+    is_own_png = plot is None or (plot.suffix.lower() == ".png" and plot != path)
+    if plot is not None and is_own_png and plot.exists():
+        with plot.open("rb") as stream:
+            is_own_png = stream.read(8) == b"\x89PNG\r\n\x1a\n"
+    if plot is not None and not is_own_png:
         found = "a file that is no picture" if plot.exists() else "another suffix than .png"
         raise CampaignError(found, f"--plot {plot}", "the name of a new .png file", "Choose another name.")
     logging.getLogger("apertura.common.errors").addHandler(
@@ -78,11 +81,6 @@ def inspect_path(
         if plot is not None:
             print(shown(drawn, 400) if drawn else "nothing to draw")
     return 2 if report.problem else 0
-
-
-def _is_png(path: Path) -> bool:
-    with path.open("rb") as stream:
-        return stream.read(8) == b"\x89PNG\r\n\x1a\n"
 
 
 def _drawn(figure: "Figure", plot: Path) -> Path:
@@ -180,7 +178,12 @@ def _readers(path: Path, beside: Surroundings) -> Iterator[tuple[str, str, Reade
     if path.is_file() and (".track." in path.name or beside.options.format is None or "format" in beside.typed):
         with suppress(CampaignError):  # none that is known
             yield "flight log", log_format(path, beside.options), partial(_log, path, beside)
-    yield from _others(path)
+    from apertura.views.inspect.files import ARRAY, DEM, array_report, dem_report
+
+    if path.suffix.lower() in DEM:
+        yield "elevation model", "", partial(dem_report, path)
+    if path.suffix in ARRAY:
+        yield "array", "", partial(array_report, path)
 
 
 def _of_recorders(path: Path, beside: Surroundings) -> Iterator[tuple[str, str, Reader]]:
@@ -210,15 +213,6 @@ def _log(path: Path, beside: Surroundings) -> Report:
     from apertura.views.inspect.files import log_report
 
     return log_report(path, beside)
-
-
-def _others(path: Path) -> Iterator[tuple[str, str, Reader]]:
-    from apertura.views.inspect.files import ARRAY, DEM, array_report, dem_report
-
-    if path.suffix.lower() in DEM:
-        yield "elevation model", "", partial(dem_report, path)
-    if path.suffix in ARRAY:
-        yield "array", "", partial(array_report, path)
 
 
 def _size(path: Path) -> dict[str, int]:
@@ -316,7 +310,12 @@ def _node_report(examined: Examination, key: Key) -> tuple[Report, dict[str, Spa
     if key in examined.logs:
         log = examined.logs[key]
         spans["logged"] = log.times.span
-        rows |= _log_rows(log)
+        rows |= {
+            "logged": _span_row(log.times.span),
+            "log_rate_hz": log.times.rate_hz,
+            "log_gaps": int(log.times.gap_at.size),
+            "fix": log.fixes,
+        }
         if pulses.size:
             rows["captures_inside_log_share"] = float(inside(pulses, log.times.span).mean())
     path = examined.campaign.root / "raw" / flight / node
@@ -352,16 +351,6 @@ def _history_line(campaign: Campaign, key: Key) -> tuple[dict[str, Any], Times, 
 
 def _rate_rows(times: TimeFacts) -> dict[str, Any]:
     return {"prf_hz": times.rate_hz, "lost": times.lost}
-
-
-def _log_rows(log: LogFacts) -> dict[str, Any]:
-    times = log.times
-    return {
-        "logged": _span_row(times.span),
-        "log_rate_hz": times.rate_hz,
-        "log_gaps": int(times.gap_at.size),
-        "fix": log.fixes,
-    }
 
 
 def _span_row(span: Span) -> dict[str, str]:

@@ -1,12 +1,17 @@
-"""What the report is written in: one HTML file that needs nothing else, and reStructuredText for Snakemake's report."""
+"""Markup of reports: a self-contained HTML file, and reStructuredText for Snakemake's report."""
 
 import base64
 import re
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
-from html import escape
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
-_STYLE = """
+_PAGE = """<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta http-equiv="Content-Security-Policy" content="default-src 'none'; img-src data:; style-src 'unsafe-inline'">
+<title>{{ title }}</title>
+<style>
 @page { size: A4; margin: 18mm 20mm; }
 body { font: 10.5pt/1.45 Georgia, 'DejaVu Serif', serif; color: #111; }
 body { max-width: 170mm; margin: 12mm auto; padding: 0 4mm; }
@@ -26,8 +31,33 @@ td:first-child { min-width: 22mm; }
 td.number { white-space: nowrap; }
 .wide { overflow-x: auto; }
 @media print { body { margin: 0; padding: 0; max-width: none; } h2 { break-before: auto; } }
+</style>
+</head>
+<body>
+{% for block in blocks -%}
+{% if block.level is defined -%}
+<h{{ block.level }}>{{ block.text }}</h{{ block.level }}>
+{% elif block.rows is defined -%}
+{% set count.tables = count.tables + 1 -%}
+<div class="wide"><table><caption>Table {{ count.tables }}. {{ block.caption }}</caption>
+<thead><tr>{% for cell in block.head %}<th>{{ cell }}</th>{% endfor %}</tr></thead>
+<tbody>{% for row in block.rows %}<tr>{% for cell in row -%}
+<td{% if is_number(cell) %} class="number"{% endif %}>{{ cell.split("\n") | join("<br>" | safe) }}</td>
+{%- endfor %}</tr>
+{% endfor %}</tbody></table></div>
+{% elif block.png is defined -%}
+{% set count.figures = count.figures + 1 -%}
+{% set caption = "Figure %d. %s" % (count.figures, block.caption) -%}
+<figure><img alt="{{ caption }}" src="data:image/png;base64,{{ base64(block.png).decode() }}">
+<figcaption>{{ caption }}</figcaption></figure>
+{% else -%}
+<p>{{ block.text }}</p>
+{% endif -%}
+{% endfor -%}
+</body>
+</html>
 """
-_POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
+_NUMBERS = re.compile(r"[-−+±\d.,e\s/%]+")  # a cell of numbers alone, which breaks between lines only where stated
 
 
 @dataclass(frozen=True)
@@ -37,22 +67,12 @@ class Heading:
     level: int
     text: str
 
-    @property
-    def html(self) -> str:
-        """As HTML, escaped."""
-        return f"<h{self.level}>{escape(self.text)}</h{self.level}>"
-
 
 @dataclass(frozen=True)
 class Paragraph:
     """Sentences."""
 
     text: str
-
-    @property
-    def html(self) -> str:
-        """As HTML, escaped."""
-        return f"<p>{escape(self.text)}</p>"
 
 
 @dataclass(frozen=True)
@@ -63,65 +83,20 @@ class Table:
     head: Sequence[str]
     rows: Sequence[Sequence[str]]
 
-    @property
-    def html(self) -> str:
-        """As HTML, escaped."""
-        head = "".join(f"<th>{escape(cell)}</th>" for cell in self.head)
-        rows = "".join(f"<tr>{''.join(map(_cell, row))}</tr>\n" for row in self.rows)
-        caption = f"<caption>{escape(self.caption)}</caption>"
-        table = f"<table>{caption}<thead><tr>{head}</tr></thead>\n<tbody>{rows}</tbody></table>"
-        return f'<div class="wide">{table}</div>'
-
-
-_NUMBERS = re.compile(r"[-−+±\d.,e\s/%]+")  # a cell of numbers alone, which break between lines only where told
-
-
-def _cell(text: str) -> str:
-    kind = ' class="number"' if _NUMBERS.fullmatch(text) else ""
-    return f"<td{kind}>{escape(text).replace(chr(10), '<br>')}</td>"
-
 
 @dataclass(frozen=True)
 class Picture:
-    """A PNG with a caption below it.
-
-    Attributes
-    ----------
-    png
-        The whole file.
-    caption
-        What it shows.
-    """
+    """A whole PNG file with a caption below it."""
 
     png: bytes
     caption: str
-
-    @property
-    def html(self) -> str:
-        """As HTML, the picture inside."""
-        source = base64.b64encode(self.png).decode("ascii")
-        caption = escape(self.caption)
-        picture = f'<img alt="{caption}" src="data:image/png;base64,{source}">'
-        return f"<figure>{picture}<figcaption>{caption}</figcaption></figure>"
 
 
 Block = Heading | Paragraph | Table | Picture
 
 
-def _numbered(blocks: Iterable[Block]) -> Iterator[Block]:
-    """Yield blocks with their pictures and tables counted."""
-    count = dict.fromkeys((Picture, Table), 0)
-    for block in blocks:
-        if isinstance(block, Picture | Table):
-            count[type(block)] += 1
-            kind = "Figure" if isinstance(block, Picture) else "Table"
-            yield replace(block, caption=f"{kind} {count[type(block)]}. {block.caption}")
-        else:
-            yield block
-
-
 def page(title: str, blocks: Iterable[Block]) -> str:
-    """Return blocks as one HTML document.
+    """Render blocks as one HTML document, its tables and figures numbered.
 
     Parameters
     ----------
@@ -132,18 +107,20 @@ def page(title: str, blocks: Iterable[Block]) -> str:
 
     Notes
     -----
-    All text is escaped; a policy in the page forbids scripts and requests, whatever stood in it.
+    All text is escaped, and a policy in the page forbids scripts and requests.
 
     Examples
     --------
     >>> "<p>a &lt; b</p>" in page("one", [Paragraph("a < b")])
     True
     """
-    body = "\n".join(block.html for block in _numbered(blocks))
-    policy = f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">'
-    return (
-        f'<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n{policy}\n<title>{escape(title)}</title>\n'
-        f"<style>{_STYLE}</style>\n</head>\n<body>\n{body}\n</body>\n</html>\n"
+    from jinja2 import Environment
+    from jinja2.utils import Namespace
+
+    template = Environment(autoescape=True, keep_trailing_newline=True).from_string(_PAGE)
+    count = Namespace(tables=0, figures=0)
+    return template.render(
+        title=title, blocks=blocks, count=count, is_number=_NUMBERS.fullmatch, base64=base64.b64encode
     )
 
 

@@ -148,24 +148,26 @@ def differences(first: Path, second: Path) -> dict[str, list[str]]:
     if first.is_dir() != second.is_dir() or first.suffix != second.suffix:
         raise CampaignError(f"of another kind than {first.name}", second, "two products of one kind", REMEDY)
     sections = sections_of(first), sections_of(second)
-    found = {
-        section: _lines(*(one.get(section, {}) for one in sections)) for section in SECTIONS if section in sections[0]
-    }
+    found: dict[str, list[str]] = {}
+    for section in (name for name in SECTIONS if name in sections[0]):
+        one, other = (entries.get(section, {}) for entries in sections)
+        if bool(one) != bool(other):
+            found[section] = [f"{len(one)} entries → absent" if one else f"absent → {len(other)} entries"]
+            continue
+        keys = [key for key in sorted({*one, *other}) if one.get(key) != other.get(key)]
+        found[section] = [f"{key}: {_cut(one.get(key))} → {_cut(other.get(key))}" for key in keys]
     if first.is_dir():
         return found | {"values": list(_stages(first, second))}
-    if first.suffix in _PIXELS:
-        found["pixels"] = list(_PIXELS[first.suffix](first, second))
+    if first.suffix == ".tif":
+        found["pixels"] = list(_rasters(first, second))
+    elif first.suffix == ".png":
+        pictures = [np.asarray(picture(path)).astype(np.float32) for path in (first, second)]
+        tally = Tally.of([(pictures[0], pictures[1])]) if pictures[0].shape == pictures[1].shape else None
+        found["pixels"] = list(difference_lines(tally, unit="of 255")) if tally else []  # sizes are in geometry
     if not any(found.values()):
         at = first_difference(first, second)
         found["bytes"] = [] if at is None else [f"first differ at byte {at}"]
     return found
-
-
-def _lines(one: Mapping[str, str], other: Mapping[str, str]) -> list[str]:
-    if bool(one) != bool(other):
-        return [f"{len(one or other)} entries → absent" if one else f"absent → {len(other)} entries"]
-    keys = [key for key in sorted({*one, *other}) if one.get(key) != other.get(key)]
-    return [f"{key}: {_cut(one.get(key))} → {_cut(other.get(key))}" for key in keys]
 
 
 def _cut(text: str | None) -> str:
@@ -240,16 +242,6 @@ def _blocks(
         size = columns.stop - columns.start, rows.stop - rows.start
         window, moved = Window(left, top, *size), Window(left - shift[1], top - shift[0], *size)
         yield one.read(1, window=window), other.read(1, window=moved)
-
-
-def _pictures(first: Path, second: Path) -> Iterator[str]:
-    """Yield how two pictures of one size differ."""
-    one, other = (np.asarray(picture(path)) for path in (first, second))
-    if one.shape == other.shape:  # else geometry says so
-        yield from difference_lines(Tally.of([(one.astype(np.float32), other.astype(np.float32))]), unit="of 255")
-
-
-_PIXELS = {".tif": _rasters, ".png": _pictures}
 
 
 def _stages(first: Path, second: Path) -> Iterator[str]:

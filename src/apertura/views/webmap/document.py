@@ -248,13 +248,16 @@ def webmap(campaign: Campaign) -> list[Path]:
         with undamaged(campaign.result(flight, image, "image.json"), expected="a report", remedy="Run export again."):
             images.append(image_entry(flight, image, report, _layers(campaign, flight, image, report)))
             places += found_places(flight, image, report)
+    coverage = None
+    if scene.grid.crs != LOCAL:
+        coverage = read_manifest(campaign.root / campaign.manifest("coverage"))["files"].get(COVERAGE[1])
     document = map_document(
         campaign.settings.campaign,
         grid={"bounds_m": scene.grid.bounds_m, "spacing_m": scene.grid.spacing_m, "shape": scene.grid.shape},
         crs=crs_of(scene.grid),
         images=images,
         places=places,
-        coverage_url=None if scene.grid.crs == LOCAL else _coverage_url(campaign),
+        coverage_url=url_of(COVERAGE[1], coverage) if coverage else None,
         notes=notes,
     )
     path = campaign.result(MAP)
@@ -330,12 +333,6 @@ def _proj4(crs: Any) -> str | None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # what the short form loses, the control places show
         return str(crs.to_proj4()) or None
-
-
-def _coverage_url(campaign: Campaign) -> str | None:
-    name = COVERAGE[1]
-    digest = read_manifest(campaign.root / campaign.manifest("coverage"))["files"].get(name)
-    return url_of(name, digest) if digest else None
 
 
 def stated_places(campaign: Campaign) -> list[Place]:
