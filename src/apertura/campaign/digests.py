@@ -173,9 +173,9 @@ class Result:
         """Hash of the code that makes it, as the manifest records it."""
         return _code_sha256(self.modules)
 
-    def begin(self, root: Path, *, further: Sequence[str] = ()) -> "Lineage":
-        """Hash its sources, and `further` files that these name."""
-        return Lineage(self, Sources.of(root, (*self.sources, *further)))
+    def begin(self, root: Path, *, others: Sequence[str] = ()) -> "Lineage":
+        """Hash its sources, and `others` that these name."""
+        return Lineage(self, Sources.of(root, (*self.sources, *others)))
 
 
 @dataclass(frozen=True)

@@ -225,7 +225,9 @@ def _over_windows(heights: NDArray[np.float64], by: np.ufunc) -> NDArray[np.floa
     """Return the extreme of the window about each sample, both ways; outside is NaN, as voids are."""
     half = _WINDOW // 2
     for axis in (0, 1):
-        padded = np.pad(heights, [(half, half) if way == axis else (0, 0) for way in (0, 1)], constant_values=np.nan)
+        padded = np.pad(
+            heights, [(half, half) if dimension == axis else (0, 0) for dimension in (0, 1)], constant_values=np.nan
+        )
         parts = [np.take(padded, range(first, first + heights.shape[axis]), axis) for first in range(_WINDOW)]
         heights = by.reduce(parts)
     return heights

@@ -61,15 +61,15 @@ def check_nodes_apart(examined: Examination) -> Iterator[CampaignError]:
             if node == flight.transmitter or not {key, other} <= examined.logs.keys():
                 continue
             logs = [examined.logs[one] for one in (key, other)]
-            apart_m = float(np.linalg.norm(logs[0].middle_m - logs[1].middle_m))
+            distance_m = float(np.linalg.norm(logs[0].middle_m - logs[1].middle_m))
             middles = [log.middle_geodetic for log in logs if log.middle_geodetic is not None]
             if len(middles) < 2:
                 continue
             horizon_m = _HORIZON_M * sum(np.sqrt(max(height_m, _LEAST_HEIGHT_M)) for *_, height_m in middles)
-            if apart_m > horizon_m:
+            if distance_m > horizon_m:
                 (a, b, _), (c, d, _) = middles
                 yield CampaignError(
-                    f"{apart_m / 1e3:.0f} km from {flight.transmitter}: latitude {c:.4f}, longitude {d:.4f} and "
+                    f"{distance_m / 1e3:.0f} km from {flight.transmitter}: latitude {c:.4f}, longitude {d:.4f} and "
                     f"latitude {a:.4f}, longitude {b:.4f}",
                     where=examined.campaign.track_file(*other),
                     expected=f"nodes in sight of each other, at most {horizon_m / 1e3:.0f} km apart",

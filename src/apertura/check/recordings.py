@@ -9,11 +9,11 @@ from apertura.check.examination import Examination
 from apertura.check.hints import likely_cause
 from apertura.check.times import (
     LAG,
-    apart_s,
     expected_pulses,
     frame_numbers,
     iso,
     recorded_span,
+    seconds_between,
     shift_s,
     steps_s,
 )
@@ -159,7 +159,7 @@ def _nothing_in_common(tx: Recording, rx: Recording, prf_hz: float) -> CampaignE
             expected="recordings of the same pulses",
             remedy="Check that both are of the same flight, and apertura:frame of their captures.",
         )
-    if apart_s(recorded_span(tx), recorded_span(rx)) <= 1 / prf_hz:
+    if seconds_between(recorded_span(tx), recorded_span(rx)) <= 1 / prf_hz:
         return None
     shift = shift_s(recorded_span(tx), recorded_span(rx))
     first, second = (" to ".join(map(iso, recorded_span(node))) for node in (tx, rx))

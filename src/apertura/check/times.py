@@ -246,15 +246,17 @@ def inside(times: Times, span: Span) -> NDArray[np.bool_]:
     return np.asarray((times >= span[0]) & (times <= span[1]))
 
 
-def apart_s(one: Span, other: Span) -> float:
+def seconds_between(one: Span, other: Span) -> float:
     """Return the seconds between two spans; 0 or less where they touch or overlap.
 
     Examples
     --------
     >>> first, second = (np.datetime64(f"2025-05-14T{time}", "ns") for time in ("09:30:00", "09:30:10"))
     >>> late = np.timedelta64(1, "h")
-    >>> apart_s((first, second), (first + late, second + late)), apart_s((first, second), (second, second + late))
-    (3590.0, 0.0)
+    >>> seconds_between((first, second), (first + late, second + late))
+    3590.0
+    >>> seconds_between((first, second), (second, second + late))
+    0.0
     """
     second = np.timedelta64(1, "s")
     return float(max((other[0] - one[1]) / second, (one[0] - other[1]) / second))

@@ -94,9 +94,9 @@ def _east_north_up(point_m: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _referred(echo: xr.Dataset, collection: CphdCollection) -> Iterator[NDArray[np.complex64]]:
     """Yield the samples referred to the delay of the reference point instead of that of the stage."""
-    further = collection.reference_delay_s - echo.reference_delay.values
+    extra_delay_s = collection.reference_delay_s - echo.reference_delay.values
     frequency: Any = echo.frequency.values
-    with progress("pulses", len(further)) as done:
+    with progress("pulses", len(extra_delay_s)) as done:
         for part in blocks_of_rows(echo, "transfer"):
-            yield remove_path(echo.transfer[part].values, frequency, delay_s=further[part])
+            yield remove_path(echo.transfer[part].values, frequency, delay_s=extra_delay_s[part])
             done(part.stop - part.start)

@@ -32,7 +32,7 @@ from apertura.core.scene.grid import SceneGrid
 from apertura.formats.export import product, remove_outdated, write_exports
 from apertura.formats.export.radiometry import CROSS_SECTIONS, ECHO, of_sums
 from apertura.stages.agreement import ComparedImage, assessment_of, bright_places
-from apertura.stages.layers import LazyLayer, coarse, multilook_of, said_of
+from apertura.stages.layers import LazyLayer, coarse, mean_power_report, multilook_of
 from apertura.stages.scene import settled_scene
 from apertura.stages.tags import acquisition_tags, quality_tags, tags_of
 from apertura.workflow.lineage import result_of
@@ -79,14 +79,18 @@ def export_pair(campaign: Campaign, flight: str, pair: str) -> list[Path]:
 def _calibrated(campaign: Campaign, flight: str, pair: str, report: Mapping[str, Any]) -> dict[str, Any]:
     """Return what the pair's constant says of its image: cross-sections of points, line of the budget, flags."""
     manifest = campaign.root / campaign.manifest("layers", flight, pair)
-    said = open_listed(campaign.result(flight, pair, CROSS_SECTIONS), manifest)
-    std_db = said["std_db"]
+    calibration = open_listed(campaign.result(flight, pair, CROSS_SECTIONS), manifest)
+    std_db = calibration["std_db"]
     stated = None if std_db is None else f"{std_db:.2g} dB"
     lines = [BudgetLine("amplitude", stated, NO_EFFECT, "an error of power or gain")]
-    if said["pointing_std_db"]:
-        lines.insert(0, BudgetLine("pointing", f"{said['pointing_std_db']:.2g} dB by attitude", NO_EFFECT))
-    flags = Flags.merged(report["flags"], said["flags"])
-    return {"cross_sections": said, "budget": [*report["budget"], *(one.report for one in lines)], "flags": flags}
+    if calibration["pointing_std_db"]:
+        lines.insert(0, BudgetLine("pointing", f"{calibration['pointing_std_db']:.2g} dB by attitude", NO_EFFECT))
+    flags = Flags.merged(report["flags"], calibration["flags"])
+    return {
+        "cross_sections": calibration,
+        "budget": [*report["budget"], *(one.report for one in lines)],
+        "flags": flags,
+    }
 
 
 def export_fused(campaign: Campaign, flight: str) -> list[Path]:
@@ -146,15 +150,15 @@ def export_fused(campaign: Campaign, flight: str) -> list[Path]:
         tags=tags,
         **_georeference(grid),
     )
-    if asked := campaign.settings.processing.multilook:
+    if multilook := campaign.settings.processing.multilook:
         for source, raster in sums.items():
             noise = _noise_of_sum(campaign, flight, source, report["radiometry"][source]["divided_by"])
-            layer, said = _averaged_sum(raster, grid, asked, report["radiometry"][source], noise)
+            layer, power_report = _averaged_sum(raster, grid, multilook, report["radiometry"][source], noise)
             written += write_exports(
                 "multilook_fused",
                 folder,
                 {f"multilook_{source}": held(layer)},
-                radiometry={f"multilook_{source}": said},
+                radiometry={f"multilook_{source}": power_report},
                 titles={f"multilook_{source}": f"{name} · mean power of the {titles[source]}"},
                 tags=tags,
                 **_georeference(layer.grid),
@@ -166,18 +170,18 @@ def export_fused(campaign: Campaign, flight: str) -> list[Path]:
 def _averaged_sum(
     raster: BlockRaster,
     grid: SceneGrid,
-    asked: Multilooking,
+    multilook: Multilooking,
     means: Mapping[str, Any],
     noise: Callable[[Window], Floats] | None,
 ) -> tuple[LazyLayer, dict[str, Any]]:
     """Return the mean power of a sum on a coarser grid, less its noise, and what it means."""
-    cells = multilook_of(lambda window: np.asarray(raster[window], np.complex64), grid, asked)
+    cells = multilook_of(lambda window: np.asarray(raster[window], np.complex64), grid, multilook)
 
     def less(window: Window) -> Floats:
         return cells.mean(window) - (0.0 if noise is None else noise(window))
 
-    said = said_of(cells, means, noise="in it" if noise is None else "subtracted")
-    return coarse(grid, cells, threads=1, of=less), said
+    report = mean_power_report(cells, means, noise="in it" if noise is None else "subtracted")
+    return coarse(grid, cells, threads=1, of=less), report
 
 
 def _noise_of_sum(
@@ -187,9 +191,9 @@ def _noise_of_sum(
 
     Source: docs/theory/speckle.md, eq. 6.
     """
-    asked, kept = campaign.settings.processing.multilook, product("multilook_noise", "write_mean_power").file
+    multilook, kept = campaign.settings.processing.multilook, product("multilook_noise", "write_mean_power").file
     paths = [campaign.result(flight, pair, kept) for pair in divisors]
-    if asked is None or not asked.subtract_noise or not all(path.is_file() for path in paths):
+    if multilook is None or not multilook.subtract_noise or not all(path.is_file() for path in paths):
         return None
     # Noise of pairs is independent: powers add up, over n² where amplitudes are averaged and over n where powers are.
     count = len(divisors) ** (2 if source == "coherent" else 1)
@@ -303,14 +307,14 @@ def _focus(images: Mapping[str, xr.Dataset], measured: InPhase | None, added: Se
         return {name: one[name] for name in ("verdict", "loss_db", "std_db") if name in one} | {
             "why": f"{added[0]} alone: {one['why']}"
         }
-    told = [one for one in of_pairs.values() if "loss_db" in one]
-    if measured is None or not told:
+    focuses = [one for one in of_pairs.values() if "loss_db" in one]
+    if measured is None or not focuses:
         missing = "no isolated bright point is common to the pairs added" if measured is None else "no pair was judged"
         return {"verdict": "cannot tell", "why": missing}
     # Images are added at equal peaks; in focus each peak would be higher by what it lost.
-    of_images = -20 * float(np.log10(np.mean([10 ** (-one["loss_db"] / 20) for one in told])))
+    of_images = -20 * float(np.log10(np.mean([10 ** (-one["loss_db"] / 20) for one in focuses])))
     loss_db = of_images + measured.loss_db
-    std_db = float(np.hypot(np.mean([one["std_db"] for one in told]), measured.loss_std_db))
+    std_db = float(np.hypot(np.mean([one["std_db"] for one in focuses]), measured.loss_std_db))
     return {
         "verdict": verdict_of_loss(loss_db, std_db),
         "loss_db": round(loss_db, 3),

@@ -79,10 +79,10 @@ def image(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Pa
             "view": view_report(work.formation, work.pair.began, work.pair.time_s),
             "autofocus": work.track.report(pair),
         }
-        told = judgement(work.formation, target, [*budget, arithmetic_line(quality["numerical_error_db"])])
-        quality |= {"focus": told.focus, "budget": told.budget}
+        judged = judgement(work.formation, target, [*budget, arithmetic_line(quality["numerical_error_db"])])
+        quality |= {"focus": judged.focus, "budget": judged.budget}
         of_stages = work.empty.attrs["flags"], work.track.stage.attrs["flags"]
-        quality["flags"] = Flags.merged(*of_stages, plan.flags, quality["flags"], told.flags)
+        quality["flags"] = Flags.merged(*of_stages, plan.flags, quality["flags"], judged.flags)
         finish(wip, folder, lineage=lineage, quality=quality, flags=quality["flags"])
     # Also those of another number of jobs, of a run that was killed: the workflow only knows of the present ones.
     _receipts(folder).remove()

@@ -113,7 +113,7 @@ def ingest(campaign: Campaign, flight: str, node: str) -> tuple[Path, Path]:
     track = stamped(log, "track", modules=logged.modules, **how)
     recording = checked_recording(campaign, flight, node)
     recorded = result_of(campaign, "raw", flight, node).begin(
-        campaign.root, further=[*map(campaign.relative, preamble_files(recording, campaign))]
+        campaign.root, others=[*map(campaign.relative, preamble_files(recording, campaign))]
     )
     settings: Mapping[str, Any] = {} if recording.framing is None else recorded.result.settings
     dataset = captures_of(recording, campaign, node=node)

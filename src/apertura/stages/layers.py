@@ -89,21 +89,21 @@ class LazyLayer:
 _FEWEST_CELLS = 64  # along a tile of mean power: those around it that the filter reads, too, are few
 
 
-def side_of(grid: SceneGrid, asked: Multilooking) -> int:
+def side_of(grid: SceneGrid, multilook: Multilooking) -> int:
     """Return the side of the squares that power is averaged over, pixels."""
-    return max(1, round(asked.spacing_m / grid.spacing_m))
+    return max(1, round(multilook.spacing_m / grid.spacing_m))
 
 
 def multilook_of(
     image: Callable[[Window], NDArray[np.complex64]],
     grid: SceneGrid,
-    asked: Multilooking,
+    multilook: Multilooking,
     *,
     noise: Callable[[Window], Floats] | None = None,
 ) -> Multilook:
-    """Return the mean power of an image as it is asked for, `noise` taken off; else as `Multilook`."""
-    filtered = asked.speckle_filter == "lee"
-    return Multilook.of(image, grid.shape, side_of(grid, asked), noise=noise, filtered=filtered)
+    """Return the mean power of an image by the settings, with `noise` subtracted where it is given."""
+    filtered = multilook.speckle_filter == "lee"
+    return Multilook.of(image, grid.shape, side_of(grid, multilook), noise=noise, filtered=filtered)
 
 
 def coarse(
@@ -114,7 +114,7 @@ def coarse(
     return LazyLayer(coarser, np.float32, of or cells.mean, threads, max(_FEWEST_CELLS, BLOCK_PX // cells.side))
 
 
-def said_of(cells: Multilook, means: Mapping[str, Any], *, noise: str) -> dict[str, Any]:
+def mean_power_report(cells: Multilook, means: Mapping[str, Any], *, noise: str) -> dict[str, Any]:
     """Return what mean power means, of pixels that mean `means`."""
     return of_multilooked(
         means,
@@ -141,7 +141,7 @@ def layers(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> l
     places_m = noise_places(scene.grid, scene.terrain)
     measured_noise = noise_power(profiles, places_m, time_s=opened.time_s, beams=beams)
     noise = measured_noise.power
-    asked, multilook = campaign.settings.processing.radiometry, campaign.settings.processing.multilook
+    coefficients, multilook = campaign.settings.processing.radiometry, campaign.settings.processing.multilook
     measured = campaign.calibrated or multilook is not None
     image = open_stage(campaign.stage("image", flight, pair), "image") if measured else None
     origin = Provenance.of(
@@ -176,8 +176,8 @@ def layers(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> l
         if campaign.calibrated:
             mask = folder / product("mask", "write_mask").file
             known = calibrated is not None
-            powers = {name: GroundPower(scene, image, calibrated, mask, name, known) for name in asked}
-            means = {name: means_of(name) for name in asked}
+            powers = {name: GroundPower(scene, image, calibrated, mask, name, known) for name in coefficients}
+            means = {name: means_of(name) for name in coefficients}
             images = ((name, one.amplitude) for name, one in powers.items())
             write("radiometry", {name: LazyLayer(scene.grid, np.complex64, of, threads) for name, of in images}, means)
             written.append(folder / CROSS_SECTIONS)
@@ -189,8 +189,8 @@ def layers(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> l
             for source, (power, meaning) in (
                 averaged or {"multilook": (GroundPower(scene, image), ECHO.report)}
             ).items():
-                raster, said = _multilooked(power, meaning, looks, per_weight, multilook, threads=threads)
-                write("multilook", {source: raster}, {source: said})
+                raster, power_report = _multilooked(power, meaning, looks, per_weight, multilook, threads=threads)
+                write("multilook", {source: raster}, {source: power_report})
             if multilook.subtract_noise and np.isfinite(noise):
                 write("multilook", *_noise_of_echoes(scene, image, looks, per_weight, multilook, threads=threads))
     remove_outdated(folder, written)
@@ -239,24 +239,30 @@ class GroundPower:
 
 
 def _multilooked(
-    power: GroundPower, means: Mapping[str, Any], looks: Looks, pulse_noise: float, asked: Multilooking, *, threads: int
+    power: GroundPower,
+    means: Mapping[str, Any],
+    looks: Looks,
+    pulse_noise: float,
+    multilook: Multilooking,
+    *,
+    threads: int,
 ) -> tuple[LazyLayer, dict[str, Any]]:
     """Return mean power on a coarser grid, float32, and what it means; `pulse_noise` is noise per Σw² of a pixel."""
 
     def noise(window: Window) -> Floats:
         return pulse_noise * looks.weight_squares(window) / power.per_one(window)
 
-    subtracted = noise if asked.subtract_noise and np.isfinite(pulse_noise) else None
-    cells = multilook_of(power.amplitude, power.scene.grid, asked, noise=subtracted)
+    subtracted = noise if multilook.subtract_noise and np.isfinite(pulse_noise) else None
+    cells = multilook_of(power.amplitude, power.scene.grid, multilook, noise=subtracted)
     noise_is = "in it" if subtracted is None else "subtracted"
-    return coarse(power.scene.grid, cells, threads=threads), said_of(cells, means, noise=noise_is)
+    return coarse(power.scene.grid, cells, threads=threads), mean_power_report(cells, means, noise=noise_is)
 
 
 def _noise_of_echoes(
-    scene: OpenScene, image: xr.Dataset, looks: Looks, pulse_noise: float, asked: Multilooking, *, threads: int
+    scene: OpenScene, image: xr.Dataset, looks: Looks, pulse_noise: float, multilook: Multilooking, *, threads: int
 ) -> tuple[dict[str, LazyLayer], dict[str, dict[str, Any]]]:
     """Return mean power of the noise in the pixels of power.tif, on the coarser grid, which sums of pairs are told."""
-    side = side_of(scene.grid, asked)
+    side = side_of(scene.grid, multilook)
     cells = Multilook(
         GroundPower(scene, image).amplitude,
         scene.grid.shape,
@@ -274,7 +280,7 @@ def _report(scene: OpenScene, image: xr.Dataset, calibrated: CalibratedPair, noi
     """Return what the radio says of an image, for radiometry.json."""
     found = points_of(image.image, image.attrs["quality"], scene, list(scene.grid.tiles(BLOCK_PX)))
     constant = calibrated.calibration.constant
-    noise_said, noise_flags = calibrated.noise_report(noise, bound="pulses_sparse" in image.attrs["flags"])
+    noise_report, noise_flags = calibrated.noise_report(noise, bound="pulses_sparse" in image.attrs["flags"])
     return {
         "calibrated_by": calibrated.calibrated_by,
         "constant_db": round(10 * float(np.log10(constant)), 3),
@@ -282,7 +288,7 @@ def _report(scene: OpenScene, image: xr.Dataset, calibrated: CalibratedPair, noi
         "pointing_std_db": round(calibrated.pointing_std_db, 3),
         "flags": Flags.merged(calibrated.flags, noise_flags),
         "link": calibrated.link and asdict(calibrated.link),
-        "noise": {"pulse": noise.power if np.isfinite(noise.power) else None, **noise_said},
+        "noise": {"pulse": noise.power if np.isfinite(noise.power) else None, **noise_report},
         "points": calibrated.points(found, scene, noise.power),
         "points_listed": POINTS_LISTED,
     }

@@ -182,7 +182,7 @@ def _air(campaign: Campaign, pair: OpenPair, paths: PointPaths) -> BudgetLine:
     Against the transmitter's own image a pair's phase is off by what its path differs, the sidelink's length included
     (docs/theory/atmosphere.md, eq. 6).
     """
-    per_n, said = 1e-6 * float(pair.air["std_n"]), f"{pair.air['source']}: N = {pair.air['refractivity_n']:.1f}"
+    per_n, words = 1e-6 * float(pair.air["std_n"]), f"{pair.air['source']}: N = {pair.air['refractivity_n']:.1f}"
     tx_m, rx_m = (np.linalg.norm(leg - paths.point_m, axis=1) for leg in paths.aperture.legs)
     known_m, further_m = np.zeros(len(tx_m)), rx_m - tx_m
     if _by_sidelink(campaign, pair):
@@ -190,9 +190,9 @@ def _air(campaign: Campaign, pair: OpenPair, paths: PointPaths) -> BudgetLine:
     effect = paths.of_offset(per_n * (tx_m + rx_m - known_m), common=True)
     phase_rad = 2 * np.pi / paths.wavelength_m * per_n * float(np.abs(further_m - known_m).mean())
     effect = replace(effect, phase_rad=0.0 if pair.monostatic else phase_rad)
-    said = f"{said} ± {pair.air['std_n']:.1f}"
+    words = f"{words} ± {pair.air['std_n']:.1f}"
     assumed = campaign.settings.scene.atmosphere == "auto"
-    return BudgetLine("atmosphere", None if assumed else said, effect, assumed=said if assumed else None)
+    return BudgetLine("atmosphere", None if assumed else words, effect, assumed=words if assumed else None)
 
 
 def air_decision(pair: OpenPair) -> Decision:

@@ -300,14 +300,14 @@ def in_air(campaign: Campaign, history: xr.Dataset) -> xr.Dataset:
     Where samples are referred to a point, its delay is that of its distance in the air: none of the samples changes.
     """
     waveform, given = campaign.settings.waveform, history.attrs.get("reference", "delay")
-    asked: str = waveform.air if isinstance(waveform, PhaseHistoryWaveform) else "auto"
-    if asked == "auto":
-        asked = "point" if given == "point" else "measured"
+    requested: str = waveform.air if isinstance(waveform, PhaseHistoryWaveform) else "auto"
+    if requested == "auto":
+        requested = "point" if given == "point" else "measured"
     air = scene_air(campaign, history.tx_position.values)
-    if asked == "corrected":
+    if requested == "corrected":
         corrected = replace(Atmosphere.stated(0.0, ground_m=0.0), source="none: taken out of the files, as stated")
         air = replace(air, atmosphere=corrected)
     flown = air.over(aperture_of(history))
-    if asked == "point":
+    if requested == "point":
         history = history.assign(reference_delay=history.reference_delay * (1 + 1e-6 * flown.refractivity_n))
     return history.assign_attrs(stated_air(flown))

@@ -350,29 +350,29 @@ class CalibratedPair:
         Source: docs/theory/radiometry.md, eqs. 8, 8a and 8b.
         """
         own = pulse_noise.power - self.sidelink_noise
-        said = {"noise_figure_db": self.noise_figure_db, "noise_figure_measured_db": None, "std_db": None}
-        said |= {"sidelink": self.sidelink_noise or None}
-        apart = list[tuple[str, float, float]]()
+        report = {"noise_figure_db": self.noise_figure_db, "noise_figure_measured_db": None, "std_db": None}
+        report |= {"sidelink": self.sidelink_noise or None}
+        differences = list[tuple[str, float, float]]()
         if self.thermal_noise and own > 0:  # NaN is not
             figure_db = 10 * float(np.log10(own / self.thermal_noise))
             of_own_db = np.hypot(pulse_noise.std_db * pulse_noise.power, _SIDELINK_STD_DB * self.sidelink_noise) / own
-            said |= {"noise_figure_measured_db": round(figure_db, 2), "std_db": round(float(of_own_db), 2)}
+            report |= {"noise_figure_measured_db": round(figure_db, 2), "std_db": round(float(of_own_db), 2)}
             radio_db = _UNSTATED_STD_DB if self.radio_std_db is None else self.radio_std_db
             std_db = float(np.hypot(of_own_db, np.hypot(radio_db, _FIGURE_STD_DB)))
             if self.noise_figure_db is not None:
-                apart.append(("the noise figure stated", figure_db - self.noise_figure_db, std_db))
+                differences.append(("the noise figure stated", figure_db - self.noise_figure_db, std_db))
             elif figure_db < 0:  # nobody who states no figure has a receiver below 0 dB
-                apart.append(("a receiver of 0 dB", figure_db, std_db))
+                differences.append(("a receiver of 0 dB", figure_db, std_db))
         if self.noise_before and pulse_noise.power > 0 and not self.sidelink_noise:
             std_db = float(np.hypot(2**0.5 * pulse_noise.std_db, _FIGURE_STD_DB))
             since_db = 10 * float(np.log10(pulse_noise.power / self.noise_before))
-            apart.append(("that over the reflectors, of another gain?", since_db, std_db))
+            differences.append(("that over the reflectors, of another gain?", since_db, std_db))
         lines = [
             f"the noise measured is {by_db:+.1f} dB of {than}, ± {std_db:.1f} dB"
-            for than, by_db, std_db in apart
+            for than, by_db, std_db in differences
             if abs(by_db) > DRIFT_SIGMAS * std_db and not (by_db > 0 and bound)
         ]
-        return said, Flags({"noise_disagrees": "; ".join(lines)} if lines else {})
+        return report, Flags({"noise_disagrees": "; ".join(lines)} if lines else {})
 
 
 def stated_link(campaign: Campaign, pair: str) -> tuple[Link, float | None, float | None] | None:
@@ -481,13 +481,13 @@ def _turns(campaign: Campaign, opened: OpenPair, scene: OpenScene) -> list[Turn]
 
 def _disagreement(found: PairConstant, stated: float, std_db: float | None) -> dict[str, str]:
     """Return the flag of a constant that was measured and is not what the config's radio says."""
-    apart_db = 10 * float(np.log10(stated)) - found.constant_db
+    difference_db = 10 * float(np.log10(stated)) - found.constant_db
     both_db = float(np.hypot(found.std_db, std_db or 0.0))
-    if std_db is None or abs(apart_db) <= DRIFT_SIGMAS * both_db:
+    if std_db is None or abs(difference_db) <= DRIFT_SIGMAS * both_db:
         return {}
     return {
-        "constant_disagrees": f"the radio that the config states makes it {apart_db:+.2f} dB of what reflectors said, "
-        f"{abs(apart_db) / both_db:.1f} standard deviations of both"
+        "constant_disagrees": f"the radio that the config states makes it {difference_db:+.2f} dB of what "
+        f"reflectors said, {abs(difference_db) / both_db:.1f} standard deviations of both"
     }
 
 

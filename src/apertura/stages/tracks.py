@@ -102,6 +102,6 @@ def _stated_m(track: xr.Dataset, settings: Node) -> Floats:
     stated_m = np.array(np.broadcast_to(config_m, track.position.shape), np.float64)
     if "position_std" in track:
         own_m = track.position_std.values
-        told = (own_m > 0).all(axis=1)  # 0 states nothing, as when an error is budgeted
-        stated_m[told] = own_m[told]
+        is_stated = (own_m > 0).all(axis=1)  # 0 states nothing, as when an error is budgeted
+        stated_m[is_stated] = own_m[is_stated]
     return stated_m[:, [1, 0, 2]]

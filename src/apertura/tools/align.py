@@ -51,8 +51,8 @@ class Unaligned:
     Attributes
     ----------
     echo, log
-        As `apertura.methods.alignment` takes them: each by seconds of its own, from its first pulse and epoch.
-    apart_ns
+        As `apertura.methods.synchronisation` takes them: each by seconds of its own, from its first pulse and epoch.
+    log_start_ns
         Delay of the log's first epoch against the recorder's first pulse, nanoseconds.
     applied_ns
         Offset of config/clocks.tsv that the recorder's times already contain, nanoseconds.
@@ -68,7 +68,7 @@ class Unaligned:
 
     echo: Recorded
     log: Logged
-    apart_ns: int
+    log_start_ns: int
     applied_ns: int
     stated_ns: int
     applied_ppm: float
@@ -82,12 +82,12 @@ class Unaligned:
 
     def offset_ns(self, offset_s: float) -> int:
         """Return the offset for clocks.tsv, given one between the first pulse and the first epoch."""
-        return self.applied_ns + self.apart_ns + round(offset_s * 1e9)
+        return self.applied_ns + self.log_start_ns + round(offset_s * 1e9)
 
     @property
     def stated_s(self) -> float:
         """Offset at which `offset_ns` returns the stated one, seconds."""
-        return (self.stated_ns - self.applied_ns - self.apart_ns) * 1e-9
+        return (self.stated_ns - self.applied_ns - self.log_start_ns) * 1e-9
 
 
 def unaligned(campaign: Campaign, flight: str, node: str) -> Unaligned:
@@ -134,9 +134,9 @@ def unaligned(campaign: Campaign, flight: str, node: str) -> Unaligned:
         seconds_since(times, times[0]),
         speed,
     )
-    apart_ns = int((log.track.time.values[0] - times[0]).astype("timedelta64[ns]").astype(np.int64))
+    log_start_ns = int((log.track.time.values[0] - times[0]).astype("timedelta64[ns]").astype(np.int64))
     own_clock = bool(times[0] < FIRST)
-    return Unaligned(echo, _logged(log), apart_ns, applied_ns, clock.offset_ns, applied_ppm, off_m, own_clock)
+    return Unaligned(echo, _logged(log), log_start_ns, applied_ns, clock.offset_ns, applied_ppm, off_m, own_clock)
 
 
 def _some(history: xr.Dataset) -> xr.Dataset:

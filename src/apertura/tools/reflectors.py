@@ -188,10 +188,11 @@ class _View:
         reflector = Reflector(stated.kind, stated.size_m, axes)
         to_tx, to_rx = (_unit(leg - place) for leg in pulses.legs)
         rcs_m2, formula_db = reflector.seen(to_tx, to_rx, part, self.opened.frequency_hz)
-        apart_deg = float(np.degrees(np.arccos(np.clip((to_tx * to_rx).sum(axis=-1), -1, 1))).max())
+        bistatic_deg = float(np.degrees(np.arccos(np.clip((to_tx * to_rx).sum(axis=-1), -1, 1))).max())
         if not np.isfinite(rcs_m2):
             return (
-                f"its antennas are up to {apart_deg:.0f}° apart as it sees them: too much for a {stated.kind} its size"
+                f"its antennas are up to {bistatic_deg:.0f}° apart as it sees them: too much for a {stated.kind} "
+                "its size"
             )
         if not rcs_m2 > 0:
             return "turned away"
@@ -225,7 +226,7 @@ class _View:
             "scatter_db": round(scatter_db, 3),
             "rcs_dbsm": round(10 * float(np.log10(rcs_m2)), 3),
             "rcs_std_db": round(common_db, 3),
-            "antennas_apart_deg": round(apart_deg, 2),
+            "antennas_apart_deg": round(bistatic_deg, 2),
             "contrast_db": round(-10 * float(np.log10(inverse)), 1),
             "off_m": round(off_m, 4),
             "phase_rad": round(phase, 4),
@@ -374,8 +375,8 @@ def _flags(mean: Mean, unit: str) -> dict[str, str]:
             f"{mean.chance:.1g} of the times"
         )
     if mean.drift is not None and mean.drifts:
-        first, second, apart, std = mean.drift
-        flags["constant_drifts"] = f"{apart:+.2f} ± {std:.2f} {unit} from {first} to {second}"
+        first, second, difference, std = mean.drift
+        flags["constant_drifts"] = f"{difference:+.2f} ± {std:.2f} {unit} from {first} to {second}"
     return flags
 
 
@@ -385,9 +386,9 @@ def _drifted(pairs: Mapping[str, PairConstant], before: Constants) -> Iterator[t
         if was is None or was.radar.differs(now.radar):
             yield pair, now
             continue
-        apart_db, std_db = now.constant_db - was.constant_db, float(np.hypot(now.std_db, was.std_db))
-        drifted = abs(apart_db) > DRIFT_SIGMAS * std_db
-        line = {"constant_drifts": f"{apart_db:+.2f} ± {std_db:.2f} dB since {before.measured}"} if drifted else {}
+        drift_db, std_db = now.constant_db - was.constant_db, float(np.hypot(now.std_db, was.std_db))
+        drifted = abs(drift_db) > DRIFT_SIGMAS * std_db
+        line = {"constant_drifts": f"{drift_db:+.2f} ± {std_db:.2f} dB since {before.measured}"} if drifted else {}
         yield pair, now.model_copy(update={"flags": Flags.merged(now.flags, line)})
 
 

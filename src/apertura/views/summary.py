@@ -132,8 +132,8 @@ def _interferograms(campaign: Campaign) -> Iterator[tuple[str, dict[str, Any]]]:
         if campaign.is_current(campaign.result(INTERFEROMETRY, name, "interferogram")):
             report = open_listed(path, path.with_name("interferogram.manifest.json"))
             with undamaged(path, expected="the report of an interferogram", remedy="Run the workflow again."):
-                says = {"says": shown(report["says"], 400), "flags": printable(report["flags"])}
-            yield f"{INTERFEROMETRY} {name}", says
+                entry = {"says": shown(report["says"], 400), "flags": printable(report["flags"])}
+            yield f"{INTERFEROMETRY} {name}", entry
 
 
 def _some(names: Sequence[str], most: int = 3) -> str:

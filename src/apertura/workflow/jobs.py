@@ -41,7 +41,7 @@ class Jobs:
 
     def __getitem__(self, rule: str) -> Job:
         """Return what the jobs of a rule ask for; its parameters are the settings and code that matter to them."""
-        asked, row = self._resources[rule], RULES[rule]
+        resources, row = self._resources[rule], RULES[rule]
         rows = [made for made in RESULTS.values() if made.name == rule] or [RESULTS[row.result]]
 
         def results(wildcards: Any) -> list[Any]:
@@ -52,7 +52,7 @@ class Jobs:
             "settings": lambda wildcards: {k: v for one in results(wildcards) for k, v in one.settings.items()},
             "code": lambda wildcards: [one.code_sha256 for one in results(wildcards)],
         }
-        return Job(asked.threads, {"mem_mb": asked.mem_mb, "runtime": asked.runtime}, params)
+        return Job(resources.threads, {"mem_mb": resources.mem_mb, "runtime": resources.runtime}, params)
 
     def each(self, manifest: str, of: Scope | None = None) -> FilesOfJob:
         """Return the input function of a manifest with wildcards: one for each node, pair or flight of the job.

@@ -179,26 +179,26 @@ class Resources:
     @cached_property
     def _shape(self) -> tuple[int, int] | None:
         """Rows and columns: as settled, or as the config says; None where nobody knows yet."""
-        asked = self.campaign.settings.scene
+        scene = self.campaign.settings.scene
         with suppress(CampaignError, LookupError, TypeError, ValueError):  # not there, or damaged
             settled = read_json(self.campaign.result("scene.json"), expected="a settled scene", remedy=DAMAGED)
             rows, columns = map(int, settled["grid"]["shape"])
             return rows, columns
-        if asked.bounds_m == "auto" or asked.spacing_m == "auto":
+        if scene.bounds_m == "auto" or scene.spacing_m == "auto":
             return None
-        xmin, ymin, xmax, ymax = asked.bounds_m
-        return math.ceil((ymax - ymin) / asked.spacing_m), math.ceil((xmax - xmin) / asked.spacing_m)
+        xmin, ymin, xmax, ymax = scene.bounds_m
+        return math.ceil((ymax - ymin) / scene.spacing_m), math.ceil((xmax - xmin) / scene.spacing_m)
 
     @cached_property
     def _range_samples(self) -> int:
         """How many samples a range profile has at most: those of the whole period, or of the scene's depth."""
-        waveform, asked = self.campaign.settings.waveform, self.campaign.settings.scene
+        waveform, scene = self.campaign.settings.waveform, self.campaign.settings.scene
         if not isinstance(waveform, SampledWaveform):
             return 1000
         whole = _OVERSAMPLING * waveform.most_subcarriers
-        if asked.bounds_m == "auto":
+        if scene.bounds_m == "auto":
             return whole
-        xmin, ymin, xmax, ymax = asked.bounds_m
+        xmin, ymin, xmax, ymax = scene.bounds_m
         depth_m = 2 * math.hypot(xmax - xmin, ymax - ymin)
         cells = depth_m * waveform.widest_band_hz / SPEED_OF_LIGHT_M_S
         return min(whole, 64 + math.ceil(1.1 * _OVERSAMPLING * cells))

@@ -325,8 +325,8 @@ def multilook(place: JobPlace) -> Mapping[str, Any]:
 
 def noise_of_sums(place: JobPlace) -> Iterable[str]:
     """Return the manifests of what states the noise of a flight's images, where it is taken off their sums."""
-    asked = place.campaign.settings.processing.multilook
-    subtracted = asked is not None and asked.subtract_noise
+    multilooking = place.campaign.settings.processing.multilook
+    subtracted = multilooking is not None and multilooking.subtract_noise
     return [place.campaign.manifest("layers", *pair) for pair in place.pairs] if subtracted else []
 
 
@@ -336,8 +336,8 @@ def measured_image(place: JobPlace) -> Iterable[str]:
     if campaign.calibrated:
         files += [campaign.sent_file] if is_sampled(campaign) else []
         files += [path for path in [campaign.calibration_file] if path is not None]
-    asked = campaign.calibrated or multilook(place)
-    return [*map(campaign.relative, files), *(campaign.manifest("image", *pair) for pair in place.pairs if asked)]
+    is_needed = campaign.calibrated or multilook(place)
+    return [*map(campaign.relative, files), *(campaign.manifest("image", *pair) for pair in place.pairs if is_needed)]
 
 
 def calibration_of_images(place: JobPlace) -> Iterable[str]:

@@ -248,8 +248,8 @@ class ClockRow:
         if not times.size:
             return times
         elapsed_ns = (times - times[0]).astype("int64")
-        further_ns = self.offset_ns + (elapsed_ns * (self.drift_ppm * 1e-6)).round().astype("int64")
-        shifted: NDArray[np.datetime64] = times + further_ns.astype("timedelta64[ns]")
+        correction_ns = self.offset_ns + (elapsed_ns * (self.drift_ppm * 1e-6)).round().astype("int64")
+        shifted: NDArray[np.datetime64] = times + correction_ns.astype("timedelta64[ns]")
         return shifted
 
 

@@ -151,7 +151,7 @@ class Bench:
     splits: Mapping[str, SplitAgreement]
     carrier_hz: float
     interval_s: float
-    further: Flags = field(default_factory=Flags)
+    pair_flags: Flags = field(default_factory=Flags)
 
     def pair(self, node: str) -> str:
         """Return the name of the pair of a node."""
@@ -160,7 +160,7 @@ class Bench:
     @property
     def flags(self) -> Flags:
         """All flags."""
-        return Flags.merged(*(node.flags for node in self.nodes), self.further)
+        return Flags.merged(*(node.flags for node in self.nodes), self.pair_flags)
 
     @property
     def lines(self) -> list[VerdictLine]:
@@ -168,7 +168,7 @@ class Bench:
         return [line for node in self.nodes for line in self._lines(node)]
 
     def _lines(self, node: BenchNode) -> Iterator[VerdictLine]:
-        raised = [*node.flags, *(name for name, line in self.further.items() if self.pair(node.name) in line)]
+        raised = [*node.flags, *(name for name, line in self.pair_flags.items() if self.pair(node.name) in line)]
 
         def line(of: str, what: str, measured: str, limit: str, *names: str) -> VerdictLine:
             return VerdictLine(of, what, measured, limit, tuple(name for name in names if name in raised))
@@ -374,7 +374,7 @@ def measure_bench(campaign: Campaign, flight: str) -> Bench:
         replace(node, triggers=triggers, flags=Flags.merged(node.flags, triggers.flags))
         for node, triggers in zip(nodes, counts, strict=True)
     )
-    stated, offsets, further = campaign.settings.bench, {}, []
+    stated, offsets, flags = campaign.settings.bench, {}, []
     for node in nodes:
         own = node.name == flown.transmitter
         expected_m = stated.radar_m
@@ -383,23 +383,23 @@ def measure_bench(campaign: Campaign, flight: str) -> Bench:
         if node.link is None:
             continue
         if not own:
-            further.append(reversed_flags(node.link, expected_m))
+            flags.append(reversed_flags(node.link, expected_m))
         if expected_m is not None:
             paths = campaign.settings.nodes[node.name].path_offset_m
             offset_m = paths.radar if own else paths.radar - paths.sidelink
             link = node.link
             offsets[node.name] = BenchPathOffset(link.path_m - expected_m, link.path_std_m, offset_m, link.cell_m)
-            further.append(offsets[node.name].flags(link.name))
+            flags.append(offsets[node.name].flags(link.name))
     first = nodes[0].link if nodes and nodes[0].name == flown.transmitter else None
     splits = {}
     if stated.split and first is not None:
         for node in nodes[1:]:
             if node.link is not None:
                 splits[node.link.name] = split_agreement(first, node.link)
-                further.append(splits[node.link.name].flags(node.link.name))
+                flags.append(splits[node.link.name].flags(node.link.name))
     return Bench(
         flight, flown.transmitter, nodes, offsets, splits, waveform.carrier_hz, 1 / waveform.prf_hz,
-        Flags.merged(*further),
+        Flags.merged(*flags),
     )  # fmt: skip
 
 

@@ -101,19 +101,19 @@ class ResourceEstimate:
             update={"bounds_m": scene.grid.bounds_m, "spacing_m": scene.grid.spacing_m}
         )
         settled = campaign.settings.model_copy(update={"scene": with_grid})
-        asked = Resources(replace(campaign, settings=settled), sizes)
+        resources = Resources(replace(campaign, settings=settled), sizes)
         jobs = [(name, where) for name, rule in RULES.items() if not rule.on_demand for where in places(campaign, rule)]
         wildcards = [
             (name, SimpleNamespace(**dict(zip(RULES[name].of.wildcards, where, strict=False)))) for name, where in jobs
         ]
-        memory_mb = [asked[name].mem_mb(which, 1) for name, which in wildcards if RULES[name].demand is not None]
+        memory_mb = [resources[name].mem_mb(which, 1) for name, which in wildcards if RULES[name].demand is not None]
         return cls(
             flight_s,
             transfer_s,
             pulses,
             rates,
             sum(size for size, _ in sizes.values()),
-            sum(asked.expected_seconds(name, *where) for name, where in jobs),
+            sum(resources.expected_seconds(name, *where) for name, where in jobs),
             int(max(memory_mb, default=0) * 1e6),
         )
 

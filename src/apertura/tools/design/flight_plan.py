@@ -115,8 +115,8 @@ class FormationSettings(Section):
         step, numbers = self.spacing_m, range(1, followers + 1)
         if self.shape == "vee":
             return [(-step * ((n + 1) // 2), step * ((n + 1) // 2) * (1 if n % 2 else -1), 0.0) for n in numbers]
-        way = {"column": (-1.0, 0.0, 0.0), "row": (0.0, 1.0, 0.0), "stack": (0.0, 0.0, 1.0)}[self.shape]
-        return [(n * step * way[0] + 0.0, n * step * way[1], n * step * way[2]) for n in numbers]
+        direction = {"column": (-1.0, 0.0, 0.0), "row": (0.0, 1.0, 0.0), "stack": (0.0, 0.0, 1.0)}[self.shape]
+        return [(n * step * direction[0] + 0.0, n * step * direction[1], n * step * direction[2]) for n in numbers]
 
 
 class WobbleSettings(Section):

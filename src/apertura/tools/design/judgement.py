@@ -48,8 +48,8 @@ class Verdict:
     ----------
     requirement
         A key of `require`.
-    asked, found
-        In its unit; found is NaN where the plan does not say.
+    required, found
+        In its unit; found is NaN where the plan does not determine it.
     image
         Which is the worst.
     cause
@@ -57,7 +57,7 @@ class Verdict:
     """
 
     requirement: str
-    asked: float | None
+    required: float | None
     found: float
     image: str
     cause: str
@@ -65,14 +65,14 @@ class Verdict:
     @property
     def short_db(self) -> float:
         """How far it is missed, dB; negative where there is some to spare."""
-        if self.asked is None:
+        if self.required is None:
             return -np.inf
         if not np.isfinite(self.found):
             return 100.0
         sign = -1 if self.requirement in _LEAST else 1
         if self.requirement in _IN_DB:
-            return sign * (self.found - self.asked)
-        return sign * 10 * float(np.log10(max(self.found, 1e-9) / self.asked))
+            return sign * (self.found - self.required)
+        return sign * 10 * float(np.log10(max(self.found, 1e-9) / self.required))
 
     @property
     def met(self) -> bool:
@@ -83,7 +83,7 @@ class Verdict:
     def report(self) -> dict[str, Any]:
         """As JSON values."""
         found = float(f"{self.found:.4g}") if np.isfinite(self.found) else None
-        named = {"requirement": self.requirement, "asked": self.asked, "found": found, "met": self.met}
+        named = {"requirement": self.requirement, "asked": self.required, "found": found, "met": self.met}
         return named | {"image": self.image, "cause": self.cause}
 
 
@@ -105,12 +105,12 @@ def judge(design: Design, *, every: bool = False) -> list[Verdict]:
     required = design.opened.plan.require
     verdicts = []
     for name in type(required).model_fields:
-        asked, some = getattr(required, name), [one for one in found if one[0] == name]
-        if some and (every or asked is not None):
+        limit, some = getattr(required, name), [one for one in found if one[0] == name]
+        if some and (every or limit is not None):
             worst = (min if name in _LEAST else max)(some, key=lambda one: (np.isnan(one[1]), one[1]))
-            verdicts.append(Verdict(name, asked, *worst[1:]))
-        elif asked is not None:
-            verdicts.append(Verdict(name, asked, float("nan"), "none", "nothing of the plan says it"))
+            verdicts.append(Verdict(name, limit, *worst[1:]))
+        elif limit is not None:
+            verdicts.append(Verdict(name, limit, float("nan"), "none", "nothing of the plan says it"))
     return verdicts
 
 
@@ -193,8 +193,8 @@ def _coarsest(image: PlannedImage) -> str:
     pixel = tuple(slice(size // 2, size // 2 + 1) for size in shape)
     _, _, fine_deg = image.resolution.axes((pixel[0], pixel[1]))
     ahead = image.resolution.look_azimuth_deg((pixel[0], pixel[1]))
-    apart = abs((float(fine_deg[0, 0]) - float(ahead[0, 0]) + 90) % 180 - 90)
-    if apart > 45:  # the finest direction is across the line of sight
+    across_deg = abs((float(fine_deg[0, 0]) - float(ahead[0, 0]) + 90) % 180 - 90)
+    if across_deg > 45:  # the finest direction is across the line of sight
         return "range: bandwidth over the sine of incidence"
     return "cross-range: wavelength over the angle that the aperture turns about the scene"
 
@@ -287,13 +287,16 @@ def _candidates(plan: FlightPlan) -> Iterator[tuple[str, _Changing]]:
         change = partial(_scaled_speed, factor=factor)
         yield f"fly at {factor:g} times the speed (speed_m_s)", partial(_tracks, change=change)
     for height_m in (-10.0, 10.0, 20.0):
-        way = "higher" if height_m > 0 else "lower"
+        direction = "higher" if height_m > 0 else "lower"
         now_m = plan.moved.height_m + height_m
-        yield f"fly {abs(height_m):g} m {way} (moved.height_m: {now_m:g})", partial(moved, height_m=height_m)
+        yield f"fly {abs(height_m):g} m {direction} (moved.height_m: {now_m:g})", partial(moved, height_m=height_m)
     for offset_m in (-10.0, 10.0, 20.0):
-        way = "farther from" if offset_m > 0 else "nearer to"
+        direction = "farther from" if offset_m > 0 else "nearer to"
         now_m = plan.moved.offset_m + offset_m
-        yield f"fly {abs(offset_m):g} m {way} the scene (moved.offset_m: {now_m:g})", partial(moved, offset_m=offset_m)
+        yield (
+            f"fly {abs(offset_m):g} m {direction} the scene (moved.offset_m: {now_m:g})",
+            partial(moved, offset_m=offset_m),
+        )
     for factor in (0.5, 2.0) if several else ():
         yield f"separations times {factor:g} (moved.spacing)", partial(moved, spacing=plan.moved.spacing * factor)
     if lines:
@@ -446,9 +449,9 @@ def search(
             verdicts = judge(designed(one, root, threads=threads, coarse=COARSE_PX), every=True)
         except CampaignError:
             return IMPOSSIBLE_DB
-        asked = [verdict for verdict in verdicts if verdict.asked is not None]
-        short = [verdict.short_db for verdict in asked]
-        missed = 10 * shortfall_db(asked) + max(short) + 0.01 * float(np.mean(short))
+        required = [verdict for verdict in verdicts if verdict.required is not None]
+        short = [verdict.short_db for verdict in required]
+        missed = 10 * shortfall_db(required) + max(short) + 0.01 * float(np.mean(short))
         tried.append(Tried(values, tuple(verdicts), missed))
         return missed
 
@@ -473,6 +476,6 @@ def tried_report(tried: Sequence[Tried]) -> list[dict[str, Any]]:
 
 def with_front(tried: Sequence[Tried]) -> list[Tried]:
     """Return plans marked where no other is as good in all that is asked and better in some."""
-    short = np.array([[v.short_db for v in one.verdicts if v.asked is not None] for one in tried])
+    short = np.array([[v.short_db for v in one.verdicts if v.required is not None] for one in tried])
     front = [not ((short <= own).all(axis=1) & (short < own).any(axis=1)).any() for own in short]
     return [replace(one, on_front=on) for one, on in zip(tried, front, strict=True)]

@@ -146,8 +146,8 @@ class OpenPlan:
             first = {pair.flight: pair for pair in reversed(self.pairs)}
             sectors = [integration_of(self.campaign, pair, self.scene).sector for pair in first.values()]
             spacing_m = self.scene.grid.spacing_m * (1 + TAPER)
-            asked: Any = {"integration": {"resolution_m": spacing_m} if any(sectors) else "all"}
-            processing = type(processing).model_validate(processing.model_dump(exclude_unset=True) | asked)
+            integration: Any = {"integration": {"resolution_m": spacing_m} if any(sectors) else "all"}
+            processing = type(processing).model_validate(processing.model_dump(exclude_unset=True) | integration)
         settings = self.campaign.settings.model_copy(update={"processing": processing})
         grid, terrain = self.scene.grid.coarse(count), self.scene.terrain
         if isinstance(terrain, GridHeights):
@@ -327,8 +327,8 @@ def _drawn(track: LineTrack | RacetrackTrack | CircleTrack) -> _Drawn:
     if isinstance(track, CircleTrack):
         length_s = float(np.radians(abs(track.turn_deg))) * track.radius_m / track.speed_m_s
         time_s = np.linspace(-LEAD_S, length_s + LEAD_S, 2 + int((length_s + 2 * LEAD_S) / _ARC_S))
-        way = np.sign(track.turn_deg) or 1.0
-        azimuth = np.radians(track.start_deg) + way * time_s * track.speed_m_s / track.radius_m
+        turn_sign = np.sign(track.turn_deg) or 1.0
+        azimuth = np.radians(track.start_deg) + turn_sign * time_s * track.speed_m_s / track.radius_m
         around = np.array([*track.centre_m, track.height_m])
         out = np.stack([np.sin(azimuth), np.cos(azimuth), np.zeros(len(time_s))], -1)
         return time_s, around + track.radius_m * out, ((0.0, length_s),)
@@ -413,8 +413,8 @@ def _mission(
         base = np.zeros(len(flat))
     place = np.column_stack([flat, height + base])
     steps = np.linalg.norm(np.diff(place, axis=0), axis=1)
-    apart = np.concatenate([[True], steps > 1e-3])
-    place, steps, speed = place[apart], steps[apart[1:]], speed[apart]
+    is_distinct = np.concatenate([[True], steps > 1e-3])
+    place, steps, speed = place[is_distinct], steps[is_distinct[1:]], speed[is_distinct]
     if len(place) < 2:
         raise CampaignError("waypoints at one place", path, "a mission that goes somewhere", "Export it again.")
     time_s = np.concatenate([[0.0], np.cumsum(steps / speed[1:])])
@@ -480,11 +480,12 @@ def _check_separation(name: str, flight: PlannedFlight, courses: Mapping[str, Co
     """Raise CampaignError where two nodes come closer to each other than they may."""
     for one, other in combinations(courses, 2):
         length = min(len(courses[one].time_s), len(courses[other].time_s))
-        apart = np.linalg.norm(courses[one].place_m[:length] - courses[other].place_m[:length], axis=1)
-        at = int(apart.argmin())
-        if apart[at] < flight.separation_m:
+        separation_m = np.linalg.norm(courses[one].place_m[:length] - courses[other].place_m[:length], axis=1)
+        at = int(separation_m.argmin())
+        if separation_m[at] < flight.separation_m:
+            at_s = courses[one].time_s[at]
             raise CampaignError(
-                f"{one} and {other} come within {apart[at]:.2f} m at {courses[one].time_s[at]:.1f} s: they collide",
+                f"{one} and {other} come within {separation_m[at]:.2f} m at {at_s:.1f} s: they collide",
                 f"flights.{name}",
                 f"{flight.separation_m:g} m between any two nodes, separation_m",
                 "Fly them farther apart, or allow less by separation_m.",

@@ -153,7 +153,7 @@ def headline(verdicts: Sequence[Verdict], changes: Sequence[Change]) -> str:
     missed = [one for one in verdicts if not one.met]
     if not missed:
         return f"GO: all of {number_of(len(verdicts), 'requirement')} met"
-    found = ", ".join(f"{one.requirement} {_value(one.found)} (required {_value(one.asked)})" for one in missed)
+    found = ", ".join(f"{one.requirement} {_value(one.found)} (required {_value(one.required)})" for one in missed)
     helps = f"; most helpful change: {changes[0].words}" if changes else ""
     return f"NO-GO: {found}{helps}"
 
@@ -194,7 +194,7 @@ def interferogram_lines(design: Design) -> Iterator[str]:
 def verdict_row(verdict: Verdict) -> tuple[str, ...]:
     """Return a verdict as text."""
     met = "yes" if verdict.met else f"no, {verdict.short_db:.2g} dB short"
-    return verdict.requirement, f"{verdict.asked:g}", f"{verdict.found:.4g}", met, verdict.image, verdict.cause
+    return verdict.requirement, f"{verdict.required:g}", f"{verdict.found:.4g}", met, verdict.image, verdict.cause
 
 
 def recording_lines(design: Design) -> Iterator[str]:
@@ -385,12 +385,12 @@ def _ends(values: NDArray[np.float64]) -> tuple[float, float]:
 
 def draw_pareto(path: Path, tried: Sequence[Tried]) -> None:
     """Draw the plans that a search tried over two requirements, those that no other beats, and the one taken."""
-    asked = [one.requirement for one in tried[0].verdicts if one.asked is not None]
-    names = [*asked, *(one.requirement for one in tried[0].verdicts if one.requirement not in asked)]
+    required = [one.requirement for one in tried[0].verdicts if one.required is not None]
+    names = [*required, *(one.requirement for one in tried[0].verdicts if one.requirement not in required)]
     spread = {name: np.ptp([_found(one, name) for one in tried]) for name in names}
     names = [name for name in names if np.isfinite(spread[name]) and spread[name] > 0] or names
     across, up = (*names, *names)[:2]
-    limits = {one.requirement: one.asked for one in tried[0].verdicts}
+    limits = {one.requirement: one.required for one in tried[0].verdicts}
     with sheet(path, 4.2, title="plans tried", tags=PICTURE_TAGS) as figure:
         axes = figure.add_subplot()
         for front, colour, label in ((False, GREY, "tried"), (True, BLUE, "none is better in all that is required")):
@@ -491,9 +491,11 @@ def comparison_rows(plan: FlightPlan, root: Path, campaign: Campaign, *, threads
             numbers[0] |= {"pulses": pulses[0], "speed, m/s": speeds[0]}
             numbers[1] |= {"pulses": pulses[1], "speed, m/s": speeds[1]}
             for name, value in numbers[0].items():
-                said = measured.get(name)
+                measured_value = measured.get(name)
                 texts = ["" if np.isnan(one) else f"{one:.4g}" for one in (value, numbers[1].get(name, np.nan))]
-                rows.append((f"{flight.name}/{pair}", name, *texts, "" if said is None else f"{said:.4g}"))
+                rows.append(
+                    (f"{flight.name}/{pair}", name, *texts, "" if measured_value is None else f"{measured_value:.4g}")
+                )
     if not rows:
         raise CampaignError(
             f"images {', '.join(design.images)}",

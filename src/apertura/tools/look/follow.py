@@ -188,9 +188,9 @@ class Look:
         began = time.monotonic()
         pairs = {}
         for pair in self.pairs:
-            told = self.show_pair(pair)
-            pairs[f"{pair.flight}/{pair.name}"] = told
-            print(f"{datetime.now(UTC):%H:%M:%S}  {_line(pair, told, self.decimated)}", flush=True)
+            report = self.show_pair(pair)
+            pairs[f"{pair.flight}/{pair.name}"] = report
+            print(f"{datetime.now(UTC):%H:%M:%S}  {_line(pair, report, self.decimated)}", flush=True)
         delays = [one["delay_s"] for one in pairs.values() if one["delay_s"] is not None]
         status = {
             "campaign": self.campaign.settings.campaign,
@@ -216,42 +216,42 @@ class Look:
     def show_pair(self, pair: PairSoFar) -> dict[str, Any]:
         """Write the picture of a pair; return what is known of it, for the status."""
         shown = pair.shown
-        told: dict[str, Any] = {"pulses": pair.counts, "waits": pair.waits, "delay_s": None, "image": None}
+        report: dict[str, Any] = {"pulses": pair.counts, "waits": pair.waits, "delay_s": None, "image": None}
         if shown is None or not shown.sums.any():
-            return told
+            return report
         judged, bound_db = pair.judged(), float(shown.error_db)
         error_db = round(bound_db, 1) if np.isfinite(bound_db) else None
-        told |= {"peak": shown.peak, **judged, "flags": Flags.merged(pair.flags, judged["flags"])}
-        told |= {"share": shown.share, "error_db": error_db}
-        told |= {"spacing_m": shown.grid.spacing_m, "setting": shown.setting}
-        told["delay_s"] = pair.delay_s
+        report |= {"peak": shown.peak, **judged, "flags": Flags.merged(pair.flags, judged["flags"])}
+        report |= {"share": shown.share, "error_db": error_db}
+        report |= {"spacing_m": shown.grid.spacing_m, "setting": shown.setting}
+        report["delay_s"] = pair.delay_s
         path = self._picture(pair)
         path.parent.mkdir(parents=True, exist_ok=True)
-        self._draw(path, pair, told)
-        self._map.add(pair, told)
+        self._draw(path, pair, report)
+        self._map.add(pair, report)
         if pair.tx is not None:
             pair.tx.read()
             if pair.tx.begun_anew:
                 return {"pulses": pair.anew().counts, "waits": "", "delay_s": None, "image": None}
-        told |= {"delay_s": pair.delay_s, "pulses": pair.counts}  # when the picture is there
-        told["image"] = f"{pair.flight}/{pair.name}.png"
-        return told
+        report |= {"delay_s": pair.delay_s, "pulses": pair.counts}  # when the picture is there
+        report["image"] = f"{pair.flight}/{pair.name}.png"
+        return report
 
     def _picture(self, pair: PairSoFar) -> Path:
         return self.campaign.result(LOOK, pair.flight, f"{pair.name}.png")
 
-    def _draw(self, path: Path, pair: PairSoFar, told: Mapping[str, Any]) -> None:
+    def _draw(self, path: Path, pair: PairSoFar, report: Mapping[str, Any]) -> None:
         shown = pair.shown
         if shown is None:
             raise TypeError("a pair without an image is not drawn")
         image, grid = shown.image, shown.grid
         image[image == 0] = np.complex64(complex(np.nan, np.nan))  # no pulse has seen it yet
-        focus = {"verdict": told["verdict"], **({"loss_db": told["loss_db"]} if "loss_db" in told else {})}
+        focus = {"verdict": report["verdict"], **({"loss_db": report["loss_db"]} if "loss_db" in report else {})}
         tags = {
             "APERTURA_VERSION": __version__,
             "APERTURA_FOCUS": json.dumps(focus),
-            **({} if told["error_db"] is None else {"APERTURA_ERROR_DB": f"{told['error_db']:g}"}),
-            **({"APERTURA_FLAGS": json.dumps(told["flags"])} if told["flags"] else {}),
+            **({} if report["error_db"] is None else {"APERTURA_ERROR_DB": f"{report['error_db']:g}"}),
+            **({"APERTURA_FLAGS": json.dumps(report["flags"])} if report["flags"] else {}),
         }
         write_quicklook(
             path,
@@ -259,8 +259,8 @@ class Look:
             **placed_on(grid),
             tags=tags,
             title=f"{self.campaign.settings.campaign} · {pair.flight} {pair.name}, so far",
-            subtitle=_subtitle(pair, told, self.decimated),
-            markers=[(told["peak"]["x_m"], told["peak"]["y_m"], "peak")],
+            subtitle=_subtitle(pair, report, self.decimated),
+            markers=[(report["peak"]["x_m"], report["peak"]["y_m"], "peak")],
         )
 
 
@@ -313,34 +313,34 @@ def _behind(delay_s: float | None) -> str:
     return "" if delay_s is None else f"{delay_s:.1f} s behind"
 
 
-def _extent(told: Mapping[str, Any]) -> str:
-    of = "coarse: half the band, every 2nd pixel" if told["share"] == 2 else "fine"
-    return f"{of} ({told['spacing_m']:g} m)"
+def _extent(report: Mapping[str, Any]) -> str:
+    of = "coarse: half the band, every 2nd pixel" if report["share"] == 2 else "fine"
+    return f"{of} ({report['spacing_m']:g} m)"
 
 
-def _subtitle(pair: PairSoFar, told: Mapping[str, Any], every: int) -> str:
+def _subtitle(pair: PairSoFar, report: Mapping[str, Any], every: int) -> str:
     until = "" if pair.until is None else f"{str(pair.until)[11:21]}Z"
     words = (
-        f"{told['pulses']['added']} pulses to {until}",
-        _behind(told["delay_s"]),
+        f"{report['pulses']['added']} pulses to {until}",
+        _behind(report["delay_s"]),
         _decimation(every),
-        _extent(told),
+        _extent(report),
     )
     return " · ".join(word for word in words if word)
 
 
-def _line(pair: PairSoFar, told: Mapping[str, Any], every: int) -> str:
-    name, counts = f"{pair.flight} {pair.name}", told["pulses"]
-    if told["image"] is None:
-        return f"{name}: no image yet, {counts['recorded']} pulses recorded{told['waits'] and '; '}{told['waits']}"
+def _line(pair: PairSoFar, report: Mapping[str, Any], every: int) -> str:
+    name, counts = f"{pair.flight} {pair.name}", report["pulses"]
+    if report["image"] is None:
+        return f"{name}: no image yet, {counts['recorded']} pulses recorded{report['waits'] and '; '}{report['waits']}"
     words = (
         f"{counts['added']} of {counts['recorded']} pulses",
-        _behind(told["delay_s"]),
+        _behind(report["delay_s"]),
         _decimation(every),
-        _extent(told),
-        told["verdict"],
-        f"peak at {told['peak']['x_m']:.2f}, {told['peak']['y_m']:.2f}",
-        ", ".join(flag for flag in told["flags"] if flag != told["verdict"]),
+        _extent(report),
+        report["verdict"],
+        f"peak at {report['peak']['x_m']:.2f}, {report['peak']['y_m']:.2f}",
+        ", ".join(flag for flag in report["flags"] if flag != report["verdict"]),
     )
     return f"{name}: {'; '.join(word for word in words if word)}"
 
@@ -414,8 +414,8 @@ class LiveMap:
         """Remove the document of an earlier look: who asks for the map now waits for the first picture of this one."""
         (self._folder / MAP).unlink(missing_ok=True)
 
-    def add(self, pair: PairSoFar, told: Mapping[str, Any]) -> None:
-        """Write the image so far of a pair, of which `told` is known."""
+    def add(self, pair: PairSoFar, report: Mapping[str, Any]) -> None:
+        """Write the present image of a pair and its report."""
         shown, grid = pair.shown, pair.images[-1].grid
         if shown is None:
             return
@@ -433,13 +433,13 @@ class LiveMap:
         self._entries[where] = {
             "flight": pair.flight,
             "image": pair.name,
-            "verdict": told["verdict"],
-            "why": told["why"],
-            "error_db": told["error_db"],
-            "flags": explained_flags(told["flags"]),
+            "verdict": report["verdict"],
+            "why": report["why"],
+            "error_db": report["error_db"],
+            "flags": explained_flags(report["flags"]),
             "layers": [{**asdict(layer), "url": url_of(f"{where}/{path.name}", layer.sha256)}],
         }
-        peak = told["peak"]
+        peak = report["peak"]
         self._places[where] = Place("brightest", "found", float(peak["x_m"]), float(peak["y_m"]), where)
 
     def drop(self, pair: PairSoFar) -> None:

@@ -227,12 +227,12 @@ class ImageSoFar:
 
     def _beams(self, aperture: Aperture, axes: Axes, centre_hz: float) -> Beams | None:
         """Return the weights of pulses: antennas, and a sector that no later pulse changes; None: all count alike."""
-        asked = self._campaign.settings.processing.integrated
+        requested = self._campaign.settings.processing.integrated
         antennas = beams_of(self._campaign, self._pair, axes)
-        if asked == "all" or len(aperture) < 2:
+        if requested == "all" or len(aperture) < 2:
             return antennas
-        half = sector_half(asked, self._speed_m_s / centre_hz, self.grid.spacing_m)
-        half /= 1 if asked == "auto" else self.share  # what pixels carry follows from their spacing
+        half = sector_half(requested, self._speed_m_s / centre_hz, self.grid.spacing_m)
+        half /= 1 if requested == "auto" else self.share  # what pixels carry follows from their spacing
         if half * (1 - TAPER) >= 1:  # all directions
             return antennas
         middle_m = self._terrain.positions_at(self.grid, *((size - 1) / 2 for size in self.grid.shape))
@@ -278,9 +278,9 @@ class ImageSoFar:
         seconds = (at - at[0]) / np.timedelta64(1, "s")
         error_db = float(self.error_db) if np.isfinite(self.error_db) else None
         lines = budget_by_hand(formation, error_db=error_db, position_std_m=std_m, time_s=seconds)
-        told = judgement(formation, self.image, lines)
-        loss = {"loss_db": told.focus["loss_db"]} if "loss_db" in told.focus else {}
-        return {"verdict": told.verdict, "why": told.why, **loss, "flags": dict(told.flags)}
+        judged = judgement(formation, self.image, lines)
+        loss = {"loss_db": judged.focus["loss_db"]} if "loss_db" in judged.focus else {}
+        return {"verdict": judged.verdict, "why": judged.why, **loss, "flags": dict(judged.flags)}
 
 
 AT_ONCE = 2048
@@ -456,8 +456,8 @@ class PairSoFar:
     def _begin(self, block: PulseBlock) -> list[ImageSoFar]:
         """Return the images, coarse and fine."""
         campaign, (grid, ground) = self.campaign, self.scene(block)
-        asked = campaign.settings.processing.accuracy_db
-        accuracy_db = MOST_ACCURACY_DB if asked == "auto" else float(asked)
+        requested = campaign.settings.processing.accuracy_db
+        accuracy_db = MOST_ACCURACY_DB if requested == "auto" else float(requested)
         images = []
         for share in (2, 1):
             own = grid.coarse(max(grid.shape) // share)
@@ -486,10 +486,10 @@ class PairSoFar:
         """
         coarse, fine = self.images
         by = fine if 2 * fine.pulses >= coarse.pulses else coarse
-        told = by.judged() | {"judged_by": f"{by.pulses} pulses, {'fine' if by is fine else 'coarse'}"}
-        if by is coarse and told["flags"]:
-            told |= {"verdict": "cannot tell", "why": f"the coarse image alone: {told['why']}", "flags": {}}
-        return told
+        judged = by.judged() | {"judged_by": f"{by.pulses} pulses, {'fine' if by is fine else 'coarse'}"}
+        if by is coarse and judged["flags"]:
+            judged |= {"verdict": "cannot tell", "why": f"the coarse image alone: {judged['why']}", "flags": {}}
+        return judged
 
     @property
     def time(self) -> Times:

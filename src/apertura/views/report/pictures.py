@@ -171,7 +171,7 @@ class Shown:
     def record(self) -> PulseRecord:
         """Return which pulses make the image, and what the sidelink measured of them."""
         echo, sent = self.echo, self._sent()
-        told = echo.attrs.get("pulses") or {}
+        counts = echo.attrs.get("pulses") or {}
         snr_db = echo.sidelink_snr.values if "sidelink_snr" in echo else None
         beyond_m = None
         if "sidelink_delay" in echo and "sidelink_vector" in echo:
@@ -180,7 +180,7 @@ class Shown:
         return PulseRecord(
             seconds_since(sent, sent[0]),
             np.isin(sent, echo.time.values),
-            told.get("reasons") or {},
+            counts.get("reasons") or {},
             seconds_since(echo.time.values, sent[0]),
             snr_db,
             beyond_m,

@@ -34,7 +34,7 @@ from apertura.views.report.page import Block, Heading, Paragraph, Picture, Table
 from apertura.views.report.page import page as page_of
 from apertura.workflow.lineage import result_of
 
-ASKED = ("key", "value")
+SETTING_COLUMNS = ("key", "value")
 """Headings of what was asked."""
 
 
@@ -53,8 +53,8 @@ def _blocks(campaign: Campaign, flight: str, reports: Mapping[str, Mapping[str, 
     yield Table("Summary of the flight.", ("quantity", "value"), flight_rows(campaign, flight, reports))
     yield Table(
         "Configuration and output grid (settings not listed are chosen automatically, see Processing decisions).",
-        ASKED,
-        asked_rows(campaign),
+        SETTING_COLUMNS,
+        setting_rows(campaign),
     )
     yield Table("Image quality.", VERDICTS, [verdict_row(*one) for one in reports.items()])
     if FUSED in reports:
@@ -123,7 +123,7 @@ def _place_text(place: Any) -> str:
     )
 
 
-def asked_rows(campaign: Campaign) -> list[tuple[str, str]]:
+def setting_rows(campaign: Campaign) -> list[tuple[str, str]]:
     """Return what was asked of a campaign, key of the config → value; grid as settled, and why."""
     scene, values = settled_scene(campaign), campaign.values
     west, south, east, north = scene.grid.bounds_m
@@ -199,7 +199,7 @@ def landing(campaign: Campaign) -> dict[str, Any]:
     return {
         "title": rst_text(campaign.settings.campaign),
         "flights": rst_text(", ".join(f"{one} ({', '.join(names)})" for one, names in flights.items())),
-        "asked": rst_table(ASKED, asked_rows(campaign)),
+        "asked": rst_table(SETTING_COLUMNS, setting_rows(campaign)),
         "verdicts": rst_table(VERDICTS, [verdict_row(*one) for one in reports.items()]),
         "sentences": [
             rst_text(" ".join(sentences(f"Sum of the pairs of {one}", reports[f"{one} {FUSED}"])))

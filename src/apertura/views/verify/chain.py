@@ -336,8 +336,8 @@ class Chain:
             if stage == "image.manifest.json":
                 spec = _spec(ConfinedPath.at(self.root).named(f"{folder}/image.zarr/zarr.json", where=link.name))
                 image = folder.removeprefix("results/")  # of several, each has its own under its name
-                told = stated, stated.get(image), stated.get(image.rpartition("/")[2])
-                if spec is not None and not any(_holds(one, spec) for one in told):
+                candidates = stated, stated.get(image), stated.get(image.rpartition("/")[2])
+                if spec is not None and not any(_holds(one, spec) for one in candidates):
                     link.add("changed", f"APERTURA_RUNSPEC: {folder}/image.zarr was made with other settings")
 
 

@@ -83,12 +83,15 @@ class Tally:
         self.phased = np.iscomplexobj(first) or np.iscomplexobj(second)
         wide = np.complex128 if self.phased else np.float64
         a, b = (values[valid[0] & valid[1]].astype(wide) for values in (first, second))
-        apart = np.abs(a - b)
-        self.differing += int(np.count_nonzero(apart)) + sum(lacking)
+        difference = np.abs(a - b)
+        self.differing += int(np.count_nonzero(difference)) + sum(lacking)
         if not a.size:
             return
         self.compared += a.size
-        self.largest, self.square = max(self.largest, float(apart.max())), self.square + float((apart**2).sum())
+        self.largest, self.square = (
+            max(self.largest, float(difference.max())),
+            self.square + float((difference**2).sum()),
+        )
         self.peak = max(self.peak, float(np.abs(a).max()), float(np.abs(b).max()))
         if self._sums is None:  # of real values the mean is taken off: sums about one of them keep their digits
             self._sums, self._about = np.zeros(5, complex), 0.0 if self.phased else float(a[0])
@@ -352,9 +355,9 @@ def print_reproduced(path: Path, *, cores: int, keep: Path | None = None) -> int
     wanted = [one for one in known if (product.root / one).is_file()] if whole else [product.manifest]
     if not wanted:
         raise CampaignError("no results", product.root, "a campaign that was run", "Run it: `apertura run`.")
-    asked = [one for one in wanted if on_demand(campaign, one)]
+    requested = [one for one in wanted if on_demand(campaign, one)]
     with _scratch(campaign, keep) as again:
-        status = run_workflow(again, cores, *(["all", *asked] if whole else wanted))
+        status = run_workflow(again, cores, *(["all", *requested] if whole else wanted))
         if status:
             return status
         lines = _found(product.root, again, wanted, known)

@@ -140,7 +140,7 @@ def url_of(file: str, sha256: str) -> str:
     return f"../{quote(file)}?sha256={sha256}"
 
 
-def asked_file(target: str) -> tuple[str, str | None]:
+def requested_file(target: str) -> tuple[str, str | None]:
     """Return the file that a request names and the hash it expects, if any; '' is no name of a file.
 
     Parameters
@@ -150,7 +150,7 @@ def asked_file(target: str) -> tuple[str, str | None]:
 
     Examples
     --------
-    >>> asked_file("/f01/a-b/db.tif?sha256=0f"), asked_file("http://x/y"), asked_file("/%ff")
+    >>> requested_file("/f01/a-b/db.tif?sha256=0f"), requested_file("http://x/y"), requested_file("/%ff")
     (('f01/a-b/db.tif', '0f'), ('', None), ('', None))
     """
     try:
@@ -180,8 +180,8 @@ def named_files(document: Mapping[str, Any]) -> dict[str, str]:
     if document["format"] != FORMAT:
         return {}
     urls = [layer["url"] for image in document["images"] for layer in image["layers"]]
-    asked = (asked_file(url.removeprefix("..")) for url in (*urls, document["coverage_url"]) if url is not None)
-    return {name: sha256 for name, sha256 in asked if sha256 is not None}
+    requests = (requested_file(url.removeprefix("..")) for url in (*urls, document["coverage_url"]) if url is not None)
+    return {name: sha256 for name, sha256 in requests if sha256 is not None}
 
 
 def map_document(

@@ -29,7 +29,7 @@ from apertura.common.errors import CampaignError
 from apertura.common.processes import Interrupted
 from apertura.common.provenance import sha256_file
 from apertura.formats.export import LOOK, MAP, product_files
-from apertura.views.webmap.document import asked_file, named_files
+from apertura.views.webmap.document import named_files, requested_file
 
 LOOPBACK = "127.0.0.1"
 """The only address that is listened on, and the name under which the map and its data are answered."""
@@ -63,7 +63,7 @@ def own_host(hosts: list[str], port: int) -> str | None:
     return names.get(hosts[0].lower()) if len(hosts) == 1 else None
 
 
-def asked_bytes(header: str | None, size: int) -> tuple[int, int] | None:
+def requested_range(header: str | None, size: int) -> tuple[int, int] | None:
     """Return the first byte asked for and the one after the last; None for the whole file.
 
     A header that is none, or asks for several ranges, asks for the whole file (RFC 9110, 14.2).
@@ -82,8 +82,10 @@ def asked_bytes(header: str | None, size: int) -> tuple[int, int] | None:
 
     Examples
     --------
-    >>> asked_bytes("bytes=10-19", 100), asked_bytes("bytes=90-", 95), asked_bytes("bytes=-5", 95), asked_bytes(None, 9)
-    ((10, 20), (90, 95), (90, 95), None)
+    >>> requested_range("bytes=10-19", 100), requested_range("bytes=90-", 95)
+    ((10, 20), (90, 95))
+    >>> requested_range("bytes=-5", 95), requested_range(None, 9)
+    ((90, 95), None)
     """
     found = _RANGE.fullmatch(header.strip()) if header else None
     if found is None:
@@ -295,7 +297,7 @@ class _Handler(BaseHTTPRequestHandler):
         if opened and host == LOOPBACK:  # by a reader, and not as the frame
             self._say(HTTPStatus.FOUND, "the map", Location=self.server.url)
             return
-        name, expected = (SHELL[0], None) if self.path == "/" else asked_file(self.path)
+        name, expected = (SHELL[0], None) if self.path == "/" else requested_file(self.path)
         if name in self.server.pages[host]:
             self._send(BytesIO(self.server.pages[host][name]), name)
         elif host == LOOPBACK:
@@ -335,7 +337,7 @@ class _Handler(BaseHTTPRequestHandler):
     def _send(self, file: IO[bytes], name: str) -> None:
         size = file.seek(0, os.SEEK_END)
         try:
-            part = asked_bytes(self.headers.get("Range"), size)
+            part = requested_range(self.headers.get("Range"), size)
         except UnsatisfiableRangeError:
             self._say(HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE, "beyond the file", Content_Range=f"bytes */{size}")
             return
