@@ -92,7 +92,7 @@ class RawFolder:
         return [self._recorded(flight, name) for name in own]
 
     def logged(self, flight: str, node: str) -> bool:
-        """Return whether a flight log of a node lies there, or lay there when results were made."""
+        """Test whether a flight log of a node is there, or was when results were made."""
         return bool(self._logs(flight, node))
 
     def track_file(self, flight: str, node: str) -> ConfinedPath:
@@ -245,7 +245,7 @@ class Campaign(RawFolder):
 
     @cached_property
     def calibrated(self) -> bool:
-        """Whether the radio of its pairs is stated, or their constants were measured, so that images are calibrated."""
+        """True if the radio of its pairs is stated, or their constants were measured, so that images are calibrated."""
         if self.settings.processing.radiometric_calibration:
             return True
         stated = (radio_of(self.settings.nodes, pair) for pair in self._pairs)
@@ -302,7 +302,7 @@ class Campaign(RawFolder):
         return "/".join(["results", *where, f"{stage}.manifest.json"])
 
     def is_current(self, result: ConfinedPath) -> bool:
-        """Return whether a stage or document is finished and not `outdated`."""
+        """Test whether a stage or document is finished and not `outdated`."""
         from apertura.campaign.store.manifest import manifest_of  # whoever asks has the store's arrays loaded
 
         manifest = manifest_of(result)
@@ -335,7 +335,7 @@ class Campaign(RawFolder):
         return {role: self.file(name, f"scene.{role}") for role, name in named.items() if name}
 
     def antennas(self, pair: str) -> dict[str, tuple[str, Antenna]]:
-        """Return which antennas of a pair have beams: radar_tx, radar_rx → node and antenna."""
+        """Return the antennas of a pair that have beams: radar_tx, radar_rx → node and antenna."""
         nodes = zip(("radar_tx", "radar_rx"), pair.split("-"), strict=True)
         found = {point: (name, getattr(self.settings.nodes[name].antennas, point)) for point, name in nodes}
         return {point: (name, antenna) for point, (name, antenna) in found.items() if antenna is not None}

@@ -50,18 +50,18 @@ class Examination:
 
     @property
     def waveform(self) -> SampledWaveform | None:
-        """What was transmitted, where it was recorded as samples; None: phase history."""
+        """Transmitted waveform of a campaign recorded as samples; None: phase history."""
         stated = self.campaign.settings.waveform
         return stated if isinstance(stated, SampledWaveform) else None
 
     @property
     def transmitted(self) -> "Transmitted | None":
-        """What was transmitted; None without samples, or where the file is not what the waveform says."""
+        """Transmitted signal; None without samples, or where the file contradicts the waveform settings."""
         return self._transmitted[0]
 
     @property
     def transmitted_problems(self) -> list[CampaignError]:
-        """What is wrong with the file of what was transmitted."""
+        """Faults of the file of the transmitted signal."""
         return self._transmitted[1]
 
     @cached_property
@@ -82,7 +82,7 @@ class Examination:
         )
 
     def needs_log(self, key: Key) -> bool:
-        """Return whether a flight needs the logs of its nodes: on a bench nothing moves."""
+        """Test whether a flight needs the logs of its nodes: on a bench nothing moves."""
         return self.campaign.flight(key[0]).kind != "bench"
 
     @property
@@ -92,7 +92,7 @@ class Examination:
 
     @cached_property
     def recorded(self) -> dict[Key, RecordingFacts]:
-        """What the headers of these recordings say."""
+        """Facts of the headers of these recordings."""
         return {key: recording_facts(recording) for key, recording in self.recordings.items()}
 
     @property
@@ -107,7 +107,7 @@ class Examination:
 
     @cached_property
     def logs(self) -> dict[Key, LogFacts]:
-        """What these logs hold."""
+        """Facts of these logs."""
         return {key: log_facts(track) for key, track in self.tracks.items()}
 
     @property
@@ -116,7 +116,7 @@ class Examination:
         return self._tracks[1]
 
     def opens(self, flight: str, pair: str) -> bool:
-        """Return whether a pair can be opened by logs and headers, or its phase history is small."""
+        """Test whether a pair can be opened by logs and headers, or its phase history is small."""
         if self.waveform is not None:
             keys = {(flight, node) for node in pair.split("-")}
             return keys <= self.tracks.keys() & self.recordings.keys()
@@ -125,7 +125,7 @@ class Examination:
 
     @cached_property
     def history_problems(self) -> list[CampaignError]:
-        """What is wrong with phase history: of every pair whose files are small, and of one that states the frame."""
+        """Faults of phase history: of every pair whose files are small, and of one that states the frame."""
         if self.waveform is not None:
             return []
         from apertura.stages.transfer import recorded_echo
@@ -190,7 +190,7 @@ class Examination:
 
     @property
     def frame(self) -> str:
-        """What positions are in, ecef or local; empty where only the samples say."""
+        """Frame of the positions, ecef or local; empty where only the samples determine it."""
         frames = [track.attrs["frame"] for track in self.tracks.values()]
         if frames or self.waveform:
             return next(iter(frames), "ecef")
@@ -209,12 +209,12 @@ class Examination:
 
     @property
     def other_frame(self) -> bool:
-        """Whether the scene's CRS is another frame than positions are in."""
+        """True if the scene's CRS is another frame than positions are in."""
         return bool(self.frame) and (self.campaign.settings.scene.crs == LOCAL) is not (self.frame == LOCAL)
 
     @cached_property
     def middle_m(self) -> NDArray[np.float64] | None:
-        """Where the first image flight flew: (3,) float64 ECEF, metres; None without a log."""
+        """Median position of the first image flight: (3,) float64 ECEF, metres; None without a log."""
         first = {flight.name for flight in self.campaign.image_flights[:1]}
         logs = [
             track.position.values
@@ -273,7 +273,7 @@ class Examination:
 
 
 def in_metres(crs: str) -> bool:
-    """Return whether PROJ knows a CRS and it is projected in metres.
+    """Test whether PROJ knows a CRS and it is projected in metres.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""What one file says of itself, as plain values: a flight log, a recording, phase history, a DEM."""
+"""Contents of one file as plain values: a flight log, a recording, phase history, a DEM."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -45,7 +45,7 @@ Range = list[float]
 
 @dataclass(frozen=True, eq=False)
 class LogFacts:
-    """What a flight log holds.
+    """Contents of a flight log.
 
     Attributes
     ----------
@@ -95,7 +95,7 @@ class LogFacts:
 
 
 def log_facts(track: "xr.Dataset") -> LogFacts:
-    """Return what a flight log holds; `track` is its stage."""
+    """Return the contents of a flight log; `track` is its stage."""
     times, position, frame = track.time.values, track.position.values, track.attrs["frame"]
     steps_m = np.linalg.norm(np.diff(position, axis=0), axis=1)
     speed_m_s = steps_m / np.diff(seconds(times))
@@ -127,7 +127,7 @@ def _stated_std_m(track: "xr.Dataset") -> tuple[float | None, ...] | None:
 
 
 def log_faults(track: "xr.Dataset") -> CheckedTrack:
-    """Return what of a log by itself images may rest on, where errors of 1/16 of `WAVE_M` are tolerated."""
+    """Return the sound part of a log, where errors of 1/16 of `WAVE_M` are tolerated."""
     from apertura.stages.node_log import poorer_fix
 
     poor = poorer_fix(track.fix.values, "auto") if "fix" in track else np.zeros(track.sizes["epoch"], bool)
@@ -173,7 +173,7 @@ def _fixes(track: "xr.Dataset") -> dict[str, int] | None:
 
 @dataclass(frozen=True, eq=False)
 class RecordingFacts:
-    """What the header of a recording says.
+    """Contents of the header of a recording.
 
     Attributes
     ----------
@@ -207,12 +207,12 @@ class RecordingFacts:
 
     @property
     def runs_through(self) -> bool:
-        """Whether the recorder ran through: it was not triggered by pulses."""
+        """True if the recorder ran through: it was not triggered by pulses."""
         return self.times is None
 
 
 def recording_facts(recording: Recording) -> RecordingFacts:
-    """Return what the header of a recording says; no sample is read."""
+    """Return the contents of the header of a recording; no sample is read."""
     captures, triggered = recording.captures, recording.framing is None
     return RecordingFacts(
         channels=tuple(recording.channels),
@@ -241,7 +241,7 @@ def _frames(numbers: NDArray[np.int64]) -> dict[str, int] | None:
 
 @dataclass(frozen=True, eq=False)
 class HistoryFacts:
-    """What phase history holds.
+    """Contents of phase history.
 
     Attributes
     ----------
@@ -281,7 +281,7 @@ class HistoryFacts:
 
 
 def history_facts(echo: "xr.Dataset") -> HistoryFacts:
-    """Return what phase history holds; `echo` is its stage."""
+    """Return the contents of phase history; `echo` is its stage."""
     frequency = echo.frequency.values
     band_hz = [float(frequency[0]), float(frequency[-1])]
     step_hz = (band_hz[1] - band_hz[0]) / (frequency.size - 1) if frequency.size > 1 else None
@@ -305,7 +305,7 @@ def history_facts(echo: "xr.Dataset") -> HistoryFacts:
 
 @dataclass(frozen=True, eq=False)
 class DemFacts:
-    """What a raster of heights, or a product of apertura, holds.
+    """Contents of a raster of heights, or of a product of apertura.
 
     Attributes
     ----------
@@ -345,7 +345,7 @@ class DemFacts:
 
 
 def dem_facts(path: Path) -> DemFacts:
-    """Return what a raster of heights holds.
+    """Return the contents of a raster of heights.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Whether all that flights.tsv and the config promise is there and readable, and memory and disk suffice."""
+"""Check that the files of flights.tsv and the config are present and readable, and that memory and disk suffice."""
 
 import json
 import os
@@ -85,7 +85,7 @@ def _wanted(campaign: Campaign) -> Callable[[str], str | None]:
 
 
 def _recorded(campaign: Campaign, flight: Flight, wanted: Callable[[str], str | None]) -> Iterator[CampaignError]:
-    """Yield what is wrong with the files of a flight: samples and logs, or phase history."""
+    """Yield faults of the files of a flight: samples and logs, or phase history."""
     if not isinstance(campaign.settings.waveform, SampledWaveform):
         for node in flight.nodes:
             yield from _looked_up(lambda node=node: list(campaign.raw_files(flight.name, node).values()))  # type: ignore[misc]

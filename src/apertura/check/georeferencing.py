@@ -1,4 +1,4 @@
-"""Whether the scene's CRS, reference points and DEM are of the place where images were taken."""
+"""Check the scene's CRS, reference points and DEM against the place where images were taken."""
 
 from collections.abc import Iterator
 
@@ -108,7 +108,7 @@ def _elsewhere(examined: Examination, crs: str) -> Iterator[CampaignError]:
 
 
 def _not_in_metres(examined: Examination, crs: str) -> CampaignError:
-    """Return what is wrong with a CRS wherever it is used, with the UTM zone that would do."""
+    """Return the fault of a CRS that is not in metres, with the UTM zone that fits."""
     try:
         system = horizontal_crs(crs)
     except CampaignError as problem:
@@ -182,7 +182,7 @@ def _heights(dem: Dem, grid: SceneGrid, window: SceneGrid) -> NDArray[np.float64
 
 
 def post_width_m(dem: Dem, grid: SceneGrid) -> float:
-    """Return how far posts of a DEM are apart at the middle of a grid, metres, the narrower way."""
+    """Return the post spacing of a DEM at the middle of a grid, metres, along the finer axis."""
     xmin, ymin, xmax, ymax = grid.bounds_m
     x, y = (xmin + xmax) / 2 + np.array([0.0, 1.0, 0.0]), (ymin + ymax) / 2 + np.array([0.0, 0.0, 1.0])
     if grid.crs != LOCAL:

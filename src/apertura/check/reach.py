@@ -1,4 +1,4 @@
-"""Whether nodes, scene and reflector lie where waves reach, antennas have patterns, and images can be planned."""
+"""Check that nodes, scene and reflector are within range and beams, and that images can be planned."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
@@ -98,7 +98,7 @@ def check_distance(examined: Examination) -> Iterator[CampaignError]:
 
 
 def _too_high(examined: Examination, distance_m: float) -> str:
-    """Return what to correct where it is the height that keeps scene and track apart; else ''."""
+    """Return the remedy where the height keeps scene and track apart; else ''."""
     if examined.middle_m is None or examined.ground is None or examined.ground.dem:
         return ""
     above_m = float(geodetic_from_ecef(examined.middle_m)[2]) - examined.level_m
@@ -324,7 +324,7 @@ _MOST_PIXELS = 1_000_000  # of a scene whose heights are read here, 0.5 s; of a 
 
 
 def check_imaging(examined: Examination) -> Iterator[CampaignError]:
-    """Yield what steps `echo`, `scene`, `profile` and `image` will refuse of the first pairs, in their words."""
+    """Yield the errors that steps `echo`, `scene`, `profile` and `image` would raise for the first pairs."""
     from apertura.stages.planning import job_of, ranges_of
 
     campaign, problems = examined.campaign, list[CampaignError]()

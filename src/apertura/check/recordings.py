@@ -1,4 +1,4 @@
-"""Whether what was transmitted and recorded fits the waveform, the nodes of a flight and each other."""
+"""Check recordings against the transmitted waveform, the nodes of a flight and each other."""
 
 from collections.abc import Iterator
 

@@ -62,7 +62,7 @@ class TimeFacts:
 
     @property
     def lost(self) -> int:
-        """How many times are missing in all gaps."""
+        """Number of missing times in all gaps."""
         return int((np.round(self.gap_s / self.interval_s) - 1).sum())
 
 
@@ -162,7 +162,7 @@ def gaps(times: Times, longer: float) -> NDArray[np.intp]:
 
 
 def own_clock(times: Times) -> bool:
-    """Return whether times count from the epoch of the machine: no clock was set when they were taken.
+    """Test whether times count from the epoch of the machine, as a clock that was never set does.
 
     Examples
     --------
@@ -173,7 +173,7 @@ def own_clock(times: Times) -> bool:
 
 
 def counted(times: Times) -> bool:
-    """Return whether times only count pulses from the epoch of the machine, one a second: there was no clock at all.
+    """Test whether times count pulses from the epoch of the machine, one a second, as without a clock.
 
     Examples
     --------

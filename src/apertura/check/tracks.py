@@ -1,4 +1,4 @@
-"""Whether flight logs can be read, can be of a flight, and reach over the pulses of their nodes."""
+"""Check that flight logs can be read, belong to their flight, and cover the pulses of their nodes."""
 
 from collections.abc import Iterator
 
@@ -66,7 +66,7 @@ def check_attitude(examined: Examination) -> Iterator[CampaignError]:
 
 
 def _turned(campaign: Campaign, flight: str, node: str) -> bool:
-    """Return whether a node has an antenna in this flight that its attitude moves or turns."""
+    """Test whether a node has an antenna in this flight that its attitude moves or turns."""
     arms = campaign.settings.nodes[node].lever_arms_m
     for pair in campaign.flight(flight).pairs:
         legs = dict(zip(("radar_tx", "radar_rx"), pair.split("-"), strict=True))
@@ -107,7 +107,7 @@ def check_coverage(examined: Examination) -> Iterator[CampaignError]:
 
 
 def _no_overlap(examined: Examination, key: Key) -> CampaignError | None:
-    """Return what is wrong where the recorder ran through: its pulses are not known, but when it ran."""
+    """Return the fault of a continuous recording, of which only its span is known, not its pulses."""
     log, recorded = examined.logs[key].times.span, recorded_span(examined.recordings[key])
     shift = shift_s(recorded, log)
     found = f"log and recording are {abs(shift):.1f} s apart{likely_cause(shift)}"
@@ -138,7 +138,7 @@ def _uncovered(examined: Examination, key: Key, pulses: Times) -> CampaignError 
 
 
 def _all_poor(examined: Examination, key: Key, pulses: Times) -> CampaignError | None:
-    """Return what is wrong where every epoch between the first and the last pulse is poorer than the config allows."""
+    """Return the fault of a log of which every epoch over the pulses has a poorer fix than the config allows."""
     track, node = examined.tracks[key], examined.campaign.settings.nodes[key[1]]
     worst = node.worst_fix
     if "fix" not in track or not pulses.size or worst == "any":

@@ -71,7 +71,7 @@ def check_length(samples: int, needed: int, *, where: Path | str) -> None:
 
 @dataclass(frozen=True)
 class Captured:
-    """What one node recorded in one flight.
+    """Recording and header of one node in one flight.
 
     Attributes
     ----------
@@ -160,7 +160,7 @@ class Captured:
 
 @dataclass(frozen=True)
 class Acquisition(Captured, NodeLog):
-    """What one node recorded in one flight, beside its log."""
+    """Recording of one node in one flight, with its log."""
 
 
 def open_acquisition(campaign: Campaign, flight: str, node: str, sent: Transmitted) -> Acquisition:

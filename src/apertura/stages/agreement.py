@@ -130,7 +130,7 @@ class ComparedImage:
         return -north * self.grid.spacing_m, east * self.grid.spacing_m
 
     def shows(self, point: BrightPoint) -> bool:
-        """Return whether one of its bright points lies within a resolution cell of another image's."""
+        """Test whether one of its bright points lies within a resolution cell of another image's."""
         reach_px = self.cell_m / self.grid.spacing_m
         return any(np.hypot(point.row - one.row, point.column - one.column) <= reach_px for one in self.points)
 
@@ -179,7 +179,7 @@ def bright_places(
 def agreement_of(
     first: ComparedImage, second: ComparedImage, grid: SceneGrid, windows: Sequence[Window]
 ) -> Agreement | None:
-    """Return how a second image lies against a first: by bright points, else by ground; None where nothing tells.
+    """Compare a second image with a first: by bright points, else by ground; None where neither is possible.
 
     None as well where pixels are wider than a resolution cell: they do not resolve the place of a point.
     """
@@ -197,12 +197,12 @@ def agreement_of(
 
 
 def comparable(first: ComparedImage, second: ComparedImage, grid: SceneGrid) -> bool:
-    """Return whether the pixels of two images are fine enough to compare the places of points."""
+    """Test whether the pixels of two images are fine enough to compare the places of points."""
     return grid.spacing_m <= WIDEST_PIXEL * min(first.cell_m, second.cell_m)
 
 
 def shows_points_of(first: ComparedImage, second: ComparedImage, grid: SceneGrid) -> bool:
-    """Return whether a second image has a bright pixel where a first has one of its bright points."""
+    """Test whether a second image has a bright pixel where a first has one of its bright points."""
     reach = max(1, round(first.cell_m / grid.spacing_m))
     return any(has_point(second.raster, round(one.row), round(one.column), reach=reach) for one in first.points)
 

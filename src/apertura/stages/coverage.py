@@ -69,7 +69,7 @@ def few_looks(campaign: Campaign, flight: str, pair: str) -> NDArray[np.float32]
 
 
 def transform_of(grid: SceneGrid, looks: NDArray[np.float32]) -> Affine:
-    """Return where the places of `few_looks` lie on the map."""
+    """Return the transform of the places of `few_looks` on the map."""
     step, _, west, _, _, north = grid.transform
     down, right = (size * step / dots for size, dots in zip(grid.shape, looks.shape, strict=True))
     return Affine(right, 0, west, 0, -down, north)

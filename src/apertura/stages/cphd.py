@@ -24,7 +24,7 @@ from apertura.stages.transfer import PairEcho
 from apertura.workflow.lineage import result_of
 
 _NULL_ISLAND = (0.0, 0.0, 0.0)
-"""Where the origin of a frame without a place on Earth is put: latitude, longitude (deg) and height (m)."""
+"""Origin assumed for a frame without a place on Earth: latitude, longitude (deg) and height (m)."""
 
 
 def cphd(campaign: Campaign, flight: str, pair: str) -> Path:

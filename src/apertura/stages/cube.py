@@ -126,7 +126,7 @@ Compared = Mapping[str, Mapping[tuple[str, str], tuple[str, str]]]
 
 
 def compared(images: Images, references: Mapping[str, str], first_flights: Mapping[str, str]) -> Compared:
-    """Return which images are compared: each with its flight's reference pair, and with its pair's first flight.
+    """Return the images to compare: each with its flight's reference pair, and with its pair's first flight.
 
     Parameters
     ----------

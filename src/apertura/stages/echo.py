@@ -199,7 +199,7 @@ def _transfer(
 
 
 def _sidelink(measured: Transfer) -> dict[str, tuple[str, Any]]:
-    """Return what was measured of the sidelink in each pulse; nothing of a node that hears itself."""
+    """Return the measurements of the sidelink in each pulse; empty for a monostatic pair."""
     correction, kept = measured.correction, measured.kept
     if correction is None:
         return {}
@@ -214,7 +214,7 @@ def _sidelink(measured: Transfer) -> dict[str, tuple[str, Any]]:
 
 
 def _of_what_was_sent(measured: Transfer, sent: Transmitted) -> Transfer:
-    """Return what captures measured, with what was decided of the waveform, and whether they hold it whole."""
+    """Add flags and report of the transmitted waveform to the transfer functions, and of truncated captures."""
     flags, waveform = dict(sent.flags), sent.waveform
     if measured.report.get("sidelink", {}).get("method") in DIVIDING:
         flags.pop("waveform_sidelobes", None)  # the pulse cancels: it is in both channels
@@ -239,7 +239,7 @@ def _repeated(rx: Acquisition, pulses: Association, repeats: NDArray[np.bool_]) 
 def _counted(
     sent: int, pulses: Association, repeats: NDArray[np.bool_], positions: PulsePositions, measured: Transfer
 ) -> dict[str, Any]:
-    """Return how many of the pulses sent are used, how many not, and why."""
+    """Count the pulses sent that are used and those that are not, by reason."""
     used = int(measured.kept.sum())
     reasons = {
         "unpaired": pulses.tx_dropped,

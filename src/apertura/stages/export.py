@@ -77,7 +77,7 @@ def export_pair(campaign: Campaign, flight: str, pair: str) -> list[Path]:
 
 
 def _calibrated(campaign: Campaign, flight: str, pair: str, report: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what the pair's constant says of its image: cross-sections of points, line of the budget, flags."""
+    """Return what radiometric calibration adds to a report: cross-sections of points, budget lines, flags."""
     manifest = campaign.root / campaign.manifest("layers", flight, pair)
     calibration = open_listed(campaign.result(flight, pair, CROSS_SECTIONS), manifest)
     std_db = calibration["std_db"]
@@ -273,7 +273,7 @@ def _in_phase(
     grid: SceneGrid,
     windows: Sequence[Window],
 ) -> tuple[InPhase | None, bool]:
-    """Return how far the images added are in phase at bright places of the sum without phase; None of a single image.
+    """Measure the phase agreement of the summed images at bright places of the noncoherent sum; None of one image.
 
     And whether these are isolated points that all of them show. Without any, the brightest places are taken: of many
     scatterers in a cell each image has its own sum, and the phases need not agree.

@@ -122,7 +122,7 @@ def tiles(campaign: Campaign, flight: str, pair: str, share: str, *, threads: in
 
 
 def _receipts(folder: ConfinedPath) -> ConfinedPath:
-    """Where the shares say that they are done, until their image is."""
+    """Receipts of finished shares of an image, until the image is complete."""
     return folder.with_name("tiles")
 
 

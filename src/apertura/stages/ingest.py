@@ -53,7 +53,7 @@ def captures_of(recording: Recording, campaign: Campaign, *, node: str) -> xr.Da
 
 
 def framing_of(recording: Recording, campaign: Campaign) -> PulseFraming:
-    """Return what was sent before each symbol of a continuous recording.
+    """Return the preambles sent before the symbols of a continuous recording.
 
     Raises
     ------

@@ -192,7 +192,7 @@ def sensed_heights(
 
 
 def _plain(campaign: Campaign, flight: str, pair: str) -> NDArray[np.bool_]:
-    """Return which pixels are visible to a pair, without shadow or layover."""
+    """Return the pixels visible to a pair, without shadow or layover."""
     with opened_layer(campaign, flight, pair, "mask.tif") as raster:
         visible: NDArray[np.bool_] = raster.read(1) == 0
     return visible

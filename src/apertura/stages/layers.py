@@ -115,7 +115,7 @@ def coarse(
 
 
 def mean_power_report(cells: Multilook, means: Mapping[str, Any], *, noise: str) -> dict[str, Any]:
-    """Return what mean power means, of pixels that mean `means`."""
+    """Return the meaning of mean power, of pixels that mean `means`."""
     return of_multilooked(
         means,
         side_px=cells.side,
@@ -277,7 +277,7 @@ def _noise_of_echoes(
 
 
 def _report(scene: OpenScene, image: xr.Dataset, calibrated: CalibratedPair, noise: PulseNoise) -> dict[str, Any]:
-    """Return what the radio says of an image, for radiometry.json."""
+    """Return the link budget and noise of an image, for radiometry.json."""
     found = points_of(image.image, image.attrs["quality"], scene, list(scene.grid.tiles(BLOCK_PX)))
     constant = calibrated.calibration.constant
     noise_report, noise_flags = calibrated.noise_report(noise, bound="pulses_sparse" in image.attrs["flags"])

@@ -1,4 +1,4 @@
-"""Where a node was: its flight log, how far it can be trusted, and its antennas at any time."""
+"""Positions of a node: its flight log, its sound epochs, and its antennas at any time."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -77,7 +77,7 @@ class NodeLog:
 
     @cached_property
     def yaw_fault(self) -> YawFault | None:
-        """What its attitude contradicts the course by, where it is the log's and turns antennas."""
+        """Contradiction of its attitude and course, where the attitude is the log's and turns antennas."""
         turns = self.settings.attitude == "log" and (self.settings.antennas.any() or self.settings.lever_arms_m.any())
         return yaw_fault_of(self.track.isel(epoch=self.checked.kept)) if turns else None
 
@@ -111,21 +111,21 @@ class NodeLog:
         return float(np.sqrt(np.mean((smooth(self.log_seconds(times)) - position) ** 2)))
 
     def antenna(self, name: Literal["radar_tx", "radar_rx", "sidelink"], at: Times) -> NDArray[np.float64]:
-        """Return where an antenna was, by the sound epochs of the log, (time, 3) float64 metres in the log's frame."""
+        """Return positions of an antenna by the sound epochs of the log, (time, 3) float64 metres in its frame."""
         return phase_centres(
             *self._sound, at=at, lever_arm_m=getattr(self.settings.lever_arms_m, name), **self._from_log
         )
 
     @property
     def has_attitude(self) -> bool:
-        """Whether body axes are known: from the log at all its sound epochs, or from the course."""
+        """True if body axes are known: from the log at all its sound epochs, or from the course."""
         _, _, logged = self._sound
         return self.settings.attitude == "course" or (
             self.settings.attitude == "log" and bool(np.isfinite(logged).all())
         )
 
     def turns(self, name: Literal["radar_tx", "radar_rx"]) -> bool:
-        """Return whether attitude counts where this antenna is used: it has a beam, or the node has a lever arm."""
+        """Test whether attitude counts where this antenna is used: it has a beam, or the node has a lever arm."""
         return getattr(self.settings.antennas, name) is not None or self.settings.lever_arms_m.any()
 
     def body_axes(self, at: Times) -> NDArray[np.float64]:
@@ -148,13 +148,13 @@ class NodeLog:
 
 
 def raw_log(campaign: Campaign, flight: str, node: str, wave_m: float) -> NodeLog:
-    """Return where a node was by its log as it lies in raw/; `wave_m` is the shortest wavelength."""
+    """Read the log of a node from raw/; `wave_m` is the shortest wavelength."""
     file = str(campaign.track_file(flight, node))
     return NodeLog(node, campaign.node(flight, node), read_log(campaign, flight, node), file, wave_m)
 
 
 def yaw_fault_of(track: xr.Dataset) -> YawFault | None:
-    """Return what the attitude of a track contradicts its course by."""
+    """Return the contradiction of attitude and course of a track."""
     position = track.position.values
     ned = LOCAL_NED if track.attrs["frame"] == LOCAL else ned_axes(position)
     return check_yaw(position, track.attitude.values, ned)

@@ -38,7 +38,7 @@ _POINTS = 33
 
 
 def body_axes(echo: xr.Dataset) -> dict[str, NDArray[np.float64]]:
-    """Return what an echo stage holds of the bodies' attitude: radar_tx, radar_rx → (pulse, axis, body)."""
+    """Return the bodies' attitude in an echo stage: radar_tx, radar_rx → (pulse, axis, body)."""
     return {point: echo[name].values for point, name in _STAGED.items() if name in echo}
 
 
@@ -100,7 +100,7 @@ def scene_illumination(
     scene: OpenScene,
     aperture: Aperture,
 ) -> Illumination | None:
-    """Return how many pulses illuminate points of the scene; None without beams.
+    """Count the pulses that illuminate points of the scene; None without beams.
 
     Parameters
     ----------
@@ -164,7 +164,7 @@ def _refuse(
 
 @dataclass(frozen=True, eq=False)
 class OpenPair:
-    """What is known of a pair.
+    """A pair with its geometry, band, errors and, once echoes are there, its phase history.
 
     Attributes
     ----------
@@ -221,7 +221,7 @@ class OpenPair:
 
     @property
     def monostatic(self) -> bool:
-        """Whether one node sends and receives."""
+        """True if one node sends and receives."""
         tx, rx = self.name.split("-")
         return tx == rx
 
@@ -232,7 +232,7 @@ class OpenPair:
 
     @property
     def flown(self) -> Flown:
-        """What `auto` settles the grid from."""
+        """The geometry and band from which `auto` settles the grid."""
         return Flown(self.aperture, self.frequency_hz, self.path_limit_m)
 
 

@@ -1,4 +1,4 @@
-"""How each pair of a campaign will be imaged, and its error budget: from its echo, or from the flight logs."""
+"""Plan of each pair's image, and its error budget: from its echo, or from the flight logs."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -50,7 +50,7 @@ _SHOWN_CELLS = 0.01  # of a range cell: a shift below it is lost in any peak of 
 def budget_of(
     campaign: Campaign, pair: OpenPair, scene: OpenScene, *, place_m: NDArray[np.float64] | None = None
 ) -> list[BudgetLine]:
-    """Return what is expected to spoil an image of a pair, but for arithmetic: one line per cause.
+    """Return the expected degradation of an image of a pair, except arithmetic: one line per cause.
 
     Parameters
     ----------
@@ -113,7 +113,7 @@ def budget_of(
 
 
 def positions_loss_db(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> float:
-    """Return what errors of position that somebody stated are expected to cost an image of a pair, dB, 0 or less."""
+    """Return the expected focus loss of an image of a pair by stated position errors, dB, 0 or less."""
     lines = _positions(campaign, pair, paths_to(pair, scene, scene.middle_m))
     return summed(line.effect for line in lines if line.stated is not None).loss_db
 
@@ -136,12 +136,12 @@ def _positions(campaign: Campaign, pair: OpenPair, paths: PointPaths) -> list[Bu
 
 
 def _by_sidelink(campaign: Campaign, pair: OpenPair) -> bool:
-    """Return whether echoes are divided by a sidelink whose length comes from the logs."""
+    """Test whether echoes are divided by a sidelink whose length comes from the logs."""
     return not pair.monostatic and isinstance(campaign.settings.waveform, SampledWaveform)
 
 
 def _attitude(campaign: Campaign, pair: OpenPair, paths: PointPaths) -> list[BudgetLine]:
-    """Return what errors of attitude and of lever arms do; nothing where refined tracks have moved the antennas."""
+    """Return the effect of attitude and lever-arm errors; empty where refined tracks have moved the antennas."""
     if pair.left is not None or not pair.axes:
         return []
     some = pair.aperture.sample(MOST_PULSES)
@@ -177,7 +177,7 @@ def _between_epochs(paths: PointPaths, pair: OpenPair) -> list[BudgetLine]:
 
 
 def _air(campaign: Campaign, pair: OpenPair, paths: PointPaths) -> BudgetLine:
-    """Return what the uncertainty of the air's refractivity does: all pairs lie wrong alike, less what paths differ by.
+    """Return the effect of uncertain refractivity: displacement common to all pairs, phase by path difference.
 
     Against the transmitter's own image a pair's phase is off by what its path differs, the sidelink's length included
     (docs/theory/atmosphere.md, eq. 6).
@@ -196,7 +196,7 @@ def _air(campaign: Campaign, pair: OpenPair, paths: PointPaths) -> BudgetLine:
 
 
 def air_decision(pair: OpenPair) -> Decision:
-    """Return which air the paths of a pair are of, and what vacuum would have done: one constant for all of them."""
+    """Return the air assumed on the paths of a pair, and its effect against vacuum: one constant for all pairs."""
     air = pair.air
     cell_m = pair.wave_speed_m_s / float(np.ptp(pair.frequency_hz)) / 2
     moved_m, left_m, other = float(air["vacuum_would_move_m"]), float(air["one_constant_leaves_m"]), "vacuum"
@@ -242,7 +242,7 @@ def _antenna(pair: OpenPair, paths: PointPaths) -> BudgetLine:
 
 
 def plan_pair(campaign: Campaign, pair: OpenPair, scene: OpenScene, *, threads: int = 1) -> Plan:
-    """Return how an open pair will be imaged.
+    """Plan the image of an open pair.
 
     Parameters
     ----------
@@ -274,7 +274,7 @@ def plan_pair(campaign: Campaign, pair: OpenPair, scene: OpenScene, *, threads: 
 
 
 def plan_job(campaign: Campaign, job: Job, *, accuracy_db: float) -> Plan:
-    """Return how a job will be done at an accuracy and with the overrides of a campaign."""
+    """Plan a job at an accuracy and with the overrides of a campaign."""
     overrides = campaign.settings.processing.planned
     return make_plan(job, accuracy_db=accuracy_db, overrides=overrides, where=f"{CONFIG}: processing")
 

@@ -1,4 +1,4 @@
-"""Which pulses of a pair are imaged, at which positions; and the air on their paths."""
+"""Imaged pulses of a pair, their positions, and the air on their paths."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -91,7 +91,7 @@ class PulsePositions:
 
 
 def place(tx: NodeLog, rx: NodeLog, at: Times, *, hovers: bool = False) -> PulsePositions:
-    """Return which pulses, at the transmitter's tags `at`, both logs of a pair give positions for.
+    """Place a pair at the transmitter's tags `at`, and select the pulses for which both logs give positions.
 
     Pulses of a hover are left out unless `hovers`: segments of the pair say what images it.
 
@@ -145,7 +145,7 @@ def _log_report(node: NodeLog) -> dict[str, Any]:
 
 
 def position_error(track: xr.Dataset, settings: Node, at: Times) -> dict[str, Any]:
-    """Return what is known of the error of a node's positions at some pulses.
+    """Return the known position error of a node at some pulses.
 
     Returns
     -------

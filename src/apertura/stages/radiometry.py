@@ -55,7 +55,7 @@ class AntennaShape(_Part):
 
 
 class Radar(_Part):
-    """What a constant depends on beside the radio: the constant of another is another.
+    """Conditions of a constant beside the radio: it holds under the same ones alone.
 
     `sent_power` is the mean power of the signal in the units that echoes are divided by; None of phase histories.
     """
@@ -69,7 +69,7 @@ class Radar(_Part):
 
     @classmethod
     def of(cls, campaign: Campaign, opened: OpenPair) -> "Radar":
-        """Return what the constant of an open pair depends on."""
+        """Return the conditions of the constant of an open pair."""
         waveform, frequency = campaign.settings.waveform, opened.frequency_hz
         sent = transmitted(campaign, waveform).mean_power if isinstance(waveform, SampledWaveform) else None
         files = campaign.pattern_files(opened.name)

@@ -51,7 +51,7 @@ ONE_PHASE = "minimum_entropy"
 
 
 def autofocus_of(campaign: Campaign, pairs: Sequence[OpenPair], scene: OpenScene) -> tuple[Decision, ...]:
-    """Return whether the tracks of a flight, of which these are all pairs, are to be refined; if so, how; and why."""
+    """Decide on refinement of the tracks of a flight, of which these are all pairs, and on its method."""
     requested = campaign.settings.processing
     silent = [node for node, known in positions_of(pairs).items() if known.std_m is None]
     loss_db = {pair.name: positions_loss_db(campaign, pair, scene) for pair in pairs}
@@ -64,7 +64,7 @@ def autofocus_of(campaign: Campaign, pairs: Sequence[OpenPair], scene: OpenScene
 
 
 def decide_method(requested: str, variances: Mapping[str, SpaceVariance], *, known_points: bool) -> Decision:
-    """Return how tracks are refined, and why.
+    """Choose the refinement method, with the reason.
 
     Parameters
     ----------
@@ -109,7 +109,7 @@ def errors_of(pairs: Sequence[OpenPair]) -> Mapping[str, TrackErrors]:
 
 
 def _variance(pair: OpenPair, scene: OpenScene, errors: Mapping[str, TrackErrors]) -> SpaceVariance:
-    """Return what one phase per pulse leaves at the corners of the scene."""
+    """Return the residual of one phase per pulse at the corners of the scene."""
     last_row, last_column = (size - 1 for size in scene.grid.shape)
     rows, columns = np.array([0, 0, last_row, last_row]), np.array([0, last_column, 0, last_column])
     corners_m = scene.terrain.positions_at(scene.grid, rows, columns)
@@ -158,7 +158,7 @@ class RefinedTrack:
 
     @property
     def decisions(self) -> tuple[Decision, ...]:
-        """Whether tracks were to be refined, why, and what became of it; if so, how."""
+        """Decisions on refinement and its method, with reason and outcome."""
         became = {"autofocus": f"; {self.stage.attrs['why']}"}
         made = self.stage.attrs["decisions"].items()
         return tuple(Decision(name, one["value"], one["reason"] + became.get(name, "")) for name, one in made)
@@ -197,7 +197,7 @@ class RefinedTrack:
         return replace(logged, track=logged.track.assign(position=logged.track.position + moved_m))
 
     def moved_m(self, node: str, at: Times) -> NDArray[np.float64]:
-        """Return what is added to the logged points of a node at some times, (time, 3) float64 metres in the frame.
+        """Return the correction of the logged points of a node at some times, (time, 3) float64 metres in the frame.
 
         Before the first pulse and after the last it stays what it was there.
         """
@@ -231,7 +231,7 @@ class RefinedTrack:
 
 
 def open_refined(campaign: Campaign, flight: str) -> RefinedTrack:
-    """Return what step `refine` wrote of a flight."""
+    """Open the refined track of a flight."""
     return RefinedTrack.of(open_stage(campaign.stage("refined_track", flight), "refined_track"))
 
 
@@ -254,7 +254,7 @@ def clock_s(pair: OpenPair, began: np.datetime64) -> NDArray[np.float64]:
 
 
 def _sizes_cm(correction: TrackCorrection, pair: str) -> dict[str, Any]:
-    """Return how far the nodes of a pair were moved, or by how much its echoes lie further, rms."""
+    """Return the rms size of the correction of a pair: of its nodes, or of its path."""
     if pair in correction.extra_path_m:
         return {"further_rms_cm": _rms_cm(correction.extra_path_m[pair][:, None])}
     nodes = dict.fromkeys(pair.split("-"))
@@ -322,7 +322,7 @@ def refinement_inputs(campaign: Campaign, pairs: Mapping[OpenPair, Profiles], sc
 def _causes(
     campaign: Campaign, flight: str, records: Sequence[PairRecord], began: np.datetime64, up: Floats
 ) -> Iterator[Cause]:
-    """Yield what may be wrong: height of the ground; times of logs; lever arms of nodes whose attitude is known."""
+    """Yield possible causes: height of the ground; times of logs; lever arms of nodes whose attitude is known."""
     flown = {
         node: (one.time_s, leg)
         for one in records

@@ -106,7 +106,7 @@ def _jobs(campaign: Campaign, made: Sequence[_Made], known: Mapping[str, str]) -
 
 
 def _doubts(recorded: Mapping[str, Any], result: Result, known: Mapping[str, str]) -> Iterator[str]:
-    """Yield why a result would not be made so today."""
+    """Yield the reasons why a result would be made otherwise today."""
     if recorded["code"] != result.code_sha256:
         yield f"made by other code than is installed now, which is {result.code_sha256}"
     if recorded["settings"] != result.settings_sha256:

@@ -130,7 +130,7 @@ Bounds = tuple[float, float, float, float]
 
 @dataclass(frozen=True)
 class Flown:
-    """What `auto` settles the grid from.
+    """Geometry and band from which `auto` settles the grid.
 
     Attributes
     ----------
@@ -148,7 +148,7 @@ class Flown:
 
     @classmethod
     def together(cls, pairs: Sequence["Flown"]) -> "Flown":
-        """Return what all pairs of a flight flew: a campaign has one grid, whichever pair is imaged."""
+        """Join the geometry of all pairs of a flight: a campaign has one grid, whichever pair is imaged."""
         tx_m, rx_m = (np.concatenate([flown.aperture.legs[leg] for flown in pairs]) for leg in (0, 1))
         return cls(Aperture(tx_m, rx_m), pairs[0].frequency_hz, min(flown.path_limit_m for flown in pairs))
 

@@ -155,7 +155,7 @@ class _Described:
 
     @cached_property
     def _shared(self) -> dict[str, Any]:
-        """What all images share: the grid and the software."""
+        """Properties shared by all images: the grid and the software."""
         grid = self.scene.grid
         return {
             **projection(grid.crs_wkt, grid.shape, grid.transform),

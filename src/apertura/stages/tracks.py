@@ -72,7 +72,7 @@ def _positions(campaign: Campaign, flight: str, node: str) -> xr.Dataset:
 
 
 def outcome_of(found: RefinedTrack) -> str:
-    """Return whether the tracks of a flight are refined, or why they are as logged: a line."""
+    """Return the outcome of refinement for the tracks of a flight, with the reason, in a line."""
     decided = found.decisions[0]
     why = f"autofocus {decided.value}: {decided.reason}"
     if found.correction is None:
@@ -97,7 +97,7 @@ def refined_log(found: RefinedTrack, node: str, track: xr.Dataset, settings: Nod
 
 
 def _stated_m(track: xr.Dataset, settings: Node) -> Floats:
-    """Return what is stated of the errors of a log's epochs, (epoch, 3) metres east, north, up: its own word first."""
+    """Return stated errors of a log's epochs, (epoch, 3) metres east, north, up: the log's own, else the config's."""
     config_m = np.nan if settings.position_std_m is None else settings.position_std_m
     stated_m = np.array(np.broadcast_to(config_m, track.position.shape), np.float64)
     if "position_std" in track:

@@ -180,14 +180,14 @@ class _Transfer(BackendArray):
 
 
 def forming_from(rx: Acquisition, sent: Transmitted, saturation: Saturation, *, divided: bool) -> Form:
-    """Return what forms transfer functions of the captures of a recording, divided by the sidelink or by the code."""
+    """Return the former of transfer functions of a recording, divided by the sidelink or by the code."""
     read = rx.reader(["radar", "sidelink"] if divided else ["radar"], np.arange(len(rx.raw.start)))
     demodulator = Demodulator(sent.inverse, rx.numerology, sent.waveform.capture_samples)
     return forming(read, demodulator, saturation)
 
 
 def _correction(stage: xr.Dataset) -> Correction | None:
-    """Return what the pulses of a stage are corrected by; None where a node hears itself."""
+    """Return the correction of the pulses of a stage; None of a monostatic pair."""
     if "sidelink_amplitude" not in stage:
         return None
     frequency, amplitude = stage.frequency.values, stage.sidelink_amplitude.values

@@ -1,4 +1,4 @@
-"""What was transmitted: code symbols or the samples of a pulse, and what was sent before each symbol."""
+"""Transmitted signal: code symbols or the samples of a pulse, and the preamble of each symbol."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -112,7 +112,7 @@ def transmitted(campaign: Campaign, waveform: SampledWaveform) -> Transmitted:
 
 
 def symbol_numerology(waveform: OfdmWaveform) -> Numerology:
-    """Return how receivers sample an OFDM symbol."""
+    """Return the numerology of an OFDM symbol as receivers sample it."""
     return Numerology(
         waveform.carrier_hz,
         waveform.sample_rate_hz,
@@ -223,7 +223,7 @@ def read_codes(path: Path, subcarriers: int) -> NDArray[np.complex64]:
 
 
 def read_framing(path: Path, described: Mapping[str, Any], *, sample_rate_hz: float, where: Path) -> PulseFraming:
-    """Return what was sent before each symbol.
+    """Return the preamble of each symbol.
 
     Parameters
     ----------

@@ -44,8 +44,7 @@ from apertura.stages.scene import OpenScene, open_scene
 from apertura.workflow.stale import stale_results
 
 REACH_CELLS = 2.0
-"""How far from where it is expected a reflector is searched for, resolution cells, beside three standard deviations of
-its place."""
+"""Search radius about the expected place of a reflector, resolution cells, beside three standard deviations of it."""
 
 _ODD = {"HH", "VV", "LR", "RL"}
 RETURNED = {"trihedral": _ODD, "sphere": _ODD, "dihedral": {"HH", "VV", "LL", "RR"}}
@@ -59,7 +58,7 @@ _DB = 10 / np.log(10)  # dB per relative error of a power
 
 @dataclass(frozen=True)
 class Measurement:
-    """What a reflector says in one image.
+    """Measurement of a reflector in one image.
 
     Attributes
     ----------
@@ -178,7 +177,7 @@ class _View:
         return cls(opened, scene, image, *image_weights(campaign, opened, scene), noise if np.isfinite(noise) else 0.0)
 
     def at(self, stated: KnownReflector) -> Measurement | str:
-        """Return what a reflector says, or why it says nothing."""
+        """Measure a reflector, or return the reason why it cannot be measured."""
         grid, quality = self.scene.grid, self.image.attrs["quality"]
         place, axes = self._placed(stated)
         pulses, parts, noise = point_parts(self.opened.aperture, self.beams, place[None], count=self.count)
@@ -290,7 +289,7 @@ class _View:
     def _response(
         self, pulses: Aperture, path_m: NDArray[np.float64], part: NDArray[np.float64], row: float, column: float
     ) -> complex:
-        """Return what a pixel shows of a target of 1 m² with these paths where K is 1: eq. 15."""
+        """Return the pixel power of a target of 1 m² with these paths where K is 1: eq. 15."""
         k = 2 * np.pi * centre_frequency(self.opened.frequency_hz) / self.opened.wave_speed_m_s
         turned = np.exp(-1j * k * (path_m - pulses.path(self._ground(row, column))))
         return complex((part * turned).sum())

@@ -24,7 +24,7 @@ _AT_ONCE = 1 << 20  # samples
 
 @dataclass(frozen=True)
 class RecordedNode:
-    """What one node recorded in one flight.
+    """Recording and log of one node in one flight.
 
     Attributes
     ----------

@@ -20,13 +20,13 @@ if TYPE_CHECKING:
 
 
 def expected_plan(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Plan:
-    """Return how a pair will be imaged: from its echo, or from the flight logs before anything ran."""
+    """Plan the image of a pair: from its echo, or from the flight logs before anything ran."""
     scene = expected_scene(campaign, lambda: first_flight(campaign))
     return plan_pair(campaign, open_pair(campaign, flight, pair), scene, threads=threads)
 
 
 def first_flight(campaign: Campaign) -> Flown:
-    """Return what all pairs of the first image flight fly, from which the one grid of all images is settled."""
+    """Return the joint geometry of the first image flight, from which the one grid of all images is settled."""
     flight = campaign.image_flights[0]
     return Flown.together([open_pair(campaign, flight.name, pair).flown for pair in flight.pairs])
 

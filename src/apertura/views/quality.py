@@ -1,4 +1,4 @@
-"""What images state of themselves, image.json, as values, rows of tables and sentences: for summary, page and map."""
+"""Contents of image.json as values, rows of tables and sentences: for summary, page and map."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ FLAGGED = ("flag", "images", "what was measured", "what it means", "what to look
 
 @dataclass(frozen=True)
 class ImageValues:
-    """What an image states of itself; None and empty where it states nothing.
+    """Values of an image report; None and empty where they are not stated.
 
     Attributes
     ----------
@@ -146,7 +146,7 @@ def decibels(loss_db: float | None, digits: int) -> str:
 
 
 def sentences(name: str, report: Report) -> Iterator[str]:
-    """Yield what a results section would say of an image: focus, certificate, agreement.
+    """Yield sentences for a results section on an image: focus, certificate, agreement.
 
     Parameters
     ----------
@@ -197,7 +197,7 @@ def _length(agreement: Mapping[str, float]) -> float:
 
 
 def certificate(report: Report) -> str:
-    """Return what is certified of an image's arithmetic, in a sentence.
+    """Return the certificate of an image's arithmetic, in a sentence.
 
     Examples
     --------

@@ -24,7 +24,7 @@ from apertura.stages.scene import open_scene, settled_scene
 from apertura.views.summary import print_summary
 
 REACH_M = 1.0
-"""How far from its true place a target is searched for and its cuts reach, metres."""
+"""Radius around its true place in which a target is searched for and cut, metres."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Finding:
 
 
 def score(campaign: Campaign) -> list[Finding]:
-    """Return where each target of truth.json is found in each SLC of the campaign, and its −3 dB widths.
+    """Find each target of truth.json in each SLC of the campaign, with its −3 dB widths.
 
     Raises
     ------
@@ -107,7 +107,7 @@ def _flight(campaign: Campaign, flight: Flight, targets: list[dict[str, float]])
 def _cross_sections(
     campaign: Campaign, flight: str, pair: str
 ) -> Callable[[BrightPoint, float | None], dict[str, Any]] | None:
-    """Return what gives a point's cross-section in a pair's image, and that put there; None where none is known."""
+    """Return the function that measures a point's cross-section in a pair's image, beside its true one; or None."""
     if not campaign.calibrated or pair == FUSED:
         return None
     scene, path = open_scene(campaign), campaign.result(flight, pair, CROSS_SECTIONS)

@@ -34,7 +34,7 @@ _MOST_FLIGHTS = 3
 
 
 def is_finished(campaign: Campaign) -> bool:
-    """Return whether every image has its report, made and not overtaken since."""
+    """Test whether every image has its report, complete and up to date."""
     images = ((flight.name, name) for flight in campaign.image_flights for name in flight.images)
     return all(campaign.is_current(campaign.result(*image, "export")) for image in images)
 
@@ -126,7 +126,7 @@ def print_products(campaign: Campaign) -> None:
 
 
 def _interferograms(campaign: Campaign) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield what each interferogram that is there states."""
+    """Yield the summary of each interferogram."""
     for name in campaign.settings.interferometry.pairs:
         path = campaign.result(INTERFEROMETRY, name, "interferogram.json")
         if campaign.is_current(campaign.result(INTERFEROMETRY, name, "interferogram")):

@@ -1,4 +1,4 @@
-"""What the rules in `workflow/` take from the campaign: inputs that follow from its flights, resources, parameters.
+"""Inputs, resources and parameters of the rules in `workflow/`, by the campaign's flights and settings.
 
 Names of files stand in the rules as they are. `apertura.workflow.rules` has the same graph for lineage and staleness;
 a test holds the two together.
@@ -22,7 +22,7 @@ FilesOfJob = Callable[[Any], list[str]]
 
 @dataclass(frozen=True)
 class Job:
-    """What the jobs of a rule ask for, as Snakemake takes it: functions of a job's wildcards."""
+    """Resources and parameters of the jobs of a rule, as Snakemake takes them: functions of a job's wildcards."""
 
     threads: Callable[..., int]
     resources: Mapping[str, Callable[..., int]]
@@ -40,7 +40,7 @@ class Jobs:
         return Resources(self.campaign)
 
     def __getitem__(self, rule: str) -> Job:
-        """Return what the jobs of a rule ask for; its parameters are the settings and code that matter to them."""
+        """Return resources of the jobs of a rule; its parameters are the settings and code that matter to them."""
         resources, row = self._resources[rule], RULES[rule]
         rows = [made for made in RESULTS.values() if made.name == rule] or [RESULTS[row.result]]
 
@@ -68,7 +68,7 @@ class Jobs:
         return lambda wildcards: [str((root / name).location) for name in source(self._place(wildcards, of))]
 
     def _place(self, wildcards: Any, of: Scope | None) -> JobPlace:
-        """Return what a job runs on: of the kind stated, or by the names of its wildcards."""
+        """Return the arguments of a job: of the kind stated, or by the names of its wildcards."""
         named = {name for name in ("flight", "node", "pair", "two") if hasattr(wildcards, name)}
         of = of or next(of for of in Scope if set(of.wildcards) == named)
         return JobPlace(self.campaign, of, tuple(getattr(wildcards, word) for word in of.wildcards))

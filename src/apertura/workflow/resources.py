@@ -1,4 +1,4 @@
-"""What a job of each rule takes, by sizes of files and the config: of a cluster, and of time on this machine.
+"""Resources of a job of each rule, by sizes of files and the config: of a cluster, and time on this machine.
 
 Nothing here opens a recording: each job of a thousand flights is asked about while the workflow is put together.
 Estimates are from above; a job that was killed for want of memory or time asks for twice as much.
@@ -28,7 +28,7 @@ _OVERSAMPLING = 2  # of range profiles
 
 @dataclass(frozen=True)
 class Work:
-    """What a job works on.
+    """Amount of work of a job.
 
     Attributes
     ----------
@@ -61,7 +61,7 @@ _SLOWER = 3  # than the machine that the constants are from
 
 @dataclass(frozen=True)
 class Resources:
-    """What the jobs of a campaign's rules ask for; rules quote its methods, and Snakemake calls them.
+    """Resources of the jobs of a campaign's rules; rules quote its methods, and Snakemake calls them.
 
     Attributes
     ----------
@@ -82,14 +82,14 @@ class Resources:
     planned: Mapping[tuple[str, str], tuple[int, int]] | None = None
 
     def __getitem__(self, rule: str) -> "RuleResources":
-        """Return what the jobs of a rule ask for."""
+        """Return the resources of the jobs of a rule."""
         demand = RULES[rule].demand
         if demand is None:
             raise LookupError(rule)
         return RuleResources(demand, self)
 
     def expected_seconds(self, rule: str, *where: str) -> float:
-        """Return what a job of a rule is expected to take on this machine, seconds.
+        """Return the expected time of a job of a rule on this machine, seconds.
 
         Parameters
         ----------
@@ -108,7 +108,7 @@ class Resources:
         return cost.begin_s + cost.mb_s * recorded_mb + cost.mpx_s * mpx + cost.mb_mpx_s * recorded_mb * mpx
 
     def _recorded_mb(self, stated: dict[str, str]) -> float:
-        """Return how much was recorded by the nodes that a job names; 0 of what the campaign does not have."""
+        """Return the recorded megabytes of the nodes of a job; 0 for names that are not in the campaign."""
         flight, pair, node = (stated.get(word) for word in ("flight", "pair", "node"))
         named = [name for name in (node, *(pair or "").split("-")) if name]
         known = flight in {each.name for each in self.campaign.flights} and {*named} <= {*self.campaign.settings.nodes}
@@ -117,7 +117,7 @@ class Resources:
         return 0.0
 
     def work(self, flight: str | None, pair: str | None, node: str | None, jobs: int = 1) -> Work:
-        """Return what a job works on: a node's recording, a pair, a flight, or all of them.
+        """Return the work of a job: of a node's recording, a pair, a flight, or all of them.
 
         Parameters
         ----------
@@ -170,7 +170,7 @@ class Resources:
         )
 
     def _captures(self, flight: str, node: str) -> int:
-        """Return how many captures stage `raw` has of a recording that is not there; 0 where nobody knows."""
+        """Count the captures in stage `raw` of a recording that is not there; 0 where it is not known."""
         with suppress(CampaignError, LookupError, TypeError, ValueError):
             path = self.campaign.stage("raw", flight, node) / "start" / "zarr.json"
             return int(read_json(path, expected="an array of stage raw", remedy=DAMAGED)["shape"][0])
@@ -191,7 +191,7 @@ class Resources:
 
     @cached_property
     def _range_samples(self) -> int:
-        """How many samples a range profile has at most: those of the whole period, or of the scene's depth."""
+        """Largest number of samples of a range profile: of the whole period, or of the scene's depth."""
         waveform, scene = self.campaign.settings.waveform, self.campaign.settings.scene
         if not isinstance(waveform, SampledWaveform):
             return 1000
@@ -206,13 +206,13 @@ class Resources:
 
 @dataclass(frozen=True)
 class RuleResources:
-    """What the jobs of one rule ask for, as Snakemake calls it: by the wildcards of a job."""
+    """Resources of the jobs of one rule, as Snakemake calls them: by the wildcards of a job."""
 
     demand: Demand
     of: Resources
 
     def threads(self, wildcards: Any) -> int:
-        """Return how many threads a job can use: not more than it has tiles, where it forms them."""
+        """Return the threads of a job: not more than it has tiles, where it forms them."""
         return max(1, min(self.demand.threads, self._work(wildcards).tiles))
 
     def mem_mb(self, wildcards: Any, attempt: int) -> int:

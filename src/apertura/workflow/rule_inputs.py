@@ -1,4 +1,4 @@
-"""What the rows of rules quote: what a job runs on, and the files and settings there that no name of a result says.
+"""Functions that rows of rules quote: scope of a job, and files and settings that are not results.
 
 Nothing is imported here but what a function needs when it is called: the command line reads the rows.
 """
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 class Scope(Enum):
-    """What a rule runs on, and the wildcards of its jobs, as Snakemake has them."""
+    """Scope of a rule, with the wildcards of its jobs as Snakemake has them."""
 
     NODE = "node", ("flight", "node")
     PAIR = "pair", ("flight", "pair")
@@ -29,7 +29,7 @@ class Scope(Enum):
 
 @dataclass(frozen=True)
 class JobPlace:
-    """What one job runs on.
+    """Scope of one job.
 
     Attributes
     ----------
@@ -82,7 +82,7 @@ class JobPlace:
 
 SourceSpec = str | Callable[[JobPlace], Iterable[str]]
 SettingSpec = str | Callable[[JobPlace], Mapping[str, Any]]
-"""What a row states of a result: a name, or a function of the place that returns further ones."""
+"""Input of a result in its row: a name, or a function of the place that returns names."""
 
 
 def charted(campaign: "Campaign") -> tuple[str, str]:
@@ -98,19 +98,19 @@ def charted(campaign: "Campaign") -> tuple[str, str]:
 
 
 def is_sampled(campaign: "Campaign") -> bool:
-    """Return whether samples were recorded, and not phase histories."""
+    """Test whether samples were recorded, and not phase histories."""
     from apertura.campaign.config import SampledWaveform
 
     return isinstance(campaign.settings.waveform, SampledWaveform)
 
 
 def of_samples(place: JobPlace) -> bool:
-    """Return whether samples were recorded, as `is_sampled`."""
+    """Test whether samples were recorded, as `is_sampled`."""
     return is_sampled(place.campaign)
 
 
 def adds_up(place: JobPlace) -> bool:
-    """Return whether a flight has pairs to add up."""
+    """Test whether a flight has pairs to add up."""
     from apertura.campaign.config import FUSED
 
     return FUSED in place.campaign.flight(place.where[0]).images
@@ -131,7 +131,7 @@ def recorded_on_the_bench(place: JobPlace) -> Iterable[str]:
 
 
 def stated_paths(place: JobPlace) -> Mapping[str, Any]:
-    """Return what the config states of the electrical paths of a flight's nodes."""
+    """Return the configured electrical paths of a flight's nodes."""
     nodes = place.campaign.values["nodes"]
     return {"path_offset_m": {node: nodes[node]["path_offset_m"] for (_, node) in place.below(Scope.NODE)}}
 
@@ -172,7 +172,7 @@ def echoes_that_bound_the_scene(place: JobPlace) -> Iterable[str]:
 
 
 def unstaged_positions(place: JobPlace) -> Iterable[str]:
-    """Return what positions of a phase history come from, which has no stage `track`: flight logs, else echoes."""
+    """Return the sources of positions of a phase history, which has no stage `track`: flight logs, else echoes."""
     campaign = place.campaign
     if is_sampled(campaign):
         return []
@@ -192,7 +192,7 @@ def ground_under_air(place: JobPlace) -> Iterable[str]:
 
 
 def air(place: JobPlace) -> Mapping[str, Any]:
-    """Return what decides the air that waves fly through: of the ground's height no more than counts."""
+    """Return the settings of the air on the paths: of the ground's height no more than matters."""
     stated = place.campaign.values["scene"]
     if stated["atmosphere"] == "vacuum":
         return {"scene": {"atmosphere": "vacuum"}}
@@ -210,7 +210,7 @@ def patterns(place: JobPlace) -> Iterable[str]:
 
 
 def autofocused(place: JobPlace) -> Iterable[str]:
-    """Return what autofocus forms images from; nothing where it is off."""
+    """Return the settings of images formed by autofocus; empty where it is off."""
     if place.campaign.settings.processing.autofocus == "off":
         return []
     stages = [place.campaign.manifest(stage, *pair) for pair in place.pairs for stage in ("echo", "profile")]
@@ -224,7 +224,7 @@ def transmitter_raw(place: JobPlace) -> Iterable[str]:
 
 
 def truth(place: JobPlace) -> Iterable[str]:
-    """Return where targets were put, of a simulation."""
+    """Return the file of true target places of a simulation."""
     return ["truth.json"] if (place.campaign.root / "truth.json").is_file() else []
 
 
@@ -249,13 +249,13 @@ def everything(place: JobPlace) -> Mapping[str, Any]:
 
 
 def log_settings(place: JobPlace) -> Mapping[str, Any]:
-    """Return how a node's log is read."""
+    """Return the settings for reading a node's log."""
     stated = place.campaign.values["nodes"][place.where[1]]["log"]
     return {name: value for name, value in stated.items() if name not in {"longest_gap_s", "smoothing_m"}}
 
 
 def unstaged_log_settings(place: JobPlace) -> Mapping[str, Any]:
-    """Return how the logs of a flight are read, where no stage `track` holds them."""
+    """Return the settings for reading the logs of a flight, where no stage `track` holds them."""
     if is_sampled(place.campaign):
         return {}
     nodes = {at[1]: at for at in place.below(Scope.NODE) if place.campaign.logged(*at)}
@@ -272,7 +272,7 @@ def polarisations(place: JobPlace) -> Mapping[str, Any]:
 
 
 def stated_errors(place: JobPlace) -> Mapping[str, Any]:
-    """Return what the config states of the errors of a flight's logs."""
+    """Return the configured errors of a flight's logs."""
     nodes = place.campaign.values["nodes"]
     return {"position_std_m": {node: nodes[node]["position_std_m"] for (_, node) in place.below(Scope.NODE)}}
 
@@ -288,7 +288,7 @@ def _beams(place: JobPlace) -> Mapping[str, tuple[str, Any]]:
 
 
 _RADIO = frozenset({"antennas", "transmit_power_dbm", "receiver", "amplitude_std_db"})
-"""What a node states that its echoes do not depend on."""
+"""Settings of a node that its echoes do not depend on."""
 
 
 def radio(place: JobPlace) -> Mapping[str, Any]:
@@ -312,13 +312,13 @@ def radio(place: JobPlace) -> Mapping[str, Any]:
 
 
 def coefficients(place: JobPlace) -> Mapping[str, Any]:
-    """Return which backscattering coefficients and mean powers are written; nothing where none is."""
+    """Return the backscattering coefficients and mean powers to write; empty where none is."""
     written = place.campaign.coefficients
     return {"radiometry": list(written)} if written else {}
 
 
 def multilook(place: JobPlace) -> Mapping[str, Any]:
-    """Return how power is averaged; nothing where it is not."""
+    """Return the settings of power averaging; empty where it is off."""
     stated = place.campaign.values["processing"]["multilook"]
     return {"multilook": stated} if stated else {}
 
@@ -347,7 +347,7 @@ def calibration_of_images(place: JobPlace) -> Iterable[str]:
 
 
 def pair_settings(place: JobPlace) -> Mapping[str, Any]:
-    """Return what matters for a pair's echo: its nodes, whether there are beams, not what they are."""
+    """Return the settings of a pair's echo: its nodes and the presence of beams, not their shapes."""
     campaign, (flight, pair) = place.campaign, place.where
     nodes = {
         node: {key: value for key, value in campaign.values["nodes"][node].items() if key not in _RADIO}
@@ -366,7 +366,7 @@ _POINTS = frozenset({"reference_points", "reflectors"})
 
 
 def grid(place: JobPlace) -> Mapping[str, Any]:
-    """Return what decides the grid."""
+    """Return the settings of the grid."""
     stated = place.campaign.values["scene"]
     return {"scene": {key: value for key, value in stated.items() if key not in _POINTS}}
 

@@ -97,7 +97,7 @@ def absent_lines(campaign: Campaign) -> Iterator[str]:
 
 
 def any_is_missing(campaign: Campaign) -> bool:
-    """Return whether a result that is not made on demand is not there."""
+    """Test whether a result is missing that is not made on demand."""
     made = (result.manifest for _, result in results_of(campaign) if not on_demand(campaign, result.manifest))
     return not all((campaign.root / manifest).is_file() for manifest in made)
 
@@ -174,7 +174,7 @@ def stale_lines(stale: Mapping[str, str]) -> Iterator[str]:
 
 
 def forms_results(arguments: Sequence[str]) -> bool:
-    """Return whether snakemake, called so, runs jobs; while it reads the workflow it says so nowhere else.
+    """Test whether a command line of snakemake runs jobs; inside the workflow nothing else states it.
 
     Examples
     --------

@@ -20,7 +20,7 @@ Cell = Annotated[str, Field(min_length=1, max_length=200)]
 
 
 class Log(Section):
-    """How a flight log is to be read where it leaves that open."""
+    """Settings for reading a flight log that the log itself leaves open."""
 
     format: str | None = Field(None, description=f"one of {', '.join(TRACKS)}; null: by the file's suffix and heading")
     time_system: Literal["utc", "gpst"] | None = Field(
@@ -78,7 +78,7 @@ Beamwidth = Annotated[float, Field(gt=0, le=180)]
 
 
 class Antenna(Section):
-    """Where one antenna looks and how widely; its horizontal axis lies in the body's forward-right plane."""
+    """Boresight and beam widths of one antenna; its horizontal axis lies in the body's forward-right plane."""
 
     boresight_deg: tuple[Annotated[float, Field(ge=-180, le=360)], Annotated[float, Field(ge=-90, le=90)]] = Field(
         description="azimuth clockwise from forward, elevation above the forward-right plane (down is negative), deg"
@@ -128,7 +128,7 @@ class Antennas(Section):
     )
 
     def any(self) -> bool:
-        """Return whether one of them has a beam."""
+        """Test whether one of them has a beam."""
         return self.radar_tx is not None or self.radar_rx is not None
 
 
@@ -140,7 +140,7 @@ class LeverArms(Section):
     sidelink: Metres3 = Field((0.0, 0.0, 0.0), description="sidelink antenna, m")
 
     def any(self) -> bool:
-        """Return whether one of them is not zero."""
+        """Test whether one of them is not zero."""
         return any(any(arm) for arm in (self.radar_tx, self.radar_rx, self.sidelink))
 
 

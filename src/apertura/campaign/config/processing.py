@@ -16,7 +16,7 @@ from apertura.core.imaging.choices import ImagingChoices
 
 
 class Fusion(Section):
-    """How the images of a flight's pairs are added up."""
+    """Settings of the sum of the images of a flight's pairs."""
 
     align_phase: bool = Field(
         False, description="take a constant phase between pairs, measured at bright points, off before they are added"
@@ -34,7 +34,7 @@ class Multilooking(Section):
 
 
 class Processing(ImagingChoices):
-    """How to compute; every key has a default."""
+    """Processing settings; every key has a default."""
 
     sidelink: Literal["auto", "divide", "wiener", "gated", "two_parameter"] = Field(
         "auto", description="correction of a secondary node by its sidelink; auto takes the cheapest adequate"
@@ -92,7 +92,7 @@ class Processing(ImagingChoices):
 
 
 class CalibrationSettings(Section):
-    """Which flight the path offsets come from."""
+    """Calibration flight that the path offsets come from."""
 
     flight: Name = Field(description="flight of kind calibration whose offsets the imaging flights use")
     reflector_m: Metres3 = Field(description="reflector: easting, northing in scene.crs, ellipsoidal height, m")
@@ -100,7 +100,7 @@ class CalibrationSettings(Section):
 
 
 class BenchSettings(Section):
-    """What is known of a set-up that stands still, in flights of kind bench."""
+    """Known electrical paths of a stationary set-up, in flights of kind bench."""
 
     radar_m: float | None = Field(
         None,
@@ -316,7 +316,7 @@ class Scene(Section):
 
     @property
     def height_is_default(self) -> bool:
-        """Whether flat ground lies at 0 m: what the template says, and hardly any ground is at."""
+        """True if flat ground lies at 0 m, as in the template: an unlikely height."""
         return self.dem is None and self.height_m == 0
 
     @model_validator(mode="after")

@@ -23,7 +23,7 @@ RESERVED_NAMES = frozenset(
 """Names of the results folder that no flight or node may take."""
 
 _RESERVED_ENDS = (".json", ".geojson", ".zarr", ".wip", ".lock", ".tif", ".png", ".html", ".vrt", ".qml")
-"""What files of the results folder end in: scene.json, cube.manifest.json, cube.zarr …"""
+"""Endings of files of the results folder: scene.json, cube.manifest.json, cube.zarr …"""
 
 WAVEFORM_KINDS = (
     "ofdm, samples (a pulse given by its samples), fmcw (beat signals of sweeps) or phase_history "
@@ -102,7 +102,7 @@ Doi = Annotated[str, Field(pattern=r"^10\.[0-9]{4,9}/[A-Za-z0-9._;()/:-]{1,100}$
 """A digital object identifier, without https://doi.org/."""
 
 Title = Annotated[str, AfterValidator(_title)]
-"""What people read: a line without what WKT, HTML or a terminal would take for their own."""
+"""Text for people: one line without characters that WKT, HTML or a terminal interpret."""
 
 
 # ---- Tab-separated tables of the config: a heading, then one line per row ------------------------------------------
@@ -112,7 +112,7 @@ LARGEST_TABLE = 1_000_000
 
 
 def table_rows(path: Path, columns: Sequence[str], *, remedy: str) -> Iterator[tuple[str, dict[str, str]]]:
-    """Yield where each row stands, for messages, and its stripped cells by column.
+    """Yield the position of each row, for messages, and its stripped cells by column.
 
     Parameters
     ----------

@@ -264,7 +264,7 @@ class PhaseHistoryWaveform(Section):
 
 
 class Trigger(Section):
-    """Where sweeps begin in a .wav file."""
+    """Beginnings of the sweeps in a .wav file."""
 
     sync_channel: int = Field(1, ge=1, le=64, description="channel of the sync pulses, counted from 1")
     beat_channel: int = Field(2, ge=1, le=64, description="channel of the beat signal, counted from 1")

@@ -39,7 +39,7 @@ zarr.config.update(zarr.config.defaults[0], priority="new")
 zarr.config.set({"array.write_empty_chunks": True})  # no chunk means not computed yet: zeros are written too
 
 CODECS = (ZstdCodec(), Crc32cCodec())
-"""How the bytes of a chunk are packed; the sum comes last, so that it is over the bytes on the disk."""
+"""Codecs of a chunk; the checksum comes last, so that it covers the bytes on the disk."""
 
 _SUM_BYTES = 4
 _METADATA = "zarr.json"
@@ -163,7 +163,7 @@ def damaged(folder: Path, key: str) -> CampaignError:
 
 
 def encoding_of(dataset: "xr.Dataset", chunks: Mapping[str, int]) -> dict[Hashable, dict[str, Any]]:
-    """Return how each variable of a stage is written.
+    """Return the encoding of each variable of a stage.
 
     Parameters
     ----------
@@ -347,7 +347,7 @@ def blocks_of_rows(stage: "xr.Dataset", name: str) -> Iterator[slice]:
 
 
 def rows_of_chunk(row_bytes: int) -> int:
-    """Return how many rows a chunk holds, a power of two.
+    """Return the number of rows of a chunk, a power of two.
 
     Examples
     --------

@@ -13,7 +13,7 @@ from apertura.common.provenance import sha256_file
 
 
 def manifest_of(result: Path) -> Path:
-    """Return where the manifest of a stage folder or of a document lies.
+    """Return the path of the manifest of a stage folder or of a document.
 
     Examples
     --------
@@ -24,7 +24,7 @@ def manifest_of(result: Path) -> Path:
 
 
 def remake(result: Path) -> str:
-    """Return what to do about a result that is not as it was written.
+    """Return the remedy for a result that is not as it was written.
 
     Examples
     --------
@@ -35,7 +35,7 @@ def remake(result: Path) -> str:
 
 
 class ResultOrigin(Protocol):
-    """What a result is being made from, `apertura.campaign.digests.Lineage`."""
+    """Origin of a result that is being made, `apertura.campaign.digests.Lineage`."""
 
     def record(self) -> dict[str, Any]:
         """Return sources (file → sha256), settings and code for the manifest, once more compared with what is there."""
@@ -104,7 +104,7 @@ class Difference:
 
 
 class CurrentInputs(Protocol):
-    """What a result would be made from now, `apertura.campaign.digests.Result`."""
+    """Origin that a result would have now, `apertura.campaign.digests.Result`."""
 
     @property
     def sources(self) -> Sequence[str]:
@@ -175,7 +175,7 @@ def compare_origin(
 
 
 def states_origin(document: Mapping[str, Any]) -> bool:
-    """Return whether a manifest says what its result was made from; those before 0.1.0 did not."""
+    """Test whether a manifest states the origin of its result; those before 0.1.0 did not."""
     return {"sources", "settings", "code"} <= document.keys()
 
 

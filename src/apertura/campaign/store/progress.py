@@ -177,7 +177,7 @@ def _attributes(wip: Path) -> dict[str, Any]:
 
 
 def is_work_on(wip: Path, stage: "xr.Dataset") -> bool:
-    """Return whether `wip` was begun with the settings, inputs and code of the stamped `stage`."""
+    """Test whether `wip` was begun with the settings, inputs and code of the stamped `stage`."""
     try:
         begun = _attributes(wip)
         return {key: begun[key] for key in _PROVENANCE} == {key: stage.attrs[key] for key in _PROVENANCE}
@@ -239,7 +239,7 @@ def _begin(wip: ConfinedPath, files: Mapping[str, bytes]) -> None:
 
 
 def is_intact(wip: ConfinedPath, files: Mapping[str, bytes]) -> bool:
-    """Return whether metadata and coordinates of work in progress are as it was begun, but for what was measured."""
+    """Test whether metadata and coordinates of work in progress are as it was begun, but for what was measured."""
     paths = ((wip / name, content) for name, content in files.items() if name != "zarr.json")
     return all(path.is_file(follow_symlinks=False) and path.read_bytes() == content for path, content in paths)
 
@@ -259,7 +259,7 @@ def _repair(wip: ConfinedPath, files: Mapping[str, bytes], chunks: Collection[st
 
 
 def _key(window: Window, windows: Sequence[Window]) -> str:
-    """Return where the chunk of a window lies in its array."""
+    """Return the chunk indices of a window in its array."""
     return "/".join(["c", *(str(part.start // size) for part, size in zip(window, _chunk(windows), strict=True))])
 
 

@@ -94,7 +94,7 @@ class VerdictLine:
 
 @dataclass(frozen=True, eq=False)
 class BenchNode:
-    """What one node recorded on the bench.
+    """Measurements of one node on the bench.
 
     Attributes
     ----------
@@ -210,7 +210,7 @@ class Bench:
             yield line(self.pair(node.name), "path", "none above the noise", "one", "link_weak", "sidelink_lost")
 
     def _received(self, node: BenchNode, line: Any) -> Iterator[VerdictLine]:
-        """Yield what a receiver's sidelink and clock say."""
+        """Yield facts of a receiver's sidelink and clock."""
         if node.name == self.transmitter:
             return
         if node.clock is not None:
@@ -491,7 +491,7 @@ def _conjugated(read: Read) -> Read:
 
 
 def _is_inverted(read: Read, sent: Transmitted, channel: str, count: int) -> bool:
-    """Return whether the code locks in the conjugates of a channel's samples, and not in the samples."""
+    """Test whether the code locks in the conjugates of a channel's samples, and not in the samples."""
     some = np.concatenate(spread(count, groups=4, each=16))
 
     def locks(one: Read) -> bool:

@@ -157,7 +157,7 @@ def _is_reference(setting: Setting) -> bool:
 
 
 def measure(part: Part, plan: Plan, settings: Sequence[Setting], *, seconds: float) -> list[Point]:
-    """Return what the plan, the reference and as many settings as time allows take and err, fastest first."""
+    """Measure time and error of the plan, the reference and as many settings as time allows, fastest first."""
     begin = perf_counter()
     points = [_reference_point(part, plan)]
     if not _is_reference(plan.setting):
@@ -194,7 +194,7 @@ def _reference_point(part: Part, plan: Plan) -> Point:
 
 
 def _point(part: Part, setting: Setting, taken: float, error_db: float | None, plan: Plan | None) -> Point:
-    """Return what a setting took and errs; `plan` where it is the planner's choice."""
+    """Return time and error of a setting; `plan` where it is the planner's choice."""
     return Point(
         engine=setting.engine,
         setting=setting.line,

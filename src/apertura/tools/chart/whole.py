@@ -39,7 +39,7 @@ _MARKS = {
 
 @dataclass(frozen=True)
 class Whole:
-    """What one setting takes from raw samples to GeoTIFFs, and errs; of the pair that is worse.
+    """Time and error of one setting from raw samples to GeoTIFFs, of the pair with the larger error.
 
     Attributes
     ----------
@@ -193,7 +193,7 @@ def whole_chart(campaign: Campaign, *, repeats: int = 3) -> Sequence[Path]:
 
 
 def _applies(campaign: Campaign, name: str) -> bool:
-    """Return whether a setting makes a difference to ask for: terrain where there is a DEM, a sidelink where one is."""
+    """Test whether a setting can take effect: terrain where there is a DEM, a sidelink where there is one."""
     if "terrain" in _SETTINGS[name]:
         return campaign.settings.scene.dem is not None
     receivers = any(len(set(pair.split("-"))) > 1 for pair in campaign.image_flights[0].pairs)

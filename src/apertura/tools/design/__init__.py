@@ -23,7 +23,7 @@ from apertura.tools.design.layers import UNITS
 def design(
     plan: FlightPlan | Mapping[str, Any] | str | Path, *, root: Path | None = None, threads: int = 1
 ) -> xr.Dataset:
-    """Return what a planned flight will give, pixel by pixel, for each pair and for the sums of flights.
+    """Predict the images of a planned flight, pixel by pixel, for each pair and for the sums of flights.
 
     Parameters
     ----------

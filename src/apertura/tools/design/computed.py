@@ -45,7 +45,7 @@ _REAL_BYTES = 2
 
 @dataclass(frozen=True)
 class ResourceEstimate:
-    """What recording and processing take.
+    """Time, storage and memory of recording and processing.
 
     Attributes
     ----------
@@ -75,7 +75,7 @@ class ResourceEstimate:
 
     @classmethod
     def of(cls, opened: OpenPlan) -> "ResourceEstimate":
-        """Return what a plan takes."""
+        """Return time, storage and memory of a plan."""
         campaign, waveform = opened.campaign, opened.campaign.settings.waveform
         prf_hz = float(getattr(waveform, "prf_hz", None) or 0.0)
         sizes, flight_s, pulses = dict[tuple[str, str], tuple[int, int]](), dict[str, float](), dict[str, int]()
@@ -120,7 +120,7 @@ class ResourceEstimate:
 
 @dataclass(frozen=True, eq=False)
 class Design:
-    """What a plan will give.
+    """Predicted images and costs of a plan.
 
     Attributes
     ----------
@@ -153,7 +153,7 @@ class Design:
 
 
 def designed(plan: FlightPlan, root: Path, *, threads: int = 1, coarse: int | None = None) -> Design:
-    """Return what a plan will give.
+    """Predict images and costs of a plan.
 
     Parameters
     ----------
@@ -211,7 +211,7 @@ def _computed(opened: OpenPlan, *, threads: int, coarse: int | None) -> Design:
 
 
 def _refinement(opened: OpenPlan, pairs: Sequence[OpenPair]) -> PlannedRefinement:
-    """Return whether the plan has the tracks of a flight refined, and what that is expected to leave."""
+    """Decide on refinement of the tracks of a flight, with its expected remainder."""
     errors = errors_of([replace(pair, positions=tuple(one.assumed for one in pair.positions)) for pair in pairs])
     remainder_db, obstacles = expected_remainder(
         errors.values(),

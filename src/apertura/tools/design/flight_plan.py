@@ -20,7 +20,7 @@ _MOST_LEGS = 500
 
 
 class _Track(Section):
-    """What tracks that fly by themselves have in common."""
+    """Settings shared by tracks that do not follow another node."""
 
     speed_m_s: Positive = Field(description="over the ground, m/s")
     height_m: float = Field(description="above what `above` says, m")
@@ -96,7 +96,7 @@ PlannedTrack = Annotated[
 
 
 class FormationSettings(Section):
-    """Where nodes without a track of their own fly: behind, beside or above the leader, at equal separations."""
+    """Positions of nodes without a track of their own: behind, beside or above the leader, equally separated."""
 
     shape: Literal["column", "row", "vee", "stack"] = Field(
         description="column: one behind the other; row: to the right; vee: behind, right and left in turn; stack: above"
@@ -157,14 +157,14 @@ class PlannedFlight(Section):
 
 
 class ExpectedScene(Section):
-    """What is to be seen."""
+    """Reference targets that the predicted SNR is for."""
 
     sigma0_db: float | None = Field(-15.0, description="backscattering coefficient of the ground, dB; null: not asked")
     rcs_dbsm: float | None = Field(0.0, description="radar cross-section of a point, dB of 1 m²; null: not asked")
 
 
 class Requirements(Section):
-    """What the flight must give, where 95 % of what is seen has it; null: not asked."""
+    """Requirements, to be met by 95 % of the visible scene; null: no requirement."""
 
     resolution_m: Positive | None = Field(None, description="−3 dB width of a point in its coarsest direction, m")
     nesz_db: float | None = Field(None, description="σ⁰ that equals the noise, at most, dB")
@@ -190,7 +190,7 @@ Range = tuple[float, float]
 
 
 class Moved(Section):
-    """How tracks are moved from where they are drawn, all together; what `--optimise` finds goes here."""
+    """Common displacement of the tracks as drawn; `--optimise` writes its result here."""
 
     height_m: float = Field(0.0, description="up, m")
     offset_m: float = Field(0.0, description="away from the middle of the scene, m")

@@ -1,4 +1,4 @@
-"""Whether a plan gives what is required: the first cause where it does not, and which change helps most."""
+"""Verdicts on the requirements of a plan: the dominant cause of a shortfall, and the most helpful change."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -64,7 +64,7 @@ class Verdict:
 
     @property
     def short_db(self) -> float:
-        """How far it is missed, dB; negative where there is some to spare."""
+        """Shortfall, dB; negative: margin."""
         if self.required is None:
             return -np.inf
         if not np.isfinite(self.found):
@@ -76,7 +76,7 @@ class Verdict:
 
     @property
     def met(self) -> bool:
-        """Whether it is met."""
+        """True if it is met."""
         return self.short_db <= 0
 
     @property
@@ -115,7 +115,7 @@ def judge(design: Design, *, every: bool = False) -> list[Verdict]:
 
 
 def report_of(design: Design) -> dict[str, Any]:
-    """Return what a design says in numbers, as JSON values."""
+    """Return the values of a design, as JSON values."""
     return {
         "judgement": [verdict.report for verdict in judge(design)],
         "recording": asdict(design.recording),
@@ -164,7 +164,7 @@ def _cause(name: str, design: Design, image: PlannedImage, seen: np.ndarray, val
 
 
 def refinement_line(design: Design, flight: str) -> str:
-    """Return whether the tracks of a flight will be refined by its images, and what that needs of the scene."""
+    """Return the decision on refinement of the tracks of a flight, and the points that it needs in the scene."""
     refinement = design.refinements[flight]
     if refinement.obstacles:
         return f"refinement is not expected to succeed: {', '.join(refinement.obstacles)}"
@@ -188,7 +188,7 @@ def _least_point(design: Design, flight: str) -> str:
 
 
 def _coarsest(image: PlannedImage) -> str:
-    """Return whether the band or the aperture makes the coarsest direction in the middle of the scene."""
+    """Return the cause of the coarsest resolution in the middle of the scene: the band or the aperture."""
     shape = image.layers["mask"].shape
     pixel = tuple(slice(size // 2, size // 2 + 1) for size in shape)
     _, _, fine_deg = image.resolution.axes((pixel[0], pixel[1]))

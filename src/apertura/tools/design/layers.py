@@ -1,4 +1,4 @@
-"""What each image of a flight plan will be, pixel by pixel: by the functions that describe images after a flight."""
+"""Predicted images of a flight plan, pixel by pixel: by the functions that describe images after a flight."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -79,7 +79,7 @@ class PlannedRefinement:
 
     @property
     def applied(self) -> bool:
-        """Whether images are judged with refined tracks: requested by the plan, and within the measured limits."""
+        """True if images are judged with refined tracks: requested by the plan, and within the measured limits."""
         return self.decision.value == "on" and not self.obstacles
 
 
@@ -124,7 +124,7 @@ def planned_image(
     refinement: PlannedRefinement | None = None,
     threads: int = 1,
 ) -> PlannedImage:
-    """Return what the image of a pair will be.
+    """Predict the image of a pair.
 
     Parameters
     ----------
@@ -170,7 +170,7 @@ def planned_image(
 
 
 def summed_image(flight: str, images: list[PlannedImage]) -> PlannedImage:
-    """Return what the sum of a flight's pairs will be, each divided by its peak (docs/theory.md, eq. 7).
+    """Predict the sum of a flight's pairs, each divided by its peak (docs/theory.md, eq. 7).
 
     Parameters
     ----------
@@ -247,7 +247,7 @@ def resolution_layers(resolution: Resolution, shape: tuple[int, int]) -> dict[st
 
 
 def planned_job(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> tuple[Job, Integration, Beams | None]:
-    """Return what the limits of imaging are checked on: the planner's job without its signal; and its weights."""
+    """Return the job that limits of imaging are checked on, the planner's without its signal; and its weights."""
     integration = integration_of(campaign, pair, scene)
     beams = Beams.within(integration.sector, pair.beams)
     grid, frequency_hz = scene.grid, pair.frequency_hz

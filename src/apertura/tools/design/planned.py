@@ -68,7 +68,7 @@ _SEED = 31  # of the wobble drawn: the same plan gives the same figures
 
 @dataclass(frozen=True, eq=False)
 class Course:
-    """What a node is meant to fly.
+    """Planned course of a node.
 
     Attributes
     ----------
@@ -97,7 +97,7 @@ class Course:
 
     @property
     def imaged_m(self) -> float:
-        """How far it flies in what makes the image, metres."""
+        """Length of the imaged part, metres."""
         return float(sum(np.linalg.norm(np.diff(leg, axis=0), axis=1).sum() for leg in self.imaged_legs_m()))
 
     @property
@@ -279,7 +279,7 @@ def _crs(plan: FlightPlan, campaign: Campaign) -> str:
 
 
 def _courses(plan: FlightPlan, campaign: Campaign, name: str, ground: ConfiguredGround) -> dict[str, Course]:
-    """Return what each node of a flight is meant to fly, as drawn."""
+    """Return the planned course of each node of a flight, as drawn."""
     flight = plan.flights[name]
     if plan.scene.bounds_m == "auto":
         level_m = ground.flat_m
@@ -387,7 +387,7 @@ def _sampled(
 def _mission(
     track: MissionTrack, campaign: Campaign, flight: PlannedFlight, ground: ConfiguredGround, where: str
 ) -> Course:
-    """Return what a mission flies: straight from waypoint to waypoint, with rounded corners."""
+    """Return the course of a mission: straight from waypoint to waypoint, with rounded corners."""
     from scipy.ndimage import gaussian_filter1d
 
     path = campaign.file(track.file, where)
@@ -509,7 +509,7 @@ def _pulses(course: Course, prf_hz: float, *, where: str) -> NDArray[np.datetime
 
 
 def _log(campaign: Campaign, at: tuple[str, str], flight: PlannedFlight, course: Course, frame: _Frame) -> NodeLog:
-    """Return what the log of a node will say: its course, and the wobble about it; `at` is flight and node."""
+    """Simulate the log of a node: its course and the wobble about it; `at` is flight and node."""
     (name, node), (crs, wave_m) = at, frame
     local = crs == LOCAL
     place, attitude = course.place_m, np.zeros_like(course.place_m)

@@ -198,7 +198,7 @@ def verdict_row(verdict: Verdict) -> tuple[str, ...]:
 
 
 def recording_lines(design: Design) -> Iterator[str]:
-    """Yield what is sent, what of the tracks makes the image, and what recording and processing take."""
+    """Yield band, imaged part of the tracks, and cost of recording and processing."""
     recording, opened = design.recording, design.opened
     low, high = (float(edge(opened.pairs[0].frequency_hz)) for edge in (np.min, np.max))
     wave_cm = 200 * SPEED_OF_LIGHT_M_S / (low + high)
@@ -370,7 +370,7 @@ def _draw_layers(path: Path, design: Design) -> None:
 
 
 def _ends(values: NDArray[np.float64]) -> tuple[float, float]:
-    """Return where the colours of a layer end: no nearer than a hundredth of its size, so that labels stay short.
+    """Return the colour limits of a layer: at least a hundredth of its size apart, so that labels stay short.
 
     Examples
     --------
@@ -507,7 +507,7 @@ def comparison_rows(plan: FlightPlan, root: Path, campaign: Campaign, *, threads
 
 
 def _numbers(image: PlannedImage) -> dict[str, float]:
-    """Return what a comparison shows of an image: medians over what is seen."""
+    """Return the values of an image that are compared: medians over the visible scene."""
     seen = image.layers["mask"] == 0
     numbers = {"coverage, %": 100 * float(seen.mean())}
     for name in ("resolution", "resolution_fine", "looks", "incidence", "bistatic_angle", "nesz", "point_snr"):
@@ -519,7 +519,7 @@ def _numbers(image: PlannedImage) -> dict[str, float]:
 
 
 def _measured(campaign: Campaign, flight: str, pair: str) -> Mapping[str, float]:
-    """Return what a finished image says of itself; nothing before."""
+    """Return the same values of a finished image; empty before."""
     from apertura.common.raster import opened_raster
 
     if not campaign.is_current(campaign.result(flight, pair, "export")):

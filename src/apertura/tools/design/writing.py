@@ -67,11 +67,11 @@ def write_design(design: Design, folder: Path, tried: Sequence[Tried] = ()) -> l
 
 
 PICTURE_TAGS = {"APERTURA_VERSION": __version__, "APERTURA_PLANNED": "true"}
-"""What pictures of a design say of where they come from; rasters name their plan, too."""
+"""Provenance tags of pictures of a design; rasters name their plan, too."""
 
 
 def tags_of(design: Design) -> dict[str, str]:
-    """Return what rasters of a design say of where they come from."""
+    """Return the provenance tags of rasters of a design."""
     plan = design.opened.plan.model_dump(mode="json", exclude_unset=True)
     return PICTURE_TAGS | {"APERTURA_PLAN": canonical_json(plan)}
 

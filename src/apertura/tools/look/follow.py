@@ -123,7 +123,7 @@ class Look:
         return self._settled
 
     def _flown(self) -> Flown:
-        """Return what all pairs of the first flight flew, by its logs."""
+        """Return the joint geometry of all pairs of the first flight, by its logs."""
         pairs = [pair for pair in self.pairs if pair.flight == self.pairs[0].flight]
         tags = [None if pair.tx is None else pair.tx.time for pair in pairs]
         opened = (
@@ -378,7 +378,7 @@ _KEPT = 2
 
 
 class LiveMap:
-    """What the map page shows of a campaign while it flies, in a folder laid out like the results.
+    """Live document of the map page, in a folder laid out like the results.
 
     Parameters
     ----------
@@ -399,7 +399,7 @@ class LiveMap:
 
     @cached_property
     def _fixed(self) -> dict[str, Any]:
-        """What the document says of the campaign whatever comes."""
+        """Constant part of the document."""
         if self._grid is None:
             raise ValueError("no image was added")
         campaign, grid, notes = self._campaign, self._grid, list[str]()

@@ -1,4 +1,4 @@
-"""What a node has recorded and logged so far: captures and lines that are whole, read once."""
+"""Recording and log of a node while they grow: complete captures and lines, read once."""
 
 import time
 import zlib
@@ -27,11 +27,11 @@ _EPOCHS = 4  # that a log must be ahead of a pulse: those to come would move it 
 
 
 class NotFollowedError(CampaignError):
-    """What is there cannot be read while it is written: no waiting helps."""
+    """A recording that cannot be read while it is written."""
 
 
 class NodeSoFar:
-    """What a node has recorded and logged so far; whole captures and whole lines alone.
+    """Recording and log of a node so far; complete captures and lines alone.
 
     What was read is dropped where the files no longer begin with it: a recorder that is started again under the same
     name. A change in the middle of the samples is not seen; the run reads all of them.
@@ -122,7 +122,7 @@ class NodeSoFar:
         self.ended = self._growing.ended
 
     def _changed(self, recording: Recording | None, path: Path) -> str:
-        """Return what is no longer as it was read before, of captures and the file of samples; empty: nothing."""
+        """Return the parts of captures and samples that differ from the earlier reading; empty: none."""
         if self._recording is None or not path.is_file():
             return ""
         known = self._recording.captures.time
@@ -173,17 +173,17 @@ class NodeSoFar:
 
     @property
     def has_read(self) -> bool:
-        """Whether captures and epochs of the log have been read."""
+        """True if captures and epochs of the log have been read."""
         return bool(len(self.time)) and self.track is not None
 
     @property
     def complete(self) -> bool:
-        """Whether the recording says that it has ended, and the log reaches as far."""
+        """True if the recording says that it has ended, and the log reaches as far."""
         return bool(self.ended and len(self.time) and self.known_until(ended=True) >= self.time[-1])
 
     @property
     def lacks(self) -> str:
-        """What is missing for `complete`, in words."""
+        """Missing parts for `complete`, in words."""
         if not self.ended:
             return f"the metadata of {self.name} do not state the hash of its samples, or not all of these are there"
         return "" if self.complete else f"the log of {self.name} ends before its last capture"

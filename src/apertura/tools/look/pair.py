@@ -517,7 +517,7 @@ class PairSoFar:
 
     @property
     def waits(self) -> str:
-        """What is missing for more; empty: nothing."""
+        """Missing parts for more pulses; empty: none."""
         nodes = [node.waits for node in (self.tx, self.rx) if node is not None]
         return next((why for why in (*nodes, self.why_dropped) if why), "")
 

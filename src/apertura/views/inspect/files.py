@@ -60,7 +60,7 @@ _EXPECTED = f"--set KEY=VALUE, a key of {', '.join(sorted(_OPTIONS))}"
 
 @dataclass(frozen=True)
 class Surroundings:
-    """How a file is to be read.
+    """Settings for reading a file.
 
     Attributes
     ----------
@@ -90,7 +90,7 @@ class Surroundings:
 
 
 def surroundings(path: Path, settings: Sequence[str]) -> Surroundings:
-    """Return how a file is to be read: by what is typed, else as the config of its campaign says.
+    """Return the settings for reading a file: as typed, else by the config of its campaign.
 
     Parameters
     ----------
@@ -145,7 +145,7 @@ def _parsed(settings: Sequence[str]) -> dict[str, Any]:
 
 
 def retries(problem: CampaignError) -> list[str]:
-    """Return what to type to read a log that was refused for want of a key.
+    """Return the options to type for a log that was refused for want of a key.
 
     Examples
     --------
@@ -495,7 +495,7 @@ def dem_report(path: Path) -> Report:
 
 
 def _product_rows(facts: DemFacts) -> dict[str, Any]:
-    """Return what a product of apertura is, by its tags."""
+    """Return the report of a product of apertura, by its tags."""
     tags = facts.tags
     rows = {
         "title": tags.get("TIFFTAG_IMAGEDESCRIPTION", ""),
@@ -510,7 +510,7 @@ def _product_rows(facts: DemFacts) -> dict[str, Any]:
 
 
 def _tag(tags: Mapping[str, str], name: str, kind: type) -> Any:
-    """Return what a tag holds as JSON, or an empty value where it is not of that kind."""
+    """Return the JSON value of a tag, or an empty value where it is not of that kind."""
     try:
         value = json.loads(tags.get(name, "null"))
     except ValueError:

@@ -96,7 +96,7 @@ def _drawn(figure: "Figure", plot: Path) -> Path:
 
 
 def look(path: Path, settings: Sequence[str] = ()) -> Report:
-    """Return what a file or folder is and holds.
+    """Identify a file or folder and return its report.
 
     Parameters
     ----------
@@ -293,7 +293,7 @@ def campaign_report(root: Path) -> Report:
 
 
 def _node_report(examined: Examination, key: Key) -> tuple[Report, dict[str, Span], list[CampaignError]]:
-    """Return what one node recorded and logged in one flight, when, and what of it cannot be read."""
+    """Return recording and log of one node in one flight, their spans, and errors in reading them."""
     flight, node = key
     rows: dict[str, Any] = {}
     spans: dict[str, Span] = {}

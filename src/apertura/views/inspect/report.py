@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _UNITS = {"hz": "Hz", "m": "m", "m_s": "m/s", "s": "s", "deg": "deg", "db": "dB", "utc": "UTC", "share": "share"}
-"""What the name of a fact ends in → unit."""
+"""Ending of the name of a fact → unit."""
 
 _PREFIXES = ((1e9, "G"), (1e6, "M"), (1e3, "k"), (1.0, ""))
 _LONGEST = 600
@@ -19,7 +19,7 @@ _LONGEST = 600
 
 @dataclass(frozen=True)
 class Report:
-    """What a file or folder is, and what it holds.
+    """Kind and contents of a file or folder.
 
     Attributes
     ----------
@@ -59,11 +59,11 @@ class Report:
 
     @property
     def title(self) -> str:
-        """What it is, in words."""
+        """Kind and format, in words."""
         return f"{self.kind} ({self.format})" if self.format else self.kind
 
     def as_json(self) -> dict[str, Any]:
-        """Return what JSON can hold of it.
+        """Return its contents as JSON values.
 
         Examples
         --------

@@ -1,4 +1,4 @@
-"""What an image holds, drawn: phase and cuts of its brightest target, and its error budget."""
+"""Figures of an image: phase and cuts of its brightest target, and its error budget."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -54,7 +54,7 @@ def sidelink_error_rad(
 
 
 def steadiness(phasors: NDArray[np.complex128]) -> tuple[float, float]:
-    """Return how far a target's phase scatters, rms radians about its mean, and |Σz|/Σ|z|; NaN without an echo.
+    """Return the phase scatter of a target, rms radians about its mean, and |Σz|/Σ|z|; NaN without an echo.
 
     Parameters
     ----------
@@ -206,7 +206,7 @@ def _draw_cut(axes: Axes, cut: DrawnCut, colour: str) -> None:
 
 
 def _crossings(cut: DrawnCut) -> tuple[float, float]:
-    """Return where the main lobe has fallen to half its power on both sides, metres from the peak."""
+    """Return the half-power edges of the main lobe on both sides, metres from the peak."""
     middle, half = cut.power.size // 2, cut.power[cut.power.size // 2] / 2
     sides = []
     for side in (-1, 1):
@@ -225,7 +225,7 @@ _STYLES: Mapping[bool, Any] = {
 
 @dataclass(frozen=True)
 class Measured:
-    """What is measured at an image's bright points.
+    """Measured focus at an image's bright points.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""What was flown and recorded, drawn: geometry of a pair, its pulses over time, its range profiles."""
+"""Figures of a flight: geometry of a pair, its pulses over time, its range profiles."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -28,7 +28,7 @@ _MARGIN, _BELOW = 0.18, 0.1
 
 @dataclass(frozen=True, eq=False)
 class FlownGeometry:
-    """What a drawing of a pair's geometry needs.
+    """Geometry of a pair, to be drawn.
 
     Attributes
     ----------
@@ -171,7 +171,7 @@ _BINS = 60
 
 @dataclass(frozen=True, eq=False)
 class PulseRecord:
-    """What is known of the pulses of a pair.
+    """Pulses of a pair and their sidelink, to be drawn.
 
     Attributes
     ----------
@@ -264,7 +264,7 @@ def _draw_counts(axes: Axes, record: PulseRecord) -> None:
 
 
 def _of_bin(slots: int) -> int:
-    """Return how many pulses a column counts: so many that the last column is as full as can be.
+    """Return the pulses per column, with which the last column is as full as possible.
 
     Examples
     --------

@@ -124,7 +124,7 @@ class Shown:
 
     @cached_property
     def counted(self) -> bool:
-        """Whether these count pulses, since the recording has no times."""
+        """True if these count pulses, since the recording has no times."""
         return counted(self.echo.time.values)
 
     @cached_property
@@ -169,7 +169,7 @@ class Shown:
         )
 
     def record(self) -> PulseRecord:
-        """Return which pulses make the image, and what the sidelink measured of them."""
+        """Return the imaged pulses and the measurements of their sidelink."""
         echo, sent = self.echo, self._sent()
         counts = echo.attrs.get("pulses") or {}
         snr_db = echo.sidelink_snr.values if "sidelink_snr" in echo else None
@@ -196,7 +196,7 @@ class Shown:
         return np.asarray(self.campaign.clock(self.flight, node).utc(raw.time.values)).astype("datetime64[ns]")
 
     def phasors(self) -> dict[str, NDArray[np.complex128]]:
-        """Return what each pulse adds at the brightest target: without sidelink, with it, with tracks refined."""
+        """Return the contribution of each pulse at the brightest target: without and with sidelink, and with refined tracks."""
         logged, echo = profiles_of(self.profile, lazy=True), self.echo
         every = np.arange(len(logged) + 1)
         phasors = block_contributions(logged, self._target_m, edges=every)[0].astype(np.complex128)

@@ -94,7 +94,7 @@ def column_of(figure: Figure, rows: int) -> list[Axes]:
 
 
 def thinned(count: int, most: int = MOST_DOTS) -> NDArray[np.int64]:
-    """Return which of a series are drawn, (point,) int64, evenly spread.
+    """Return the indices of a series to draw, (point,) int64, evenly spread.
 
     Examples
     --------

@@ -124,7 +124,7 @@ def _place_text(place: Any) -> str:
 
 
 def setting_rows(campaign: Campaign) -> list[tuple[str, str]]:
-    """Return what was asked of a campaign, key of the config → value; grid as settled, and why."""
+    """Return the settings of a campaign, key of the config → value; grid as settled, with reasons."""
     scene, values = settled_scene(campaign), campaign.values
     west, south, east, north = scene.grid.bounds_m
     rows, columns = scene.grid.shape
@@ -189,7 +189,7 @@ def _why(scene: OpenScene, name: str) -> str:
 
 
 def landing(campaign: Campaign) -> dict[str, Any]:
-    """Return what the workflow's report opens with, as reStructuredText in which nothing is markup but the tables."""
+    """Return the opening of the workflow's report, as reStructuredText with tables as its only markup."""
     flights = {one.name: one.pairs for one in campaign.image_flights}
     reports = {
         f"{one} {name}": read_report(campaign, one, name) for one, names in campaign.images.items() for name in names
@@ -214,7 +214,7 @@ def landing(campaign: Campaign) -> dict[str, Any]:
 
 @contextmanager
 def open_report(campaign: Campaign) -> Iterator[tuple[Path, Path]]:
-    """Yield where snakemake's report is to be written, and its style; it is recorded when the body ends.
+    """Yield the paths of snakemake's report and its style; it is recorded when the body ends.
 
     Its sources are hashed when it is written: snakemake settles the times of files before.
     """

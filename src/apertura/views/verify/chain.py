@@ -109,7 +109,7 @@ class Links:
         return self._digests[name]
 
     def exists(self, name: str) -> bool:
-        """Return whether a file is there and was read."""
+        """Test whether a file is there and was read."""
         return _HASH.fullmatch(self.sha256(name)) is not None
 
     def compare(self, recorded: Mapping[str, str], by: str) -> None:
@@ -342,7 +342,7 @@ class Chain:
 
 
 def _holds(stated: object, spec: Any) -> bool:
-    """Return whether settings are among those stated, where a calibrated layer adds its own."""
+    """Test whether settings are among those stated, where a calibrated layer adds its own."""
     return isinstance(stated, Mapping) and isinstance(spec, Mapping) and {**stated, **spec} == stated
 
 
@@ -355,7 +355,7 @@ def _spec(path: Path) -> Any:
 
 
 def other_versions(tags: Mapping[str, str], made_with: Mapping[str, Any], name: str) -> Iterator[str]:
-    """Yield what a file was made with that is not installed here, a line each.
+    """Yield the software of a file that is not installed here, a line each.
 
     Another version is no change of a product, and may be the reason of one.
 

@@ -200,7 +200,7 @@ def first_difference(first: Path, second: Path) -> int | None:
 
 
 def _rasters(first: Path, second: Path) -> Iterator[str]:
-    """Yield how the pixels of two rasters differ, where their grids lie on each other."""
+    """Yield the differences of the pixels of two rasters, where their grids coincide."""
     with ExitStack() as stack:
         one, other = (
             stack.enter_context(opened_raster(path, expected=EXPECTED, remedy=REMEDY)) for path in (first, second)
@@ -248,7 +248,7 @@ def _blocks(
 
 
 def _stages(first: Path, second: Path) -> Iterator[str]:
-    """Yield how the arrays of two stages differ, each with its name."""
+    """Yield the differences of the arrays of two stages, each with its name."""
     one, other = (open_stage(folder, folder.stem) for folder in (first, second))
     for name in one.variables:
         if name not in other.variables or one[name].shape != other[name].shape or one[name].dtype.kind not in "fciubM":
@@ -271,7 +271,7 @@ def _numbers(values: Pixels) -> Pixels:
 
 
 def difference_lines(tally: Tally, *, unit: str = "1", power: bool = False) -> Iterator[str]:
-    """Yield how two arrays differ, in words; nothing where they are the same.
+    """Yield the differences of two arrays, in words; nothing where they are the same.
 
     Parameters
     ----------
@@ -369,7 +369,7 @@ def print_reproduced(path: Path, *, cores: int, keep: Path | None = None) -> int
 
 
 def _found(root: Path, again: Path, wanted: Sequence[str], known: Sequence[str]) -> list[str]:
-    """Return what differs in the results wanted, and with which of those known that begins; or that nothing does."""
+    """Return the differences of the requested results and the first known result that differs; or their agreement."""
     lines = [line for manifest in wanted for line in compared(root, again, manifest)]
     if not lines:
         count, more = sum(len(_files(root, one)) for one in wanted), len(wanted) - 1
@@ -397,7 +397,7 @@ def _scratch(campaign: Campaign, keep: Path | None) -> Iterator[Path]:
 
 
 def compared(root: Path, again: Path, manifest: str) -> list[str]:
-    """Return what differs between a result and the same result made again, a line each.
+    """Return the differences between a result and the same result made again, a line each.
 
     Parameters
     ----------
@@ -425,7 +425,7 @@ def compared(root: Path, again: Path, manifest: str) -> list[str]:
 
 
 def _differences(path: Path, again: Path) -> Iterator[str]:
-    """Yield what `apertura diff` says of the first file that differs, from what is there to what was made again."""
+    """Yield the output of `apertura diff` for the first file that differs, old against new."""
     stage = next((folder for folder in path.parents if folder.suffix == ".zarr"), None)
     if stage is not None:
         path, again = stage, again.parents[len(path.relative_to(stage).parts) - 1]

@@ -1,4 +1,4 @@
-"""Which product a path means, and what it says of itself: tags of a GeoTIFF or PNG, a stage, a report."""
+"""Product of a path and its contents: tags of a GeoTIFF or PNG, a stage, a report."""
 
 import json
 import warnings
@@ -206,7 +206,7 @@ def hashes(tags: Mapping[str, str], name: str, where: Path) -> dict[str, str]:
 
 
 SECTIONS = ("geometry", "settings", "inputs", "stages", "code", "software", "flags", "report")
-"""What is compared, in this order."""
+"""Compared sections, in this order."""
 
 EXPECTED = "a raster, a picture, a stage or a JSON file that the workflow wrote"
 REMEDY = "Name one file of a result, and the file to hold it against."
@@ -249,7 +249,7 @@ def sections_of(path: Path) -> Sections:
 
 
 def _tag_sections(path: Path) -> Sections:
-    """Return what the tags of a file say."""
+    """Return the sections of a file by its tags."""
     tags = read_tags(path)
     others = {name.removeprefix("APERTURA_"): text for name, text in tags.items()}
     return {
@@ -265,7 +265,7 @@ def _tag_sections(path: Path) -> Sections:
 
 
 def _value(text: str) -> Any:
-    """Return what the JSON of a tag holds, or its text."""
+    """Return the JSON value of a tag, or its text."""
     try:
         return json.loads(text) if text[:1] in {"{", "["} else text
     except (ValueError, RecursionError):
@@ -273,7 +273,7 @@ def _value(text: str) -> Any:
 
 
 def _stage_sections(folder: Path) -> Sections:
-    """Return what the attributes of a finished stage say; its arrays are compared elsewhere."""
+    """Return the sections of a finished stage by its attributes; its arrays are compared elsewhere."""
     if folder.suffix != ".zarr" or folder.stem not in STAGES:
         raise CampaignError("a folder that is no stage", folder, EXPECTED, REMEDY)
     stage = open_stage(folder, folder.stem)

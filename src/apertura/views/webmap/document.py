@@ -28,7 +28,7 @@ FORMAT = 1
 """Of `map.json`; the page refuses another."""
 
 KINDS = ("image", "classes", "measure")
-"""How a layer is drawn: grey between two dB that the reader chooses, colours with a name each, a ramp of colours."""
+"""Style of a layer: grey between two dB that the reader chooses, named colours, a ramp of colours."""
 
 CLASSES = {0: "seen", 1: "shadow", 2: "layover", 3: "shadow and layover"}
 """Value of the mask → what it means."""
@@ -83,7 +83,7 @@ class Place:
 
 
 def image_entry(flight: str, image: str, report: Mapping[str, Any], layers: Iterable[Layer]) -> dict[str, Any]:
-    """Return what the page knows of an image.
+    """Return the entry of an image in the document.
 
     Parameters
     ----------
@@ -267,7 +267,7 @@ def webmap(campaign: Campaign) -> list[Path]:
 
 
 def _layers(campaign: Campaign, flight: str, image: str, report: Mapping[str, Any]) -> list[Layer]:
-    """Return what a page can show of an image: real rasters, the linear ones only where no dB show the same."""
+    """Return the layers of an image to show: real rasters, the linear ones only without an equivalent in dB."""
     of_pairs = [("export", "pair"), ("layers", "layers"), ("layers", "radiometry")]
     kinds = [("export", "fused")] if image == FUSED else of_pairs
     return [

@@ -45,7 +45,7 @@ class UnsatisfiableRangeError(ValueError):
 
 
 def own_host(hosts: list[str], port: int) -> str | None:
-    """Return which name of this server a request says; None for another that leads here (DNS rebinding).
+    """Return the host name of this server in a request; None for another that leads here (DNS rebinding).
 
     Parameters
     ----------
@@ -145,7 +145,7 @@ FILES = ("index.html", "app.js", "app.css")
 """The map; what is opened first."""
 
 BUILT = Path(__file__).parent / "page"
-"""Where `webmap/build.mjs` writes: no part of the sources, but of the package that is installed."""
+"""Output folder of `webmap/build.mjs`: no part of the sources, but of the package that is installed."""
 
 
 def page_files(built: Path = BUILT) -> Mapping[str, bytes]:
@@ -172,7 +172,7 @@ def page_files(built: Path = BUILT) -> Mapping[str, bytes]:
 
 
 def is_built(built: Path = BUILT) -> bool:
-    """Return whether the bundle is there."""
+    """Test whether the bundle is built."""
     return all((built / name).is_file() for name in (*SHELL, *FILES))
 
 
@@ -274,7 +274,7 @@ class _Handler(BaseHTTPRequestHandler):
         self._answer()
 
     def __getattr__(self, name: str) -> Callable[[], None]:
-        """Return what answers every other method."""
+        """Return the handler of every other method."""
         if name.startswith("do_"):
             return self._refuse
         raise AttributeError(name)
@@ -328,7 +328,7 @@ class _Handler(BaseHTTPRequestHandler):
         return None
 
     def _is(self, file: IO[bytes], name: str, sha256: str | None) -> bool:
-        """Return whether an open file has the hash; products are replaced as a whole, so it is asked of its path."""
+        """Test whether an open file has the hash; it is computed by path, since products are replaced as a whole."""
         with suppress(OSError, CampaignError):
             same = self.server.sha256_of(name) == sha256
             return same and os.path.samestat(os.fstat(file.fileno()), (self.server.folder / name).stat())
@@ -426,7 +426,7 @@ def _serving(campaign: Campaign, folder: Path, files: Callable[[], Mapping[str, 
 
 
 def _listing(campaign: Campaign) -> Callable[[], Mapping[str, str]]:
-    """Return what gives file of the results → sha256: `map.json` by its manifest, and what that names.
+    """Return a function to the served files of the results → sha256: `map.json` by its manifest, and its layers.
 
     Both are read again when the manifest is another: the workflow ran meanwhile.
     """
