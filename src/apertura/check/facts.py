@@ -14,10 +14,10 @@ from apertura.check.times import (
     TimeFacts,
     frame_numbers,
     recorded_span,
-    seconds,
     time_facts,
 )
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
+from apertura.common.units import seconds_since
 from apertura.core.geometry.geodesy import geodetic_from_ecef, longitude_range, longitudes_about
 from apertura.core.geometry.track_checks import LONG_GAP, CheckedTrack, check_track
 from apertura.formats.recordings.recording import Recording
@@ -98,7 +98,7 @@ def log_facts(track: "xr.Dataset") -> LogFacts:
     """Return the contents of a flight log; `track` is its stage."""
     times, position, frame = track.time.values, track.position.values, track.attrs["frame"]
     steps_m = np.linalg.norm(np.diff(position, axis=0), axis=1)
-    speed_m_s = steps_m / np.diff(seconds(times))
+    speed_m_s = steps_m / np.diff(seconds_since(times, times[0]))
     logged = np.isfinite(track.attitude.values)
     places = geodetic_from_ecef(position) if frame == "ecef" else position
     return LogFacts(
@@ -131,7 +131,12 @@ def log_faults(track: "xr.Dataset") -> CheckedTrack:
     from apertura.stages.node_log import poorer_fix
 
     poor = poorer_fix(track.fix.values, "auto") if "fix" in track else np.zeros(track.sizes["epoch"], bool)
-    return check_track(seconds(track.time.values), track.position.values, poor_fix=poor, tolerated_m=WAVE_M / 16)
+    return check_track(
+        seconds_since(track.time.values, track.time.values[0]),
+        track.position.values,
+        poor_fix=poor,
+        tolerated_m=WAVE_M / 16,
+    )
 
 
 def bounds_of(position_m: NDArray[np.float64], frame: str) -> dict[str, Range]:

@@ -21,6 +21,7 @@ from apertura.check.times import expected_pulses, recorded_span
 from apertura.common.arrays import Times
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
+from apertura.common.units import seconds_since
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.geodesy import frame_from_map, geodetic_from_ecef
 from apertura.core.scene.clearance import clearance
@@ -150,9 +151,9 @@ def pair_aperture(examined: Examination, flight: Flight, node: str, waveform: Sa
 def _positions(examined: Examination, key: Key, times: Times) -> NDArray[np.float64]:
     """Return (time, 3) float64 ECEF positions of a log, straight between epochs."""
     track = examined.tracks[key]
-    start, second = track.time.values[0], np.timedelta64(1, "s")
-    at, epochs = (times - start) / second, (track.time.values - start) / second
-    return np.stack([np.interp(at, epochs, axis) for axis in track.position.values.T], axis=-1)
+    epochs = track.time.values
+    at_s, epoch_s = seconds_since(times, epochs[0]), seconds_since(epochs, epochs[0])
+    return np.stack([np.interp(at_s, epoch_s, axis) for axis in track.position.values.T], axis=-1)
 
 
 def scene_points(examined: Examination) -> tuple[NDArray[np.float64], float]:

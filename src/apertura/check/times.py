@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apertura.common.arrays import Times
+from apertura.common.units import seconds_since
 from apertura.formats.recordings.recording import Recording
 
 Span = tuple[np.datetime64, np.datetime64]
@@ -83,7 +84,7 @@ def time_facts(times: Times, *, longer: float) -> TimeFacts:
     >>> facts.clock, round(facts.rate_hz, 9), facts.gap_at.tolist(), facts.gap_s.round(9).tolist(), facts.lost
     ('UTC', 20.0, [20], [0.15], 2)
     """
-    late, elapsed_s = gaps(times, longer), seconds(times)
+    late, elapsed_s = gaps(times, longer), seconds_since(times, times[0])
     return TimeFacts(
         count=len(times),
         span=(times[0], times[-1]),
@@ -115,11 +116,6 @@ def utc(time: np.datetime64) -> str:
     '2025-05-14T09:30:00.123Z'
     """
     return f"{iso(time)}Z"
-
-
-def seconds(times: Times) -> NDArray[np.float64]:
-    """Return (time,) float64: seconds since the first."""
-    return np.asarray((times - times[0]) / np.timedelta64(1, "s"), np.float64)
 
 
 def steps_s(times: Times, *, over: int = 1) -> NDArray[np.float64]:
@@ -158,7 +154,7 @@ def gaps(times: Times, longer: float) -> NDArray[np.intp]:
     >>> gaps(np.datetime64("2025-05-14", "ns") + kept * np.timedelta64(50, "ms"), 1.5)
     array([20])
     """
-    return np.flatnonzero(np.diff(seconds(times)) > longer * interval_s(times)) + 1
+    return np.flatnonzero(np.diff(seconds_since(times, times[0])) > longer * interval_s(times)) + 1
 
 
 def own_clock(times: Times) -> bool:

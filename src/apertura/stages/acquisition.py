@@ -174,7 +174,7 @@ def open_acquisition(campaign: Campaign, flight: str, node: str, sent: Transmitt
     raw, track = (open_stage(campaign.stage(stage, flight, node), stage) for stage in ("raw", "track"))
     raw = raw.assign(time=("pulse", campaign.clock(flight, node).utc(raw.time.values)))
     files = Path("raw") / flight / node
-    recording, log = (_read_from(stage, files) for stage in (raw, track))
+    recording, log = (_own_sources(stage, files) for stage in (raw, track))
     path = campaign.root.named(raw.attrs["samples"], where=campaign.stage("raw", flight, node))
     captured = Captured.of(raw, path, files, recording, sent)
     name = raw.attrs["samples"]
@@ -190,8 +190,8 @@ def open_acquisition(campaign: Campaign, flight: str, node: str, sent: Transmitt
     return Acquisition(node, campaign.node(flight, node), track, log, wave_m, **own)
 
 
-def _read_from(stage: xr.Dataset, files: Path) -> str:
-    """Return the node's own files that a stage was read from, without the preamble."""
+def _own_sources(stage: xr.Dataset, files: Path) -> str:
+    """Return the node's own source files of a stage, without the preamble."""
     own = [name for name in stage.attrs["inputs"] if name.startswith(f"{files.as_posix()}.")]
     return " and ".join(own or stage.attrs["inputs"])  # a collection may give other names
 

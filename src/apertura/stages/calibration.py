@@ -61,7 +61,7 @@ def calibrated(campaign: Campaign, flight: str, pair: str) -> dict[str, Any] | N
     path = campaign.result(requested.flight, "calibration.json")
     document = open_document(path)
     with undamaged(path, expected="what step calibrate writes", remedy=remake(path)):
-        offsets = {name: _taken(offset) for name, offset in document["pairs"].items()}
+        offsets = {name: _validated(offset) for name, offset in document["pairs"].items()}
     if pair not in offsets:
         raise CampaignError(
             f"no offset of pair {pair}",
@@ -72,7 +72,7 @@ def calibrated(campaign: Campaign, flight: str, pair: str) -> dict[str, Any] | N
     return {"flight": requested.flight, **offsets[pair]}
 
 
-def _taken(offset: dict[str, Any]) -> dict[str, Any]:
+def _validated(offset: dict[str, Any]) -> dict[str, Any]:
     """Return the validated values of a pair's report."""
     std_m = offset["std_m"]
     return {

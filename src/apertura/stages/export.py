@@ -23,6 +23,7 @@ from apertura.common.errors import number_of
 from apertura.common.flags import Flags
 from apertura.common.provenance import Provenance, chained_sha256
 from apertura.common.raster import opened_raster
+from apertura.common.units import decibels
 from apertura.core.combination import InPhase, in_phase
 from apertura.core.quality.budget import NO_EFFECT, BudgetLine
 from apertura.core.quality.focus import DEFOCUSED_DB, focus_with_flags, verdict_of_loss
@@ -248,7 +249,7 @@ def _measures(
         "gain": {
             "best_pair": best,
             "over_best_pair_db": round(floors[best] - top.noise_floor_db, 2),
-            "allowed_db": round(10 * float(np.log10(len(floors))), 2),
+            "allowed_db": round(decibels(len(floors)), 2),
         },
         "brightest": {
             "x_m": round(x, 4),

@@ -100,7 +100,7 @@ def open_two(campaign: Campaign, name: str, scene: OpenScene) -> TwoImages:
     first, second = ("/".join(image) for image in images)
     stages = [open_stage(campaign.stage("image", *image), "image") for image in images]
     sensed = sensed_heights(scene, looks[0], legs, bands[0])
-    visible = np.logical_and(*(_plain(campaign, *image) for image in images))
+    visible = np.logical_and(*(_visible_pixels(campaign, *image) for image in images))
     height_m = np.broadcast_to(np.asarray(scene.terrain.heights(scene.grid), np.float64), scene.grid.shape)
     shift_px = np.stack([-sensed.shift[..., 1], sensed.shift[..., 0]], axis=-1) / scene.grid.spacing_m
     points = [point.model_dump() for point in campaign.settings.scene.reference_points]
@@ -191,7 +191,7 @@ def sensed_heights(
     return Sensitivity(**{name: between(name) for name in ("slope", "bend", "shift", "overlap", "range_m")})
 
 
-def _plain(campaign: Campaign, flight: str, pair: str) -> NDArray[np.bool_]:
+def _visible_pixels(campaign: Campaign, flight: str, pair: str) -> NDArray[np.bool_]:
     """Return the pixels visible to a pair, without shadow or layover."""
     with opened_layer(campaign, flight, pair, "mask.tif") as raster:
         visible: NDArray[np.bool_] = raster.read(1) == 0

@@ -23,6 +23,7 @@ from apertura.common.contracts import Window
 from apertura.common.flags import Flags
 from apertura.common.provenance import Provenance
 from apertura.common.raster import opened_raster
+from apertura.common.units import decibels
 from apertura.core.imaging.multilook import Multilook
 from apertura.core.imaging.noise import PulseNoise, noise_places, noise_power
 from apertura.core.imaging.radiometry import Quantity
@@ -283,7 +284,7 @@ def _report(scene: OpenScene, image: xr.Dataset, calibrated: CalibratedPair, noi
     noise_report, noise_flags = calibrated.noise_report(noise, bound="pulses_sparse" in image.attrs["flags"])
     return {
         "calibrated_by": calibrated.calibrated_by,
-        "constant_db": round(10 * float(np.log10(constant)), 3),
+        "constant_db": round(decibels(constant), 3),
         "std_db": calibrated.std_db,
         "pointing_std_db": round(calibrated.pointing_std_db, 3),
         "flags": Flags.merged(calibrated.flags, noise_flags),

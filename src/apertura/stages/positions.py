@@ -198,7 +198,11 @@ def _flags(node: NodeLog, at: Times, barred: dict[str, NDArray[np.bool_]]) -> di
         faults = [fault for fault in checked.faults.get(name, ()) if begin <= fault[0] <= end]
         if not (out or faults):
             continue
-        worst = f"; {len(faults)} found, worst {_worst(node, faults)}" if faults else ""
+        worst = ""
+        if faults:
+            time_s, size_m = faults[0]
+            size = f"{size_m:.3f} m " if size_m else ""
+            worst = f"; {len(faults)} found, worst {size}at {node.log_time(time_s)}"
         longest = _longest(node, checked, name) if out else ""
         reason = what.format(poorest_fix=node.settings.poorest_fix)
         lines[name] = f"{node.name}: {out} of {len(at)} pulses left out: {reason}{longest}{worst}"
@@ -220,11 +224,6 @@ def _flags(node: NodeLog, at: Times, barred: dict[str, NDArray[np.bool_]]) -> di
     if node.yaw_fault is not None:
         lines["attitude_suspect"] = f"{node.name}: {node.yaw_fault.line}"
     return lines
-
-
-def _worst(node: NodeLog, faults: list[tuple[float, float]]) -> str:
-    time_s, size_m = faults[0]
-    return f"{size_m:.3f} m at {node.log_time(time_s)}" if size_m else f"at {node.log_time(time_s)}"
 
 
 def _longest(node: NodeLog, checked: CheckedTrack, cause: str) -> str:

@@ -17,6 +17,7 @@ from apertura.common.documents import read_json, validated
 from apertura.common.errors import CampaignError
 from apertura.common.flags import Flags
 from apertura.common.provenance import sha256_file
+from apertura.common.units import decibels
 from apertura.core.antenna.beam import Beams
 from apertura.core.echo.compression import centre_frequency
 from apertura.core.imaging.noise import PulseNoise, noise_places, sidelink_noise
@@ -210,7 +211,7 @@ _MOST_POINTS = 50  # whose cross-section is stated, the brightest
 POINTS_LISTED = {
     "most": _MOST_POINTS,
     "below_brightest_db": DEEPEST_DB,
-    "above_surroundings_db": round(-10 * float(np.log10(SPECKLE)), 1),
+    "above_surroundings_db": round(-decibels(SPECKLE), 1),
 }
 """Limits of the list of points in radiometry.json: a weaker target has no cross-section there."""
 
@@ -354,7 +355,7 @@ class CalibratedPair:
         report |= {"sidelink": self.sidelink_noise or None}
         differences = list[tuple[str, float, float]]()
         if self.thermal_noise and own > 0:  # NaN is not
-            figure_db = 10 * float(np.log10(own / self.thermal_noise))
+            figure_db = decibels(own / self.thermal_noise)
             of_own_db = np.hypot(pulse_noise.std_db * pulse_noise.power, _SIDELINK_STD_DB * self.sidelink_noise) / own
             report |= {"noise_figure_measured_db": round(figure_db, 2), "std_db": round(float(of_own_db), 2)}
             radio_db = _UNSTATED_STD_DB if self.radio_std_db is None else self.radio_std_db
@@ -365,7 +366,7 @@ class CalibratedPair:
                 differences.append(("a receiver of 0 dB", figure_db, std_db))
         if self.noise_before and pulse_noise.power > 0 and not self.sidelink_noise:
             std_db = float(np.hypot(2**0.5 * pulse_noise.std_db, _FIGURE_STD_DB))
-            since_db = 10 * float(np.log10(pulse_noise.power / self.noise_before))
+            since_db = decibels(pulse_noise.power / self.noise_before)
             differences.append(("that over the reflectors, of another gain?", since_db, std_db))
         lines = [
             f"the noise measured is {by_db:+.1f} dB of {than}, ± {std_db:.1f} dB"
@@ -481,7 +482,7 @@ def _turns(campaign: Campaign, opened: OpenPair, scene: OpenScene) -> list[Turn]
 
 def _disagreement(found: PairConstant, stated: float, std_db: float | None) -> dict[str, str]:
     """Return the flag of a constant that was measured and is not what the config's radio says."""
-    difference_db = 10 * float(np.log10(stated)) - found.constant_db
+    difference_db = decibels(stated) - found.constant_db
     both_db = float(np.hypot(found.std_db, std_db or 0.0))
     if std_db is None or abs(difference_db) <= DRIFT_SIGMAS * both_db:
         return {}

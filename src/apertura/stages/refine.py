@@ -14,6 +14,7 @@ from apertura.campaign.store import open_stage, save_stage
 from apertura.common.arrays import Floats, Times
 from apertura.common.flags import Flags
 from apertura.common.provenance import merged
+from apertura.common.units import seconds_since
 from apertura.core.backprojection.inputs import Profiles
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.geodesy import frame_from_map
@@ -154,7 +155,7 @@ class RefinedTrack:
             return cls(stage, None, np.datetime64(0, "ns"))
         moved_m = dict(zip(nodes, stage.correction.values, strict=True))
         extra_path_m = dict(zip(stage.attrs["pairs"], stage.further.values, strict=True))
-        return cls(stage, TrackCorrection(_seconds(time - time[0]), moved_m, extra_path_m), time[0])
+        return cls(stage, TrackCorrection(seconds_since(time, time[0]), moved_m, extra_path_m), time[0])
 
     @property
     def decisions(self) -> tuple[Decision, ...]:
@@ -203,7 +204,7 @@ class RefinedTrack:
         """
         if self.correction is None:
             return np.zeros((len(at), 3))
-        return self.correction.at(node, _seconds(at - self.began))
+        return self.correction.at(node, seconds_since(at, self.began))
 
     def left_m(self, node: str, at: Times) -> NDArray[np.float64]:
         """Return the standard deviation of what the refinement leaves of a node's error, along the axes of the frame.
@@ -217,7 +218,7 @@ class RefinedTrack:
         left_m, nodes = np.full((len(at), 3), np.nan), self.stage.attrs["nodes"]
         if self.correction is None or self.correction.extra_path_m or node not in nodes:
             return left_m
-        knots_s, at_s = self.correction.time_s, _seconds(at - self.began)
+        knots_s, at_s = self.correction.time_s, seconds_since(at, self.began)
         inside = (at_s >= knots_s[0]) & (at_s <= knots_s[-1])
         std_m = self.stage["std"].values[nodes.index(node)]
         left_m[inside] = np.stack([np.interp(at_s[inside], knots_s, axis) for axis in std_m.T], axis=-1)
@@ -250,7 +251,7 @@ def expected_track(
 
 def clock_s(pair: OpenPair, began: np.datetime64) -> NDArray[np.float64]:
     """Return the times of a pair's pulses, (pulse,) float64 seconds from an instant."""
-    return pair.time_s + float(_seconds(pair.began - began))
+    return pair.time_s + float((pair.began - began) / np.timedelta64(1, "s"))
 
 
 def _sizes_cm(correction: TrackCorrection, pair: str) -> dict[str, Any]:
@@ -263,10 +264,6 @@ def _sizes_cm(correction: TrackCorrection, pair: str) -> dict[str, Any]:
 
 def _rms_cm(moved_m: NDArray[np.float64]) -> float:
     return round(100 * float(np.sqrt((moved_m**2).sum(axis=-1).mean())), 2)
-
-
-def _seconds(span: Any) -> Any:
-    return span / np.timedelta64(1, "s")
 
 
 # ---- Inputs of a refinement of tracks from an open flight: profiles of each pair, errors of the logs ---------------

@@ -306,7 +306,10 @@ def settled(campaign: Campaign, flown: Callable[[], Flown]) -> tuple[SceneGrid, 
     ground = ConfiguredGround.of(requested, campaign.height_files(), crs=crs)
     height_m = None
     if bounds == "auto":
-        bounds, height_m = _bounds(flown(), ground)
+        first = flown()
+        east, north = map_from_frame(crs, _middle(first))[:2]
+        height_m = ground.height_at(float(east), float(north))  # under the track
+        bounds = auto_bounds(first.aperture, crs=crs, height_m=height_m, path_limit_m=first.path_limit_m)
         chosen["bounds_m"] = "ground that the first image flight illuminates well (docs/theory.md, eq. 8)"
     if spacing == "auto":
         finest = _spacing(flown(), ground, bounds, height_m)
@@ -325,14 +328,6 @@ def settled(campaign: Campaign, flown: Callable[[], Flown]) -> tuple[SceneGrid, 
         bounds = (xmin, ymax - rows * spacing, xmin + columns * spacing, ymax)
     grid = SceneGrid.from_bounds(crs, bounds, spacing_m=spacing, name=campaign.settings.campaign)
     return grid, ground, chosen | ground.reason
-
-
-def _bounds(flown: Flown, ground: ConfiguredGround) -> tuple[Bounds, float]:
-    """Return automatic bounds and the height (m) of the ground under the track that they start from."""
-    east, north = map_from_frame(ground.crs, _middle(flown))[:2]
-    height_m = ground.height_at(float(east), float(north))
-    limit_m = flown.path_limit_m
-    return auto_bounds(flown.aperture, crs=ground.crs, height_m=height_m, path_limit_m=limit_m), height_m
 
 
 def _spacing(flown: Flown, ground: ConfiguredGround, bounds: Bounds, height_m: float | None) -> float:

@@ -138,11 +138,20 @@ class _Described:
         report, remedy = open_listed(path, manifest), f"Delete {manifest} and run the workflow again."
         code = read_manifest(manifest).get("code", "unknown")
         with undamaged(path, expected="the report of an image", remedy=remedy):
-            verdict = str(report["focus"]["verdict"])
+            verdict, facts = str(report["focus"]["verdict"]), dict[str, Any]()
+            if verdict == "focused":  # widths at -3 dB of the brightest point
+                brightest = report.get("brightest") or {}
+                for axis, width in (("range", "ground_range_width_m"), ("azimuth", "cross_range_width_m")):
+                    if brightest.get(width) is not None:
+                        facts[f"sar:resolution_{axis}"] = float(brightest[width])
+            if "view" in report:  # direction in which the pair looks at the middle of the scene
+                view = report["view"]
+                directions = {"sar:observation_direction": view["side"], "view:azimuth": view["look_deg"]}
+                facts |= {name: value for name, value in directions.items() if value not in {"both", None}}
+                facts["view:incidence_angle"] = float(view["incidence_deg"])
             return {
                 **self._shared,
-                **(_resolution(report.get("brightest") or {}) if verdict == "focused" else {}),
-                **(_view(report["view"]) if "view" in report else {}),
+                **facts,
                 "processing:lineage": f"apertura step export {flight} {name}; code {code}; lock {self._lock}",
                 "apertura:verdict": verdict,
                 "apertura:flags": sorted(report["flags"]),
@@ -179,16 +188,3 @@ class _Described:
         bandwidth_hz = span_hz * frequency.size / max(frequency.size - 1, 1)
         ends = instant(int(times.min())), instant(int(times.max()))
         return AcquisitionTime(*ends, centre_frequency(frequency), bandwidth_hz)
-
-
-def _resolution(brightest: Mapping[str, Any]) -> dict[str, float]:
-    """Return the widths at -3 dB of an image's brightest point, as they were measured."""
-    widths = {"range": brightest.get("ground_range_width_m"), "azimuth": brightest.get("cross_range_width_m")}
-    return {f"sar:resolution_{axis}": float(width) for axis, width in widths.items() if width is not None}
-
-
-def _view(view: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the direction in which a pair looks at the middle of the scene."""
-    directions = {"sar:observation_direction": view["side"], "view:azimuth": view["look_deg"]}
-    known = {name: value for name, value in directions.items() if value not in {"both", None}}
-    return known | {"view:incidence_angle": float(view["incidence_deg"])}

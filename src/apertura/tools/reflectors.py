@@ -20,6 +20,7 @@ from apertura.common.atomic import write_json
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
 from apertura.common.flags import Flags
+from apertura.common.units import decibels
 from apertura.core.antenna.beam import Beams
 from apertura.core.echo.compression import centre_frequency
 from apertura.core.geometry.aperture import Aperture
@@ -132,7 +133,7 @@ def measured_constants(campaign: Campaign) -> tuple[Constants, list[str]]:
         raise CampaignError(
             f"no reflector is of use in any image ({'; '.join(left_out[:3])})",
             where=campaign.root,
-            expected=f"a peak {10 * np.log10(LEAST_CONTRAST):.0f} dB above what lies around it, within "
+            expected=f"a peak {decibels(LEAST_CONTRAST):.0f} dB above what lies around it, within "
             f"{REACH_CELLS:g} resolution cells of its place",
             remedy="Check scene.reflectors, or fly closer to them.",
         )
@@ -208,10 +209,10 @@ class _View:
         off_m = float(np.hypot(peak.row - row, peak.column - column)) * grid.spacing_m
         inverse = max(float(noise[0]) * self.pulse_noise / peak.amplitude**2, peak.background)
         if inverse * LEAST_CONTRAST > 1 or off_m > (reach + 1) * grid.spacing_m:
-            return f"no peak of its own ({-10 * np.log10(inverse):.1f} dB above what lies around it)"
+            return f"no peak of its own ({-decibels(inverse):.1f} dB above what lies around it)"
         power = peak.amplitude**2 - float(noise[0]) * self.pulse_noise
         amplitude = abs(self._response(pulses, path_m, part, row, column))
-        constant_db = 10 * float(np.log10(power / (rcs_m2 * amplitude**2)))
+        constant_db = decibels(power / (rcs_m2 * amplitude**2))
         numerical = 10 ** (quality["numerical_error_db"] / 20)
         lost_db = abs(float(quality["focus"].get("loss_db", 0.0)))
         scatter_db = float(np.hypot(_DB * np.hypot(np.sqrt(2 * inverse + inverse**2), 2 * numerical), lost_db))
@@ -223,10 +224,10 @@ class _View:
             "reflector": stated.name,
             "constant_db": round(constant_db, 3),
             "scatter_db": round(scatter_db, 3),
-            "rcs_dbsm": round(10 * float(np.log10(rcs_m2)), 3),
+            "rcs_dbsm": round(decibels(rcs_m2), 3),
             "rcs_std_db": round(common_db, 3),
             "antennas_apart_deg": round(bistatic_deg, 2),
-            "contrast_db": round(-10 * float(np.log10(inverse)), 1),
+            "contrast_db": round(-decibels(inverse), 1),
             "off_m": round(off_m, 4),
             "phase_rad": round(phase, 4),
         }

@@ -161,9 +161,10 @@ def sentences(name: str, report: Report) -> Iterator[str]:
     yield certificate(report)
     agreement = report.get("agreement")
     if agreement and report.get("reference") != report.get("pair"):
+        shift_m = float((agreement["shift_east_m"] ** 2 + agreement["shift_north_m"] ** 2) ** 0.5)
         yield (
             f"Against {report['reference']}, {agreement['points']:.0f} {agreement['by']} lie "
-            f"{100 * _length(agreement):.1f} cm apart and "
+            f"{100 * shift_m:.1f} cm apart and "
             f"{_signed(agreement['phase_rad'], 3)} ± {agreement['phase_std_rad']:.3f} rad out of phase."
         )
     coherence = report.get("coherence") or {}
@@ -190,10 +191,6 @@ def _cut_sentence(brightest: Mapping[str, Any]) -> str:
             lobe = "" if pslr is None else f", its highest sidelobe {_signed(pslr, 1)} dB"
             parts.append(f"{100 * width:.1f} cm wide {words}{lobe}")
     return f"Its brightest target is {' and '.join(parts) or 'wider than its cuts'}."
-
-
-def _length(agreement: Mapping[str, float]) -> float:
-    return float((agreement["shift_east_m"] ** 2 + agreement["shift_north_m"] ** 2) ** 0.5)
 
 
 def certificate(report: Report) -> str:

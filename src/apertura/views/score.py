@@ -14,6 +14,7 @@ from apertura.campaign.store import open_listed, open_stage
 from apertura.common.documents import read_json, undamaged
 from apertura.common.errors import CampaignError
 from apertura.common.raster import opened_raster
+from apertura.common.units import decibels
 from apertura.core.quality.bright_points import BrightPoint, bright_point, brightest_near
 from apertura.core.quality.point_targets import cut_through, find_peak
 from apertura.formats.export import product, product_files
@@ -118,7 +119,7 @@ def _cross_sections(
         if calibrated is None:
             return {}
         (one,) = calibrated.points([point], scene, np.nan if noise is None else float(noise))
-        put = None if not put_m2 else 10 * float(np.log10(put_m2))
+        put = None if not put_m2 else decibels(put_m2)
         return {"rcs_dbsm": one["rcs_dbsm"], "rcs_std_db": one["std_db"], "rcs_put_dbsm": put}
 
     return found

@@ -12,7 +12,7 @@ from apertura.campaign.folder import Campaign
 from apertura.common.arrays import Complexes, Floats
 from apertura.common.errors import CampaignError
 from apertura.common.flags import Flags
-from apertura.common.units import seconds_since
+from apertura.common.units import decibels, seconds_since
 from apertura.core.echo.captures import (
     SATURATED_SHARE,
     Pulses,
@@ -252,7 +252,7 @@ class Bench:
             "link_incoherent",
             "phase_unstable",
         )
-        yield line(pair, "SNR of a compressed pulse", f"{10 * np.log10(link.snr):.1f} dB", f"{WEAK_DB:g} dB",
+        yield line(pair, "SNR of a compressed pulse", f"{decibels(link.snr):.1f} dB", f"{WEAK_DB:g} dB",
                    "link_weak", "code_unconfirmed", "wrong_code", "spectrum_inverted")  # fmt: skip
         yield line(
             pair,
@@ -337,7 +337,7 @@ def _link_report(node: BenchNode, interval_s: float) -> dict[str, Any]:
         "coherence_limit": round(link.coherence_limit, 9),
         "coherence_std": round(link.coherence_std, 9),
         "coherence_before": node.coherence_before,
-        "snr_db": round(10 * np.log10(link.snr), 2),
+        "snr_db": round(decibels(link.snr), 2),
         "phase_excess_rad": round(link.phase_excess_rad, 5),
         "phase_drift_rad": [round(value, 5) for value in drift],
         "delay_drift_ps": [round(value, 3) for value in moved],

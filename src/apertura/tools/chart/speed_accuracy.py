@@ -97,9 +97,15 @@ def speed_accuracy(campaign: Campaign, flight: str, pair: str, *, seconds: float
     job = job_of(campaign, opened, scene)
     plan, search = plan_job(campaign, job, accuracy_db=accuracy_db), SettingSearch(job)
     part = _part(history, profiles[block], scene, plan, total_pixels=job.pixels, beams=beams)
+    settings = [  # cheapest first: of every engine but the reference, which is timed once
+        setting
+        for setting in search.settings(len(job.aperture))
+        if not _is_reference(setting)
+        and setting.form_options.get("tolerance_rad", _TOLERANCES_RAD[0]) in _TOLERANCES_RAD
+    ]
     points = [
         replace(point, predicted_seconds=point.predicted_seconds - search.tile_seconds)
-        for point in measure(part, plan, _settings(search), seconds=seconds)
+        for point in measure(part, plan, settings, seconds=seconds)
     ]
     some = "" if len(history) == len(opened.time_s) else f"the middle {len(history)} of "
     size = f"{scene.grid.shape[0]} × {scene.grid.shape[1]} pixels, {some}{len(opened.time_s)} pulses"
@@ -142,16 +148,6 @@ def _part(
     return Part(history, profiles, pixels, picked, density, exact, total_pixels, perf_counter() - begin, beams)
 
 
-def _settings(search: SettingSearch) -> list[Setting]:
-    """Return the settings to measure, cheapest first: of every engine but the reference, which is timed once."""
-    return [
-        setting
-        for setting in search.settings(len(search.job.aperture))
-        if not _is_reference(setting)
-        and setting.form_options.get("tolerance_rad", _TOLERANCES_RAD[0]) in _TOLERANCES_RAD
-    ]
-
-
 def _is_reference(setting: Setting) -> bool:
     return cast("object", load_engine(setting.engine)) is reference
 
@@ -159,7 +155,9 @@ def _is_reference(setting: Setting) -> bool:
 def measure(part: Part, plan: Plan, settings: Sequence[Setting], *, seconds: float) -> list[Point]:
     """Measure time and error of the plan, the reference and as many settings as time allows, fastest first."""
     begin = perf_counter()
-    points = [_reference_point(part, plan)]
+    exact = plan.fallbacks[-1] if plan.fallbacks else plan.setting
+    taken_s = part.reference_seconds * part.total_pixels / len(part.picked)
+    points = [replace(_point(part, exact, taken_s, None, None), planned=_is_reference(plan.setting))]
     if not _is_reference(plan.setting):
         points.append(_measured(part, plan.setting, plan))
     unplanned = [s for s in settings if plan.presum is not None or s.line != plan.setting.line]
@@ -185,12 +183,6 @@ def _measured(part: Part, setting: Setting, plan: Plan | None) -> Point:
     power = float((np.abs(image[:LEAST_ROWS]) ** 2).sum())
     error = error_bound(image[tuple(part.picked.T)], part.exact, part.density, power=power)
     return _point(part, setting, tables_s + form_s * part.total_pixels / pixels[..., 0].size, error.bound_db, plan)
-
-
-def _reference_point(part: Part, plan: Plan) -> Point:
-    setting = plan.fallbacks[-1] if plan.fallbacks else plan.setting
-    taken = part.reference_seconds * part.total_pixels / len(part.picked)
-    return replace(_point(part, setting, taken, None, None), planned=_is_reference(plan.setting))
 
 
 def _point(part: Part, setting: Setting, taken: float, error_db: float | None, plan: Plan | None) -> Point:

@@ -22,6 +22,7 @@ from apertura.common.atomic import remove
 from apertura.common.confined import ConfinedPath
 from apertura.common.errors import CampaignError
 from apertura.common.tables import write_table
+from apertura.common.units import decibels
 from apertura.core.quality.budget import is_counted
 from apertura.stages import assess, calibration, cube, echo, export, image, ingest, profile, refine, scene
 from apertura.tools.chart.pareto import save_png
@@ -81,7 +82,7 @@ def spread_db(loss_db: float) -> float:
     >>> round(spread_db(-1.0), 1), spread_db(0.0)
     (-6.9, -110.0)
     """
-    return float(10 * np.log10(max(1 - 10 ** (min(loss_db, 0.0) / 10), 10 ** (_FLOOR_DB / 10))))
+    return decibels(max(1 - 10 ** (min(loss_db, 0.0) / 10), 10 ** (_FLOOR_DB / 10)))
 
 
 def draw_whole(rows: Sequence[Whole], path: Path, *, title: str, refused: Collection[str]) -> None:

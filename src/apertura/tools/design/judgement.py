@@ -10,6 +10,7 @@ import numpy as np
 
 from apertura.campaign.config import OfdmWaveform
 from apertura.common.errors import CampaignError
+from apertura.common.units import decibels
 from apertura.core.quality.budget import RECEIVER_STD_M
 from apertura.formats.export.layers import LAYOVER, OUTSIDE, SHADOW
 from apertura.methods.autofocus.expected import LEAST_POINTS, LEAST_SNR_DB
@@ -72,7 +73,7 @@ class Verdict:
         sign = -1 if self.requirement in _LEAST else 1
         if self.requirement in _IN_DB:
             return sign * (self.found - self.required)
-        return sign * 10 * float(np.log10(max(self.found, 1e-9) / self.required))
+        return sign * decibels(max(self.found, 1e-9) / self.required)
 
     @property
     def met(self) -> bool:

@@ -141,7 +141,9 @@ def planned_image(
     job, integration, beams = planned_job(campaign, pair, scene)
     flags = Flags.merged(check_geometry(job), decide_antennas(job.beams, job.illumination)[1], integration.flags)
     calibrated = calibrated_pair(campaign, pair, scene, weights=(beams, integration.count), threads=threads)
-    noise = _noise(calibrated)
+    noise = float("nan")  # of a pulse by the receiver's noise figure, where it is stated
+    if calibrated is not None and calibrated.thermal_noise is not None and calibrated.noise_figure_db is not None:
+        noise = calibrated.thermal_noise * 10 ** (calibrated.noise_figure_db / 10)
     looks = Looks.of(grid, scene.terrain, pair.aperture, beams, threads=threads)
     layers = {
         name: lazy[slice(0, grid.shape[0]), slice(0, grid.shape[1])]
@@ -267,13 +269,6 @@ def planned_job(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> tuple[J
         illumination=scene_illumination(campaign, pair.name, beams, scene, pair.aperture),
     )
     return job, integration, beams
-
-
-def _noise(calibrated: CalibratedPair | None) -> float:
-    """Return the noise of a pulse by the receiver's noise figure; NaN where it is not stated."""
-    if calibrated is None or calibrated.thermal_noise is None or calibrated.noise_figure_db is None:
-        return float("nan")
-    return calibrated.thermal_noise * 10 ** (calibrated.noise_figure_db / 10)
 
 
 def _point_snr(calibrated: CalibratedPair | None, noise: float, rcs_dbsm: float, shape: tuple[int, int]) -> Layer:

@@ -432,16 +432,11 @@ def print_comparison(path: Path, folder: Path, *, threads: int = 1) -> None:
     console.print(_table("Planned and flown; measured resolution: widths of the brightest point", head, rows))
     for line in outdated_lines(campaign):
         console.print(line, highlight=False)
-    for line in _other_radar(plan, campaign):
-        console.print(f"[yellow]another radar[/yellow]: {line}", highlight=False)
-
-
-def _other_radar(plan: FlightPlan, campaign: Campaign) -> Iterator[str]:
-    """Yield numbers of the waveform in which a campaign is not what was planned."""
     planned, flown = (one.model_dump() for one in (plan.waveform, campaign.settings.waveform))
     for key, value in planned.items():
         if isinstance(value, int | float) and flown.get(key) != value:
-            yield f"waveform.{key}: {_value(value)} planned, {_value(flown.get(key)) or 'none'} in the campaign"
+            line = f"waveform.{key}: {_value(value)} planned, {_value(flown.get(key)) or 'none'} in the campaign"
+            console.print(f"[yellow]another radar[/yellow]: {line}", highlight=False)
 
 
 def comparison_rows(plan: FlightPlan, root: Path, campaign: Campaign, *, threads: int = 1) -> list[tuple[str, ...]]:

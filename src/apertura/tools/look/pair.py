@@ -12,6 +12,7 @@ from apertura.campaign.folder import Campaign
 from apertura.common.arrays import Times
 from apertura.common.errors import CampaignError
 from apertura.common.flags import Flags
+from apertura.common.units import seconds_since
 from apertura.core.antenna.beam import Beams
 from apertura.core.backprojection.contributions import band_limited_image
 from apertura.core.backprojection.inputs import PhaseHistory, Profiles
@@ -275,7 +276,7 @@ class ImageSoFar:
             return {"verdict": "cannot tell", "why": f"no aperture yet: cells of {cell_m:.2g} m", "flags": {}}
         stated = [self._campaign.settings.nodes[node].position_std_m for node in self._pair.split("-")]
         std_m = None if None in stated else max(float(np.max(cast("Any", one))) for one in stated)
-        seconds = (at - at[0]) / np.timedelta64(1, "s")
+        seconds = seconds_since(at, at[0])
         error_db = float(self.error_db) if np.isfinite(self.error_db) else None
         lines = budget_by_hand(formation, error_db=error_db, position_std_m=std_m, time_s=seconds)
         judged = judgement(formation, self.image, lines)

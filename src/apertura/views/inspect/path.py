@@ -173,33 +173,24 @@ def _readers(path: Path, beside: Surroundings) -> Iterator[tuple[str, str, Reade
     if stated in PHASE_HISTORIES and path.name.endswith(PHASE_HISTORIES[stated].suffix):
         yield "phase history", stated, partial(_history, path, stated, beside)
         return  # the campaign reads it as that, whichever other reader knows the file
+    from apertura.views.inspect.files import ARRAY, DEM, array_report, dem_report, log_report, recording_report
+
     if "format" not in beside.typed:
-        yield from _of_recorders(path, beside)
+        for row in RECORDERS:
+            suffix = next((suffix for suffix in row if path.name.endswith(suffix)), None)
+            if suffix is not None:
+                files = recording_files(path.parent, path.name.removesuffix(suffix))
+                yield "recording", row[0].lstrip("."), partial(recording_report, files, beside)
+        for name, history in PHASE_HISTORIES.items():
+            if path.name.endswith(history.suffix):
+                yield "phase history", name, partial(_history, path, name, beside)
     if path.is_file() and (".track." in path.name or beside.options.format is None or "format" in beside.typed):
         with suppress(CampaignError):  # none that is known
-            yield "flight log", log_format(path, beside.options), partial(_log, path, beside)
-    from apertura.views.inspect.files import ARRAY, DEM, array_report, dem_report
-
+            yield "flight log", log_format(path, beside.options), partial(log_report, path, beside)
     if path.suffix.lower() in DEM:
         yield "elevation model", "", partial(dem_report, path)
     if path.suffix in ARRAY:
         yield "array", "", partial(array_report, path)
-
-
-def _of_recorders(path: Path, beside: Surroundings) -> Iterator[tuple[str, str, Reader]]:
-    for row in RECORDERS:
-        suffix = next((suffix for suffix in row if path.name.endswith(suffix)), None)
-        if suffix is not None:
-            yield "recording", row[0].lstrip("."), partial(_recording, path, path.name.removesuffix(suffix), beside)
-    for name, history in PHASE_HISTORIES.items():
-        if path.name.endswith(history.suffix):
-            yield "phase history", name, partial(_history, path, name, beside)
-
-
-def _recording(path: Path, node: str, beside: Surroundings) -> Report:
-    from apertura.views.inspect.files import recording_report
-
-    return recording_report(recording_files(path.parent, node), beside)
 
 
 def _history(path: Path, name: str, beside: Surroundings) -> Report:
@@ -207,12 +198,6 @@ def _history(path: Path, name: str, beside: Surroundings) -> Report:
 
     files = PHASE_HISTORIES[name].files_of(path)
     return history_report(path if path.is_dir() else files[0], files, name, beside)
-
-
-def _log(path: Path, beside: Surroundings) -> Report:
-    from apertura.views.inspect.files import log_report
-
-    return log_report(path, beside)
 
 
 def _size(path: Path) -> dict[str, int]:

@@ -8,9 +8,10 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import ScalarFormatter
 from numpy.typing import NDArray
 
-from apertura.check.times import LOST_CAPTURE, Span, gaps, interval_s, seconds, utc
+from apertura.check.times import LOST_CAPTURE, Span, gaps, interval_s, utc
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import number_of, shown
+from apertura.common.units import seconds_since
 from apertura.core.geometry.geodesy import geodetic_from_ecef, ned_axes
 from apertura.core.geometry.track_checks import LONG_GAP
 from apertura.formats.tracks.track import FIXES
@@ -44,7 +45,7 @@ def draw_log(track: "xr.Dataset", name: str) -> Figure:
     plan, height = figure.add_subplot(grid[:, 0]), figure.add_subplot(grid[0, 1])
     steps = figure.add_subplot(grid[1, 1], sharex=height)
     position, times, frame = track.position.values, track.time.values, track.attrs["frame"]
-    place, at_s = east_north_up(position, frame, np.median(position, axis=0)), seconds(times)
+    place, at_s = east_north_up(position, frame, np.median(position, axis=0)), seconds_since(times, times[0])
     for label, own in _by_fix(track).items():
         words, colour = f"{label}, {number_of(int(own.sum()), 'epoch')}", _COLOURS[label]
         plan.plot(place[own, 0], place[own, 1], ".", color=colour, label=words, markersize=2.5)

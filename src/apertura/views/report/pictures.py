@@ -196,7 +196,7 @@ class Shown:
         return np.asarray(self.campaign.clock(self.flight, node).utc(raw.time.values)).astype("datetime64[ns]")
 
     def phasors(self) -> dict[str, NDArray[np.complex128]]:
-        """Return the contribution of each pulse at the brightest target: without and with sidelink, and with refined tracks."""
+        """Return the contribution of each pulse at the brightest target: without and with sidelink, refined."""
         logged, echo = profiles_of(self.profile, lazy=True), self.echo
         every = np.arange(len(logged) + 1)
         phasors = block_contributions(logged, self._target_m, edges=every)[0].astype(np.complex128)

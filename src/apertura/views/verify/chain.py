@@ -38,7 +38,7 @@ _LONGEST = 300
 _DIGITS = 12
 _NAMED = 3
 _VERSIONS_NAMED = 4
-_HASH = re.compile("[0-9a-f]{64}")
+HASH = re.compile("[0-9a-f]{64}")
 _FILES = {"missing": "missing", "altered": "changed", "added": "is new"}
 """State of a file of a stage → words."""
 
@@ -110,7 +110,7 @@ class Links:
 
     def exists(self, name: str) -> bool:
         """Test whether a file is there and was read."""
-        return _HASH.fullmatch(self.sha256(name)) is not None
+        return HASH.fullmatch(self.sha256(name)) is not None
 
     def compare(self, recorded: Mapping[str, str], by: str) -> None:
         """Compare files, relative to the campaign folder, with the hashes that `by` has recorded."""
@@ -123,7 +123,7 @@ class Links:
         for one in differences:
             if one.state == "missing":
                 self.of(one.name).add("missing", f"recorded by {by}")
-            elif _HASH.fullmatch(one.present):
+            elif HASH.fullmatch(one.present):
                 self.of(one.name).add("changed", f"{shortened(one.present)}, was {shortened(one.recorded)} for {by}")
             else:
                 self.of(one.name).add("changed", one.present)
@@ -337,13 +337,12 @@ class Chain:
                 spec = _spec(ConfinedPath.at(self.root).named(f"{folder}/image.zarr/zarr.json", where=link.name))
                 image = folder.removeprefix("results/")  # of several, each has its own under its name
                 candidates = stated, stated.get(image), stated.get(image.rpartition("/")[2])
-                if spec is not None and not any(_holds(one, spec) for one in candidates):
+                # a calibrated layer states settings of its own beside those of the image
+                is_stated = isinstance(spec, Mapping) and any(
+                    isinstance(one, Mapping) and {**one, **spec} == one for one in candidates
+                )
+                if spec is not None and not is_stated:
                     link.add("changed", f"APERTURA_RUNSPEC: {folder}/image.zarr was made with other settings")
-
-
-def _holds(stated: object, spec: Any) -> bool:
-    """Test whether settings are among those stated, where a calibrated layer adds its own."""
-    return isinstance(stated, Mapping) and isinstance(spec, Mapping) and {**stated, **spec} == stated
 
 
 def _spec(path: Path) -> Any:

@@ -1,6 +1,5 @@
 """`apertura diff` and `apertura reproduce`: two products compared, and a campaign made again to compare with."""
 
-import re
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
@@ -19,7 +18,7 @@ from apertura.common.processes import holder
 from apertura.common.raster import opened_raster
 from apertura.formats.export.writing import blocks_of
 from apertura.run.driver import run_workflow
-from apertura.views.verify.chain import shortened
+from apertura.views.verify.chain import HASH, shortened
 from apertura.views.verify.products import EXPECTED, REMEDY, SECTIONS, as_product, find_product, picture, sections_of
 from apertura.workflow.lineage import on_demand, results_of, with_inputs
 
@@ -28,7 +27,6 @@ Pixels = NDArray[Any]
 _LINES = 20
 _VALUE = 60
 _READ_BYTES = 1 << 20
-_HASH = re.compile("[0-9a-f]{64}")
 
 
 @dataclass
@@ -176,7 +174,7 @@ def differences(first: Path, second: Path) -> dict[str, list[str]]:
 def _cut(text: str | None) -> str:
     if text is None:
         return "absent"
-    return shown(shortened(text) if _HASH.fullmatch(text) else text, _VALUE)
+    return shown(shortened(text) if HASH.fullmatch(text) else text, _VALUE)
 
 
 def first_difference(first: Path, second: Path) -> int | None:
@@ -290,19 +288,16 @@ def difference_lines(tally: Tally, *, unit: str = "1", power: bool = False) -> I
     if not tally.differing:
         return
     if tally.compared and tally.largest:
-        largest, rms = (_level(one, tally, unit, power=power) for one in (tally.largest, tally.rms))
+        largest, rms = (f"{value:.3g} {unit}" for value in (tally.largest, tally.rms))
+        if unit == "1":
+            levels = ((10 if power else 20) * np.log10(value / tally.peak) for value in (tally.largest, tally.rms))
+            largest, rms = (f"{level:.1f} dB" for level in levels)
         of = " of the peak" if unit == "1" else ""
         kind = "coherence" if tally.phased else "correlation"
         count = tally.compared + sum(tally.only)
         yield f"{tally.differing} of {count} differ, by {largest}{of} at most, {rms} rms; {kind} {tally.alike:.6f}"
     if any(tally.only):
         yield f"{tally.only[0]} values are in the first alone, {tally.only[1]} in the second alone"
-
-
-def _level(value: float, tally: Tally, unit: str, *, power: bool) -> str:
-    if unit != "1":
-        return f"{value:.3g} {unit}"
-    return f"{(10 if power else 20) * np.log10(value / tally.peak):.1f} dB"
 
 
 def print_differences(first: Path, second: Path, *, whole: bool = False) -> int:
