@@ -303,7 +303,7 @@ class Campaign(RawFolder):
 
     def is_current(self, result: ConfinedPath) -> bool:
         """Test whether a stage or document is finished and not `outdated`."""
-        from apertura.campaign.store.manifest import manifest_of  # whoever asks has the store's arrays loaded
+        from apertura.campaign.store.manifest import manifest_of  # callers have the store's arrays loaded
 
         manifest = manifest_of(result)
         return manifest.is_file() and self.relative(manifest) not in self.outdated

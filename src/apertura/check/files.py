@@ -67,14 +67,14 @@ def check_files(examined: "Examination") -> Iterator[CampaignError]:
 def _wanted(campaign: Campaign) -> Callable[[str], str | None]:
     """Return a function of a recording's file that is not there: the result that a run would make of it.
 
-    Empty where it would make none, None where nothing was made of it or nobody knows.
+    Empty where it would make none, None where nothing was made of it or this is unknown.
     """
 
     @cache
     def files() -> tuple[dict[str, str], list[str]] | None:
         try:
             return wanted_files(campaign), absent_files(campaign)
-        except CampaignError:  # for other checks to tell
+        except CampaignError:  # other checks report it
             return None
 
     def wanted(name: str) -> str | None:
@@ -314,7 +314,7 @@ def _made(examined: Examination, stage: str, *where: str) -> bool:
 
 
 def check_scheduler(examined: Examination) -> Iterable[CampaignError]:
-    """Raise for a scheduler that whoever runs this has not named."""
+    """Raise for a scheduler that the user has not named."""
     scheduler = examined.campaign.settings.processing.scheduler
     if scheduler != "threads":
         from apertura.core.backprojection.tiles import check_named

@@ -94,11 +94,13 @@ def check_distance(examined: Examination) -> Iterator[CampaignError]:
             f"no echo travels less than {_length(path_m)}",
             where=f"{CONFIG}: scene",
             expected=f"a total path of at most {_length(limit_m)}, what waveform.{waveform.delay_key} holds",
-            remedy=_too_high(examined, distance_m) or likely_place(examined) or _CHECK.format(key=waveform.delay_key),
+            remedy=_height_remedy(examined, distance_m)
+            or likely_place(examined)
+            or _CHECK.format(key=waveform.delay_key),
         )
 
 
-def _too_high(examined: Examination, distance_m: float) -> str:
+def _height_remedy(examined: Examination, distance_m: float) -> str:
     """Return the remedy where the height keeps scene and track apart; else ''."""
     if examined.middle_m is None or examined.ground is None or examined.ground.dem:
         return ""
@@ -353,7 +355,7 @@ def check_plan(examined: Examination) -> Iterator[CampaignError]:
         return
     pairs, scene = _opened(examined, problems)
     yield from problems
-    if scene is not None:  # asked of one pair: the config is one for all
+    if scene is not None:  # of one pair: the config is one for all
         job, accuracy = job_of(campaign, pairs[0], scene), accuracy_of(campaign, pairs[0], scene)
         plan_job(campaign, job, accuracy_db=float(accuracy.value))
 

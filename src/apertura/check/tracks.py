@@ -45,7 +45,7 @@ def check_attitude(examined: Examination) -> Iterator[CampaignError]:
 
     campaign = examined.campaign
     for (flight, node), log in examined.logs.items():
-        if campaign.settings.nodes[node].attitude != "log" or not _turned(campaign, flight, node):
+        if campaign.settings.nodes[node].attitude != "log" or not _uses_attitude(campaign, flight, node):
             continue
         fault = yaw_fault_of(examined.tracks[flight, node]) if log.has_attitude else None
         if fault is not None and fault.certain:
@@ -65,7 +65,7 @@ def check_attitude(examined: Examination) -> Iterator[CampaignError]:
             )
 
 
-def _turned(campaign: Campaign, flight: str, node: str) -> bool:
+def _uses_attitude(campaign: Campaign, flight: str, node: str) -> bool:
     """Test whether a node has an antenna in this flight that its attitude moves or turns."""
     arms = campaign.settings.nodes[node].lever_arms_m
     for pair in campaign.flight(flight).pairs:

@@ -42,7 +42,7 @@ def cphd(campaign: Campaign, flight: str, pair: str) -> Path:
             expected="a reference point whose echoes were recorded",
             remedy="Correct scene.bounds_m.",
         )
-    write_cphd(path, collection, _referred(echo, collection))
+    write_cphd(path, collection, _rereferenced(echo, collection))
     record_files(path.with_name("cphd.manifest.json"), [path], lineage)
     return path
 
@@ -92,7 +92,7 @@ def _east_north_up(point_m: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.stack([east, north, -down])
 
 
-def _referred(echo: xr.Dataset, collection: CphdCollection) -> Iterator[NDArray[np.complex64]]:
+def _rereferenced(echo: xr.Dataset, collection: CphdCollection) -> Iterator[NDArray[np.complex64]]:
     """Yield the samples referred to the delay of the reference point instead of that of the stage."""
     extra_delay_s = collection.reference_delay_s - echo.reference_delay.values
     frequency: Any = echo.frequency.values

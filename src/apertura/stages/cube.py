@@ -60,7 +60,7 @@ def labels(images: Images, assessed: Mapping[str, Mapping[str, Any]], sums: Sums
     for place, (flight, one) in enumerate(assessed.items()):
         for pair in pairs:
             if (flight, pair) in images:
-                measures = _quoted(images[flight, pair], one["pairs"][pair])
+                measures = _quoted_values(images[flight, pair], one["pairs"][pair])
                 measures["phase_removed"] = sums[flight]["phases_rad"].get(pair) if flight in sums else None
                 for name, value in measures.items():
                     if value is not None:
@@ -70,7 +70,11 @@ def labels(images: Images, assessed: Mapping[str, Mapping[str, Any]], sums: Sums
         coords={
             "flight": ("flight", np.array([*assessed], _TEXTS)),
             "pair": ("pair", np.array(pairs, _TEXTS)),
-            "time": ("flight", np.array([_middle(images, flight) for flight in assessed]), {"standard_name": "time"}),
+            "time": (
+                "flight",
+                np.array([_middle_time(images, flight) for flight in assessed]),
+                {"standard_name": "time"},
+            ),
             "reference_pair": ("flight", np.array([one["reference"] for one in assessed.values()], _TEXTS)),
             "reference_flight": ("pair", np.array([*reference_flights(images, pairs).values()], _TEXTS)),
         },
@@ -82,14 +86,14 @@ def reference_flights(images: Images, pairs: Sequence[str]) -> dict[str, str]:
     return {pair: next(flight for flight, other in images if other == pair) for pair in pairs}
 
 
-def _middle(images: Images, flight: str) -> Any:
+def _middle_time(images: Images, flight: str) -> Any:
     """Return the middle of the pulses of all pairs of a flight, UTC."""
     views = [image.attrs["quality"]["view"] for (name, _), image in images.items() if name == flight]
     ends = np.array([view[end] for view in views for end in ("first_utc", "last_utc")], "datetime64[ns]")
     return ends.min() + (ends.max() - ends.min()) // 2
 
 
-def _quoted(image: xr.Dataset, assessed: Mapping[str, Any]) -> dict[str, float | str | None]:
+def _quoted_values(image: xr.Dataset, assessed: Mapping[str, Any]) -> dict[str, float | str | None]:
     """Return the quality of an image and its assessment: name of a row of `QUOTED` → value or None."""
     quality = image.attrs["quality"]
     view, focus, pulses = quality["view"], quality["focus"], quality.get("pulses", {})  # a phase history has none
@@ -201,7 +205,7 @@ def write_phase(
                 array[tile] = values[middle]
             return 1 / looks
 
-        shares += [share for share in workers.map(measured, _inside(grid, block, side)) if share is not None]
+        shares += [share for share in workers.map(measured, _subwindows(grid, block, side)) if share is not None]
     looks = 1 / float(np.mean(shares)) if shares else float("nan")
     return looks, chance(looks) if shares else looks
 
@@ -210,7 +214,7 @@ def _spectrum(image: xr.Dataset) -> Any:
     return np.array(image.attrs["quality"]["focus"]["spectrum_cycles2_m2"])
 
 
-def _inside(grid: SceneGrid, block: Window, side: int) -> Iterator[Window]:
+def _subwindows(grid: SceneGrid, block: Window, side: int) -> Iterator[Window]:
     for rows, columns in grid[block].tiles(side):
         top, left = block[0].start, block[1].start
         yield slice(rows.start + top, rows.stop + top), slice(columns.start + left, columns.stop + left)
@@ -251,7 +255,7 @@ def cube(campaign: Campaign, *, threads: int = 1) -> Path:
     grid, side = settled_scene(campaign).grid, campaign.settings.processing.tile_px
     folder, windows = campaign.stage("cube"), list(grid.tiles(side))
     with undamaged(folder, expected="images as this version forms them", remedy="Run the workflow again."):
-        described = _empty(campaign.settings.campaign, images, assessed, sums, grid, windows)
+        described = _empty_cube(campaign.settings.campaign, images, assessed, sums, grid, windows)
     with writing(folder) as wip, ThreadPoolExecutor(threads) as workers:
         empty = stamped(
             described,
@@ -392,7 +396,7 @@ def _between_flights(
     return {"agreement": {"reference": first, "flights": between}, "flags": flags}
 
 
-def _empty(
+def _empty_cube(
     campaign: str,
     images: Images,
     assessed: Mapping[str, Mapping[str, Any]],

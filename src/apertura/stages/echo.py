@@ -154,13 +154,13 @@ def _attributes(
         },
         "flags": Flags.merged(
             pulses.flags,
-            _repeated(rx, pulses, repeats),
+            _repeat_flags(rx, pulses, repeats),
             positions.flags,
             measured.flags,
             missing,
             calibration["flags"] if calibration else {},
         ),
-        "pulses": _counted(len(tx.raw.time), pulses, repeats, positions, measured),
+        "pulses": _pulse_counts(len(tx.raw.time), pulses, repeats, positions, measured),
     }
     if calibration:
         attrs["calibration"] = {name: calibration[name] for name in ("flight", "offset_m", "std_m")}
@@ -183,7 +183,7 @@ def _transfer(
     if tx.name == rx.name:
         read, sent_ns = rx.reader(["radar"], captures), at.astype("datetime64[ns]").astype(np.int64)
         measured = transfer_by_code(read, sent.inverse, rx.numerology, time_s=(sent_ns - sent_ns[0]) * 1e-9)
-        return _of_what_was_sent(measured, sent), np.zeros(len(at))
+        return _with_waveform(measured, sent), np.zeros(len(at))
     length_m = air.electrical_m(tx.antenna("sidelink", at), rx.antenna("sidelink", at))
     measured = transfer_by_sidelink(
         rx.reader(["radar", "sidelink"], captures),
@@ -195,7 +195,7 @@ def _transfer(
         accuracy_db=strictest_accuracy_db(processing.accuracy_db),
         where=str(rx.files),
     )
-    return _of_what_was_sent(measured, sent), length_m[measured.kept]
+    return _with_waveform(measured, sent), length_m[measured.kept]
 
 
 def _sidelink(measured: Transfer) -> dict[str, tuple[str, Any]]:
@@ -213,7 +213,7 @@ def _sidelink(measured: Transfer) -> dict[str, tuple[str, Any]]:
     return {name: ("pulse", values) for name, values in known.items() if values is not None}
 
 
-def _of_what_was_sent(measured: Transfer, sent: Transmitted) -> Transfer:
+def _with_waveform(measured: Transfer, sent: Transmitted) -> Transfer:
     """Add flags and report of the transmitted waveform to the transfer functions, and of truncated captures."""
     flags, waveform = dict(sent.flags), sent.waveform
     if measured.report.get("sidelink", {}).get("method") in DIVIDING:
@@ -227,7 +227,7 @@ def _of_what_was_sent(measured: Transfer, sent: Transmitted) -> Transfer:
     return replace(measured, flags=Flags.merged(measured.flags, flags), report=report)
 
 
-def _repeated(rx: Acquisition, pulses: Association, repeats: NDArray[np.bool_]) -> Flags:
+def _repeat_flags(rx: Acquisition, pulses: Association, repeats: NDArray[np.bool_]) -> Flags:
     """Raise a flag where captures of the receiver repeat earlier ones bit for bit; they are left out."""
     if not repeats.any():
         return Flags()
@@ -236,7 +236,7 @@ def _repeated(rx: Acquisition, pulses: Association, repeats: NDArray[np.bool_]) 
     return Flags({"captures_repeated": line})
 
 
-def _counted(
+def _pulse_counts(
     sent: int, pulses: Association, repeats: NDArray[np.bool_], positions: PulsePositions, measured: Transfer
 ) -> dict[str, Any]:
     """Count the pulses sent that are used and those that are not, by reason."""

@@ -104,7 +104,7 @@ def open_two(campaign: Campaign, name: str, scene: OpenScene) -> TwoImages:
     height_m = np.broadcast_to(np.asarray(scene.terrain.heights(scene.grid), np.float64), scene.grid.shape)
     shift_px = np.stack([-sensed.shift[..., 1], sensed.shift[..., 0]], axis=-1) / scene.grid.spacing_m
     points = [point.model_dump() for point in campaign.settings.scene.reference_points]
-    known = [one for point in points if (one := _shown(point, scene, sensed, height_m, shift_px)) is not None]
+    known = [one for point in points if (one := _known_height(point, scene, sensed, height_m, shift_px)) is not None]
     ground = AssumedGround(height_m, visible, sensed, shift_px, known)
     if antennas:
         wavenumber = np.pi * sum(bands[0]) / opened.wave_speed_m_s
@@ -198,7 +198,7 @@ def _visible_pixels(campaign: Campaign, flight: str, pair: str) -> NDArray[np.bo
     return visible
 
 
-def _shown(
+def _known_height(
     point: Mapping[str, Any],
     scene: OpenScene,
     sensed: Sensitivity,

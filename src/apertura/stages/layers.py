@@ -222,7 +222,7 @@ class GroundPower:
     is_known: bool = True
 
     def per_one(self, window: Window) -> NDArray[np.float64]:
-        """Return the mean power of a window, (row, column), of ground that is 1; NaN where it is not told."""
+        """Return the mean power of a window, (row, column), of ground that is 1; NaN where it is not determined."""
         if self.calibrated is None:
             return np.full([part.stop - part.start for part in window], 1.0 if self.is_known else np.nan)
         scene, flat = self.scene, isinstance(self.scene.terrain, FlatGround)
@@ -262,7 +262,7 @@ def _multilooked(
 def _noise_of_echoes(
     scene: OpenScene, image: xr.Dataset, looks: Looks, pulse_noise: float, multilook: Multilooking, *, threads: int
 ) -> tuple[dict[str, LazyLayer], dict[str, dict[str, Any]]]:
-    """Return mean power of the noise in the pixels of power.tif, on the coarser grid, which sums of pairs are told."""
+    """Return mean power of the noise in the pixels of power.tif, on the coarser grid, for the sums of pairs."""
     side = side_of(scene.grid, multilook)
     cells = Multilook(
         GroundPower(scene, image).amplitude,
@@ -321,7 +321,7 @@ def layer_rasters(
     scene, looks
         Grid and ground; pulses that make each pixel.
     noise
-        Of one pulse in its range profile, power; NaN where nobody knows.
+        Of one pulse in its range profile, power; NaN where it is unknown.
     calibrated
         Of the pair; None: its noise is relative.
     threads

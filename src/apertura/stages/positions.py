@@ -203,7 +203,7 @@ def _flags(node: NodeLog, at: Times, barred: dict[str, NDArray[np.bool_]]) -> di
             time_s, size_m = faults[0]
             size = f"{size_m:.3f} m " if size_m else ""
             worst = f"; {len(faults)} found, worst {size}at {node.log_time(time_s)}"
-        longest = _longest(node, checked, name) if out else ""
+        longest = _longest_hole(node, checked, name) if out else ""
         reason = what.format(poorest_fix=node.settings.poorest_fix)
         lines[name] = f"{node.name}: {out} of {len(at)} pulses left out: {reason}{longest}{worst}"
     if node.track.attrs["dropped"]:
@@ -226,7 +226,7 @@ def _flags(node: NodeLog, at: Times, barred: dict[str, NDArray[np.bool_]]) -> di
     return lines
 
 
-def _longest(node: NodeLog, checked: CheckedTrack, cause: str) -> str:
+def _longest_hole(node: NodeLog, checked: CheckedTrack, cause: str) -> str:
     holes = [hole for hole in checked.holes if hole.cause == cause and np.isfinite(hole.end_s - hole.start_s)]
     if not holes:
         return " at an end of the log"

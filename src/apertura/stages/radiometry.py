@@ -101,7 +101,7 @@ class Radar(_Part):
         for name in type(self).model_fields:
             was, now = getattr(self, name), getattr(other, name)
             if name == "polarisation" and None in (was, now):
-                continue  # nobody said that it is another
+                continue  # no other set-up is stated
             numbers = isinstance(was, float) and isinstance(now, float)
             if not (abs(was - now) <= _SAME * abs(was) if numbers else was == now):
                 words = [f"{one:g}" if isinstance(one, float) else str(one) for one in (now, was)]
@@ -204,7 +204,7 @@ def check_pairs(constants: Constants, campaign: Campaign, path: Path) -> None:
 LEAST_CONTRAST = 10.0
 """Power of a peak against noise and clutter around it, below which it is as likely one of theirs: no cross-section."""
 
-_UNSTATED_STD_DB, _FIGURE_STD_DB = 1.0, 0.5  # of a radio whose amplitude_std_db nobody states; of a noise figure
+_UNSTATED_STD_DB, _FIGURE_STD_DB = 1.0, 0.5  # of a radio without amplitude_std_db; of a noise figure
 _SIDELINK_STD_DB = 0.3  # of the noise that a sidelink adds, by its mean SNR
 _MOST_POINTS = 50  # whose cross-section is stated, the brightest
 
@@ -227,7 +227,7 @@ class CalibratedPair:
     link
         Its radio; None where it is not stated.
     std_db
-        Standard deviation of its constant; None where nobody knows.
+        Standard deviation of its constant; None where it is unknown.
     flags
         Of its constant.
     calibration
@@ -235,11 +235,11 @@ class CalibratedPair:
     beams
         Weights of its pulses.
     radio_std_db
-        Standard deviation of the radio as stated; None where nobody knows.
+        Standard deviation of the radio as stated; None where it is unknown.
     thermal_noise
         Power that thermal noise would have in a profile by a receiver of 0 dB; None where no radio is stated.
     noise_before
-        Noise of a pulse in the flights that measured the constant; None where it is stated, or nobody measured it.
+        Noise of a pulse in the flights that measured the constant; None where it is stated, or not measured.
     sidelink_noise
         Power that the noise of the sidelink has in a profile; 0 without one.
     noise_figure_db
@@ -362,7 +362,7 @@ class CalibratedPair:
             std_db = float(np.hypot(of_own_db, np.hypot(radio_db, _FIGURE_STD_DB)))
             if self.noise_figure_db is not None:
                 differences.append(("the noise figure stated", figure_db - self.noise_figure_db, std_db))
-            elif figure_db < 0:  # nobody who states no figure has a receiver below 0 dB
+            elif figure_db < 0:  # no receiver has a noise figure below 0 dB
                 differences.append(("a receiver of 0 dB", figure_db, std_db))
         if self.noise_before and pulse_noise.power > 0 and not self.sidelink_noise:
             std_db = float(np.hypot(2**0.5 * pulse_noise.std_db, _FIGURE_STD_DB))

@@ -104,7 +104,7 @@ def positions_of(pairs: Sequence[OpenPair]) -> Mapping[str, NodePositions]:
 def errors_of(pairs: Sequence[OpenPair]) -> Mapping[str, TrackErrors]:
     """Return node → the errors that its log is taken to have."""
     return {
-        node: TrackErrors(_stated(known), known.correlation_s, known.drift_m)
+        node: TrackErrors(_stated_std_m(known), known.correlation_s, known.drift_m)
         for node, known in positions_of(pairs).items()
     }
 
@@ -118,7 +118,7 @@ def _variance(pair: OpenPair, scene: OpenScene, errors: Mapping[str, TrackErrors
     return space_variance(paths_to(pair, scene, scene.middle_m), corners_m, of_nodes)
 
 
-def _stated(known: NodePositions) -> tuple[float, float, float]:
+def _stated_std_m(known: NodePositions) -> tuple[float, float, float]:
     """Return the errors of a node's log, east, north, up."""
     east, north, up = (max(one, LEAST_STD_M) for one in known.std_m or (ASSUMED_STD_M,) * 3)
     return east, north, up
@@ -361,7 +361,7 @@ def refine(campaign: Campaign, flight: str) -> Path:
         stages = {pair: open_stage(campaign.stage("profile", flight, pair), "profile") for pair in names}
         profiles = {pair: profiles_of(stages[pair.name], lazy=True) for pair in pairs}
         given = refinement_inputs(campaign, profiles, scene)
-        found = _searched(given, scene, str(decisions[1].value))
+        found = _estimated(given, scene, str(decisions[1].value))
         stage = refined_stage(found, decisions, given, scene)
     else:
         nothing = {node: np.zeros((0, 3)) for pair in names for node in pair.split("-")}
@@ -378,7 +378,7 @@ def refine(campaign: Campaign, flight: str) -> Path:
     return folder
 
 
-def _searched(given: RefinementInputs, scene: OpenScene, method: str) -> Refinement:
+def _estimated(given: RefinementInputs, scene: OpenScene, method: str) -> Refinement:
     """Return the refinement of tracks, or of one phase per pulse where there are places enough to validate it."""
     records, errors = given.records, given.errors
     found = None if method == "tracks" else Candidates.of(records, scene.grid, scene.terrain, errors)
@@ -405,7 +405,7 @@ def refined_stage(
     knots_s, nodes = found.correction.time_s, list(found.correction.moved_m)
     extra_path_m = found.correction.extra_path_m
     began = np.datetime64(0, "ns") if given is None else given.began.astype("datetime64[ns]")
-    logged = _logged(() if given is None else given.records, knots_s)
+    logged = _logged_positions(() if given is None else given.records, knots_s)
     moved_m, std_m = (np.stack([values[node] for node in nodes]) for values in (found.correction.moved_m, found.std_m))
     position_m = np.stack([logged.get(node, np.zeros((0, 3))) for node in nodes])
     by_node = ("node", "knot", "axis")
@@ -434,7 +434,9 @@ def refined_stage(
     )
 
 
-def _logged(records: Collection[PairRecord], knots_s: NDArray[np.float64]) -> Mapping[str, NDArray[np.float64]]:
+def _logged_positions(
+    records: Collection[PairRecord], knots_s: NDArray[np.float64]
+) -> Mapping[str, NDArray[np.float64]]:
     """Return node → (knot, 3), its radar phase centre as the log has it, in the first pair that it takes part in."""
     places: dict[str, NDArray[np.float64]] = {}
     for one in records:

@@ -92,7 +92,7 @@ def _jobs(campaign: Campaign, made: Sequence[_Made], known: Mapping[str, str]) -
     for one in made:
         jobs.setdefault((RESULTS[one.name].name, one.where), []).append(one)
     for (rule, where), parts in jobs.items():
-        doubts = [doubt for one in parts for doubt in _doubts(one.recorded, one.result, known)]
+        doubts = [doubt for one in parts for doubt in _differences(one.recorded, one.result, known)]
         yield CrateJob(
             rule,
             where,
@@ -105,7 +105,7 @@ def _jobs(campaign: Campaign, made: Sequence[_Made], known: Mapping[str, str]) -
         )
 
 
-def _doubts(recorded: Mapping[str, Any], result: Result, known: Mapping[str, str]) -> Iterator[str]:
+def _differences(recorded: Mapping[str, Any], result: Result, known: Mapping[str, str]) -> Iterator[str]:
     """Yield the reasons why a result would be made otherwise today."""
     if recorded["code"] != result.code_sha256:
         yield f"made by other code than is installed now, which is {result.code_sha256}"

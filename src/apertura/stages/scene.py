@@ -396,7 +396,7 @@ def terrain(campaign: Campaign) -> Path:
     ground.dem.check_cover(grid)
     windows = list(grid.tiles(campaign.settings.processing.tile_px))
     with writing(folder) as wip:
-        missing = resume(wip, _empty(scene, ground, lineage), "height", windows)
+        missing = resume(wip, _empty_terrain(scene, ground, lineage), "height", windows)
         print(f"{len(missing)} of {number_of(len(windows), 'tile')} to read from {ground.dem.path.name}", flush=True)
         heights = open_array(wip, "height")
         for window in missing:
@@ -416,7 +416,7 @@ def terrain(campaign: Campaign) -> Path:
     return folder
 
 
-def _empty(scene: OpenScene, ground: ConfiguredGround, lineage: Lineage) -> xr.Dataset:
+def _empty_terrain(scene: OpenScene, ground: ConfiguredGround, lineage: Lineage) -> xr.Dataset:
     """Return the stamped stage without its heights."""
     return stamped(
         xr.Dataset(

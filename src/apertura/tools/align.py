@@ -118,11 +118,11 @@ def unaligned(campaign: Campaign, flight: str, node: str) -> Unaligned:
                 expected=f"the echo of {node} by its own pulses",
                 remedy="Run `apertura run CAMPAIGN --until echo` first.",
             )
-        history = _some(PairEcho.opened(campaign, flight, f"{node}-{node}").stage)
+        history = _thinned(PairEcho.opened(campaign, flight, f"{node}-{node}").stage)
         off_m, applied_ns = float(history.attrs["stated_offset_m"]), clock.offset_ns
         applied_ppm = clock.drift_ppm
     else:
-        history = _some(read_history(campaign, flight, node, pair=f"{node}-{node}"))
+        history = _thinned(read_history(campaign, flight, node, pair=f"{node}-{node}"))
         off_m = 0.0
     times = history.time.values
     log = raw_log(campaign, flight, node, shortest_wave(history.frequency.values))
@@ -136,10 +136,10 @@ def unaligned(campaign: Campaign, flight: str, node: str) -> Unaligned:
     )
     log_start_ns = int((log.track.time.values[0] - times[0]).astype("timedelta64[ns]").astype(np.int64))
     own_clock = bool(times[0] < FIRST)
-    return Unaligned(echo, _logged(log), log_start_ns, applied_ns, clock.offset_ns, applied_ppm, off_m, own_clock)
+    return Unaligned(echo, _log_geometry(log), log_start_ns, applied_ns, clock.offset_ns, applied_ppm, off_m, own_clock)
 
 
-def _some(history: xr.Dataset) -> xr.Dataset:
+def _thinned(history: xr.Dataset) -> xr.Dataset:
     """Return at most `MOST_PULSES` pulses, evenly spread."""
     return history.isel(pulse=slice(None, None, -(-history.sizes["pulse"] // MOST_PULSES)))
 
@@ -152,7 +152,7 @@ def _wave_speed(campaign: Campaign, log: NodeLog) -> float:
     return scene_air(campaign, aperture.tx_m).over(aperture).wave_speed_m_s
 
 
-def _logged(log: NodeLog) -> Logged:
+def _log_geometry(log: NodeLog) -> Logged:
     times = log.track.time.values[log.checked.kept]
     began = log.track.time.values[0]
 
@@ -212,7 +212,7 @@ def align(
     given = unaligned(campaign, campaign.flight(flight).name, node)
     if search_m == 0.0:
         given = given.less_path(campaign.settings.nodes[node].path_offset_m.radar)
-    within_s = _within(given, search_s)
+    within_s = _search_range(given, search_s)
     try:
         if point is None:
             found = align_on_scene(given.echo, given.log, *_scene(campaign), within_s=within_s, search_m=search_m)
@@ -274,7 +274,7 @@ def print_alignment(campaign: Campaign, flight: str, node: str, *, write: bool, 
         print(f"{written} is written")
 
 
-def _within(given: Unaligned, search_s: float | None) -> tuple[float, float]:
+def _search_range(given: Unaligned, search_s: float | None) -> tuple[float, float]:
     """Return the least and largest offset between first pulse and first epoch to try, seconds."""
     recorded_s = float(given.echo.time_s[-1])
     overlapping = given.log.first_s - recorded_s, given.log.last_s

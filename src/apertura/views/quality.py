@@ -37,7 +37,7 @@ class ImageValues:
     worst_cause
         Of the causes stated, the one that the budget expects to cost most.
     not_stated
-        Causes of the budget whose size nobody has stated and nothing is assumed for.
+        Causes of the budget whose size is neither stated nor assumed.
     place_m, place_cause
         Deviation of the places of points that the budget expects, metres, and the cause that moves them most.
     error_db
@@ -238,7 +238,7 @@ def shared_rows(reports: Mapping[str, Report]) -> list[Cells]:
 
 
 def budget_rows(lines: Sequence[Report]) -> list[Cells]:
-    """Return the rows of an error budget, under `BUDGET`; in brackets what is not expected, as nobody stated it.
+    """Return the rows of an error budget, under `BUDGET`; in brackets what is assumed and not stated.
 
     Examples
     --------
@@ -250,7 +250,7 @@ def budget_rows(lines: Sequence[Report]) -> list[Cells]:
     for line in lines:
         bracket = "{}" if is_counted(line) else "({})"
         sizes = (
-            "" if line[name] is None else bracket.format(_size(abs(line[name]), unit))
+            "" if line[name] is None else bracket.format(_size_text(abs(line[name]), unit))
             for name, unit in (("loss_db", "dB"), ("shift_m", "m"), ("phase_rad", "rad"))
         )
         rows.append((line["cause"], line["stated"], *sizes))
@@ -342,7 +342,7 @@ def _explained(flag: str) -> tuple[str, str]:
     return (known.means, known.look) if known else ("", "")
 
 
-def _size(value: float, unit: str) -> str:
+def _size_text(value: float, unit: str) -> str:
     return f"{value:.2g} {unit}" if value >= 1e-4 else f"< 0.0001 {unit}" if value else f"0 {unit}"
 
 

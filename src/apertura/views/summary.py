@@ -63,7 +63,7 @@ def print_summary(campaign: Campaign) -> None:
         if one.verdict not in ("", "focused") and not one.flags:
             undecided.setdefault(f"{one.verdict}: {one.why}", []).append(name)
     for why, images in undecided.items():
-        console.print(f"{_some(images)}: {why}", soft_wrap=True)
+        console.print(f"{_abbreviated(images)}: {why}", soft_wrap=True)
     unsure = max(values.values(), key=lambda one: one.place_m, default=None)
     if unsure and unsure.place_m:
         console.print(
@@ -77,14 +77,14 @@ def print_summary(campaign: Campaign) -> None:
         console.print(f"interferogram {name.removeprefix(f'{INTERFEROMETRY} ')}: {report['says']}", soft_wrap=True)
     _print_flags(console, {**reports, **interferograms})
     if missing := [" ".join(image) for image in names if image not in there]:
-        console.print(f"not there yet: {_some(missing)}; apertura run makes what is missing", soft_wrap=True)
+        console.print(f"not there yet: {_abbreviated(missing)}; apertura run makes what is missing", soft_wrap=True)
     print_products(campaign)
 
 
 def print_stale(campaign: Campaign) -> None:
     """Print a line where results are overtaken by a file, a setting or code, but those made on demand.
 
-    And one where recordings are not there to tell.
+    And one where recordings are absent, so that this is unknown.
     """
     print(*(f"{line}\n" for line in absent_lines(campaign)), sep="", end="")
     if stale := [manifest for manifest in stale_results(campaign) if not on_demand(campaign, manifest)]:
@@ -136,7 +136,7 @@ def _interferograms(campaign: Campaign) -> Iterator[tuple[str, dict[str, Any]]]:
             yield f"{INTERFEROMETRY} {name}", entry
 
 
-def _some(names: Sequence[str], most: int = 3) -> str:
+def _abbreviated(names: Sequence[str], most: int = 3) -> str:
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
@@ -147,7 +147,7 @@ def _print_flags(console: "Console", reports: Mapping[str, Report]) -> None:
 
     for flag in raised_flags(reports, quotes=False):
         console.print(Text.assemble((flag.name, "yellow"), f": {flag.means}" if flag.means else ""))
-        measured = [f"{_some(images)}: {line}" for line, images in flag.measured.items()]
+        measured = [f"{_abbreviated(images)}: {line}" for line, images in flag.measured.items()]
         for line in [*measured, *([f"look at: {flag.look}"] if flag.look else [])]:
             console.print(Padding(Text(line), (0, 0, 0, 4)))
 

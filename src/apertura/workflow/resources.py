@@ -1,6 +1,6 @@
 """Resources of a job of each rule, by sizes of files and the config: of a cluster, and time on this machine.
 
-Nothing here opens a recording: each job of a thousand flights is asked about while the workflow is put together.
+Nothing here opens a recording: it runs for each job of a thousand flights while the workflow is put together.
 Estimates are from above; a job that was killed for want of memory or time asks for twice as much.
 """
 
@@ -178,7 +178,7 @@ class Resources:
 
     @cached_property
     def _shape(self) -> tuple[int, int] | None:
-        """Rows and columns: as settled, or as the config says; None where nobody knows yet."""
+        """Rows and columns: as settled, or as the config says; None where they are not known yet."""
         scene = self.campaign.settings.scene
         with suppress(CampaignError, LookupError, TypeError, ValueError):  # not there, or damaged
             settled = read_json(self.campaign.result("scene.json"), expected="a settled scene", remedy=DAMAGED)

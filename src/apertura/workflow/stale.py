@@ -28,9 +28,9 @@ _SOURCE = {"missing": "is gone", "altered": "has changed", "added": "is new to i
 
 
 def stale_results(campaign: Campaign, *, paranoid: bool = False) -> dict[str, str]:
-    """Return manifest → why its result has to be made again, of those that are there, each after those it stands on.
+    """Return manifest → why its result has to be made again, of those that are there, each after those it depends on.
 
-    The reason is empty where it only stands on one that is made again. A file of raw/ that is not there overtakes
+    The reason is empty where it only depends on one that is made again. A file of raw/ that is not there overtakes
     nothing: it may lie elsewhere, see `absent_files`.
 
     Parameters
@@ -129,20 +129,20 @@ def make_again(campaign: Campaign, stale: Mapping[str, str], *, remove: bool) ->
     """Say which results will be made again, and `remove` their manifests: what has none is not finished."""
     for line in stale_lines(stale):
         print(line, file=sys.stderr, flush=True)
-    for manifest in reversed(list(stale)) if remove else ():  # what stands on others first: a kill leaves no gap below
-        for kept in _kept(campaign.root, manifest):
+    for manifest in reversed(list(stale)) if remove else ():  # dependent results first: a kill leaves no gap below
+        for kept in _set_aside(campaign.root, manifest):
             print(f"what was edited by hand is kept as {kept}", file=sys.stderr, flush=True)
         (campaign.root / manifest).unlink(missing_ok=True)
     if stale and not remove:
         print("a dry run of snakemake alone does not count them: `apertura run CAMPAIGN -n` does", file=sys.stderr)
 
 
-def _kept(root: ConfinedPath, manifest: str) -> Iterator[str]:
+def _set_aside(root: ConfinedPath, manifest: str) -> Iterator[str]:
     """Put files of a result that were edited since out of the workflow's way; yield their new names."""
     path = root / manifest
     try:
         files = read_manifest(path)["files"]
-    except CampaignError:  # nobody knows how they were
+    except CampaignError:  # their former hashes are unknown
         return
     for name, digest in files.items():
         file = path.parent.named(name, where=path)
@@ -155,7 +155,7 @@ def _kept(root: ConfinedPath, manifest: str) -> Iterator[str]:
 
 
 def stale_lines(stale: Mapping[str, str]) -> Iterator[str]:
-    """Yield a line for each reason and the results it holds for, and one for those that only stand on them.
+    """Yield a line for each reason and the results it holds for, and one for those that only depend on them.
 
     Examples
     --------

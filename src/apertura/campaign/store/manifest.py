@@ -51,7 +51,7 @@ def write_manifest(manifest: Path, files: Mapping[str, str], lineage: ResultOrig
     files
         File relative to the manifest's folder → sha256.
     lineage
-        What it was made from; None: nobody says.
+        Its origin; None: not stated.
     """
     write_json(manifest, {"files": files, **(lineage.record() if lineage else {})})
 

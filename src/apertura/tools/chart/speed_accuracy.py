@@ -176,10 +176,12 @@ def _measured(part: Part, setting: Setting, plan: Plan | None) -> Point:
             return engine.prepare(part.history, **setting.options)
         return engine.prepare(part.profiles if plan is None else plan.inputs(part.profiles), **setting.options)
 
-    tables_s, prepared = _least(prepare, repeats=2)
+    tables_s, prepared = _shortest(prepare, repeats=2)
     quick = _SLOW_SECONDS / max(setting.form_seconds, 1e-9) * part.total_pixels / part.pixels.shape[1]
     pixels = part.pixels[: max(LEAST_ROWS, round(quick))]
-    form_s, image = _least(lambda: engine.form(prepared, pixels, beams=part.beams, **setting.form_options), repeats=3)
+    form_s, image = _shortest(
+        lambda: engine.form(prepared, pixels, beams=part.beams, **setting.form_options), repeats=3
+    )
     power = float((np.abs(image[:LEAST_ROWS]) ** 2).sum())
     error = error_bound(image[tuple(part.picked.T)], part.exact, part.density, power=power)
     return _point(part, setting, tables_s + form_s * part.total_pixels / pixels[..., 0].size, error.bound_db, plan)
@@ -201,7 +203,7 @@ def _point(part: Part, setting: Setting, taken: float, error_db: float | None, p
     )
 
 
-def _least(work: Any, *, repeats: int) -> tuple[float, Any]:
+def _shortest(work: Any, *, repeats: int) -> tuple[float, Any]:
     times = []
     for _ in range(repeats):
         begin = perf_counter()

@@ -35,7 +35,7 @@ _LAYERS = {
 """Requirement → layer, and whether the requirement is the most or the least of it."""
 
 LEAST_GAIN_DB = 0.05
-"""Of a change that is told, where not all that is missed is less: a smaller one is printed as nothing."""
+"""Least gain of a listed change that does not reduce every shortfall: a smaller one is printed as nothing."""
 
 _LEAST = {"snr_db", "point_snr_db", "coverage", "coherence"}
 _IN_DB = {"nesz_db", "snr_db", "point_snr_db", "loss_db"}
@@ -144,14 +144,14 @@ def _of_images(design: Design) -> Iterator[tuple[str, float, str, str]]:
                 at = SHARE if side == "most" else 100 - SHARE
                 value = float(np.percentile(values, at, method="nearest")) if values.size else float("nan")
                 yield name, value, image.name, _cause(name, design, image, seen, value)
-        yield "coverage", float(seen.mean()), image.name, _unseen(image)
+        yield "coverage", float(seen.mean()), image.name, _coverage_cause(image)
 
 
 def _cause(name: str, design: Design, image: PlannedImage, seen: np.ndarray, value: float) -> str:
     if not seen.any() or not np.isfinite(value):
         return "nothing is seen" if not seen.any() else "power, gains, receiver or its noise figure are not stated"
     if name == "resolution_m":
-        return _coarsest(image)
+        return _resolution_cause(image)
     if name == "loss_db":
         pairs = [one for one in design.images.values() if one.budget and one.name.startswith(image.name.split("/")[0])]
         lines = [line for one in pairs for line in one.budget if line.counts]
@@ -188,7 +188,7 @@ def _least_point(design: Design, flight: str) -> str:
     return f"{each}: at least {rcs_dbsm + LEAST_SNR_DB - min(excess_db):.0f} dBsm"
 
 
-def _coarsest(image: PlannedImage) -> str:
+def _resolution_cause(image: PlannedImage) -> str:
     """Return the cause of the coarsest resolution in the middle of the scene: the band or the aperture."""
     shape = image.layers["mask"].shape
     pixel = tuple(slice(size // 2, size // 2 + 1) for size in shape)
@@ -200,7 +200,7 @@ def _coarsest(image: PlannedImage) -> str:
     return "cross-range: wavelength over the angle that the aperture turns about the scene"
 
 
-def _unseen(image: PlannedImage) -> str:
+def _coverage_cause(image: PlannedImage) -> str:
     mask = image.layers["mask"]
     late = image.layers["path_margin"] < 0
     shares = {
@@ -267,7 +267,7 @@ def helpful_changes(plan: FlightPlan, root: Path, before: Sequence[Verdict], *, 
     for words, change in _candidates(plan):
         try:
             after = judge(designed(change(plan), root, threads=threads, coarse=COARSE_PX))
-        except (CampaignError, ValueError):  # a change that makes another plan impossible helps nobody
+        except (CampaignError, ValueError):  # the changed plan is impossible
             continue
         after = [replace(one, found=one.found + np.nan_to_num(off.get(one.requirement, 0.0))) for one in after]
         gain = missed_db - shortfall_db(after)
@@ -308,9 +308,9 @@ def _candidates(plan: FlightPlan) -> Iterator[tuple[str, _Changing]]:
     if isinstance(plan.waveform, OfdmWaveform):
         yield "twice the bandwidth (waveform.subcarriers)", partial(_radar, subcarriers=2 * plan.waveform.subcarriers)
     if plan.processing.autofocus != "on":
-        yield "refine the tracks by the images (processing.autofocus: on)", _refined
-    yield "3 dB more power (transmit_power_dbm)", _louder
-    yield "positions known twice as well (position_std_m)", _surer
+        yield "refine the tracks by the images (processing.autofocus: on)", _with_autofocus
+    yield "3 dB more power (transmit_power_dbm)", _with_more_power
+    yield "positions known twice as well (position_std_m)", _with_surer_positions
 
 
 def moved(plan: FlightPlan, **changes: float) -> FlightPlan:
@@ -352,11 +352,11 @@ def _radar(plan: FlightPlan, **changes: Any) -> FlightPlan:
     return plan.model_copy(update={"waveform": waveform})
 
 
-def _refined(plan: FlightPlan) -> FlightPlan:
+def _with_autofocus(plan: FlightPlan) -> FlightPlan:
     return plan.model_copy(update={"processing": plan.processing.model_copy(update={"autofocus": "on"})})
 
 
-def _louder(plan: FlightPlan) -> FlightPlan:
+def _with_more_power(plan: FlightPlan) -> FlightPlan:
     nodes = {
         name: node
         if node.transmit_power_dbm is None
@@ -366,7 +366,7 @@ def _louder(plan: FlightPlan) -> FlightPlan:
     return plan.model_copy(update={"nodes": nodes})
 
 
-def _surer(plan: FlightPlan) -> FlightPlan:
+def _with_surer_positions(plan: FlightPlan) -> FlightPlan:
     solutions = {node: flight.solution for flight in plan.flights.values() for node in flight.participants}
     nodes = {}
     for name, node in plan.nodes.items():
@@ -476,7 +476,7 @@ def tried_report(tried: Sequence[Tried]) -> list[dict[str, Any]]:
 
 
 def with_front(tried: Sequence[Tried]) -> list[Tried]:
-    """Return plans marked where no other is as good in all that is asked and better in some."""
+    """Mark the Pareto-optimal plans: no other is as good in all requirements and better in some."""
     short = np.array([[v.short_db for v in one.verdicts if v.required is not None] for one in tried])
     front = [not ((short <= own).all(axis=1) & (short < own).any(axis=1)).any() for own in short]
     return [replace(one, on_front=on) for one, on in zip(tried, front, strict=True)]

@@ -131,7 +131,7 @@ def planned_image(
     campaign, pair, scene
         Settings, the pair as it will fly, or as its logs say that it flew; grid and ground.
     sigma0_db, rcs_dbsm
-        Of the ground and of a point, to be seen above the noise; None: not asked.
+        Of the ground and of a point, to be seen above the noise; None: not computed.
     refinement
         Of the flight's tracks before the flight; None: the pair is as it will be imaged.
     threads
@@ -306,10 +306,10 @@ def _coarse_layers(
         "ambiguity": (AMBIGUITY_NODES, folded),
         "path_margin": (AMBIGUITY_NODES, left_m),
     }
-    return {name: _between(scene, count, values) for name, (count, values) in counts.items()}
+    return {name: _interpolated(scene, count, values) for name, (count, values) in counts.items()}
 
 
-def _between(scene: OpenScene, count: int, values: Callable[[Floats], Floats]) -> Layer:
+def _interpolated(scene: OpenScene, count: int, values: Callable[[Floats], Floats]) -> Layer:
     """Return values computed at count × count points of the ground, bilinear at all pixels."""
     rows, columns = (np.linspace(0, size - 1, count) for size in scene.grid.shape)
     row, column = np.meshgrid(rows, columns, indexing="ij")

@@ -195,7 +195,7 @@ def _opened(plan: FlightPlan, campaign: Campaign) -> OpenPlan:
     crs = _crs(plan, campaign)
     ground = ConfiguredGround.of(campaign.settings.scene, campaign.height_files(), crs=crs)
     courses = {name: _courses(plan, campaign, name, ground) for name in plan.flights}
-    courses = _moved(courses, plan)
+    courses = _displaced(courses, plan)
     for name, planned in plan.flights.items():
         _check_separation(name, planned, courses[name])
     frequency_hz, delay_s, prf_hz = _radar(campaign)
@@ -298,19 +298,19 @@ def _courses(plan: FlightPlan, campaign: Campaign, name: str, ground: Configured
     for node, track in sorted(tracks.items(), key=lambda item: isinstance(item[1], BesideTrack)):
         where = f"flights.{name}.tracks.{node}"
         if isinstance(track, BesideTrack):
-            courses[node] = _beside(courses[track.of], track, plan.moved.spacing)
+            courses[node] = _follower(courses[track.of], track, plan.moved.spacing)
         elif isinstance(track, MissionTrack):
             courses[node] = _mission(track, campaign, flight, ground, where)
         else:
             time_s, place, imaged = _drawn(track)
             course = _sampled(time_s, place, imaged, flight.log_rate_hz, where)
             base = level_m if track.above == "ground" else 0.0
-            below = _below(ground, course.place_m[:, :2], course.time_s) if track.above == "terrain" else base
+            below = _ground_below(ground, course.place_m[:, :2], course.time_s) if track.above == "terrain" else base
             courses[node] = replace(course, place_m=course.place_m + np.multiply.outer(below, [0.0, 0.0, 1.0]))
     return courses
 
 
-def _below(ground: ConfiguredGround, place_m: Floats, time_s: Floats) -> Floats:
+def _ground_below(ground: ConfiguredGround, place_m: Floats, time_s: Floats) -> Floats:
     """Return the height of the ground below places, once a second and linear between."""
     if ground.dem is None:
         return np.full(len(place_m), ground.height_at(*map(float, place_m[0])))
@@ -432,7 +432,7 @@ def _mission(
     return replace(course, place_m=rounded + place[0])
 
 
-def _beside(leader: Course, track: BesideTrack, spacing: float) -> Course:
+def _follower(leader: Course, track: BesideTrack, spacing: float) -> Course:
     velocity = np.gradient(leader.place_m, leader.time_s, axis=0)[:, :2]
     ahead = velocity / np.maximum(np.linalg.norm(velocity, axis=1, keepdims=True), 1e-9)
     right = np.stack([ahead[:, 1], -ahead[:, 0]], -1)
@@ -441,7 +441,7 @@ def _beside(leader: Course, track: BesideTrack, spacing: float) -> Course:
     return replace(leader, place_m=leader.place_m + np.hstack([moved, up]))
 
 
-def _moved(courses: dict[str, dict[str, Course]], plan: FlightPlan) -> dict[str, dict[str, Course]]:
+def _displaced(courses: dict[str, dict[str, Course]], plan: FlightPlan) -> dict[str, dict[str, Course]]:
     """Return courses moved together by what the plan says: turned, pushed away from the scene's middle, lifted."""
     moved = plan.moved
     if moved.model_copy(update={"spacing": 1.0}) == Moved():

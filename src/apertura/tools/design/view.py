@@ -240,8 +240,9 @@ def recording_lines(design: Design) -> Iterator[str]:
         f"A pixel of {opened.scene.grid.spacing_m:g} m integrates {pulses:.0f} pulses; a smaller scene.spacing_m "
         "integrates more, where more is flown"
     )
+    processing = _duration_text(recording.processing_s)
     yield (
-        f"Recorded data {recording.recorded_bytes / 1e9:.3g} GB; processing about {_lasting(recording.processing_s)}, "
+        f"Recorded data {recording.recorded_bytes / 1e9:.3g} GB; processing about {processing}, "
         f"{recording.memory_bytes / 1e9:.2g} GB of memory"
     )
 
@@ -253,14 +254,14 @@ def _loss(design: Design, flight: str, layer: str) -> str:
     return f"{np.percentile(values, SHARE):.2f} dB" if values.size and np.isfinite(values).all() else "not known"
 
 
-def _lasting(seconds: float) -> str:
+def _duration_text(seconds: float) -> str:
     for unit, size in (("h", 3600), ("min", 60)):
         if seconds >= size:
             return f"{seconds / size:.2g} {unit}"
     return f"{seconds:.0f} s"
 
 
-def _given(change: Change) -> str:
+def _values_text(change: Change) -> str:
     return ", ".join(f"{name} {value:.4g}" for name, value in change.found.items())
 
 
@@ -269,7 +270,7 @@ def change_lines(changes: Sequence[Change]) -> Iterator[str]:
     for place, change in enumerate(changes[:_MOST_CHANGES], 1):
         then = ", all requirements met" if change.meets else ""
         then += f", but no longer met: {', '.join(change.breaks)}" if change.breaks else ""
-        yield f"{place}. {change.words}: {change.gain_db:.2g} dB closer{then} ({_given(change)})"
+        yield f"{place}. {change.words}: {change.gain_db:.2g} dB closer{then} ({_values_text(change)})"
 
 
 def _blocks(
@@ -290,7 +291,7 @@ def _blocks(
                     change.words,
                     f"{change.gain_db:.2g} dB",
                     "yes" if change.meets else ", nor ".join(("no", *change.breaks)),
-                    _given(change),
+                    _values_text(change),
                 )
                 for change in changes[:_MOST_CHANGES]
             ],

@@ -305,15 +305,15 @@ def look_at(campaign: Campaign, *, follow: bool, every_s: float, end_after_s: fl
 # ---- In words -------------------------------------------------------------------------------------------------------
 
 
-def _decimation(every: int) -> str:
+def _decimation_text(every: int) -> str:
     return f"1 pulse in {every}" if every > 1 else ""
 
 
-def _behind(delay_s: float | None) -> str:
+def _delay_text(delay_s: float | None) -> str:
     return "" if delay_s is None else f"{delay_s:.1f} s behind"
 
 
-def _extent(report: Mapping[str, Any]) -> str:
+def _resolution_text(report: Mapping[str, Any]) -> str:
     of = "coarse: half the band, every 2nd pixel" if report["share"] == 2 else "fine"
     return f"{of} ({report['spacing_m']:g} m)"
 
@@ -322,9 +322,9 @@ def _subtitle(pair: PairSoFar, report: Mapping[str, Any], every: int) -> str:
     until = "" if pair.until is None else f"{str(pair.until)[11:21]}Z"
     words = (
         f"{report['pulses']['added']} pulses to {until}",
-        _behind(report["delay_s"]),
-        _decimation(every),
-        _extent(report),
+        _delay_text(report["delay_s"]),
+        _decimation_text(every),
+        _resolution_text(report),
     )
     return " · ".join(word for word in words if word)
 
@@ -335,9 +335,9 @@ def _line(pair: PairSoFar, report: Mapping[str, Any], every: int) -> str:
         return f"{name}: no image yet, {counts['recorded']} pulses recorded{report['waits'] and '; '}{report['waits']}"
     words = (
         f"{counts['added']} of {counts['recorded']} pulses",
-        _behind(report["delay_s"]),
-        _decimation(every),
-        _extent(report),
+        _delay_text(report["delay_s"]),
+        _decimation_text(every),
+        _resolution_text(report),
         report["verdict"],
         f"peak at {report['peak']['x_m']:.2f}, {report['peak']['y_m']:.2f}",
         ", ".join(flag for flag in report["flags"] if flag != report["verdict"]),

@@ -121,7 +121,7 @@ class ImageSoFar:
         Of the band and of the resolution along the flight: 2 takes the middle half of the subcarriers and half the
         angle, whose cells twice as wide need every second pixel.
     accuracy_db
-        Numerical error asked.
+        Requested numerical error.
     threads
         Tiles formed at once.
     plans
@@ -184,7 +184,7 @@ class ImageSoFar:
     def add(self, block: "Compressed") -> None:
         """Add a block of `compressed` pulses.
 
-        The setting is planned for the first, and again where the error measured is above the one asked.
+        The setting is planned for the first, and again where the measured error is above the requested one.
         """
         self.pulses += block.pulses
         profiles = block.profiles
@@ -513,7 +513,7 @@ class PairSoFar:
 
     @property
     def flags(self) -> dict[str, str]:
-        """Flags that most blocks raised, by the last line: what is told by the statistics of one may be chance."""
+        """Flags that most blocks raised, with the last line: the statistics of a single block may be chance."""
         return {name: line for name, (times, line) in self._raised.items() if 2 * times > self._blocks}
 
     @property

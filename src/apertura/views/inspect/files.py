@@ -203,7 +203,7 @@ def log_report(path: Path, beside: Surroundings) -> Report:
     """
     track = read_track(path, node=beside.node, options=beside.options)
     facts = log_facts(track)
-    lacks = _log_lacks(path, facts, beside)
+    lacks = _missing_of_log(path, facts, beside)
     from apertura.stages.node_log import yaw_fault_of
     from apertura.views.inspect.pictures import draw_log
 
@@ -242,7 +242,7 @@ def _log_rows(log: LogFacts, track: "xr.Dataset") -> dict[str, Any]:
     return rows
 
 
-def _log_lacks(path: Path, log: LogFacts, beside: Surroundings) -> list[str]:
+def _missing_of_log(path: Path, log: LogFacts, beside: Surroundings) -> list[str]:
     lacks, suffixes = [], log_suffixes()
     if beside.node == NODE:
         suffix = path.suffix[1:].lower()
@@ -292,7 +292,7 @@ def recording_report(files: Sequence[Path], beside: Surroundings) -> Report:
 
     node = files[0].name.removesuffix(files[0].suffix)
     logs = sorted(log for log in files[0].parent.glob("*.track.*") if log.name.startswith(f"{node}.track."))
-    lacks = _recording_lacks(recording, facts, beside)
+    lacks = _missing_of_recording(recording, facts, beside)
     if logs:
         covered, left_out = _against_log(recording, node, logs[0], beside)
         rows, lacks = rows | covered, lacks + left_out
@@ -333,7 +333,7 @@ def first_samples(recording: "Recording") -> NDArray[np.complex64]:
     return np.asarray(iq[..., 0] + 1j * iq[..., 1], np.complex64)
 
 
-def _recording_lacks(recording: "Recording", facts: RecordingFacts, beside: Surroundings) -> list[str]:
+def _missing_of_recording(recording: "Recording", facts: RecordingFacts, beside: Surroundings) -> list[str]:
     lacks = []
     if not beside.waveform:
         prf_hz = facts.times and facts.times.rate_hz
@@ -408,7 +408,7 @@ def history_report(here: Path, files: Sequence[Path], kind: str, beside: Surroun
         "phase history",
         kind,
         _history_rows(facts),
-        tuple(_history_lacks(facts, kind, beside)),
+        tuple(_missing_of_history(facts, kind, beside)),
         picture=lambda: draw_history(echo, here.name),
     )
 
@@ -436,7 +436,7 @@ def _history_rows(facts: HistoryFacts) -> dict[str, Any]:
     return rows | ({"remarks": list(facts.remarks)} if facts.remarks else {})
 
 
-def _history_lacks(facts: HistoryFacts, kind: str, beside: Surroundings) -> list[str]:
+def _missing_of_history(facts: HistoryFacts, kind: str, beside: Surroundings) -> list[str]:
     lacks = []
     if facts.frame is None and not beside.logged:
         lacks.append(f"where it was: a flight log {NODE}.track.<{'|'.join(log_suffixes())}> beside, for each antenna")

@@ -308,7 +308,7 @@ def _draw_causes(axes: Axes, lines: Sequence[Mapping[str, Any]], measure: str) -
 
 
 def _names(lines: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return the cause of each line, with what tells those apart that come twice.
+    """Return the cause of each line, with a distinction of those that occur twice.
 
     Examples
     --------

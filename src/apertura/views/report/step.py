@@ -35,7 +35,7 @@ from apertura.views.report.page import page as page_of
 from apertura.workflow.lineage import result_of
 
 SETTING_COLUMNS = ("key", "value")
-"""Headings of what was asked."""
+"""Headings of the table of settings."""
 
 
 def page(campaign: Campaign, flight: str) -> list[Path]:

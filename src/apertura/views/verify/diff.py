@@ -355,7 +355,7 @@ def print_reproduced(path: Path, *, cores: int, keep: Path | None = None) -> int
         status = run_workflow(again, cores, *(["all", *requested] if whole else wanted))
         if status:
             return status
-        lines = _found(product.root, again, wanted, known)
+        lines = _outcome(product.root, again, wanted, known)
     for line in lines:
         print(shown(line, _LONGEST))
     if keep is not None:
@@ -363,7 +363,7 @@ def print_reproduced(path: Path, *, cores: int, keep: Path | None = None) -> int
     return 0 if lines[0].startswith("same") else 1
 
 
-def _found(root: Path, again: Path, wanted: Sequence[str], known: Sequence[str]) -> list[str]:
+def _outcome(root: Path, again: Path, wanted: Sequence[str], known: Sequence[str]) -> list[str]:
     """Return the differences of the requested results and the first known result that differs; or their agreement."""
     lines = [line for manifest in wanted for line in compared(root, again, manifest)]
     if not lines:

@@ -93,7 +93,7 @@ def _manifest(results: Path, path: Path) -> str:
 def _listing(results: Path, path: Path, *, sha256: str = "") -> str:
     """Return the manifest that lists a file, relative to the campaign; empty if none does.
 
-    A file that lies elsewhere is recognised by its hash, as long as nobody has edited it.
+    A file elsewhere is recognised by its hash, unless it was edited.
     """
     for manifest in manifests(results):
         with suppress(CampaignError):  # a damaged manifest lists nothing

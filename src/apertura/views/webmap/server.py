@@ -41,7 +41,7 @@ _RANGE = re.compile(r"bytes=(?:(\d{1,18})-(\d{1,18})?|-(\d{1,18}))", re.ASCII)
 
 
 class UnsatisfiableRangeError(ValueError):
-    """No byte of the file is asked for."""
+    """The requested range has no byte of the file."""
 
 
 def own_host(hosts: list[str], port: int) -> str | None:
@@ -64,7 +64,7 @@ def own_host(hosts: list[str], port: int) -> str | None:
 
 
 def requested_range(header: str | None, size: int) -> tuple[int, int] | None:
-    """Return the first byte asked for and the one after the last; None for the whole file.
+    """Return the first requested byte and the one after the last; None for the whole file.
 
     A header that is none, or asks for several ranges, asks for the whole file (RFC 9110, 14.2).
 
