@@ -1,6 +1,7 @@
 """Conversions of units: powers to decibels, times to seconds."""
 
 import numpy as np
+from numpy.typing import NDArray
 
 from apertura.common.arrays import Floats, Times
 
@@ -26,3 +27,14 @@ def seconds_since(times: Times, start: np.datetime64) -> Floats:
     array([0. , 1.5])
     """
     return np.asarray((times - start) / np.timedelta64(1, "s"), np.float64)
+
+
+def nanoseconds(times: Times) -> NDArray[np.int64]:
+    """Return times as nanoseconds since 1970.
+
+    Examples
+    --------
+    >>> nanoseconds(np.array(["1970-01-01T00:00:01"], "datetime64[s]")).tolist()
+    [1000000000]
+    """
+    return times.astype("datetime64[ns]").astype(np.int64)

@@ -13,6 +13,7 @@ from apertura.campaign.digests import digest_of
 from apertura.campaign.folder import Campaign
 from apertura.campaign.store import open_stage
 from apertura.common.errors import CampaignError
+from apertura.common.units import nanoseconds
 from apertura.core.echo.association import Association, associate
 from apertura.core.echo.captures import Read, Samples, ordered
 from apertura.core.echo.demodulate import Numerology
@@ -198,7 +199,7 @@ def _own_sources(stage: xr.Dataset, files: Path) -> str:
 
 def common_pulses(tx: Acquisition, rx: Acquisition, *, prf_hz: float) -> Association:
     """Return the pulses that a transmitter and a receiver have in common."""
-    tx_time, rx_time = (node.raw.time.values.astype("datetime64[ns]").astype(np.int64) for node in (tx, rx))
+    tx_time, rx_time = (nanoseconds(node.raw.time.values) for node in (tx, rx))
     return associate(
         tx_time,
         rx_time,

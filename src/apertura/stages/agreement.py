@@ -15,6 +15,7 @@ from apertura.campaign.store import (
     open_listed,
     read_manifest,
     remake,
+    remake_from,
 )
 from apertura.common.contracts import Window
 from apertura.common.documents import undamaged
@@ -45,7 +46,7 @@ def opened_layer(campaign: Campaign, flight: str, pair: str, file: str) -> Itera
 
     path = campaign.result(flight, pair, file)
     manifest = campaign.root / campaign.manifest("layers", flight, pair)
-    remedy = f"Delete {manifest} and run the workflow again."
+    remedy = remake_from(manifest)
     if not path.is_file() or read_manifest(manifest)["files"].get(path.name) != sha256_file(path):
         raise CampaignError("not as it was written", path, f"what {manifest.name} describes", remedy)
     with opened_raster(path, expected="what step layers writes", remedy=remedy) as raster:

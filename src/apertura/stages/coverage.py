@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rasterio import Affine
 
+from apertura.campaign.config import is_monostatic
 from apertura.campaign.folder import Campaign
 from apertura.campaign.store import open_stage, record_files
 from apertura.common.atomic import replacement
@@ -50,7 +51,7 @@ def _covered(campaign: Campaign, flight: str, pair: str, grid: SceneGrid) -> Cov
     aperture = aperture_of(open_stage(campaign.stage("echo", flight, pair), "echo"))
     some = np.unique(np.linspace(0, len(aperture) - 1, _VERTICES).round().astype(int))
     legs = dict(zip(("transmitter", "receiver"), aperture[some].legs, strict=True))
-    if len(set(pair.split("-"))) == 1:
+    if is_monostatic(pair):
         del legs["receiver"]  # the same node: one track
     tracks_m = {antenna: map_from_frame(grid.crs, leg) for antenna, leg in legs.items()}
     return Covered(flight, pair, tracks_m, few_looks(campaign, flight, pair))

@@ -19,6 +19,7 @@ from apertura.common.arrays import Times
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.flags import Flags
 from apertura.common.provenance import merged
+from apertura.common.units import nanoseconds
 from apertura.core.echo.association import Association, missing_flags, tag_jitter_s
 from apertura.core.echo.captures import Saturation
 from apertura.core.echo.pulse_filter import truncation_flags
@@ -141,7 +142,7 @@ def _attributes(
 ) -> dict[str, Any]:
     """Return the attributes of an echo whose pulses were sent `at`: flags, counts of pulses left out, reports."""
     tx, rx = nodes
-    missing = missing_flags(at.astype("datetime64[ns]").astype(np.int64))
+    missing = missing_flags(nanoseconds(at))
     attrs = {
         "frame": "ecef",
         "pair": f"{tx.name}-{rx.name}",
@@ -150,7 +151,7 @@ def _attributes(
         "time_tags": {
             **{name: getattr(pulses, name) for name in ("offset_s", "drift_ppm", "residual_s", "method")},
             "std_s": tx.settings.time_tag_std_s,
-            "jitter_s": tag_jitter_s(tx.raw.time.values.astype("datetime64[ns]").astype(np.int64)),
+            "jitter_s": tag_jitter_s(nanoseconds(tx.raw.time.values)),
         },
         "flags": Flags.merged(
             pulses.flags,
@@ -181,7 +182,7 @@ def _transfer(
     """
     tx, rx = nodes
     if tx.name == rx.name:
-        read, sent_ns = rx.reader(["radar"], captures), at.astype("datetime64[ns]").astype(np.int64)
+        read, sent_ns = rx.reader(["radar"], captures), nanoseconds(at)
         measured = transfer_by_code(read, sent.inverse, rx.numerology, time_s=(sent_ns - sent_ns[0]) * 1e-9)
         return _with_waveform(measured, sent), np.zeros(len(at))
     length_m = air.electrical_m(tx.antenna("sidelink", at), rx.antenna("sidelink", at))

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from apertura.campaign.folder import Campaign
-from apertura.campaign.store import read_manifest, record_files
+from apertura.campaign.store import read_manifest, record_files, remake_from
 from apertura.common.errors import CampaignError
 from apertura.common.provenance import sha256_file
 from apertura.formats.export import EXPORTS, MOSAICS, mosaics, remove_outdated
@@ -34,7 +34,7 @@ def mosaic(campaign: Campaign) -> Sequence[Path]:
                     "not as it was written" if source.is_file() else "no such file",
                     where=source,
                     expected=f"what {manifest.name} describes",
-                    remedy=f"Delete {manifest} and run the workflow again.",
+                    remedy=remake_from(manifest),
                 )
         flown = f"{len(sources)} flight{'s' * (len(sources) > 1)}"
         title = f"{campaign.settings.campaign} · {name.removesuffix('.vrt')} of {flown}"

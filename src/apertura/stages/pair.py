@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from apertura.campaign.config import Antenna, SampledWaveform
+from apertura.campaign.config import Antenna, SampledWaveform, is_monostatic
 from apertura.campaign.folder import Campaign
 from apertura.common.arrays import Times
 from apertura.common.errors import CampaignError
@@ -253,7 +253,7 @@ def open_pair(
     history = phase_history_of(echo, campaign.settings.processing.window, lazy=True)
     axes = body_axes(echo)
     stated = echo.attrs.get("positions", {})
-    legs = ("tx",) if len(set(pair.split("-"))) == 1 else ("tx", "rx")  # one node has one position
+    legs = ("tx",) if is_monostatic(pair) else ("tx", "rx")  # one node has one position
     return OpenPair(
         flight,
         pair,

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 from apertura.campaign.digests import Result
 from apertura.campaign.folder import Campaign
-from apertura.campaign.store import read_manifest, record_files, remake
+from apertura.campaign.store import read_manifest, record_files, remake, remake_from
 from apertura.common.atomic import write_json, write_text
 from apertura.common.documents import read_json, undamaged
 from apertura.common.paths import shipped
@@ -71,7 +71,7 @@ def _results(campaign: Campaign) -> Iterator[_Made]:
         if name != "ro_crate" and not on_demand(campaign, result.manifest):
             path = campaign.root / result.manifest
             recorded, expected = read_manifest(path), "a manifest that states the sources of a result"
-            with undamaged(path, expected=expected, remedy=f"Delete {path} and run the workflow again."):
+            with undamaged(path, expected=expected, remedy=remake_from(path)):
                 hashes = {key: str(recorded[key]) for key in ("code", "settings")}
                 yield _Made(name, where, result, {**recorded, **hashes, "sources": dict(recorded["sources"])})
 

@@ -10,9 +10,9 @@ from urllib.parse import quote
 import numpy as np
 from numpy.typing import NDArray
 
-from apertura.campaign.config import FUSED, polarisation_of
+from apertura.campaign.config import FUSED, is_monostatic, polarisation_of
 from apertura.campaign.folder import Campaign
-from apertura.campaign.store import open_listed, open_stage, read_manifest, record_files
+from apertura.campaign.store import open_listed, open_stage, read_manifest, record_files, remake_from
 from apertura.common.atomic import write_json
 from apertura.common.documents import undamaged
 from apertura.common.errors import CampaignError
@@ -73,7 +73,7 @@ class _Described:
     def _pair(self, flight: str, pair: str, looks: NDArray[np.float32]) -> Image:
         files = self._listed(flight, pair, "export") | self._listed(flight, pair, "layers")
         facts: dict[str, Any] = {
-            "sar:instrument_mode": "monostatic" if len(set(pair.split("-"))) == 1 else "bistatic",
+            "sar:instrument_mode": "monostatic" if is_monostatic(pair) else "bistatic",
             "product:type": "SLC",
             "sar:looks_range": 1,
             "sar:looks_azimuth": 1,
@@ -135,7 +135,7 @@ class _Described:
         """Return the properties of an image: projection, processing, quality."""
         path = self.campaign.result(flight, name, "image.json")
         manifest = path.with_name("export.manifest.json")
-        report, remedy = open_listed(path, manifest), f"Delete {manifest} and run the workflow again."
+        report, remedy = open_listed(path, manifest), remake_from(manifest)
         code = read_manifest(manifest).get("code", "unknown")
         with undamaged(path, expected="the report of an image", remedy=remedy):
             verdict, facts = str(report["focus"]["verdict"]), dict[str, Any]()

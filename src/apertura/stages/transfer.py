@@ -19,6 +19,7 @@ from apertura.common.arrays import Complexes
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
 from apertura.common.flags import Flags
+from apertura.common.units import nanoseconds
 from apertura.core.echo.association import missing_flags
 from apertura.core.echo.captures import Pulses, Saturation, blocks_of
 from apertura.core.echo.dechirp import sweep_motion_flags
@@ -265,7 +266,7 @@ def _placed_by_logs(campaign: Campaign, flight: str, nodes: tuple[str, str], his
     counts: dict[str, Any] = {"used": len(at), "dropped": sum(left_out.values()), "reasons": left_out}
     antennas = tx.antenna("radar_tx", at), rx.antenna("radar_rx", at)
     lasting_s = history.attrs.get("sweep_used_s", 0.0)
-    missing = missing_flags(at.astype("datetime64[ns]").astype("int64"))
+    missing = missing_flags(nanoseconds(at))
     moved = sweep_motion_flags(at, antennas, lasting_s=lasting_s, frequency_hz=history.frequency.values)
     return history.assign(
         reference_delay=history.reference_delay - offset_s,

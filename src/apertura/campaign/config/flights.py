@@ -78,6 +78,12 @@ class Flight:
         return (*self.pairs, FUSED) if len(self.pairs) > 1 else self.pairs
 
 
+def is_monostatic(pair: str) -> bool:
+    """Test whether one node sends and receives in a pair."""
+    transmitter, receiver = pair.split("-")
+    return transmitter == receiver
+
+
 def read_flights(path: Path, *, nodes: Collection[str]) -> Iterator[Flight]:
     """Yield the flights of a flights.tsv.
 

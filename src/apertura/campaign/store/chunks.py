@@ -18,7 +18,7 @@ from zarr.core.buffer import Buffer, BufferPrototype
 from zarr.errors import ZarrUserWarning
 from zarr.storage import LocalStore, MemoryStore
 
-from apertura.campaign.store.manifest import ResultOrigin, check_stage, manifest_of
+from apertura.campaign.store.manifest import ResultOrigin, check_stage, remake
 from apertura.campaign.store.progress import create, finish, open_array, writing
 from apertura.common.atomic import naming, remove, write_beside
 from apertura.common.confined import ConfinedPath
@@ -158,7 +158,7 @@ def damaged(folder: Path, key: str) -> CampaignError:
         "damaged since it was written",
         where=folder / key,
         expected="bytes that agree with their sum",
-        remedy=f"Delete {manifest_of(folder)} and run the workflow again." if finished else "Run the workflow again.",
+        remedy=remake(folder) if finished else "Run the workflow again.",
     )
 
 

@@ -31,7 +31,12 @@ def remake(result: Path) -> str:
     >>> remake(Path("results/scene.json"))
     'Delete results/scene.manifest.json and run the workflow again.'
     """
-    return f"Delete {manifest_of(result)} and run the workflow again."
+    return remake_from(manifest_of(result))
+
+
+def remake_from(manifest: Path) -> str:
+    """Return the remedy for a result whose files contradict their manifest, or have none that is whole."""
+    return f"Delete {manifest} and run the workflow again."
 
 
 class ResultOrigin(Protocol):
@@ -71,7 +76,7 @@ def read_manifest(manifest: Path) -> dict[str, Any]:
     CampaignError
         If it is no manifest.
     """
-    expected, remedy = "a manifest as the workflow wrote it", f"Delete {manifest} and run the workflow again."
+    expected, remedy = "a manifest as the workflow wrote it", remake_from(manifest)
     document = read_json(manifest, expected=expected, remedy=remedy)
     with undamaged(manifest, expected=expected, remedy=remedy):
         for hashes in (document["files"], document.get("sources", {})):
@@ -252,7 +257,7 @@ def _check(manifest: Path, recorded: Mapping[str, str], present: Mapping[str, st
             f"{len(differing)} files are not as they were written, first {differing[0].name}",
             where=manifest.parent,
             expected=f"what {manifest.name} describes",
-            remedy=f"Delete {manifest} and run the workflow again.",
+            remedy=remake_from(manifest),
         )
 
 
@@ -275,7 +280,7 @@ def check_listed(path: Path, manifest: Path, *, present: Callable[[Path], str] =
     """
     recorded = str(read_manifest(manifest)["files"].get(path.relative_to(manifest.parent).as_posix(), ""))
     if not recorded or present(path) != recorded:
-        remedy = f"Delete {manifest} and run the workflow again."
+        remedy = remake_from(manifest)
         raise CampaignError("not as it was written", path, f"what {manifest.name} describes", remedy)
     return recorded
 

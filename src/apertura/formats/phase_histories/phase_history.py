@@ -13,6 +13,7 @@ from apertura.common.arrays import Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
 from apertura.common.flags import Flags
+from apertura.common.units import nanoseconds
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -169,7 +170,7 @@ def joined(histories: Sequence[History], *, pair: str, expected: str) -> "xr.Dat
     }
     pulsed = {name: (dims[name], np.concatenate([getattr(one, name)[one.used] for one in histories])) for name in dims}
     attrs: dict[str, Any] = {"frame": first.frame} if first.frame else {}
-    missing = missing_flags(pulsed["time"][1].astype("datetime64[ns]").astype(np.int64))
+    missing = missing_flags(nanoseconds(pulsed["time"][1]))
     flags = Flags.merged(missing, *(one.flags for one in histories))
     attrs |= {"pair": pair, "flags": flags, "reference": first.reference, "wave_speed_m_s": SPEED_OF_LIGHT_M_S}
     reasons = Counter[str]()

@@ -15,7 +15,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from apertura.campaign.config import Flight, SampledWaveform
+from apertura.campaign.config import Flight, SampledWaveform, is_monostatic
 from apertura.campaign.folder import Campaign
 from apertura.campaign.store import record_files
 from apertura.common.atomic import remove
@@ -197,7 +197,7 @@ def _applies(campaign: Campaign, name: str) -> bool:
     """Test whether a setting can take effect: terrain where there is a DEM, a sidelink where there is one."""
     if "terrain" in _SETTINGS[name]:
         return campaign.settings.scene.dem is not None
-    receivers = any(len(set(pair.split("-"))) > 1 for pair in campaign.image_flights[0].pairs)
+    receivers = not all(map(is_monostatic, campaign.image_flights[0].pairs))
     return "sidelink" not in _SETTINGS[name] or (receivers and isinstance(campaign.settings.waveform, SampledWaveform))
 
 

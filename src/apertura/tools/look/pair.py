@@ -12,7 +12,7 @@ from apertura.campaign.folder import Campaign
 from apertura.common.arrays import Times
 from apertura.common.errors import CampaignError
 from apertura.common.flags import Flags
-from apertura.common.units import seconds_since
+from apertura.common.units import nanoseconds, seconds_since
 from apertura.core.antenna.beam import Beams
 from apertura.core.backprojection.contributions import band_limited_image
 from apertura.core.backprojection.inputs import PhaseHistory, Profiles
@@ -356,7 +356,7 @@ class PairSoFar:
         if self.tx is self.rx:
             here = np.arange(self.taken, last)
             return here, here
-        tags = [node.time.astype("datetime64[ns]").astype(np.int64) for node in (self.tx, self.rx)]
+        tags = [nanoseconds(node.time) for node in (self.tx, self.rx)]
         if last <= self.taken or not tags[1].size:
             return nothing, nothing
         interval_ns = round(1e9 / self.sent.waveform.prf_hz)

@@ -15,7 +15,7 @@ from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 from rasterio import Affine
 
-from apertura.campaign.config import FUSED, SampledWaveform
+from apertura.campaign.config import FUSED, SampledWaveform, is_monostatic
 from apertura.campaign.folder import Campaign
 from apertura.campaign.store import blocks_of_rows, open_stage, record_files
 from apertura.check.times import counted
@@ -150,7 +150,7 @@ class Shown:
         grid, aperture = self.scene.grid, aperture_of(self.echo)
         some = thinned(len(aperture), 400)
         legs = dict(zip(("transmitter", "receiver"), aperture[some].legs, strict=True))
-        if len(set(self.pair.split("-"))) == 1:
+        if is_monostatic(self.pair):
             del legs["receiver"]  # the same node: one track
         step, _, west, _, _, north = grid.transform
         looks = few_looks(self.campaign, self.flight, self.pair)

@@ -12,7 +12,7 @@ import numpy as np
 from apertura.campaign.config import FUSED
 from apertura.campaign.digests import digest_of
 from apertura.campaign.folder import Campaign
-from apertura.campaign.store import check_listed, read_manifest, record_files
+from apertura.campaign.store import check_listed, read_manifest, record_files, remake_from
 from apertura.common.atomic import write_json
 from apertura.common.documents import read_json, undamaged
 from apertura.common.errors import CampaignError
@@ -287,7 +287,7 @@ def _layer(manifest: Path, row: Export, report: Mapping[str, Any]) -> Layer | No
         return digest_of(root, file.relative_to(root).as_posix()) if file.is_file() else ""
 
     sha256 = check_listed(path, manifest, present=present)
-    remedy = f"Delete {manifest} and run the workflow again."
+    remedy = remake_from(manifest)
     with opened_raster(path, expected="what the workflow wrote", remedy=remedy) as raster:
         title, unit = str(raster.descriptions[0] or row.file), str(raster.units[0] or "")
         if np.dtype(raster.dtypes[0]).kind == "c" or (unit == "1" and row.source in _SHOWN_IN_DB):
