@@ -140,8 +140,8 @@ def export_fused(campaign: Campaign, flight: str) -> list[Path]:
     # the cube depends on every flight, its files of one flight on that flight's pairs alone
     origin = Provenance.of(lineage.modules, images, settings={"fusion": assessed["fusion"]})
     code_sha256 = chained_sha256(lineage.result.code_sha256, [cube.attrs["code_sha256"]])
-    tags = tags_of(replace(origin, code_sha256=code_sha256), lineage) | _quality_tags(report)
-    tags |= _acquisition_tags(campaign, {pair: image.attrs["quality"]["view"] for pair, image in images.items()})
+    tags = tags_of(replace(origin, code_sha256=code_sha256), lineage) | quality_tags(report)
+    tags |= acquisition_tags(campaign, {pair: image.attrs["quality"]["view"] for pair, image in images.items()})
     written = write_exports(
         "fused",
         folder,
