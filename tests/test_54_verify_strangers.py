@@ -19,7 +19,7 @@ def root(finished_tiny, tmp_path):
     return copy_writable(finished_tiny.root, tmp_path / "finished")
 
 
-@pytest.mark.quick("[[]1", '{"a": 3}')
+@pytest.mark.quick("[[]1]", '{"a": 3}')
 @pytest.mark.parametrize("text", ["{", "[1]", '{"a": 3}', "[" * 100_000, "\x1b[31m", "NaN"])
 def test_a_tag_that_is_no_document_is_reported(root, capsys, text):
     retag(root / DB, SOURCES=text)

@@ -402,7 +402,6 @@ def test_a_pair_that_falls_behind_takes_every_other_pulse_and_says_so(tiny):
     assert "1 pulse in 2 taken" in (tiny / "results/look/index.html").read_text()
 
 
-@pytest.mark.slow
 def test_pulses_stand_for_those_left_out_beside_them(finished_tiny, tmp_path, monkeypatch):
     root = copy_writable(finished_tiny.root, tmp_path / "campaign")
     (whole, _), look = in_blocks(root, 20, monkeypatch), Look(Campaign.load(root), follow=False)
