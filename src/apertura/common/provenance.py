@@ -224,8 +224,10 @@ def check_size(path: Path, size: int) -> None:
 def hashes_of_file(path: Path, algorithms: Sequence[str]) -> dict[str, str]:
     """Return algorithm → hash of a file's bytes, hex; read once, each hash taken by a thread of its own."""
     digests = {name: hashlib.new(name) for name in algorithms}
-    blocks, updates = cycle([memoryview(bytearray(_READ_BYTES)) for _ in range(2)]), list[Future[None]]()
+    updates = list[Future[None]]()
     with path.open("rb", buffering=0) as stream, ThreadPoolExecutor(len(digests)) as pool:
+        block_bytes = min(_READ_BYTES, max(os.fstat(stream.fileno()).st_size, 1))  # of a small file, all
+        blocks = cycle([memoryview(bytearray(block_bytes)) for _ in range(2)])
         while size := stream.readinto(block := next(blocks)):  # while the block before is hashed
             wait(updates)
             updates = [pool.submit(digest.update, block[:size]) for digest in digests.values()]

@@ -51,7 +51,7 @@ class Unaligned:
     Attributes
     ----------
     echo, log
-        As `apertura.methods.synchronisation` takes them: each by seconds of its own, from its first pulse and epoch.
+        As `apertura.methods.alignment` takes them: each by seconds of its own, from its first pulse and epoch.
     log_start_ns
         Delay of the log's first epoch against the recorder's first pulse, nanoseconds.
     applied_ns

@@ -1,7 +1,7 @@
 """Backprojection by the project's compiled kernel: range tables, no gathers, AVX-512, AVX2 or portable.
 
 1. `prepare` turns range profiles into tables (native/expand.hpp): in each cell the least-squares polynomial of the
-   profile, times the carrier (docs/theory/engine.md, "Cells"; `native_tables` designs the filters).
+   profile, times the carrier (docs/theory/engine.md, "Cells"; `range_interpolation` designs the filters).
 2. `form` sums them over patches of 16 × 16 pixels (native/patch.cpp, batch.hpp). Paths are polynomials in blocks of
    4 × 4 pixels with one curvature for the patch or one for each block, or exact in float64, the cheapest within
    `tolerance_rad` ("Paths"). Weights of beams are polynomials over the patch where they are smooth (7), those of a
