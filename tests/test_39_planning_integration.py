@@ -11,7 +11,7 @@ from apertura.common.errors import CampaignError
 from apertura.core.antenna.beam import Beam, Beams
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.imaging.backproject import backproject
-from apertura.core.imaging.choices import ImagingChoices
+from apertura.core.imaging.options import ImagingChoices
 from apertura.core.planning.decisions import integrate
 from apertura.core.quality.point_targets import cut_through, find_peak
 from apertura.core.scene.grid import SceneGrid

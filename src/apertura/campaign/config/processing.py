@@ -10,7 +10,7 @@ from pydantic import Field, field_validator, model_validator
 from apertura.campaign.config.section import CrsName, Metres3, Name, Section, Title, plain_crs
 from apertura.common.constants import LARGEST_REFRACTIVITY, VERTICAL_DATUMS
 from apertura.common.errors import CampaignError, quoted
-from apertura.core.imaging.choices import ImagingChoices
+from apertura.core.imaging.options import ImagingChoices
 
 # ---- Sections `processing` and `calibration` ------------------------------------------------------------------------
 

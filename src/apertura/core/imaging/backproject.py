@@ -22,10 +22,10 @@ from apertura.core.backprojection.job import Job
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.geometry.atmosphere import Atmosphere, SceneAir
 from apertura.core.geometry.geodesy import LOCAL, geodetic_from_ecef
-from apertura.core.imaging.choices import ImagingChoices, IntegrationAngle, IntegrationResolution
 from apertura.core.imaging.formation import Formation
 from apertura.core.imaging.job import check_inputs, imaging_job, profiles_job
 from apertura.core.imaging.judgement import Judgement, budget_by_hand, judgement
+from apertura.core.imaging.options import ImagingChoices, IntegrationAngle, IntegrationResolution
 from apertura.core.imaging.radiometry import Calibration, cell_constant
 from apertura.core.imaging.range_profiles import RangeWindow, inputs_of, range_compress
 from apertura.core.planning.plan import memory_limit
