@@ -251,7 +251,7 @@ VACUUM = {
     "check/reach.py": _SIZE,
     "workflow/resources.py": _SIZE,
     "check/facts.py": _DRAWN,
-    "stages/diagnosis.py": _SIZE,
+    "stages/hypotheses.py": _SIZE,
     "stages/echo.py": _ELECTRICAL,
     "stages/tags.py": "wavelength written beside the frequency",
     "stages/transfer.py": _ELECTRICAL,

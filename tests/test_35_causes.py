@@ -6,9 +6,10 @@ from apertura_research.autofocus.cases import GRID, wrong_case
 from apertura_research.autofocus.outcomes import judge
 
 from apertura.core.scene.terrain import FlatGround
-from apertura.methods.autofocus.causes import explained, late_logs, other_height
+from apertura.methods.autofocus.cause_fit import CausePrior, explained
 from apertura.methods.autofocus.inputs import NodePrior, Prior, TrackErrors
 from apertura.methods.autofocus.refine import TrackSearch, refine
+from apertura.methods.causes import late_logs, other_height
 
 GROUND = FlatGround(0.0)
 
@@ -18,7 +19,7 @@ def test_the_adjoint_of_a_cause_is_its_transpose():
     flight = Prior({node: NodePrior.of(TrackErrors((0.01,) * 3), knots_s, np.eye(3)) for node in "ab"})
     flown = {node: (np.arange(0, 5, 0.01), generator.standard_normal((500, 3))) for node in "ab"}
     for cause in (late_logs("ab", flown), other_height("ab", flown["a"][0], np.array([0.0, 0.6, 0.8]))):
-        prior = cause.prior(flight, knots_s)
+        prior = CausePrior.of(cause, flight, knots_s)
         unknowns = generator.standard_normal(prior.size)
         gradient = {node: generator.standard_normal((50, 3)) for node in "ab"}
         forward = sum(float((track * gradient[node]).sum()) for node, track in prior.tracks(unknowns).items())
@@ -30,7 +31,7 @@ def test_ground_that_lies_higher_is_as_if_all_flew_lower():
     up, height_m = np.array([0.0, 0.0, 1.0]), 0.7
     flight = Prior({"a": NodePrior.of(TrackErrors((0.01,) * 3), np.arange(10.0), np.eye(3))})
     cause = other_height(["a"], np.arange(10.0), up)
-    moved = cause.prior(flight, np.arange(10.0)).tracks(np.array([height_m]) / cause.std)["a"]
+    moved = CausePrior.of(cause, flight, np.arange(10.0)).tracks(np.array([height_m]) / cause.std)["a"]
     flown, target = np.array([3.0, -20.0, 30.0]), np.array([1.0, 5.0, height_m])
     true_m = np.linalg.norm(flown - target)
     assert np.linalg.norm(flown + moved[0] - target * [1, 1, 0]) == pytest.approx(true_m)
@@ -43,7 +44,7 @@ def test_the_arm_that_is_wrong_is_found_to_centimetres():
     search = TrackSearch.begin(made.records, GRID, GROUND, made.errors)
     found = explained(search.problem, causes, search.axes, np.random.default_rng(0))
     assert found is not None
-    assert found.cause.kind == "lever arm"
+    assert found.cause.quantity.kind == "lever arm"
     assert list(found.cause.moved_m) == [node]
     assert found.values == pytest.approx(arm_m, abs=0.03)
 

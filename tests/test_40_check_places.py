@@ -12,9 +12,9 @@ from rasterio.transform import from_origin
 from apertura.campaign.folder import Campaign
 from apertura.check import as_line, files, problems
 from apertura.check.georeferencing import needles
-from apertura.check.hints import likely_cause
 from apertura.common.confined import ConfinedPath
 from apertura.core.geometry.geodesy import projected_from_ecef
+from apertura.methods.causes import mistaken_time
 from apertura.simulation.presets import DEMO_ORIGIN
 from apertura.stages.node_log import read_log
 
@@ -70,11 +70,18 @@ def test_a_log_18_seconds_late_is_asked_about_gpst(tiny):
 
 @pytest.mark.parametrize(
     ("shift_s", "cause"),
-    [(18.9, "GPST taken"), (-18.0, "GPST taken off"), (3600 * 9.5, "local time"), (5e5, "another day"), (400.0, "")],
+    [
+        (18.9, "GPST taken"),
+        (-18.0, "UTC taken for GPST"),
+        (36.1, "TAI taken for UTC"),
+        (3600 * 9.5, "local time"),
+        (5e5, "another day"),
+        (400.0, ""),
+    ],
 )
 def test_a_shift_in_time_looks_like_what_makes_it(shift_s, cause):
-    assert cause in likely_cause(shift_s)
-    assert bool(likely_cause(shift_s)) is bool(cause)
+    assert cause in mistaken_time(shift_s)
+    assert bool(mistaken_time(shift_s)) is bool(cause)
 
 
 def test_a_log_may_end_with_the_last_pulse_and_not_before(tiny):

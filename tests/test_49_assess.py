@@ -14,10 +14,10 @@ from apertura.common.errors import CampaignError
 from apertura.core.geometry.aperture import Aperture
 from apertura.core.scene.grid import SceneGrid
 from apertura.simulation import preset, simulate
-from apertura.stages import assess, cube, echo, export, image, profile
+from apertura.stages import assess, cube, echo, export, hypotheses, image, profile
 from apertura.stages.acquisition import check_rates
 from apertura.stages.agreement import assessment_of
-from apertura.stages.diagnosis import Hypothesis, Trial, explanation
+from apertura.stages.hypotheses import Hypothesis, explanation
 from apertura.views.summary import print_summary
 
 PAIRS = ("uav1-uav1", "uav1-uav2")
@@ -150,7 +150,7 @@ def test_random_errors_of_a_log_have_no_cause_that_is_named(tmp_path):
 
 
 def trial(gain_db, kind, *, offset=False):
-    return Trial(gain_db, Hypothesis(f"it is {kind}", kind, ()), offset)
+    return Hypothesis(f"it is {kind}", kind, (), gain_db=gain_db, is_offset=offset)
 
 
 @pytest.mark.parametrize(
@@ -306,9 +306,9 @@ def test_a_hypothesis_on_the_height_is_tried_where_its_point_then_lies(monkeypat
     track = np.stack([np.linspace(-5, 5, 64), np.full(64, -30.0), np.full(64, 25.0)], -1)
     found = [SimpleNamespace(history=SimpleNamespace(aperture=Aperture(track, track + [0.0, 4.0, 2.0])))]
     here_m = np.array([1.0, 2.0, 0.0])
-    monkeypatch.setattr(assess, "_ground", lambda *_: here_m)
+    monkeypatch.setattr(hypotheses, "_ground", lambda *_: here_m)
     scene = SimpleNamespace(axes=np.eye(3))
-    east_m, north_m = assess._moved_by_height(scene, (1.0, 2.0), found, height_m)
+    east_m, north_m = hypotheses._moved_by_height(scene, (1.0, 2.0), found, height_m)
     there_m = here_m + [east_m, north_m, height_m]
     before, after = (found[0].history.aperture.path(one[None]).mean() for one in (here_m, there_m))
     moved_m = np.hypot(east_m, north_m)

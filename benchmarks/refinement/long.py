@@ -25,9 +25,9 @@ from apertura.core.geometry.aperture import Aperture
 from apertura.core.imaging.job import decide_integration
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import FlatGround
-from apertura.methods.autofocus.causes import late_logs, other_height
 from apertura.methods.autofocus.inputs import NodePrior, PairRecord, TrackErrors
 from apertura.methods.autofocus.refine import refine
+from apertura.methods.causes import late_logs, other_height
 
 PULSES_HZ, SPEED_M_S, SIGMA_M, NOISE = 500.0, 5.0, 0.02, 0.02
 CENTRE_HZ, BAND_HZ = 1.2512e9, 102.4e6

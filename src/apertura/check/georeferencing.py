@@ -5,12 +5,12 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 from pyproj import CRS, Transformer
+from pyproj.exceptions import ProjError
 
 from apertura.campaign.config import CONFIG
 from apertura.check.examination import Examination
-from apertura.check.hints import likely_place
 from apertura.common.errors import CampaignError
-from apertura.core.geometry.geodesy import LOCAL, ecef_from_geodetic, projected_from_ecef
+from apertura.core.geometry.geodesy import LOCAL, ecef_from_geodetic, geodetic_from_ecef, projected_from_ecef
 from apertura.core.scene.auto_grid import utm_crs
 from apertura.core.scene.dem import Dem
 from apertura.core.scene.grid import SceneGrid
@@ -21,12 +21,20 @@ _FAR_UP_M = 1000.0  # between a point and the ground: heights are known at least
 TALLEST_M = 500.0
 """Nothing narrower than two posts stands out of all land about it by more, and by more than ten posts are wide."""
 
+_NEAR_M = 20e3
+"""A scene this close to the track is where it was meant to be, far as a mistake puts it."""
+
 _STEEPEST_POSTS = 10.0
 _PER_POST = 2  # samples
 _WINDOW = 7  # samples: three and a half posts
 _MOST_SAMPLES = 1_000_000
 _COARSE = 256
 _MARGIN = _WINDOW - 1  # samples about the scene, which are not judged
+
+Place = tuple[float, float]
+"""Latitude and longitude, degrees."""
+
+_NOWHERE = (np.nan, np.nan)
 
 
 def check_scene_crs(examined: Examination) -> Iterator[CampaignError]:
@@ -231,3 +239,49 @@ def _over_windows(heights: NDArray[np.float64], by: np.ufunc) -> NDArray[np.floa
         parts = [np.take(padded, range(first, first + heights.shape[axis]), axis) for first in range(_WINDOW)]
         heights = by.reduce(parts)
     return heights
+
+
+def likely_place(examined: Examination) -> str:
+    """Return what to correct, as a sentence that names the mistake under which scene and track meet; '' if none does.
+
+    The scene lies elsewhere than the first image flight flew.
+    """
+    bounds = examined.campaign.settings.scene.bounds_m
+    if bounds == "auto" or examined.middle_m is None or examined.crs is None:
+        return ""
+    x, y = (bounds[0] + bounds[2]) / 2, (bounds[1] + bounds[3]) / 2
+    latitude, longitude, _ = map(float, geodetic_from_ecef(examined.middle_m))
+    zone, crs = utm_crs(examined.middle_m), str(examined.crs)
+    stated, flown = _place(crs, x, y), (latitude, longitude)
+    degrees = f"These look like degrees: give scene.bounds_m in metres of {crs}."
+    mistakes = [  # each with the places of scene and track if it was made
+        (degrees, (y, x), flown),
+        (degrees, (x, y), flown),
+        ("Give scene.bounds_m easting before northing: [xmin, ymin, xmax, ymax].", _place(crs, y, x), flown),
+        (
+            f"Is scene.crs {zone}, the zone of the track, instead of {crs}?",
+            _place(zone, x, y) if zone != crs else _NOWHERE,
+            flown,
+        ),
+        ("Are latitude and longitude swapped in the logs?", stated, (longitude, latitude)),
+        ("Has longitude the wrong sign in the logs (east is positive)?", stated, (latitude, -longitude)),
+        ("Has latitude the wrong sign in the logs (north is positive)?", stated, (-latitude, longitude)),
+        ("Are the logs in radians?", stated, (float(np.degrees(latitude)), float(np.degrees(longitude)))),
+    ]
+    return next((sentence for sentence, *places in mistakes if _apart_m(*places) < _NEAR_M), "")
+
+
+def _place(crs: str, x: float, y: float) -> Place:
+    try:
+        longitude, latitude = Transformer.from_crs(crs, CRS(crs).geodetic_crs, always_xy=True).transform(x, y)
+    except ProjError:
+        return _NOWHERE
+    return float(latitude), float(longitude)
+
+
+def _apart_m(*places: Place) -> float:
+    """Return the distance of two places, straight; inf where one is none on Earth."""
+    if not all(abs(latitude) <= 90 and abs(longitude) <= 180 for latitude, longitude in places):
+        return np.inf
+    one, other = (ecef_from_geodetic(*(np.array(value) for value in (*place, 0.0))) for place in places)
+    return float(np.linalg.norm(one - other))

@@ -16,7 +16,7 @@ from apertura.campaign.config import (
     SampledWaveform,
 )
 from apertura.check.examination import Examination, Key
-from apertura.check.hints import likely_place
+from apertura.check.georeferencing import likely_place
 from apertura.check.times import expected_pulses, recorded_span
 from apertura.common.arrays import Times
 from apertura.common.constants import SPEED_OF_LIGHT_M_S

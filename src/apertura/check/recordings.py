@@ -6,7 +6,6 @@ import numpy as np
 
 from apertura.campaign.config import CONFIG
 from apertura.check.examination import Examination
-from apertura.check.hints import likely_cause
 from apertura.check.times import (
     LAG,
     expected_pulses,
@@ -20,6 +19,7 @@ from apertura.check.times import (
 from apertura.common.arrays import Times
 from apertura.common.errors import CampaignError
 from apertura.formats.recordings.recording import Recording
+from apertura.methods.causes import mistaken_time
 from apertura.stages.acquisition import check_channels, check_length, check_rates
 from apertura.stages.ingest import framing_of
 from apertura.stages.positions import inside_segments
@@ -164,7 +164,7 @@ def _nothing_in_common(tx: Recording, rx: Recording, prf_hz: float) -> CampaignE
     shift = shift_s(recorded_span(tx), recorded_span(rx))
     first, second = (" to ".join(map(iso, recorded_span(node))) for node in (tx, rx))
     return CampaignError(
-        f"recorded {first} and {second}, {abs(shift):.1f} s apart{likely_cause(shift)}",
+        f"recorded {first} and {second}, {abs(shift):.1f} s apart{mistaken_time(shift)}",
         where=where,
         expected="time tags of the same pulses",
         remedy="Check that both are of the same flight, and their core:datetime.",

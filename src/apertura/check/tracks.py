@@ -7,11 +7,11 @@ import numpy as np
 from apertura.campaign.config import CONFIG
 from apertura.campaign.folder import Campaign
 from apertura.check.examination import Examination, Key
-from apertura.check.hints import likely_cause
-from apertura.check.times import Span, common_pulses, inside, iso, recorded_span, seconds_between, shift_s
+from apertura.check.times import Span, apart_s, common_pulses, inside, iso, recorded_span, shift_s
 from apertura.common.arrays import Times
 from apertura.common.errors import CampaignError
 from apertura.formats.tracks.track import FIXES
+from apertura.methods.causes import mistaken_time
 
 FASTEST_M_S = 340.0
 """No node flies faster than sound: times or positions are in another unit."""
@@ -110,8 +110,8 @@ def _no_overlap(examined: Examination, key: Key) -> CampaignError | None:
     """Return the fault of a continuous recording, of which only its span is known, not its pulses."""
     log, recorded = examined.logs[key].times.span, recorded_span(examined.recordings[key])
     shift = shift_s(recorded, log)
-    found = f"log and recording are {abs(shift):.1f} s apart{likely_cause(shift)}"
-    return _problem(examined, key, found, recorded) if seconds_between(recorded, log) > 0 else None
+    found = f"log and recording are {abs(shift):.1f} s apart{mistaken_time(shift)}"
+    return _problem(examined, key, found, recorded) if apart_s(recorded, log) > 0 else None
 
 
 def _uncovered(examined: Examination, key: Key, pulses: Times) -> CampaignError | None:
@@ -131,9 +131,9 @@ def _uncovered(examined: Examination, key: Key, pulses: Times) -> CampaignError 
     ends += [f"ends {(pulses[-1] - times[-1]) / second:.3f} s before the last"] if after.any() else []
     recorded = (pulses[0], pulses[-1])
     shift = shift_s(recorded, (times[0], times[-1]))
-    cause = likely_cause(shift)
-    separation = f"; log and recording are {abs(shift):.1f} s apart{cause}" if cause else ""
-    found = f"the log {' and '.join(ends)}: {lost} of {len(pulses)} pulses without a position{separation}"
+    cause = mistaken_time(shift)
+    apart = f"; log and recording are {abs(shift):.1f} s apart{cause}" if cause else ""
+    found = f"the log {' and '.join(ends)}: {lost} of {len(pulses)} pulses without a position{apart}"
     return _problem(examined, key, found, recorded)
 
 

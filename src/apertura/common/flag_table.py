@@ -249,7 +249,7 @@ _OF_IMAGES = {
         "what is wrong, by how much, dB explained",
         "a wrong constant explains the loss better than errors of the logs: images are formed with it corrected",
         "the constant named: lever_arms_m or attitude, config/clocks.tsv, scene.height_m",
-        "methods/autofocus/causes.py"),
+        "methods/autofocus/cause_fit.py"),
     "paths_differ": Flag(
         "cm of path, and standard deviation", "after refinement pairs show points a constant path apart",
         "nodes.<n>.path_offset_m of the pair's receiver, lever arms", "methods/autofocus/refine.py"),

@@ -24,13 +24,13 @@ from apertura.core.planning.decisions import decide_autofocus
 from apertura.core.planning.plan import Decision
 from apertura.core.quality.budget import NodePositions
 from apertura.core.quality.path_errors import Effect
-from apertura.methods.autofocus.causes import Cause, late_logs, other_arm, other_height
 from apertura.methods.autofocus.evidence import FOLDS
 from apertura.methods.autofocus.inputs import PairRecord, ReferencePoint, Refinement, TrackErrors
 from apertura.methods.autofocus.one_phase import SpaceVariance, space_variance
 from apertura.methods.autofocus.patches import Candidates
 from apertura.methods.autofocus.path_offsets import refine_one_phase
 from apertura.methods.autofocus.refine import refine as refine_tracks
+from apertura.methods.causes import Cause, late_logs, other_arm, other_height
 from apertura.stages.acquisition import Acquisition
 from apertura.stages.node_log import raw_log
 from apertura.stages.pair import OpenPair, open_pair, pattern_digests

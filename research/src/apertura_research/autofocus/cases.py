@@ -15,8 +15,8 @@ from apertura.core.geometry.lever_arms import TrackCorrection
 from apertura.core.imaging.range_profiles import range_compress
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import FlatGround
-from apertura.methods.autofocus.causes import Cause, late_logs, other_arm, other_height
 from apertura.methods.autofocus.inputs import PairRecord, TrackErrors
+from apertura.methods.causes import Cause, late_logs, other_arm, other_height
 from apertura.simulation.scatterers import transfer
 from apertura.simulation.targets import Scatterers
 
@@ -423,7 +423,7 @@ def wrong_case(
         other_height(NODES, flight.time_s, np.array([0.0, 0.0, 1.0])),
         late_logs(NODES, flown),
     ]
-    possible = [cause for cause in causes if cause.kind == kind]
+    possible = [cause for cause in causes if cause.quantity.kind == kind]
     node, values = "", np.zeros(0)
     moved = {node: np.array(moved_m) for node, moved_m in one.truth.moved_m.items()}
     if possible:

@@ -10,7 +10,7 @@ from apertura.common.arrays import Bools, Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import Terrain
-from apertura.methods.autofocus.causes import LEAST_EVIDENCE, Cause, Explained, explained, more_of
+from apertura.methods.autofocus.cause_fit import LEAST_EVIDENCE, CauseFit, explained
 from apertura.methods.autofocus.evidence import (
     FOLDS,
     MOST_RATIO,
@@ -44,6 +44,7 @@ from apertura.methods.autofocus.solve import (
     prominent_point_start,
     unslipped_start,
 )
+from apertura.methods.causes import Cause
 
 # ---- Gauge fixed by points common to pairs and by reference points --------------------------------------------------
 
@@ -365,7 +366,7 @@ class _Model:
             flags["paths_differ"] = f"against {search.problem.pairs[0].record.pair}: {', '.join(lines)}"
         return Refinement(correction, left.std_m, evidence.accepted, evidence.why, report, flags)
 
-    def evidence_against(self, plain: "_Model", cause: Explained) -> float:
+    def evidence_against(self, plain: "_Model", cause: CauseFit) -> float:
         """Return the objective of the logs' errors alone less that of these beside a cause.
 
         Notes
@@ -601,7 +602,7 @@ class TrackSearch:
 
     def cause(
         self, grid: SceneGrid, terrain: Terrain, errors: Mapping[str, TrackErrors], causes: Sequence[Cause]
-    ) -> Explained | None:
+    ) -> CauseFit | None:
         """Return the cause that explains most of what a flight lost, its size found in rounds as places come out."""
         if not causes or not self.problem.patches:
             return None
@@ -611,7 +612,7 @@ class TrackSearch:
         for _ in range(MOST_ROUNDS - 1):
             moved = [blocks.record.corrected(found.correction) for blocks in self.problem.pairs]
             again = TrackSearch.begin(moved, grid, terrain, errors)
-            improved = more_of(again.problem, found, again.axes) if again.problem.patches else found
+            improved = found.more(again.problem, again.axes) if again.problem.patches else found
             if improved.gain_db - found.gain_db < LEAST_FURTHER_DB:
                 break
             found = improved
