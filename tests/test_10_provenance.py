@@ -88,7 +88,7 @@ def test_every_module_that_an_import_loads_is_in_the_closure():
     shown = subprocess.run([sys.executable, "-c", LOADED], check=True, capture_output=True, text=True)
     loaded = set(json.loads(shown.stdout))
     assert {
-        "apertura.campaign.store.chunks",
+        "apertura.campaign.store.progress",
         "apertura.core.backprojection.tiles",
         "apertura.core.geometry.aperture",
     } <= loaded

@@ -21,11 +21,11 @@ from apertura.campaign.store import (
     open_array,
     open_document,
     open_stage,
+    progress,
     resume,
     save_document,
     save_stage,
     sharing,
-    stages,
     write_blocks,
     writing,
 )
@@ -93,8 +93,8 @@ def test_a_chunk_in_the_place_of_another_is_refused_when_it_is_read(tmp_path):
 
 
 def test_an_array_is_the_same_on_the_disk_however_its_blocks_are_cut(tmp_path, monkeypatch):
-    monkeypatch.setattr(stages, "_CHUNK_BYTES", 3 * 4 * 8)
-    monkeypatch.setattr(stages, "_FEWEST_ROWS", 1)
+    monkeypatch.setattr(progress, "_CHUNK_BYTES", 3 * 4 * 8)
+    monkeypatch.setattr(progress, "_FEWEST_ROWS", 1)
     values = np.random.default_rng(1).normal(size=(11, 4))
     stage = xr.Dataset({"profile": (("pulse", "range"), np.broadcast_to(0.0, values.shape))})
     trees = []

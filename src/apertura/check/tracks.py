@@ -7,7 +7,7 @@ import numpy as np
 from apertura.campaign.config import CONFIG
 from apertura.campaign.folder import Campaign
 from apertura.check.examination import Examination, Key
-from apertura.check.times import Span, apart_s, common_pulses, inside, iso, recorded_span, shift_s
+from apertura.check.times import Span, common_pulses, inside, iso, recorded_span, seconds_between, shift_s
 from apertura.common.arrays import Times
 from apertura.common.errors import CampaignError
 from apertura.formats.tracks.track import FIXES
@@ -111,7 +111,7 @@ def _no_overlap(examined: Examination, key: Key) -> CampaignError | None:
     log, recorded = examined.logs[key].times.span, recorded_span(examined.recordings[key])
     shift = shift_s(recorded, log)
     found = f"log and recording are {abs(shift):.1f} s apart{mistaken_time(shift)}"
-    return _problem(examined, key, found, recorded) if apart_s(recorded, log) > 0 else None
+    return _problem(examined, key, found, recorded) if seconds_between(recorded, log) > 0 else None
 
 
 def _uncovered(examined: Examination, key: Key, pulses: Times) -> CampaignError | None:

@@ -5,7 +5,6 @@ A stage is written as ``<stage>.zarr.wip`` under a kernel lock, finished by a re
 products have manifests of the same kind. Each names its files with their hashes and what they were made from.
 """
 
-from apertura.campaign.store.chunks import blocks_of_rows, open_stage, save_stage, write_blocks
 from apertura.campaign.store.manifest import (
     check_listed,
     compare,
@@ -23,13 +22,17 @@ from apertura.campaign.store.manifest import (
     states_origin,
 )
 from apertura.campaign.store.progress import (
+    blocks_of_rows,
     create,
     finish,
     mark_rewritten,
     missing,
     open_array,
+    open_stage,
     resume,
+    save_stage,
     sharing,
+    write_blocks,
     writing,
 )
 

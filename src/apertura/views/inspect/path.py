@@ -179,8 +179,7 @@ def _readers(path: Path, beside: Surroundings) -> Iterator[tuple[str, str, Reade
         for row in RECORDERS:
             suffix = next((suffix for suffix in row if path.name.endswith(suffix)), None)
             if suffix is not None:
-                files = recording_files(path.parent, path.name.removesuffix(suffix))
-                yield "recording", row[0].lstrip("."), partial(recording_report, files, beside)
+                yield "recording", row[0].lstrip("."), partial(_recording, path, suffix, beside)
         for name, history in PHASE_HISTORIES.items():
             if path.name.endswith(history.suffix):
                 yield "phase history", name, partial(_history, path, name, beside)
@@ -191,6 +190,10 @@ def _readers(path: Path, beside: Surroundings) -> Iterator[tuple[str, str, Reade
         yield "elevation model", "", partial(dem_report, path)
     if path.suffix in ARRAY:
         yield "array", "", partial(array_report, path)
+
+
+def _recording(path: Path, suffix: str, beside: Surroundings) -> Report:
+    return recording_report(recording_files(path.parent, path.name.removesuffix(suffix)), beside)
 
 
 def _history(path: Path, name: str, beside: Surroundings) -> Report:
