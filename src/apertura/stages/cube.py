@@ -293,7 +293,7 @@ class _Plane:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Of the plane."""
+        """Shape of the plane."""
         shape: tuple[int, ...] = self.array.shape[len(self.place) :]
         return shape
 

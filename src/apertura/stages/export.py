@@ -78,7 +78,7 @@ def export_pair(campaign: Campaign, flight: str, pair: str) -> list[Path]:
 
 
 def _calibrated(campaign: Campaign, flight: str, pair: str, report: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what radiometric calibration adds to a report: cross-sections of points, budget lines, flags."""
+    """Return the radiometric part of a report: cross-sections of points, budget lines, flags."""
     manifest = campaign.root / campaign.manifest("layers", flight, pair)
     calibration = open_listed(campaign.result(flight, pair, CROSS_SECTIONS), manifest)
     std_db = calibration["std_db"]

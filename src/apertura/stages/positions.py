@@ -236,7 +236,7 @@ def _longest_hole(node: NodeLog, checked: CheckedTrack, cause: str) -> str:
 
 
 GROUND_STEP_M = 10.0
-"""To which the ground's height is rounded here: 0.4 N units, so that a height of focus does not form echoes anew."""
+"""Rounding of the ground's height for air: 0.4 N units, so that a height of focus does not form echoes anew."""
 
 _SIDE = 16  # of a grid on which the mean height of a DEM is taken
 

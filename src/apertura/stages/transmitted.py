@@ -52,7 +52,7 @@ MOST_SYMBOLS = 1 << 24
 """Code symbols of a waveform."""
 
 MOST_PULSE_SAMPLES = 1 << 22
-"""Of a pulse, and of a capture."""
+"""Largest number of samples of a pulse, and of a capture."""
 
 MOST_CHIPS = 1 << 20
 """Chips of a preamble."""

@@ -41,7 +41,7 @@ NEAR_S = 5.0
 """Largest offset searched for a clock in UTC, seconds; of a clock without UTC every offset is searched."""
 
 MOST_PULSES = 8192
-"""Of a recording, evenly spread: bounds memory; their changes show when the node moved."""
+"""Pulses of a recording that are used, evenly spread: bounds memory."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -362,7 +362,7 @@ def pair_settings(place: JobPlace) -> Mapping[str, Any]:
 
 
 _POINTS = frozenset({"reference_points", "reflectors"})
-"""Of the scene, what its grid does not depend on."""
+"""Settings of the scene that its grid does not depend on."""
 
 
 def grid(place: JobPlace) -> Mapping[str, Any]:

@@ -126,7 +126,7 @@ def _newest_ns(root: ConfinedPath, names: Iterable[str]) -> int:
 
 
 def make_again(campaign: Campaign, stale: Mapping[str, str], *, remove: bool) -> None:
-    """Say which results will be made again, and `remove` their manifests: what has none is not finished."""
+    """Print the results that will be made again, and `remove` their manifests: without one a result is unfinished."""
     for line in stale_lines(stale):
         print(line, file=sys.stderr, flush=True)
     for manifest in reversed(list(stale)) if remove else ():  # dependent results first: a kill leaves no gap below

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 FLIGHTS = Path("config/flights.tsv")
 _COLUMNS = ["flight", "kind", "transmitter", "nodes"]
 KINDS = ("bench", "calibration", "image")
-"""Of flights: a radar that stands still; a flight past a reflector, which corrects the echoes of others; images."""
+"""Kinds of flights: a stationary radar; a flight past a reflector, which corrects the echoes of others; images."""
 _NAME: TypeAdapter[str] = TypeAdapter(Name)
 
 FUSED = "fused"
@@ -52,7 +52,7 @@ class Flight:
 
     @property
     def recorded(self) -> tuple[str, ...]:
-        """Of which nodes there is a recording: of all, on a bench also without the transmitter's.
+        """Nodes with a recording: all that take part, on a bench the receivers.
 
         Examples
         --------

@@ -133,7 +133,7 @@ class Antennas(Section):
 
 
 class LeverArms(Section):
-    """From the logged point to each phase centre, body axes forward-right-down."""
+    """Lever arms from the logged point to each phase centre, body axes forward-right-down."""
 
     radar_tx: Metres3 = Field((0.0, 0.0, 0.0), description="transmitting radar antenna, m")
     radar_rx: Metres3 = Field((0.0, 0.0, 0.0), description="receiving radar antenna, m")
@@ -152,7 +152,7 @@ class PathOffsets(Section):
 
 
 class Receiver(Section):
-    """From the port of the receiving radar antenna to the numbers recorded."""
+    """Receiver chain from the port of the receiving radar antenna to the recorded numbers."""
 
     full_scale_counts: float = Field(
         gt=0, le=2**32, description="|I + jQ| of a complex sine at full scale, in the numbers recorded: 8192 of 14 bits"

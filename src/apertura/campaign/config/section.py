@@ -87,7 +87,7 @@ def plain_crs(crs: str) -> str:
 
 
 Name = Annotated[str, AfterValidator(_plain_name)]
-"""Of a flight or a node."""
+"""Name of a flight or a node."""
 
 CrsName = Annotated[str, AfterValidator(plain_crs)]
 """A coordinate reference system by authority and code, two of them joined by ``+``, 'auto' or 'local'."""

@@ -178,17 +178,17 @@ class PulseWaveform(SampledWaveform):
 
     @property
     def needed_samples(self) -> int:
-        """All of a capture: its end holds the end of the last echo."""
+        """Number of samples of a whole capture: its end holds the end of the last echo."""
         return self.capture_samples
 
     @property
     def most_subcarriers(self) -> int:
-        """Those of the band."""
+        """Number of subcarriers of the band."""
         return min(self.capture_samples, int(self.widest_band_hz / self.sample_rate_hz * self.capture_samples) + 1)
 
     @property
     def widest_band_hz(self) -> float:
-        """As stated, or all that the samples carry."""
+        """Stated bandwidth, or all that the samples carry."""
         return self.sample_rate_hz if self.band_hz is None else self.band_hz[1] - self.band_hz[0]
 
     @model_validator(mode="after")
@@ -210,7 +210,7 @@ class PulseWaveform(SampledWaveform):
 # ---- Waveforms as transfer functions: phase histories, beat signals of FMCW -----------------------------------------
 
 _MOST_SAMPLES = 1_000_000
-"""Of a sweep; ramps of real radars have 100 to 100 000."""
+"""Largest number of samples of a sweep; ramps of real radars have 100 to 100 000."""
 
 _LONGEST_REFERENCE_M = 1e6
 

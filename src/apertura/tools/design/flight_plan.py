@@ -32,7 +32,7 @@ class _Track(Section):
 
 
 class _Leg(_Track):
-    """From one place to another."""
+    """Straight track from one place to another."""
 
     start_m: Place = Field(description="where the first leg begins: easting, northing in scene.crs, m")
     end_m: Place = Field(description="where it ends, m")
@@ -81,7 +81,7 @@ class MissionTrack(Section):
 
 
 class BesideTrack(Section):
-    """Beside another node, by its course."""
+    """Track beside another node, by its course."""
 
     kind: Literal["beside"]
     of: Name = Field(description="node that it follows")
@@ -152,7 +152,7 @@ class PlannedFlight(Section):
 
     @property
     def participants(self) -> tuple[str, ...]:
-        """Every node that flies."""
+        """Nodes that fly."""
         return tuple(dict.fromkeys((self.transmitter, *self.receivers)))
 
 

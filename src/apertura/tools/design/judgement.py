@@ -82,7 +82,7 @@ class Verdict:
 
     @property
     def report(self) -> dict[str, Any]:
-        """As JSON values."""
+        """JSON values of the verdict."""
         found = float(f"{self.found:.4g}") if np.isfinite(self.found) else None
         named = {"requirement": self.requirement, "asked": self.required, "found": found, "met": self.met}
         return named | {"image": self.image, "cause": self.cause}

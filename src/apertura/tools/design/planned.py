@@ -102,7 +102,7 @@ class Course:
 
     @property
     def length_s(self) -> float:
-        """From the first pulse to the end of what is flown."""
+        """Duration from the first pulse to the end of the flight."""
         return float(self.time_s[-1]) - LEAD_S
 
     def transfer_s(self, climb_m_s: float) -> float:

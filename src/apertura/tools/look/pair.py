@@ -44,7 +44,7 @@ from apertura.stages.transmitted import Transmitted
 from apertura.tools.look.node import NodeSoFar
 
 Axes = dict[str, NDArray[np.float64]]
-"""As of `apertura.stages.pair.beams_of`."""
+"""Body axes of the antennas with beams, as of `apertura.stages.pair.beams_of`."""
 
 
 _CERTIFIED = 16  # pixels that are also summed exactly

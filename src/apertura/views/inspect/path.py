@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MOST_FILES = 100
-"""Of a folder that are looked into."""
+"""Most files of a folder that are inspected."""
 
 _HEAD_BYTES = 16
 

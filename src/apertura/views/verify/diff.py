@@ -86,10 +86,8 @@ class Tally:
         if not a.size:
             return
         self.compared += a.size
-        self.largest, self.square = (
-            max(self.largest, float(difference.max())),
-            self.square + float((difference**2).sum()),
-        )
+        self.largest = max(self.largest, float(difference.max()))
+        self.square += float((difference**2).sum())
         self.peak = max(self.peak, float(np.abs(a).max()), float(np.abs(b).max()))
         if self._sums is None:  # of real values the mean is taken off: sums about one of them keep their digits
             self._sums, self._about = np.zeros(5, complex), 0.0 if self.phased else float(a[0])
@@ -288,11 +286,10 @@ def difference_lines(tally: Tally, *, unit: str = "1", power: bool = False) -> I
     if not tally.differing:
         return
     if tally.compared and tally.largest:
-        largest, rms = (f"{value:.3g} {unit}" for value in (tally.largest, tally.rms))
+        values, of = np.array([tally.largest, tally.rms]), ""
         if unit == "1":
-            levels = ((10 if power else 20) * np.log10(value / tally.peak) for value in (tally.largest, tally.rms))
-            largest, rms = (f"{level:.1f} dB" for level in levels)
-        of = " of the peak" if unit == "1" else ""
+            values, unit, of = (10 if power else 20) * np.log10(values / tally.peak), "dB", " of the peak"
+        largest, rms = (f"{value:.1f} dB" if of else f"{value:.3g} {unit}" for value in values)
         kind = "coherence" if tally.phased else "correlation"
         count = tally.compared + sum(tally.only)
         yield f"{tally.differing} of {count} differ, by {largest}{of} at most, {rms} rms; {kind} {tally.alike:.6f}"

@@ -25,7 +25,7 @@ from apertura.views.quality import ImageValues, explained_flags, read_report
 from apertura.workflow.lineage import result_of
 
 FORMAT = 1
-"""Of `map.json`; the page refuses another."""
+"""Format of `map.json`; the page refuses another."""
 
 KINDS = ("image", "classes", "measure")
 """Style of a layer: grey between two dB that the reader chooses, named colours, a ramp of colours."""

@@ -252,7 +252,7 @@ class MapServer(ThreadingHTTPServer):
             self.serve_forever()
 
     def handle_error(self, request: object, client_address: object) -> None:  # noqa: ARG002
-        """Say in one line what went wrong with a request, unless its reader has just gone."""
+        """Print the error of a request in one line, unless its reader has just gone."""
         error = sys.exception()
         if not isinstance(error, ConnectionError | TimeoutError):
             print(f"error: a request failed: {error}", file=sys.stderr)
@@ -376,7 +376,7 @@ class _Handler(BaseHTTPRequestHandler):
         super().end_headers()
 
     def log_message(self, format: str, *arguments: object) -> None:  # noqa: A002
-        """Say nothing: a map asks for hundreds of ranges."""
+        """Log nothing: a map requests hundreds of ranges."""
 
 
 def served_look(campaign: Campaign, *, port: int = 0) -> MapServer:
