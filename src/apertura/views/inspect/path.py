@@ -173,7 +173,7 @@ def _readers(path: Path, beside: Surroundings) -> Iterator[tuple[str, str, Reade
     if stated in PHASE_HISTORIES and path.name.endswith(PHASE_HISTORIES[stated].suffix):
         yield "phase history", stated, partial(_history, path, stated, beside)
         return  # the campaign reads it as that, whichever other reader knows the file
-    from apertura.views.inspect.files import ARRAY, DEM, array_report, dem_report, log_report, recording_report
+    from apertura.views.inspect.files import ARRAY, DEM, array_report, dem_report, log_report
 
     if "format" not in beside.typed:
         for row in RECORDERS:
@@ -193,6 +193,8 @@ def _readers(path: Path, beside: Surroundings) -> Iterator[tuple[str, str, Reade
 
 
 def _recording(path: Path, suffix: str, beside: Surroundings) -> Report:
+    from apertura.views.inspect.files import recording_report
+
     return recording_report(recording_files(path.parent, path.name.removesuffix(suffix)), beside)
 
 
