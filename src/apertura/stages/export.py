@@ -127,13 +127,20 @@ def export_fused(campaign: Campaign, flight: str) -> list[Path]:
         ),
         **_measures(grid, windows, sums, images, assessed),
         "fusion": assessed["fusion"],
-        "coherence": _coherence(measured, assessed) | {"isolated": isolated},
+        "coherence": {
+            "mean": None if measured is None else round(measured.coherence, 4),
+            "std": None if measured is None else round(measured.std, 4),
+            "chance": round(1 / len(added), 4),
+            "pairs": len(added),
+            "points": 0 if measured is None else measured.places,
+            "isolated": isolated,
+        },
         "agreement": cube.attrs["agreement"]["flights"].get(flight),
         "flags": Flags.merged(_flags_of_pairs(of_pairs), of_sum),
     }
-    name, coherently = f"{campaign.settings.campaign} · flight {flight}", assessed["fusion"]["phases_rad"]
+    name = f"{campaign.settings.campaign} · flight {flight}"
     titles = {
-        "coherent": f"coherent sum of {' + '.join(coherently)}",
+        "coherent": f"coherent sum of {' + '.join(added)}",
         "noncoherent": f"non-coherent sum of {' + '.join(pairs)}",
         "magnitude": f"sum of magnitudes of {' + '.join(pairs)}",
     }
@@ -324,17 +331,6 @@ def _focus(images: Mapping[str, xr.Dataset], measured: InPhase | None, added: Se
             f"{number_of(measured.places, 'bright point')} of the sum lost {abs(loss_db):.2f} ± {std_db:.2f} dB of "
             f"their peak, {abs(measured.loss_db):.2f} dB of it because the pairs differ in phase"
         ),
-    }
-
-
-def _coherence(measured: InPhase | None, assessed: Mapping[str, Any]) -> dict[str, float | int | None]:
-    pairs = len(assessed["fusion"]["phases_rad"])
-    return {
-        "mean": None if measured is None else round(measured.coherence, 4),
-        "std": None if measured is None else round(measured.std, 4),
-        "chance": round(1 / pairs, 4),
-        "pairs": pairs,
-        "points": 0 if measured is None else measured.places,
     }
 
 

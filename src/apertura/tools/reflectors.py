@@ -149,7 +149,7 @@ def measured_constants(campaign: Campaign) -> tuple[Constants, list[str]]:
         campaign=campaign.settings.campaign,
         flights=began,
         reference=reference,
-        pairs=dict(_drifted(pairs, before)) if before else dict(pairs),
+        pairs=dict(_with_drift(pairs, before)) if before else dict(pairs),
         measurements=tuple(one.report for one in found),
         images=images,
     )
@@ -380,7 +380,8 @@ def _flags(mean: Mean, unit: str) -> dict[str, str]:
     return flags
 
 
-def _drifted(pairs: Mapping[str, PairConstant], before: Constants) -> Iterator[tuple[str, PairConstant]]:
+def _with_drift(pairs: Mapping[str, PairConstant], before: Constants) -> Iterator[tuple[str, PairConstant]]:
+    """Yield the constants of pairs, with a flag where they drifted since those that the campaign uses."""
     for pair, now in pairs.items():
         was = before.pairs.get(pair)
         if was is None or was.radar.differs(now.radar):
