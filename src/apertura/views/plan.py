@@ -19,12 +19,6 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 
-def expected_plan(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Plan:
-    """Plan the image of a pair: from its echo, or from the flight logs before anything ran."""
-    scene = expected_scene(campaign, lambda: first_flight(campaign))
-    return plan_pair(campaign, open_pair(campaign, flight, pair), scene, threads=threads)
-
-
 def first_flight(campaign: Campaign) -> Flown:
     """Return the joint geometry of the first image flight, from which the one grid of all images is settled."""
     flight = campaign.image_flights[0]
