@@ -30,7 +30,7 @@ import apertura as ap
 from apertura.common.errors import CampaignError
 from apertura.core.antenna.beam import Beams
 from apertura.core.backprojection.engines import cuda, native, reference
-from apertura.core.backprojection.engines.cuda import candidates
+from apertura.core.backprojection.engines.cuda_prediction import candidates
 from apertura.core.backprojection.inputs import PhaseHistory
 from apertura.core.backprojection.job import Job, Signal
 from apertura.core.geometry.aperture import Aperture

@@ -15,7 +15,7 @@ from scenes import side_beam as beam_of
 from apertura.common.errors import CampaignError
 from apertura.core.antenna.beam import Beams
 from apertura.core.backprojection.engines import cuda, load_engine
-from apertura.core.backprojection.engines.cuda import (
+from apertura.core.backprojection.engines.cuda_prediction import (
     ANGLE_ERROR,
     ANGLE_RMS,
     FARTHEST,

@@ -8,8 +8,7 @@ cost.
 """
 
 import ctypes
-import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cache
@@ -23,55 +22,13 @@ from pydantic import Field
 
 from apertura.common.errors import CampaignError
 from apertura.core.antenna.beam import Beams
+from apertura.core.backprojection.engines.cuda_prediction import CHUNK, DEGREE, SIDE, candidates, simulated
 from apertura.core.backprojection.engines.engine import (
     EngineOptions,
-    Setting,
     checked_pixels,
-    option_values,
-    power_sum_db,
 )
-from apertura.core.backprojection.engines.native import OVERSAMPLINGS, TOLERANCES_RAD, View, view_of
-from apertura.core.backprojection.engines.native_binding import KERNEL
-from apertura.core.backprojection.engines.range_interpolation import PHASE_POLYNOMIALS, TableDesign, design_table, ratio
+from apertura.core.backprojection.engines.range_interpolation import PHASE_POLYNOMIALS, TableDesign, design_table
 from apertura.core.backprojection.inputs import Profiles
-from apertura.core.backprojection.job import Job
-
-# ---- Sizes and error bounds of the GPU's kernel
-#
-# Errors are of one leg's path. D is the largest distance of a pixel from the middle of its patch, s as in
-# docs/theory/engine.md, (8).
-
-SIDE = KERNEL.patch_side
-"""Pixels along a patch, which one block of threads sums; tiles begin at multiples of it."""
-
-TAPS = KERNEL.taps
-"""Taps of a table's filters."""
-
-DEGREE = 2
-"""Degree of the polynomials in a cell: linear ones save two look-ups of six, and need tables 1.7 times as fine."""
-
-CHUNK = 64
-"""Pulses of a patch that are summed in float32; these sums add up in float64."""
-
-LAST_ORDER, LAST_TERM = 6, 21 / 1024
-"""The first order of √(1 + s) that (8) neglects, and its coefficient: at most that over 1 − |s| is neglected."""
-
-FARTHEST = 0.5
-"""Largest |s| at which the series is used: beyond, its error bound is of no use."""
-
-FLOAT32_ERROR, FLOAT32_RMS = 2.5e-7, 3.2e-8
-"""Error of (8) by float32, relative to D: at worst, and RMS over 20 000 random pixels at each of five ranges."""
-
-MOST_CELLS = 2.0**20
-"""Cells across a patch beyond which float32 cannot separate neighbours."""
-
-
-ANGLE_ERROR, ANGLE_RMS = 1e-6, 2e-7
-"""Error of a pixel's angle in a cut by float32, rad: at worst, and RMS."""
-
-PLACE_ERROR, PLACE_RMS = 3e-7, 3.2e-8
-"""Error of s of docs/theory/integration.md, (1), by float32, relative to D/R: at worst, and RMS."""
-
 
 # ---- The device, and arrays on it
 #
@@ -80,17 +37,6 @@ PLACE_ERROR, PLACE_RMS = 3e-7, 3.2e-8
 
 _LOCK = Lock()
 _THREADS, _CHUNK_THREADS = 128, 32  # of blocks that fill tables, and that compare pulses of chunks
-
-
-def simulated() -> bool:
-    """Return whether numba's simulator replaces the device: for tests, thousands of times slower.
-
-    Examples
-    --------
-    >>> simulated()
-    False
-    """
-    return os.environ.get("NUMBA_ENABLE_CUDASIM", "0") not in ("", "0")
 
 
 @cache
@@ -428,130 +374,3 @@ def form(
     if not pixels.size:
         return np.zeros(pixels.shape[:2], np.complex64)
     return sum_on_device(tables, pixels, beams, tolerance_rad, counts)
-
-
-# ---- Error and cost of settings
-
-_WORST_TO_RMS = 0.105  # of a sixth power over a square patch along its diagonal, √(2/13 − 2/14)
-_FLOAT32_RAD = 2e-6  # tables and their look-ups, as native
-_NO_ERROR = 1e-20  # added before a logarithm
-
-# Seconds, not measured: a tenth of the rate that torchbp publishes for a card of 2022 (docs/theory/engine.md, "A GPU"),
-# float64 at 1/64 of float32's rate as on gaming cards, 10 GB/s there and back, and the wait for a first kernel.
-_PIXEL_S, _EXACT_S = 5e-11, 5e-9  # per pixel and pulse: by the series, by exact paths
-_CELL_S, _SAMPLE_S = 2e-11, 8e-10  # per pulse and coefficient of a cell; per pulse and sample
-_PLACE_S = 3.2e-9  # per pixel: position there, sum back
-_SECTOR_S, _BEAM_S = 3e-11, 1e-10  # on top, at the edge of a sector and for each beam: operations over a pixel's
-_START_S = 3.0
-_SIMULATED_S = 1e-4  # per pixel and pulse, half as much for a weight, in Python: this one is measured
-
-
-def candidates(job: Job, *, pulses: int, requested: Mapping[str, Any]) -> Iterator[Setting]:
-    """Yield settings of the GPU engine, as `apertura.core.backprojection.engines.engine.Engine` describes.
-
-    Notes
-    -----
-    Source: docs/theory/engine.md, "A GPU".
-    """
-    view = view_of(job)
-    weights = weights_error(job, view)
-    for oversampling in option_values(requested, "oversampling", OVERSAMPLINGS[DEGREE]):
-        for tolerance_rad in option_values(requested, "tolerance_rad", TOLERANCES_RAD):
-            yield _setting(job, view, weights, pulses, oversampling, tolerance_rad)
-
-
-def series(view: View, *, wavenumber_rad_m: float, tolerance_rad: float) -> tuple[float, float]:
-    """Return the share of pulses × patches with exact paths, and the phase error of all paths.
-
-    Parameters
-    ----------
-    view
-        Imaging geometry of the scene.
-    wavenumber_rad_m
-        2πf_mid/c.
-    tolerance_rad
-        Largest phase error that the path series may make.
-
-    Returns
-    -------
-    exact : float
-        Share of patches × pulses.
-    error_rad : float
-        RMS over patches, pulses and pixels.
-
-    Examples
-    --------
-    >>> near, far = (View(np.full((2, 1, 1), m), np.full((2, 1, 1), 0.05), 0.05) for m in (1.0, 100.0))
-    >>> limits = {"wavenumber_rad_m": 25.0, "tolerance_rad": 1e-3}
-    >>> series(near, **limits)[0], series(far, **limits)[0]
-    (1.0, 0.0)
-    """
-    reach = np.sqrt(2) * (SIDE - 1) / 2 * view.spacing_m
-    most = reach * (2 * view.range_m + reach) / view.range_m**2
-    within = np.minimum(most, FARTHEST)
-    neglected = (LAST_TERM * view.range_m * within**LAST_ORDER / (1 - within)).sum(axis=0)
-    worst = wavenumber_rad_m * (neglected + 2 * FLOAT32_ERROR * reach)
-    taken = (worst <= tolerance_rad) & (most.max(axis=0) < FARTHEST)
-    error = wavenumber_rad_m * np.hypot(_WORST_TO_RMS * neglected, np.sqrt(2) * FLOAT32_RMS * reach)
-    return float(1 - taken.mean()), float(np.sqrt((np.where(taken, error, 0.0) ** 2).mean()))
-
-
-def weights_error(job: Job, view: View) -> float:
-    """Return the RMS error of weights by float32, relative to a weight of one.
-
-    Parameters
-    ----------
-    job
-        With its beams and sector.
-    view
-        Imaging geometry of the scene.
-
-    Notes
-    -----
-    Source: docs/theory/engine.md, "A GPU": angles times the steepest slopes of the cuts; s over the sector's edge.
-    """
-    if job.beams is None:
-        return 0.0
-    slopes = [beam.steepest for beam in (job.beams.transmit, job.beams.receive) if beam is not None]
-    squared = (ANGLE_RMS * np.linalg.norm(slopes)) ** 2
-    if job.sector is not None:
-        reach = np.sqrt(2) * (SIDE - 1) / 2 * view.spacing_m
-        place = PLACE_RMS * (reach / view.range_m.min() + 2 * job.sector.half)
-        squared += view.weights.edge * (1.5 * place / (job.sector.outer - job.sector.inner)) ** 2
-    return float(np.sqrt(squared))
-
-
-def _pixel_seconds(view: View, exact: float) -> float:
-    """Return the seconds per pixel and pulse that is summed."""
-    weights = view.weights
-    if simulated():
-        return (1 - weights.dark) * (1 + (weights.antennas + weights.edge) / 2) * _SIMULATED_S
-    series_s = _PIXEL_S + weights.antennas * _BEAM_S + weights.edge * _SECTOR_S
-    exact_s = _EXACT_S * (1 + weights.antennas + weights.edge)
-    return (1 - weights.dark) * ((1 - exact) * series_s + exact * exact_s)
-
-
-def _setting(job: Job, view: View, weights: float, pulses: int, oversampling: int, tolerance_rad: float) -> Setting:
-    signal, k = job.signal, job.signal.wavenumber_rad_m
-    design = design_table(signal.oversampling, k * signal.step_m, oversampling=oversampling, degree=DEGREE)
-    table_db = design.error_db(signal.window)
-    exact, path_rad = series(view, wavenumber_rad_m=k, tolerance_rad=tolerance_rad)
-    paths_db = 20 * np.log10(path_rad + _FLOAT32_RAD)
-    weights_db = 20 * np.log10(weights + _NO_ERROR)
-    weighed = f", weights by {weights_db:.1f} dB" if job.weights else ""
-    up, down = ratio(signal.oversampling, oversampling)
-    coefficients = pulses * ((signal.samples - 1) * up // down + 1) * (DEGREE + 1)
-    return Setting(
-        "cuda",
-        {"oversampling": oversampling},
-        {"tolerance_rad": tolerance_rad},
-        power_sum_db(table_db, paths_db, weights_db),
-        job.pixels * (pulses * job.share * _pixel_seconds(view, exact) + _PLACE_S),
-        table_seconds=_START_S + _CELL_S * coefficients + _SAMPLE_S * pulses * signal.samples,
-        table_bytes=8 * coefficients,
-        reasons={
-            "oversampling": f"table errs by {table_db:.1f} dB, paths by {paths_db:.1f} dB{weighed}; "
-            "seconds are not measured",
-            "tolerance_rad": f"of pixel·pulses {100 * exact:.0f} % take exact paths in float64",
-        },
-    )

@@ -6,7 +6,7 @@ import warnings
 import numpy as np
 from numba import cuda
 
-from apertura.core.backprojection.engines.cuda import (
+from apertura.core.backprojection.engines.cuda_prediction import (
     CHUNK,
     FARTHEST,
     FLOAT32_ERROR,
