@@ -29,7 +29,7 @@ from apertura.stages.pair import open_pair
 from apertura.stages.radiometry import calibrated_pair
 from apertura.stages.scene import open_scene
 from apertura.tools.design import designed
-from apertura.tools.design.computed import rehearse
+from apertura.tools.design.expected_images import rehearse
 from apertura.tools.design.flight_plan import FlightPlan
 
 EAST, NORTH = 570661.0, 5363707.0

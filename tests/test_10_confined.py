@@ -236,7 +236,7 @@ _ELSEWHERE = {
     ("common/processes.py", "os.open"): "folders that Landlock is told of, opened without following by their names",
     ("cli.py", "os.open"): "/dev/null",
     ("views/report/step.py", "shutil.copyfile"): "from a temporary folder into a replacement",
-    ("tools/design/computed.py", "shutil.copyfile"): "into a campaign folder that was just made",
+    ("tools/design/expected_images.py", "shutil.copyfile"): "into a campaign folder that was just made",
     ("tools/write_campaign.py", "shutil.copyfile"): "into a replacement of the whole campaign folder",
 }
 

@@ -258,7 +258,7 @@ VACUUM = {
     "tools/align.py": _ELECTRICAL,
     "stages/node_log.py": _SIZE,
     "stages/radiometry.py": _POWER,
-    "tools/design/planned.py": _ELECTRICAL,
+    "tools/design/planned_tracks.py": _ELECTRICAL,
     "tools/reflectors.py": "phase that an error of a place leaves, to 0.03 %",
     "stages/calibration.py": _ELECTRICAL,
     "tools/design/view.py": _DRAWN,

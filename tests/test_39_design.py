@@ -15,8 +15,8 @@ from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import FlatGround, Plane
 from apertura.tools.design import designed
 from apertura.tools.design.flight_plan import FlightPlan, read_flight_plan
-from apertura.tools.design.judgement import helpful_changes, judge, refinement_line, search, tried_report
-from apertura.tools.design.planned import open_plan
+from apertura.tools.design.planned_tracks import open_plan
+from apertura.tools.design.requirements import helpful_changes, judge, refinement_line, search, tried_report
 
 HERE = Path()
 CARRIER, SPACING, COUNT = 1.3e9, 4e5, 512

@@ -22,9 +22,9 @@ from apertura.common.errors import CampaignError
 from apertura.common.processes import hold, holder, keep_caches_writable
 from apertura.common.progress import progress_path
 from apertura.run.journal import JobRecord, JournalReader, RunRecord, a_step_was_killed, failures, note
-from apertura.run.outlook import Outlook, StepProgress
 from apertura.run.results import clean, print_list, states
 from apertura.run.screen import Bar, Screen, bars, print_status, table
+from apertura.run.time_left import Outlook, StepProgress
 from apertura.workflow.resources import Resources
 
 PLANNED = {"ingest": 2, "image": 2, "cube": 1, "all": 1, "total": 6}

@@ -286,7 +286,7 @@ def test_steps_are_forks_that_end_with_the_run_whatever_is_killed_outright(tiny,
     run = apertura("run", tiny, "--cores", 2, *TO_IMAGES)  # others may be begun before the images, and would be more
     wait_for_tiles(tiny, run, count=2)
     processes = below(run.pid)
-    assert all(b"apertura.run.warm" in command for command in processes.values())
+    assert all(b"apertura.run.fork_server" in command for command in processes.values())
     warm, snakemake_itself, *steps = processes
     assert steps
     for one in (snakemake_itself, *steps):

@@ -18,7 +18,7 @@ from apertura.core.quality.point_targets import cut_through, find_peak
 from apertura.simulation.targets import PointTarget
 from apertura.stages.scene import open_scene
 from apertura.tools.design import designed
-from apertura.tools.design.computed import rehearse
+from apertura.tools.design.expected_images import rehearse
 from apertura.tools.design.flight_plan import FlightPlan, read_flight_plan
 
 EAST, NORTH = 570661.0, 5363707.0

@@ -601,7 +601,7 @@ def init(
     if from_ is not None:
         path, folder = given(from_), given(directory)
         from apertura.tools.design.flight_plan import read_flight_plan
-        from apertura.tools.design.writing import write_campaign_config
+        from apertura.tools.design.products import write_campaign_config
 
         print(*map(as_typed, write_campaign_config(read_flight_plan(path), folder)), sep="\n")
         print(_next_after_init(directory))

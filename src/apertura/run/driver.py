@@ -32,11 +32,11 @@ from apertura.common.processes import (
     isolate,
 )
 from apertura.common.progress import RUN
+from apertura.run.fork_server import AT_ONCE, Order
+from apertura.run.fork_server import NAME as WARM
 from apertura.run.journal import JOURNAL, NAME, RECORDER, JournalReader, a_step_was_killed, failures, note
-from apertura.run.outlook import Outlook
 from apertura.run.screen import NOTHING, Screen, listed
-from apertura.run.warm import AT_ONCE, Order
-from apertura.run.warm import NAME as WARM
+from apertura.run.time_left import Outlook
 from apertura.workflow.lineage import on_demand, results_of
 from apertura.workflow.rules import RULES
 from apertura.workflow.stale import absent_lines, any_is_missing, forms_results, stale_lines, stale_results

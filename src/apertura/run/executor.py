@@ -1,4 +1,4 @@
-"""Snakemake's executor `apertura`: asks for steps at `apertura.run.warm`, the process that they are forks of.
+"""Snakemake's executor `apertura`: asks for steps at `apertura.run.fork_server`, the process that they are forks of.
 
 Jobs that are no steps go to Snakemake's own local executor.
 """

@@ -12,8 +12,8 @@ from apertura.common.errors import number_of, shown
 from apertura.common.processes import INTERRUPTED, holder
 from apertura.common.progress import RUN
 from apertura.run.journal import JobRecord, JournalReader, RunRecord, failures
-from apertura.run.outlook import Outlook, StepProgress
 from apertura.run.results import counted, states
+from apertura.run.time_left import Outlook, StepProgress
 
 if TYPE_CHECKING:
     from rich.table import Table

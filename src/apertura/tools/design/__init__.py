@@ -14,10 +14,10 @@ import xarray as xr
 
 from apertura.common.documents import validated
 from apertura.common.errors import CampaignError, quoted
-from apertura.tools.design.computed import Design, designed
+from apertura.tools.design.expected_images import Design, designed
 from apertura.tools.design.flight_plan import FlightPlan, read_flight_plan
-from apertura.tools.design.judgement import report_of
 from apertura.tools.design.layers import UNITS
+from apertura.tools.design.requirements import report_of
 
 
 def design(

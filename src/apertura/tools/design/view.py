@@ -19,9 +19,11 @@ from apertura.stages.pair import open_pair
 from apertura.stages.refine import open_refined
 from apertura.stages.scene import expected_scene
 from apertura.tools.design import as_plan
-from apertura.tools.design.computed import Design, designed
+from apertura.tools.design.expected_images import Design, designed
 from apertura.tools.design.flight_plan import FlightPlan, MissionTrack, read_flight_plan
-from apertura.tools.design.judgement import (
+from apertura.tools.design.layers import UNITS, PlannedImage, planned_image
+from apertura.tools.design.products import PICTURE_TAGS, copy_named, plan_text, write_design
+from apertura.tools.design.requirements import (
     AXES,
     SHARE,
     Change,
@@ -33,8 +35,6 @@ from apertura.tools.design.judgement import (
     search,
     tried_report,
 )
-from apertura.tools.design.layers import UNITS, PlannedImage, planned_image
-from apertura.tools.design.writing import PICTURE_TAGS, copy_named, plan_text, write_design
 from apertura.views.plan import first_flight
 from apertura.views.quality import read_report
 from apertura.views.report.page import Block, Heading, Paragraph, Picture, Table, page

@@ -22,10 +22,10 @@ from apertura.formats.export.layers import BISTATIC_ANGLE, INCIDENCE, LOOKS, MAS
 from apertura.formats.export.style import write_layer_style, write_mask_style
 from apertura.formats.tracks.missions import write_kml
 from apertura.stages.coverage import crs_name, place_of, transform_of
-from apertura.tools.design.computed import Design
+from apertura.tools.design.expected_images import Design
 from apertura.tools.design.flight_plan import FlightPlan
-from apertura.tools.design.judgement import Tried, report_of, tried_report
 from apertura.tools.design.layers import UNITS
+from apertura.tools.design.requirements import Tried, report_of, tried_report
 
 _BANDS = {"incidence": INCIDENCE, "bistatic_angle": BISTATIC_ANGLE, "mask": MASK, "looks": LOOKS}
 _DOTS = 480  # of the longer side of the scene, in footprints

@@ -34,7 +34,7 @@ from apertura.tools.design.layers import (
     planned_job,
     summed_image,
 )
-from apertura.tools.design.planned import OpenPlan, errors_of_the_plan, open_plan
+from apertura.tools.design.planned_tracks import OpenPlan, errors_of_the_plan, open_plan
 from apertura.workflow.lineage import places
 from apertura.workflow.resources import Resources
 from apertura.workflow.rules import RULES

@@ -14,7 +14,7 @@ from apertura.common.units import decibels
 from apertura.core.quality.budget import RECEIVER_STD_M
 from apertura.formats.export.layers import LAYOVER, OUTSIDE, SHADOW
 from apertura.methods.autofocus.expected import LEAST_POINTS, LEAST_SNR_DB
-from apertura.tools.design.computed import Design, designed
+from apertura.tools.design.expected_images import Design, designed
 from apertura.tools.design.flight_plan import BesideTrack, FlightPlan, LineTrack
 from apertura.tools.design.layers import PlannedImage
 

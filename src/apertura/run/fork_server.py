@@ -1,6 +1,6 @@
 """Steps as forks of one process that has imported what they need: what `apertura run` starts on this machine.
 
-``python -m apertura.run.warm`` reads what to run, forks snakemake, with a journal, and then a process for
+``python -m apertura.run.fork_server`` reads what to run, forks snakemake, with a journal, and then a process for
 each step that its executor asks for; it has no thread of its own. Log, benchmark, variables, signals and exit
 status of a step are those of the command in its rule, which plain snakemake and other machines start as it stands.
 """
@@ -31,7 +31,7 @@ from apertura.common.processes import ALGEBRA_THREADS, CONFINED, ENDING, SIGNALL
 from apertura.run.journal import NAME as PLUGIN
 from apertura.workflow.rules import RULES
 
-NAME = "apertura.run.warm"
+NAME = "apertura.run.fork_server"
 """This module."""
 AT_ONCE = "--at-once"
 """Argument: steps will be asked for, so import what they need without being asked."""

@@ -12,7 +12,7 @@ import pytest
 from snakemake.benchmark import BenchmarkRecord
 
 from apertura.run.executor import Executor
-from apertura.run.warm import _benchmark
+from apertura.run.fork_server import _benchmark
 
 STEP = "apertura step image f01 uav1-uav2 --threads 2 > results/logs/f01/uav1-uav2.image.log 2>&1"
 
