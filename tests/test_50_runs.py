@@ -24,7 +24,7 @@ from apertura.common.progress import progress_path
 from apertura.run.journal import JobRecord, JournalReader, RunRecord, a_step_was_killed, failures, note
 from apertura.run.results import clean, print_list, states
 from apertura.run.screen import Bar, Screen, bars, print_status, table
-from apertura.run.time_left import Outlook, StepProgress
+from apertura.run.time_left import StepProgress, TimeLeft
 from apertura.workflow.resources import Resources
 
 PLANNED = {"ingest": 2, "image": 2, "cube": 1, "all": 1, "total": 6}
@@ -121,14 +121,14 @@ def timed(campaign, factor):
 
 
 def test_time_left_follows_what_has_been_measured(finished_tiny):
-    outlook = Outlook(finished_tiny, cores=2)
-    once, tenfold = (outlook.left(timed(finished_tiny, factor), 0.0, {})[1] for factor in (1, 10))
+    time_left = TimeLeft(finished_tiny, cores=2)
+    once, tenfold = (time_left.left(timed(finished_tiny, factor), 0.0, {})[1] for factor in (1, 10))
     assert tenfold == pytest.approx(10 * once)
 
 
 def test_before_a_step_of_this_run_was_timed_nobody_knows_how_long_it_takes(finished_tiny):
     job = JobRecord("image", ("image", "f01", "uav1-uav1"), "", 0.0)
-    assert Outlook(finished_tiny, cores=2).left(RunRecord(planned={"image": 2}, jobs={1: job}), 1.0, {}) == (
+    assert TimeLeft(finished_tiny, cores=2).left(RunRecord(planned={"image": 2}, jobs={1: job}), 1.0, {}) == (
         {1: None},
         None,
     )
@@ -150,8 +150,8 @@ SECONDS = {
 
 def told_and_true(campaign, expected, cores=2):
     """Return for each step of a scripted run that ends: told (or None) and true seconds left, rules timed by then."""
-    outlook, run = Outlook(campaign, cores), RunRecord(planned=dict.fromkeys(SECONDS, 6))
-    outlook._expected = lambda rule, _: expected[rule]
+    time_left, run = TimeLeft(campaign, cores), RunRecord(planned=dict.fromkeys(SECONDS, 6))
+    time_left._expected = lambda rule, _: expected[rule]
     waiting = [rule for rule in SECONDS for _ in range(6)]
     ends = [0.0] * cores
     for number, rule in enumerate(waiting):  # each on the core that is free first
@@ -166,7 +166,7 @@ def told_and_true(campaign, expected, cores=2):
             for number, job in all_jobs.items()
             if job.begun_s <= now_s
         }
-        found.append((outlook.left(run, now_s, {})[1], max(ends) - now_s, {job.rule for job in run.finished}))
+        found.append((time_left.left(run, now_s, {})[1], max(ends) - now_s, {job.rule for job in run.finished}))
     return found
 
 
@@ -183,15 +183,15 @@ def test_time_left_is_told_within_a_factor_of_two_or_not_at_all(finished_tiny, w
 
 @pytest.mark.parametrize(("timed_rule", "told"), [("layers", True), ("image", False)])
 def test_jobs_of_rasters_tell_how_long_others_take(finished_tiny, timed_rule, told):
-    outlook, where = Outlook(finished_tiny, cores=1), ("f01", "uav1-uav1")
-    outlook._expected = lambda rule, _: {"layers": 20.0, "image": 20.0, "export": 30.0}[rule]
+    time_left, where = TimeLeft(finished_tiny, cores=1), ("f01", "uav1-uav1")
+    time_left._expected = lambda rule, _: {"layers": 20.0, "image": 20.0, "export": 30.0}[rule]
     done = JobRecord(timed_rule, (timed_rule, *where), "", 0.0, 60.0)
-    left_s = outlook.left(RunRecord(planned={timed_rule: 1, "export": 1}, jobs={1: done}), 60.0, {})[1]
+    left_s = time_left.left(RunRecord(planned={timed_rule: 1, "export": 1}, jobs={1: done}), 60.0, {})[1]
     assert left_s == (pytest.approx(90.0) if told else None)
 
 
 def test_a_share_of_an_images_tiles_takes_a_start_and_its_share_of_the_work(finished_tiny):
-    outlook, shares = Outlook(finished_tiny, cores=0), (8, 80)
+    time_left, shares = TimeLeft(finished_tiny, cores=0), (8, 80)
     runs = [
         RunRecord(
             planned={"tiles": 2 * count},
@@ -199,7 +199,7 @@ def test_a_share_of_an_images_tiles_takes_a_start_and_its_share_of_the_work(fini
         )
         for count in shares
     ]
-    few, many = (outlook._expects(run, "tiles", ("f01", "uav1-uav1")) for run in runs)
+    few, many = (time_left._expects(run, "tiles", ("f01", "uav1-uav1")) for run in runs)
     assert few == pytest.approx((many[0], 10 * many[1]))
 
 
@@ -211,23 +211,23 @@ def test_nothing_is_told_before_an_image_was_formed_however_little_it_is_expecte
         {"planned": {"scene": 9, "tracks": 9, "tiles": 1}},
     ):
         done = {n: JobRecord(rule, (rule, "f01"), "", 0.0, 0.4) for n, rule in enumerate(["scene", "tracks"])}
-        assert Outlook(finished_tiny, cores=2).left(RunRecord(**to_come, jobs=done), 1.0, {})[1] is None
+        assert TimeLeft(finished_tiny, cores=2).left(RunRecord(**to_come, jobs=done), 1.0, {})[1] is None
     run = RunRecord(planned={"scene": 9, "tracks": 9, "image": 1}, jobs=done | {7: begun})
-    assert Outlook(finished_tiny, cores=2).left(run, 400.0, {})[1] is None
+    assert TimeLeft(finished_tiny, cores=2).left(run, 400.0, {})[1] is None
     paced = {7: StepProgress("tiles", 10, 20, 40.0, 400.0)}
-    assert Outlook(finished_tiny, cores=2).left(run, 400.0, paced)[1] >= 360
+    assert TimeLeft(finished_tiny, cores=2).left(run, 400.0, paced)[1] >= 360
 
 
 def test_a_job_that_runs_over_what_was_expected_is_not_about_to_end(finished_tiny):
     done = JobRecord("cube", ("cube", "f01"), "", 0.0, 10.0)
     for now_s, left_s in ((11.0, 9.0), (19.0, 1.0), (50.0, 30.0)):
         run = RunRecord(planned={"cube": 2}, jobs={1: done, 2: replace(done, begun_s=10.0, ended_s=None)})
-        assert Outlook(finished_tiny, cores=2).left(run, now_s, {})[1] == pytest.approx(left_s)
+        assert TimeLeft(finished_tiny, cores=2).left(run, now_s, {})[1] == pytest.approx(left_s)
 
 
 def test_shares_of_tiles_tell_how_long_the_image_takes_that_gathers_them(finished_tiny):
     done = JobRecord("tiles", ("tiles", "f01", "uav1-uav1", "1-of-2"), "", 0.0, 30.0)
-    assert Outlook(finished_tiny, cores=1).left(RunRecord(planned={"tiles": 1, "image": 1}, jobs={1: done}), 30.0, {})[
+    assert TimeLeft(finished_tiny, cores=1).left(RunRecord(planned={"tiles": 1, "image": 1}, jobs={1: done}), 30.0, {})[
         1
     ]
 
@@ -238,7 +238,7 @@ def test_nothing_is_told_while_tiles_of_an_image_are_formed_again(finished_tiny)
     run = RunRecord(planned={"image": 2}, jobs={1: done, 2: replace(done, begun_s=60.0, ended_s=None)})
     for parts, told in ((0, False), (1, False), (4, True)):
         paced = {2: StepProgress("parts of tiles", parts, 7, 125.0, 155.0)}
-        of_jobs, whole = Outlook(finished_tiny, cores=2).left(run, 155.0, paced)
+        of_jobs, whole = TimeLeft(finished_tiny, cores=2).left(run, 155.0, paced)
         assert [one is not None for one in (of_jobs[2], whole)] == [told, told]
 
 
@@ -247,7 +247,7 @@ def test_the_first_tiles_of_an_image_do_not_tell_how_long_it_takes_where_others_
     done = JobRecord("image", ("image", "f01", "uav1-uav1"), "", 0.0, 60.0)
     run = RunRecord(planned={"image": 2}, jobs={1: done, 2: replace(done, begun_s=60.0, ended_s=None)})
     paced = {2: StepProgress("tiles", 1, 100, 60.0, 90.0)}
-    assert Outlook(finished_tiny, cores=2).left(run, 90.0, paced)[1] == pytest.approx(30.0)
+    assert TimeLeft(finished_tiny, cores=2).left(run, 90.0, paced)[1] == pytest.approx(30.0)
 
 
 def test_what_the_campaign_does_not_have_is_not_looked_for(finished_tiny):
@@ -270,7 +270,7 @@ def test_a_step_that_tells_how_far_it_is_is_believed_over_what_was_expected(tmp_
     job = JobRecord("image", ("image", "f01", "uav1-uav1"), "", now - 100)
     run = RunRecord(planned={"image": 1}, jobs={1: job})
     tell(campaign, job.step, what="tiles", done=10, total=40, since=now - 90, at=now)
-    bar, whole = bars(campaign, run, Outlook(campaign, cores=2))
+    bar, whole = bars(campaign, run, TimeLeft(campaign, cores=2))
     assert (bar.told, bar.fraction) == ("10 of 40 tiles", 0.25)
     assert bar.left_s == pytest.approx(270, rel=0.01)
     assert whole.left_s == pytest.approx(270, rel=0.01)
@@ -310,7 +310,7 @@ class Terminal(io.StringIO):
 
 def test_without_a_terminal_each_step_has_a_line_when_it_begins_and_one_when_it_ends(finished_tiny, journal):
     stream, reader = io.StringIO(), JournalReader(journal)
-    with Screen(finished_tiny, Outlook(finished_tiny, 2), stream=stream) as screen:
+    with Screen(finished_tiny, TimeLeft(finished_tiny, 2), stream=stream) as screen:
         screen.update(reader.news())
         note(journal, "failed", job=2)
         screen.update(reader.news())
@@ -333,7 +333,7 @@ def test_what_happened_between_two_looks_is_told_in_its_order_and_counted_one_by
         2: JobRecord("scene", ("scene",), "", 10.5, 12.0),
         3: JobRecord("ingest", ("ingest", "f01", "uav2"), "", 12.0),
     }
-    with Screen(finished_tiny, Outlook(finished_tiny, 2), stream=stream) as screen:
+    with Screen(finished_tiny, TimeLeft(finished_tiny, 2), stream=stream) as screen:
         screen.update(run)
     told = [re.sub(r"^\S+  |: .* s;|, (time|about) .*", "", line) for line in stream.getvalue().splitlines()]
     assert told == [
@@ -348,7 +348,7 @@ def test_what_happened_between_two_looks_is_told_in_its_order_and_counted_one_by
 def test_a_terminal_shows_bars_and_gets_its_cursor_back(finished_tiny, journal, monkeypatch):
     monkeypatch.setenv("TERM", "xterm-256color")
     stream = Terminal()
-    screen = Screen(finished_tiny, Outlook(finished_tiny, 2), stream=stream)
+    screen = Screen(finished_tiny, TimeLeft(finished_tiny, 2), stream=stream)
     with pytest.raises(AttributeError), screen:  # whatever ends it
         [screen.update(run) for run in (JournalReader(journal).news(), None)]
     said = stream.getvalue()
@@ -359,7 +359,7 @@ def test_a_terminal_shows_bars_and_gets_its_cursor_back(finished_tiny, journal, 
 
 def test_a_quiet_run_shows_nothing(finished_tiny, journal):
     stream = Terminal()
-    with Screen(finished_tiny, Outlook(finished_tiny, 2), quiet=True, stream=stream) as screen:
+    with Screen(finished_tiny, TimeLeft(finished_tiny, 2), quiet=True, stream=stream) as screen:
         screen.update(JournalReader(journal).news())
         screen.ended(JournalReader(journal).news())
     assert not stream.getvalue()

@@ -33,10 +33,10 @@ from apertura.common.processes import (
 )
 from apertura.common.progress import RUN
 from apertura.run.fork_server import AT_ONCE, Order
-from apertura.run.fork_server import NAME as WARM
+from apertura.run.fork_server import NAME as SERVER
 from apertura.run.journal import JOURNAL, NAME, RECORDER, JournalReader, a_step_was_killed, failures, note
 from apertura.run.screen import NOTHING, Screen, listed
-from apertura.run.time_left import Outlook
+from apertura.run.time_left import TimeLeft
 from apertura.workflow.lineage import on_demand, results_of
 from apertura.workflow.rules import RULES
 from apertura.workflow.stale import absent_lines, any_is_missing, forms_results, stale_lines, stale_results
@@ -145,7 +145,7 @@ def run_workflow(root: Path, cores: int, *arguments: str, paranoid: bool = False
     if elsewhere:
         check_shell_name(root.absolute())
     forms = forms_results(["", *arguments])
-    with _ahead(root) if forms and not elsewhere else nullcontext() as warm:
+    with _ahead(root) if forms and not elsewhere else nullcontext() as server:
         if print_problems(root, without=_ELSEWHERE if elsewhere else (), stream=sys.stderr):
             return 2
         root = root.absolute()
@@ -159,7 +159,7 @@ def run_workflow(root: Path, cores: int, *arguments: str, paranoid: bool = False
                 print(line, file=sys.stderr, flush=True)
         overtaken = [manifest for manifest in stale if not on_demand(campaign, manifest)]
         forced = ["--forcerun", *overtaken] if overtaken else []  # in time for a dry run; the workflow says why
-        forks = warm and not any(argument.startswith(_BY_SHELL) for argument in arguments)
+        forks = server and not any(argument.startswith(_BY_SHELL) for argument in arguments)
         executor = ["--executor", NAME] if forks else []
         words = _words(root, cores, [*executor, *_without_inner_steps(campaign, options), *forced])
         if forms:
@@ -167,8 +167,8 @@ def run_workflow(root: Path, cores: int, *arguments: str, paranoid: bool = False
             files = _Files.of(campaign, confined=not (elsewhere or deploys))
             at_once = 0 if elsewhere else cores
             note(files.journal, "start", cores=at_once)
-            screen = Screen(campaign, Outlook(campaign, at_once), quiet=show != "steps")
-            return _formed(root, words, files, screen, warm, aloud=show == "snakemake")
+            screen = Screen(campaign, TimeLeft(campaign, at_once), quiet=show != "steps")
+            return _formed(root, words, files, screen, server, aloud=show == "snakemake")
     with tempfile.TemporaryDirectory() as scratch:
         dry = any(map(_DRY_RUN.fullmatch, arguments))
         files = _Files.apart(scratch, confined=root if dry and not elsewhere else None)
@@ -184,7 +184,7 @@ def _ahead(root: Path) -> Iterator["subprocess.Popen[bytes]"]:
     at_once = []
     with suppress(CampaignError):  # the check tells it
         at_once = [AT_ONCE] if any_is_missing(Campaign.load(root)) else []
-    process = _started([WARM, *at_once], os.environ, stdin=subprocess.PIPE)
+    process = _started([SERVER, *at_once], os.environ, stdin=subprocess.PIPE)
     try:
         yield process
     finally:
@@ -197,7 +197,7 @@ def _formed(
     words: Sequence[str],
     files: "_Files",
     screen: Screen,
-    warm: "subprocess.Popen[bytes] | None",
+    server: "subprocess.Popen[bytes] | None",
     *,
     aloud: bool,
 ) -> int:
@@ -211,9 +211,9 @@ def _formed(
                 if aloud:
                     print(said.read().decode("utf-8", "replace"), end="", file=sys.stderr, flush=True)
 
-            if warm and warm.stdin:
-                Order(words, files.environment, files.log.reference()).give(warm.stdin)
-            ended = _watched(warm or _started([RECORDER, *words], files.environment, output=output), look)
+            if server and server.stdin:
+                Order(words, files.environment, files.log.reference()).give(server.stdin)
+            ended = _watched(server or _started([RECORDER, *words], files.environment, output=output), look)
             status = files.status_of(ended)
             look()
             if status == 2 and a_step_was_killed(root, reader.run):

@@ -13,7 +13,7 @@ from apertura.common.processes import INTERRUPTED, holder
 from apertura.common.progress import RUN
 from apertura.run.journal import JobRecord, JournalReader, RunRecord, failures
 from apertura.run.results import counted, states
-from apertura.run.time_left import Outlook, StepProgress
+from apertura.run.time_left import StepProgress, TimeLeft
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -69,11 +69,11 @@ class Bar:
         return UNKNOWN if self.left_s is None else f"about {about(self.left_s)} left"
 
 
-def bars(campaign: Campaign, run: RunRecord, outlook: Outlook) -> list[Bar]:
+def bars(campaign: Campaign, run: RunRecord, time_left: TimeLeft) -> list[Bar]:
     """Return a bar for each job under way, the oldest first, and in the end one of the whole run."""
     now_s = time.time()
     told = {number: StepProgress.of(campaign, job) for number, job in list(_running(run).items())[:_MOST_BARS]}
-    left, whole_s = outlook.left(run, now_s, told)
+    left, whole_s = time_left.left(run, now_s, told)
     steps = [_bar(job, told.get(number), left[number], now_s) for number, job in _running(run).items()]
     done = len(run.finished) + sum(bar.fraction for bar in steps)
     whole = Bar(f"{len(run.finished)} of {run.total} steps", "", done / max(run.total, 1), whole_s)
@@ -116,7 +116,7 @@ class Screen:
 
     Parameters
     ----------
-    campaign, outlook
+    campaign, time_left
         Whose run, and how long it will take.
     quiet
         Show nothing.
@@ -125,12 +125,12 @@ class Screen:
     """
 
     def __init__(
-        self, campaign: Campaign, outlook: Outlook, *, quiet: bool = False, stream: TextIO | None = None
+        self, campaign: Campaign, time_left: TimeLeft, *, quiet: bool = False, stream: TextIO | None = None
     ) -> None:
         from rich.console import Console
         from rich.live import Live
 
-        self._campaign, self._outlook, self._quiet = campaign, outlook, quiet
+        self._campaign, self._time_left, self._quiet = campaign, time_left, quiet
         self._stream = stream or sys.stderr
         self._told: dict[tuple[int, float], bool] = {}
         console = Console(file=self._stream, highlight=False)
@@ -158,7 +158,7 @@ class Screen:
             self._told[number, job.begun_s] = not job.running
         news.sort(key=lambda one: one[0])
         ended = [job for _, has_ended, job in news if has_ended]
-        whole = bars(self._campaign, run, self._outlook)[-1] if ended and not self._live else None
+        whole = bars(self._campaign, run, self._time_left)[-1] if ended and not self._live else None
         done = len(run.finished) - sum(not job.failed for job in ended)
         for _, has_ended, job in news:
             if has_ended:
@@ -169,7 +169,7 @@ class Screen:
         if self._live:
             from rich.constrain import Constrain
 
-            rows = table(bars(self._campaign, run, self._outlook)) if run.planned else "planning what to do"
+            rows = table(bars(self._campaign, run, self._time_left)) if run.planned else "planning what to do"
             self._live.update(Constrain(rows, self._live.console.width - _MARGIN), refresh=True)
 
     def ended(self, run: RunRecord) -> None:
@@ -239,7 +239,7 @@ def _print_steps(campaign: Campaign, run: RunRecord) -> None:
     from rich.console import Console
 
     print(f"done: {listed(Counter(job.rule for job in run.finished)) or 'nothing yet'}")
-    rows = bars(campaign, run, Outlook(campaign, cores=run.cores))
+    rows = bars(campaign, run, TimeLeft(campaign, cores=run.cores))
     console = Console(highlight=False)
     if console.is_terminal:
         console.print(table(rows))

@@ -129,7 +129,7 @@ class Measure:
         return self.of_start * start_s + self.of_work * work_s, self.starts and work_s <= start_s
 
 
-class Outlook:
+class TimeLeft:
     """How long the steps of a run will take, as far as it can be told.
 
     Parameters
