@@ -108,6 +108,16 @@ def test_a_waveform_that_cannot_be_demodulated_is_refused(change, expected):
         validated(document, where="config.yaml")
 
 
+def test_the_order_of_i_and_q_of_a_node_overrides_that_of_the_waveform_of_samples_alone():
+    document = yaml.safe_load(config_template()) | {"nodes": {"uav1": {}, "uav2": {"iq": "conjugate"}}}
+    document["waveform"]["iq"] = "swapped"
+    settings = validated(document, where="config.yaml")
+    assert [settings.iq_of(node) for node in ("uav1", "uav2")] == ["swapped", "conjugate"]
+    document = yaml.safe_load(config_template("fmcw")) | {"nodes": {"uav1": {"iq": "conjugate"}}}
+    with pytest.raises(CampaignError, match="nodes.uav1.iq is of recorded samples"):
+        validated(document, where="config.yaml")
+
+
 def test_only_what_matters_to_a_stage_is_its_parameter(finished_tiny):
     """A step that depended on the complete config would rerun for nothing."""
     everything = {*Settings.model_json_schema()["properties"], *Processing.model_json_schema()["properties"]}

@@ -189,6 +189,8 @@ def test_i_and_q_in_another_order_are_named_and_taken_by_the_key(undisturbed, ch
     ingest_all(campaign)
     flags = echo_of(campaign, "uav1-uav1").attrs["flags"]
     assert "set waveform.iq to swapped where I and Q are swapped" in flags["spectrum_inverted"]
+    lines = [line for text in flags.values() for line in text.split("; ")]
+    assert len(set(lines)) == len(lines)
     message = complaint(lambda: echo_of(campaign, "uav1-uav2"))
     assert "the code is in the conjugates of the samples" in message
     edit_config(campaign.root.real(), lambda document: document["waveform"].update(iq=order))
@@ -198,6 +200,23 @@ def test_i_and_q_in_another_order_are_named_and_taken_by_the_key(undisturbed, ch
         found = echo_of(campaign, pair)
         assert found.attrs["flags"] == {}
         np.testing.assert_array_equal(found.transfer.values, transfer)
+
+
+@pytest.mark.quick("swap-swapped")
+@pytest.mark.parametrize(("change", "order"), [(swap, "swapped"), (conjugate, "conjugate")])
+def test_i_and_q_of_one_node_alone_are_taken_by_its_own_key(undisturbed, change, order):
+    campaign, pair = undisturbed, "uav1-uav2"
+    right = PairEcho.opened(campaign, "f01", pair).stage.transfer.values
+    edit_data(campaign.root.real(), "uav2", change)
+    ingest_all(campaign)
+    assert "nodes.<n>.iq" in complaint(lambda: echo_of(campaign, pair))
+    edit_config(campaign.root.real(), lambda document: document["nodes"]["uav2"].update(iq=order))
+    campaign = Campaign.load(campaign.root)
+    ingest_all(campaign)
+    found = echo_of(campaign, pair)
+    assert found.attrs["flags"] == {}
+    np.testing.assert_array_equal(found.transfer.values, right)
+    assert campaign.settings.iq_of("uav1") == "complex"
 
 
 @pytest.mark.quick("0.022-True")

@@ -136,7 +136,7 @@ _OF_RECORDINGS = {
     "wrong_code": Flag(
         "SNR of the sidelink",
         "the sidelink carries another code: the transmitter's if all its pairs say so, else another transmitter's",
-        "waveform.codes, waveform.carrier_is, waveform.iq; the recording", "core/echo/sidelink_state.py"),
+        "waveform.codes, waveform.carrier_is, waveform.iq, nodes.<n>.iq; the recording", "core/echo/sidelink_state.py"),
     "sidelink_lost": Flag(
         "pulses dropped", "pulses without a sidelink were dropped", "blockage, antenna", "core/echo/sidelink_state.py"),
     "second_arrival": Flag(
@@ -378,7 +378,8 @@ _OF_BENCHES = {
         "data lines of the converter; the recorder's format", "methods/bench/channels.py"),
     "spectrum_inverted": Flag(
         "the node", "I and Q are swapped, or the mixer's oscillator is above the band",
-        "order of I and Q in the recorder; the local oscillator's side: waveform.iq", "core/echo/transfer.py"),
+        "order of I and Q in the recorder; the local oscillator's side: waveform.iq, or nodes.<n>.iq of one node",
+        "core/echo/transfer.py"),
     "link_weak": Flag(
         "dB of a compressed pulse", "the path hardly stands out of the noise",
         "attenuators, cables, gain; which channel is which", "methods/bench/links.py"),

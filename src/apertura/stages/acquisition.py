@@ -87,7 +87,7 @@ class Captured:
     numerology
         Of the symbol.
     order
-        `waveform.iq`.
+        Of I and Q: complex, swapped or conjugate.
     """
 
     raw: xr.Dataset
@@ -138,7 +138,9 @@ class Captured:
         return read
 
     @classmethod
-    def of(cls, raw: xr.Dataset, samples: Path, files: Path, recording: str, sent: Transmitted) -> "Captured":
+    def of(
+        cls, raw: xr.Dataset, samples: Path, files: Path, recording: str, sent: Transmitted, *, order: str
+    ) -> "Captured":
         """Return captures of a file of samples; raise CampaignError unless carrier and rate are those of what was sent.
 
         Parameters
@@ -147,7 +149,7 @@ class Captured:
             Stage `raw`, or what it would hold.
         samples
             The recorder's file.
-        files, recording
+        files, recording, order
             As the attributes.
         sent
             What was transmitted.
@@ -156,7 +158,7 @@ class Captured:
         check_rates(sent.waveform, recorded, where=recording)
         opened = SampleFile(samples, len(raw.attrs["channels"]), SampleLayout.of(raw))
         check_mixing(opened, sent.numerology, where=recording)
-        return cls(raw, opened, files, recording, sent.numerology, sent.waveform.iq)
+        return cls(raw, opened, files, recording, sent.numerology, order)
 
 
 @dataclass(frozen=True)
@@ -177,7 +179,7 @@ def open_acquisition(campaign: Campaign, flight: str, node: str, sent: Transmitt
     files = Path("raw") / flight / node
     recording, log = (_own_sources(stage, files) for stage in (raw, track))
     path = campaign.root.named(raw.attrs["samples"], where=campaign.stage("raw", flight, node))
-    captured = Captured.of(raw, path, files, recording, sent)
+    captured = Captured.of(raw, path, files, recording, sent, order=campaign.settings.iq_of(node))
     name = raw.attrs["samples"]
     if (campaign.root / name).is_file() and digest_of(campaign.root, name) != raw.attrs["inputs"][name]:
         raise CampaignError(

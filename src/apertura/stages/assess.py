@@ -237,7 +237,7 @@ def wrong_codes(codes: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, str, 
     --------
     >>> found, other = {"carried": True, "evidence": "locked"}, {"carried": False, "evidence": "another code"}
     >>> wrong_codes({"a-a": {}, "a-b": other})
-    [('a-a', 'wrong_code', 'another code (seen by a-b)'), ('a-b', 'wrong_code', 'another code (seen by a-b)')]
+    [('a-a', 'wrong_code', 'another code; seen by a-b'), ('a-b', 'wrong_code', 'another code; seen by a-b')]
     >>> wrong_codes({"a-a": {}, "a-b": other, "a-c": found})
     [('a-b', 'wrong_code', 'another code; a-c found the code that was stated')]
     """
@@ -247,7 +247,7 @@ def wrong_codes(codes: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, str, 
         of_one = [other for other in codes if other.split("-")[0] == pair.split("-")[0]]
         seen_by = next((other for other in of_one if carried[other] is False), None)
         if seen_by and not any(carried[other] for other in of_one):
-            flags.append((pair, "wrong_code", f"{codes[seen_by]['evidence']} (seen by {seen_by})"))
+            flags.append((pair, "wrong_code", f"{codes[seen_by]['evidence']}; seen by {seen_by}"))
         elif carried[pair] is False:
             found = ", ".join(other for other in of_one if carried[other])
             flags.append((pair, "wrong_code", f"{codes[pair]['evidence']}; {found} found the code that was stated"))

@@ -84,7 +84,7 @@ def _triggered(recording: Recording, campaign: Campaign, *, node: str) -> xr.Dat
     framing = framing_of(recording, campaign)
     rate = campaign.settings.processing.false_alarms_per_s
     channel = "sidelink" if "sidelink" in recording.channels else "radar"
-    samples = recording.samples.channel(recording.channels.index(channel), waveform.iq)
+    samples = recording.samples.channel(recording.channels.index(channel), campaign.settings.iq_of(node))
     length = waveform.capture_samples
     bits = 8 * recording.samples.sample_bytes // len(recording.channels)
     captures = trigger_captures(samples, framing, symbol_samples=length, false_alarms_per_s=rate, sample_bits=bits)

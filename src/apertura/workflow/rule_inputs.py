@@ -136,6 +136,13 @@ def stated_paths(place: JobPlace) -> Mapping[str, Any]:
     return {"path_offset_m": {node: nodes[node]["path_offset_m"] for (_, node) in place.below(Scope.NODE)}}
 
 
+def sample_orders(place: JobPlace) -> Mapping[str, Any]:
+    """Return the configured order of I and Q of each node, where it is not that of the waveform."""
+    nodes = place.campaign.settings.nodes
+    orders = {node: nodes[node].iq for (_, node) in place.below(Scope.NODE) if nodes[node].iq is not None}
+    return {"iq": orders} if orders else {}
+
+
 def log(place: JobPlace) -> Iterable[str]:
     """Return a node's flight log."""
     return [place.campaign.relative(place.campaign.track_file(*place.where))]

@@ -14,7 +14,7 @@ from apertura.campaign.config.processing import (
     Scene,
 )
 from apertura.campaign.config.section import Doi, Licence, Name, RawRoot, Section, Title
-from apertura.campaign.config.waveform import PhaseHistoryWaveform, Waveform
+from apertura.campaign.config.waveform import PhaseHistoryWaveform, SampledWaveform, Waveform
 from apertura.common import documents
 from apertura.common.documents import read_yaml
 
@@ -63,6 +63,19 @@ class Settings(Section):
         if self.calibration is not None and self.scene.crs == "auto":
             raise ValueError("calibration.reflector_m is in scene.crs, which is auto: give the CRS")
         return self
+
+    @model_validator(mode="after")
+    def _orders_are_of_samples(self) -> Self:
+        named = [name for name, node in self.nodes.items() if node.iq is not None]
+        if named and not isinstance(self.waveform, SampledWaveform):
+            raise ValueError(
+                f"nodes.{named[0]}.iq is of recorded samples (kinds ofdm and pulse): set it to null, and waveform.iq"
+            )
+        return self
+
+    def iq_of(self, node: str) -> str:
+        """Return the order of I and Q in recordings of a node: `nodes.<n>.iq`, else `waveform.iq`."""
+        return self.nodes[node].iq or self.waveform.iq
 
     @model_validator(mode="after")
     def _beams_need_a_log(self) -> Self:

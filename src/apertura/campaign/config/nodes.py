@@ -197,6 +197,9 @@ class Node(Section):
     transmit_power_dbm: Decibels | None = Field(
         None, description="mean power at the transmitting antenna's port while the signal is sent, dBm; null: unknown"
     )
+    iq: Literal["complex", "swapped", "conjugate"] | None = Field(
+        None, description="order of I and Q in its recordings, in place of waveform.iq; null: as waveform.iq"
+    )
     receiver: Receiver | None = Field(
         None,
         description="its radar receiver: full_scale_counts, full_scale_dbm or full_scale_v, gain_db, noise_figure_db; "

@@ -28,7 +28,7 @@ SATURATED_SHARE = 1e-4
 
 
 def ordered(iq: Samples, order: str) -> Samples:
-    """Return I and Q of the radar's samples, given `waveform.iq`: complex, swapped or conjugate.
+    """Return I and Q of the radar's samples, given their order as recorded: complex, swapped or conjugate.
 
     Examples
     --------

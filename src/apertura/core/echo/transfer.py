@@ -37,7 +37,7 @@ from apertura.core.echo.sidelink_state import SidelinkState, measure_blocks, sec
 
 _INVERTED = (
     "the code is in the conjugates of the samples: set waveform.iq to swapped where I and Q are swapped, to conjugate "
-    "where the local oscillator lies above the band; of one node alone, conjugate its samples"
+    "where the local oscillator lies above the band; for one node alone, set nodes.<n>.iq"
 )
 _COMPRESSED = 4.0  # times the peak of a delay profile over its mean, of conjugates against samples
 
@@ -189,7 +189,7 @@ def transfer_by_code(read: Read, inverse: Complexes, numerology: Numerology, *, 
     if not code.carried:
         other = [demodulator.transfer({"radar": conjugates(read(block)["radar"])}) for block in blocks_of(some)]
         if own_code(np.concatenate(other), prefix_cells=numerology.delay_cells).carried:
-            code, inverted = CodeEvidence(False, _INVERTED), {"spectrum_inverted": _INVERTED}
+            inverted = {"spectrum_inverted": _INVERTED}
     phase = phase_stability(sample, time_s[some], prefix_cells=numerology.delay_cells)
     flags = Flags.merged(code.flags, inverted, phase.flags if phase else {})
     report = {"code": code.report, **({"own_phase": phase.report} if phase else {})}
@@ -245,7 +245,10 @@ def transfer_by_sidelink(
         except CampaignError as unlocked:
             if not _compresses_conjugated(read, demodulator, len(sidelink_m)):
                 raise
-            expected, remedy = "samples I + jQ in the order of the recorder", "Set waveform.iq to swapped or conjugate."
+            expected, remedy = (
+                "samples I + jQ in the order of the recorder",
+                "Set waveform.iq, or nodes.<n>.iq of one node.",
+            )
             raise CampaignError(f"{unlocked.found}; {_INVERTED}", f"{where}: sidelink", expected, remedy) from None
     # Method, and flags of what it does not remove or what is wrong with the recording.
     chosen, reason = choose(state) if method == "auto" else (method, "asked for")
@@ -253,8 +256,6 @@ def transfer_by_sidelink(
     cell_m = SPEED_OF_LIGHT_M_S / (numerology.numbers.size * numerology.spacing_hz)
     delay_m = state.delay_cells * cell_m
     inverted = "wrong_code" in state.flags and _compresses_conjugated(read, demodulator, len(sidelink_m))
-    if inverted:
-        state = replace(state, flags={"wrong_code": f"{state.flags['wrong_code']}; {_INVERTED}"})
     residual = baseline_residual(delay_m, sidelink_m)
     wrong = detect_wrong_association(residual)
     flags = Flags.merged(

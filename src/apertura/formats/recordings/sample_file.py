@@ -409,7 +409,7 @@ class SampleFile:
         )
 
     def channel(self, index: int, order: str = "complex") -> "ChannelOfFile":
-        """Return one channel, to be read by slices, with I and Q as `waveform.iq` states their order."""
+        """Return one channel, to be read by slices, with I and Q in a stated order, as `ordered`."""
         return ChannelOfFile(self, index, order)
 
 

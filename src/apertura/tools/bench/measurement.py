@@ -407,7 +407,8 @@ def _node(campaign: Campaign, flight: str, name: str, sent: Transmitted, *, own:
     recording = checked_recording(campaign, flight, name)
     raw = captures_of(recording, campaign, node=name)
     where = f"raw/{flight}/{name}"
-    captured = Captured.of(raw, recording.samples.path, Path(where), where, sent)
+    order = campaign.settings.iq_of(name)
+    captured = Captured.of(raw, recording.samples.path, Path(where), where, sent, order=order)
     time_s = seconds_since(raw.time.values, raw.time.values[0])
     counted = triggers(time_s, prf_hz=sent.waveform.prf_hz)
     present = [channel for channel in _CHANNELS if channel in recording.channels]
@@ -418,7 +419,10 @@ def _node(campaign: Campaign, flight: str, name: str, sent: Transmitted, *, own:
     pair = f"{campaign.flight(flight).transmitter}-{name}"
     if _is_inverted(read, sent, "radar" if own else "sidelink", len(every)):
         read = _conjugated(read)
-        flags.append({"spectrum_inverted": f"{name}: the code is in the conjugates of its samples: toggle waveform.iq"})
+        line = (
+            f"{name}: the code is in the conjugates of its samples: toggle nodes.{name}.iq, or waveform.iq of all nodes"
+        )
+        flags.append({"spectrum_inverted": line})
     before, clock, contact, state = None, None, None, None
     measured: Transfer | None = None
     if own:

@@ -211,7 +211,8 @@ class NodeSoFar:
                 "Give the log of this flight, or the clock's offset in config/clocks.tsv.",
             )
         files = Path("raw") / self._flight / self.name
-        captured = Captured.of(raw, self._recording.samples.path, files, str(files), self._sent)
+        order = self._campaign.settings.iq_of(self.name)
+        captured = Captured.of(raw, self._recording.samples.path, files, str(files), self._sent, order=order)
         settings = self._campaign.node(self._flight, self.name)
         wave_m = shortest_wave(self._sent.numerology.frequency_hz)
         return Acquisition(self.name, settings, self.track.isel(epoch=near), log, wave_m, **vars(captured))
