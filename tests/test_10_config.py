@@ -114,7 +114,7 @@ def test_the_order_of_i_and_q_of_a_node_overrides_that_of_the_waveform_of_sample
     settings = validated(document, where="config.yaml")
     assert [settings.iq_of(node) for node in ("uav1", "uav2")] == ["swapped", "conjugate"]
     document = yaml.safe_load(config_template("fmcw")) | {"nodes": {"uav1": {"iq": "conjugate"}}}
-    with pytest.raises(CampaignError, match="nodes.uav1.iq is of recorded samples"):
+    with pytest.raises(CampaignError, match=r"nodes\.uav1\.iq is of recorded samples"):
         validated(document, where="config.yaml")
 
 

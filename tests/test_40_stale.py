@@ -11,7 +11,7 @@ from folders import copy_writable, state
 
 from apertura.campaign.digests import Sources, digest_of
 from apertura.campaign.folder import Campaign
-from apertura.check import problems
+from apertura.check import print_findings, problems
 from apertura.common.errors import CampaignError
 from apertura.common.processes import hold
 from apertura.stages import echo, ingest, scene, transfer
@@ -296,10 +296,18 @@ def archive(root):
 def test_recordings_that_lie_elsewhere_overtake_nothing_and_nothing_is_wrong(finished):
     campaign = archive(finished)
     assert stale_results(campaign) == {}
-    assert (absent_files(campaign), wanted_files(campaign)) == (SAMPLES, {})
+    assert (absent_files(campaign), wanted_files(campaign, {})) == (SAMPLES, {})
     assert list(absent_lines(campaign)) == [f"not there, so results are not compared with it: {SAMPLES[0]} and 1 more"]
     assert problems(finished, without=["memory"]) == []
     assert Resources(campaign).work("f01", None, "uav1").pulses == 40
+
+
+def test_a_check_compares_results_with_their_inputs_once(finished_tiny, monkeypatch):
+    compared = []
+    monkeypatch.setattr("apertura.workflow.stale._reasons", lambda _, result, *__, **___: compared.append(result) or ())
+    assert print_findings(finished_tiny.root.real()) == 0
+    manifests = [result.manifest for result in compared]
+    assert len(manifests) == len(set(manifests)) > 10
 
 
 def test_results_are_told_from_stale_ones_where_all_of_raw_was_left_behind(finished):
@@ -317,9 +325,9 @@ def test_an_image_is_made_again_of_what_was_kept_of_a_recording_and_of_nothing_e
     archive(finished)
     campaign = state(finished, "processing", engine="numba")
     assert "image" in names(stale_results(campaign))
-    assert (wanted_files(campaign), problems(finished, without=["memory"])) == ({}, [])
+    assert (wanted_files(campaign, stale_results(campaign)), problems(finished, without=["memory"])) == ({}, [])
     (finished / "results/f01/uav1-uav2/transfer.manifest.json").unlink()
-    assert wanted_files(campaign) == {SAMPLES[1]: "results/f01/uav1-uav2/image.manifest.json"}
+    assert wanted_files(campaign, stale_results(campaign)) == {SAMPLES[1]: "results/f01/uav1-uav2/image.manifest.json"}
     (told,) = map(str, problems(finished, without=["memory"]))
     assert TOLD in told
     assert "processing: {keep: [echo]}" in told

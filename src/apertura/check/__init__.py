@@ -111,16 +111,25 @@ def problems_of(examined: "Examination", *, without: Collection[str] = ()) -> li
 
 def print_problems(root: str | Path, *, without: Collection[str] = (), stream: TextIO | None = None) -> int:
     """Print the problems of a campaign folder, one line each, else what to know of it; return how many problems."""
-    campaign, wrong = load(Path(root))
-    notes: list[str] = []
-    if campaign is not None:
-        from apertura.check.examination import Examination
+    return _print_problems(*_examined(root), without=without, stream=stream or sys.stdout)
 
-        examined = Examination(campaign)
+
+def _examined(root: str | Path, *, paranoid: bool = False) -> "tuple[Examination | None, list[CampaignError]]":
+    from apertura.check.examination import Examination
+
+    campaign, wrong = load(Path(root))
+    return None if campaign is None else Examination(campaign, paranoid), wrong
+
+
+def _print_problems(
+    examined: "Examination | None", wrong: list[CampaignError], *, without: Collection[str], stream: TextIO
+) -> int:
+    notes: list[str] = []
+    if examined is not None:
         wrong += problems_of(examined, without=without)
         notes = [] if wrong else [*assumptions(examined)]
     for line in (*map(as_line, wrong), *notes):
-        print(as_typed(line), file=stream or sys.stdout)
+        print(as_typed(line), file=stream)
     return len(wrong)
 
 
@@ -149,15 +158,16 @@ def print_findings(root: str | Path, *, products: bool = False, paranoid: bool =
     paranoid
         Read every input again, also those that have not changed since they were hashed.
     """
-    count = print_problems(root)
-    campaign, _ = load(Path(root))
-    if campaign is None or count:
+    examined, wrong = _examined(root, paranoid=paranoid)
+    count = _print_problems(examined, wrong, without=(), stream=sys.stdout)
+    if examined is None or count:
         return count
-    from apertura.workflow.stale import absent_lines, damaged_results, stale_lines, stale_results
+    from apertura.workflow.stale import absent_lines, damaged_results, stale_lines
 
+    campaign = examined.campaign
     for line in absent_lines(campaign):  # nothing is wrong with that
         print(line)
-    lines = list(stale_lines(stale_results(campaign, paranoid=paranoid)))
+    lines = list(stale_lines(examined.stale))
     if products:
         damaged = damaged_results(campaign).items()
         lines += [f"{manifest}: damaged, {why}. Delete it and run the workflow again." for manifest, why in damaged]
@@ -165,9 +175,9 @@ def print_findings(root: str | Path, *, products: bool = False, paranoid: bool =
         print(line)
     folder = shlex.quote(as_typed(root))
     flights, nodes = len(campaign.flights), sum(len(flight.participants) for flight in campaign.flights)
-    examined = f"{number_of(flights, 'flight')}, {number_of(nodes, 'recording')} with their logs"
+    files = f"{number_of(flights, 'flight')}, {number_of(nodes, 'recording')} with their logs"
     then = f"apertura run {folder}" if lines else f"apertura plan {folder}, then apertura run {folder}"
-    print(f"no problem found in {examined}. Next: {then}")
+    print(f"no problem found in {files}. Next: {then}")
     return len(lines)
 
 

@@ -19,6 +19,7 @@ from apertura.common.errors import CampaignError
 from apertura.core.geometry.geodesy import LOCAL, geodetic_from_ecef
 from apertura.formats.names import PHASE_HISTORIES
 from apertura.formats.reading import open_recording, read_track
+from apertura.workflow.stale import stale_results
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -44,9 +45,17 @@ class Examination:
     ----------
     campaign
         Settings and flights.
+    paranoid
+        Hash every input of the results again, also those that have not changed since.
     """
 
     campaign: Campaign
+    paranoid: bool = False
+
+    @cached_property
+    def stale(self) -> dict[str, str]:
+        """Manifest of each result that is out of date → why, as `stale_results`."""
+        return stale_results(self.campaign, paranoid=self.paranoid)
 
     @property
     def waveform(self) -> SampledWaveform | None:

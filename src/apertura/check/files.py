@@ -42,7 +42,7 @@ def check_flights(examined: "Examination") -> Iterator[CampaignError]:
 def check_files(examined: "Examination") -> Iterator[CampaignError]:
     """Yield every file that is missing, empty, dated in the future or may not be read."""
     campaign = examined.campaign
-    wanted = _wanted(campaign)
+    wanted = _wanted(examined)
     for flight in campaign.flights:
         yield from _recorded(campaign, flight, wanted)
     lookups: list[Callable[[], dict[str, ConfinedPath]]] = [
@@ -64,7 +64,7 @@ def check_files(examined: "Examination") -> Iterator[CampaignError]:
             yield from _readable(path, f"the file of {CONFIG}: {key}", f"Copy it there, or correct {key}.")
 
 
-def _wanted(campaign: Campaign) -> Callable[[str], str | None]:
+def _wanted(examined: Examination) -> Callable[[str], str | None]:
     """Return a function of a recording's file that is not there: the result that a run would make of it.
 
     Empty where it would make none, None where nothing was made of it or this is unknown.
@@ -73,7 +73,7 @@ def _wanted(campaign: Campaign) -> Callable[[str], str | None]:
     @cache
     def files() -> tuple[dict[str, str], list[str]] | None:
         try:
-            return wanted_files(campaign), absent_files(campaign)
+            return wanted_files(examined.campaign, examined.stale), absent_files(examined.campaign)
         except CampaignError:  # other checks report it
             return None
 

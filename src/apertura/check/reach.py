@@ -368,7 +368,6 @@ def _opened(examined: Examination, problems: list[CampaignError]) -> tuple[list[
     from apertura.core.scene.terrain import GridHeights
     from apertura.stages.pair import open_pair
     from apertura.stages.scene import Flown, expected_scene
-    from apertura.workflow.stale import without_outdated
 
     flights = examined.campaign.image_flights
     pairs = ((flight, pair) for flight in flights for pair in flight.pairs if examined.opens(flight.name, pair))
@@ -381,7 +380,9 @@ def _opened(examined: Examination, problems: list[CampaignError]) -> tuple[list[
     first = [pair.flown for pair in opened if pair.flight == flights[0].name]
     if not first:
         return opened, None
-    scene = expected_scene(without_outdated(examined.campaign), lambda: Flown.together(first))
+    scene = expected_scene(
+        replace(examined.campaign, outdated=frozenset(examined.stale)), lambda: Flown.together(first)
+    )
     if examined.campaign.settings.scene.dem is None:
         return opened, scene
     if scene.grid.shape[0] * scene.grid.shape[1] > _MOST_PIXELS:

@@ -75,9 +75,12 @@ def absent_files(campaign: Campaign) -> list[str]:
     return [name for name in sources if not (campaign.root / name).is_file()]
 
 
-def wanted_files(campaign: Campaign) -> dict[str, str]:
-    """Return file of raw/ that is not there and that a run would read → manifest of the first result it is read for."""
-    stale, wanted = stale_results(campaign), dict[str, str]()
+def wanted_files(campaign: Campaign, stale: Collection[str]) -> dict[str, str]:
+    """Return file of raw/ that is not there and that a run would read → manifest of the first result it is read for.
+
+    `stale` holds the manifests of `stale_results`.
+    """
+    wanted = dict[str, str]()
     for name, where, result in places_of(campaign):
         made = (campaign.root / result.manifest).is_file() and result.manifest not in stale
         if not made and not on_demand(campaign, result.manifest):
