@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import rasterio
 import yaml
-from folders import run_steps
+from folders import copy_writable, run_steps
 
 from apertura import cli
 from apertura.campaign.folder import Campaign
@@ -20,6 +20,7 @@ from apertura.stages.scene import open_scene
 from apertura.tools.design import designed
 from apertura.tools.design.expected_images import rehearse
 from apertura.tools.design.flight_plan import FlightPlan, read_flight_plan
+from apertura.tools.design.view import _measured
 
 EAST, NORTH = 570661.0, 5363707.0
 PLAN = {
@@ -144,6 +145,20 @@ def test_a_scene_beyond_the_dem_is_one_message(folder, monkeypatch, capsys):
     assert (status, out) == (2, "")
     assert err.count("\n") == 1
     assert "dem.tif" in err
+
+
+def test_a_comparison_has_the_nesz_of_calibrated_images_alone(finished_tiny, tmp_path):
+    campaign = Campaign.load(copy_writable(finished_tiny.root, tmp_path / "flown"))
+    path = campaign.result("f01", "uav1-uav1", "nesz.tif")
+    with rasterio.open(str(path)) as raster:
+        values, tags, profile = raster.read(1), raster.tags(), raster.profile
+    measured = _measured(campaign, "f01", "uav1-uav1")
+    assert measured.pop("nesz, dB") == pytest.approx(np.nanmedian(values))
+    del tags["APERTURA_RADIOMETRY"]  # as of an image without a radio: dB of its own power
+    with rasterio.open(str(path), "w", **profile) as raster:
+        raster.write(values, 1)
+        raster.update_tags(**tags)
+    assert _measured(campaign, "f01", "uav1-uav1") == measured
 
 
 @pytest.mark.slow

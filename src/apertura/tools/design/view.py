@@ -15,6 +15,7 @@ from apertura.core.geometry.geodesy import LOCAL
 from apertura.core.quality.budget import expected
 from apertura.formats.export.layers import OUTSIDE
 from apertura.formats.export.map_layout import number
+from apertura.formats.export.radiometry import TAG
 from apertura.stages.pair import open_pair
 from apertura.stages.refine import open_refined
 from apertura.stages.scene import expected_scene
@@ -533,6 +534,8 @@ def _measured(campaign: Campaign, flight: str, pair: str) -> Mapping[str, float]
         with opened_raster(
             campaign.result(flight, pair, f"{name}.tif"), expected="a layer", remedy="Run again."
         ) as raster:
+            if name == "nesz" and TAG not in raster.tags():
+                continue  # uncalibrated: dB of the image's own power, no sigma0
             values = raster.read(1, masked=True).compressed()
         values = values[np.isfinite(values)]
         if values.size:
