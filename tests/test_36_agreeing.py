@@ -3,6 +3,7 @@
 from dataclasses import replace
 from itertools import combinations
 from math import pi
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import pytest
 from apertura.core.combination import choose_fusion
 from apertura.core.quality.agreement import Agreement, agreement, agreement_of_ground
 from apertura.core.quality.bright_points import BrightPoint, bright_points, has_point, near
+from apertura.stages.agreement import ComparedImage, shows_points_of
 
 PAIRS = tuple(f"a-{name}" for name in "abcdef")
 RANK = dict.fromkeys(PAIRS, (0.0,))
@@ -171,6 +173,32 @@ def test_a_pair_that_shares_nothing_is_added_and_named_unmeasured_unless_it_hide
     hidden = choose_fusion(rank, between, hidden={("a", "c")}, align=False)
     assert "shows none" in hidden.left_out["c"]
     assert hidden.unmeasured == {}
+
+
+@pytest.mark.parametrize(
+    ("shown", "points", "confirmed"), [(0, 1, False), (1, 1, True), (1, 5, True), (1, 8, False), (2, 8, True)]
+)
+def test_a_pair_is_confirmed_by_more_points_than_chance_shows(shown, points, confirmed):
+    places = [BrightPoint(20.0 + 20 * number, 96.0, 1.0) for number in range(points)]
+    image = np.ones((SIDE, SIDE), np.complex64)
+    for one in places[:shown]:
+        image[int(one.row), int(one.column)] = 5.0
+    grid = SimpleNamespace(spacing_m=SPACING_M)
+    first, second = (
+        ComparedImage(image, places, WHERE["cell_m"], WHERE["spectrum"], {}, np.empty(0), grid) for _ in "ab"
+    )
+    assert shows_points_of(first, second, grid) is confirmed
+
+
+def test_speckle_shows_a_point_at_two_places_of_a_thousand():
+    generator, band = np.random.default_rng(1), inside((0.0, 0.0))
+    found = []
+    for _ in range(20):
+        white = generator.normal(size=(2, SIDE, SIDE))
+        speckle = np.fft.ifft2(np.fft.fft2(white[0] + 1j * white[1]) * band)
+        places = [(row, column) for row in range(32, SIDE - 32, 11) for column in range(32, SIDE - 32, 11)]
+        found += [has_point(speckle, *place, reach=round(CELL_PX)) for place in places]
+    assert 0.0008 < np.mean(found) < 0.004
 
 
 def test_more_pairs_than_every_set_can_be_tried_of_still_lose_the_wrong_one():

@@ -302,7 +302,7 @@ _OF_IMAGES = {
         "cm between the points, east and north", "two flights show the same points at different places",
         "base station, datum, time system of one flight", "stages/cube.py"),
     "pair_unconfirmed": Flag(
-        "bright points in common", "a pair shows none of the bright points of another",
+        "bright points in common", "a pair shows none of the bright points of another beyond chance",
         "SNR of its echo; names of its channels", "stages/assess.py"),
     "pair_uncalibrated": Flag(
         "file of constants, pair", "no constant of the pair is known: backscattering coefficients hold no value",

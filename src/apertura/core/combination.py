@@ -229,7 +229,7 @@ def choose_fusion(
             apart[pair] = found
             left_out[pair] = _reason(found, _named(agreeing), reference, align=align)
         elif blind := [one for one in best.pairs if (one, pair) in hidden]:
-            left_out[pair] = f"shows none of the bright points of {_named(blind)}"
+            left_out[pair] = f"shows none of the bright points of {_named(blind)} beyond those expected by chance"
         else:
             phases[pair], guess = 0.0, best.against(pair, compared, reference)
             unmeasured[pair] = (

@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
+import scipy
 import xarray as xr
 from numpy.typing import NDArray
 
@@ -26,6 +27,12 @@ from apertura.core.quality.bright_points import SPECKLE, BrightPoint, bright_poi
 from apertura.core.quality.measures import BlockRaster
 from apertura.core.quality.point_targets import BandLimitedPatch, carrier_at
 from apertura.core.scene.grid import SceneGrid
+
+_SPECKLE_SHOWS = 2e-3
+"""Probability that speckle has a pixel 10 dB above its mean within a resolution cell of a place."""
+
+_BY_CHANCE = 0.01
+"""Probability below which bright pixels at the points of another image are these points."""
 
 
 @contextmanager
@@ -203,9 +210,15 @@ def comparable(first: ComparedImage, second: ComparedImage, grid: SceneGrid) -> 
 
 
 def shows_points_of(first: ComparedImage, second: ComparedImage, grid: SceneGrid) -> bool:
-    """Test whether a second image has a bright pixel where a first has one of its bright points."""
-    reach = max(1, round(first.cell_m / grid.spacing_m))
-    return any(has_point(second.raster, round(one.row), round(one.column), reach=reach) for one in first.points)
+    """Test whether a second image has bright pixels at more bright points of a first than chance explains.
+
+    Notes
+    -----
+    Source: docs/theory/fusion.md, eq. 9.
+    """
+    reach, count = max(1, round(first.cell_m / grid.spacing_m)), len(first.points)
+    shown = sum(has_point(second.raster, round(one.row), round(one.column), reach=reach) for one in first.points)
+    return shown > 0 and float(scipy.special.bdtrc(shown - 1, count, _SPECKLE_SHOWS)) < _BY_CHANCE
 
 
 def agreement_report(found: Agreement | None) -> dict[str, float | str] | None:

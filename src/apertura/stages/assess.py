@@ -197,8 +197,8 @@ def _disagreement(chosen: CoherentSum, pair: str, blind: Sequence[str]) -> dict[
     """Return the flags of a pair that is not of the set that agrees; `blind`: members none of whose points it shows."""
     agreeing, one = " and ".join(chosen.agreeing), chosen.apart.get(pair)
     if one is None:
-        line = f"{pair} shows none of the bright points of {' and '.join(blind)}: its echo is too weak, or it is wrong"
-        return {"pair_unconfirmed": line} if blind else {}
+        line = f"{pair} shows none of the bright points of {' and '.join(blind)} beyond those expected by chance"
+        return {"pair_unconfirmed": f"{line}: its echo is too weak, or it is wrong"} if blind else {}
     where = one.evidence
     if one.shifted:
         return {
