@@ -12,6 +12,7 @@ from website.equations import set_equations
 from website.outside import OUTSIDE
 
 ROOT = Path(__file__).parents[1]
+CHROMIUM = Path("/usr/bin/chromium")
 
 
 def leaves(node):
@@ -73,9 +74,28 @@ def test_dead_links_and_whatever_is_loaded_from_elsewhere_are_told(tmp_path):
     assert len(write(site, "", css='@import url("https://a.example/font.css")')) == 1
 
 
-@pytest.mark.slow
-def test_the_site_builds_without_a_warning_and_every_link_leads_somewhere(tmp_path):
-    command = [sys.executable, "-m", "mkdocs", "build", "--quiet", "--strict", "--site-dir", str(tmp_path / "site")]
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    """The site, built as `make docs` builds it."""
+    site = tmp_path_factory.mktemp("site")
+    command = [sys.executable, "-m", "mkdocs", "build", "--quiet", "--strict", "--site-dir", str(site)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    assert faults(tmp_path / "site") == []
+    return site
+
+
+@pytest.mark.slow
+def test_the_site_builds_without_a_warning_and_every_link_leads_somewhere(site):
+    assert faults(site) == []
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not CHROMIUM.exists(), reason="no /usr/bin/chromium")
+def test_pages_opened_from_a_disk_are_searched(site):
+    with pytest.importorskip("playwright.sync_api").sync_playwright() as tool:
+        browser = tool.chromium.launch(executable_path=CHROMIUM, headless=True, args=["--no-sandbox"])
+        page = browser.new_page()
+        page.goto((site / "theory/focus.html").as_uri())
+        page.fill("input.md-search__input", "spectrum_inverted")
+        page.wait_for_selector(".md-search-result__item a[href*='flags.html']", timeout=20_000)
+        browser.close()
