@@ -44,7 +44,7 @@ pytestmark = [
 @contextmanager
 def serving(root, *options):
     """Run `apertura map` as a person would, and end it with Ctrl-C."""
-    command = [APERTURA, "map", root, *options]
+    command = [APERTURA, "map", str(root), *options]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         try:
             yield process.stdout.readline().strip()
@@ -222,6 +222,15 @@ def test_the_windows_address_shows_something_else_when_it_is_edited_and_goes_bac
         window.go_back()
         until(frame, lambda: frame.input_value("#colours") == "inferno")
         assert window.url == before.replace("colours=grey", "colours=inferno")
+        assert wrong == []
+
+
+def test_tracks_outside_the_view_are_named_so_until_the_map_shows_them(browser, address):
+    with shown(browser, address) as (frame, wrong):
+        words = frame.locator("#overlays span").nth(1)
+        until(frame, lambda: words.inner_text().strip() == "tracks (outside the view)")
+        frame.click("#fit-tracks")
+        until(frame, lambda: words.inner_text().strip() == "tracks")
         assert wrong == []
 
 

@@ -29,7 +29,7 @@ class Page {
     this.fill();
     this.restore(permalink.read(location.hash));
     this.listen();
-    if (data.coverage_url) this.chart.cover(data.coverage_url).catch((error) => notice(error.message));
+    if (data.coverage_url) this.chart.cover(data.coverage_url).then(() => this.outside(), (error) => notice(error.message));
     else this.untracked();
   }
 
@@ -63,10 +63,12 @@ class Page {
     this.list();
     byId('colours').append(...Object.keys(RAMPS).map((name) => element('option', { value: name, textContent: name })));
     this.boxes = {};
+    this.overlays = {};
     for (const [name, words] of Object.entries(OVER)) {
       const box = element('input', { type: 'checkbox', checked: name !== 'mask' });
       this.boxes[name] = box;
-      byId('overlays').append(element('label', {}, box, ` ${words}`));
+      this.overlays[name] = element('span', { textContent: ` ${words}` });
+      byId('overlays').append(element('label', {}, box, this.overlays[name]));
       box.addEventListener('change', () => this.over());
     }
   }
@@ -96,7 +98,10 @@ class Page {
       byId('toggle').setAttribute('aria-expanded', String(!open));
       this.chart.map.updateSize();
     });
-    this.chart.map.on('moveend', () => this.remember());
+    this.chart.map.on('moveend', () => {
+      this.remember();
+      this.outside();
+    });
     addEventListener('hashchange', () => this.restore(permalink.read(location.hash)));
   }
 
@@ -186,6 +191,12 @@ class Page {
     for (const name of ['tracks', 'footprints', 'targets']) this.chart[name].setVisible(this.boxes[name].checked);
     this.readout.refresh();
     this.remember();
+  }
+
+  /** State beside a layer of lines that all of it lies outside the view. */
+  outside() {
+    for (const name of ['tracks', 'footprints'])
+      this.overlays[name].textContent = ` ${OVER[name]}${this.chart.isOutside(name) ? ' (outside the view)' : ''}`;
   }
 
   /** Show what the campaign has become; what the reader chose stays, and so do colours that were moved. */

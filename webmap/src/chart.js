@@ -131,6 +131,13 @@ export class Chart {
     }
   }
 
+  /** Whether no part of a layer's lines lies in the view. */
+  isOutside(name) {
+    const lines = this[name].getSource().getFeatures().map((one) => one.getGeometry()).filter(Boolean);
+    const view = this.view.calculateExtent(this.map.getSize());
+    return lines.length > 0 && !lines.some((one) => one.intersectsExtent(view));
+  }
+
   mark(places) {
     const source = this.targets.getSource();
     source.clear();
