@@ -36,6 +36,10 @@ def test_every_page_of_docs_stands_in_the_navigation_once():
         ("exp(+j2πf_mid ρ/c)", "exp(+j2πf<sub>mid</sub> ρ/c)"),
         ("f_b²π, x_tx,m, (Dm)_i", "f<sub>b</sub>²π, x<sub>tx,m</sub>, (Dm)<sub>i</sub>"),
         ("c_cT", "c<sub>c</sub>T"),
+        (
+            "max_x ½ mean_m r, 1/SNR_p, ∂_ξ R",
+            "max<sub>x</sub> ½ mean<sub>m</sub> r, 1/SNR<sub>p</sub>, ∂<sub>ξ</sub> R",
+        ),
         ("10^(−L/20), u^d, P^(1/(L−1))", "10<sup>−L/20</sup>, u<sup>d</sup>, P<sup>1/(L−1)</sup>"),
         ("GPS_DELAY, start_s, two_parameter", "GPS_DELAY, start_s, two_parameter"),
         ('<a href="w_n.md">p_i</a> <code>w_n</code>', '<a href="w_n.md">p<sub>i</sub></a> <code>w_n</code>'),

@@ -10,8 +10,9 @@ _COLUMNS = re.compile(r"\S {3,}\S")
 _PATHS = re.compile(r"^[\w/]+\.\w+ {2,}", re.M)
 
 _WORD = r"3dB|[a-z0-9]+(?:,[a-z0-9]+)*|[A-Z]+|[α-ωΑ-Ω∞⊥]"
-_INDEX = re.compile(  # of a letter or what is in parentheses; the last letter of a word is none
-    rf"(?<![A-Za-z]{{2}}[^\W\d_])(?<=[^\W\d_]|[)\u0303])([′'*]?)_(?:\{{([^{{}}]+)\}}|({_WORD}))"
+_OPERATORS = r"(?<=\bmean)|(?<=\bmax)|(?<=\bmin)|(?<=\bSNR)|(?<=∂)"
+_INDEX = re.compile(  # of a letter, what is in parentheses, or an operator; the last letter of another word is none
+    rf"(?:(?<![A-Za-z]{{2}}[^\W\d_])(?<=[^\W\d_]|[)\u0303])|{_OPERATORS})([′'*]?)_(?:\{{([^{{}}]+)\}}|({_WORD}))"
 )
 _POWER = re.compile(
     r"(?<=[\w)|>\u0303\u0307])\^(?:\{([^{}]+)\}|\(((?:[^()]|\([^()]*\))+)\)|(−?[A-Za-z0-9]+(?:\.\d+)?))"
