@@ -139,10 +139,10 @@ def test_no_words_of_a_narrow_map_are_cut(monkeypatch, tmp_path):
     assert not any(one.overlaps(other) for number, one in enumerate(boxes) for other in boxes[:number])
 
 
-def test_many_flights_have_a_legend_off_the_data_and_whole_numbers_of_pairs(monkeypatch, tmp_path):
-    several = [covered(f"f{number // 2:02d}") for number in range(40)]
+def test_several_flights_have_a_legend_off_the_data_and_whole_numbers_of_pairs(monkeypatch, tmp_path):
+    several = [covered(f"f{number // 5:02d}", np.roll(RING, number, axis=1)) for number in range(40)]
     _, words, figure = drawn(monkeypatch, tmp_path, several)
-    assert "seen by 40 pairs of 20 flights" in " ".join(words)
+    assert "seen by 40 pairs of 8 flights" in " ".join(words)
     (legend,) = figure.legends
     figure.canvas.draw()
     box = legend.get_window_extent()
@@ -150,6 +150,23 @@ def test_many_flights_have_a_legend_off_the_data_and_whole_numbers_of_pairs(monk
     assert not any(box.overlaps(text.get_window_extent()) for text in figure.texts)
     ticks = figure.axes[3].get_yticks()
     np.testing.assert_array_equal(ticks, ticks.round())
+
+
+def test_a_number_of_pairs_that_is_the_same_everywhere_is_stated_and_not_drawn(monkeypatch, tmp_path):
+    labels, words, _ = drawn(monkeypatch, tmp_path, [covered(), covered("f02")])
+    assert [label.replace("\n", " ") for label in labels[2:]] == ["pulses that make a pixel, all pairs"]
+    assert "80.0 % of the scene is seen by 2 pairs of 2 flights, each place of it by 2" in " ".join(words)
+
+
+def test_tracks_of_many_flights_are_one_colour_without_footprints_of_each(monkeypatch, tmp_path):
+    several = [covered(f"f{number:02d}", np.roll(RING, number, axis=1)) for number in range(50)]
+    _, words, figure = drawn(monkeypatch, tmp_path, several)
+    assert "edge of what is seen" in " ".join(words)
+    assert not figure.legends
+    lines = figure.axes[0].get_lines()
+    assert len({line.get_color() for line in lines}) == 2
+    assert len(lines) == 2 * 50 + len(footprint(sum(one.looks for one in several), TRANSFORM)[0])
+    assert not figure.axes[0].texts  # no arrows
 
 
 def test_a_local_frame_has_x_and_y_and_no_north(monkeypatch, tmp_path):

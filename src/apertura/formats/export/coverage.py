@@ -10,6 +10,7 @@ import matplotlib.style
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.colors import BoundaryNorm
+from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 from rasterio import Affine
@@ -23,7 +24,7 @@ from apertura.formats.export.map_layout import DPI, MapLayout
 MARGIN = 0.04
 """Left free around tracks and scene, of the longer side."""
 
-_NAMED = 8  # flights in the legend
+_NAMED = 8  # flights that are told apart by colours; tracks of more are one colour
 _HALF_DEG = 180.0  # of longitude: neighbours farther apart lie on both sides of the antimeridian
 _SMALL = 0.25  # of the map's longer side: a smaller scene is drawn once more by itself
 _COLOURS = tuple(colormaps["tab10"](number) for number in range(10))
@@ -214,6 +215,8 @@ def write_coverage(
 ) -> None:
     """Draw as a PNG the pulses of all pairs at each place, and beside it how many pairs see it, or the scene by itself.
 
+    The number of pairs is drawn where it differs from place to place, and footprints of up to eight flights each.
+
     Parameters
     ----------
     path
@@ -236,28 +239,34 @@ def write_coverage(
     flights = {name: number for number, name in enumerate(dict.fromkeys(one.flight for one in covered))}
     bounds, scene = _bounds(covered, total.shape, transform), array_bounds(*total.shape, transform)
     small = max(scene[2] - scene[0], scene[3] - scene[1]) < _SMALL * max(bounds[2] - bounds[0], bounds[3] - bounds[1])
+    counts = np.unique(pairs[pairs > 0])
     looks_label = f"pulses that make a pixel{', all pairs' if len(covered) > 1 else ''}"
     with matplotlib.style.context("default"):
-        several, part = small or len(covered) > 1, scene if small else None
+        several, part = small or counts.size > 1, scene if small else None
         maps = [MapLayout.for_bounds(bounds, maps=2 if several else 1, part=part, local=local)]
         _draw(maps[0], total, transform, "viridis", looks_label)
         if several:
             maps.append(maps[0].beside(part))
-        if len(covered) > 1:
+        if counts.size > 1:
             _draw(maps[1], pairs, transform, "YlGnBu", f"pairs that see a pixel, of {len(covered)}", counts=True)
         elif small:
             _draw(maps[1], total, transform, "viridis", f"{looks_label}, the scene alone")
         for number, layout in enumerate(maps):
-            _draw_lines(layout, covered, transform, flights)
+            if len(flights) > _NAMED:
+                _draw_overview(layout, covered, total, transform)
+            else:
+                _draw_lines(layout, covered, transform, flights)
             layout.draw_frame("" if number else crs_name)
         maps[0].draw_scale_and_north()
-        if len(flights) > 1:
-            maps[0].draw_legend(*_legend(flights))
+        if 1 < len(flights) <= _NAMED:
+            samples = [Line2D([], [], color=_COLOURS[number]) for number in flights.values()]
+            maps[0].draw_legend(samples, list(flights))
         share = f"{100 * float((pairs > 0).mean()):.1f} % of the scene is seen by {number_of(len(covered), 'pair')}"
+        each = f", each place of it by {counts[0]}" if len(covered) > 1 and counts.size == 1 else ""
         thick = ", thick: makes the image" if any(one.imaged_m for one in covered) else ""
-        subtitle = (
-            f"{share} of {number_of(len(flights), 'flight')}; lines: tracks (dashed: receiver{thick}) and footprints"
-        )
+        footprints = "footprints" if len(flights) <= _NAMED else "edge of what is seen"
+        lines = f"lines: tracks (dashed: receiver{thick}) and {footprints}"
+        subtitle = f"{share} of {number_of(len(flights), 'flight')}{each}; {lines}"
         maps[0].write_words(title, subtitle, f"apertura {tags['APERTURA_VERSION']}")
         with replacement(path) as temporary:
             maps[0].figure.savefig(temporary, dpi=DPI, metadata={"Title": title, **dict(sorted(tags.items()))})
@@ -308,6 +317,19 @@ def _draw_lines(layout: MapLayout, covered: Sequence[Covered], transform: Affine
                 layout.axes.plot(*ring.T, color=colour, alpha=0.8, linewidth=1.2)
 
 
+def _draw_overview(
+    layout: MapLayout, covered: Sequence[Covered], total: NDArray[np.float32], transform: Affine
+) -> None:
+    """Draw tracks of many flights in one colour, and the edge of what any of them sees."""
+    line: dict[str, Any] = {"color": "0.45", "alpha": 0.6, "linewidth": 0.7}
+    for one in covered:
+        for style, track_m in zip(("-", "--"), one.tracks_m.values(), strict=False):
+            layout.axes.plot(*track_m.T[:2], style, **line)
+    for rings in footprint(total, transform):
+        for ring in rings:
+            layout.axes.plot(*ring.T, color="black", linewidth=1.0)
+
+
 def _draw_way(layout: MapLayout, leg_m: NDArray[np.float64], colour: Any) -> None:
     """Point an arrow the way that a leg is flown, in its middle."""
     middle = max(1, len(leg_m) // 2)
@@ -315,13 +337,3 @@ def _draw_way(layout: MapLayout, leg_m: NDArray[np.float64], colour: Any) -> Non
         arrow = {"arrowstyle": "-|>", "color": colour, "mutation_scale": 12}
         ends = [(float(x), float(y)) for x, y in leg_m[middle - 1 : middle + 1, :2]]
         layout.axes.annotate("", ends[1], ends[0], arrowprops=arrow)
-
-
-def _legend(flights: Mapping[str, int]) -> tuple[list[Any], list[str]]:
-    from matplotlib.lines import Line2D
-
-    names = list(flights)[:_NAMED]
-    lines = [Line2D([], [], color=_COLOURS[flights[name] % len(_COLOURS)]) for name in names]
-    if more := len(flights) - len(names):
-        return [*lines, Line2D([], [], color="none")], [*names, f"and {more} more"]
-    return lines, names
