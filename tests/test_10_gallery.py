@@ -3,6 +3,7 @@
 import re
 
 import gallery
+import numpy as np
 import pytest
 from folders import ROOT
 from PIL import Image
@@ -24,6 +25,22 @@ def test_a_picture_is_small_and_not_empty(name):
     with Image.open(path) as picture:
         assert 300 < picture.width <= gallery.WIDTHS[0]
         assert sum(count > 0 for count in picture.convert("L").histogram()) > 8
+
+
+@pytest.mark.parametrize(("cell", "mode"), [(66, "RGB"), (12, "P")])
+def test_a_picture_keeps_all_its_colours_where_it_stays_below_the_limit(monkeypatch, tmp_path, cell, mode):
+    """Cells of random colours: 60 of them fit into 60 kB as they are, 1815 do not."""
+    monkeypatch.setattr(gallery, "PICTURES", tmp_path)
+    colours = np.random.default_rng(1).integers(0, 256, (396 // cell, 660 // cell, 3), np.uint8)
+    drawn = Image.fromarray(colours).resize((1320, 792), Image.Resampling.NEAREST)
+    drawn.save(tmp_path / "drawn.png")
+    gallery.publish(tmp_path / "drawn.png", "shown")
+    assert (tmp_path / "shown.png").stat().st_size <= gallery.MOST_BYTES
+    with Image.open(tmp_path / "shown.png") as shown:
+        assert shown.mode == mode
+        if mode == "RGB":
+            assert shown.size == (660, 396)
+            assert len(shown.getcolors(1 << 20)) > 1000
 
 
 def test_all_pictures_together_are_no_burden_of_the_repository():
