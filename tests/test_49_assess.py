@@ -2,11 +2,13 @@
 
 import json
 import re
+from io import StringIO
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from folders import SHARED, copy_writable, edit_config, edit_track, run_steps
+from rich.console import Console
 
 from apertura.campaign.folder import Campaign
 from apertura.campaign.store import record_files
@@ -18,7 +20,7 @@ from apertura.stages import assess, cube, echo, export, hypotheses, image, profi
 from apertura.stages.acquisition import check_rates
 from apertura.stages.agreement import assessment_of
 from apertura.stages.hypotheses import Hypothesis, explanation
-from apertura.views.summary import print_summary
+from apertura.views.summary import _print_flags, print_summary
 
 PAIRS = ("uav1-uav1", "uav1-uav2")
 
@@ -76,6 +78,20 @@ def test_the_summary_says_each_flag_once_and_whole(finished_sample, capsys, tmp_
     assert said.count("a line [with brackets]") == 1
     assert "left out of the budget, no uncertainty is configured" in said
     assert re.search(r"targets may be misplaced by \d\.\d+ m, mostly by heights, not stated; assumed 3 m", said)
+
+
+def test_a_sentence_that_several_flags_have_in_common_stands_once_in_the_summary():
+    cause = "4.1 of 4.5 dB come back if the times of the log of uav1 are 0.50 s late"
+    lines = {"defocused": f"4.5 dB lost; {cause}", "pairs_apart": f"5 points lie 12 cm apart; {cause}"}
+    reports = {"f01 a-a": {"flags": lines}, "f01 a-b": {"flags": {"defocused": f"3.2 dB lost; {cause}"}}}
+    console = Console(file=StringIO(), width=200)
+    _print_flags(console, reports)
+    lines = [line.strip() for line in console.file.getvalue().splitlines()]
+    assert [line for line in lines if line.startswith("f01")] == [
+        f"f01 a-a: 4.5 dB lost; {cause}",
+        "f01 a-b: 3.2 dB lost; as above",
+        "f01 a-a: 5 points lie 12 cm apart; see defocused",
+    ]
 
 
 def flip_right_arm(document):

@@ -31,6 +31,7 @@ _HEADINGS = ("image", "verdict", "focus loss", "expected loss", "coherence", "nu
 _WHOLE = {"image", "verdict", "focus loss", "pulses"}
 _WIDE = 120
 _MOST_FLIGHTS = 3
+_SENTENCE = 40  # letters: shorter parts of a line are measurements, which two flags may have in common
 
 
 def is_finished(campaign: Campaign) -> bool:
@@ -141,13 +142,24 @@ def _abbreviated(names: Sequence[str], most: int = 3) -> str:
 
 
 def _print_flags(console: "Console", reports: Mapping[str, Report]) -> None:
-    """Print each flag with its meaning and advice, and below it what was measured of which images."""
+    """Print each flag with its meaning and advice, and below it what was measured of which images.
+
+    A sentence that another line has printed already is replaced by a reference to its flag.
+    """
     from rich.padding import Padding
     from rich.text import Text
 
+    printed = dict[str, str]()  # sentence → its flag
     for flag in raised_flags(reports, quotes=False):
         console.print(Text.assemble((flag.name, "yellow"), f": {flag.means}" if flag.means else ""))
-        measured = [f"{_abbreviated(images)}: {line}" for line, images in flag.measured.items()]
+        measured = []
+        for line, images in flag.measured.items():
+            sentences = line.split("; ")
+            again = [one for one in sentences if one in printed]
+            above = ["as above" if printed[one] == flag.name else f"see {printed[one]}" for one in again]
+            told = [*(one for one in sentences if one not in again), *dict.fromkeys(above)]
+            measured.append(f"{_abbreviated(images)}: {'; '.join(told)}")
+            printed |= {one: flag.name for one in sentences if one not in again and len(one) >= _SENTENCE}
         for line in [*measured, *([f"look at: {flag.look}"] if flag.look else [])]:
             console.print(Padding(Text(line), (0, 0, 0, 4)))
 
