@@ -423,3 +423,16 @@ def test_the_quicklook_names_the_flags_of_its_image(tmp_path, monkeypatch):
         write_quicklook(tmp_path / "q.png", speckle(30, 40), **UTM, tags=TAGS | {"APERTURA_FLAGS": flags})
     write_quicklook(tmp_path / "q.png", speckle(30, 40), **UTM, tags=TAGS)  # not an image of a campaign
     assert written == [[], ["sidelink_noisy", "beam_misses"]]
+
+
+def test_a_long_footer_ends_inside_the_picture():
+    footer = (
+        "apertura 0.1.0 · focus: focused (0.0 dB lost) · geolocation uncertainty 1.5 m"
+        " · numerical error below −77.31 dB · looks left, assumed · code 833b8269428b"
+    )
+    for bounds in ((0.0, 0.0, 7.0, 7.0), (0.0, 0.0, 2.0, 7.0)):
+        layout = MapLayout.for_bounds(bounds)
+        layout.write_words("flight", "", footer)
+        layout.figure.canvas.draw()
+        (shown,) = (text for text in layout.figure.texts if text.get_text() == footer)
+        assert shown.get_window_extent().x1 <= layout.figure.bbox.x1

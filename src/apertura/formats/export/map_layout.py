@@ -162,7 +162,8 @@ class MapLayout:
         lines = wrap(subtitle, floor((width - LEFT - 0.1) * 72 / (0.6 * 9)))
         for line, down in zip(lines, (0.65, 0.8) if len(lines) < 2 else (0.6, 0.76), strict=False):
             self._write(LEFT, height - down, line, size=9)
-        self._write(LEFT, 0.16, footer, size=7, color="0.3")
+        room = (width - LEFT - 0.1) * 72 / 0.64
+        self._write(LEFT, 0.16, footer, size=min(7, room / max(1, len(footer))), color="0.3")
 
     def write_flags(self, flags: Sequence[str]) -> None:
         """Write the number and the names of an image's flags above the footer, on two lines where one is too short."""
