@@ -67,17 +67,17 @@ READ = FOCUSED | {"pictures", "raw", "track", "echo", "transfer", "profile", "la
 CHANGES = [
     ("formats/tracks/px4_ulog.py", "code", set()),  # no log of the campaign is of that format
     ("formats/tracks/csv_track.py", "comment", set()),
-    ("formats/tracks/csv_track.py", "code", READ - {"raw"}),
-    ("formats/recordings/sigmf.py", "code", READ - {"track", "tracks"} | {"cphd"}),
+    ("formats/tracks/csv_track.py", "code", READ - {"raw", "transfer"} | {"pictures_fused"}),
+    ("formats/recordings/sigmf.py", "code", READ - {"track", "tracks"} | {"cphd", "pictures_fused"}),
     ("views/webmap/server.py", "code", set()),  # what a browser is shown, of results that are there
     ("common/flag_table.py", "code", set()),
     ("common/errors.py", "code", set()),
     ("campaign/config/nodes.py", "docstring", set()),
     ("core/echo/dechirp.py", "docstring", set()),
-    ("formats/export/cog.py", "code", {"export", "fused", "layers", "mosaic", "pictures_fused"}),
+    ("formats/export/cog.py", "code", {"export", "fused", "layers", "mosaic", "pictures", "pictures_fused"}),
     ("workflow/rules.py", "code", set()),  # sources and settings are compared for themselves
     ("core/backprojection/engines/numba.py", "comment", set()),
-    ("core/backprojection/engines/numba.py", "code", FOCUSED),
+    ("core/backprojection/engines/numba.py", "code", FOCUSED | {"pictures", "pictures_fused", "tracks"}),
     ("common/constants.py", "code", EVERY),
 ]
 EDITS = {"code": "EDITED = 1\n", "comment": "# Edited.\n", "docstring": '"""Edited."""\n'}

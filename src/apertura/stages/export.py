@@ -33,7 +33,7 @@ from apertura.core.scene.grid import SceneGrid
 from apertura.formats.export import product, remove_outdated, write_exports
 from apertura.formats.export.radiometry import CROSS_SECTIONS, ECHO, of_sums
 from apertura.stages.agreement import ComparedImage, assessment_of, bright_places
-from apertura.stages.layers import LazyLayer, coarse, mean_power_report, multilook_of
+from apertura.stages.multilook import LazyLayer, coarse, mean_power_report, multilook_of
 from apertura.stages.scene import settled_scene
 from apertura.stages.tags import acquisition_tags, quality_tags, tags_of
 from apertura.workflow.lineage import result_of
