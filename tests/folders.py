@@ -23,6 +23,7 @@ from apertura.check.examination import Examination
 from apertura.check.files import check_files
 from apertura.common.errors import CampaignError
 from apertura.core.geometry.geodesy import projected_from_ecef
+from apertura.core.planning.plan import Plan
 from apertura.simulation import (
     CampaignSpecification,
     Framing,
@@ -57,6 +58,9 @@ from apertura.stages import (
     stac,
     tracks,
 )
+from apertura.stages.pair import open_pair
+from apertura.stages.planning import plan_pair
+from apertura.views.plan import first_flight
 from apertura.views.webmap import document as webmap
 
 ROOT = Path(__file__).parents[1]
@@ -78,6 +82,12 @@ def require_files(campaign: Campaign) -> None:
     """Raise the first problem with the files that the config and the flights promise."""
     for problem in check_files(Examination(campaign)):
         raise problem
+
+
+def expected_plan(campaign: Campaign, flight: str, pair: str) -> Plan:
+    """Plan the image of a pair: from its echo, or from the flight logs before anything ran."""
+    ground = scene.expected_scene(campaign, lambda: first_flight(campaign))
+    return plan_pair(campaign, open_pair(campaign, flight, pair), ground)
 
 
 def settle_ground(campaign: Campaign) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import toy_engine
 import yaml
-from folders import copy_writable, quality_of
+from folders import copy_writable, expected_plan, quality_of
 from scenes import TARGET_GRID, plan, point_history
 
 from apertura.campaign.folder import Campaign
@@ -22,7 +22,6 @@ from apertura.core.scene.terrain import FlatGround
 from apertura.stages import image
 from apertura.tools.chart.pareto import Point, draw_points, with_front
 from apertura.tools.chart.speed_accuracy import LEAST_ROWS, Part, measure, speed_accuracy
-from apertura.views.plan import expected_plan
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,18 @@ import pytest
 import rasterio
 import xarray as xr
 import yaml
-from folders import ALONG, SLOPE, UPHILL, complaint, copy_writable, require_files, run_steps, settle_ground, write_plane
+from folders import (
+    ALONG,
+    SLOPE,
+    UPHILL,
+    complaint,
+    copy_writable,
+    expected_plan,
+    require_files,
+    run_steps,
+    settle_ground,
+    write_plane,
+)
 
 from apertura.campaign.folder import Campaign
 from apertura.campaign.store import open_stage
@@ -29,7 +40,6 @@ from apertura.stages.pair import open_pair
 from apertura.stages.planning import job_of, plan_pair
 from apertura.stages.scene import ConfiguredGround, OpenScene, expected_scene, open_scene, settled_scene
 from apertura.stages.transfer import PairEcho
-from apertura.views.plan import expected_plan
 from apertura.views.score import score
 
 UNDULATION_M = 47.392  # of EGM96 at the demo's origin, read from egm96_15.gtx with rasterio

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import rasterio
 import yaml
-from folders import complaint, copy_writable, edit_config, quality_of
+from folders import complaint, copy_writable, edit_config, expected_plan, quality_of
 
 from apertura.campaign.folder import Campaign
 from apertura.campaign.store import open_stage
@@ -25,11 +25,7 @@ from apertura.simulation import (
 )
 from apertura.simulation.presets import DEMO_ORIGIN
 from apertura.stages import echo, image, ingest, layers, profile, refine, scene
-from apertura.stages.pair import open_pair
-from apertura.stages.planning import plan_pair
-from apertura.stages.scene import expected_scene
 from apertura.stages.transfer import PairEcho
-from apertura.views.plan import first_flight
 from apertura.workflow.lineage import result_of
 
 PULSES, STEP_M, BACK_M, UP_M = 80, 0.1, 11.5, 4.8
@@ -37,12 +33,6 @@ DEPRESSION_DEG = float(np.degrees(np.arctan2(UP_M, BACK_M)))
 AHEAD = np.array([np.sin(np.radians(40.0)), np.cos(np.radians(40.0)), 0.0])
 RIGHT = np.array([AHEAD[1], -AHEAD[0], 0.0])
 BEAM = {"boresight_deg": [90.0, -DEPRESSION_DEG], "beamwidth_deg": [15.0, 60.0]}
-
-
-def expected_plan(campaign, flight, pair):
-    """Plan the image of a pair: from its echo, or from the flight logs before anything ran."""
-    scene = expected_scene(campaign, lambda: first_flight(campaign))
-    return plan_pair(campaign, open_pair(campaign, flight, pair), scene)
 
 
 def fly(folder, antennas, snr_db):
