@@ -18,6 +18,7 @@ from apertura.common.provenance import Provenance, packages, sha256_file, softwa
 from apertura.core.backprojection.engines import instruction_set
 from apertura.formats.export import exports_in, product_files
 from apertura.simulation import ImageGrid, preset, simulate
+from apertura.stages.tags import quality_tags
 
 PAIRS = ("uav1-uav1", "uav1-uav2")
 PRODUCTS = list(product_files({"f01": (*PAIRS, "fused")}))
@@ -175,3 +176,9 @@ def test_a_layer_of_noise_lies_below_its_image(finished_tiny):
     assert np.nanmax(nesz) < np.nanpercentile(db, 20)
     assert len(np.unique(looks)) == 1  # every pulse counts for every pixel
     assert not mask.any()
+
+
+def test_tags_hold_the_flags_that_an_image_has(finished_tiny):
+    report = json.loads((finished_tiny.results / "f01/uav1-uav1/image.json").read_text())
+    flags = {"track_gap": "uav1: a gap of 1.2 s"}
+    assert json.loads(quality_tags(report | {"flags": flags})["APERTURA_FLAGS"]) == flags
