@@ -47,7 +47,7 @@ def serving(root, *options):
     command = [APERTURA, "map", str(root), *options]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         try:
-            yield process.stdout.readline().strip()
+            yield next(line.strip() for line in process.stdout if line.startswith("http"))  # after what is stale
         finally:
             process.send_signal(signal.SIGINT)
             _, complaints = process.communicate(timeout=20)
