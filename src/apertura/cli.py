@@ -126,7 +126,6 @@ Cores = Annotated[int, typer.Option(min=1, help="cores to use")]
 Paranoid = Annotated[bool, typer.Option("--paranoid", help="read every input again, whatever its times say")]
 HERE = Path()
 ALL_CORES = os.cpu_count() or 1
-_UNTIL = ("--until", "-U")
 
 
 class _PassesOn(TyperCommand):
@@ -137,12 +136,12 @@ class _PassesOn(TyperCommand):
 
         Names of steps that follow `--until` are all its values, as snakemake reads them; click takes one value.
         """
-        from apertura.run.driver import apart
+        from apertura.run.driver import UNTIL, apart
         from apertura.workflow.rules import RULES
 
         words: list[str] = []
         for word in (word for one in args for word in apart(one)):
-            if word in RULES and len(words) > 1 and words[-2] in _UNTIL and words[-1] in RULES:
+            if word in RULES and len(words) > 1 and words[-2] in UNTIL and words[-1] in RULES:
                 words.append(words[-2])
             words.append(word)
         return super().parse_args(ctx, words)
@@ -278,7 +277,7 @@ def run(
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="all that snakemake says")] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", "-n", help="tell which steps would run; run none")] = False,
     until: Annotated[
-        list[str] | None, typer.Option(*_UNTIL, metavar="STEP …", help="last steps: image, export, cube, …")
+        list[str] | None, typer.Option("--until", "-U", metavar="STEP …", help="last steps: image, export, cube, …")
     ] = None,
     profile: Annotated[
         str | None, typer.Option(metavar="PROFILE", help="where steps run: profiles/slurm, or a folder of yours")

@@ -104,12 +104,19 @@ def _source_outside(name: str) -> Path | None:
     return _source(name, Path(spec.origin).parent) if spec.submodule_search_locations else Path(spec.origin)
 
 
-@functools.cache
-def _imports(name: str, path: Path) -> tuple[str, ...]:
+def _imports(name: str, path: Path) -> list[str]:
     """Return the dotted names that a module may import, wherever the statement stands."""
-    state, kept = [path.stat().st_mtime_ns, path.stat().st_size], _kept()
-    if path.is_relative_to(PACKAGE) and kept.get(name, [])[:2] == state:
-        return tuple(kept[name][2])
+    status, kept = path.stat(), _kept()
+    state = [status.st_mtime_ns, status.st_size]
+    if kept.get(str(path), [])[:2] != state:
+        kept[str(path)] = [*state, _parsed_imports(name, path)]
+        if path.is_relative_to(PACKAGE):
+            _keep_at_exit()
+    found: list[str] = kept[str(path)][2]
+    return found
+
+
+def _parsed_imports(name: str, path: Path) -> list[str]:
     package = name if path.name == "__init__.py" else name.rpartition(".")[0]
     names: list[str] = []
     waiting: list[ast.stmt] = list(ast.parse(source_of(path)).body)
@@ -127,33 +134,34 @@ def _imports(name: str, path: Path) -> tuple[str, ...]:
             bodies = (getattr(statement, field, []) for field in ("body", "orelse", "finalbody"))
             handlers = (part.body for field in ("handlers", "cases") for part in getattr(statement, field, []))
             waiting += [one for body in (*bodies, *handlers) for one in body]
-    found = [one for one in names if "." in one or _is_ours(one)]
-    if path.is_relative_to(PACKAGE):
-        kept[name] = [*state, found]
-    return tuple(found)
+    return [one for one in names if "." in one or _is_ours(one)]
 
 
 _KEPT = PACKAGE / "__pycache__" / "imports.json"
-"""Imports of each module with time and size of its source: parsing all of them takes half a second of every process."""
+"""Source → its time, size and imports: parsing all of them takes half a second of every process."""
 
 
 @functools.cache
 def _kept() -> dict[str, list[Any]]:
-    """Return the imports that an earlier process found; those of this one are added, and written when it ends."""
-    kept: dict[str, list[Any]] = {}
+    """Return the imports that earlier processes found, to which this one adds."""
     with suppress(OSError, ValueError):
-        kept = json.loads(_KEPT.read_text(encoding="utf-8"))
-    before = json.dumps(kept)
+        kept: dict[str, list[Any]] = json.loads(_KEPT.read_text(encoding="utf-8"))
+        return kept
+    return {}
+
+
+@functools.cache
+def _keep_at_exit() -> None:
+    """Write what this process has found of the package when it ends."""
 
     def keep() -> None:
-        if (now := json.dumps(kept)) != before:
-            with suppress(OSError):  # a package that is read only: each process parses
-                part = _KEPT.with_suffix(f".{os.getpid()}")
-                part.write_text(now, encoding="utf-8")
-                part.replace(_KEPT)
+        ours = {path: found for path, found in _kept().items() if Path(path).is_relative_to(PACKAGE)}
+        with suppress(OSError):  # a package that is read only: each process parses
+            part = _KEPT.with_suffix(f".{os.getpid()}")
+            part.write_text(json.dumps(ours), encoding="utf-8")
+            part.replace(_KEPT)
 
     atexit.register(keep)
-    return kept
 
 
 @functools.cache

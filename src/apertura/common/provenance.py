@@ -245,7 +245,7 @@ def code_sha256(*modules: str, package: Path = PACKAGE) -> str:
 
     A stage's hash therefore changes when, and only when, code it can run has changed: not with a comment or a
     docstring. Compiled code counts by what it was built from: each ``*.sha256`` that was installed beside one of the
-    modules. Of tables whose rows name functions, ``module:function``, `modules` holds those that are called.
+    modules. Of tables whose rows are `apertura.common.lazy.Lazy`, `modules` holds those that are called.
 
     Parameters
     ----------

@@ -63,7 +63,7 @@ _DEPLOYS = ("--sd", "--so", "--use-c", "--use-s", "--use-a", "--conda")
 """Beginnings of options with which Snakemake installs software, wherever that is kept: its changes are not confined."""
 _BY_SHELL = (*_DEPLOYS, "--cac", "--be")
 """Beginnings of options that concern commands of shells: software, caching between workflows, extended benchmarks."""
-_UNTIL = ("--until", "-U")
+UNTIL = ("--until", "-U")
 _TARGETS = ("all", "pages", "phase_history")
 """Rules of the workflow that only gather results of others."""
 _LOG = "snakemake.log"
@@ -354,10 +354,10 @@ def _steps_as_until(options: Sequence[str]) -> list[str]:
     rest = list(options[leading:])
     if not steps:
         return [*others, *rest]
-    if _UNTIL[0] in rest:
-        at = rest.index(_UNTIL[0]) + 1
+    if UNTIL[0] in rest:
+        at = rest.index(UNTIL[0]) + 1
         return [*others, *rest[:at], *steps, *rest[at:]]
-    return [*others, _UNTIL[0], *steps, *rest]
+    return [*others, UNTIL[0], *steps, *rest]
 
 
 def _check_values(options: Sequence[str]) -> None:
@@ -370,10 +370,10 @@ def _check_values(options: Sequence[str]) -> None:
                 "tiles=N, N >= 1",
                 "Give the number of jobs that form each image.",
             )
-    for step in (options[at] for at in _values(options, *_UNTIL)):
+    for step in (options[at] for at in _values(options, *UNTIL)):
         if step not in (*RULES, *_TARGETS) and "/" not in step:  # a file may be named, too
             raise CampaignError(
-                f"{_UNTIL[0]} {step}", "apertura run", f"a step: {', '.join(RULES)}", "Correct the name of the step."
+                f"{UNTIL[0]} {step}", "apertura run", f"a step: {', '.join(RULES)}", "Correct the name of the step."
             )
 
 
@@ -393,7 +393,7 @@ def _check_targets(campaign: Campaign, options: Sequence[str]) -> None:
 
 def _without_inner_steps(campaign: Campaign, options: Sequence[str]) -> list[str]:
     """Return the options without last steps that other last steps need: Snakemake ends in an error over both."""
-    places = [at for at in _values(options, *_UNTIL) if options[at] in RULES]
+    places = [at for at in _values(options, *UNTIL) if options[at] in RULES]
     if len(places) < 2:
         return list(options)
     results = list(results_of(campaign))

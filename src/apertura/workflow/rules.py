@@ -1,7 +1,7 @@
 """The rules of the workflow, one row each: what a rule makes, of what, by which module, at what cost.
 
-Lineage, resources, the time left, `apertura step` and the headers of the rules in `workflow/` follow from the rows.
-They name modules as text, since the command line reads them, too: what a row needs is imported when it is asked.
+Lineage, resources, the time left and `apertura step` follow from the rows; a test compares them with the rules in
+`workflow/`. Rows refer to functions by `Lazy`, since the command line reads them, too.
 """
 
 from collections.abc import Callable, Iterable, Mapping

@@ -1,6 +1,6 @@
 """The campaign folder's config: one model generates the defaults, the JSON schema and the validation.
 
-Only `pipeline`, `views` and `research` use these objects; other layers get plain arrays and numbers.
+Layers from `campaign` up use these objects; those below get plain arrays and numbers.
 """
 
 from apertura.campaign.config.config import CONFIG, Settings, located, read_settings, validated
