@@ -39,7 +39,7 @@ class ExecutorSettings(ExecutorSettingsBase):  # type: ignore[misc]  # the inter
 
 
 class Executor(AbstractExecutor):  # type: ignore[misc]
-    """Runs the jobs of a workflow: asks for steps, and reports each end as it is told.
+    """Runs the jobs of a workflow: requests steps, and reports to Snakemake when each has ended.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ class Executor(AbstractExecutor):  # type: ignore[misc]
         self._requests.send(json.dumps(asked).encode())
 
     def _report(self) -> None:
-        """Tell Snakemake of each step that has ended."""
+        """Report each step that has ended to Snakemake."""
         while said := self._requests.recv(64):
             job, status = json.loads(said)
             info = self._running.pop(job)
@@ -90,6 +90,6 @@ class Executor(AbstractExecutor):  # type: ignore[misc]
     cancel = shutdown
 
     def handle_job_success(self, job: Any) -> None:
-        """Do nothing more: Snakemake has been told."""
+        """Do nothing more: Snakemake has been informed."""
 
     handle_job_error = handle_job_success
