@@ -19,7 +19,7 @@ def write_power(path, image, *, transform, crs, tags, title=""):
     power = abs(image[:, :]) ** 2
     write_json(path, {"title": title, "mean_power": float(power.mean()), "error_db": tags["APERTURA_ERROR_DB"]})
 
-ROW = Export("power.json", "image", "toy_export:write_power")
+ROW = Export("power.json", "image", write_power)
 """
 PRODUCTS = {f"results/f01/{pair}/power.json" for pair in ("uav1-uav1", "uav1-uav2")}
 

@@ -22,6 +22,7 @@ from pyproj import Transformer
 from apertura.campaign.folder import Campaign
 from apertura.campaign.store import record_files
 from apertura.simulation import preset, simulate
+from apertura.tools.look import pair as look_pair
 from apertura.tools.look.follow import Look
 from apertura.views.webmap.server import is_built
 
@@ -488,8 +489,9 @@ def test_a_page_that_came_with_the_results_is_not_shown_and_its_address_leads_to
         page.close()
 
 
-def test_a_page_of_a_look_shows_what_came_since_and_keeps_what_the_reader_chose(browser, tmp_path):
+def test_a_page_of_a_look_shows_what_came_since_and_keeps_what_the_reader_chose(browser, tmp_path, monkeypatch):
     """A campaign of which half the pulses are there, then all: the page changes without being loaded again."""
+    monkeypatch.setattr(look_pair, "AT_ONCE", 60)
     root = simulate(tmp_path / "campaign", preset("demo", pulses=120), seed=1)
     look = Look(Campaign.load(root), follow=True, every_s=1.0, end_after_s=1e6)
     for node in look.nodes.values():
