@@ -140,7 +140,7 @@ def test_the_legend_of_a_budget_shows_what_a_bar_of_each_kind_looks_like(monkeyp
 @pytest.mark.parametrize(
     ("counted", "labels"),
     [
-        (True, ["of 2 pulses", "pulses from the first pulse sent; no times"]),
+        (True, ["pulses per 2 transmitted", "pulses from the first pulse sent (no times recorded)"]),
         (False, ["pulses in 2 s", "time from the first pulse sent, s"]),
     ],
 )
@@ -161,8 +161,8 @@ def test_panels_of_a_local_frame_have_x_and_y_and_no_north(monkeypatch, tmp_path
         axes = figure.axes[0]
         return [axes.get_xlabel(), axes.get_ylabel(), *(text.get_text() for text in axes.texts)]
 
-    assert texts(True) == ["x of the corner, m", "y of the corner, m", "2 m"]
-    assert texts(False) == ["east of the corner, m", "north of the corner, m", "2 m", "", "N"]
+    assert texts(True) == ["x from the lower left corner, m", "y from the lower left corner, m", "2 m"]
+    assert texts(False) == ["east from the lower left corner, m", "north from the lower left corner, m", "2 m", "", "N"]
 
 
 def test_the_sidelink_takes_out_what_clocks_and_triggers_put_in():
