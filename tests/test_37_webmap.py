@@ -251,7 +251,7 @@ def test_a_document_names_no_file_without_its_hash_and_none_in_another_format():
 
 
 def test_without_a_bundle_there_is_no_address_but_one_message_how_to_get_it(tmp_path):
-    with pytest.raises(CampaignError, match=r"no map page: pip install does not build it.*make webmap"):
+    with pytest.raises(CampaignError, match=r"no map page, because pip install does not build it.*make webmap"):
         page_files(tmp_path)
     for name in PAGE:
         (tmp_path / name).write_text(name)

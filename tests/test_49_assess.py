@@ -76,8 +76,8 @@ def test_the_summary_says_each_flag_once_and_whole(finished_sample, capsys, tmp_
     print_summary(Campaign.load(root))
     said = capsys.readouterr().out
     assert said.count("a line [with brackets]") == 1
-    assert "left out of the budget, no uncertainty is configured" in said
-    assert re.search(r"targets may be misplaced by \d\.\d+ m, mostly by heights, not stated; assumed 3 m", said)
+    assert "not in the error budget, because no uncertainty is configured" in said
+    assert re.search(r"geolocation uncertainty \d\.\d+ m, dominated by heights, not stated; assumed 3 m", said)
 
 
 def test_a_sentence_that_several_flags_have_in_common_stands_once_in_the_summary():

@@ -348,7 +348,7 @@ def test_a_run_from_any_folder_tells_each_step_and_ends_with_what_its_images_say
     assert "Building DAG" in (tiny / "results/logs/snakemake.log").read_text()
     code, output = finished(apertura("run", tiny, "-q"))
     assert code == 0
-    assert output.startswith("what to open")
+    assert output.startswith("main files")
     assert "Building DAG" in finished(apertura("run", tiny, "-v"))[1]
     assert "Building DAG" in finished(apertura("run", tiny, "-n", "-v"))[1]
     assert "digraph" in finished(apertura("run", tiny, "--forceall", "--dag"))[1]

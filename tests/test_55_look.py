@@ -441,7 +441,7 @@ def test_a_map_of_a_look_serves_the_last_pictures_and_nothing_else(tiny, capsys)
     serving = threading.Thread(target=serve)
     serving.start()
     assert not waiting.wait(0.5)
-    assert "waiting for the first picture" in capsys.readouterr().out
+    assert "waiting for the first image" in capsys.readouterr().out
     for node in look.nodes.values():
         node.read()
     assert all(pair.add_next(ended=True) for pair in look.pairs)
