@@ -187,7 +187,7 @@ def test_results_are_read_where_their_recordings_are_not(finished_tiny, tmp_path
 def test_a_node_that_sends_nothing_is_not_aligned(typed, tiny, node):
     status, _, err = typed("align", tiny, "f01", node)
     assert status == 2
-    assert f"{node} does not send and receive in f01" in err
+    assert f"{node} does not transmit and receive in f01" in err
     assert "--until echo" in typed("align", tiny, "f01", "uav1")[2]
 
 

@@ -132,7 +132,7 @@ def test_what_a_plan_lacks_is_one_message(folder, monkeypatch, capsys):
 def test_an_unknown_word_of_optimise_is_one_message(folder, monkeypatch, capsys):
     status, _, err = typed(monkeypatch, capsys, "design", folder / "plan.yaml", "--optimise", "speed")
     assert status == 2
-    assert "expected some of height,offset,spacing,heading" in err
+    assert "expected one or more of height,offset,spacing,heading" in err
 
 
 def test_a_scene_beyond_the_dem_is_one_message(folder, monkeypatch, capsys):
