@@ -94,8 +94,8 @@ def test_a_name_that_does_not_exist_is_answered_with_those_that_do(opened):
 
 def test_a_stage_that_is_asked_for_without_its_place_says_what_is_missing(opened):
     message = complaint(lambda: opened.stage("echo", "f01"))
-    assert "campaign.stage('echo'): given f01; expected a flight and a pair" in message
-    assert "given nothing more; expected a flight and a node" in complaint(lambda: opened.stage("raw"))
+    assert "campaign.stage('echo'): arguments: f01; expected a flight and a pair" in message
+    assert "arguments: none; expected a flight and a node" in complaint(lambda: opened.stage("raw"))
     assert "arguments: f01; expected no further arguments" in complaint(lambda: opened.stage("cube", "f01"))
 
 

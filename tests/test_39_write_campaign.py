@@ -76,7 +76,7 @@ GULF = {"crs": "EPSG:32631", "bounds_m": [184000, 92000, 184010, 92010], "height
 def test_a_track_in_radians_is_refused(tmp_path, scene):
     config = CONFIG | ({"scene": scene} if scene else {})
     message = complaint(lambda: write(tmp_path / "c", along(48.0, 10.0, 8.0, np.float64), config=config))
-    assert "in radians the track lies" in message
+    assert "apparently in radians, for which the track is" in message
     assert "expected degrees" in message
     assert not (tmp_path / "c").exists()
 
@@ -158,7 +158,7 @@ def test_a_recording_that_cannot_be_is_named_and_nothing_is_left(tmp_path, chang
         ({"kind": "picture"}, "kind 'picture' is none of bench, calibration, image"),
         (
             {"config": CONFIG | {"waveform": {"kind": "phase_history", "format": "afrl_mat"}}},
-            "waveform.kind phase_history; expected one recorded as samples",
+            "waveform.kind phase_history; expected a waveform that is recorded as samples",
         ),
         ({"config": CONFIG | {"waveform": WAVEFORM | {"codes": "../codes.npy"}}}, "leads out of the campaign folder"),
     ],
