@@ -76,7 +76,7 @@ GULF = {"crs": "EPSG:32631", "bounds_m": [184000, 92000, 184010, 92010], "height
 def test_a_track_in_radians_is_refused(tmp_path, scene):
     config = CONFIG | ({"scene": scene} if scene else {})
     message = complaint(lambda: write(tmp_path / "c", along(48.0, 10.0, 8.0, np.float64), config=config))
-    assert "apparently in radians, for which the track is" in message
+    assert "apparently in radians, for which the" in message
     assert "expected degrees" in message
     assert not (tmp_path / "c").exists()
 
@@ -131,7 +131,7 @@ def test_samples_and_logs_may_lie_in_files(tmp_path):
         ({"start": [0, 24, 480]}, "capture 2 starts at sample 480, the data end at 72"),
         ({"frame": [1, 2]}, "and 2 frame numbers"),
         ({"frame": [1, 2, -7]}, "captures.2.apertura:frame"),
-        ({"track": NODE.track[:, :2]}, "track of shape (2, 2); expected (2, 3)"),
+        ({"track": NODE.track[:, :2]}, "track of shape (2, 2); expected shape (2, 3)"),
         ({"track": NODE.track * np.nan}, "0 epochs (2 left out: no fix)"),
         ({"track_utc": NODE.track_utc[::-1]}, "an earlier time"),
         ({"track": "nowhere.pos"}, "nowhere.pos: no such file"),

@@ -209,18 +209,18 @@ def align(
             expected="the position of a reflector, because the sharpness of a scene does not determine a drift",
             remedy="Give --point, or omit --drift.",
         )
-    given = unaligned(campaign, campaign.flight(flight).name, node)
+    inputs = unaligned(campaign, campaign.flight(flight).name, node)
     if search_m == 0.0:
-        given = given.less_path(campaign.settings.nodes[node].path_offset_m.radar)
-    within_s = _search_range(given, search_s)
+        inputs = inputs.less_path(campaign.settings.nodes[node].path_offset_m.radar)
+    within_s = _search_range(inputs, search_s)
     try:
         if point is None:
-            alignment = align_on_scene(given.echo, given.log, *_scene(campaign), within_s=within_s, search_m=search_m)
+            alignment = align_on_scene(inputs.echo, inputs.log, *_scene(campaign), within_s=within_s, search_m=search_m)
         else:
-            position_m = frame_from_map(_crs(campaign, given), *point)
-            alignment = align_on_point(given.echo, given.log, position_m, within_s=within_s, search_m=search_m)
+            position_m = frame_from_map(_crs(campaign, inputs), *point)
+            alignment = align_on_point(inputs.echo, inputs.log, position_m, within_s=within_s, search_m=search_m)
             if drift:
-                alignment = estimate_drift(alignment, given.echo, given.log, position_m)
+                alignment = estimate_drift(alignment, inputs.echo, inputs.log, position_m)
     except ValueError as error:
         raise CampaignError(
             str(error),
@@ -228,9 +228,9 @@ def align(
             expected="a recording within the times of the log of its node",
             remedy="Check that recording and log belong together, and nodes.<node>.log.",
         ) from error
-    offset = Decimal(given.offset_ns(alignment.offset_s)).scaleb(-9)
-    values = {"offset_s": str(offset), "drift_ppm": round(given.applied_ppm + alignment.drift_ppm, 4)}
-    return alignment, values | {"path_offset_m": given.taken_off_m + alignment.path_m}
+    offset = Decimal(inputs.offset_ns(alignment.offset_s)).scaleb(-9)
+    values = {"offset_s": str(offset), "drift_ppm": round(inputs.applied_ppm + alignment.drift_ppm, 4)}
+    return alignment, values | {"path_offset_m": inputs.taken_off_m + alignment.path_m}
 
 
 def write_clock(
@@ -281,24 +281,24 @@ def print_alignment(campaign: Campaign, flight: str, node: str, *, write: bool, 
         print(f"{written} written")
 
 
-def _search_range(given: Unaligned, search_s: float | None) -> tuple[float, float]:
+def _search_range(inputs: Unaligned, search_s: float | None) -> tuple[float, float]:
     """Return the bounds of the search for the offset between first pulse and first epoch, seconds."""
-    recorded_s = float(given.echo.time_s[-1])
-    overlapping = given.log.first_s - recorded_s, given.log.last_s
-    if search_s is None and given.own_clock:
+    recorded_s = float(inputs.echo.time_s[-1])
+    overlapping = inputs.log.first_s - recorded_s, inputs.log.last_s
+    if search_s is None and inputs.own_clock:
         return overlapping
     near_s = NEAR_S if search_s is None else search_s
-    return max(overlapping[0], given.stated_s - near_s), min(overlapping[1], given.stated_s + near_s)
+    return max(overlapping[0], inputs.stated_s - near_s), min(overlapping[1], inputs.stated_s + near_s)
 
 
-def _crs(campaign: Campaign, given: Unaligned) -> str:
+def _crs(campaign: Campaign, inputs: Unaligned) -> str:
     """Return the CRS of `point`; for `auto`, that of a finished scene stage, or else the UTM zone of the log."""
     if campaign.settings.scene.crs != "auto":
         return campaign.settings.scene.crs
     if manifest_of(campaign.result("scene.json")).is_file():
         return settled_scene(campaign).grid.crs
-    middle_s = np.array([given.log.first_s + given.log.last_s]) / 2
-    return utm_crs(given.log.phase_centres(middle_s).tx_m[0])
+    middle_s = np.array([inputs.log.first_s + inputs.log.last_s]) / 2
+    return utm_crs(inputs.log.phase_centres(middle_s).tx_m[0])
 
 
 def _scene(campaign: Campaign) -> tuple[SceneGrid, FlatGround]:

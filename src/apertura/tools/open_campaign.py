@@ -100,17 +100,17 @@ class OpenCampaign:
         return flags
 
 
-def _check_name(name: str, kind: str, known: Iterable[str], *, where: object) -> None:
-    if name not in known:
+def _check_name(name: str, kind: str, names: Iterable[str], *, where: object) -> None:
+    if name not in names:
         raise CampaignError(
-            f"no {kind} {name!r}", where=where, expected=f"one of {', '.join(known)}", remedy=f"Correct the {kind}."
+            f"no {kind} {name!r}", where=where, expected=f"one of {', '.join(names)}", remedy=f"Correct the {kind}."
         )
 
 
-def _check_count(given: tuple[str, ...], count: int, stage: str, expected: str) -> None:
-    if len(given) != count:
+def _check_count(arguments: tuple[str, ...], count: int, stage: str, expected: str) -> None:
+    if len(arguments) != count:
         raise CampaignError(
-            f"arguments: {', '.join(given) or 'none'}",
+            f"arguments: {', '.join(arguments) or 'none'}",
             where=f"campaign.stage({stage!r})",
             expected=expected,
             remedy="Correct the arguments after the stage name.",

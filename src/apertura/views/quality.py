@@ -291,7 +291,7 @@ def raised_flags(reports: Mapping[str, Report], *, quotes: bool = True) -> list[
     for image, report in reports.items():
         for flag, line in report["flags"].items():
             images = raised.setdefault(flag, {})
-            if quotes or not image.endswith(FUSED) or not any(known in line for known in images):
+            if quotes or not image.endswith(FUSED) or not any(earlier in line for earlier in images):
                 images.setdefault(line, []).append(image)
     return [RaisedFlag(flag, lines, *_explained(flag)) for flag, lines in raised.items()]
 
@@ -338,8 +338,8 @@ def explained_flags(flags: Mapping[str, str]) -> dict[str, str]:
 
 
 def _explained(flag: str) -> tuple[str, str]:
-    known = FLAGS.get(flag)  # an image of another version may have a flag that this version does not define
-    return (known.means, known.look) if known else ("", "")
+    definition = FLAGS.get(flag)  # an image of another version may have a flag that this version does not define
+    return (definition.means, definition.look) if definition else ("", "")
 
 
 def _size_text(value: float, unit: str) -> str:

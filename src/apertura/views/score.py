@@ -141,8 +141,8 @@ def print_findings(campaign: Campaign, *, paths: bool) -> None:
         row = [f"{100 * value:+.1f} cm" for value in numbers[:2]] + [f"{100 * numbers[2]:.1f} cm"]
         row += [f"{100 * width:.1f} cm" for width in widths]
         if finding.rcs_put_dbsm is not None or finding.rcs_dbsm is not None:
-            known = finding.rcs_dbsm is not None
-            row.append(f"{finding.rcs_dbsm:.2f} ± {finding.rcs_std_db:.2f}" if known else "in noise or clutter")
+            is_measured = finding.rcs_dbsm is not None
+            row.append(f"{finding.rcs_dbsm:.2f} ± {finding.rcs_std_db:.2f}" if is_measured else "in noise or clutter")
             row.append("" if finding.rcs_put_dbsm is None else f"{finding.rcs_put_dbsm:.2f}")
         table.add_row(finding.flight, finding.image, str(finding.target), *row)
     console.print(table)

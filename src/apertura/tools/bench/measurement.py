@@ -371,7 +371,7 @@ def measure_bench(campaign: Campaign, flight: str) -> Bench:
         )
     flown, sent = campaign.flight(flight), transmitted(campaign, waveform)
     names = [name for name in flown.participants if name in flown.nodes]
-    nodes = tuple(_node(campaign, flight, name, sent, own=name == flown.transmitter) for name in names)
+    nodes = tuple(_node(campaign, flight, name, sent, is_transmitter=name == flown.transmitter) for name in names)
     due = max((node.triggers.due for node in nodes), default=0)
     # pulses recorded by other nodes before a node started or after it stopped
     counts = [replace(node.triggers, beyond=due - node.triggers.due) for node in nodes]
@@ -381,17 +381,17 @@ def measure_bench(campaign: Campaign, flight: str) -> Bench:
     )
     stated, offsets, flags = campaign.settings.bench, {}, []
     for node in nodes:
-        own = node.name == flown.transmitter
+        is_transmitter = node.name == flown.transmitter
         expected_m = stated.radar_m
-        if not own and expected_m is not None:
+        if not is_transmitter and expected_m is not None:
             expected_m = None if stated.sidelink_m is None else expected_m - stated.sidelink_m
         if node.link is None:
             continue
-        if not own:
+        if not is_transmitter:
             flags.append(reversed_flags(node.link, expected_m))
         if expected_m is not None:
             paths = campaign.settings.nodes[node.name].path_offset_m
-            offset_m = paths.radar if own else paths.radar - paths.sidelink
+            offset_m = paths.radar if is_transmitter else paths.radar - paths.sidelink
             link = node.link
             offsets[node.name] = BenchPathOffset(link.path_m - expected_m, link.path_std_m, offset_m, link.cell_m)
             flags.append(offsets[node.name].flags(link.name))
@@ -408,7 +408,7 @@ def measure_bench(campaign: Campaign, flight: str) -> Bench:
     )  # fmt: skip
 
 
-def _node(campaign: Campaign, flight: str, name: str, sent: Transmitted, *, own: bool) -> BenchNode:
+def _node(campaign: Campaign, flight: str, name: str, sent: Transmitted, *, is_transmitter: bool) -> BenchNode:
     recording = checked_recording(campaign, flight, name)
     raw = captures_of(recording, campaign, node=name)
     where = f"raw/{flight}/{name}"
@@ -418,11 +418,11 @@ def _node(campaign: Campaign, flight: str, name: str, sent: Transmitted, *, own:
     counted = triggers(time_s, prf_hz=sent.waveform.prf_hz)
     present = [channel for channel in _CHANNELS if channel in recording.channels]
     every = np.arange(len(time_s))
-    read = captured.reader(present if own else list(_CHANNELS), every)
+    read = captured.reader(present if is_transmitter else list(_CHANNELS), every)
     channels, saturation = _channels(read, present, captured, len(every))
     flags = [channel.flags for channel in channels] + [saturation.flags]
     pair = f"{campaign.flight(flight).transmitter}-{name}"
-    if _is_inverted(read, sent, "radar" if own else "sidelink", len(every)):
+    if _is_inverted(read, sent, "radar" if is_transmitter else "sidelink", len(every)):
         read = _conjugated(read)
         line = (
             f"{name}: the code matches the complex conjugate of the samples; toggle nodes.{name}.iq, or waveform.iq "
@@ -431,7 +431,7 @@ def _node(campaign: Campaign, flight: str, name: str, sent: Transmitted, *, own:
         flags.append({"spectrum_inverted": line})
     before, clock, contact, state = None, None, None, None
     measured: Transfer | None = None
-    if own:
+    if is_transmitter:
         measured = transfer_by_code(read, sent.inverse, captured.numerology, time_s=time_s)
     else:
         contact = measure_contact(f"{name} sidelink", _by_code(read, sent, "sidelink"), len(every))
@@ -458,8 +458,8 @@ def _node(campaign: Campaign, flight: str, name: str, sent: Transmitted, *, own:
         if len(kept) > 1:
             rows = measured.form
             link = measure_link(
-                pair, lambda some: rows(kept[some]), time_s[kept], captured.numerology, divided=not own,
-                prefix_cells=captured.numerology.delay_cells if own else None,
+                pair, lambda pulses: rows(kept[pulses]), time_s[kept], captured.numerology, divided=not is_transmitter,
+                prefix_cells=captured.numerology.delay_cells if is_transmitter else None,
             )  # fmt: skip
             flags.append(link.flags if link else {"link_weak": f"{pair}: no path above the noise"})
     return BenchNode(

@@ -179,13 +179,13 @@ def _offer(campaign: Campaign, flight: str, offsets: Mapping[str, Any], *, write
         print(f"measured paths for {CONFIG} (`apertura bench --write` writes them):")
         transmitter = campaign.flight(flight).transmitter
         for node, offset in differing.items():
-            radar_m = _radar_m(campaign, node, offset["offset_m"], own=node == transmitter)
+            radar_m = _radar_m(campaign, node, offset["offset_m"], is_transmitter=node == transmitter)
             print(f"  nodes.{node}.path_offset_m.radar: {radar_m}  # ± {offset['std_m']:.4f}")
 
 
-def _radar_m(campaign: Campaign, node: str, offset_m: float, *, own: bool) -> float:
+def _radar_m(campaign: Campaign, node: str, offset_m: float, *, is_transmitter: bool) -> float:
     """Return the path offset of a radar channel; for a receiver, the measured offset is relative to its sidelink."""
-    return round(offset_m if own else offset_m + campaign.settings.nodes[node].path_offset_m.sidelink, 4)
+    return round(offset_m if is_transmitter else offset_m + campaign.settings.nodes[node].path_offset_m.sidelink, 4)
 
 
 def write_offsets(campaign: Campaign, flight: str, offsets: Mapping[str, Any]) -> None:
@@ -193,7 +193,8 @@ def write_offsets(campaign: Campaign, flight: str, offsets: Mapping[str, Any]) -
     path, transmitter = campaign.root / CONFIG, campaign.flight(flight).transmitter
     text = path.read_text(encoding="utf-8")
     values = {
-        node: _radar_m(campaign, node, offset["offset_m"], own=node == transmitter) for node, offset in offsets.items()
+        node: _radar_m(campaign, node, offset["offset_m"], is_transmitter=node == transmitter)
+        for node, offset in offsets.items()
     }
     for node, value in values.items():
         text = with_value(text, ("nodes", node, "path_offset_m", "radar"), value)

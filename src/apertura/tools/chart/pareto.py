@@ -143,12 +143,12 @@ function draw() {
   make("text",{x:box.right-4,y:Y(requested)-5,"text-anchor":"end"},`requested: ${requested} dB`);
   make("text",{x:(box.left+box.right)/2,y:box.bottom+40,"text-anchor":"middle"},
     "time of tables and sums for the whole image, one thread, s");
-  const seen = points.filter(p=>shown[p.engine]); let best = Infinity, path = "";
-  for (const p of seen) if (p.error_db!==null && p.error_db<best) {
+  const selected = points.filter(p=>shown[p.engine]); let best = Infinity, path = "";
+  for (const p of selected) if (p.error_db!==null && p.error_db<best) {
     path += path ? `H${X(p.seconds)}V${Y(p.error_db)}` : `M${X(p.seconds)},${Y(p.error_db)}`; best = p.error_db;
   }
   if (path) make("path",{d:path,fill:"none",stroke:"#777"});
-  for (const p of seen) {
+  for (const p of selected) {
     const mark = p.error_db===null
       ? make("line",{x1:X(p.seconds),x2:X(p.seconds),y1:box.top,y2:box.bottom,stroke:"#777","stroke-dasharray":"2 4"})
       : p.planned

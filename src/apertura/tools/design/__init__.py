@@ -52,7 +52,7 @@ def design(
     --------
     >>> import apertura as ap
     >>> node = {"attitude": "log"}
-    >>> found = ap.design({
+    >>> design = ap.design({
     ...     "campaign": "meadow",
     ...     "waveform": {"kind": "ofdm", "subcarriers": 512, "subcarrier_spacing_hz": 4e5, "symbol_s": 2.5e-6,
     ...                  "cyclic_prefix_s": 1e-6, "carrier_hz": 1.3e9, "sample_rate_hz": 2.56e8, "prf_hz": 100.0},
@@ -61,7 +61,7 @@ def design(
     ...     "flights": {"f01": {"transmitter": "uav1", "receivers": ["uav1"], "tracks": {"uav1": {
     ...         "kind": "line", "start_m": [-20, 0], "end_m": [20, 0], "height_m": 30.0, "speed_m_s": 5.0}}}},
     ...     "require": {"resolution_m": 2.0, "coverage": 0.95}})
-    >>> found.sizes["image"], [line["met"] for line in found.attrs["judgement"]]
+    >>> design.sizes["image"], [line["met"] for line in design.attrs["judgement"]]
     (1, [True, True])
     """
     return dataset_of(designed(*as_plan(plan, root), threads=threads))

@@ -496,5 +496,5 @@ def tried_report(tried: Sequence[Tried]) -> list[dict[str, Any]]:
 def with_front(tried: Sequence[Tried]) -> list[Tried]:
     """Mark the Pareto-optimal plans: no other is at least as good in all requirements and better in one."""
     short = np.array([[v.short_db for v in trial.verdicts if v.required is not None] for trial in tried])
-    front = [not ((short <= own).all(axis=1) & (short < own).any(axis=1)).any() for own in short]
-    return [replace(trial, on_front=on) for trial, on in zip(tried, front, strict=True)]
+    front = [not ((short <= row).all(axis=1) & (short < row).any(axis=1)).any() for row in short]
+    return [replace(trial, on_front=is_optimal) for trial, is_optimal in zip(tried, front, strict=True)]

@@ -125,10 +125,10 @@ class NodeSoFar:
         """Describe the change of captures or samples since the last reading; empty without a change."""
         if self._recording is None or not path.is_file():
             return ""
-        known = self._recording.captures.time
-        now = known[:0] if recording is None else recording.captures.time
-        both = min(len(now), len(known))
-        if not np.array_equal(now[:both], known[:both]):
+        earlier = self._recording.captures.time
+        present = earlier[:0] if recording is None else recording.captures.time
+        common = min(len(present), len(earlier))
+        if not np.array_equal(present[:common], earlier[:common]):
             return "the capture times changed"
         if (size := path.stat().st_size) < self._known[0]:
             return f"the file size decreased from {self._known[0]} to {size} bytes"

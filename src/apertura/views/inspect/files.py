@@ -342,9 +342,11 @@ def _missing_of_recording(recording: "Recording", facts: RecordingFacts, context
     if not context.waveform:
         prf_hz = facts.times and facts.times.rate_hz
         stated = {"sample_rate_hz": facts.sample_rate_hz, "carrier_hz": facts.carrier_hz, "prf_hz": prf_hz}
-        known = ", ".join(f"{key}: {value:.9g}" for key, value in stated.items() if value)
+        settings = ", ".join(f"{key}: {value:.9g}" for key, value in stated.items() if value)
         suffixes = "|".join(file.suffix for file in recording.files)
-        lacks.append(f"transmitted waveform: section waveform of config/config.yaml, with {known} as in the recording")
+        lacks.append(
+            f"transmitted waveform: section waveform of config/config.yaml, with {settings} as in the recording"
+        )
         lacks.append(f"a campaign: copy the recording to raw/<flight>/{NODE}{suffixes} of a campaign folder")
     if not facts.carrier_hz:
         lacks.append("the carrier frequency: not in the recording; the configured value is used")
@@ -377,12 +379,12 @@ def _against_log(
     return rows, [f"positions for {1 - covered:.1%} of the captures: {log.name} covers {first} to {last}{clocks}"]
 
 
-def history_report(here: Path, files: Sequence[Path], kind: str, context: Surroundings) -> Report:
+def history_report(path: Path, files: Sequence[Path], kind: str, context: Surroundings) -> Report:
     """Return the report of phase history.
 
     Parameters
     ----------
-    here
+    path
         Path of the file or folder.
     files
         The file and its companion file, or all files of the folder.
@@ -398,13 +400,13 @@ def history_report(here: Path, files: Sequence[Path], kind: str, context: Surrou
         campaign and there is none.
     """
     if not files:
-        raise CampaignError(f"no {kind} group, the folder is empty", here, "phase history", "Copy the folder again.")
+        raise CampaignError(f"no {kind} group, the folder is empty", path, "phase history", "Copy the folder again.")
     described = context.waveform if context.waveform.get("format") == kind else {}
     if PHASE_HISTORIES[kind].waveform != PHASE_HISTORY and not described:
         raise CampaignError(
             "samples without a description of the transmitted waveform",
-            here,
-            f"raw/<flight>/{here.name} of a campaign whose config sets waveform.format: {kind}",
+            path,
+            f"raw/<flight>/{path.name} of a campaign whose config sets waveform.format: {kind}",
             "Create a campaign folder with `apertura init` and copy the samples there.",
         )
     echo = _read_history(files, kind, context.node, described)
@@ -412,12 +414,12 @@ def history_report(here: Path, files: Sequence[Path], kind: str, context: Surrou
     from apertura.views.inspect.pictures import draw_history
 
     return Report(
-        here,
+        path,
         "phase history",
         kind,
         _history_rows(facts),
         tuple(_missing_of_history(facts, kind, context)),
-        picture=lambda: draw_history(echo, here.name),
+        picture=lambda: draw_history(echo, path.name),
     )
 
 
@@ -481,13 +483,13 @@ def dem_report(path: Path) -> Report:
         return Report(path, "product of apertura", "", rows)
     heights = facts.heights
     if heights is not None:
-        known = heights[np.isfinite(heights)]
-        ends = [float(known.min()), float(known.max())] if known.size else None
+        finite = heights[np.isfinite(heights)]
+        ends = [float(finite.min()), float(finite.max())] if finite.size else None
         if facts.values_unit.lower() in METRES:
             rows["height_m"] = ends
         else:
             rows["height"] = None if ends is None else f"{ends[0]:.2f} to {ends[1]:.2f} {shown(facts.values_unit, 40)}"
-        rows["posts_without_height_share"] = 1 - known.size / max(heights.size, 1)
+        rows["posts_without_height_share"] = 1 - finite.size / max(heights.size, 1)
     try:
         open_dem(path, "a scene on Earth")
         lacks: tuple[str, ...] = ()

@@ -164,8 +164,8 @@ def _with_config(report: Report, context: Surroundings) -> Report:
 def _as_problem(error: Exception, path: Path) -> CampaignError:
     if isinstance(error, CampaignError):
         return error
-    known = explained(error)
-    found = known or f"reader failed: {type(error).__name__}: {error}"
+    explanation = explained(error)
+    found = explanation or f"reader failed: {type(error).__name__}: {error}"
     remedy = "Check whether the file is damaged; if not, report an internal error of apertura."
     return CampaignError(found, path, "an undamaged file", remedy)
 

@@ -45,22 +45,22 @@ def draw_log(track: "xr.Dataset", name: str) -> Figure:
     plan, height = figure.add_subplot(grid[:, 0]), figure.add_subplot(grid[0, 1])
     steps = figure.add_subplot(grid[1, 1], sharex=height)
     position, times, frame = track.position.values, track.time.values, track.attrs["frame"]
-    place, at_s = east_north_up(position, frame, np.median(position, axis=0)), seconds_since(times, times[0])
-    for label, own in _by_fix(track).items():
-        words, colour = f"{label}, {number_of(int(own.sum()), 'epoch')}", _COLOURS[label]
-        plan.plot(place[own, 0], place[own, 1], ".", color=colour, label=words, markersize=2.5)
-        height.plot(at_s[own], place[own, 2], ".", color=colour, markersize=2.5)
+    local_m, time_s = east_north_up(position, frame, np.median(position, axis=0)), seconds_since(times, times[0])
+    for fix, epochs in _by_fix(track).items():
+        label, colour = f"{fix}, {number_of(int(epochs.sum()), 'epoch')}", _COLOURS[fix]
+        plan.plot(local_m[epochs, 0], local_m[epochs, 1], ".", color=colour, label=label, markersize=2.5)
+        height.plot(time_s[epochs], local_m[epochs, 2], ".", color=colour, markersize=2.5)
     for number, epoch in enumerate(gaps(times, LONG_GAP)):
         ends = slice(epoch - 1, epoch + 1)
-        plan.plot(*place[ends, :2].T, "r--", linewidth=1, label="gap" if number == 0 else None)
-        height.axvspan(*at_s[ends], color="red", alpha=0.2)
-    plan.plot(*place[0, :2], "k^", label="first epoch")
+        plan.plot(*local_m[ends, :2].T, "r--", linewidth=1, label="gap" if number == 0 else None)
+        height.axvspan(*time_s[ends], color="red", alpha=0.2)
+    plan.plot(*local_m[0, :2], "k^", label="first epoch")
     earth = frame == "ecef"
     _named(plan, "east of the median, m" if earth else "x, m", "north of the median, m" if earth else "y, m")
     plan.set_aspect("equal", adjustable="datalim")
     plan.legend(loc="best", fontsize="small")
     _named(height, "", "height above the ellipsoid, m" if earth else "z, m")
-    _intervals(steps, at_s[1:], times)
+    _intervals(steps, time_s[1:], times)
     _named(steps, f"seconds since {utc(times[0])}", "interval to the previous epoch, s")
     return figure
 
@@ -94,9 +94,9 @@ def _intervals(axes: "Axes", across: NDArray[Any], times: NDArray[np.datetime64]
 def _by_fix(track: "xr.Dataset") -> dict[str, NDArray[np.bool_]]:
     """Return a mapping of kind of fix → (epoch,) bool."""
     kinds = track.fix.values if "fix" in track else np.zeros(track.sizes["epoch"], np.int8)
-    known = {"fix" if kind == 1 else name: kinds == kind for name, kind in FIXES.items()}
-    known["not stated"] = ~np.isin(kinds, list(FIXES.values()))
-    return {name: own for name, own in known.items() if own.any()}
+    masks = {"fix" if kind == 1 else name: kinds == kind for name, kind in FIXES.items()}
+    masks["not stated"] = ~np.isin(kinds, list(FIXES.values()))
+    return {name: mask for name, mask in masks.items() if mask.any()}
 
 
 def draw_recording(recording: "Recording", samples: NDArray[np.complex64], name: str) -> Figure:
@@ -108,14 +108,14 @@ def draw_recording(recording: "Recording", samples: NDArray[np.complex64], name:
     if several:
         _captures(axes.pop(0), recording.captures.time)
     length_us = samples.shape[1] / recording.sample_rate_hz * 1e6
-    for channel, own, values in zip(recording.channels, axes, np.moveaxis(samples, 2, 0), strict=True):
+    for channel, panel, values in zip(recording.channels, axes, np.moveaxis(samples, 2, 0), strict=True):
         level_db, label = _decibels(values), f"dB relative to the maximum, {shown(channel)}"
         if several:
-            _image(own, level_db, (0.0, length_us), label)
-            _named(own, "time in the capture, µs", "capture")
+            _image(panel, level_db, (0.0, length_us), label)
+            _named(panel, "time in the capture, µs", "capture")
         else:
-            own.plot(np.linspace(0, length_us, level_db.shape[1], endpoint=False), level_db[0], "k", linewidth=0.6)
-            _named(own, f"time since {utc(recording.captures.time[0])}, µs", label)
+            panel.plot(np.linspace(0, length_us, level_db.shape[1], endpoint=False), level_db[0], "k", linewidth=0.6)
+            _named(panel, f"time since {utc(recording.captures.time[0])}, µs", label)
     return figure
 
 
@@ -174,18 +174,19 @@ def draw_campaign(spans: Mapping[tuple[str, str], Mapping[str, Span]], name: str
     flights = list(dict.fromkeys(flight for flight, _ in spans)) or [""]
     figure = _figure(name, (10, 1.5 + 1.2 * len(spans)))
     for axes, flight in zip(np.ravel(figure.subplots(len(flights), 1)), flights, strict=True):
-        own = {node: known for (of, node), known in spans.items() if of == flight}
-        begun = min(
-            (first for known in own.values() for first, _ in known.values()), default=np.datetime64("NaT", "ns")
+        nodes = {node: node_spans for (span_flight, node), node_spans in spans.items() if span_flight == flight}
+        start = min(
+            (first for node_spans in nodes.values() for first, _ in node_spans.values()),
+            default=np.datetime64("NaT", "ns"),
         )
-        for row, known in enumerate(own.values()):
-            for kind, (first, last) in known.items():
-                start_s, length_s = (float(step / np.timedelta64(1, "s")) for step in (first - begun, last - first))
+        for row, node_spans in enumerate(nodes.values()):
+            for kind, (first, last) in node_spans.items():
+                start_s, length_s = (float(step / np.timedelta64(1, "s")) for step in (first - start, last - first))
                 colour, lift = ("tab:blue", 0.05) if kind == "recorded" else ("tab:green", -0.35)
                 axes.barh(row + lift, length_s, left=start_s, height=0.3, align="edge", color=colour)
-        axes.set_yticks(range(len(own)), [shown(node) for node in own])
-        begins = "" if np.isnat(begun) else f", seconds since {utc(begun)}"
-        _named(axes, f"{shown(flight)}{begins}; blue: recorded, green: logged", "")
+        axes.set_yticks(range(len(nodes)), [shown(node) for node in nodes])
+        since = "" if np.isnat(start) else f", seconds since {utc(start)}"
+        _named(axes, f"{shown(flight)}{since}; blue: recorded, green: logged", "")
     return figure
 
 

@@ -183,44 +183,42 @@ def first_difference(first: Path, second: Path) -> int | None:
     >>> first_difference(Path(__file__), Path(__file__)) is None
     True
     """
-    at = 0
-    with first.open("rb") as one, second.open("rb") as other:
+    offset = 0
+    with first.open("rb") as left_stream, second.open("rb") as right_stream:
         while True:
-            left, right = one.read(_READ_BYTES), other.read(_READ_BYTES)
+            left, right = left_stream.read(_READ_BYTES), right_stream.read(_READ_BYTES)
             if left != right:
                 pairs = zip(left, right, strict=False)
-                return at + next((i for i, (a, b) in enumerate(pairs) if a != b), min(len(left), len(right)))
+                return offset + next((i for i, (a, b) in enumerate(pairs) if a != b), min(len(left), len(right)))
             if not left:
                 return None
-            at += len(left)
+            offset += len(left)
 
 
-def _rasters(first: Path, second: Path) -> Iterator[str]:
+def _rasters(*paths: Path) -> Iterator[str]:
     """Yield the differences between the pixels of two rasters in the overlap of their grids."""
     with ExitStack() as stack:
-        one, other = (
-            stack.enter_context(opened_raster(path, expected=EXPECTED, remedy=REMEDY)) for path in (first, second)
-        )
-        shift = _shift(one, other)
+        first, second = (stack.enter_context(opened_raster(path, expected=EXPECTED, remedy=REMEDY)) for path in paths)
+        shift = _shift(first, second)
         if shift is None:
             yield "not compared: CRS or pixel spacing differ, or the offset is not an integer number of pixels"
             return
         down, right = shift
-        rows = range(max(0, down), min(one.height, other.height + down))
-        columns = range(max(0, right), min(one.width, other.width + right))
+        rows = range(max(0, down), min(first.height, second.height + down))
+        columns = range(max(0, right), min(first.width, second.width + right))
         if not rows or not columns:
             yield "not compared: the grids do not overlap"
             return
-        if (len(rows), len(columns)) != one.shape or one.shape != other.shape:
+        if (len(rows), len(columns)) != first.shape or first.shape != second.shape:
             yield f"compared in the overlap: {len(columns)} × {len(rows)} pixels"
-        tally = Tally.of(_blocks(one, other, (rows[0], columns[0]), shift, (len(rows), len(columns))))
-        yield from difference_lines(tally, unit=one.units[0] or "1", power="power" in (one.descriptions[0] or ""))
+        tally = Tally.of(_blocks(first, second, (rows[0], columns[0]), shift, (len(rows), len(columns))))
+        yield from difference_lines(tally, unit=first.units[0] or "1", power="power" in (first.descriptions[0] or ""))
 
 
-def _shift(one: Any, other: Any) -> tuple[int, int] | None:
+def _shift(first: Any, second: Any) -> tuple[int, int] | None:
     """Return row and column of the second raster's origin in the first; None if the grids do not coincide."""
-    a, b = one.transform, other.transform
-    if one.crs != other.crs or not np.allclose(a[:2] + a[3:5], b[:2] + b[3:5], rtol=1e-9, atol=0):
+    a, b = first.transform, second.transform
+    if first.crs != second.crs or not np.allclose(a[:2] + a[3:5], b[:2] + b[3:5], rtol=1e-9, atol=0):
         return None
     if a.b or a.d or not a.a or not a.e:
         return None
@@ -231,7 +229,7 @@ def _shift(one: Any, other: Any) -> tuple[int, int] | None:
 
 
 def _blocks(
-    one: Any, other: Any, begin: tuple[int, int], shift: tuple[int, int], shape: tuple[int, int]
+    first: Any, second: Any, begin: tuple[int, int], shift: tuple[int, int], shape: tuple[int, int]
 ) -> Iterator[tuple[Pixels, Pixels]]:
     """Yield the overlap of two rasters in blocks."""
     from rasterio.windows import Window
@@ -240,25 +238,31 @@ def _blocks(
         top, left = rows.start + begin[0], columns.start + begin[1]
         size = columns.stop - columns.start, rows.stop - rows.start
         window, shifted = Window(left, top, *size), Window(left - shift[1], top - shift[0], *size)
-        yield one.read(1, window=window), other.read(1, window=shifted)
+        yield first.read(1, window=window), second.read(1, window=shifted)
 
 
-def _stages(first: Path, second: Path) -> Iterator[str]:
+def _stages(*folders: Path) -> Iterator[str]:
     """Yield the differences between the arrays of two stages, prefixed with the array name."""
-    one, other = (open_stage(folder, folder.stem) for folder in (first, second))
-    for name in one.variables:
-        if name not in other.variables or one[name].shape != other[name].shape or one[name].dtype.kind not in "fciubM":
+    first, second = (open_stage(folder, folder.stem) for folder in folders)
+    for name in first.variables:
+        if (
+            name not in second.variables
+            or first[name].shape != second[name].shape
+            or first[name].dtype.kind not in "fciubM"
+        ):
             continue  # reported in section geometry
-        tally = Tally.of(_rows(one[name], other[name]))
-        yield from (f"{name}: {line}" for line in difference_lines(tally, unit=str(one[name].attrs.get("units", "1"))))
+        tally = Tally.of(_rows(first[name], second[name]))
+        yield from (
+            f"{name}: {line}" for line in difference_lines(tally, unit=str(first[name].attrs.get("units", "1")))
+        )
 
 
-def _rows(one: Any, other: Any) -> Iterator[tuple[Pixels, Pixels]]:
-    if not one.ndim:
-        yield tuple(np.atleast_1d(_numbers(array.values)) for array in (one, other))  # type: ignore[misc]
+def _rows(first: Any, second: Any) -> Iterator[tuple[Pixels, Pixels]]:
+    if not first.ndim:
+        yield tuple(np.atleast_1d(_numbers(array.values)) for array in (first, second))  # type: ignore[misc]
         return
-    for rows in rows_of(one.shape, one.dtype.itemsize):
-        yield _numbers(one[rows].values), _numbers(other[rows].values)
+    for rows in rows_of(first.shape, first.dtype.itemsize):
+        yield _numbers(first[rows].values), _numbers(second[rows].values)
 
 
 def _numbers(values: Pixels) -> Pixels:
