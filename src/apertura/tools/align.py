@@ -91,7 +91,7 @@ class Unaligned:
 
 
 def unaligned(campaign: Campaign, flight: str, node: str) -> Unaligned:
-    """Return echoes and log of a node that sends and receives.
+    """Open the echoes and the log of a node of a monostatic pair.
 
     Raises
     ------

@@ -86,9 +86,9 @@ def print_summary(campaign: Campaign) -> None:
 
 
 def print_stale(campaign: Campaign) -> None:
-    """Print the number of results that are out of date by a file, a setting or code, except those made on demand.
+    """Print the number of results that are out of date, except those made on demand.
 
-    A line reports missing recordings, for which this is unknown.
+    Missing recordings, for which this cannot be determined, are reported in a further line.
     """
     print(*(f"{line}\n" for line in absent_lines(campaign)), sep="", end="")
     if stale := [manifest for manifest in stale_results(campaign) if not on_demand(campaign, manifest)]:

@@ -153,7 +153,7 @@ class _Run:
 
 
 def whole_chart(campaign: Campaign, *, repeats: int = 3) -> Sequence[Path]:
-    """Write results/study/whole.csv and .png: total error against seconds from raw samples to GeoTIFFs.
+    """Write results/study/whole.csv and .png: error against processing time from raw samples to GeoTIFFs.
 
     Parameters
     ----------

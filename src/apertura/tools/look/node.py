@@ -21,7 +21,7 @@ from apertura.stages.ingest import captures_of
 from apertura.stages.node_log import shortest_wave
 from apertura.stages.transmitted import Transmitted
 
-_MARGIN_S = 60.0  # of the log before and after the pulses of a block: the spline does not depend on farther epochs
+_MARGIN_S = 60.0  # log margin before and after the pulses of a block: farther epochs do not affect the spline
 _KNOWN_BYTES = 4096  # compared at either end of the samples that were read, to detect a restarted recording
 _EPOCHS = 4  # lead of the log over a pulse: later epochs change the spline there by 0.27⁴ of its error at the end
 
@@ -61,7 +61,7 @@ class NodeSoFar:
         self.track: xr.Dataset | None = None
         self.ended = False
         self._recording: Recording | None = None
-        self._found: xr.Dataset | None = None  # captures found in samples that never stopped
+        self._found: xr.Dataset | None = None  # captures found in a continuous recording
         self._growing: Any = None
         self._known = 0, b"", b""  # size, first and last bytes of the samples read
         self._log_size, self._log_bytes, self._log_crc = -1, 0, 0  # file size; size and CRC of its complete lines

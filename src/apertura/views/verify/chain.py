@@ -63,7 +63,7 @@ class ChainLink:
     why: list[str] = field(default_factory=list)
 
     def add(self, state: State, why: str) -> None:
-        """Add a difference to those noted already; a missing part outranks a changed one."""
+        """Add a difference to the link; state "missing" takes precedence over "changed"."""
         self.state = "missing" if "missing" in (state, self.state) else state
         if why not in self.why:
             self.why.append(why)
@@ -398,7 +398,7 @@ def other_versions(tags: Mapping[str, str], made_with: Mapping[str, Any], name: 
 
 
 def verify(path: Path, campaign: Path | None = None) -> Chain:
-    """Compare a product, or all results of a campaign, with the recorded hashes of its sources, to the raw samples.
+    """Compare a product, or all results of a campaign, and all their sources with the recorded hashes.
 
     Parameters
     ----------
