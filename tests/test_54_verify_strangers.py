@@ -95,7 +95,7 @@ def test_what_is_no_product_is_one_message(root, tmp_path):
     assert "outside a campaign folder" in complaint(lambda: print_verified(tmp_path / "note.txt"))
     assert "not readable as GeoTIFF" in complaint(lambda: print_verified(tmp_path / "plain.tif"))
     assert "not listed in any manifest" in complaint(lambda: print_verified(tmp_path / "note.txt", root))
-    assert "is no result" in complaint(lambda: print_verified(root / "results/f01"))
+    assert "a folder that is not a result" in complaint(lambda: print_verified(root / "results/f01"))
 
 
 def test_a_file_beside_the_products_with_a_hostile_name_is_shown_harmlessly(root, capsys):
