@@ -316,7 +316,7 @@ def _blocks(
     for image in design.images.values():
         if image.budget:
             counted = [line for line in image.budget if line.counts]
-            rows = [
+            budget_lines = [
                 (
                     line.cause,
                     line.stated or line.assumed or "",
@@ -327,7 +327,7 @@ def _blocks(
             ]
             total_db = expected(image.budget).loss_db
             caption = f"Error budget of {image.name} at the scene centre; total loss {total_db:.2f} dB."
-            yield Table(caption, ("cause", "size", "loss, dB", "displacement, cm"), rows)
+            yield Table(caption, ("cause", "size", "loss, dB", "displacement, cm"), budget_lines)
             break
     raised = [
         (flag, name, line) for name, image in design.images.items() if image.looks for flag, line in image.flags.items()
