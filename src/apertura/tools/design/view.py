@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from apertura.campaign.folder import Campaign
 from apertura.common.atomic import made_folder, write_text
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
-from apertura.common.errors import CampaignError, number_of
+from apertura.common.errors import CampaignError
 from apertura.core.geometry.geodesy import LOCAL
 from apertura.core.quality.budget import expected
 from apertura.formats.export.layers import OUTSIDE
@@ -145,7 +145,7 @@ def headline(verdicts: Sequence[Verdict], changes: Sequence[Change]) -> str:
     Examples
     --------
     >>> headline([Verdict("loss_db", 1.0, 0.3, "f01/a-a", "positions")], [])
-    'GO: 1 requirement met'
+    'GO: all requirements met (1 of 1)'
     >>> headline([Verdict("loss_db", 1.0, 4.4, "f01/a-a", "positions")], [])
     'NO-GO: loss_db 4.4 (required 1)'
     """
@@ -153,7 +153,7 @@ def headline(verdicts: Sequence[Verdict], changes: Sequence[Change]) -> str:
         return "No verdict: the plan has no requirements (section require)"
     missed = [verdict for verdict in verdicts if not verdict.met]
     if not missed:
-        return f"GO: {number_of(len(verdicts), 'requirement')} met"
+        return f"GO: all requirements met ({len(verdicts)} of {len(verdicts)})"
     values = ", ".join(
         f"{verdict.requirement} {_value(verdict.found)} (required {_value(verdict.required)})" for verdict in missed
     )
