@@ -267,7 +267,7 @@ def test_echoes_that_fold_are_told_for_what_is_required_and_more_pulses_help(tmp
     plan["scene"] |= {"bounds_m": [-30.0, 20.0, 30.0, 80.0], "spacing_m": 1.0}
     (verdict,) = judge(designed(FlightPlan.model_validate(plan), tmp_path))
     assert not verdict.met
-    assert "Doppler spreads" in verdict.cause
+    assert "Doppler spread of" in verdict.cause
     assert "double the pulse rate (waveform.prf_hz)" in {one.words for one in changes_of(plan, tmp_path) if one.meets}
 
 
