@@ -115,7 +115,7 @@ def test_tags_further_apart_than_good_ones_are_flagged_with_what_was_flown_meanw
     (tx, rx), _ = fly(np.random.default_rng(5), interval_s=0.1, offset_s=offset_s)
     flags = associate(tx, rx, repetition_interval_s=0.1, speed_m_s=12.0).flags
     assert ("time_tags_apart" in flags) == flagged
-    assert not flagged or flags["time_tags_apart"].endswith("moved 0.25 m meanwhile")
+    assert not flagged or flags["time_tags_apart"].endswith("moved 0.25 m in that time")
 
 
 @pytest.mark.parametrize(("late_s", "left_out"), [(0.004, False), (0.006, True)])
@@ -142,8 +142,8 @@ def test_pulses_before_and_after_the_other_recording_are_remarked_from_five_perc
 def test_tags_late_by_whole_intervals_show_as_equal_recordings_that_begin_apart():
     (tx, rx), _ = fly(np.random.default_rng(5), pulses=130, jitter_s=0.001)
     shifted = associate(tx, rx + NS // 2, repetition_interval_s=0.05).flags["pulses_unpaired"]
-    assert shifted.startswith("10 pulses before and 0 after the other recording, of 130: both recordings are equally")
-    assert "+0.499 s apart" in shifted
+    assert shifted.startswith("of 130 transmitted pulses, 10 are before and 0 after the receiver's recording: ")
+    assert "equally long and start +0.499 s from each other" in shifted
     assert "equally" not in associate(tx, rx[10:], repetition_interval_s=0.05).flags["pulses_unpaired"]
 
 
