@@ -481,6 +481,6 @@ def test_an_attitude_in_radians_is_refused_where_the_course_proves_it_and_an_arm
 
     edit_track(tiny, "uav1", circle)
     lines = reported(tiny)
-    assert any(line.startswith(f"{TX}: angles of attitude look in radians: yaw is") for line in lines) is refused
+    assert any(line.startswith(f"{TX}: attitude angles appear to be in radians: yaw") for line in lines) is refused
     edit_config(tiny, lambda document: document["nodes"]["uav1"].update(lever_arms_m={}))
     assert not any("attitude" in line for line in reported(tiny))

@@ -192,7 +192,7 @@ def test_i_and_q_in_another_order_are_named_and_taken_by_the_key(undisturbed, ch
     lines = [line for text in flags.values() for line in text.split("; ")]
     assert len(set(lines)) == len(lines)
     message = complaint(lambda: echo_of(campaign, "uav1-uav2"))
-    assert "the code is in the conjugates of the samples" in message
+    assert "the conjugate samples contain the code" in message
     edit_config(campaign.root.real(), lambda document: document["waveform"].update(iq=order))
     campaign = Campaign.load(campaign.root)
     ingest_all(campaign)

@@ -293,7 +293,8 @@ def test_an_attitude_that_looks_like_radians_is_a_flag_where_it_moves_an_antenna
     flags = place(log, log, time[5:-5]).flags
     assert ("attitude_suspect" in flags) is flagged
     if flagged:
-        assert "a: angles of attitude look in radians: yaw is 0° off the course so, 88°" in flags["attitude_suspect"]
+        measured = "yaw then deviates from the course by 0°, but by 88° as degrees clockwise from north"
+        assert f"a: attitude angles appear to be in radians: {measured}" in flags["attitude_suspect"]
 
 
 @pytest.mark.parametrize("pair", ["uav1-uav1", "uav1-uav2"])
