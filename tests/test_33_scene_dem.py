@@ -138,7 +138,7 @@ def test_what_the_dem_carries_is_taken_or_must_agree(shared, tmp_path, monkeypat
     stated = open_dem(silent, UTM_GRID.crs, datum="egm96", geoid=gtx).heights(UTM_GRID)
     np.testing.assert_allclose(carried, stated, atol=1e-6)
     assert 45 < (carried - 600).mean() < 50
-    with pytest.raises(CampaignError, match="heights of egm96 by its own CRS"):
+    with pytest.raises(CampaignError, match="heights of egm96 declared by its own CRS"):
         open_dem(carrying, UTM_GRID.crs, datum="ellipsoid")
     with pytest.raises(CampaignError, match="a CRS without heights"):
         open_dem(silent, UTM_GRID.crs, datum="carried")
@@ -220,7 +220,8 @@ def test_a_void_filled_with_a_constant_is_refused_where_it_counts(tmp_path, fill
     terrain = open_dem(write_dem(path, heights, corner), UTM_GRID.crs, datum="ellipsoid")
     message = complaint(lambda: terrain.heights(UTM_GRID))
     count = "1 post" if side == 1 else f"{side**2} posts"
-    assert f"{count} from row 30, column 20 on are exactly {fill}, and all posts beside at least" in message
+    void = f"a void filled with {fill}: {count} of this value from row 30, column 20, surrounded by posts that differ"
+    assert void in message
     assert f"Declare {fill} as nodata of those posts and fill them with a GIS" in message
 
 
@@ -260,11 +261,11 @@ def test_a_file_that_is_no_dem_is_refused(tmp_path):
     for path, expected in (
         (tmp_path / "dem.tif", "not readable"),
         (tmp_path / "none.tif", "no such file"),
-        (write_dem(tmp_path / "bare.tif", np.zeros((4, 4)), from_origin(0, 4, 1, 1), crs=None), "no CRS on Earth"),
+        (write_dem(tmp_path / "bare.tif", np.zeros((4, 4)), from_origin(0, 4, 1, 1), crs=None), "no geodetic CRS"),
     ):
         with pytest.raises(CampaignError, match=expected):
             open_dem(path, UTM_GRID.crs, datum="ellipsoid")
-    with pytest.raises(CampaignError, match="under a scene in the local frame"):
+    with pytest.raises(CampaignError, match="for a scene in the local frame"):
         open_dem(plane_dem(tmp_path / "utm.tif"), "local", datum="carried")
 
 

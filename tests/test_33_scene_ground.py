@@ -128,7 +128,7 @@ def test_an_antenna_below_flat_ground_is_refused_and_below_a_dem_beside_it_is_fl
     with pytest.raises(CampaignError, match=r"scene\.dem: .*transmitter.*where the DEM has 650.00 m"):
         check_antennas(UTM_GRID, hill, Aperture(low, track), where="f01")
     flags = check_antennas(UTM_GRID, hill, Aperture(high, track), where="f01")
-    assert flags["platform_below_scene"].startswith("the receiver is 0.5 m below the lowest ground of the scene")
+    assert flags["platform_below_scene"].startswith("the receiver is 0.5 m below the lowest terrain of the scene")
     assert check_antennas(UTM_GRID, hill, Aperture(high, high), where="f01") == {}
 
 
