@@ -125,7 +125,7 @@ def test_a_geoid_grid_in_the_working_folder_opens_by_its_bare_name(shared, monke
 
 
 def test_the_grid_of_another_geoid_is_refused(shared):
-    with pytest.raises(CampaignError, match="another geoid than egm2008"):
+    with pytest.raises(CampaignError, match="a geoid other than egm2008"):
         geoid.geoid_file("egm2008", shared / "dem_isce3" / "egm96_15.gtx")
 
 

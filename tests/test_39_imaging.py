@@ -148,7 +148,7 @@ def test_an_image_can_be_written_with_its_plan_and_certificate(image, tmp_path):
     [
         (1e6, TARGET_GRID, {}, "no echo of the scene is in the samples"),
         (0.0, SceneGrid("EPSG:32632", 5e5, 5e6, 0.5, (9, 9)), {"terrain": 0.0}, "no echo of the scene"),
-        (0.0, SceneGrid("EPSG:32632", 5e5, 5e6, 0.5, (9, 9)), {}, "no terrain for a grid on Earth"),
+        (0.0, SceneGrid("EPSG:32632", 5e5, 5e6, 0.5, (9, 9)), {}, "no terrain for a georeferenced grid"),
     ],
 )
 def test_a_scene_elsewhere_is_refused_with_one_message(by_m, grid, options, complaint):

@@ -213,8 +213,8 @@ class Dem(Terrain):
             if requested.any() and np.isnan(bilinear(np.where(requested, np.nan, 0.0)[None], *index)).any():
                 row, column = (int(axis[0]) + offset for axis, offset in zip(np.nonzero(block), start, strict=True))
                 raise CampaignError(
-                    f"a void filled with {value:g}: {number_of(int(block.sum()), 'post')} of this value from row {row}, "
-                    f"column {column}, surrounded by posts that differ by at least {lowest_m:.0f} m",
+                    f"a void filled with {value:g}: {number_of(int(block.sum()), 'post')} of this value from row "
+                    f"{row}, column {column}, surrounded by posts that differ by at least {lowest_m:.0f} m",
                     where=self.path,
                     expected="terrain heights, and voids declared as nodata",
                     remedy=f"Declare {value:g} as nodata for these posts, and fill them with a GIS.",

@@ -103,9 +103,7 @@ class SceneGrid:
             )
         if not (is_number(spacing_m) and spacing_m > 0):
             where = "SceneGrid.from_bounds: spacing_m"
-            raise CampaignError(
-                quoted(spacing_m), where, "a finite number of metres above 0", "Correct spacing_m."
-            )
+            raise CampaignError(quoted(spacing_m), where, "a finite number of metres above 0", "Correct spacing_m.")
         shape = (max(1, round((ymax - ymin) / spacing_m)), max(1, round((xmax - xmin) / spacing_m)))
         if crs != LOCAL:
             check_crs(crs, bounds_m)
