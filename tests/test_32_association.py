@@ -100,7 +100,7 @@ def test_recordings_with_little_in_common_are_flagged(common, flagged):
 
 def test_recordings_of_different_flights_are_refused_with_how_far_apart_they_are():
     (tx, rx), _ = fly(np.random.default_rng(8), 100)
-    with pytest.raises(CampaignError, match=r"begins \+18\.000 s.*half a repetition interval \(0\.025 s\)"):
+    with pytest.raises(CampaignError, match=r"starts \+18\.000 s.*half a repetition interval \(0\.025 s\)"):
         associate(tx, rx + 18 * NS, repetition_interval_s=0.05)
 
 

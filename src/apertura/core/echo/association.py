@@ -226,8 +226,8 @@ def _require_ascending(tags: Integers, node: str, where: str) -> None:
 def _no_common_pulse(tags: Pairs, repetition_interval_s: float, where: str) -> CampaignError:
     gap_s = [(tags[1][0] - tags[0][0]) * 1e-9, (tags[1][-1] - tags[0][-1]) * 1e-9]
     return CampaignError(
-        f"no pulse pairs: relative to the transmitter, the receiver's recording starts {gap_s[0]:+.3f} s and ends "
-        f"{gap_s[1]:+.3f} s later",
+        f"no pulse pairs: the receiver's recording starts {gap_s[0]:+.3f} s and ends {gap_s[1]:+.3f} s relative to the "
+        "transmitter's",
         where=where,
         expected=f"pairs within half a repetition interval ({repetition_interval_s / 2:.4g} s)",
         remedy="Check that both recordings belong to the same flight, and check their core:datetime.",
