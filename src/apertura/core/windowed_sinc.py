@@ -28,12 +28,12 @@ def kaiser_beta(rejection_db: float) -> float:
     return 0.1102 * (rejection_db - 8.7)
 
 
-def kaiser_window(place: Floats, beta: float) -> Floats:
-    """Return I0(β·√(1 - place²))/I0(β), zero outside -1…1.
+def kaiser_window(position: Floats, beta: float) -> Floats:
+    """Return the Kaiser window I0(β·√(1 - position²))/I0(β), zero outside -1…1.
 
     Parameters
     ----------
-    place
+    position
         (...,) float64, offset from the middle of the window as a fraction of its half width.
     beta
         Shape parameter; a larger value gives a wider main lobe and lower sidelobes.
@@ -43,7 +43,7 @@ def kaiser_window(place: Floats, beta: float) -> Floats:
     >>> bool(np.allclose(kaiser_window(np.linspace(-1, 1, 9), 6.0), np.kaiser(9, 6.0)))
     True
     """
-    inside = 1 - place**2
+    inside = 1 - position**2
     return np.where(inside >= 0, np.i0(beta * np.sqrt(np.maximum(inside, 0.0))) / np.i0(beta), 0.0)
 
 

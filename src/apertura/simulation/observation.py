@@ -20,7 +20,7 @@ from apertura.simulation.impairments import (
 )
 from apertura.simulation.specification import DrawnCampaign, SimulatedFlight
 from apertura.simulation.synthesis import Channel, Geometry, receive
-from apertura.simulation.targets import Scatterers, body_turn, logged_velocity, phase_centre
+from apertura.simulation.targets import Scatterers, body_rotation, logged_velocity, phase_centre
 from apertura.simulation.waveform import TransmitWaveform
 
 _Node = tuple[Impairments, ImpairmentDraw]
@@ -146,7 +146,7 @@ def _gain(
         beam = campaign.specification.nodes[name].antennas.get(point)
         if beam is not None:
             path, time_s = campaign.trajectories[flight.name, name], campaign.pulse_times(flight)
-            rotation = body_turn(campaign.specification.origin, path, time_s)
+            rotation = body_rotation(campaign.specification.origin, path, time_s)
             gain = gain * beam.gain(rotation, antenna_m, scatterers.position_m)
     return gain
 

@@ -323,15 +323,15 @@ def phase_centre(origin: Origin, path: Trajectory, time_s: Floats, lever_arm_m: 
     array([[6378138.,       0.,       0.]])
     """
     position = origin.ecef(path.position(time_s))
-    return np.asarray(position + body_turn(origin, path, time_s) @ np.array(lever_arm_m, np.float64))
+    return np.asarray(position + body_rotation(origin, path, time_s) @ np.array(lever_arm_m, np.float64))
 
 
-def body_turn(origin: Origin, path: Trajectory, time_s: Floats) -> Floats:
+def body_rotation(origin: Origin, path: Trajectory, time_s: Floats) -> Floats:
     """Return the rotations from body axes (forward, right, down) to ECEF, (time, 3, 3) float64.
 
     Examples
     --------
-    >>> rotation = body_turn(Origin(0, 0, 0), Straight((0, 0, 0), (1, 0, 0)), np.zeros(1))
+    >>> rotation = body_rotation(Origin(0, 0, 0), Straight((0, 0, 0), (1, 0, 0)), np.zeros(1))
     >>> (rotation[0] @ [1.0, 0.0, 0.0]).round(6) + 0.0  # forward is east
     array([0., 1., 0.])
     """
@@ -354,12 +354,12 @@ class GaussianBeam:
     )
     beamwidth_deg: tuple[float, float] = Field(description="full width at half power in azimuth, elevation, degrees")
 
-    def gain(self, turn: Floats, antenna_m: Floats, points_m: Floats) -> Floats:
+    def gain(self, rotation: Floats, antenna_m: Floats, points_m: Floats) -> Floats:
         """Return the field towards points relative to boresight, (pulse, point) float64.
 
         Parameters
         ----------
-        turn
+        rotation
             (pulse, 3, 3) float64, rotations from body axes (forward, right, down) to the frame of the points.
         antenna_m, points_m
             (pulse, 3) and (point, 3) float64, metres, in that frame.
@@ -376,7 +376,7 @@ class GaussianBeam:
         array([[1. , 0.5]])
         """
         azimuth_deg, elevation_deg = self.boresight_deg
-        axes = turn @ body_axes(np.radians([0.0, elevation_deg, azimuth_deg]))
+        axes = rotation @ body_axes(np.radians([0.0, elevation_deg, azimuth_deg]))
         ahead, right, down = np.einsum("pij,pni->jpn", axes, points_m[None] - antenna_m[:, None])
         azimuth, elevation = np.arctan2(right, ahead), np.arctan2(-down, np.hypot(ahead, right))
         cuts = zip((azimuth, elevation), np.radians(self.beamwidth_deg), strict=True)

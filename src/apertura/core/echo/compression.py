@@ -13,32 +13,32 @@ from apertura.core.windowed_sinc import kaiser_window
 # ---- Phasors over equally spaced frequencies
 
 
-def unit_phasor(turns: NDArray[np.float64]) -> NDArray[np.complex64]:
-    """Return exp(j2π·turns), complex64; integer cycles are removed in float64, the rest is evaluated in float32.
+def unit_phasor(cycles: NDArray[np.float64]) -> NDArray[np.complex64]:
+    """Return exp(j2π·cycles), complex64; integer cycles are removed in float64, the rest is evaluated in float32.
 
     Examples
     --------
     >>> unit_phasor(np.array([1e6 + 0.25])).round(6) + 0
     array([0.+1.j], dtype=complex64)
     """
-    angle = ((turns - np.rint(turns)) * (2 * np.pi)).astype(np.float32)
+    angle = ((cycles - np.rint(cycles)) * (2 * np.pi)).astype(np.float32)
     out = np.empty(angle.shape, np.complex64)
     np.cos(angle, out=out.real)
     np.sin(angle, out=out.imag)
     return out
 
 
-def rotated(values: NDArray[np.number], turns: NDArray[np.float64]) -> NDArray[np.complex64]:
-    """Return values·exp(j2π·turns), complex64."""
-    return np.asarray(values * unit_phasor(turns), np.complex64)
+def rotated(values: NDArray[np.number], cycles: NDArray[np.float64]) -> NDArray[np.complex64]:
+    """Return values·exp(j2π·cycles), complex64."""
+    return np.asarray(values * unit_phasor(cycles), np.complex64)
 
 
-def phasors(turns: NDArray[np.float64], count: int, *, first: float = 0.0) -> NDArray[np.complex64]:
-    """Return (pulse, count) complex64, exp(j2π·turns·n) for n = first, first + 1, ….
+def phasors(cycles: NDArray[np.float64], count: int, *, first: float = 0.0) -> NDArray[np.complex64]:
+    """Return the phasors exp(j2π·cycles·n) for n = first, first + 1, …, (pulse, count) complex64.
 
     Parameters
     ----------
-    turns
+    cycles
         (pulse,) float64, cycles from one n to the next.
     count
         Number of n.
@@ -55,9 +55,9 @@ def phasors(turns: NDArray[np.float64], count: int, *, first: float = 0.0) -> ND
     array([[ 1.+0.j,  0.+1.j, -1.+0.j,  0.-1.j]], dtype=complex64)
     """
     side = int(np.ceil(np.sqrt(count)))
-    fine = unit_phasor(turns[:, None] * np.arange(side))
-    coarse = unit_phasor(turns[:, None] * (first + side * np.arange(-(-count // side))))
-    return (coarse[:, :, None] * fine[:, None]).reshape(len(turns), -1)[:, :count]
+    fine = unit_phasor(cycles[:, None] * np.arange(side))
+    coarse = unit_phasor(cycles[:, None] * (first + side * np.arange(-(-count // side))))
+    return (coarse[:, :, None] * fine[:, None]).reshape(len(cycles), -1)[:, :count]
 
 
 # ---- Range compression
