@@ -344,9 +344,9 @@ class _Set:
     def contradicts(self, other: "_Set", measured: Mapping[tuple[str, str], Agreement]) -> bool:
         """Return True if a difference was measured between pairs that are each in only one of the two sets."""
         return any(
-            agreement_between(measured, one, two) is not None
-            for one in self.pairs - other.pairs
-            for two in other.pairs - self.pairs
+            agreement_between(measured, first, second) is not None
+            for first in self.pairs - other.pairs
+            for second in other.pairs - self.pairs
         )
 
 

@@ -97,12 +97,12 @@ def _write_segments(root: Path, specification: CampaignSpecification) -> None:
 
 
 def _node_section(node: SimulatedNode) -> dict[str, Any]:
-    stated = node.path_offset_m if node.stated_path_offset_m is None else node.stated_path_offset_m
+    path_offset_m = node.path_offset_m if node.stated_path_offset_m is None else node.stated_path_offset_m
     beams = {point: {key: list(pair) for key, pair in asdict(beam).items()} for point, beam in node.antennas.items()}
     return {
         **_radio_section(node, beams),
         "lever_arms_m": {name: list(arm) for name, arm in node.lever_arms_m.items()},
-        "path_offset_m": dict(stated),
+        "path_offset_m": dict(path_offset_m),
         "attitude": node.attitude,
         **({} if node.position_std_m is None else {"position_std_m": node.position_std_m}),
     }

@@ -67,8 +67,8 @@ def paper_lab(*, pulses: int = STATIC_PULSES, snr_db: float = COHERENT_SNR_DB["c
     """
     joint = (PointTarget((0.0, 0.0, 1.0 - _JOINT_M), _JOINT_M**2),)
     cable_m = RADAR_CABLE_M - 2 * _JOINT_M
-    known: Mapping[str, float | bool] = {"radar_m": 2 * _JOINT_M, "sidelink_m": 0.0}
-    return _static_pair("paper-lab", joint, (0.0, 0.0, 1.0), cable_m, _per_subcarrier(snr_db), pulses, bench=known)
+    bench: Mapping[str, float | bool] = {"radar_m": 2 * _JOINT_M, "sidelink_m": 0.0}
+    return _static_pair("paper-lab", joint, (0.0, 0.0, 1.0), cable_m, _per_subcarrier(snr_db), pulses, bench=bench)
 
 
 def paper_static(*, pulses: int = STATIC_PULSES) -> CampaignSpecification:
@@ -90,8 +90,8 @@ def paper_static(*, pulses: int = STATIC_PULSES) -> CampaignSpecification:
     )
     both_db = decibels(1 + 10 ** (-weaker_db / 10))  # mean power of both relative to that of the first
     snr_db = _per_subcarrier(COHERENT_SNR_DB["first cylinder"]) + both_db
-    known: Mapping[str, float | bool] = {"radar_m": 2 * near_m, "sidelink_m": 0.0, "split": True}
-    return _static_pair("paper-static", cylinders, (0.0, -6.0, antenna_up_m), 0.911, snr_db, pulses, bench=known)
+    bench: Mapping[str, float | bool] = {"radar_m": 2 * near_m, "sidelink_m": 0.0, "split": True}
+    return _static_pair("paper-static", cylinders, (0.0, -6.0, antenna_up_m), 0.911, snr_db, pulses, bench=bench)
 
 
 def _cylinder(north_m: float, up_m: float, amplitude: float) -> Line:

@@ -211,10 +211,10 @@ def associate(
 
 
 def _require_ascending(tags: Integers, node: str, where: str) -> None:
-    back = np.flatnonzero(np.diff(tags) <= 0)
-    if back.size or tags.size == 0:
+    descents = np.flatnonzero(np.diff(tags) <= 0)
+    if descents.size or tags.size == 0:
         found = (
-            f"the time tag of pulse {back[0] + 1} of the {node} is not later than the one before it"
+            f"the time tag of pulse {descents[0] + 1} of the {node} is not later than the one before it"
             if tags.size
             else f"the recording of the {node} contains no pulses"
         )

@@ -111,8 +111,8 @@ def estimate_path_offset(
     peak = int(np.argmax(power))
     surroundings = float(np.median(power)) * len(groups) / float(gammaincinv(len(groups), 0.5))  # mean of clutter
     _require_visible(power, peak, surroundings, len(groups), search_m, where)
-    parts = _refine(groups, frequency_hz, offset_m[peak])
-    mean_m, std_m = float(parts.mean()), _deviation_of_mean(parts)
+    group_offsets_m = _refine(groups, frequency_hz, offset_m[peak])
+    mean_m, std_m = float(group_offsets_m.mean()), _deviation_of_mean(group_offsets_m)
     contrast_db = decibels(float(power[peak]) / max(surroundings, 1e-30))
     flags = Flags()
     if std_m > NEEDED_STD_M:
@@ -143,8 +143,8 @@ def reflector_history(transfer: Pulses, frequency_hz: Floats, *, path_m: Floats)
     >>> reflector_history(echo, frequency, path_m=path).round(4) + 0.0
     array([2.+0.j, 2.+0.j])
     """
-    parts = (slice(first, first + AT_ONCE) for first in range(0, len(transfer), AT_ONCE))
-    return np.concatenate([_aligned(transfer[part], frequency_hz, path_m[part]).mean(axis=1) for part in parts])
+    blocks = (slice(first, first + AT_ONCE) for first in range(0, len(transfer), AT_ONCE))
+    return np.concatenate([_aligned(transfer[block], frequency_hz, path_m[block]).mean(axis=1) for block in blocks])
 
 
 def _aligned(transfer: Complexes, frequency_hz: Floats, path_m: Floats) -> NDArray[np.complex128]:
@@ -163,8 +163,8 @@ def _mean(transfer: Pulses, frequency_hz: Floats, path_m: Floats, first: int, la
     """Return the mean of pulses first to last, (subcarrier,), aligned to the predicted path, block by block."""
     total = np.zeros(len(frequency_hz), np.complex128)
     for start in range(first, last, AT_ONCE):
-        part = slice(start, min(start + AT_ONCE, last))
-        total += _aligned(transfer[part], frequency_hz, path_m[part]).sum(axis=0)
+        block = slice(start, min(start + AT_ONCE, last))
+        total += _aligned(transfer[block], frequency_hz, path_m[block]).sum(axis=0)
     return total / (last - first)
 
 
@@ -213,12 +213,12 @@ def _refine(groups: NDArray[np.complex128], frequency_hz: Floats, start_m: float
     return offset
 
 
-def _deviation_of_mean(parts: Floats) -> float:
-    """Return the standard deviation of the mean of parts, of which neighbours may have common track errors."""
-    if len(parts) < _GROUPS:
+def _deviation_of_mean(offsets_m: Floats) -> float:
+    """Return the standard deviation of the mean of the group offsets, whose neighbours may have common track errors."""
+    if len(offsets_m) < _GROUPS:
         return np.inf
-    quarters = parts.reshape(4, -1).mean(1)
-    return float(max(np.std(offsets, ddof=1) / np.sqrt(len(offsets)) for offsets in (parts, quarters)))
+    quarters_m = offsets_m.reshape(4, -1).mean(1)
+    return float(max(np.std(values, ddof=1) / np.sqrt(len(values)) for values in (offsets_m, quarters_m)))
 
 
 def _rival(offset_m: Floats, power: Floats, peak: int, frequency_hz: Floats) -> tuple[float, float]:

@@ -99,8 +99,8 @@ def bistatic_angle_deg(position: Floats, tx: Floats, rx: Floats) -> Floats:
     return np.degrees(_angle(tx - position, rx - position))
 
 
-def _angle(one: Floats, other: Floats) -> Floats:
-    chord = _unit(one) - _unit(other)  # exact for small angles, where the arc cosine is not
+def _angle(first: Floats, second: Floats) -> Floats:
+    chord = _unit(first) - _unit(second)  # exact for small angles, where the arc cosine is not
     return np.asarray(2 * np.arcsin(np.minimum(1.0, np.sqrt(np.einsum("...i,...i", chord, chord)) / 2)))
 
 

@@ -42,11 +42,11 @@ def check_grid(path: Path) -> None:
     wrong = None
     if path.suffix.lower() == ".tif":
         with opened_raster(path, expected=_EXPECTED, remedy=_REMEDY) as raster:
-            posts, place = raster.width * raster.height, raster.transform
-        valid_steps = all(_STEPS_DEG[0] <= abs(step) <= _STEPS_DEG[1] for step in (place.a, place.e))  # false for NaN
-        valid_origin = abs(place.c) <= 2 * 360 and abs(place.f) <= 2 * 90
-        if posts > MOST_POSTS or place.b or place.d or not (valid_steps and valid_origin):
-            wrong = f"{posts} posts with the transform {[float(value) for value in place[:6]]}"
+            posts, affine = raster.width * raster.height, raster.transform
+        valid_steps = all(_STEPS_DEG[0] <= abs(step) <= _STEPS_DEG[1] for step in (affine.a, affine.e))  # not for NaN
+        valid_origin = abs(affine.c) <= 2 * 360 and abs(affine.f) <= 2 * 90
+        if posts > MOST_POSTS or affine.b or affine.d or not (valid_steps and valid_origin):
+            wrong = f"{posts} posts with the transform {[float(value) for value in affine[:6]]}"
     elif path.suffix.lower() == ".gtx":
         with path.open("rb") as stream:
             header = stream.read(_GTX.size)
@@ -123,10 +123,10 @@ def _of_tif(grid: Path, longitude: Floats, latitude: Floats) -> Floats:
     from rasterio.windows import Window
 
     with opened_raster(grid, expected=_EXPECTED, remedy=_REMEDY) as raster:
-        place, (rows, columns) = raster.transform, raster.shape
-        columns_of_circle = 360 / abs(place.a)
-        column = np.mod((longitude - place.c) / place.a - 0.5 + 1e-6, columns_of_circle) - 1e-6  # includes post 0
-        row = (latitude - place.f) / place.e - 0.5
+        affine, (rows, columns) = raster.transform, raster.shape
+        columns_of_circle = 360 / abs(affine.a)
+        column = np.mod((longitude - affine.c) / affine.a - 0.5 + 1e-6, columns_of_circle) - 1e-6  # includes post 0
+        row = (latitude - affine.f) / affine.e - 0.5
         is_global = columns >= round(columns_of_circle)
         inside = (row >= -1e-6) & (row <= rows - 1 + 1e-6) & (column >= -1e-6)
         inside &= is_global | (column <= columns - 1 + 1e-6)

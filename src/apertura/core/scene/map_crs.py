@@ -132,16 +132,16 @@ def _check_usable(system: CRS, bounds_m: tuple[float, float, float, float]) -> N
     if usable.all():
         return
     first = int(np.argmin(usable))
-    near = ""
+    near_area = ""
     if area is not None:
-        near = (
+        near_area = (
             f"within {MARGIN_DEG:g} degrees of the area of use of {system.name}: "
             f"longitude {area.west} to {area.east}, latitude {area.south} to {area.north}"
         )
     raise CampaignError(
         f"bounds_m {list(bounds_m)} reach longitude {longitudes[first]:.4f}, latitude {latitudes[first]:.4f}",
         where=_WHERE,
-        expected=near or f"bounds within the domain of {system.name}",
+        expected=near_area or f"bounds within the domain of {system.name}",
         remedy="Correct scene.bounds_m (easting before northing) or scene.crs.",
     )
 
