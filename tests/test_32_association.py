@@ -185,7 +185,7 @@ def test_a_misread_number_is_dropped_and_flagged():
     frame[42] = -1
     pairs = associate(tx, rx, repetition_interval_s=0.05, tx_frame=numbers[0], rx_frame=frame, frame_modulus=1024)
     assert share_right(pairs, numbers) == 1.0
-    assert pairs.flags["frame_counter_conflict"].startswith("1 pulse dropped")
+    assert pairs.flags["frame_counter_conflict"].startswith("1 pulse excluded")
 
 
 def test_without_any_read_number_the_tags_decide():

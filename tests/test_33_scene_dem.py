@@ -184,7 +184,7 @@ def test_a_height_that_no_land_has_is_counted_where_it_counts(tmp_path, wild):
     terrain = open_dem(write_dem(path, heights, corner), UTM_GRID.crs, datum="ellipsoid")
     with pytest.raises(CampaignError, match=r"dem\.tif: 2 of the \d+ posts in rows ") as caught:
         terrain.heights(UTM_GRID)
-    assert f"most often {wild:g} m" in str(caught.value)
+    assert f"most frequently {wild:g} m" in str(caught.value)
     local = open_dem(write_dem(path, heights, corner, crs=None), "local", datum="carried")
     assert np.isfinite(local.heights(SceneGrid("local", 500020.0, 5400060.0, 0.5, (70, 90)))).all()
 
@@ -222,7 +222,7 @@ def test_a_void_filled_with_a_constant_is_refused_where_it_counts(tmp_path, fill
     count = "1 post" if side == 1 else f"{side**2} posts"
     void = f"a void filled with {fill}: {count} of this value from row 30, column 20, surrounded by posts that differ"
     assert void in message
-    assert f"Declare {fill} as nodata of those posts and fill them with a GIS" in message
+    assert f"Declare {fill} as nodata for these posts, and fill them with a GIS" in message
 
 
 @pytest.mark.parametrize("kind", ["sea cliff", "coast", "lake", "declared"])
