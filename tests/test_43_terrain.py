@@ -281,7 +281,7 @@ def test_a_void_undeclared_is_no_height_on_earth(tiny):
     for work in (lambda: expected_plan(campaign, *PAIR), lambda: settle_ground(campaign)):
         message = complaint(work)
         assert "dem.tif: 1 of the " in message
-        assert "no height on Earth, most often -9999 m" in message
+        assert "impossible heights, most frequently -9999 m" in message
         assert "nodata" in message
 
 

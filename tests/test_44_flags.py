@@ -188,7 +188,7 @@ def test_i_and_q_in_another_order_are_named_and_taken_by_the_key(undisturbed, ch
         edit_data(campaign.root.real(), node, change)
     ingest_all(campaign)
     flags = echo_of(campaign, "uav1-uav1").attrs["flags"]
-    assert "set waveform.iq to swapped where I and Q are swapped" in flags["spectrum_inverted"]
+    assert "set waveform.iq to swapped if I and Q are swapped" in flags["spectrum_inverted"]
     lines = [line for text in flags.values() for line in text.split("; ")]
     assert len(set(lines)) == len(lines)
     message = complaint(lambda: echo_of(campaign, "uav1-uav2"))
