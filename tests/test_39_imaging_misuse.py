@@ -112,7 +112,7 @@ REFUSED = {
     ),
     "terrain a path": (lambda: HISTORY, {"terrain": "dem.tif"}, "open_dem"),
     "terrain heights alone": (lambda: HISTORY, {"terrain": np.zeros((160, 160))}, "open_dem|a height"),
-    "terrain NaN": (lambda: HISTORY, {"terrain": np.nan}, "metres, finite"),
+    "terrain NaN": (lambda: HISTORY, {"terrain": np.nan}, "a finite number of metres"),
     "terrain above the antennas": (lambda: HISTORY, {"terrain": 15.0}, "at or below the terrain"),
     "accuracy positive": (lambda: HISTORY, {"accuracy_db": 60.0}, "accuracy_db"),
     "accuracy a word": (lambda: HISTORY, {"accuracy_db": "high"}, "accuracy_db"),

@@ -167,7 +167,7 @@ def test_a_wrong_code_is_flagged_in_a_monostatic_image(undisturbed):
     own, secondary = (echo_of(campaign, pair).attrs for pair in ("uav1-uav1", "uav1-uav2"))
     assert "code_unconfirmed" in own["flags"]
     assert own["code"]["carried"] is secondary["code"]["carried"] is False
-    assert "right without one" in secondary["flags"]["wrong_code"]
+    assert "so this image is right" in secondary["flags"]["wrong_code"]
 
 
 def swap(samples):
