@@ -51,9 +51,9 @@ REFUSED = {
     "MHz": (of(frequency_hz=FREQUENCY / 1e6), {}, "Is that in MHz"),
     "frequencies negative": (of(frequency_hz=-FREQUENCY), {}, "in Hz"),
     "frequencies NaN": (of(frequency_hz=np.full(200, np.nan)), {}, "in Hz"),
-    "frequencies falling": (of(frequency_hz=FREQUENCY[::-1].copy()), {}, "ascend in equal steps"),
+    "frequencies falling": (of(frequency_hz=FREQUENCY[::-1].copy()), {}, "ascending in equal steps"),
     "frequencies from zero": (of(frequency_hz=FREQUENCY - FREQUENCY[0]), {}, "in Hz"),
-    "frequencies uneven": (of(frequency_hz=FREQUENCY**2 / FREQUENCY[0]), {}, "ascend in equal steps"),
+    "frequencies uneven": (of(frequency_hz=FREQUENCY**2 / FREQUENCY[0]), {}, "ascending in equal steps"),
     "one frequency": (
         lambda: ap.PhaseHistory(ECHO[:, :1], FREQUENCY[:1], np.ones(1), np.zeros(96), APERTURE),
         {},
