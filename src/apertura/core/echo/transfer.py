@@ -303,7 +303,7 @@ def forming(
 
 
 def _compresses_conjugated(read: Read, demodulator: Demodulator, count: int) -> bool:
-    """Return True if the sidelink is compressed to a path by the code for the conjugate samples only."""
+    """Return True if only the conjugate samples of the sidelink compress to a path after removal of the code."""
     pulses = np.concatenate(spread(count, groups=4, each=16))
 
     def compression(samples: Samples) -> float:
