@@ -259,6 +259,7 @@ def test_what_beams_forbid_is_refused_when_asked_for_and_not_chosen_otherwise(be
     reasons = expected_plan(stated(beamed, BEAM), "f01", "uav1-uav1").reasons
     assert "weigh every pulse" in reasons["presum"]
     assert reasons["antenna"].startswith("transmit, receive: each point of the scene is illuminated by ")
+    assert " of 80 pulses (median " in reasons["antenna"]
     assert "antenna" not in expected_plan(stated(beamed, None), "f01", "uav1-uav1").reasons
 
 
