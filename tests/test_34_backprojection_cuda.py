@@ -181,7 +181,7 @@ def test_the_simulator_is_said_to_be_slower_than_the_double_sum_and_is_no_fallba
 @pytest.mark.skipif(cuda.available(), reason="there is a device")
 def test_without_a_device_the_engine_is_refused_with_one_message(plain):
     pixels, profiles = plain
-    with pytest.raises(CampaignError, match="engine cuda cannot run here") as told:
+    with pytest.raises(CampaignError, match="engine cuda is not available on this machine") as told:
         plan(overrides={"engine": "cuda"})
     assert "NVIDIA" in told.value.remedy
     assert "cuda" not in told.value.expected

@@ -75,8 +75,8 @@ def test_tracks_left_alone_have_no_knots_and_their_images_say_why(finished_tiny)
     assert stage.attrs["nodes"] == ["uav1", "uav2"]
     quality = quality_of(finished_tiny, "uav1-uav2")
     assert quality["autofocus"] == {
-        "decision": "off: auto: position accuracy of uav1 is not configured; state nodes.<node>.position_std_m to "
-        "have them refined",
+        "decision": "off: auto: position accuracy of uav1 is not configured; set nodes.<node>.position_std_m to "
+        "have the tracks refined",
         "accepted": False,
         "why": "images are formed from the logs as they are",
     }
@@ -211,7 +211,7 @@ def test_what_refinement_costs_or_knows_makes_again_only_what_stands_on_it(finis
 
 @pytest.mark.parametrize(
     ("by_m", "told"),
-    [((4.0, 0.0, 0.0), "outside the scene"), ((0.0, 0.0, 2000.0), "whose ground lies at about 620.0 m")],
+    [((4.0, 0.0, 0.0), "outside the scene"), ((0.0, 0.0, 2000.0), "close to the terrain of the scene, about 620.0 m")],
 )
 def test_a_reference_point_outside_the_scene_is_told(finished_tiny, tmp_path, by_m, told):
     root = copy_writable(finished_tiny.root, tmp_path / "campaign")

@@ -273,4 +273,4 @@ def test_the_phase_of_a_pattern_is_in_the_budget_and_flagged_where_it_costs_more
         line = next(one for one in report["budget"] if one["cause"] == "antenna")
         assert ("antenna_phase" in report["flags"]) is flagged
         assert (line["loss_db"] < -0.2) is flagged
-        assert "whose phase turns by" in line["stated"]
+        assert "whose phase varies by" in line["stated"]
