@@ -78,7 +78,7 @@ def test_tiles_fall_back_until_they_are_exact_enough_and_a_rest_is_flagged(speck
     assert len(report["redone"]) == len(speckle.plan.fallbacks)
     report = certify(speckle, target, accuracy_db=-200.0)
     assert report["flags"] == {
-        "accuracy_missed": f"numerical error up to {report['numerical_error_db']:.1f} dB (95% sure), -200.0 dB asked"
+        "accuracy_missed": f"numerical error up to {report['numerical_error_db']:.1f} dB (95% confidence), -200.0 dB requested"
     }
 
 

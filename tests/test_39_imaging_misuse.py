@@ -270,7 +270,7 @@ def test_errors_of_positions_that_are_stated_are_expected():
     told = ap.judge(image, position_std_m=0.01, time_s=10.0 * np.arange(len(HISTORY)))
     assert told.focus["loss_db"] == pytest.approx(told.focus["expected_db"], abs=0.3)
     assert not told.flags
-    with pytest.raises(CampaignError, match="with time_s"):
+    with pytest.raises(CampaignError, match="in time_s"):
         ap.judge(image, position_std_m=0.01)
     with pytest.raises(CampaignError, match="times of 96 pulses"):
         ap.judge(image, position_std_m=0.01, time_s=np.arange(3.0))

@@ -174,7 +174,7 @@ def test_latitude_and_longitude_swapped_in_one_log_puts_the_earth_between_nodes(
     assert "expected nodes in line of sight" in "\n".join(lines)
 
 
-@pytest.mark.quick("*swapped in the logs.", "*check heights*")
+@pytest.mark.quick("*swapped in the logs.", "*check the heights*")
 @pytest.mark.parametrize(
     ("change", "remedy"),
     [

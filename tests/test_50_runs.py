@@ -271,7 +271,7 @@ def test_a_step_that_tells_how_far_it_is_is_believed_over_what_was_expected(tmp_
     run = RunRecord(planned={"image": 1}, jobs={1: job})
     tell(campaign, job.step, what="tiles", done=10, total=40, since=now - 90, at=now)
     bar, whole = bars(campaign, run, TimeLeft(campaign, cores=2))
-    assert (bar.told, bar.fraction) == ("10 of 40 tiles", 0.25)
+    assert (bar.counts, bar.fraction) == ("10 of 40 tiles", 0.25)
     assert bar.left_s == pytest.approx(270, rel=0.01)
     assert whole.left_s == pytest.approx(270, rel=0.01)
 
@@ -441,7 +441,7 @@ def test_with_a_writable_home_caches_stay_where_they_are(tmp_path, monkeypatch):
 
 
 def test_what_the_workflow_says_is_told_where_no_step_failed(tmp_path):
-    run = RunRecord(said=["MissingRuleException:\nno rule for \x1b[31mx"])
+    run = RunRecord(errors=["MissingRuleException:\nno rule for \x1b[31mx"])
     assert next(failures(tmp_path, run, tmp_path / "a.log")) == r"error: MissingRuleException: no rule for \x1b[31mx"
 
 

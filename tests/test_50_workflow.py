@@ -322,7 +322,7 @@ def test_a_step_that_is_killed_ends_the_run_with_status_1(tiny):
 def test_a_run_from_any_folder_tells_each_step_and_ends_with_what_its_images_say(tiny, tmp_path):
     code, output = finished(apertura("run", tiny, "-n"))
     assert code == 0
-    assert output.startswith("23 steps to do: ")
+    assert output.startswith("23 steps to run: ")
     assert output.count("\n") == 1
     assert not (tiny / "results/.run").exists()
     elsewhere = {"cwd": tmp_path, "env": {**os.environ, "PATH": "/usr/bin:/bin"}}  # without an active environment
@@ -330,7 +330,7 @@ def test_a_run_from_any_folder_tells_each_step_and_ends_with_what_its_images_say
     assert code == 0, output
     assert (tiny / "results" / "f01" / "fused" / "coherent_db.tif").is_file()
     told = [line.split("  ") for line in output.splitlines()]
-    for word, count in (("begun", 23), ("done", 23), ("failed", 0)):
+    for word, count in (("started", 23), ("done", 23), ("failed", 0)):
         assert sum(len(cells) > 2 and cells[1].strip() == word for cells in told) == count
     assert "23 steps done in " in output
     timed = list((tiny / "results/benchmarks").rglob("*.tsv"))

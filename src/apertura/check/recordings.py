@@ -157,7 +157,7 @@ def _nothing_in_common(tx: Recording, rx: Recording, prf_hz: float) -> CampaignE
             f"frame numbers {first} and {second}, without a common number",
             where=where,
             expected="recordings of the same pulses",
-            remedy="Check that both recordings are of the same flight, and apertura:frame of their captures.",
+            remedy="Check that both recordings are of the same flight, and check apertura:frame of their captures.",
         )
     if seconds_between(recorded_span(tx), recorded_span(rx)) <= 1 / prf_hz:
         return None
@@ -167,7 +167,7 @@ def _nothing_in_common(tx: Recording, rx: Recording, prf_hz: float) -> CampaignE
         f"recorded {first} and {second}, a difference of {abs(shift):.1f} s{mistaken_time(shift)}",
         where=where,
         expected="time tags of the same pulses",
-        remedy="Check that both recordings are of the same flight, and their core:datetime.",
+        remedy="Check that both recordings are of the same flight, and check their core:datetime.",
     )
 
 

@@ -242,7 +242,7 @@ def inside(times: Times, span: Span) -> NDArray[np.bool_]:
     return np.asarray((times >= span[0]) & (times <= span[1]))
 
 
-def seconds_between(one: Span, other: Span) -> float:
+def seconds_between(first: Span, second: Span) -> float:
     """Return the time between two spans, seconds; 0 or less if they touch or overlap.
 
     Examples
@@ -254,11 +254,11 @@ def seconds_between(one: Span, other: Span) -> float:
     >>> seconds_between((first, second), (second, second + late))
     0.0
     """
-    second = np.timedelta64(1, "s")
-    return float(max((other[0] - one[1]) / second, (one[0] - other[1]) / second))
+    one_second = np.timedelta64(1, "s")
+    return float(max((second[0] - first[1]) / one_second, (first[0] - second[1]) / one_second))
 
 
-def shift_s(one: Span, other: Span) -> float:
-    """Return the delay of the other span's middle relative to the first span's, seconds."""
-    second = np.timedelta64(1, "s")
-    return float(((other[0] - one[0]) / second + (other[1] - one[1]) / second) / 2)
+def shift_s(first: Span, second: Span) -> float:
+    """Return the delay of the second span's middle relative to the first span's, seconds."""
+    one_second = np.timedelta64(1, "s")
+    return float(((second[0] - first[0]) / one_second + (second[1] - first[1]) / one_second) / 2)

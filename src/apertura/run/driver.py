@@ -90,7 +90,7 @@ class _Files:
         return cls(*own, str(campaign.root) if confined else "")
 
     @classmethod
-    def apart(cls, folder: str, *, confined: Path | None) -> "_Files":
+    def temporary(cls, folder: str, *, confined: Path | None) -> "_Files":
         """Return the files of a run that computes no results, in a temporary folder."""
         own = ConfinedPath.at(folder)
         return cls(own / "journal.jsonl", own / "status", own / _LOG, str(confined or ""))
@@ -171,7 +171,7 @@ def run_workflow(root: Path, cores: int, *arguments: str, paranoid: bool = False
             return _formed(root, words, files, screen, server, verbose=show == "snakemake")
     with tempfile.TemporaryDirectory() as scratch:
         dry = any(map(_DRY_RUN.fullmatch, arguments))
-        files = _Files.apart(scratch, confined=root if dry and not elsewhere else None)
+        files = _Files.temporary(scratch, confined=root if dry and not elsewhere else None)
         if show == "errors" or (dry and show == "steps"):
             return _examined(root, words, files, report=dry)
         return files.status_of(_watched(_started([RECORDER, *words], files.environment)))
@@ -376,7 +376,7 @@ def _check_values(options: Sequence[str]) -> None:
 
 
 def _check_targets(campaign: Campaign, options: Sequence[str]) -> None:
-    """Raise CampaignError for result files of an unknown flight, pair or node, some of which match rules."""
+    """Raise CampaignError for result files of an unknown flight, pair or node, even if they match a rule."""
     requested = [path for path in map(PurePosixPath, options) if path.parts[:1] == ("results",) and len(path.parts) > 3]
     requested = [path for path in requested if path.parts[1] not in RESERVED_NAMES]
     known = [PurePosixPath(result.manifest).parts for _, result in results_of(campaign)] if requested else []

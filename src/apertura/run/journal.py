@@ -90,7 +90,7 @@ class RunRecord:
         Rule → number of jobs, as planned before the first job.
     jobs
         Number of a job → the job, for jobs that have started.
-    said
+    errors
         Error messages of Snakemake.
     cores
         Number of cores used; 0 on a cluster.
@@ -102,7 +102,7 @@ class RunRecord:
 
     planned: dict[str, int] = field(default_factory=dict)
     jobs: dict[int, JobRecord] = field(default_factory=dict)
-    said: list[str] = field(default_factory=list)
+    errors: list[str] = field(default_factory=list)
     cores: int = 0
     status: int | None = None
     begun_s: float = 0.0
@@ -149,7 +149,7 @@ class RunRecord:
             job = self.jobs[line["job"]]
             job.ended_s, job.failed = at, event == "failed"
         elif event == "said":
-            self.said.append(str(line["message"]))
+            self.errors.append(str(line["message"]))
         elif event == "start":
             self.begun_s, self.cores = at, int(line["cores"])
         elif event == "end":
@@ -210,7 +210,7 @@ def failures(root: Path, run: RunRecord, log: Path) -> Iterator[str]:
         messages.setdefault(_message(root / job.log if job.log else None), []).append(job.log)
     if not messages:
         last = [_installable(line) for line in _tail(log)[-1:]]
-        messages = {shown(" ".join(message.split()), 2000): [] for message in run.said or last}
+        messages = {shown(" ".join(message.split()), 2000): [] for message in run.errors or last}
     for message, logs in messages.items():
         yield f"error: {message.removeprefix(_ERROR_PREFIX)}"
         for name in filter(None, logs):

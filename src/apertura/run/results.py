@@ -173,7 +173,7 @@ def _is_confirmed(question: str, root: Path) -> bool:
 
     if not sys.stdin.isatty():
         raise CampaignError(
-            "confirmation required without a terminal", root, "a terminal, or --yes", "Use --yes to skip confirmation."
+            "confirmation required, but no terminal", root, "a terminal, or --yes", "Use --yes to skip confirmation."
         )
     return typer.confirm(question)
 

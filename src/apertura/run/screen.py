@@ -59,7 +59,7 @@ class Bar:
     """Progress bar: name, progress in words, completed fraction, and time left in seconds (None: unknown)."""
 
     name: str
-    told: str
+    counts: str
     fraction: float
     left_s: float | None
 
@@ -105,7 +105,7 @@ def table(rows: list[Bar]) -> "Table":
     grid.add_column(no_wrap=True, justify="right", min_width=len(UNKNOWN))
     *steps, whole = rows
     for row in steps[:_MOST_BARS]:
-        grid.add_row(Text(f"{'':8}{row.name}"), ProgressBar(1.0, row.fraction), Text(row.told), Text(row.left))
+        grid.add_row(Text(f"{'':8}{row.name}"), ProgressBar(1.0, row.fraction), Text(row.counts), Text(row.left))
     if len(steps) > _MOST_BARS:
         grid.add_row(Text(f"{'':8}and {len(steps) - _MOST_BARS} more", style="dim"))
     grid.add_row(Text(whole.name, style="bold"), ProgressBar(1.0, whole.fraction), "", Text(whole.left, style="bold"))
@@ -246,7 +246,7 @@ def _print_steps(campaign: Campaign, run: RunRecord) -> None:
         console.print(table(rows))
     else:
         for row in rows:
-            print(f"{row.name}: {100 * row.fraction:.0f} %{', ' + row.told if row.told else ''}, {row.left}")
+            print(f"{row.name}: {100 * row.fraction:.0f} %{', ' + row.counts if row.counts else ''}, {row.left}")
     if run.waiting:
         print(f"waiting: {listed(run.waiting)}")
 

@@ -438,11 +438,11 @@ def focus_report(formation: Formation, target: Any) -> dict[str, Any]:
     ]
     parts = _parts(formation, points, cell_m)
     verdict = judge([(point.amplitude, focus) for point, focus in zip(points, measured, strict=True)])
-    inputs, found = formation.history or formation.profiles, verdict.points > 0
-    elsewhere = echo_elsewhere(inputs, grid, formation.plan.terrain, points=terms, measured=found)
+    inputs, has_points = formation.history or formation.profiles, verdict.points > 0
+    elsewhere = echo_elsewhere(inputs, grid, formation.plan.terrain, points=terms, measured=has_points)
     if elsewhere:
         measured = [None] * len(points)  # the points may be its sidelobes
-    if elsewhere or not found:
+    if elsewhere or not has_points:
         verdict = judge_parts(parts, cell_m=cell_m)
     peak = max((point.amplitude for point in points), default=0.0)
     conjugated = elsewhere or verdict.loss_db < _CONJUGATED_LOSS_DB

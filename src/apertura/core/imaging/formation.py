@@ -113,19 +113,19 @@ class Formation:
 
         Profiles are interpolated band-limited in float64. The result does not depend on the number of threads.
         """
-        places = self.positions_at(*pixels.T)
+        points_m = self.positions_at(*pixels.T)
 
         def summed(read: tuple[slice, list[tuple[slice, NDArray[np.bool_]]]]) -> NDArray[np.complex128]:
             pulses, parts = read
-            inputs, total = self.summed[pulses], np.zeros(len(places), np.complex128)
+            inputs, total = self.summed[pulses], np.zeros(len(points_m), np.complex128)
             for part, inside in parts:
                 weights = self.beams and self.beams[pulses][part]
-                total[inside] += _exact_sum(inputs[part], places[inside], weights)
+                total[inside] += _exact_sum(inputs[part], points_m[inside], weights)
             return total
 
         with ThreadPoolExecutor(threads) as pool:
-            blocks = pool.map(summed, self.illuminating_pulses(places))
-            return np.asarray(sum(blocks, np.zeros(len(places), np.complex128)) / self.count)
+            blocks = pool.map(summed, self.illuminating_pulses(points_m))
+            return np.asarray(sum(blocks, np.zeros(len(points_m), np.complex128)) / self.count)
 
     def values(self, pixels: NDArray[np.int64]) -> tuple[NDArray[np.complex64], NDArray[np.float64]]:
         """Return the planned image at (pixel, 2) rows and columns, computing only the pieces that contain them.
@@ -165,15 +165,15 @@ class Formation:
         if isinstance(inputs, Profiles) and presum is not None:
             inputs = self.plan.inputs(inputs)
         reach = Reach.of(beams, inputs.aperture, self.grid, self.plan.terrain, windows)
-        places = [self.plan.terrain.positions(self.grid[window]) for window in windows]
-        image = [np.zeros(place.shape[:2], np.complex64) for place in places]
+        patches_m = [self.plan.terrain.positions(self.grid[window]) for window in windows]
+        image = [np.zeros(patch_m.shape[:2], np.complex64) for patch_m in patches_m]
         for block in pulse_blocks_of(len(inputs), setting.pulse_blocks, any_start=beams is None):
             tables = engine.prepare(inputs[block], **setting.options)
-            for number, place in enumerate(places):
+            for number, patch_m in enumerate(patches_m):
                 if (part := reach.within(number, block)) is not None:
                     used = tables if part == slice(0, block.stop - block.start) else tables[part]
                     weights = beams and beams[block][part]
-                    image[number] += engine.form(used, place, beams=weights, **setting.form_options) / self.count
+                    image[number] += engine.form(used, patch_m, beams=weights, **setting.form_options) / self.count
         return image
 
     def contributions(self, row: ArrayLike, column: ArrayLike) -> list[NDArray[np.complex128]]:
@@ -181,28 +181,28 @@ class Formation:
 
         Computed by the sum over a history's subcarriers, or by band-limited interpolation of profiles.
         """
-        places = self.positions_at(np.atleast_1d(row), np.atleast_1d(column))
-        terms_of: list[list[NDArray[np.complex128]]] = [[np.empty(0, np.complex128)] for _ in places]
-        for pulses, parts in self.illuminating_pulses(places):
+        points_m = self.positions_at(np.atleast_1d(row), np.atleast_1d(column))
+        terms_of: list[list[NDArray[np.complex128]]] = [[np.empty(0, np.complex128)] for _ in points_m]
+        for pulses, parts in self.illuminating_pulses(points_m):
             inputs = self.summed[pulses]
             for part, inside in parts:
-                terms = _terms(inputs[part], places[inside], self.beams and self.beams[pulses][part])
-                for place, of_place in zip(np.flatnonzero(inside), terms.T, strict=True):
-                    terms_of[place].append(of_place[of_place != 0])
+                terms = _terms(inputs[part], points_m[inside], self.beams and self.beams[pulses][part])
+                for point, of_point in zip(np.flatnonzero(inside), terms.T, strict=True):
+                    terms_of[point].append(of_point[of_point != 0])
         return [np.concatenate(terms) for terms in terms_of]
 
     def illuminating_pulses(
-        self, places: NDArray[np.float64]
+        self, points_m: NDArray[np.float64]
     ) -> Iterator[tuple[slice, list[tuple[slice, NDArray[np.bool_]]]]]:
         """Yield pulse blocks to read, each with its sub-blocks that may illuminate points, and the masks of the points.
 
         Parameters
         ----------
-        places
+        points_m
             (point, 3) float64, metres.
         """
         aperture, beams = self.profiles.aperture, self.beams
-        mask = illumination_mask(beams, aperture, places, np.zeros(len(places)), pulses=PULSES)
+        mask = illumination_mask(beams, aperture, points_m, np.zeros(len(points_m)), pulses=PULSES)
         for first in range(0, len(aperture), PULSES_READ):
             block = slice(first, min(first + PULSES_READ, len(aperture)))
             length = block.stop - block.start
@@ -235,15 +235,17 @@ class Formation:
         )
 
 
-def _terms(inputs: PhaseHistory | Profiles, places: NDArray[np.float64], beams: Beams | None) -> NDArray[np.complex128]:
+def _terms(
+    inputs: PhaseHistory | Profiles, points_m: NDArray[np.float64], beams: Beams | None
+) -> NDArray[np.complex128]:
     if isinstance(inputs, PhaseHistory):
-        return reference.terms(inputs, places, beams)
-    return band_limited_terms(inputs, places, beams=beams)
+        return reference.terms(inputs, points_m, beams)
+    return band_limited_terms(inputs, points_m, beams=beams)
 
 
 def _exact_sum(
-    inputs: PhaseHistory | Profiles, places: NDArray[np.float64], beams: Beams | None
+    inputs: PhaseHistory | Profiles, points_m: NDArray[np.float64], beams: Beams | None
 ) -> NDArray[np.complex128]:
     if isinstance(inputs, PhaseHistory):
-        return reference.form(inputs, places, beams=beams)
-    return band_limited_image(inputs, places, beams=beams)
+        return reference.form(inputs, points_m, beams=beams)
+    return band_limited_image(inputs, points_m, beams=beams)

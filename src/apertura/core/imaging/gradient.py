@@ -1,4 +1,4 @@
-"""Gradient of a caller's objective of an image with respect to phase centres and paths."""
+"""Gradient of a user-defined image objective with respect to phase centres and paths."""
 
 from typing import TYPE_CHECKING, Any, cast
 

@@ -156,18 +156,19 @@ def _outside(inputs: PhaseHistory | Profiles, points: np.ndarray) -> float:
 
     A phase history is periodic with c/Δf; total paths farther than that from its reference count as beyond.
     """
-    some = inputs[inputs.aperture.sample(_PULSES)]
-    path = some.aperture.path(points)
-    if isinstance(some, PhaseHistory):
-        unambiguous_m = some.wave_speed_m_s / float(np.abs(np.diff(some.frequency_hz)).mean())
-        return float((np.abs(path - some.wave_speed_m_s * some.reference_delay_s[:, None]) > unambiguous_m).mean())
-    place = (path - some.start_m[:, None]) / some.step_m
-    return float(((place < 0) | (place > some.samples.shape[1] - 1)).mean())
+    sampled = inputs[inputs.aperture.sample(_PULSES)]
+    path_m = sampled.aperture.path(points)
+    if isinstance(sampled, PhaseHistory):
+        unambiguous_m = sampled.wave_speed_m_s / float(np.abs(np.diff(sampled.frequency_hz)).mean())
+        reference_m = sampled.wave_speed_m_s * sampled.reference_delay_s[:, None]
+        return float((np.abs(path_m - reference_m) > unambiguous_m).mean())
+    at = (path_m - sampled.start_m[:, None]) / sampled.step_m
+    return float(((at < 0) | (at > sampled.samples.shape[1] - 1)).mean())
 
 
 # ---- The planner's job of a pair and a scene
 
-_PATCH_PX = 256  # side of the windows whose positions predictions use
+_PATCH_PX = 256  # side of the windows at whose pixels the engines' errors are predicted
 
 
 def decide_integration(

@@ -25,7 +25,7 @@ WINDOW = 7
 _PARTS = 4  # subdivisions of a block per axis, for the variation of the look direction across it
 _MOST_CHANCE = 0.5  # |ρ|² at large lags: reached by blocks of two resolution cells, or a constant image
 _FEWEST_PX = 10  # least side of a block: a smaller one has only lags close to zero
-_STEP, _SCATTER = 0.02, 0.2  # of ln(ENL): bin of its histogram, and standard deviation from 49 pixels, which smooths it
+_STEP, _SCATTER = 0.02, 0.2  # of ln(ENL): histogram bin, and standard deviation of a local estimate, for smoothing
 
 
 def block_means(values: Floats, side: int) -> Floats:

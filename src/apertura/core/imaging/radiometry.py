@@ -57,7 +57,7 @@ class Link:
     full_scale_counts: float
 
     def __post_init__(self) -> None:
-        wrong = [one.name for one in fields(self) if not is_number(getattr(self, one.name))]
+        wrong = [field.name for field in fields(self) if not is_number(getattr(self, field.name))]
         wrong += ["full_scale_counts"] * (not wrong and self.full_scale_counts <= 0)
         wrong += ["transmit_power_dbm"] * (not wrong and self.transmit_power_dbm > MOST_DBM)
         if wrong:
@@ -151,19 +151,19 @@ def pointing_std_db(beams: Beams | None, aperture: Aperture, place_m: Floats, tu
     -----
     Source: docs/theory/radiometry.md, eq. 19.
     """
-    some = aperture.sample(_PULSES)
-    antennas, place = beams and beams[some].antennas, place_m[None]
+    sampled = aperture.sample(_PULSES)
+    antennas, point = beams and beams[sampled].antennas, place_m[None]
     if beams is None or antennas is None:
         return 0.0
-    aperture = aperture[some]
+    aperture = aperture[sampled]
     spread_m2 = np.prod([np.linalg.norm(place_m - leg, axis=-1) for leg in aperture.legs], axis=0)
-    weight = beams[some].weight(aperture, place)[:, 0] / spread_m2
+    weight = beams[sampled].weight(aperture, point)[:, 0] / spread_m2
 
     def amplitude(vector: Floats, turned: tuple[bool, bool]) -> float:
         both = zip((antennas.transmit, antennas.receive), turned, strict=True)
         transmit, receive = (beam.turned(vector) if beam and on else beam for beam, on in both)
         mispointed = Beams(transmit, receive)
-        return float((weight * mispointed.weight(aperture, place)[:, 0]).sum())
+        return float((weight * mispointed.weight(aperture, point)[:, 0]).sum())
 
     nominal = amplitude(np.zeros(3), (False, False))
     perturbed = np.array([[amplitude(sign * vector, turned) for sign in (1, -1)] for vector, turned in turns])
@@ -203,7 +203,7 @@ class Calibration:
         Nodes at which the following arrays are computed.
     gain, area_m2, noise
         (node row, node column) float64: ln A² (eq. 3), ln of the cell's area on level ground (eq. 5), and ln Σw²/M² of
-        the pixel's noise; -inf where no pulse sees the node.
+        the pixel's noise; -inf where no pulse illuminates the node.
     directions
         (node row, node column, 3, 3) float64, unit vectors: up, normal of the slant plane, towards the bisector of
         both antennas.

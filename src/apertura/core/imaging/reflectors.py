@@ -275,9 +275,9 @@ def _difference(
 ) -> tuple[str, str, float, float] | None:
     """Return the difference between two flights at their common reflectors, and its standard deviation."""
     both = [(np.flatnonzero(first & (of == name)), np.flatnonzero(second & (of == name))) for name in np.unique(of)]
-    shared = [(one[0], two[0]) for one, two in both if one.size and two.size]
+    shared = [(in_first[0], in_second[0]) for in_first, in_second in both if in_first.size and in_second.size]
     if not shared:
         return None
-    weight = np.array([1 / (variance[one] + variance[two]) for one, two in shared])
-    differences = np.array([value[two] - value[one] for one, two in shared])
+    weight = np.array([1 / (variance[i] + variance[j]) for i, j in shared])
+    differences = np.array([value[j] - value[i] for i, j in shared])
     return (*names, float((weight * differences).sum() / weight.sum()), float(weight.sum() ** -0.5))  # type: ignore[return-value]

@@ -136,7 +136,7 @@ def separated(
     Examples
     --------
     >>> at = np.array([0.0, 1.4, 40.0, 50.0])
-    >>> separated(np.array([1, 0.22, 0.2, 0.1]), lambda one, others: np.abs(np.sinc(at[others] - at[one])), most=9)
+    >>> separated(np.array([1, 0.22, 0.2, 0.1]), lambda i, others: np.abs(np.sinc(at[others] - at[i])), most=9)
     [0, 2, 3]
     """
     explained, points = np.zeros(len(amplitude)), list[int]()
@@ -182,8 +182,8 @@ def near(
     """
     unit = 2 * np.pi * spacing_m * np.linalg.cholesky(spectrum)
 
-    def shown(one: NDArray[np.int64], others: NDArray[np.int64]) -> NDArray[np.float64]:
-        down, right = (others - one).T
+    def shown(pixel: NDArray[np.int64], others: NDArray[np.int64]) -> NDArray[np.float64]:
+        down, right = (others - pixel).T
         lobe = np.linalg.norm(np.stack([right, -down], axis=1) @ unit, axis=1) < _LOBE_CELLS * _CELL_UNITS
         return np.asarray(lobe | (np.hypot(down, right) < SMEARED_CELLS * cell_m / spacing_m), np.float64)
 

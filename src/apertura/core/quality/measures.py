@@ -157,7 +157,7 @@ def coherence_factor(contributions: NDArray[np.complex128]) -> float:
 
 
 def weighted_median(values: NDArray[np.float64], weights: NDArray[np.float64]) -> float:
-    """Return the value with half of the weight on either side, interpolated.
+    """Return the weighted median of values, interpolated.
 
     Examples
     --------
