@@ -283,9 +283,9 @@ def _integration_of(
     points = points_m.reshape(-1, 3)
     total, counts = _pulses_per_place(sector, aperture, points)
     if counts.max() < _FEWEST:
-        count = "no pulses" if not counts.any() else f"at most {counts.max():.0f} pulses"
+        pulses = "no pulses" if not counts.any() else f"at most {counts.max():.0f} pulses"
         raise CampaignError(
-            f"{count} illuminate a pixel inside the integration angle (s = {sector.centre:.3g} ± {sector.half:.3g})",
+            f"{pulses} illuminate a pixel inside the integration angle (s = {sector.centre:.3g} ± {sector.half:.3g})",
             where=f"{where}.integration",
             expected=f"at least {_FEWEST} pulses: a flight past the scene, and antennas directed at it",
             remedy="Set processing.integration to all or to a larger angle, or correct scene.bounds_m.",
