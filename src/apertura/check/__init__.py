@@ -111,7 +111,7 @@ def problems_of(examined: "Examination", *, without: Collection[str] = ()) -> li
 
 
 def print_problems(root: str | Path, *, without: Collection[str] = (), stream: TextIO | None = None) -> int:
-    """Print the problems of a campaign folder, one line each, or notes without problems; return their number."""
+    """Print the problems of a campaign folder, one line each, or notes if there are none; return their number."""
     return _print_problems(*_examined(root), without=without, stream=stream or sys.stdout)
 
 

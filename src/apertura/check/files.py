@@ -75,7 +75,7 @@ def _wanted(examined: Examination) -> Callable[[str], str | None]:
     def files() -> tuple[dict[str, str], list[str]] | None:
         try:
             return wanted_files(examined.campaign, examined.stale), absent_files(examined.campaign)
-        except CampaignError:  # other checks report it
+        except CampaignError:  # reported by other checks
             return None
 
     def wanted(name: str) -> str | None:

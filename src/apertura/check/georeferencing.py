@@ -174,7 +174,7 @@ def check_spikes(examined: Examination) -> Iterator[CampaignError]:
         f"{np.nanmedian(heights[max(row - 6, 0) : row + 7, max(column - 6, 0) : column + 7]):.0f} m; "
         f"{int(spikes.sum())} of {spikes.size} samples are such spikes",
         where=dem.path,
-        expected=f"height differences to all neighbours of at most {TALLEST_M:.0f} m, or ten post widths",
+        expected=f"no post above or below all its neighbours by more than {TALLEST_M:.0f} m, or ten post widths",
         remedy="Set these posts to nodata and fill them with a GIS.",
     )
 

@@ -131,7 +131,7 @@ Turn = tuple[Floats, tuple[bool, bool]]
 
 
 def pointing_std_db(beams: Beams | None, aperture: Aperture, place_m: Floats, turns: Sequence[Turn]) -> float:
-    """Return the error of a point's power caused by mispointed beams, from errors of attitude.
+    """Return the standard deviation of a point's power caused by mispointed beams, from attitude errors.
 
     Parameters
     ----------

@@ -175,8 +175,8 @@ def _share_beyond(aperture: Aperture, points_m: NDArray[np.float64], path_limit_
     beyond = shortest > path_limit_m
     if beyond.all():
         raise CampaignError(
-            f"no pulse receives an echo of the scene: the shortest total path is {shortest.min():.1f} m, the scene at "
-            f"least {shortest.min() / 2000:.3g} km from the tracks",
+            f"no pulse receives an echo of the scene: the shortest total path is {shortest.min():.1f} m, and the scene "
+            f"is at least {shortest.min() / 2000:.3g} km from the tracks",
             where="scene.bounds_m",
             expected=f"a total path of at most {path_limit_m:.1f} m, the length of the cyclic prefix",
             remedy="Correct scene.bounds_m (easting before northing), scene.crs, the positions of the tracks, or the "
