@@ -162,7 +162,7 @@ def test_a_campaign_of_a_pulse_passes_the_checks_and_asks_for_little(tiny):
         ({"pulse": "raw/other.npy"}, "no such file"),
         ({"band_hz": [400e6, 500e6]}, "of its energy"),
         ({"carrier_hz": 1.2e9}, "waveform.carrier_hz"),
-        ({"listen_s": 0.02e-6}, "what waveform.listen_s holds"),
+        ({"listen_s": 0.02e-6}, "the limit by waveform.listen_s"),
     ],
 )
 def test_what_does_not_fit_the_recording_is_told_before_anything_runs(tiny, changed, told):
