@@ -29,7 +29,7 @@ def test_pulses_are_summed_only_where_the_aperture_is_oversampled(step_m, summed
 
 
 def test_a_presum_beyond_the_doppler_band_of_a_wide_scene_is_refused():
-    with pytest.raises(CampaignError, match="presum is 32"):
+    with pytest.raises(CampaignError, match="presum factor 32"):
         plan(overrides={"presum": 32}, aperture=monostatic(straight_track(length_m=30)))
 
 
