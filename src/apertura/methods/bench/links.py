@@ -567,7 +567,8 @@ class SplitAgreement:
             return {}
         return {
             "splitter_channels_differ": f"{name}: {self.gain_db:+.2f} dB, "
-            f"{self.phase_rad:+.3f} ± {self.phase_std_rad:.3f} rad; over the band {self.band_db:.2f} dB and {self.band_rad:.3f} rad rms"
+            f"{self.phase_rad:+.3f} ± {self.phase_std_rad:.3f} rad; "
+            f"over the band {self.band_db:.2f} dB and {self.band_rad:.3f} rad rms"
         }
 
 
