@@ -20,7 +20,7 @@ _NAME = re.compile(r"(?<![\w/(.-])((?:[\w]+[./])+[\w<>]+(?:\.[\w<>]+)*|\w+_\w+|-
 def flags_page() -> str:
     """Return the text of docs/flags.md."""
     return _HEADER + "".join(
-        f"- **`{name}`** *{_marked(flag.measured)}*; {_marked(flag.means)} → {_marked(flag.look)}\n"
+        f"- **`{name}`** *{_marked(flag.measured)}*; {_marked(flag.meaning)} → {_marked(flag.advice)}\n"
         for name, flag in FLAGS.items()
     )
 
