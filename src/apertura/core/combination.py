@@ -166,7 +166,7 @@ class CoherentSum:
             "left_out": dict(self.left_out),
             "why": dict(self.why),
             "agreeing": list(self.agreeing),
-            "would_align_rad": {pair: round(-one.phase_rad, 4) for pair, one in self.apart.items() if one.alignable},
+            "aligning_phase_rad": {pair: round(-one.phase_rad, 4) for pair, one in self.apart.items() if one.alignable},
             "unmeasured": dict(self.unmeasured),
             "ties": [list(tie) for tie in self.ties],
             "misfit": round(self.misfit, 2),

@@ -197,7 +197,7 @@ def _report(scene: OpenScene, image: xr.Dataset, calibrated: CalibratedPair, noi
     """Return the link budget and noise of an image, for radiometry.json."""
     found = points_of(image.image, image.attrs["quality"], scene, list(scene.grid.tiles(BLOCK_PX)))
     constant = calibrated.calibration.constant
-    noise_report, noise_flags = calibrated.noise_report(noise, bound="pulses_sparse" in image.attrs["flags"])
+    noise_report, noise_flags = calibrated.noise_report(noise, bound="azimuth_undersampled" in image.attrs["flags"])
     return {
         "calibrated_by": calibrated.calibrated_by,
         "constant_db": round(decibels(constant), 3),

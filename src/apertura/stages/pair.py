@@ -90,7 +90,7 @@ def antennas_report(campaign: Campaign, pair: str, illumination: Illumination | 
     stated = {point: {"node": node, **beam.model_dump()} for point, (node, beam) in campaign.antennas(pair).items()}
     if illumination is None or not stated:
         return {}
-    return {"antennas": {**stated, "pulses_seeing": {**illumination.counts, "of": illumination.pulses}}}
+    return {"antennas": {**stated, "illuminating_pulses": {**illumination.counts, "of": illumination.pulses}}}
 
 
 def scene_illumination(

@@ -199,7 +199,7 @@ def air_decision(pair: OpenPair) -> Decision:
     """Return the air assumed on the paths of a pair, and its effect against vacuum: one constant for all pairs."""
     air = pair.air
     cell_m = pair.wave_speed_m_s / float(np.ptp(pair.frequency_hz)) / 2
-    moved_m, left_m, other = float(air["vacuum_would_move_m"]), float(air["one_constant_leaves_m"]), "vacuum"
+    moved_m, left_m, other = float(air["vacuum_shift_m"]), float(air["constant_refractivity_error_m"]), "vacuum"
     if not air["refractivity_n"]:
         moved_m, other = 1e-6 * USUAL_N * float(air["range_m"]), f"air of N = {USUAL_N:.0f}"
     shows = "" if moved_m > _SHOWN_CELLS * cell_m else ", which does not show"

@@ -369,7 +369,7 @@ def association_flags(
             "every pair may be off by one pulse"
         )
     if abs(association.offset_s) > LARGEST_OFFSET_S:
-        flags["time_tags_apart"] = _offset_line(association, speed_m_s)
+        flags["time_tag_offset"] = _offset_line(association, speed_m_s)
     if conflicts:
         flags["frame_counter_conflict"] = (
             f"{number_of(conflicts, 'pulse')} dropped: frame counter and time tags disagree"
