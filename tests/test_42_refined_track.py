@@ -25,7 +25,7 @@ from apertura.methods.autofocus.inputs import PairRecord, Refinement
 from apertura.simulation import ImageGrid, preset, simulate
 from apertura.stages import echo, image, profile, refine, scene, tracks
 from apertura.stages.acquisition import open_acquisition
-from apertura.stages.hypotheses import evidence_of, flown
+from apertura.stages.hypotheses import subset_geometry, with_logs
 from apertura.stages.pair import open_pair
 from apertura.stages.refine import RefinedTrack, RefinementInputs, clock_s, open_refined, reference_points
 from apertura.stages.scene import open_scene
@@ -189,8 +189,8 @@ def test_hypotheses_begin_where_the_images_do(spoilt):
     nodes = {name: track.node(node) for name, node in logged.items()}
     for name in PAIRS:
         pair = open_pair(campaign, "f01", name)
-        told = evidence_of(logged, name, PairEcho.opened(campaign, "f01", name).stage, "hann")
-        (moved,) = flown(nodes, [told])
+        told = subset_geometry(logged, name, PairEcho.opened(campaign, "f01", name).stage, "hann")
+        (moved,) = with_logs(nodes, [told])
         imaged = track.pair(pair).history
         assert np.abs(imaged.aperture.tx_m - pair.aperture.tx_m).max() > 0.02
         np.testing.assert_allclose(moved.history.aperture.tx_m, imaged.aperture.tx_m, atol=1e-3)

@@ -12,9 +12,9 @@ _HEAD = """# Command line
 
 `apertura COMMAND --help` says the same. Exit codes: 0, done; 2, something for you to fix, in one message;
 130, ended by a signal; 1, what `verify`, `diff` or `reproduce` compared is not the same, or a defect of apertura.
-`[campaign]` is a campaign folder; without it, the current folder. Written by `make pages` from the commands.
+`[campaign]` is a campaign folder; default: the current directory. Written by `make pages` from the commands.
 """
-_SAID_ABOVE = {"campaign folder, default: current folder"}
+_SAID_ABOVE = {"campaign folder, default: current directory"}
 """What the head says once for all commands."""
 
 

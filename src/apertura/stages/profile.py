@@ -39,12 +39,12 @@ def profile(campaign: Campaign, flight: str, pair: str) -> Path:
         "oversampling": window.unambiguous / len(frequency),
         "window": requested,
         "wave_speed_m_s": window.wave_speed_m_s,
-        "compression_error_db": 0.0,  # not known before the last pulse
+        "compression_error_db": 0.0,  # set after the last pulse
     }
     settings, parents = {**lineage.result.settings, **scene.spec}, [source, *scene.parents]
     inputs = merged(scene.inputs, pattern_digests(campaign, pair))
-    how: dict[str, Any] = {"modules": lineage.modules, "parents": parents, "settings": settings, "inputs": inputs}
-    stage, folder = stamped(dataset, "profile", **how), campaign.stage("profile", flight, pair)
+    origin: dict[str, Any] = {"modules": lineage.modules, "parents": parents, "settings": settings, "inputs": inputs}
+    stage, folder = stamped(dataset, "profile", **origin), campaign.stage("profile", flight, pair)
     error = CompressionError(np.random.default_rng(0))
     with writing(folder) as wip:
         write_blocks(wip, stage, "profile", _compressed(source, requested, window, scene, error))
@@ -55,13 +55,13 @@ def profile(campaign: Campaign, flight: str, pair: str) -> Path:
 def _compressed(
     source: xr.Dataset, requested: str, window: RangeWindow, scene: OpenScene, error: CompressionError
 ) -> Iterator[NDArray[np.complex64]]:
-    """Yield the profiles of one chunk of the echo at a time; zeros where none of its pulses adds to the scene."""
+    """Yield the profiles of one chunk of the echo at a time; zeros if none of its pulses contributes to the scene."""
     for part in blocks_of_rows(source, "transfer"):
         if not window.contributing[part].any():
             yield np.zeros((part.stop - part.start, window.samples), np.complex64)
             continue
         history = phase_history_of(source.isel(pulse=part), requested)
-        here = replace(window, start_m=window.start_m[part], farthest_m=window.farthest_m[part])
-        profiles = range_compress(history, scene.grid, scene.terrain, window=here)
+        chunk = replace(window, start_m=window.start_m[part], farthest_m=window.farthest_m[part])
+        profiles = range_compress(history, scene.grid, scene.terrain, window=chunk)
         error.add(history, profiles)
         yield profiles.samples

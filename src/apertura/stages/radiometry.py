@@ -26,7 +26,7 @@ from apertura.core.imaging.reflectors import DRIFT_SIGMAS
 from apertura.core.quality.bright_points import DEEPEST_DB, SPECKLE, BrightPoint
 from apertura.core.quality.budget import ATTITUDE_STD_DEG
 from apertura.core.quality.measures import BlockRaster
-from apertura.stages.agreement import bright_places
+from apertura.stages.agreement import bright_points_within
 from apertura.stages.pair import OpenPair
 from apertura.stages.planning import integration_of
 from apertura.stages.scene import OpenScene
@@ -498,4 +498,4 @@ def points_of(
     """Return the bright points of a finished image, brightest first; `quality` is that of its stage."""
     focus = quality["focus"]
     spectrum = np.array(focus["spectrum_cycles2_m2"])
-    return bright_places(image, scene.grid, windows, spectrum, cell_m=focus["cell_m"])
+    return bright_points_within(image, scene.grid, windows, spectrum, cell_m=focus["cell_m"])
