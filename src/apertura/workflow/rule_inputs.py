@@ -1,6 +1,6 @@
-"""Functions that rows of rules quote: scope of a job, and files and settings that are not results.
+"""Scope of a job, and functions of rule rows that return source files and settings.
 
-Nothing is imported here but what a function needs when it is called: the command line reads the rows.
+Functions import what they need when they are called, because the command line imports the rows.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 class Scope(Enum):
-    """Scope of a rule, with the wildcards of its jobs as Snakemake has them."""
+    """Scope of a rule, with the Snakemake wildcards of its jobs."""
 
     NODE = "node", ("flight", "node")
     PAIR = "pair", ("flight", "pair")
@@ -29,14 +29,14 @@ class Scope(Enum):
 
 @dataclass(frozen=True)
 class JobPlace:
-    """Scope of one job.
+    """Scope of a job with the values of its wildcards.
 
     Attributes
     ----------
     campaign
-        Settings and flights.
+        Campaign with settings and flights.
     of
-        Kind of the place.
+        Kind of scope.
     where
         Values of the wildcards.
     """
@@ -47,7 +47,7 @@ class JobPlace:
 
     @property
     def pairs(self) -> list[tuple[str, str]]:
-        """Flight and pair of every image that the place covers."""
+        """Flight and pair of every image within the scope."""
         campaign = self.campaign
         if self.of is Scope.PAIR:
             return [(self.where[0], self.where[1])]
@@ -60,7 +60,7 @@ class JobPlace:
         return [(flight.name, pair) for flight in campaign.image_flights for pair in flight.pairs]
 
     def below(self, of: Scope) -> list[tuple[str, ...]]:
-        """Return the places of another kind that belong to this one, each once.
+        """Return the wildcard values of all jobs of another kind of scope that are related to this job.
 
         Examples
         --------
@@ -72,57 +72,57 @@ class JobPlace:
         if of is Scope.CAMPAIGN:
             return [()]
         if of is Scope.NODE:
-            found: Iterable[tuple[str, ...]] = ((name, node) for name, pair in self.pairs for node in pair.split("-"))
+            values: Iterable[tuple[str, ...]] = ((name, node) for name, pair in self.pairs for node in pair.split("-"))
         elif of is Scope.FLIGHT:
-            found = ((name,) for name, _ in self.pairs)
+            values = ((name,) for name, _ in self.pairs)
         else:
-            found = self.pairs
-        return list(dict.fromkeys(found))
+            values = self.pairs
+        return list(dict.fromkeys(values))
 
 
 SourceSpec = str | Callable[[JobPlace], Iterable[str]]
 SettingSpec = str | Callable[[JobPlace], Mapping[str, Any]]
-"""Input of a result in its row: a name, or a function of the place that returns names."""
+"""Source or setting in the row of a result: a name, or a function of the job's scope that returns names or values."""
 
 
 def charted(campaign: "Campaign") -> tuple[str, str]:
-    """Return the flight and the pair that are charted: the last pair of the first flight, bistatic where one is.
+    """Return flight and pair of `apertura chart`: the last pair of the first flight, bistatic if there is one.
 
     Raises
     ------
     CampaignError
-        If no flight becomes an image.
+        If the campaign has no image flight.
     """
     campaign.check_images()
     return campaign.image_flights[0].name, campaign.image_flights[0].pairs[-1]
 
 
 def is_sampled(campaign: "Campaign") -> bool:
-    """Test whether samples were recorded, and not phase histories."""
+    """Return True if samples were recorded, not phase histories."""
     from apertura.campaign.config import SampledWaveform
 
     return isinstance(campaign.settings.waveform, SampledWaveform)
 
 
 def of_samples(place: JobPlace) -> bool:
-    """Test whether samples were recorded, as `is_sampled`."""
+    """Return True if samples were recorded, not phase histories."""
     return is_sampled(place.campaign)
 
 
 def adds_up(place: JobPlace) -> bool:
-    """Test whether a flight has pairs to add up."""
+    """Return True if a flight has several pairs, and thus sums."""
     from apertura.campaign.config import FUSED
 
     return FUSED in place.campaign.flight(place.where[0]).images
 
 
 def recording(place: JobPlace) -> Iterable[str]:
-    """Return the files of what a node recorded."""
+    """Return the files of a node's recording."""
     return map(place.campaign.relative, place.campaign.promised_files(*place.where))
 
 
 def recorded_on_the_bench(place: JobPlace) -> Iterable[str]:
-    """Return the recordings of a flight, and what was transmitted."""
+    """Return the recordings of a flight, and the file of the transmitted signal."""
     campaign, flight = place.campaign, place.campaign.flight(place.where[0])
     if not is_sampled(campaign):
         return []
@@ -131,13 +131,13 @@ def recorded_on_the_bench(place: JobPlace) -> Iterable[str]:
 
 
 def stated_paths(place: JobPlace) -> Mapping[str, Any]:
-    """Return the configured electrical paths of a flight's nodes."""
+    """Return the configured path offsets of a flight's nodes."""
     nodes = place.campaign.values["nodes"]
     return {"path_offset_m": {node: nodes[node]["path_offset_m"] for (_, node) in place.below(Scope.NODE)}}
 
 
 def sample_orders(place: JobPlace) -> Mapping[str, Any]:
-    """Return the configured order of I and Q of each node, where it is not that of the waveform."""
+    """Return the configured order of I and Q of each node that does not use that of the waveform."""
     nodes = place.campaign.settings.nodes
     orders = {node: nodes[node].iq for (_, node) in place.below(Scope.NODE) if nodes[node].iq is not None}
     return {"iq": orders} if orders else {}
@@ -149,7 +149,7 @@ def log(place: JobPlace) -> Iterable[str]:
 
 
 def transmitted_and_received(place: JobPlace) -> Iterable[str]:
-    """Return the files that an echo is read from, and the calibration that it is corrected by."""
+    """Return the files from which an echo is formed, and the calibration applied to it."""
     campaign, (flight, pair) = place.campaign, place.where
     nodes = list(dict.fromkeys(pair.split("-")))
     if not is_sampled(campaign):
@@ -164,22 +164,22 @@ def transmitted_and_received(place: JobPlace) -> Iterable[str]:
 
 
 def received(place: JobPlace) -> Iterable[str]:
-    """Return the files that the transfer functions of the pairs are formed from, beside what was measured of these."""
+    """Return the files from which the pairs' transfer functions are formed, in addition to stage `echo`."""
     campaign = place.campaign
     samples = (campaign.promised_files(flight, pair.split("-")[1])[-1] for flight, pair in place.pairs)
     return map(campaign.relative, (campaign.sent_file, *samples))
 
 
 def echoes_that_bound_the_scene(place: JobPlace) -> Iterable[str]:
-    """Return the echoes that decide the grid, where the config leaves it open."""
+    """Return the echoes from which an automatic grid is derived; empty for a configured grid."""
     campaign, stated = place.campaign, place.campaign.settings.scene
     first = campaign.image_flights[0]
-    by_flight = "auto" in {stated.crs, stated.spacing_m, stated.bounds_m}
-    return [campaign.manifest("echo", first.name, pair) for pair in first.pairs] if by_flight else []
+    is_automatic = "auto" in {stated.crs, stated.spacing_m, stated.bounds_m}
+    return [campaign.manifest("echo", first.name, pair) for pair in first.pairs] if is_automatic else []
 
 
 def unstaged_positions(place: JobPlace) -> Iterable[str]:
-    """Return the sources of positions of a phase history, which has no stage `track`: flight logs, else echoes."""
+    """Return the sources of positions for phase histories, which have no stage `track`: flight logs, else echoes."""
     campaign = place.campaign
     if is_sampled(campaign):
         return []
@@ -189,17 +189,17 @@ def unstaged_positions(place: JobPlace) -> Iterable[str]:
 
 
 def heights(place: JobPlace) -> Iterable[str]:
-    """Return the files of the DEM and of the geoid."""
+    """Return the files of the DEM and of the geoid grid."""
     return map(place.campaign.relative, place.campaign.height_files().values())
 
 
 def ground_under_air(place: JobPlace) -> Iterable[str]:
-    """Return the files that the height of the ground comes from, where it decides the air."""
+    """Return the files of terrain heights if the refractivity depends on them."""
     return [] if place.campaign.settings.scene.atmosphere == "vacuum" else heights(place)
 
 
 def air(place: JobPlace) -> Mapping[str, Any]:
-    """Return the settings of the air on the paths: of the ground's height no more than matters."""
+    """Return the settings of the atmosphere; the terrain height is rounded to the step that affects it."""
     stated = place.campaign.values["scene"]
     if stated["atmosphere"] == "vacuum":
         return {"scene": {"atmosphere": "vacuum"}}
@@ -217,7 +217,7 @@ def patterns(place: JobPlace) -> Iterable[str]:
 
 
 def autofocused(place: JobPlace) -> Iterable[str]:
-    """Return the settings of images formed by autofocus; empty where it is off."""
+    """Return the sources of autofocus; empty if it is off."""
     if place.campaign.settings.processing.autofocus == "off":
         return []
     stages = [place.campaign.manifest(stage, *pair) for pair in place.pairs for stage in ("echo", "profile")]
@@ -225,25 +225,25 @@ def autofocused(place: JobPlace) -> Iterable[str]:
 
 
 def transmitter_raw(place: JobPlace) -> Iterable[str]:
-    """Return the manifest of what the transmitter recorded."""
+    """Return the manifest of the transmitter's recording."""
     campaign, (flight, pair) = place.campaign, place.where
     return [campaign.manifest("raw", flight, pair.partition("-")[0])] if is_sampled(campaign) else []
 
 
 def truth(place: JobPlace) -> Iterable[str]:
-    """Return the file of true target places of a simulation."""
+    """Return the file of true target positions of a simulation."""
     return ["truth.json"] if (place.campaign.root / "truth.json").is_file() else []
 
 
 def everything_recorded(place: JobPlace) -> Iterable[str]:
-    """Return every file that was recorded."""
+    """Return all recorded files."""
     campaign = place.campaign
     nodes = [(flight.name, node) for flight in campaign.flights for node in flight.nodes]
     return [campaign.relative(path) for at in nodes for path in campaign.raw_files(*at).values()]
 
 
 def config_files(place: JobPlace) -> Iterable[str]:
-    """Return the files of the config that are there."""
+    """Return the existing config files."""
     from apertura.campaign.config import CLOCKS, CONFIG, FLIGHTS, SEGMENTS
 
     files = (CONFIG, FLIGHTS, SEGMENTS, CLOCKS)
@@ -262,7 +262,7 @@ def log_settings(place: JobPlace) -> Mapping[str, Any]:
 
 
 def unstaged_log_settings(place: JobPlace) -> Mapping[str, Any]:
-    """Return the settings for reading the logs of a flight, where no stage `track` holds them."""
+    """Return the settings for reading the logs of a flight, if there is no stage `track`."""
     if is_sampled(place.campaign):
         return {}
     nodes = {at[1]: at for at in place.below(Scope.NODE) if place.campaign.logged(*at)}
@@ -279,7 +279,7 @@ def polarisations(place: JobPlace) -> Mapping[str, Any]:
 
 
 def stated_errors(place: JobPlace) -> Mapping[str, Any]:
-    """Return the configured errors of a flight's logs."""
+    """Return the configured position accuracy of a flight's logs."""
     nodes = place.campaign.values["nodes"]
     return {"position_std_m": {node: nodes[node]["position_std_m"] for (_, node) in place.below(Scope.NODE)}}
 
@@ -295,11 +295,11 @@ def _beams(place: JobPlace) -> Mapping[str, tuple[str, Any]]:
 
 
 _RADIO = frozenset({"antennas", "transmit_power_dbm", "receiver", "amplitude_std_db"})
-"""Settings of a node that its echoes do not depend on."""
+"""Settings of a node that do not affect its echoes."""
 
 
 def radio(place: JobPlace) -> Mapping[str, Any]:
-    """Return the radios of the pairs and what is made of them; nothing where images are relative."""
+    """Return the radios of the pairs and the settings of radiometry; empty if images are relative."""
     from apertura.campaign.config import Receiver, polarisation_of, radio_of
 
     campaign = place.campaign
@@ -319,26 +319,26 @@ def radio(place: JobPlace) -> Mapping[str, Any]:
 
 
 def coefficients(place: JobPlace) -> Mapping[str, Any]:
-    """Return the backscattering coefficients and mean powers to write; empty where none is."""
+    """Return the backscattering coefficients and mean powers to write; empty if there are none."""
     written = place.campaign.coefficients
     return {"radiometry": list(written)} if written else {}
 
 
 def multilook(place: JobPlace) -> Mapping[str, Any]:
-    """Return the settings of power averaging; empty where it is off."""
+    """Return the settings of multilooking; empty if it is off."""
     stated = place.campaign.values["processing"]["multilook"]
     return {"multilook": stated} if stated else {}
 
 
 def noise_of_sums(place: JobPlace) -> Iterable[str]:
-    """Return the manifests of what states the noise of a flight's images, where it is taken off their sums."""
+    """Return the manifests with the noise of a flight's images if it is subtracted from their sums."""
     multilooking = place.campaign.settings.processing.multilook
     subtracted = multilooking is not None and multilooking.subtract_noise
     return [place.campaign.manifest("layers", *pair) for pair in place.pairs] if subtracted else []
 
 
 def measured_image(place: JobPlace) -> Iterable[str]:
-    """Return the image that is calibrated, with what was sent and the file of constants, or averaged; else nothing."""
+    """Return the image if it is calibrated or multilooked, with the transmitted signal and the file of constants."""
     campaign, files = place.campaign, list[Path]()
     if campaign.calibrated:
         files += [campaign.sent_file] if is_sampled(campaign) else []
@@ -348,13 +348,13 @@ def measured_image(place: JobPlace) -> Iterable[str]:
 
 
 def calibration_of_images(place: JobPlace) -> Iterable[str]:
-    """Return the manifests of what states the radiometry of images; nothing where they are relative."""
+    """Return the manifests with the radiometry of images; empty if images are relative."""
     campaign = place.campaign
     return [campaign.manifest("layers", *pair) for pair in place.pairs] if campaign.calibrated else []
 
 
 def pair_settings(place: JobPlace) -> Mapping[str, Any]:
-    """Return the settings of a pair's echo: its nodes and the presence of beams, not their shapes."""
+    """Return the settings of a pair's echo: its nodes, and the presence of beams but not their shapes."""
     campaign, (flight, pair) = place.campaign, place.where
     nodes = {
         node: {key: value for key, value in campaign.values["nodes"][node].items() if key not in _RADIO}
@@ -363,13 +363,13 @@ def pair_settings(place: JobPlace) -> Mapping[str, Any]:
     stated = {
         "beams": sorted(_beams(place)),
         "segments": [list(segment) for segment in campaign.segments_of(flight, pair)],
-        "clocks": [asdict(one) for one in campaign.clocks if one.flight == flight and one.node in nodes],
+        "clocks": [asdict(clock) for clock in campaign.clocks if clock.flight == flight and clock.node in nodes],
     }
     return {"nodes": nodes, **{name: value for name, value in stated.items() if value}}
 
 
 _POINTS = frozenset({"reference_points", "reflectors"})
-"""Settings of the scene that its grid does not depend on."""
+"""Settings of the scene that do not affect its grid."""
 
 
 def grid(place: JobPlace) -> Mapping[str, Any]:
@@ -383,7 +383,7 @@ _AFTER_THE_IMAGE = frozenset({"fusion", "radiometry", "radiometric_calibration",
 
 
 def imaging(place: JobPlace) -> Mapping[str, Any]:
-    """Return all settings of the processing but those of other rules: a new one counts for the image."""
+    """Return all settings of section `processing` except those of other rules; new keys count as image settings."""
     processing = place.campaign.values["processing"]
     return {name: value for name, value in processing.items() if name not in _BEFORE_THE_IMAGE | _AFTER_THE_IMAGE}
 
@@ -394,5 +394,5 @@ def two_images(place: JobPlace) -> Mapping[str, Any]:
 
 
 def charted_pair(place: JobPlace) -> Mapping[str, Any]:
-    """Return the pair that is charted."""
+    """Return the pair of `apertura chart`."""
     return {"pair": list(charted(place.campaign))}
