@@ -86,7 +86,7 @@ class Cost:
 
     @property
     def of_rasters(self) -> bool:
-        """True if a job mainly reads and writes rasters; the run times of such jobs deviate from expected ones alike."""
+        """True if a job mainly reads and writes rasters; run times of such jobs deviate alike from expected ones."""
         return bool(self.mpx_s) and not self.mb_s and not self.mb_mpx_s
 
 
