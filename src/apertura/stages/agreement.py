@@ -56,7 +56,7 @@ def opened_layer(campaign: Campaign, flight: str, pair: str, file: str) -> Itera
     remedy = remake_from(manifest)
     if not path.is_file() or read_manifest(manifest)["files"].get(path.name) != sha256_file(path):
         raise CampaignError(
-            "the file is missing or has changed since it was written",
+            "the file has changed since it was written" if path.is_file() else "no such file",
             path,
             f"the file listed in {manifest.name}",
             remedy,
