@@ -31,12 +31,12 @@ C = SPEED_OF_LIGHT_M_S
         ({"refractivity_n": 1000.0}, "less than or equal to 500"),
         (
             {"refractivity_n": 290.0, "temperature_c": 10.0},
-            "1 of temperature_c, pressure_hpa, relative_humidity beside",
+            "1 of temperature_c, pressure_hpa and relative_humidity are stated in addition to",
         ),
-        ({"temperature_c": 10.0, "pressure_hpa": 950.0}, "give all three"),
+        ({"temperature_c": 10.0, "pressure_hpa": 950.0}, "state all three"),
         ({"temperature_c": 10.0, "pressure_hpa": 95000.0, "relative_humidity": 50.0}, "pressure_hpa"),
         ({"temperature_k": 283.0}, "did you mean 'temperature_c'"),
-        ({}, "give all three"),
+        ({}, "state all three"),
         (290, "atmosphere"),
     ],
 )

@@ -192,7 +192,7 @@ def test_a_log_with_rounded_times_is_flagged_with_how_far_that_moves_its_positio
     edit_track(campaign.root, "a", epochs(lambda table: rounded(table[::3])))
     flags = flags_of(echo_of(campaign))
     assert ("track_times" in flags) is flagged
-    assert not flagged or "positions err by 0.29 m along the flight" in flags["track_times"]
+    assert not flagged or "position errors of 0.29 m along the track" in flags["track_times"]
 
 
 def logged_flags(position, *, damage=""):
@@ -209,7 +209,7 @@ def test_a_log_on_a_coarse_grid_is_flagged_with_how_far_its_positions_err():
     flown = np.stack([5 * time_s, 3 * np.sin(time_s), 5 + np.sin(0.7 * time_s)], -1)
     assert logged_flags(flown) == {}
     flags = logged_flags(np.round(flown / [0.2, 0.1, 0.01]) * [0.2, 0.1, 0.01])
-    assert "a: positions of the log are written so coarsely that they err by 0.065 m" in flags["track_positions"]
+    assert "a: rounded coordinates of the log cause position errors of 0.065 m" in flags["track_positions"]
 
 
 def test_a_damaged_log_is_flagged():
@@ -262,7 +262,7 @@ def test_captures_that_repeat_earlier_ones_are_left_out(tmp_path, node):
     edit_data(Path(str(campaign.root)), node, repeat)
     attrs = echo_of(campaign, f"a-{node}").attrs
     assert attrs["pulses"] == {"used": 32, "dropped": 8, "reasons": {"captures_repeated": 8}}
-    assert attrs["flags"]["captures_repeated"] == f"8 of 40 captures of {node}, the first is number 20"
+    assert attrs["flags"]["captures_repeated"] == f"8 of 40 captures of {node}, first at capture 20"
 
 
 @pytest.mark.slow

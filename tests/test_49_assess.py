@@ -81,7 +81,7 @@ def test_the_summary_says_each_flag_once_and_whole(finished_sample, capsys, tmp_
 
 
 def test_a_sentence_that_several_flags_have_in_common_stands_once_in_the_summary():
-    cause = "4.1 of 4.5 dB come back if the times of the log of uav1 are 0.50 s late"
+    cause = "4.1 of 4.5 dB are explained if the times of the log of uav1 are 0.50 s late"
     lines = {"defocused": f"4.5 dB lost; {cause}", "pairs_apart": f"5 points lie 12 cm apart; {cause}"}
     reports = {"f01 a-a": {"flags": lines}, "f01 a-b": {"flags": {"defocused": f"3.2 dB lost; {cause}"}}}
     console = Console(file=StringIO(), width=200)

@@ -172,7 +172,7 @@ def _hypotheses(
     causes = hypotheses(campaign, flight, brightest=brightest, cell_m=quality["focus"]["cell_m"], focused=sharp)
     cause = "; no single cause explains it"
     if causes:
-        cause = f"; {causes[0]['gain_db']:.1f} of {causes[0]['lost_db']:.1f} dB come back if {causes[0]['what']}"
+        cause = f"; {causes[0]['gain_db']:.1f} of {causes[0]['lost_db']:.1f} dB are explained if {causes[0]['what']}"
     for pair, names in suspicious.items():
         for name in names:
             line = flags[pair].get(name) or images[pair].attrs["flags"][name]

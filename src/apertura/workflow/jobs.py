@@ -13,7 +13,7 @@ from apertura.campaign.folder import Campaign
 from apertura.formats.export import added_exports
 from apertura.workflow.lineage import manifests_below, result_of
 from apertura.workflow.resources import Resources
-from apertura.workflow.rule_inputs import JobPlace, Scope
+from apertura.workflow.rule_inputs import JobScope, Scope
 from apertura.workflow.rules import RESULTS, RULES, Rule
 
 FilesOfJob = Callable[[Any], list[str]]
@@ -60,18 +60,18 @@ class Jobs:
         Results that the campaign does not have are omitted, such as the terrain of a campaign without a DEM.
         """
         row = next(row for row in RESULTS.values() if f"results/{row.manifest}.manifest.json" == manifest)
-        return lambda wildcards: manifests_below(self._place(wildcards, of), row)
+        return lambda wildcards: manifests_below(self._scope(wildcards, of), row)
 
-    def files(self, source: Callable[[JobPlace], Iterable[str]], of: Scope | None = None) -> FilesOfJob:
+    def files(self, source: Callable[[JobScope], Iterable[str]], of: Scope | None = None) -> FilesOfJob:
         """Return the input function of the files of a function in `apertura.workflow.rule_inputs`."""
         root = self.campaign.root
-        return lambda wildcards: [str((root / name).location) for name in source(self._place(wildcards, of))]
+        return lambda wildcards: [str((root / name).location) for name in source(self._scope(wildcards, of))]
 
-    def _place(self, wildcards: Any, of: Scope | None) -> JobPlace:
+    def _scope(self, wildcards: Any, of: Scope | None) -> JobScope:
         """Return the scope of a job: of the given kind, or of the kind that its wildcards imply."""
         named = {name for name in ("flight", "node", "pair", "two") if hasattr(wildcards, name)}
         of = of or next(of for of in Scope if set(of.wildcards) == named)
-        return JobPlace(self.campaign, of, tuple(getattr(wildcards, word) for word in of.wildcards))
+        return JobScope(self.campaign, of, tuple(getattr(wildcards, word) for word in of.wildcards))
 
 
 def added_files(rule: str) -> list[str]:

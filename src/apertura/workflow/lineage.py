@@ -20,7 +20,7 @@ from apertura.common.provenance import code_sha256
 from apertura.core.backprojection.engines import ENGINES
 from apertura.formats.export import EXPORTS, export_modules, exports_in
 from apertura.formats.names import FINDERS, PHASE_HISTORIES, RECORDERS, TRACKS, log_format
-from apertura.workflow.rule_inputs import JobPlace, Scope, SettingSpec, SourceSpec, is_sampled, received
+from apertura.workflow.rule_inputs import JobScope, Scope, SettingSpec, SourceSpec, is_sampled, received
 from apertura.workflow.rules import EVERY, RESULTS, Rule
 
 _READS = "apertura.formats.reading"
@@ -60,16 +60,16 @@ def result_of(campaign: Campaign, result: str, *where: str) -> Result:
         If the campaign does not have the result, such as sums of a flight with one pair.
     """
     rule = RESULTS[result]
-    place = JobPlace(campaign, rule.of, where)
-    if not rule.needed(place):
+    scope = JobScope(campaign, rule.of, where)
+    if not rule.needed(scope):
         raise CampaignError(
             f"no {result} of {' '.join(where) or 'this campaign'}",
             where=campaign.root,
             expected="a result that follows from the campaign's flights and config",
             remedy="`apertura list` lists them.",
         )
-    sources = tuple(dict.fromkeys(source for one in rule.sources for source in _read(place, one)))
-    settings = {name: value for one in rule.settings for name, value in _stated(place, one).items()}
+    sources = tuple(dict.fromkeys(source for one in rule.sources for source in _read(scope, one)))
+    settings = {name: value for one in rule.settings for name, value in _stated(scope, one).items()}
     return Result(_manifest(rule, where), sources, settings, modules_of(campaign, result, *where))
 
 
@@ -109,9 +109,9 @@ def files_read(campaign: Campaign, result: str, *where: str) -> Iterator[str]:
     rule = RESULTS[result]
     yield from result_of(campaign, result, *where).sources
     if rule.forms and is_sampled(campaign):
-        for pair in JobPlace(campaign, rule.of, where).pairs:
+        for pair in JobScope(campaign, rule.of, where).pairs:
             if not reads_kept(campaign, *pair):
-                yield from received(JobPlace(campaign, Scope.PAIR, pair))
+                yield from received(JobScope(campaign, Scope.PAIR, pair))
 
 
 def places(campaign: Campaign, rule: Rule) -> list[tuple[str, ...]]:
@@ -137,7 +137,7 @@ def _places(campaign: Campaign, rule: Rule, kind: str) -> list[tuple[str, ...]]:
 
 
 def _needed(rule: Rule, campaign: Campaign, places: Iterable[tuple[str, ...]]) -> list[tuple[str, ...]]:
-    return [where for where in places if rule.needed(JobPlace(campaign, rule.of, where))]
+    return [where for where in places if rule.needed(JobScope(campaign, rule.of, where))]
 
 
 def _candidates(campaign: Campaign, rule: Rule, kind: str) -> list[tuple[str, ...]]:
@@ -157,24 +157,24 @@ def _manifest(rule: Rule, where: Iterable[str]) -> str:
     return f"results/{name}.manifest.json"
 
 
-def manifests_below(place: JobPlace, rule: Rule) -> list[str]:
+def manifests_below(scope: JobScope, rule: Rule) -> list[str]:
     """Return the manifests of a rule's results within the scope of a job, as far as the campaign has them."""
-    return [_manifest(rule, where) for where in _needed(rule, place.campaign, place.below(rule.of))]
+    return [_manifest(rule, where) for where in _needed(rule, scope.campaign, scope.below(rule.of))]
 
 
-def every_result(place: JobPlace) -> list[str]:
+def every_result(scope: JobScope) -> list[str]:
     """Return the manifests of all results except those written on demand and those that describe all results."""
-    every = _jobs(place.campaign)
-    return [_manifest(rule, where) for rule, where in every if not _describes_all(place.campaign, rule)]
+    every = _jobs(scope.campaign)
+    return [_manifest(rule, where) for rule, where in every if not _describes_all(scope.campaign, rule)]
 
 
-def _read(place: JobPlace, source: SourceSpec) -> Iterable[str]:
+def _read(scope: JobScope, source: SourceSpec) -> Iterable[str]:
     """Return the files and manifests of a row's source for a job."""
     if callable(source):
-        return source(place)
+        return source(scope)
     if source == EVERY:
-        return every_result(place)
-    return manifests_below(place, RESULTS[source])
+        return every_result(scope)
+    return manifests_below(scope, RESULTS[source])
 
 
 def _on_demand(campaign: Campaign, rule: Rule) -> bool:
@@ -185,11 +185,11 @@ def _describes_all(campaign: Campaign, rule: Rule) -> bool:
     return _on_demand(campaign, rule) or EVERY in rule.sources
 
 
-def _stated(place: JobPlace, setting: SettingSpec) -> dict[str, Any]:
+def _stated(scope: JobScope, setting: SettingSpec) -> dict[str, Any]:
     """Return the values of a row's setting for a job, by the last part of the key."""
     if callable(setting):
-        return dict(setting(place))
-    value: Any = place.campaign.values
+        return dict(setting(scope))
+    value: Any = scope.campaign.values
     for word in setting.split("."):
         value = value[word]
     return {setting.rpartition(".")[2]: value}

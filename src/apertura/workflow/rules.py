@@ -160,7 +160,7 @@ class Rule:
     styles: bool = False
     manifest: str = ""
     kinds: tuple[str, ...] = ("image",)
-    needed: Callable[[inputs.JobPlace], bool] = lambda _: True
+    needed: Callable[[inputs.JobScope], bool] = lambda _: True
     on_demand: bool = False
     shares: bool = False
     forms: bool = False
@@ -202,10 +202,10 @@ class Rule:
         >>> RULES["echo"].log, RULES["calibrate"].log, RULES["cube"].log
         ('{flight}/{pair}.echo', '{flight}/calibrate', 'cube')
         """
-        above, _, place = self.folder.rpartition("/")
+        above, _, last = self.folder.rpartition("/")
         if not self.of.wildcards:
             return self.name
-        return f"{above}/{place}.{self.name}" if above else f"{place}/{self.name}"
+        return f"{above}/{last}.{self.name}" if above else f"{last}/{self.name}"
 
     def command_line(self, where: Iterable[str]) -> str:
         """Return the shell command of a job.
@@ -223,7 +223,7 @@ class Rule:
         return " ".join(["apertura step", self.command, *where, *self.last_words])
 
 
-def _workflow(_: inputs.JobPlace) -> Mapping[str, Any]:
+def _workflow(_: inputs.JobScope) -> Mapping[str, Any]:
     from apertura.common.paths import shipped
     from apertura.common.provenance import canonical_json, sha256_text, sha256_tree
 
@@ -353,7 +353,7 @@ _ROWS = (
         _STAGES.scene.terrain,
         sources=("scene", inputs.heights),
         settings=("scene.dem", "scene.dem_datum", "scene.geoid"),
-        needed=lambda place: bool(place.campaign.settings.scene.dem),
+        needed=lambda scope: bool(scope.campaign.settings.scene.dem),
         demand=Demand(500, pixel_bytes=50, pixel_s=10),
     ),
     Rule(

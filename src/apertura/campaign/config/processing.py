@@ -267,7 +267,7 @@ class Air(Section):
         return self.temperature_c, self.pressure_hpa, self.relative_humidity
 
 
-HEIGHT_DEFAULT = "no ground height is configured: scene.height_m is 0 m, the ellipsoid itself"
+HEIGHT_DEFAULT = "no terrain height is configured: scene.height_m is 0 m, the ellipsoid"
 
 
 class Scene(Section):
@@ -334,8 +334,8 @@ class Scene(Section):
     def _datum_is_stated(self) -> Self:
         if self.dem is not None and self.dem_datum is None:
             raise ValueError(
-                "dem is stated without dem_datum, the vertical datum of its heights: state "
-                "ellipsoid, egm96, egm2008, or carried if its CRS defines the datum"
+                "dem is stated without dem_datum, the vertical datum of its heights, which has no default: state "
+                "ellipsoid, egm96, egm2008, or carried if the CRS of the DEM defines the datum"
             )
         if self.dem is None and self.dem_datum is not None:
             raise ValueError(f"dem_datum={self.dem_datum} is stated without dem")
