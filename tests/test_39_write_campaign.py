@@ -155,7 +155,7 @@ def test_a_recording_that_cannot_be_is_named_and_nothing_is_left(tmp_path, chang
         ({"codes": None}, "raw/codes.npy: no such file"),
         ({"transmitter": "uav3"}, "node 'uav3' is not in config/config.yaml: nodes"),
         ({"transmitter": "uav2"}, "uav2.sigmf-meta: no such file"),
-        ({"kind": "picture"}, "kind 'picture' is none of bench, calibration, image"),
+        ({"kind": "picture"}, "unknown kind 'picture', not one of bench, calibration, image"),
         (
             {"config": CONFIG | {"waveform": {"kind": "phase_history", "format": "afrl_mat"}}},
             "waveform.kind phase_history; expected one recorded as samples",

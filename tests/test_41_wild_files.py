@@ -40,7 +40,7 @@ def test_a_folder_whose_name_is_not_utf_8_is_refused_at_once(tiny):
     tiny.rename(named)
     for root in (named, f"{named}/."):
         message = complaint(lambda root=root: Campaign.load(root))
-        assert "a name that is not UTF-8 text; expected the folder and those above it named in UTF-8" in message
+        assert "the path is not UTF-8 text; expected names in UTF-8 of the folder and its parent folders" in message
         assert "LC_ALL=C.UTF-8" in message
         assert [str(problem) for problem in problems(root)] == [message]
         assert message.isprintable()
@@ -87,7 +87,7 @@ def test_comments_and_blank_lines_of_a_table_are_no_rows(tiny, line, first):
         ("f02\timage\tuav1\tuav1\tmore", "5 cells, the last 'more'"),
         ('f02\timage\tuav1\t"uav1', "not readable as a table"),
         ("f02\timage\tuav1\t" + "x" * 200_000, "field larger than field limit"),
-        ("f02\t\x1b[31mred\tuav1\tuav1", r"kind '\x1b[31mred' is none of"),
+        ("f02\t\x1b[31mred\tuav1\tuav1", r"unknown kind '\x1b[31mred', not one of"),
         ("f02\timage\tuav1\t" + "x" * 2000, "xxx…' is not in"),
     ],
 )
@@ -106,7 +106,7 @@ def test_a_wild_line_of_flights_is_named(tiny, line, expected):
 )
 def test_a_segment_at_a_time_that_no_flight_had_is_refused(tiny, time):
     (tiny / "config" / "segments.tsv").write_text(f"flight\tpair\tstart\tend\nf01\tuav1-uav1\t{time}\t{time}\n")
-    assert "is no time" in complaint(lambda: Campaign.load(tiny))
+    assert "is not a valid time" in complaint(lambda: Campaign.load(tiny))
 
 
 # Arrays

@@ -78,7 +78,7 @@ def test_tracks_left_alone_have_no_knots_and_their_images_say_why(finished_tiny)
         "decision": "off: auto: position accuracy of uav1 is not configured; state nodes.<node>.position_std_m to "
         "have them refined",
         "accepted": False,
-        "why": "images are formed from the logs as they are",
+        "why": "images are formed from the unchanged logs",
     }
     assert quality["models"]["autofocus"].startswith("off: auto: position accuracy")
 
@@ -221,7 +221,7 @@ def test_a_reference_point_outside_the_scene_is_told(finished_tiny, tmp_path, by
     (line,) = map(as_line, problems(root))
     assert line.startswith("config/config.yaml: scene.reference_points[0]: corner")
     assert told in line
-    with pytest.raises(CampaignError, match="reference_points are in crs, which is auto"):
+    with pytest.raises(CampaignError, match="positions of reference_points refer to crs, which is auto"):
         state(root, "scene", crs="auto")
 
 

@@ -148,7 +148,9 @@ def test_one_phase_per_pulse_moves_no_node(settings):
     stage = stage_of(accepted=True, further=["uav1-uav1"])
     one = RefinedTrack.of(stage.assign(correction=0 * stage.correction))
     assert isinstance(one.correction, TrackCorrection)
-    assert outcome_of(one).startswith("as logged: one path offset per pulse and pair was refined, which moves no node")
+    assert outcome_of(one).startswith(
+        "as logged: the refinement estimated one path offset per pulse and pair, and no node position"
+    )
     log = refined_log(one, "uav1", track_of(np.zeros((8, 3)), frame="local"), settings)
     assert not log.refined.any()
     assert not log.correction_m.any()

@@ -155,8 +155,8 @@ def test_coefficients_are_products_where_they_are_written():
 
 def test_a_radio_stated_in_parts_is_one_message(tiny):
     message = complaint(lambda: with_radio(tiny, left_out=["receiver"]).load(tiny))
-    assert "nodes.uav1.receiver, nodes.uav2.receiver are not stated" in message
-    assert "of every pair, or of none" in message
+    assert "nodes.uav1.receiver, nodes.uav2.receiver are not configured" in message
+    assert "of every pair, or none of these" in message
 
 
 def test_a_receiver_states_its_full_scale_once(tiny):

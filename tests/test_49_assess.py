@@ -275,7 +275,7 @@ def papers_flight(tmp_path_factory):
 
 
 @pytest.mark.parametrize(
-    ("spacing_m", "reason"), [(0.1, ""), (0.11, "pixels of 0.11 m do not resolve cells of 0.0997 m")]
+    ("spacing_m", "reason"), [(0.1, ""), (0.11, "pixels of 0.11 m do not sample resolution cells of 0.0997 m")]
 )
 def test_pixels_hardly_wider_than_a_cell_are_compared_and_wider_ones_are_named_as_the_reason(spacing_m, reason):
     """A cell of 9.97 cm against pixels of 10 cm is no loss: the band is sampled twice a cycle up to 1.13 cells."""
@@ -322,9 +322,9 @@ def test_a_hypothesis_on_the_height_is_tried_where_its_point_then_lies(monkeypat
     track = np.stack([np.linspace(-5, 5, 64), np.full(64, -30.0), np.full(64, 25.0)], -1)
     found = [SimpleNamespace(history=SimpleNamespace(aperture=Aperture(track, track + [0.0, 4.0, 2.0])))]
     here_m = np.array([1.0, 2.0, 0.0])
-    monkeypatch.setattr(hypotheses, "_ground", lambda *_: here_m)
+    monkeypatch.setattr(hypotheses, "_on_level", lambda *_: here_m)
     scene = SimpleNamespace(axes=np.eye(3))
-    east_m, north_m = hypotheses._moved_by_height(scene, (1.0, 2.0), found, height_m)
+    east_m, north_m = hypotheses._displacement_by_height(scene, (1.0, 2.0), found, height_m)
     there_m = here_m + [east_m, north_m, height_m]
     before, after = (found[0].history.aperture.path(one[None]).mean() for one in (here_m, there_m))
     moved_m = np.hypot(east_m, north_m)

@@ -172,7 +172,7 @@ def test_a_mask_edited_by_hand_is_refused(small, tmp_path):
     mask = root / "results/f02/uav1-uav1/mask.tif"
     mask.write_bytes(mask.read_bytes()[:-1] + b"x")
     told = complaint(lambda: interferogram(Campaign.load(root), NAME))
-    assert "mask.tif: not as it was written" in told
+    assert "mask.tif: the file has changed since it was written" in told
 
 
 @pytest.mark.slow

@@ -180,7 +180,7 @@ def test_results_are_read_where_their_recordings_are_not(finished_tiny, tmp_path
         assert re.findall(r"^(\w+) +(\S+sigmf-data):", out, re.MULTILINE) == [("missing", name) for name in SAMPLES]
         assert "changed" not in out
     elif command in {"check", "summary", "list"} and not makes:
-        assert "not there, so results are not compared with it: raw/f01/uav1.sigmf-" in out
+        assert "missing recordings, not compared with results: raw/f01/uav1.sigmf-" in out
 
 
 @pytest.mark.parametrize("node", ["uav2", "uav9"])

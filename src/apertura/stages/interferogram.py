@@ -79,8 +79,8 @@ def open_two(campaign: Campaign, name: str, scene: OpenScene) -> TwoImages:
     """
     requested = campaign.settings.interferometry
     if name not in requested.pairs:
-        known = ", ".join(requested.pairs)
-        expected = f"one of {known}" if known else "a configured interferogram; none is configured"
+        names = ", ".join(requested.pairs)
+        expected = f"one of {names}" if names else "a configured interferogram; none is configured"
         where = f"{CONFIG}: interferometry.pairs"
         raise CampaignError(f"no interferogram {name!r}", where, expected, "Add it to interferometry.pairs.")
     images = requested.images(name)

@@ -232,7 +232,7 @@ def _stated_tags_ms(campaign: Campaign, pair: OpenPair) -> float | None:
 def _antenna(pair: OpenPair, paths: PointPaths) -> BudgetLine:
     """Return the budget line of the antennas, whose beams weight the pulses; phases of patterns are not corrected."""
     if pair.beams is None:
-        return BudgetLine("antenna", None, NO_EFFECT, "a beam without a phase of its own")
+        return BudgetLine("antenna", None, NO_EFFECT, "a beam pattern without phase")
     beams, point = pair.beams[pair.aperture.sample(MOST_PULSES)], paths.point_m[None]
     phase = beams.phase(paths.aperture, point)
     if phase is None:
