@@ -181,7 +181,7 @@ def test_a_hover_inside_a_flight_is_left_out_unless_segments_say_what_images(tmp
         ingest.ingest(campaign, "f01", node)
     quality = open_stage(echo.echo(campaign, "f01", "uav1-uav2"), "echo").attrs
     assert 100 < quality["pulses"]["reasons"]["hover"] < 240
-    assert "the antennas stood" in quality["flags"]["hover"]
+    assert "platform stationary" in quality["flags"]["hover"]
     segments = "flight\tpair\tstart\tend\nf01\tuav1-uav2\t2025-05-14T09:30:00\t2025-05-14T09:31:00\n"
     (root / "config/segments.tsv").write_text(segments)
     quality = open_stage(echo.echo(Campaign.load(root), "f01", "uav1-uav2"), "echo").attrs

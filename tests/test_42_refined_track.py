@@ -142,7 +142,7 @@ def test_images_of_a_corrected_track_are_those_of_the_true_one(spoilt, finished_
         assert [line for line in quality["budget"] if line["cause"] == "positions"] == [
             {
                 "cause": "positions",
-                "stated": "error remaining after refinement",
+                "stated": "residual error after track refinement",
                 "loss_db": -0.05,
                 "shift_m": 0.01,
                 "phase_rad": 0.1,

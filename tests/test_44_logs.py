@@ -109,7 +109,9 @@ def test_pulses_of_a_float_solution_are_left_out_unless_allowed(tmp_path):
     left_out = dataset.attrs["pulses"]["reasons"]["fix_poor"]
     assert 10 <= left_out <= 12  # 0.6 s of 20 Hz
     assert dataset.sizes["pulse"] == dataset.attrs["pulses"]["used"] == 40 - left_out
-    assert dataset.attrs["flags"]["fix_poor"].startswith(f"b: {left_out} of 40 pulses left out: the log's solution is")
+    assert dataset.attrs["flags"]["fix_poor"].startswith(
+        f"b: {left_out} of 40 pulses excluded: position solution poorer than"
+    )
     assert flags_of(echo_of(campaign, "a-a")) == {}
     edit_config(campaign.root, lambda document: document["nodes"]["b"].update(worst_fix="float"))
     assert echo_of(campaign).attrs["pulses"]["used"] == 40
@@ -126,7 +128,7 @@ def test_a_log_of_a_poor_fix_throughout_is_refused_and_one_without_rtk_is_not(tm
         )
         if refused:
             message = complaint(lambda: echo_of(campaign))
-            assert "no pulse has a position: a: 40 of 40 pulses left out" in message
+            assert "no pulse has a valid position: a: 40 of 40 pulses excluded" in message
             assert "worst_fix" in message
         else:
             assert flags_of(echo_of(campaign)) == {}
@@ -172,7 +174,7 @@ def test_a_log_that_repeats_positions_is_read_through_those_that_are_new(tmp_pat
 
     edit_track(campaign.root, "b", epochs(repeated))
     dataset = echo_of(campaign)
-    assert dataset.attrs["flags"]["track_frozen"].startswith("b: 0 of 40 pulses left out: epochs that repeat")
+    assert dataset.attrs["flags"]["track_frozen"].startswith("b: 0 of 40 pulses excluded: epochs that repeat")
     np.testing.assert_allclose(dataset.rx_position.values, clean, atol=1e-3)
 
 

@@ -250,11 +250,11 @@ def test_a_sum_whose_phase_nothing_tells_says_so_and_that_its_peaks_are_lost(fin
     told = with_longer_path(root, 0.214 / 4)
     assert [*told["fusion"]["phases_rad"]] == list(PAIRS)
     assert "is added with phase 0: it shares nothing with" in told["flags"]["phase_unmeasured"]
-    assert "by a quarter of a turn the peak would be 3 dB lower" in told["flags"]["phase_unmeasured"]
+    assert "peak loss for a phase error of a quarter cycle: 3 dB" in told["flags"]["phase_unmeasured"]
     assert told["coherence"]["mean"] == pytest.approx(0.5, abs=0.15)
     assert "sum_incoherent" in told["flags"]
     assert told["focus"]["verdict"] == "defocused"
-    assert "because the pairs differ in phase" in told["focus"]["why"]
+    assert "from phase differences between pairs" in told["focus"]["why"]
 
 
 def test_a_sum_states_what_it_gained(finished_tiny):
@@ -310,10 +310,10 @@ def test_a_path_of_the_papers_flight_that_is_wrong_is_told_by_phase_or_place(
     root = copy_writable(papers_flight.root, tmp_path / "campaign")
     told = with_longer_path(root, wavelengths * 0.2134)
     line = told["flags"][{"phase": "pairs_out_of_phase", "place": "pairs_apart"}[flag]]
-    assert "do not show which is wrong" in line
+    assert "do not show which pairs are wrong" in line
     assert len(told["fusion"]["left_out"]) == 1
     assert told["fusion"]["ties"] == [[*told["fusion"]["left_out"]]]
-    assert "a tie: " in told["flags"]["pair_left_out"]
+    assert "; tie: " in told["flags"]["pair_left_out"]
 
 
 @pytest.mark.parametrize("height_m", [-3.0, 0.5, 3.0])

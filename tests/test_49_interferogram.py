@@ -110,7 +110,7 @@ def test_every_product_lies_there_with_its_tags(small):
         _, transform, tags, told = read(small, name)
         assert told == unit
         assert transform.a == 0.125
-        assert tags["APERTURA_LEVEL"].startswith("heights count from mark 0 and mark 1")
+        assert tags["APERTURA_LEVEL"].startswith("heights relative to mark 0 and mark 1")
         assert json.loads(tags["APERTURA_FLAGS"]) == report["flags"]
         spec = json.loads(tags["APERTURA_RUNSPEC"])
         assert spec["images"] == report["images"]

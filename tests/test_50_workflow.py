@@ -216,7 +216,7 @@ def test_what_an_input_replaced_under_its_old_time_overtakes_is_made_again_and_n
     untouched = (root / "results/f01/uav1-uav1/profile.zarr/zarr.json").stat().st_mtime_ns
     code, output = run()
     assert code == 0, output
-    assert "results/f01/uav2/track.manifest.json: stale, raw/f01/uav2.track.pos has changed" in output
+    assert "results/f01/uav2/track.manifest.json: out of date, raw/f01/uav2.track.pos has changed" in output
     assert (root / "results/f01/uav1-uav1/profile.zarr/zarr.json").stat().st_mtime_ns == untouched
     assert stale_results(Campaign.load(root)) == {}
     assert "Nothing to be done" in run("-n")[1]
