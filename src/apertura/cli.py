@@ -491,7 +491,7 @@ def bench(
 def reflectors(
     campaign: CampaignFolder = HERE,
     to: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="output file, default: calibration.json in that folder")
+        Path | None, typer.Option(metavar="FILE", help="output file, default: calibration.json in the campaign folder")
     ] = None,
 ) -> None:
     """Measure each pair's calibration constant at reflectors of known cross-section, for use in later campaigns."""
