@@ -372,7 +372,7 @@ def test_a_second_run_says_who_holds_the_campaign(tiny):
     for second in (apertura("run", tiny), snakemake(tiny)):
         code, output = finished(second)
         assert code != 0
-        assert "another run holds this campaign: process" in output
+        assert "the campaign is locked by another run: process" in output
         assert "Traceback" not in output
     assert "Building DAG" in finished(snakemake(tiny, "-n"))[1]
     run.terminate()
