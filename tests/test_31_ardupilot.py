@@ -176,7 +176,7 @@ def test_lines_of_a_text_log_that_are_no_messages_are_counted(tmp_path):
     path.write_bytes(b"\n".join([*lines[:100], b"@@@@@,,", *lines[100:]]))
     track = read_track(path, node="a")
     assert track.attrs["damage"].startswith("2 of ")
-    assert "lines are no messages, in 2 places, from line 101 on" in track.attrs["damage"]
+    assert "lines are not valid messages, in 2 blocks, from line 101 on" in track.attrs["damage"]
     assert track.sizes["epoch"] == 59
 
 
@@ -240,8 +240,8 @@ def numbered(rows):
 @pytest.mark.parametrize(
     ("suffix", "data", "found"),
     [
-        (".bin", b"", "a flight log of kind '.bin'"),
-        (".log", b"GPS, 1, 2\n" * 50, "a flight log of kind '.log'"),
+        (".bin", b"", "a flight log with suffix '.bin'"),
+        (".log", b"GPS, 1, 2\n" * 50, "a flight log with suffix '.log'"),
         (".log", b"FMT\n" * 50, "no FMT message at its beginning"),
         (".log", b"FMT, 1\n" * 50, "no GPS message"),
         (".bin", dataflash([]), "no GPS message"),

@@ -87,7 +87,7 @@ def test_a_reader_that_crashes_is_one_message_that_names_the_signal(tmp_path, mo
     (tmp_path / "broken.py").write_text("import ctypes\n\ndef read(path):\n    ctypes.string_at(0)\n")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     (tmp_path / "a.mat").write_bytes(b"x")
-    with pytest.raises(UnreadableError, match="its reader died of SIGSEGV") as caught:
+    with pytest.raises(UnreadableError, match="its reader was terminated by SIGSEGV") as caught:
         read_isolated(Lazy("broken").read, [tmp_path / "a.mat"])
     assert caught.value.path == tmp_path / "a.mat"
 

@@ -169,7 +169,7 @@ def test_epochs_behind_foreign_bytes_are_read_and_the_bytes_are_counted(tmp_path
     assert apart_m(track).max() < 0.02
     stated = len(foreign) + lost * size - len(SYNC) * foreign.endswith(SYNC)
     assert track.attrs["damage"] == track.attrs["remarks"][0]
-    assert track.attrs["damage"].startswith(f"{stated} of {len(data) + len(foreign)} bytes are no messages")
+    assert track.attrs["damage"].startswith(f"{stated} of {len(data) + len(foreign)} bytes are not valid messages")
 
 
 def _last_message(data):

@@ -179,5 +179,5 @@ def test_the_name_of_a_flight_leads_nowhere_else(tmp_path, name):
 def test_nothing_is_written_over(tmp_path):
     made = write(tmp_path / "c")
     before = contents(made)
-    assert "something is there already" in complaint(lambda: write(tmp_path / "c"))
+    assert "already exists and is not an empty folder" in complaint(lambda: write(tmp_path / "c"))
     assert contents(made) == before

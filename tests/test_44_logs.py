@@ -215,7 +215,7 @@ def test_a_log_on_a_coarse_grid_is_flagged_with_how_far_its_positions_err():
 def test_a_damaged_log_is_flagged():
     time_s = np.arange(400) * 0.1
     flown = np.stack([5 * time_s, 3 * np.sin(time_s), 5 + np.sin(0.7 * time_s)], -1)
-    found = "259 of 6873 bytes are no messages, from byte 2602 on; epochs there are lost"
+    found = "259 of 6873 bytes are not valid messages, from byte 2602 on; their epochs are lost"
     assert logged_flags(flown, damage=found) == {"track_log_damaged": f"a: {found}"}
 
 

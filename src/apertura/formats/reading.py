@@ -1,7 +1,7 @@
-"""Recorders and flight logs: bytes in, `raw`, `track` or `echo` out; one file and one row of `names` per format.
+"""Reading of recordings, flight logs and phase histories as stages `raw`, `track` and `echo`.
 
-Readers are imported when a file of theirs is read. The code hash of a result whose code imports this module holds the
-readers that the campaign's files name.
+Each format has one file and one row in `names`. Readers are imported when they are first used; the code hash of a
+result covers the readers of the campaign's files only.
 """
 
 from collections.abc import Mapping, Sequence
@@ -24,7 +24,7 @@ def open_recording(files: Sequence[Path]) -> "Recording":
     Parameters
     ----------
     files
-        In the order of a row of `RECORDERS`.
+        Files in the order of a row of `RECORDERS`.
     """
     names = [file.name for file in files]
     row = next(row for row in RECORDERS if len(row) == len(names) and names[0].endswith(row[0]))
@@ -33,12 +33,12 @@ def open_recording(files: Sequence[Path]) -> "Recording":
 
 
 def read_track(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -> "xr.Dataset":
-    """Return the `track` stage of a flight log.
+    """Read a flight log as `track` stage.
 
     Raises
     ------
     CampaignError
-        If no reader knows the file, or the log is not what its format promises.
+        If no format matches the file, or the log violates its format.
     """
     track: xr.Dataset = TRACKS[log_format(path, options)].reader(path, node=node, options=options)
     return track
@@ -47,20 +47,20 @@ def read_track(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -> "x
 def read_phase_history(
     kind: str, paths: Sequence[Path], *, pair: str, described: Mapping[str, Any] = MappingProxyType({})
 ) -> "xr.Dataset":
-    """Return the `echo` stage of phase-history files.
+    """Read phase-history files as `echo` stage.
 
     Parameters
     ----------
     kind
         A key of `PHASE_HISTORIES`.
     paths
-        The files, joined in this order.
+        The files, concatenated in this order.
     pair
         Transmitter-receiver.
     described
-        The waveform of the config, for formats that do not state it.
+        Waveform section of the config, for formats that do not contain the waveform.
     """
     row = PHASE_HISTORIES[kind]
-    further = {"described": described} if row.described else {}
-    echo: xr.Dataset = row.reader(paths, pair=pair, **further)
+    options = {"described": described} if row.described else {}
+    echo: xr.Dataset = row.reader(paths, pair=pair, **options)
     return echo
