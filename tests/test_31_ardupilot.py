@@ -120,7 +120,7 @@ def test_several_receivers_are_listed_with_their_solutions(tmp_path, suffix):
         for name, row in dataflash_rows(receivers=(0, 1))
     ]
     track = read(tmp_path, rows, suffix=suffix)
-    found = "the log holds 0 (single 60) and 1 (fix 60); 0 is read: set nodes.a.log.body to choose"
+    found = "the log contains receivers 0 (single 60) and 1 (fix 60); 0 is used: select with nodes.a.log.body"
     assert track.attrs["remarks"] == [found]
     assert "remarks" not in read(tmp_path, rows, suffix=suffix, options=LogOptions(body="1")).attrs
 
@@ -224,7 +224,7 @@ def test_an_epoch_that_is_not_where_the_velocities_lead_is_left_out(tmp_path):
         for n, (name, v) in numbered(dataflash_rows())
     ]
     track = read(tmp_path, moved)
-    assert track.attrs["dropped"] == {"not where the receiver's velocity leads": 1}
+    assert track.attrs["dropped"] == {"position contradicts the receiver's velocity": 1}
     assert apart_m(track).max() < 0.02
 
 
@@ -242,7 +242,7 @@ def numbered(rows):
     [
         (".bin", b"", "a flight log with suffix '.bin'"),
         (".log", b"GPS, 1, 2\n" * 50, "a flight log with suffix '.log'"),
-        (".log", b"FMT\n" * 50, "no FMT message at its beginning"),
+        (".log", b"FMT\n" * 50, "no FMT message at the start of the file"),
         (".log", b"FMT, 1\n" * 50, "no GPS message"),
         (".bin", dataflash([]), "no GPS message"),
         (".log", dataflash_text([]), "no GPS message"),

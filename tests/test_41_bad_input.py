@@ -103,7 +103,9 @@ def test_a_doubled_epoch_is_named(tiny):
 
 def test_an_unsorted_log_is_named(tiny):
     edit_track(tiny, "uav1", lambda lines: [*lines[:10], *lines[12:14], *lines[10:12]])
-    assert "an earlier time" in complaint(lambda: ingest.ingest(Campaign.load(tiny), "f01", "uav1"))
+    assert "is before that of the previous epoch" in complaint(
+        lambda: ingest.ingest(Campaign.load(tiny), "f01", "uav1")
+    )
 
 
 def test_a_lever_arm_without_attitude_is_refused(tiny):

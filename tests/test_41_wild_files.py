@@ -329,7 +329,7 @@ LOGS = {
     ),
     "px4: two logs joined by cat": (
         "a.track.ulg", ulog(("sensor_gps", 0, ulog_receiver())) * 2, {},
-        "another log begins at byte 3821: separate logs that were joined",
+        "a second log starts at byte 3821: separate concatenated logs",
     ),
     "px4: encrypted": ("a.track.ulg", b"ULogEnc\x01" + bytes(4000), {}, "not readable (Invalid file format"),
     "ardupilot: a page of zeros before the first message": (

@@ -30,7 +30,7 @@ FINDERS: Mapping[tuple[str, ...], Callable[..., Any]] = {
 GROWING: Mapping[tuple[str, ...], Callable[..., Any]] = {
     (".sigmf-meta", ".sigmf-data"): _RECORDINGS.sigmf.GrowingSigmf,
 }
-"""Row of `RECORDERS` that is readable while it is written → class(*files) whose read() returns the complete captures."""
+"""Row of `RECORDERS` that is readable while it is written → class(*files) whose read() returns complete captures."""
 
 
 class LogFormat(NamedTuple):
