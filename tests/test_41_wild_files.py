@@ -457,19 +457,19 @@ RECORDINGS = {
     ),
     "npy: frames × receivers × samples": ("beat_npy", "npy", saved(BEATS[:, None]), "of shape (9, 1, 88)"),
     "npy: complex samples where waveform.iq is real": (
-        "beat_npy", "npy", saved(BEATS.astype(complex)), "complex128 samples where waveform.iq is real",
+        "beat_npy", "npy", saved(BEATS.astype(complex)), "complex128 samples, but waveform.iq is real",
     ),
     "mat: version 4": ("beat_mat", "mat", matlab("4", beat=BEATS), 9),
     "mat: times as days of MATLAB": (
         "beat_mat", "mat", matlab(beat=BEATS, time=739_751.4 + np.arange(9) * 0.01 / 86400),
-        "times as days of MATLAB (datenum); expected seconds since 1970",
+        "times in days (MATLAB datenum); expected seconds since 1970",
     ),
-    "mat: a table in place of the structure": ("afrl_mat", "mat", matlab(data=BEATS), "no structure called data"),
+    "mat: a table in place of the structure": ("afrl_mat", "mat", matlab(data=BEATS), "no structure data"),
     "mat: phase history in single precision, positions whole": (
         "afrl_mat", "mat", gotcha(fp=np.ones((8, 5), np.complex64), x=np.arange(7000, 7005, dtype=np.int16)), 5,
     ),
     "mat: frequencies that descend": (
-        "afrl_mat", "mat", gotcha(freq=9.4e9 - 1e6 * np.arange(8.0)), "frequencies that do not rise in equal steps",
+        "afrl_mat", "mat", gotcha(freq=9.4e9 - 1e6 * np.arange(8.0)), "frequencies that do not increase in equal steps",
     ),
     "wav: 24 bits, extensible header": ("beat_wav", "wav", of_24_bits(sound("i4")), 9),
     "wav: floats": ("beat_wav", "wav", sound("f4"), 9),

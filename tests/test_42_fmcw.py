@@ -165,5 +165,5 @@ def test_missing_sweeps_are_counted_and_flagged(tmp_path):
     beat[60:100] = 0
     np.save(root / "raw/f01/uav1.npy", beat)
     attrs = recorded_echo(Campaign.load(root), "f01", "uav1-uav1").attrs
-    assert attrs["pulses"] == {"used": 160, "dropped": 40, "reasons": {"silent": 40}}
+    assert attrs["pulses"] == {"used": 160, "dropped": 40, "reasons": {"all samples zero": 40}}
     assert set(attrs["flags"]) == {"pulses_missing"}
