@@ -194,8 +194,8 @@ def changed(**changes):
         ({"TxPos": (4, np.nan)}, "TxPos is not a number at index [4, 0]"),
         ({"RcvPos": (4, 10.0)}, "rx_position of pulse 4 is 17 m from the Earth's centre (1 such pulses)"),
         ({"TxTime": (4, 0.0)}, "pulse 4 is not later than the previous pulse"),
-        ({"SCSS": (6, 1.0001e6)}, "frequencies (SC0, SCSS) of pulse 6 are 3900 Hz from those of the first"),
-        ({"SC0": (6, 9.001e9)}, "frequencies (SC0, SCSS) of pulse 6 are 1e+06 Hz from those of the first"),
+        ({"SCSS": (6, 1.0001e6)}, "frequencies (SC0, SCSS) of pulse 6 differ by 3900 Hz from those of the first"),
+        ({"SC0": (6, 9.001e9)}, "frequencies (SC0, SCSS) of pulse 6 differ by 1e+06 Hz from those of the first"),
         ({"SCSS": -1e6}, "fewer than two samples between FX1 and FX2"),
         ({"FX1": 1e10, "FX2": 1.1e10}, "fewer than two samples between FX1 and FX2"),
         ({"SIGNAL": np.zeros(PULSES)}, "no pulse with SIGNAL 1"),
@@ -214,7 +214,8 @@ def test_times_that_contradict_the_positions_are_flagged(tmp_path):
     pvp, _ = changed(RcvPos=(4, SRP + away * (1 + 50.0 / np.linalg.norm(away))))
     flag = read(write(tmp_path / "rx.cphd", pvp, signal)).attrs["flags"]["reference_point"]
     assert flag == (
-        "RcvTime - TxTime of pulse 4 is 1.67e-07 s from the delay of its reference point, 50 m of path (1 of 12 pulses)"
+        "RcvTime - TxTime of pulse 4 differs by 1.67e-07 s from the delay of its reference point, 50 m of path "
+        "(1 of 12 pulses)"
     )
     tropo = {"RcvTime": pvp["RcvTime"] + 8e-8}  # 24 m: a path through the whole atmosphere
     assert read(write(tmp_path / "b.cphd", {**right, **tropo}, signal)).attrs["flags"] == {}

@@ -103,9 +103,9 @@ def without(name):
     ("fields", "how", "expected"),
     [
         (arrays(), {"frame": "wgs84"}, "frame is 'wgs84', not 'ecef' or 'local'"),
-        (arrays(), {"units": "seconds since 1970-01-01"}, "units 'seconds since 1970-01-01' of time"),
+        (arrays(), {"units": "seconds since 1970-01-01"}, "units of time are 'seconds since 1970-01-01'"),
         (without("reference_delay"), {}, "reference_delay"),
-        (without("rx_position"), {}, "tx_position alone"),
+        (without("rx_position"), {}, "tx_position without the position of the other antenna"),
         (nan_at("transfer", 3, 7), {}, "transfer is not a number at index [3, 7]"),
         (nan_at("rx_position", 2, 1), {}, "rx_position is not a number at index [2, 1]"),
         (nan_at("path_limit", 2), {}, "a path_limit that is not positive"),
@@ -117,7 +117,7 @@ def without(name):
             {},
             "rx_position is float64 of shape (9, 2)",
         ),
-        (arrays() | {"reference_delay": np.zeros(PULSES - 1)}, {}, "reference_delay has 8 along pulse"),
+        (arrays() | {"reference_delay": np.zeros(PULSES - 1)}, {}, "reference_delay has length 8 along pulse"),
         (
             arrays() | {"frequency": np.geomspace(1e9, 2e9, SUBCARRIERS)},
             {},

@@ -177,7 +177,7 @@ def test_channels_are_interleaved_per_sample_and_captures_become_pulses(tmp_path
 
 
 def test_time_tags_that_run_backwards_are_refused(tmp_path):
-    with pytest.raises(CampaignError, match="capture 1 is tagged"):
+    with pytest.raises(CampaignError, match="capture 1 has time tag"):
         recording(tmp_path, np.ones((10, 1, 2)), [capture(0, 5), capture(5, 1)], **{"apertura:channels": ["radar"]})
 
 
@@ -427,7 +427,7 @@ def test_metadata_that_are_not_sigmf_are_refused_by_key(tmp_path, change, expect
 def test_metadata_that_are_not_json_are_refused(tmp_path):
     (tmp_path / "a.sigmf-meta").write_text('{"global": ')
     (tmp_path / "a.sigmf-data").write_bytes(b"1234")
-    with pytest.raises(CampaignError, match="not valid SigMF: no JSON: parse error"):
+    with pytest.raises(CampaignError, match="not valid SigMF: invalid JSON: parse error"):
         open_recording((tmp_path / "a.sigmf-meta", tmp_path / "a.sigmf-data"))
 
 

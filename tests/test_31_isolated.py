@@ -48,8 +48,8 @@ def test_arrays_come_back_from_the_process_as_they_were(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "expected"),
     [
-        ({"fp": "text"}, "field data.fp holds <U"),
-        ({"x": "text"}, "field data.x holds <U"),
+        ({"fp": "text"}, "field data.fp is <U"),
+        ({"x": "text"}, "field data.x is <U"),
         ({"z": np.zeros(0)}, "field data.z is float64 of shape"),
         ({"fp": np.zeros((0, 0))}, "field data.fp"),
         ({"r0": None}, "no field data.r0"),
@@ -58,7 +58,7 @@ def test_arrays_come_back_from_the_process_as_they_were(tmp_path):
         ({"freq": np.linspace(-9e9, -8e9, LINES)}, "do not increase in equal steps"),
         ({"x": np.full(PULSES, 1e300)}, "x reaches 1e+300"),
         ({"fp": np.full((LINES, PULSES), 1e200)}, "fp is not a number"),
-        ({"freq": {"a": 1.0}}, "field data.freq holds object"),
+        ({"freq": {"a": 1.0}}, "field data.freq is object"),
     ],
 )
 def test_a_field_that_is_not_what_it_should_be_is_named(tmp_path, changes, expected):

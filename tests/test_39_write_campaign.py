@@ -124,7 +124,7 @@ def test_samples_and_logs_may_lie_in_files(tmp_path):
         ({"samples": "nowhere.iq"}, "nowhere.iq: no such file"),
         ({"samples": NODE.samples.reshape(-1, 1, 2)[:-1]}, "71 samples, 3 captures; expected captures of equal length"),
         ({"time_utc": TAGS[:2]}, "2 time tags, 3 starts and 2 frame numbers"),
-        ({"time_utc": TAGS[::-1]}, "capture 1 is tagged 2025-05-14T09:30:02.5"),
+        ({"time_utc": TAGS[::-1]}, "capture 1 has time tag 2025-05-14T09:30:02.5"),
         ({"time_utc": ["yesterday"] * 3}, "time_utc: 'yesterday' is no time"),
         ({"time_utc": [f"{tag}+02:00" for tag in TAGS]}, "time_utc: '2025-05-14T09:30:01+02:00' is no time"),
         ({"time_utc": np.array(["3025-05-14"] * 3, "datetime64[s]")}, "is not between 1980 and 2199"),

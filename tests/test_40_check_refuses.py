@@ -93,7 +93,7 @@ SPOILT = {
     "no sidelink": (metadata("uav2", apertura_channels=["radar", "spare"]), "a channel named 'sidelink'"),
     "another rate": (metadata("uav2", core_sample_rate=1e9), "recorded with sample_rate_hz"),
     "no pulse in a segment": (segment, "no pulse of flight f01, pair uav1-uav1 inside"),
-    "a tag twice": (lambda root: edit_meta(root, "uav2", tag_twice), "not after the one before"),
+    "a tag twice": (lambda root: edit_meta(root, "uav2", tag_twice), "not after the previous capture"),
     "a DEM beside the track": (dem_beside_the_track, "under the track, where scene.bounds_m: auto starts from"),
 }
 

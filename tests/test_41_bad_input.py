@@ -374,4 +374,4 @@ def test_a_recording_that_ends_while_it_is_read_is_an_error_and_no_signal(tiny):
     with file.path.open("r+b") as stream:
         stream.truncate(4 * (whole - 2))
     message = complaint(lambda: file.read(whole - 5, whole))
-    assert f"uav1.sigmf-data: ends at sample {whole - 2}, while it is read" in message
+    assert f"uav1.sigmf-data: the file ends at sample {whole - 2}, truncated while it was read" in message

@@ -211,7 +211,7 @@ def described(meta, **changes):
         ("capture", {"core:datetime": "99999-01-01T00:00:00Z"}, "is no time"),
         ("capture", {"core:datetime": "2300-01-01T00:00:00Z"}, "is not between 1980 and 2199"),
         ("capture", {"core:datetime": "1600-01-01T00:00:00Z"}, "is not between 1980 and 2199"),
-        ("global", {"core:offset": 1}, "capture 0: core:sample_start 0; expected no sample before core:offset 1"),
+        ("global", {"core:offset": 1}, "capture 0: core:sample_start 0; expected at least core:offset 1"),
         ("global", {"core:extensions": [{"name": "packed", "version": "1", "optional": False}]}, "requires 'packed'"),
         ("capture", {"core:datetime": "nowZ"}, "is no time"),
         ("capture", {"core:datetime": "NaTZ"}, "is no time"),
@@ -659,8 +659,8 @@ SIGMF = {
     "time tags with an offset": (
         {"1.core:datetime": "2025-05-14T11:30:01+02:00"}, str.encode, "captures.1.core:datetime: ",
     ),
-    "metadata in UTF-16": ({}, lambda text: text.encode("utf-16"), "not valid SigMF: no JSON"),
-    "metadata cut off": ({}, lambda text: text[:-40].encode(), "not valid SigMF: no JSON"),
+    "metadata in UTF-16": ({}, lambda text: text.encode("utf-16"), "not valid SigMF: invalid JSON"),
+    "metadata cut off": ({}, lambda text: text[:-40].encode(), "not valid SigMF: invalid JSON"),
     "captures that are not sorted": ({"2.core:sample_start": 8}, str.encode, "capture 1 holds -8 samples"),
     "real samples without an intermediate frequency": (
         {"global.core:datatype": "ri16_le"}, str.encode, "core:datatype ri16_le without apertura:if_hz",

@@ -202,7 +202,9 @@ def _check(history: History, first: History, expected: str) -> None:
         radius = np.linalg.norm(getattr(history, name), axis=1)
         bad = np.flatnonzero(history.used & ((radius < _EARTH_M[0]) | (radius > _EARTH_M[1])))
         if bad.size:
-            found = f"{name} of pulse {bad[0]} is {radius[bad[0]]:.0f} m from the Earth's centre ({bad.size} such pulses)"
+            found = (
+                f"{name} of pulse {bad[0]} is {radius[bad[0]]:.0f} m from the Earth's centre ({bad.size} such pulses)"
+            )
             raise refused(found, history.path, expected)
 
 
