@@ -54,7 +54,7 @@ def test_a_byte_order_mark_and_the_line_ends_of_windows_change_nothing(tmp_path)
         (BOMB, "line 6, column 30: more than 100000 values"),
         ("[" * 200_000, f"line 1, column {DEEPEST + 1}: nested more than {DEEPEST} levels deep"),
         ("- " * 200_000, "nested more than"),
-        ("a: &a [*a]", "for itself"),
+        ("a: &a [*a]", "no complete node before it"),
         ("a: *b", "alias 'b'"),
         ("x: " + "9" * 5000, "an integer of 5000 digits"),
         ("a: !!python/object/apply:os.system [touch x]", "instead of a plain value"),

@@ -236,7 +236,7 @@ def test_a_solution_that_was_filtered_backward_is_turned_round(tmp_path, caplog)
     track = read(tmp_path, "\n".join([*heading, *lines[: len(heading) - 1 : -1]]) + "\n")
     np.testing.assert_array_equal(track.time.values, TIMES)
     np.testing.assert_allclose(track.position.values, ECEF, atol=1e-5, rtol=0)
-    assert "times descend" in track.remarks[0]
+    assert "times decrease" in track.remarks[0]
     read_track(tmp_path / "a.track.pos", node="a")
     assert caplog.text.count("times descend") == 1  # a command may read it for each of its checks
 
@@ -250,7 +250,7 @@ def test_dates_of_a_week_number_that_rolled_over_are_remarked(tmp_path, weeks, l
 
 def test_a_header_and_a_config_that_disagree_on_time_are_refused(tmp_path):
     text = logs.solution(TIMES, PLACES, LLH, system="GPST")
-    assert "times are GPST; expected what config.yaml says" in complaint(
+    assert "times are GPST; expected nodes.a.log.time_system of config.yaml" in complaint(
         lambda: read(tmp_path, text, time_system="utc")
     )
     assert read(tmp_path, text, time_system="gpst").sizes["epoch"] == 40
