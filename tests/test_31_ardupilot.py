@@ -17,13 +17,13 @@ from apertura.core.geometry.track_checks import check_track
 from apertura.formats.reading import read_track
 from apertura.formats.tracks.ardupilot import track_of
 from apertura.formats.tracks.dataflash_fields import read_fields
-from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions
+from apertura.formats.tracks.log_options import DEFAULT_OPTIONS, LogOptions
 
 SECOND = np.timedelta64(1, "s")
 KINDS = {".bin": dataflash, ".log": dataflash_text}
 
 
-def read(tmp_path, rows, *, suffix=".bin", options=AS_IT_SAYS, forms=None):
+def read(tmp_path, rows, *, suffix=".bin", options=DEFAULT_OPTIONS, forms=None):
     path = tmp_path / f"a.track{suffix}"
     path.write_bytes(KINDS[suffix](rows, forms))
     return check(read_track(path, node="a", options=options), "track")
@@ -277,7 +277,7 @@ def read_damaged(path, data):
     except Exception:
         return None
     try:
-        return check(track_of(fields, node="a", options=AS_IT_SAYS, where=path), "track")
+        return check(track_of(fields, node="a", options=DEFAULT_OPTIONS, where=path), "track")
     except CampaignError:
         return None
 

@@ -238,7 +238,7 @@ def test_a_solution_that_was_filtered_backward_is_turned_round(tmp_path, caplog)
     np.testing.assert_allclose(track.position.values, ECEF, atol=1e-5, rtol=0)
     assert "times decrease" in track.remarks[0]
     read_track(tmp_path / "a.track.pos", node="a")
-    assert caplog.text.count("times descend") == 1  # a command may read it for each of its checks
+    assert caplog.text.count("times decrease") == 1  # a command may read it for each of its checks
 
 
 @pytest.mark.parametrize(("weeks", "later"), [(1024, 1024), (2048, 2048), (0, 0)])

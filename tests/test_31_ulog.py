@@ -28,7 +28,7 @@ from apertura.common.errors import CampaignError
 from apertura.core.geometry.geodesy import ecef_from_geodetic, geodetic_from_ecef
 from apertura.core.geometry.track_checks import check_track
 from apertura.formats.reading import read_track
-from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions
+from apertura.formats.tracks.log_options import DEFAULT_OPTIONS, LogOptions
 from apertura.formats.tracks.px4_ulog import track_of
 from apertura.formats.tracks.ulog_fields import read_fields
 
@@ -38,7 +38,7 @@ SECOND = np.timedelta64(1, "s")
 WIDE = {"time_utc_usec": "<Q", "fix_type": "<B"}
 
 
-def read(tmp_path, *topics, options=AS_IT_SAYS, **more):
+def read(tmp_path, *topics, options=DEFAULT_OPTIONS, **more):
     path = tmp_path / "a.track.ulg"
     path.write_bytes(ulog(*topics, **more))
     return check(read_track(path, node="a", options=options), "track")
@@ -355,7 +355,7 @@ def read_damaged(path, data):
     except Exception:
         return None
     try:
-        return check(track_of(fields, node="a", options=AS_IT_SAYS, where=path), "track")
+        return check(track_of(fields, node="a", options=DEFAULT_OPTIONS, where=path), "track")
     except CampaignError:
         return None
 

@@ -142,7 +142,7 @@ def test_no_words_of_a_narrow_map_are_cut(monkeypatch, tmp_path):
 def test_several_flights_have_a_legend_off_the_data_and_whole_numbers_of_pairs(monkeypatch, tmp_path):
     several = [covered(f"f{number // 5:02d}", np.roll(RING, number, axis=1)) for number in range(40)]
     _, words, figure = drawn(monkeypatch, tmp_path, several)
-    assert "seen by 40 pairs of 8 flights" in " ".join(words)
+    assert "covered by 40 pairs of 8 flights" in " ".join(words)
     (legend,) = figure.legends
     figure.canvas.draw()
     box = legend.get_window_extent()

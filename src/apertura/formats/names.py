@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 from apertura.common.atomic import naming
 from apertura.common.errors import CampaignError, quoted
 from apertura.common.lazy import Lazy
-from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions
+from apertura.formats.tracks.log_options import DEFAULT_OPTIONS, LogOptions
 
 _RECORDINGS = Lazy("apertura.formats.recordings")
 _TRACKS = Lazy("apertura.formats.tracks")
@@ -124,7 +124,7 @@ def recording_files(folder: Path, node: str) -> tuple[Path, ...]:
     return tuple(folder / f"{node}{suffix}" for suffix in row)
 
 
-def log_format(path: Path, options: LogOptions = AS_IT_SAYS) -> str:
+def log_format(path: Path, options: LogOptions = DEFAULT_OPTIONS) -> str:
     """Determine the format of a log, a key of `TRACKS`: as configured, otherwise by suffix and heading.
 
     Raises

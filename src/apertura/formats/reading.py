@@ -10,7 +10,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from apertura.formats.names import PHASE_HISTORIES, RECORDERS, TRACKS, log_format
-from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions
+from apertura.formats.tracks.log_options import DEFAULT_OPTIONS, LogOptions
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -32,7 +32,7 @@ def open_recording(files: Sequence[Path]) -> "Recording":
     return opened
 
 
-def read_track(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -> "xr.Dataset":
+def read_track(path: Path, *, node: str, options: LogOptions = DEFAULT_OPTIONS) -> "xr.Dataset":
     """Read a flight log as `track` stage.
 
     Raises

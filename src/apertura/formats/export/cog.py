@@ -76,7 +76,7 @@ class Band:
     smooth: bool = False
 
 
-SLC = Band("complex64", np.nan, "1", "{amplitude}, complex, carrier kept", "AVERAGE_MAGPHASE")
+SLC = Band("complex64", np.nan, "1", "{amplitude}, complex, with carrier phase", "AVERAGE_MAGPHASE")
 MAGNITUDE = Band("float32", np.nan, "1", "{amplitude}", "AVERAGE")
 POWER = Band("float32", np.nan, "1", "{power}, linear", "AVERAGE")
 

@@ -13,7 +13,7 @@ from apertura.common.errors import CampaignError, quoted
 from apertura.common.units import seconds_since
 from apertura.formats.times import utc_times
 from apertura.formats.tracks.csv_track import cut_off, numbers, read_table
-from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions
+from apertura.formats.tracks.log_options import DEFAULT_OPTIONS, LogOptions
 from apertura.formats.tracks.track import contradicted, make_track, remarked, unstated
 
 _CLOCK, _UTC = "time(millisecond)", "datetime(utc)"
@@ -44,7 +44,7 @@ _SETTING = "Set the date format of the AirData account to YYYY-MM-DD and 24 hour
 _EXPECTED = f"AirData's CSV: {_CLOCK}, {_UTC}, {', '.join(_PLACE)}, altitude_above_seaLevel, {', '.join(_ATTITUDE)}"
 
 
-def read_airdata(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -> xr.Dataset:
+def read_airdata(path: Path, *, node: str, options: LogOptions = DEFAULT_OPTIONS) -> xr.Dataset:
     """Read a DJI flight exported by AirData, at 10 Hz, as `track` stage.
 
     datetime(utc) contains whole seconds, or whole minutes if a spreadsheet saved the export, truncated: UTC is the

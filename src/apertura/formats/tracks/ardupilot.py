@@ -16,7 +16,7 @@ from apertura.formats.tracks import dataflash_fields
 from apertura.formats.tracks.autopilot import Attitude, Epochs, autopilot_track
 from apertura.formats.tracks.damage import damage_of
 from apertura.formats.tracks.dataflash_fields import COLUMNS, DAMAGE, NEEDED
-from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions
+from apertura.formats.tracks.log_options import DEFAULT_OPTIONS, LogOptions
 from apertura.formats.tracks.track import FIXES, damaged, receivers_remark, remarked
 
 Fields = Mapping[str, NDArray[Any]]
@@ -33,7 +33,7 @@ _LOWEST_M = -1e6  # an unknown AEl is logged as the lowest integer
 _EXPECTED = f"an ArduPilot DataFlash log whose GPS messages contain {', '.join(NEEDED)}"
 
 
-def read_ardupilot(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -> xr.Dataset:
+def read_ardupilot(path: Path, *, node: str, options: LogOptions = DEFAULT_OPTIONS) -> xr.Dataset:
     """Read a DataFlash log as `track` stage; its attribute `source` states the receiver used and all receivers.
 
     Receiver 0 is used, or the receiver with the number ``options.body``. GPS week and milliseconds are converted to UTC

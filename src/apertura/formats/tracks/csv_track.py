@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from apertura.common.errors import CampaignError, quoted
 from apertura.common.leap_seconds import GPS_EPOCH, utc_from_gps
 from apertura.formats.times import LEAP_SECOND, in_leap_second
-from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions
+from apertura.formats.tracks.log_options import DEFAULT_OPTIONS, LogOptions
 from apertura.formats.tracks.track import (
     FIXES,
     GGA_KINDS,
@@ -236,7 +236,7 @@ class _Log(NamedTuple):
     options: LogOptions
 
 
-def read_csv_track(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -> xr.Dataset:
+def read_csv_track(path: Path, *, node: str, options: LogOptions = DEFAULT_OPTIONS) -> xr.Dataset:
     """Read a CSV flight log as `track` stage.
 
     Its columns, or those that options.columns maps to them, are

@@ -48,5 +48,5 @@ class LogOptions:
     height_offset_m: float | None = None
 
 
-AS_IT_SAYS = LogOptions()
+DEFAULT_OPTIONS = LogOptions()
 """Default options, for a log that contains all information."""

@@ -14,7 +14,7 @@ from pynmea2 import NMEASentence, ParseError
 from apertura.common.errors import CampaignError, quoted
 from apertura.formats.times import LEAP_SECOND, utc_times
 from apertura.formats.tracks.csv_track import LARGEST_LOG, number
-from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions
+from apertura.formats.tracks.log_options import DEFAULT_OPTIONS, LogOptions
 from apertura.formats.tracks.track import (
     FIXES,
     GGA_KINDS,
@@ -71,7 +71,7 @@ class _Log:
     others: Counter[str] = field(default_factory=Counter)
 
 
-def read_nmea(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -> xr.Dataset:
+def read_nmea(path: Path, *, node: str, options: LogOptions = DEFAULT_OPTIONS) -> xr.Dataset:
     """Read an NMEA 0183 log of any talkers as `track` stage.
 
     Positions, solution types and geoid separation are those of GGA: ellipsoidal height is altitude plus separation. The

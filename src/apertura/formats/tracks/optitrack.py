@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from apertura.common.documents import read_text
 from apertura.common.errors import CampaignError, quoted
 from apertura.formats.tracks.csv_track import LARGEST_LOG, number
-from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions
+from apertura.formats.tracks.log_options import DEFAULT_OPTIONS, LogOptions
 from apertura.formats.tracks.track import make_track, start_time, unstated
 
 _METRES = {"meters": 1.0, "centimeters": 0.01, "millimeters": 0.001}
@@ -27,7 +27,7 @@ _NED_FROM_MOTIVE = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]
 """Rows are north, east and down; for a body forward, right and down: as defined, a body is level and faces north."""
 
 
-def read_optitrack(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -> xr.Dataset:
+def read_optitrack(path: Path, *, node: str, options: LogOptions = DEFAULT_OPTIONS) -> xr.Dataset:
     """Read a rigid body of a motion capture as `track` stage; options.body selects one of several bodies.
 
     Frame 'local': east is Motive's x, north its −z, up its y. Attitude is that of axes forward, right, down that were

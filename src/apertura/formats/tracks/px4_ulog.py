@@ -14,7 +14,7 @@ from apertura.formats.isolated import UnreadableError, read_isolated
 from apertura.formats.tracks import ulog_fields
 from apertura.formats.tracks.autopilot import Attitude, Epochs, autopilot_track, clock_of
 from apertura.formats.tracks.damage import damage_of
-from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions
+from apertura.formats.tracks.log_options import DEFAULT_OPTIONS, LogOptions
 from apertura.formats.tracks.track import FIXES, damaged, receivers_remark, remarked
 from apertura.formats.tracks.ulog_fields import ATTITUDE, CORRUPT, DAMAGE, DELAY, DROPOUTS, FUSED, RECEIVERS
 
@@ -39,7 +39,7 @@ _SCALES = {"lat": 1e-7, "lon": 1e-7, "alt": 1e-3, "alt_ellipsoid": 1e-3}
 _EXPECTED = f"a PX4 ULog with positions in {', '.join((*RECEIVERS, FUSED))}"
 
 
-def read_px4_ulog(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -> xr.Dataset:
+def read_px4_ulog(path: Path, *, node: str, options: LogOptions = DEFAULT_OPTIONS) -> xr.Dataset:
     """Read a PX4 ULog as `track` stage; its attribute `source` states the topic and instance used.
 
     The source is vehicle_gps_position if logged, otherwise sensor_gps: the solution of the receiver for its antenna, at

@@ -17,7 +17,7 @@ from apertura.common.leap_seconds import GPS_EPOCH, gps_from_utc, utc_from_gps
 from apertura.core.geometry.geodesy import ecef_from_geodetic, ned_axes
 from apertura.formats.times import LEAP_SECOND, coarsened, in_leap_second, utc_times
 from apertura.formats.tracks.csv_track import LARGEST_LOG, number
-from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions
+from apertura.formats.tracks.log_options import DEFAULT_OPTIONS, LogOptions
 from apertura.formats.tracks.track import FIXES, contradicted, make_track, unstated
 
 _POSITIONS = {
@@ -63,7 +63,7 @@ class _Header(NamedTuple):
     base: list[str]
 
 
-def read_rtklib_pos(path: Path, *, node: str, options: LogOptions = AS_IT_SAYS) -> xr.Dataset:
+def read_rtklib_pos(path: Path, *, node: str, options: LogOptions = DEFAULT_OPTIONS) -> xr.Dataset:
     """Read an RTKLIB solution, or several in one file with separate headers, as `track` stage.
 
     A header states whether times are GPST, UTC or JST (as calendar dates or week and seconds), and whether positions
