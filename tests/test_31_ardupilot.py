@@ -204,7 +204,7 @@ def test_kinds_of_solution_are_kept_and_epochs_without_any_are_counted(tmp_path)
 @pytest.mark.usefixtures("reader")
 def test_epochs_before_the_receiver_knew_the_week_are_counted(tmp_path):
     weeks = np.where(np.arange(60) < 9, 0, 2366)
-    assert read(tmp_path, dataflash_rows(GWk=weeks)).attrs["dropped"] == {"no time of the receiver": 9}
+    assert read(tmp_path, dataflash_rows(GWk=weeks)).attrs["dropped"] == {"no UTC from the receiver": 9}
     message = complaint(lambda: read(tmp_path, dataflash_rows(GWk=np.zeros(60, int))))
     assert "no epoch has a time in UTC" in message
     assert "nodes.a.log.start_utc" in message

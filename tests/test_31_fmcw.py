@@ -201,7 +201,7 @@ def test_a_click_beside_the_pulses_is_no_trigger():
         ({"time": 1.7e9 + np.arange(8) / 128}, "sweep 1 starts 0.0078125 s after"),
         ({"time": np.r_[0.0:7, np.nan]}, "time 7 is not between 1970 and 2199"),
         ({"time": np.arange(8) * 10**18}, "time 1 is not between"),
-        ({"time": np.arange(8.0) * 1j}, "times as complex128"),
+        ({"time": np.arange(8.0) * 1j}, "array of times is complex128"),
         ({"time": None}, "no sweep times"),
         ({"beat": None}, "no variable beat"),
     ],

@@ -107,7 +107,7 @@ def test_of_two_talkers_the_one_of_all_systems_is_taken_and_what_is_said_twice_c
         lines += [logs.gga(time, place + [1e-4, 0, 0], talker="GP"), logs.gga(time, place)]
     track = read(tmp_path, "\n".join([*lines, lines[-1]]) + "\n")
     np.testing.assert_allclose(track.position.values, ecef_from_geodetic(*PLACES.T), atol=2e-5, rtol=0)
-    assert track.dropped == {"of another talker": 40, "duplicate": 1}
+    assert track.dropped == {"from another talker": 40, "duplicate": 1}
     other = logs.gga(TIMES[0], PLACES[0] + [1e-3, 0, 0])
     assert "two positions of talker GN" in complaint(lambda: read(tmp_path, "\n".join([*lines, other]) + "\n"))
 
@@ -184,7 +184,7 @@ def test_a_sentence_that_no_receiver_sends_is_one_message(tmp_path, old, new):
     assert old in bodies[at]
     bodies[at] = bodies[at].replace(old, new, 1)
     message = complaint(lambda: read(tmp_path, "\n".join(map(logs.sealed, bodies)) + "\n"))
-    assert re.search(r"a\.track\.nmea: sentence '.*GGA", message)
+    assert re.search(r"a\.track\.nmea: invalid sentence '.*GGA", message)
     assert message.isprintable()
 
 

@@ -241,7 +241,7 @@ def test_accuracies_that_no_receiver_states_are_not_kept(tmp_path):
 @pytest.mark.usefixtures("reader")
 def test_epochs_without_utc_and_those_logged_twice_are_counted(tmp_path):
     receiver = ulog_receiver(time_utc_usec=np.where(np.arange(60) < 7, 0, ulog_receiver()["time_utc_usec"][1]))
-    assert read(tmp_path, (GPS, 0, receiver)).attrs["dropped"] == {"no time of the receiver": 7}
+    assert read(tmp_path, (GPS, 0, receiver)).attrs["dropped"] == {"no UTC from the receiver": 7}
     twice = {name: (kind, np.repeat(values, 2)) for name, (kind, values) in ulog_receiver().items()}
     track = read(tmp_path, (GPS, 0, twice))
     assert track.attrs["dropped"] == {"duplicate": 60}

@@ -48,7 +48,7 @@ MEASURED: dict[str, Row] = {
         for kind in ("pair", "flight")
         for name, meaning in _OF_COHERENCE.items()
     },
-    "coherent_noise_floor": (_FLIGHTS, "float64", "dB", "median power of the coherent sum against its peak"),
+    "coherent_noise_floor": (_FLIGHTS, "float64", "dB", "median power of the coherent sum relative to its peak"),
     "clutter_reduction": (_FLIGHTS, "float64", "dB", "clutter of the images relative to that of their coherent sum"),
 }
 """Quantities measured while the rasters are written."""

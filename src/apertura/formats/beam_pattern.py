@@ -54,11 +54,11 @@ def _samples(cut: pd.DataFrame, name: str) -> Samples:
     if not all(np.isfinite(values).all() for values in (angle, gain, phase) if values is not None):
         raise ValueError(f"the {name} cut contains a cell that is not a number")
     if np.abs(gain).max() > _LARGEST_DB:
-        raise ValueError(f"a gain of {gain[np.abs(gain).argmax()]:g} dB in the {name} cut")
+        raise ValueError(f"a gain of {gain[np.abs(gain).argmax()]:g} dB in the {name} cut, beyond ±{_LARGEST_DB:g} dB")
     if not (np.diff(angle) > 0).all():
         raise ValueError(f"angles of the {name} cut do not increase")
     if angle[0] < -limit or angle[-1] > limit:
         raise ValueError(f"angles of the {name} cut range from {angle[0]:g}° to {angle[-1]:g}°, beyond ±{limit:g}°")
     if phase is not None and np.abs(phase).max() > _LARGEST_DEG:
-        raise ValueError(f"a phase of {phase[np.abs(phase).argmax()]:g}° in the {name} cut")
+        raise ValueError(f"a phase of {phase[np.abs(phase).argmax()]:g}° in the {name} cut, beyond ±{_LARGEST_DEG:g}°")
     return angle, gain, phase

@@ -179,7 +179,7 @@ def _mapped(path: Path, fields: dict[str, NDArray[Any]]) -> NDArray[Any]:
     start += int(fields["block"])
     name = str(fields["format"])
     if name not in _FORMATS:
-        raise _error(f"samples of format {name!r}", path)
+        raise _error(f"samples of format {name!r}, not {', '.join(_FORMATS)}", path)
     kind = np.dtype(_FORMATS[name])
     shape = (pulses, count) if kind.kind == "c" else (pulses, count, 2)
     if (

@@ -254,7 +254,7 @@ def beginning(described: Mapping[str, Any], path: Path) -> np.datetime64:
 def _times(stored: NDArray[Any], path: Path) -> Times:
     known = stored.dtype.kind in "fiu" or (stored.dtype.kind == "M" and stored.dtype != np.dtype("M8"))
     if not known or stored.ndim != 1 or not stored.size:
-        raise _error(f"times as {stored.dtype} of shape {stored.shape}", path)
+        raise _error(f"array of times is {stored.dtype} of shape {stored.shape}", path)
     if stored.dtype.kind != "M":
         with np.errstate(invalid="ignore", over="ignore"):  # NaN becomes NaT and is rejected below
             seconds = stored.astype(np.float64)

@@ -267,7 +267,7 @@ def autopilot_track(
     epochs = without(~np.isfinite(epochs.geodetic.sum(axis=1)), "no ellipsoidal height")
     if epochs.time_utc.size and np.isnat(epochs.time_utc).all():
         epochs = replace(epochs, time_utc=_counted(epochs.boot_s, options, node, where))
-    epochs = without(np.asarray(np.isnat(epochs.time_utc)), "no time of the receiver")
+    epochs = without(np.asarray(np.isnat(epochs.time_utc)), "no UTC from the receiver")
     epochs = without(_repeated(epochs), "duplicate")
     angles = None
     if epochs.boot_s.size:

@@ -407,7 +407,8 @@ def _iso(cells: "pd.Series[str]") -> NDArray[np.datetime64]:
 def _counted(seconds: NDArray[np.float64], log: _Log) -> NDArray[np.datetime64]:
     """Convert seconds since the configured time zero, or since the GPS epoch, to UTC."""
     if not (np.abs(seconds) <= _LONGEST_S).all():
-        raise ValueError(f"a time of {seconds[~(np.abs(seconds) <= _LONGEST_S)][0]:g} s in column time_s")
+        wrong_s = seconds[~(np.abs(seconds) <= _LONGEST_S)][0]
+        raise ValueError(f"a time of {wrong_s:g} s in column time_s, beyond ±{_LONGEST_S:g} s")
     elapsed = np.round(seconds * 1e9).astype("timedelta64[ns]")
     if log.options.time_system == "gpst" and log.options.start_utc is None:
         return utc_from_gps(GPS_EPOCH + elapsed)

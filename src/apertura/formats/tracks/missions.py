@@ -94,7 +94,7 @@ def _items(mission: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
         else:
             inside = item.get("TransectStyleComplexItem", item).get("Items", [])
             if not inside:
-                raise ValueError(f"a {item.get('complexItemType', 'complex item')} without its transects")
+                raise ValueError(f"{item.get('complexItemType', 'complex item')} without transects")
             yield from _items({"items": inside})
 
 

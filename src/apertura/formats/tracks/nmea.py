@@ -153,7 +153,7 @@ def _complete(text: str, checksum: bytes | None, log: _Log, *, ended: bool) -> I
         try:
             yield NMEASentence.parse(f"${text}{checksum.decode()}", check=bool(checksum))
         except ParseError as error:
-            raise _error(f"sentence {quoted(text, 100)}", log.path) from error
+            raise _error(f"invalid sentence {quoted(text, 100)}", log.path) from error
 
 
 def _time_of_day(text: str) -> int | None:
@@ -162,7 +162,7 @@ def _time_of_day(text: str) -> int | None:
         return None
     match = _TIME.fullmatch(text)
     if not match:
-        raise ValueError(f"time {quoted(text, 40)}")
+        raise ValueError(f"invalid time {quoted(text, 40)}")
     hour, minute, second = (int(match[part]) for part in (1, 2, 3))
     return (hour * 3600 + minute * 60 + second) * _SECOND_NS + int((match[4] or "").ljust(9, "0"))
 
@@ -211,7 +211,7 @@ def _take(sentence: Any, log: _Log) -> None:
     except (ValueError, IndexError) as error:
         if isinstance(error, CampaignError):
             raise
-        raise _error(f"sentence {quoted(str(sentence), 100)} ({error})", log.path) from error
+        raise _error(f"invalid sentence {quoted(str(sentence), 100)} ({error})", log.path) from error
 
 
 def _nearest(of_day: int, log: _Log) -> int:
@@ -247,7 +247,7 @@ def _keep(now: int, fix: _Fix, log: _Log) -> None:
         log.fixes[now] = fix
         log.order.append(now)
     elif other.talker != fix.talker:
-        log.dropped["of another talker"] += 1
+        log.dropped["from another talker"] += 1
         log.fixes[now] = fix if fix.talker == "GN" else other
     elif other == fix:
         log.dropped["duplicate"] += 1

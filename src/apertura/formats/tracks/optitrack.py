@@ -132,7 +132,7 @@ def _numbers(
     values = np.array(rows).reshape(-1, len(columns))
     beyond = np.flatnonzero(~(np.abs(values[:, 0]) < 1e6))
     if beyond.size:
-        raise _error(f"a time of {values[beyond[0], 0]:g} s", path)
+        raise _error(f"a time of {values[beyond[0], 0]:g} s, beyond ±1e6 s", path)
     return values[:, 0], values[:, 1:]
 
 

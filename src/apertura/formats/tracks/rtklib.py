@@ -186,7 +186,7 @@ def _header(lines: list[str], path: Path, first: int) -> _Header:
         raise _error(f"no header line{position} with {columns}", path)
     kind, names = _kind(heading), _CELLS.split(heading.strip("% \t"))
     if names[0] not in {"GPST", "UTC", "JST"}:
-        raise _error(f"time system {quoted(names[0])}", path)
+        raise _error(f"unknown time system {quoted(names[0])}", path)
     doubled = [name for name in names if names.count(name) > 1]
     if doubled:
         raise _error(f"repeated column {quoted(doubled[0], 40)}", path)
@@ -285,7 +285,7 @@ def _time(first: str, second: str) -> str | np.datetime64:
         return f"{first.replace('/', '-')}T{second}"
     week, seconds = number(first), number(second)
     if not (0 <= week <= _LAST_WEEK and 0 <= seconds < _WEEK_S and week.is_integer()):
-        raise ValueError(f"week {first} and second {second}")
+        raise ValueError(f"invalid week {first} or second {second}")
     return GPS_EPOCH + np.timedelta64(7 * int(week), "D") + np.timedelta64(round(seconds * 1e9), "ns")
 
 
@@ -335,13 +335,13 @@ def _base(header: _Header, options: LogOptions, *, node: str, where: Path) -> ND
         whole = [number(cell) for cell in cells]
         angles = whole if len(cells) == 3 else [_angle(cells[:3]), _angle(cells[3:6]), *whole[6:]] if whole else []
     except ValueError as error:
-        raise _error(f"ref pos {quoted(' '.join(cells), 60)}", where) from error
+        raise _error(f"invalid ref pos {quoted(' '.join(cells), 60)}", where) from error
     geodetic = angles or options.base
     if not geodetic:
         found = "baselines without the position of their base (ref pos)"
         raise unstated("base", found, node=node, where=where)
     if len(geodetic) != 3 or not (abs(geodetic[0]) <= 90 and abs(geodetic[1]) <= 360 and abs(geodetic[2]) < 1e5):
-        raise _error(f"ref pos {quoted(' '.join(cells), 60)}", where)
+        raise _error(f"invalid ref pos {quoted(' '.join(cells), 60)}", where)
     base = ecef_from_geodetic(*np.array(geodetic, np.float64))
     if options.base and np.linalg.norm(base - ecef_from_geodetic(*np.array(options.base))) > _SAME_BASE_M:
         raise contradicted("base", f"ref pos {' '.join(cells)}", node=node, where=where)
@@ -367,7 +367,7 @@ def _fix(quality: NDArray[np.float64], path: Path) -> NDArray[np.int8]:
     kinds = np.nan_to_num(quality, nan=0.0)
     wrong = np.flatnonzero(~np.isin(kinds, range(10)))
     if wrong.size:
-        raise _error(f"Q {kinds[wrong[0]]:g} in solution {int(wrong[0])}", path)
+        raise _error(f"invalid Q {kinds[wrong[0]]:g} in solution {int(wrong[0])}", path)
     return np.asarray(kinds, np.int8)
 
 

@@ -66,8 +66,9 @@ def read_fields(path: Path) -> dict[str, NDArray[Any]]:
             fields.setdefault(f"{topic.name}:{topic.multi_id}/{name}", []).append(values)
     arrays = {name: np.concatenate(parts) for name, parts in fields.items()}
     for name, values in arrays.items():
-        if values.size != arrays.get(f"{name.partition('/')[0]}/timestamp", values[:0]).size:
-            raise ValueError(f"{name} has {values.size} values, the timestamp of its topic another number")
+        timestamps = arrays.get(f"{name.partition('/')[0]}/timestamp", values[:0]).size
+        if values.size != timestamps:
+            raise ValueError(f"{name} has {values.size} values, but its topic {timestamps} timestamps")
     delay = log.initial_parameters.get(DELAY)
     return {
         **arrays,
