@@ -132,7 +132,7 @@ def write_csv_log(
     attitude_rad: NDArray[np.float64] | None,
     *,
     local: bool = False,
-    further: Mapping[str, NDArray[Any]] = MappingProxyType({}),
+    extra_columns: Mapping[str, NDArray[Any]] = MappingProxyType({}),
 ) -> None:
     """Write a flight log as .csv with the column names of `read_csv_track`.
 
@@ -146,7 +146,7 @@ def write_csv_log(
         (epoch, 3) float64: roll, pitch, yaw (clockwise from north); None: not logged. NaN is written as an empty cell.
     local
         True if positions are metres to east, north and up in the campaign's local frame.
-    further
+    extra_columns
         Additional columns: name → (epoch,); integers and text unchanged, floats to 10 µm, NaN as an empty cell.
     """
     axes = ("east_m", "north_m", "up_m") if local else ("latitude_deg", "longitude_deg", "height_m")
@@ -161,8 +161,8 @@ def write_csv_log(
         attitude_deg = np.degrees(attitude_rad)
         attitude_deg[:, 2] %= 360
         cells += [[_cell(value, 4) for value in column] for column in attitude_deg.T]
-    columns += further
-    cells += [[_cell(value, 5) for value in column.tolist()] for column in further.values()]
+    columns += extra_columns
+    cells += [[_cell(value, 5) for value in column.tolist()] for column in extra_columns.values()]
     lines = [",".join(columns), *map(",".join, zip(*cells, strict=True))]
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 

@@ -185,7 +185,7 @@ def write_csv(path: Path, log: RefinedLog) -> None:
             log.position_m if log.local else log.geodetic,
             None if np.isnan(attitude).all() else attitude,
             local=log.local,
-            further=columns,
+            extra_columns=columns,
         )
 
 

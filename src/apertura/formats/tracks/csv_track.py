@@ -223,7 +223,7 @@ _POSITIONS: dict[Literal["geodetic", "ecef", "local"], list[str]] = {
 _ATTITUDE = ["roll_deg", "pitch_deg", "yaw_deg"]
 _STD = ["std_north_m", "std_east_m", "std_up_m"]
 _QUALITY = "quality"
-_OURS = (*_TIMES, *(name for names in _POSITIONS.values() for name in names), *_ATTITUDE, *_STD, _QUALITY)
+_STANDARD = (*_TIMES, *(name for names in _POSITIONS.values() for name in names), *_ATTITUDE, *_STD, _QUALITY)
 _ZONE = r":[^:]*(?:Z|[+-]\d\d(?::?\d\d)?)$"
 _LONGEST_S = 4e9
 
@@ -318,27 +318,27 @@ def _scaled(table: pd.DataFrame, names: list[str], log: _Log) -> NDArray[np.floa
 def _table(log: _Log) -> pd.DataFrame:
     """Read the table with standard column names; ValueError if names are missing or ambiguous."""
     mapped = dict(log.options.columns)
-    for key, table_of in (("columns", mapped), ("scales", log.options.scales)):
-        unknown = [name for name in table_of if name not in _OURS]
+    for key, mapping in (("columns", mapped), ("scales", log.options.scales)):
+        unknown = [name for name in mapping if name not in _STANDARD]
         if unknown:
             raise CampaignError(
                 f"column {quoted(unknown[0])}",
                 f"config.yaml: nodes.{log.node}.log.{key}",
-                f"one of {', '.join(_OURS)}",
+                f"one of {', '.join(_STANDARD)}",
                 "Use column names of apertura as keys, and column names of the log as values."
                 if key == "columns"
                 else "Use column names of apertura as keys, and factors as values.",
             )
-    theirs = [mapped.get(name, name) for name in _OURS]
+    log_columns = [mapped.get(name, name) for name in _STANDARD]
     texts = [mapped.get(name, name) for name in ("time_utc", "time", "quality")]
-    table = read_table(log.path, list(mapped.values()), optional=theirs, texts=texts)
+    table = read_table(log.path, list(mapped.values()), optional=log_columns, texts=texts)
     doubled = [name for name in mapped if name in table.columns and name not in mapped.values()]
     if doubled:
         raise ValueError(
             f"column {doubled[0]} in addition to {quoted(mapped[doubled[0]])}, which config.yaml maps to {doubled[0]}"
         )
-    ours = {name: table[column] for name, column in zip(_OURS, theirs, strict=True) if column in table}
-    renamed = pd.DataFrame(ours)
+    standard = {name: table[column] for name, column in zip(_STANDARD, log_columns, strict=True) if column in table}
+    renamed = pd.DataFrame(standard)
     renamed.attrs["heading"] = [str(column) for column in table.columns]
     return renamed
 
