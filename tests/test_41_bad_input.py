@@ -45,7 +45,7 @@ def test_truncated_samples_are_noticed_by_their_captures(tiny):
     path = tiny / "raw" / "f01" / "uav1.sigmf-data"
     path.write_bytes(path.read_bytes()[:-4000])
     message = complaint(lambda: ingest.ingest(Campaign.load(tiny), "f01", "uav1"))
-    assert "holds 3000 samples" in message
+    assert "contains 3000 samples" in message
     assert "expected 4000" in message
     assert nothing_half_written(tiny)
 
@@ -98,7 +98,7 @@ def test_a_doubled_epoch_is_named(tiny):
     edit_track(tiny, "uav1", lambda lines: [*lines[:10], lines[9], *lines[10:]])
     message = complaint(lambda: ingest.ingest(Campaign.load(tiny), "f01", "uav1"))
     assert "epoch 9" in message
-    assert "the same time" in message
+    assert "is equal to that of the previous epoch" in message
 
 
 def test_an_unsorted_log_is_named(tiny):

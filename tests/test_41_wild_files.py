@@ -106,7 +106,7 @@ def test_a_wild_line_of_flights_is_named(tiny, line, expected):
 )
 def test_a_segment_at_a_time_that_no_flight_had_is_refused(tiny, time):
     (tiny / "config" / "segments.tsv").write_text(f"flight\tpair\tstart\tend\nf01\tuav1-uav1\t{time}\t{time}\n")
-    assert "is no time" in complaint(lambda: Campaign.load(tiny))
+    assert "is not a time" in complaint(lambda: Campaign.load(tiny))
 
 
 # Arrays
@@ -195,26 +195,26 @@ def described(meta, **changes):
     ("place", "changes", "expected"),
     [
         ("global", {"apertura:channels": 3}, "global.apertura:channels: "),
-        ("global", {"apertura:channels": ["radar", "radar"]}, "each its own"),
-        ("global", {"core:sample_rate": float("inf")}, "no JSON: "),
+        ("global", {"apertura:channels": ["radar", "radar"]}, "one unique name per channel"),
+        ("global", {"core:sample_rate": float("inf")}, "invalid JSON: "),
         ("global", {"core:sample_rate": 1e308}, "core:sample_rate: "),
         ("global", {"core:sample_rate": 1e-3}, "core:sample_rate: "),
         ("global", {"apertura:channels": ["radar", "\x1b[2J"]}, "apertura:channels.1: "),
-        ("global", {"core:num_channels": 2**70}, "no JSON: parse error: integer overflow"),
+        ("global", {"core:num_channels": 2**70}, "invalid JSON: parse error: integer overflow"),
         ("global", {"core:datatype": "\x1b[2J"}, r"core:datatype '\x1b[2J'"),
-        ("capture", {"apertura:frame": float("nan")}, "no JSON: "),
+        ("capture", {"apertura:frame": float("nan")}, "invalid JSON: "),
         ("capture", {"apertura:frame": "text"}, "apertura:frame: "),
         ("capture", {"apertura:frame": 2**62}, "captures.3.apertura:frame: "),
         ("capture", {"core:sample_start": 2**62}, "captures.3.core:sample_start: "),
-        ("capture", {"core:sample_start": 10**400}, "no JSON: "),
-        ("capture", {"core:frequency": float("nan")}, "no JSON: "),
-        ("capture", {"core:datetime": "99999-01-01T00:00:00Z"}, "is no time"),
+        ("capture", {"core:sample_start": 10**400}, "invalid JSON: "),
+        ("capture", {"core:frequency": float("nan")}, "invalid JSON: "),
+        ("capture", {"core:datetime": "99999-01-01T00:00:00Z"}, "is not a time"),
         ("capture", {"core:datetime": "2300-01-01T00:00:00Z"}, "is not between 1980 and 2199"),
         ("capture", {"core:datetime": "1600-01-01T00:00:00Z"}, "is not between 1980 and 2199"),
         ("global", {"core:offset": 1}, "capture 0: core:sample_start 0; expected at least core:offset 1"),
         ("global", {"core:extensions": [{"name": "packed", "version": "1", "optional": False}]}, "requires 'packed'"),
-        ("capture", {"core:datetime": "nowZ"}, "is no time"),
-        ("capture", {"core:datetime": "NaTZ"}, "is no time"),
+        ("capture", {"core:datetime": "nowZ"}, "is not a time"),
+        ("capture", {"core:datetime": "NaTZ"}, "is not a time"),
         ("capture", {"core:datetime": "2025-02-30T00:00:00Z"}, "core:datetime: "),
     ],
 )
@@ -321,7 +321,7 @@ LOGS = {
         {}, ECEF,
     ),
     "csv: hemispheres behind degrees": (
-        *csv_log(*(row.replace(",9.9", "E,9.9") for row in PLAIN)), {}, "in column latitude_deg: '48.4",
+        *csv_log(*(row.replace(",9.9", "E,9.9") for row in PLAIN)), {}, "column latitude_deg: '48.4",
     ),
     "csv: seconds of GPS week alone": (
         *csv_log(*(f"{293418 + n}{row[30:]}" for n, row in enumerate(PLAIN)), heading=CSV.replace("utc", "s")), {},
@@ -340,7 +340,7 @@ LOGS = {
     ),
     "airdata: saved by a German spreadsheet": (
         "a.track.csv", logs.airdata(TIMES, PLACES).replace(",", ";").replace(".", ","), {"height_offset_m": 48.0},
-        "cells between semicolons",
+        "are separated by semicolons",
     ),
     "airdata: two flights in one file": (
         "a.track.csv", logs.airdata(TIMES, PLACES) + logs.airdata(LATER, PLACES).partition("\n")[2],
@@ -661,7 +661,7 @@ SIGMF = {
     ),
     "metadata in UTF-16": ({}, lambda text: text.encode("utf-16"), "not valid SigMF: invalid JSON"),
     "metadata cut off": ({}, lambda text: text[:-40].encode(), "not valid SigMF: invalid JSON"),
-    "captures that are not sorted": ({"2.core:sample_start": 8}, str.encode, "capture 1 holds -8 samples"),
+    "captures that are not sorted": ({"2.core:sample_start": 8}, str.encode, "capture 1 contains -8 samples"),
     "real samples without an intermediate frequency": (
         {"global.core:datatype": "ri16_le"}, str.encode, "core:datatype ri16_le without apertura:if_hz",
     ),

@@ -378,7 +378,7 @@ def test_beats_of_a_campaign_are_reported_with_the_times_beside(tmp_path):
     np.save(raw / "uav1.time.npy", times[::-1])
     refused = look(raw / "uav1.npy")
     assert (refused.kind, refused.format) == ("phase history", "beat_npy")
-    assert "sweep 1 begins" in refused.problem.found
+    assert "sweep 1 starts" in refused.problem.found
 
 
 @pytest.mark.slow
