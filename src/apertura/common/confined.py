@@ -384,7 +384,7 @@ class ConfinedPath(PosixPath):
             size = os.fstat(stream.fileno()).st_size
             if size > largest:
                 raise CampaignError(
-                    f"{size} bytes", self, f"a file of at most {largest} bytes", "Check the file, and remove it."
+                    f"{size} bytes", self, f"a file of at most {largest} bytes", "Remove it if it is the wrong file."
                 )
             return stream.read()  # type: ignore[no-any-return]
 

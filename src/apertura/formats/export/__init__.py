@@ -49,9 +49,10 @@ SOURCES: Mapping[str, str] = {
 ``image`` is the complex image of a pair. ``coherent`` is the complex sum and ``noncoherent`` the power sum of a
 flight's pairs, the latter as complex amplitude without phase; ``magnitude`` is the sum of their magnitudes. Layers are
 real rasters that describe the image of a pair, in the same folder. Rasters of radiometry exist for calibrated pairs, in
-the folder of the layers: complex, with the power that they are named after. Rasters of multilook exist if requested:
-mean power of square blocks of pixels, real, on a coarser grid; ``multilook_noise`` is the mean noise power that is
-subtracted from the echo power. Rasters of an interferogram belong to two images; ``panels`` are all of them by name.
+the folder of the layers: complex amplitudes, whose power is the named coefficient. Rasters of multilook exist if
+requested: mean power of square blocks of pixels, real, on a coarser grid; ``multilook_noise`` is the mean noise power
+that is subtracted from the echo power. Rasters of an interferogram belong to two images; ``panels`` are all of them by
+name.
 """
 
 

@@ -140,7 +140,7 @@ def write_pos(path: Path, log: RefinedLog, *, outcome: str, version: str) -> Non
         Version of apertura.
     """
     unrefined = int((~log.refined).sum())
-    outside = f"; {unrefined} of {len(log.refined)} epochs lie outside the pulses and have the nearest correction"
+    outside = f"; {unrefined} of {len(log.refined)} epochs lie outside the pulses; the nearest correction is used"
     remarks = [
         outcome,
         f"logged point of {log.node}, not an antenna{outside if log.refined.any() else ''}",

@@ -482,7 +482,7 @@ def _usable(length: int, layout: SampleLayout, path: Path) -> int:
         return length
     if length <= 2 * SETTLING:
         found = f"captures of {length} real samples"
-        raise CampaignError(found, path, f"more than {2 * SETTLING}, for the filter", "Record longer captures.")
+        raise CampaignError(found, path, f"more than {2 * SETTLING} samples for the filter", "Record longer captures.")
     return length - SETTLING
 
 

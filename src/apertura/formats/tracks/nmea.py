@@ -39,7 +39,7 @@ _WANTED = re.compile(r"[^P].(?:GGA|RMC|ZDA|GST),")
 _TIME = re.compile(r"([01]\d|2[0-3])([0-5]\d)([0-5]\d|60)(?:\.(\d{1,9})\d*)?", re.ASCII)
 _LATE_NS = 60_000_000_000
 _DAY_NS, _SECOND_NS = 86_400_000_000_000, 1_000_000_000
-_REMEDY = "Log GGA with RMC or ZDA, as the receiver sends them."
+_REMEDY = "Log the unmodified GGA and RMC or ZDA sentences of the receiver."
 
 
 class _Fix(NamedTuple):

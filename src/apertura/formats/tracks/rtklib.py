@@ -178,7 +178,7 @@ def _kind(line: str) -> str:
 
 
 def _header(lines: list[str], path: Path, first: int) -> _Header:
-    """Parse a header, comment lines that start with line `first` of the file."""
+    """Parse the comment lines of a header, of which the first is line `first` of the file."""
     heading = next((line for line in lines if _kind(line)), "")
     if not heading:
         position = f" after line {first - 1}" if first > 1 else ""
@@ -401,7 +401,7 @@ def write_rtklib_pos(
 ) -> None:
     """Write latitude, longitude and ellipsoidal height as an RTKLIB solution, .pos.
 
-    RTKLIB identifies columns by position: all columns are written, unknown values as RTKLIB's default for unknown.
+    RTKLIB identifies columns by position: all columns are written, with RTKLIB's placeholders for unknown values.
 
     Parameters
     ----------
