@@ -106,7 +106,7 @@ def test_a_wild_line_of_flights_is_named(tiny, line, expected):
 )
 def test_a_segment_at_a_time_that_no_flight_had_is_refused(tiny, time):
     (tiny / "config" / "segments.tsv").write_text(f"flight\tpair\tstart\tend\nf01\tuav1-uav1\t{time}\t{time}\n")
-    assert "is not a time" in complaint(lambda: Campaign.load(tiny))
+    assert "is no time" in complaint(lambda: Campaign.load(tiny))
 
 
 # Arrays
@@ -307,7 +307,7 @@ LOGS = {
     ),
     "nmea: GNS without GGA": (
         "a.track.nmea", "".join(f"{logs.rmc(t)}\n{gns(t, p)}\n" for t, p in zip(TIMES, PLACES, strict=True)), {},
-        "no GGA, but 40 GNS; expected an NMEA 0183 log with GGA. Log GGA",
+        "no GGA, but 40 GNS; expected an NMEA 0183 log with GGA. Log the unmodified GGA",
     ),
     "csv: index column of pandas, all cells quoted": (
         *csv_log(

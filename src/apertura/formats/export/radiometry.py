@@ -65,7 +65,10 @@ ECHO = Radiometry("echo amplitude", "echo power", "the echo of a target illumina
 _COEFFICIENTS = {
     "sigma0": ("sigma0, radar cross-section per ground area", "1 m2 per m2 of ground area"),
     "beta0": ("beta0, radar cross-section per slant-plane area", "1 m2 per m2 of slant-plane area"),
-    "gamma0": ("gamma0, radar cross-section per area across the line of sight", "1 m2 per m2 across the bisector"),
+    "gamma0": (
+        "gamma0, radar cross-section per area normal to the line of sight",
+        "1 m2 per m2 normal to the bisector",
+    ),
 }
 
 
