@@ -275,7 +275,7 @@ def test_right_logs_are_left_alone():
     found = refine(one.records, GRID, FlatGround(0.0), one.errors)
     assert not found.accepted
     assert not found.flags.keys() - {"prior_too_wide"}  # which is true of logs that state 2 cm and have none
-    assert "the logs are as good" in found.why
+    assert "no improvement over the logs" in found.why
 
 
 def test_a_slip_of_the_tracks_is_found_by_delays_and_taken_back():

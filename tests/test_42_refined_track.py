@@ -256,7 +256,7 @@ def test_right_logs_that_are_said_to_err_by_2_cm_are_left_as_they_are(tmp_path, 
     refine.refine(campaign, "f01")
     image.image(campaign, "f01", "uav1-uav1")
     quality, stage = quality_of(campaign, "uav1-uav1"), open_refined(campaign, "f01").stage
-    assert "the logs are as good" in stage.attrs["why"]
+    assert "no improvement over the logs" in stage.attrs["why"]
     assert stage.attrs["flags"].keys() <= {"prior_too_wide"}
     assert quality["flags"].items() >= stage.attrs["flags"].items()
     assert quality["autofocus"]["accepted"] is False

@@ -112,7 +112,7 @@ def test_the_sign_of_a_lever_arm_is_seen_and_named(tmp_path):
         assert {"pairs_apart", "pairs_out_of_phase"} <= set(reports[pair]["flags"])
     best = reports["uav1-uav1"]["hypotheses"][0]
     assert best["kind"] == "offset"  # along a straight track an arm's sign is one of several that do the same
-    assert best["what"].endswith("right axis of the lever arms of uav1 has the other sign")
+    assert best["what"].endswith("right axis of the lever arms of uav1 has the opposite sign")
     assert best["what"] in reports["uav1-uav1"]["flags"]["pairs_apart"]
     left_out = reports["fused"]["fusion"]["left_out"]
     assert len(left_out) == 1
