@@ -105,7 +105,7 @@ def test_weights_err_by_no_more_than_is_reckoned_with():
 def test_bad_input_is_refused(plain):
     _, profiles = plain
     tables = cuda.prepare(profiles)
-    with pytest.raises(ValueError, match="holds no pulse"):
+    with pytest.raises(ValueError, match="contains no pulse"):
         cuda.prepare(profiles[slice(0, 0)])
     with pytest.raises(ValueError, match="must be finite"):
         cuda.prepare(replace(profiles, start_m=profiles.start_m * np.nan))

@@ -461,7 +461,7 @@ def test_the_band_of_a_tile_is_the_largest_slope_of_its_phase_and_the_airy_tail_
                 "start_m": np.zeros(0),
                 "aperture": Aperture(*np.zeros((2, 0, 3))),
             },
-            "holds no pulse",
+            "contains no pulse",
         ),
         ({"start_m": np.full(300, np.nan)}, "must be finite"),
     ],
