@@ -475,5 +475,5 @@ def test_pixels_and_beams_of_other_shapes_are_refused(plain):
     trees = tree.prepare(plain.profiles)
     with pytest.raises(ValueError, match=r"must be \(y, x, 3\)"):
         tree.form(trees, np.zeros((4, 3)))
-    with pytest.raises(ValueError, match="beams must be of 300 pulses"):
+    with pytest.raises(ValueError, match="beams must have 300 pulses"):
         tree.form(trees, ecef(plain.pixels), beams=Beams(swaying_beam(plain.scene.tx[:9], (12, 0, 0))))
