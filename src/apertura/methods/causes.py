@@ -47,7 +47,7 @@ def mistaken_time(shift_s: float, *, tolerance_s: float = _NEAR_S) -> str:
     zones = round(size / _ZONE_S)
     if zones and size <= _LONGEST_ZONE_S + _NEAR_ZONE_S and abs(size - zones * _ZONE_S) <= _NEAR_ZONE_S:
         return ": local time taken for UTC?"
-    return ": a log of another day?" if size > 86400 else ""
+    return ": log of another day?" if size > 86400 else ""
 
 
 # ---- Table of the quantities that may be wrong ----------------------------------------------------------------------

@@ -450,15 +450,15 @@ def _by_part(
     The shift is NaN where the point is not visible.
     """
     nothing = np.full(parts, np.nan)
-    place = echo.patch.pixels_m[int(np.abs(image).argmax())]
+    point_m = echo.patch.pixels_m[int(np.abs(image).argmax())]
     # Horizontal line through the point along which its path grows fastest.
-    slope = blocks.aperture.path_gradient(place).mean(axis=0)
+    slope = blocks.aperture.path_gradient(point_m).mean(axis=0)
     level = axes[:2].T @ (axes[:2] @ slope)
-    steep = float(level @ slope)
-    if steep < _LEAST_SLOPE or len(echo.profiles) < parts:
+    gradient = float(level @ slope)
+    if gradient < _LEAST_SLOPE or len(echo.profiles) < parts:
         return nothing
     extra_path_m = np.linspace(-_REACH_CELLS, _REACH_CELLS, _STEPS) * SPEED_OF_LIGHT_M_S / echo.profiles.bandwidth_hz
-    line = Patch(echo.patch.place_m, place + extra_path_m[:, None] / steep * level)
+    line = Patch(echo.patch.place_m, point_m + extra_path_m[:, None] / gradient * level)
     # Power along the line in each subaperture image, and its maximum by a parabola.
     values = blocks.contribution(replace(echo, patch=line), blocks.moves(tracks)).values
     ends = np.linspace(0, values.shape[1], parts + 1).astype(np.int64)[:-1]

@@ -36,7 +36,7 @@ _STEPS = 64  # pulses sampled for the size and pixels of a tile
 
 @dataclass(frozen=True, eq=False)
 class SpeckleTile:
-    """A square of the ground.
+    """Square tile of the terrain.
 
     Attributes
     ----------
@@ -317,38 +317,41 @@ class SpeckleTiles:
     def agreements(self, tracks: Tracks, used: NDArray[np.bool_] | None = None) -> list[SpeckleAgreement]:
         """Return the coherence objective of every two pairs on the used tiles, with node → (knot, 3) corrections."""
         moved = [blocks.moves(tracks) for blocks in self.pairs]
-        both = list(combinations(range(len(self.pairs)), 2))
-        alike: dict[tuple[int, int], list[TileCoherence]] = {pairs: [] for pairs in both}
+        coherences: dict[tuple[int, int], list[TileCoherence]]
+        coherences = {pairs: [] for pairs in combinations(range(len(self.pairs)), 2)}
         for number, tile in enumerate(self.tiles):
             if used is None or used[number]:
                 contribution = [
-                    blocks.contribution(echoes[number], at)
-                    for blocks, echoes, at in zip(self.pairs, self.echoes, moved, strict=True)
+                    blocks.contribution(echoes[number], displacement)
+                    for blocks, echoes, displacement in zip(self.pairs, self.echoes, moved, strict=True)
                 ]
-                for one, other in both:
-                    alike[one, other].append(TileCoherence.of(tile, contribution[one], contribution[other]))
+                for (first, second), of_pairs in coherences.items():
+                    of_pairs.append(TileCoherence.of(tile, contribution[first], contribution[second]))
         return [
             SpeckleAgreement(
-                (self.pairs[one], self.pairs[other]), self._weighted_by_brightness(found, one, used), tracks
+                (self.pairs[first], self.pairs[second]), self._weighted_by_brightness(of_pairs, first, used), tracks
             )
-            for (one, other), found in alike.items()
+            for (first, second), of_pairs in coherences.items()
         ]
 
     def _weighted_by_brightness(
-        self, alike: Sequence[TileCoherence], pair: int, used: NDArray[np.bool_] | None
+        self, coherences: Sequence[TileCoherence], pair: int, used: NDArray[np.bool_] | None
     ) -> list[TileCoherence]:
         """Return the tiles with the cells of dark tiles reduced, as sidelobes of brighter tiles cover them.
 
         Brightness is corrected for the squares of both distances, by which echoes fall off.
         """
-        bright = []
-        for one, tile in zip(
-            alike, (tile for n, tile in enumerate(self.tiles) if used is None or used[n]), strict=True
+        brightness = []
+        for coherence, tile in zip(
+            coherences, (tile for n, tile in enumerate(self.tiles) if used is None or used[n]), strict=True
         ):
-            there, back = (np.sum((leg - tile.patch.place_m) ** 2, axis=1) for leg in self.pairs[pair].aperture.legs)
-            bright.append(one.brightness / float(np.mean(1 / (there * back))))
-        share = np.minimum(1, np.array(bright) / max(float(np.mean(bright)), 1e-300))
-        return [replace(one, cells=one.cells * float(part)) for one, part in zip(alike, share, strict=True)]
+            tx_m2, rx_m2 = (np.sum((leg - tile.patch.place_m) ** 2, axis=1) for leg in self.pairs[pair].aperture.legs)
+            brightness.append(coherence.brightness / float(np.mean(1 / (tx_m2 * rx_m2))))
+        shares = np.minimum(1, np.array(brightness) / max(float(np.mean(brightness)), 1e-300))
+        return [
+            replace(coherence, cells=coherence.cells * float(share))
+            for coherence, share in zip(coherences, shares, strict=True)
+        ]
 
 
 # ---- Refinement by speckle ------------------------------------------------------------------------------------------

@@ -47,7 +47,7 @@ class PairRecord:
         tx, rx = self.pair.split("-")
         return tx, rx
 
-    def turned(self, errors: Mapping[str, "TrackErrors"]) -> tuple[float, float]:
+    def extreme_errors(self, errors: Mapping[str, "TrackErrors"]) -> tuple[float, float]:
         """Return the shortest correlation time of the nodes' errors, s, and the phase of the largest error, rad rms."""
         of_nodes = [errors[node] for node in self.nodes]
         largest_m = max(max(error.std_m) for error in of_nodes)
@@ -181,12 +181,12 @@ class NodePrior:
 
     def adjoint(self, gradient: Floats) -> Floats:
         """Return (..., size) derivatives by the unknowns from (..., knot, 3) derivatives by the corrections."""
-        turned = gradient @ self.axes.T
-        scaled = turned * self.std_m / np.sqrt(self.smooth)
+        along_axes = gradient @ self.axes.T
+        scaled = along_axes * self.std_m / np.sqrt(self.smooth)
         nothing = np.zeros((*scaled.shape[:-2], self.smooth, 3))
         total = np.cumsum(np.concatenate([nothing, scaled, nothing[..., 1:, :]], axis=-2), axis=-2)
         noise = total[..., self.smooth :, :] - total[..., : -self.smooth, :]
-        both = np.concatenate([noise, self.slow.T @ turned], axis=-2)
+        both = np.concatenate([noise, self.slow.T @ along_axes], axis=-2)
         return np.asarray(both.reshape(*both.shape[:-2], -1))
 
 

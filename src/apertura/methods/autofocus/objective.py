@@ -154,11 +154,11 @@ class Blocks:
         blocks = slice(int(illuminating[0]), int(illuminating[-1]) + 1) if illuminating.size else slice(0, 1)
         whole, aperture = self.record.profiles, self.aperture[blocks]
         middle = aperture.path(patch.place_m)
-        turned = sums[:, blocks].T * np.exp(-1j * whole.wavenumber_rad_m * (middle[:, None] + offsets))
+        referred = sums[:, blocks].T * np.exp(-1j * whole.wavenumber_rad_m * (middle[:, None] + offsets))
         return PatchEcho(
             patch,
             blocks,
-            replace(whole, samples=turned.astype(np.complex64), start_m=middle + offsets[0], aperture=aperture),
+            replace(whole, samples=referred.astype(np.complex64), start_m=middle + offsets[0], aperture=aperture),
         )
 
     def contribution(self, echo: PatchEcho, moved: Tracks) -> "Contribution":

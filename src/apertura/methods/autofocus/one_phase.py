@@ -207,16 +207,16 @@ def entropy(lines: NDArray[np.complex128], phase: Floats) -> tuple[float, Floats
     (0.114494, 0.114494)
     """
     # I_i and q of eq. 33, then H and ∂H/∂θ.
-    turned = lines * np.exp(1j * phase)
-    blocks = turned.shape[1]
-    image = np.fft.fft(turned, 2 * blocks, axis=1, norm="ortho")
+    rotated = lines * np.exp(1j * phase)
+    blocks = rotated.shape[1]
+    image = np.fft.fft(rotated, 2 * blocks, axis=1, norm="ortho")
     power = np.abs(image) ** 2
     total = max(float(power.sum()), 1e-300)
     share = power / total
     logarithm = np.log(np.maximum(share, 1e-300))
     by_image = -(logarithm + 1) * image / total
-    by_turned = np.fft.ifft(by_image, axis=1, norm="ortho")[:, :blocks]
-    return -float((share * logarithm).sum()), -2 * (turned * by_turned.conj()).imag.sum(axis=0)
+    by_rotated = np.fft.ifft(by_image, axis=1, norm="ortho")[:, :blocks]
+    return -float((share * logarithm).sum()), -2 * (rotated * by_rotated.conj()).imag.sum(axis=0)
 
 
 def _lines(patches: Patches, phase: Floats) -> NDArray[np.complex128]:

@@ -115,7 +115,7 @@ def patch_at(place_m: Floats, records: Sequence[PairRecord], axes: Floats, *, co
     Source: docs/theory/autofocus.md, "Patches".
     """
     spans = [_spans(place_m, record, axes, correlation_s) for record in records]
-    across = max(spans, key=lambda span: span[1][1])[0]
+    directions = max(spans, key=lambda span: span[1][1])[0]
     cell = np.min([span[1] for span in spans], axis=0)
     half = np.max([span[2] for span in spans], axis=0)
     counts = 2 * np.ceil(half / _SAMPLING) + 1
@@ -125,7 +125,7 @@ def patch_at(place_m: Floats, records: Sequence[PairRecord], axes: Floats, *, co
         for reach, size in zip(half, cell, strict=True)
     ]
     along, aside = np.meshgrid(*sides, indexing="ij")
-    level = along[..., None] * across[0] + aside[..., None] * across[1]
+    level = along[..., None] * directions[0] + aside[..., None] * directions[1]
     return Patch(place_m, place_m + level.reshape(-1, 2) @ axes[:2])
 
 
@@ -149,9 +149,11 @@ def _spans(place_m: Floats, record: PairRecord, axes: Floats, correlation_s: flo
         illuminated = record.beams[pulses].weight(profiles.aperture[pulses], place_m[None])[:, 0] > 0
         slope, time_s = (slope[illuminated], time_s[illuminated]) if illuminated.sum() > 2 else (slope, time_s)
     # Cycles per metre along and across the mean line of sight, over pulses and band; cells are their inverse extents.
-    ahead = slope.mean(axis=0)
-    ahead = ahead / np.linalg.norm(ahead) if np.linalg.norm(ahead) > 1e-3 else np.array([0.0, 1.0])
-    directions = np.stack([ahead, [-ahead[1], ahead[0]]])
+    along_sight = slope.mean(axis=0)
+    along_sight = (
+        along_sight / np.linalg.norm(along_sight) if np.linalg.norm(along_sight) > 1e-3 else np.array([0.0, 1.0])
+    )
+    directions = np.stack([along_sight, [-along_sight[1], along_sight[0]]])
     by_time = slope @ directions.T
     band = profiles.centre_frequency_hz + np.array([-0.5, 0.5]) * profiles.bandwidth_hz
     cycles = np.concatenate([by_time * frequency / SPEED_OF_LIGHT_M_S for frequency in band])
@@ -277,7 +279,7 @@ def looks_of(records: Sequence[PairRecord], errors: Mapping[str, TrackErrors], p
     """
     spans_s, shortest_s, longest_s = [], [], []
     for record in records:
-        correlation_s, phase_rad = record.turned(errors)
+        correlation_s, phase_rad = record.extreme_errors(errors)
         longest_s.append(correlation_s)
         shortest_s.append(correlation_s * min(1.0, _BLURRED_RAD2 / (2 * phase_rad**2)))
         spans_s.append(float(record.time_s[-1] - record.time_s[0]) * _visible_share(record, place_m))

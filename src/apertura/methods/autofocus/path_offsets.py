@@ -114,7 +114,7 @@ class _Pair:
     @classmethod
     def of(cls, record: PairRecord, patches: Sequence[Patch], errors: Mapping[str, TrackErrors]) -> "_Pair":
         profiles = record.profiles
-        correlation_s, phase_rad = record.turned(errors)
+        correlation_s, phase_rad = record.extreme_errors(errors)
         share = min(1 / _BLOCKS_PER_CORRELATION_TIME, _BETWEEN_BLOCKS_RAD2 / max(2 * phase_rad**2, 1e-12))
         edges = _edges(record.time_s, correlation_s * share)
         middle = (edges[:-1] + edges[1:] - 1) // 2

@@ -163,12 +163,12 @@ def _pair_residuals(problem: Problem, tracks: Tracks, axes: Floats) -> tuple[Flo
     rows, residuals = [np.zeros((0, len(problem.gauge.modes) + len(problem.pairs) - 1))], [np.zeros(0)]
     modes = problem.prior.tracks(problem.gauge.modes)
     for number in range(len(problem.patches)):
-        places = [
+        positions = [
             _measured_position(blocks, echoes[number], tracks, modes, axes)
             for blocks, echoes in zip(problem.pairs, problem.echoes, strict=True)
         ]
-        first = places[0]
-        for at, other in enumerate(places[1:], 1):
+        first = positions[0]
+        for at, other in enumerate(positions[1:], 1):
             if first is not None and other is not None:
                 std_m = float(np.hypot(first.std_m, other.std_m))
                 rows.append(np.hstack([other.shift_m - first.shift_m, _path_columns(other, at, problem)]) / std_m)
@@ -188,21 +188,21 @@ def _reference_residuals(
     modes = problem.prior.tracks(problem.gauge.modes)
     for at, (blocks, of_pair) in enumerate(zip(problem.pairs, echoes, strict=True)):
         for point, echo in zip(points, of_pair, strict=True):
-            place = _measured_position(blocks, echo, tracks, modes, axes)
-            if place is not None:
-                error_m = place.place_m - axes[:2] @ np.array(point.place_m)
-                rows.append(np.hstack([place.shift_m, _path_columns(place, at, problem)]) / point.std_m)
+            position = _measured_position(blocks, echo, tracks, modes, axes)
+            if position is not None:
+                error_m = position.place_m - axes[:2] @ np.array(point.place_m)
+                rows.append(np.hstack([position.shift_m, _path_columns(position, at, problem)]) / point.std_m)
                 residuals.append(error_m / point.std_m)
                 rounded = [round(float(value), 4) for value in error_m]
                 report.append({"name": point.name, "pair": blocks.record.pair, "apart_m": rounded})
     return np.concatenate(rows), np.concatenate(residuals), report
 
 
-def _path_columns(place: _MeasuredPosition, number: int, problem: Problem) -> Floats:
+def _path_columns(position: _MeasuredPosition, number: int, problem: Problem) -> Floats:
     """Return (2, pair), shift of a position per standard deviation of the path offset of each pair but the first."""
     columns = np.zeros((2, len(problem.pairs) - 1))
     if number:
-        columns[:, number - 1] = PATH_STD_M * place.longer[:, 0]
+        columns[:, number - 1] = PATH_STD_M * position.longer[:, 0]
     return columns
 
 
@@ -221,16 +221,16 @@ def _measured_position(
     _, shift_m = effects(patch, modes_of, axes)
     _, longer = effects_of_paths(patch, np.ones((patch.values.shape[1], 1)), axes)
     # Maximum of the image about the brightest pixel, on successively finer lattices.
-    place, reach_m = echo.patch.pixels_m[int(np.abs(image).argmax())], _cell_m(echo) / 4
+    position_m, reach_m = echo.patch.pixels_m[int(np.abs(image).argmax())], _cell_m(echo) / 4
     for _ in range(_ZOOMS):
         side = np.linspace(-reach_m, reach_m, _SIDE)
         east, north = np.meshgrid(side, side)
-        pixels = place + np.stack([east.ravel(), north.ravel()], axis=1) @ axes[:2]
+        pixels = position_m + np.stack([east.ravel(), north.ravel()], axis=1) @ axes[:2]
         near = replace(echo, patch=Patch(echo.patch.place_m, pixels))
-        place = pixels[int(np.abs(blocks.contribution(near, moved).values.sum(axis=1)).argmax())]
+        position_m = pixels[int(np.abs(blocks.contribution(near, moved).values.sum(axis=1)).argmax())]
         reach_m *= 2 / (_SIDE - 1)
     std_m = float(np.hypot(_LEAST_STD_M, _cell_m(echo) / (np.pi * np.sqrt(ratio))))
-    return _MeasuredPosition(axes[:2] @ place, std_m, shift_m, longer)
+    return _MeasuredPosition(axes[:2] @ position_m, std_m, shift_m, longer)
 
 
 def _patch_of(problem: Problem, point: ReferencePoint, axes: Floats) -> Patch:
@@ -644,7 +644,7 @@ def _knots(records: Sequence[PairRecord], errors: Mapping[str, TrackErrors]) -> 
     first = min(float(record.time_s[0]) for record in records)
     last = max(float(record.time_s[-1]) for record in records)
     pulse_s = max(float(np.median(np.diff(record.time_s))) for record in records)
-    correlations_s, phases_rad = zip(*(record.turned(errors) for record in records), strict=True)
+    correlations_s, phases_rad = zip(*(record.extreme_errors(errors) for record in records), strict=True)
     correlation_s, phase_rad = min(correlations_s), max(phases_rad)
     # White noise averaged over τ deviates from linear interpolation between knots spaced by Δ with variance σ²Δ/3τ.
     share = float(

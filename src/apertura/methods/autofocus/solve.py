@@ -128,7 +128,7 @@ def find_gauge(
 
 @dataclass(frozen=True, eq=False)
 class SmoothMotions:
-    """Smooth motions of each node, and rotations and scalings of its track, orthonormal in the prior's unknowns.
+    """Smooth motions of each node, including rotation and scaling of its track, orthonormal in the prior's unknowns.
 
     Attributes
     ----------
@@ -226,7 +226,7 @@ def longer_paths(patch: Contribution, moved: Mapping[str, Floats]) -> Floats:
 
 def effects_of_paths(patch: Contribution, path: Floats, axes: Floats) -> tuple[Floats, Floats]:
     """Return blur and shift, as `effects`, for path changes (block, mode) in metres."""
-    ground = np.asarray(sum(patch.slopes.values())) @ axes[:2].T
+    slope = np.asarray(sum(patch.slopes.values())) @ axes[:2].T
     weight = np.linalg.norm(patch.values, axis=0).astype(np.float64)
     weight = (weight / max(weight.sum(), 1e-300))[:, None]
 
@@ -237,7 +237,7 @@ def effects_of_paths(patch: Contribution, path: Floats, axes: Floats) -> tuple[F
         return np.asarray(np.concatenate(rows), np.float64)
 
     # Least squares for a, the shift over ground; the residual is blur.
-    by_shift, errors = (weighted(np.asarray(paths)) for paths in (ground, path))
+    by_shift, errors = (weighted(np.asarray(paths)) for paths in (slope, path))
     shift = np.linalg.pinv(by_shift) @ errors
     return errors - by_shift @ shift, shift
 
@@ -411,8 +411,8 @@ class _History:
         smooth = gaussian_filter1d(brightest.real, smoothed) + 1j * gaussian_filter1d(brightest.imag, smoothed)
         power = np.abs(smooth) ** 2
         weight = 1 / np.sqrt(0.5 + 0.5 * np.median(power) / (power + 1e-30))
-        ground = np.asarray(sum(patch.slopes.values())) @ axes[:2].T
-        columns = np.concatenate([np.ones((len(ground), 1)), ground], axis=1) * weight[:, None]
+        slope = np.asarray(sum(patch.slopes.values())) @ axes[:2].T
+        columns = np.concatenate([np.ones((len(slope), 1)), slope], axis=1) * weight[:, None]
         return cls(patch, np.unwrap(np.angle(smooth)), weight, np.linalg.qr(columns)[0])
 
 

@@ -264,7 +264,7 @@ def map_coherence(
 
 
 def _shared(one: NDArray[np.complex64], other: NDArray[np.complex64], window: int) -> NDArray[np.float64]:
-    """Return (Σp)²/(N Σp²) over a window about each pixel, p the magnitude of the images' product."""
+    """Return (Σp)²/(N Σp²) over a window about each pixel, with p the magnitude of the product of the images."""
     power = np.abs(one.astype(np.complex128) * other)
     finite = np.isfinite(power)
     power = np.where(finite, power, 0)

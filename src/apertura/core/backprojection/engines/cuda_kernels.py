@@ -82,7 +82,7 @@ def _over_an_image(weighed):  # type: ignore[no-untyped-def]
 
     @cuda.jit
     def kernel(pixels, tables, numbers, weights, results):  # type: ignore[no-untyped-def]
-        place = cuda.shared.array((3, _PIXELS), np.float64)
+        positions = cuda.shared.array((3, _PIXELS), np.float64)
         patch = cuda.shared.array(6, np.float64)
         words = cuda.shared.array((CHUNK, width), np.float32)
         steps = cuda.shared.array((CHUNK, 3), np.int32)
@@ -93,12 +93,12 @@ def _over_an_image(weighed):  # type: ignore[no-untyped-def]
         tally = cuda.local.array(4, np.int64)
         lane = cuda.threadIdx.y * SIDE + cuda.threadIdx.x
         # The patch: positions, origin, offsets; with weights, the sector centres of its pixels.
-        _place(pixels, lane, place)
+        _load_positions(pixels, lane, positions)
         cuda.syncthreads()
-        _fit(lane, place, patch)
-        _offsets(lane, place, patch, near, total)
+        _fit(lane, positions, patch)
+        _offsets(lane, positions, patch, near, total)
         if weighed:
-            _centres(lane, place, weights, numbers, (patch, centres, near))
+            _centres(lane, positions, weights, numbers, (patch, centres, near))
         for variant in range(4):
             tally[variant] = 0
         turn, pulses = _carrier(numbers), len(tables[1])
@@ -118,26 +118,26 @@ def _over_an_image(weighed):  # type: ignore[no-untyped-def]
             # Four pixels per thread: the sum over these pulses.
             _chunk(
                 (first, count),
-                (lane, place, near, total),
+                (lane, positions, near, total),
                 (words, steps, patch),
                 (tables, turn, numbers),
                 (weights, weighed),
             )
             cuda.syncthreads()
-        _write(lane, place, total, tally, results)
+        _write(lane, positions, total, tally, results)
 
     return kernel
 
 
 @cuda.jit(device=True)
-def _write(lane, place, total, tally, results):  # type: ignore[no-untyped-def]
+def _write(lane, positions, total, tally, results):  # type: ignore[no-untyped-def]
     """Write the sums of a thread to the image; add pixels × pulses of its pulses to the counts of their variants."""
     image, counts = results
     above, left = cuda.blockIdx.y * SIDE, cuda.blockIdx.x * SIDE
     for n in range(_EACH):
         row, column = above + cuda.threadIdx.y + n * ROWS, left + cuda.threadIdx.x
         if row < image.shape[0] and column < image.shape[1]:
-            unknown = math.isnan(place[0, lane + n * ROWS * SIDE])
+            unknown = math.isnan(positions[0, lane + n * ROWS * SIDE])
             image[row, column] = complex(math.nan, math.nan) if unknown else complex(total[n, 0], total[n, 1])
     pixels = min(SIDE, image.shape[0] - above) * min(SIDE, image.shape[1] - left)
     for variant in range(4):
@@ -155,7 +155,7 @@ def _carrier(numbers):  # type: ignore[no-untyped-def]
 
 
 @cuda.jit(device=True)
-def _place(pixels, lane, place):  # type: ignore[no-untyped-def]
+def _load_positions(pixels, lane, positions):  # type: ignore[no-untyped-def]
     """Write the positions of a patch to shared memory; x is NaN if a pixel has no position or is outside the image."""
     for n in range(_EACH):
         row, column = cuda.blockIdx.y * SIDE + cuda.threadIdx.y + n * ROWS, cuda.blockIdx.x * SIDE + cuda.threadIdx.x
@@ -164,39 +164,39 @@ def _place(pixels, lane, place):  # type: ignore[no-untyped-def]
         for axis in range(3):
             value = pixels[row, column, axis] if inside else math.nan
             known = known and math.isfinite(value)
-            place[axis, lane + n * ROWS * SIDE] = value
+            positions[axis, lane + n * ROWS * SIDE] = value
         if not known:
-            place[0, lane + n * ROWS * SIDE] = math.nan
+            positions[0, lane + n * ROWS * SIDE] = math.nan
 
 
 @cuda.jit(device=True)
-def _fit(lane, place, patch):  # type: ignore[no-untyped-def]
+def _fit(lane, positions, patch):  # type: ignore[no-untyped-def]
     """Write the middle of a patch's bounding box and the largest distance of its pixels to shared memory."""
     if lane < 3:
         low, high = math.inf, -math.inf
         for other in range(_PIXELS):
-            if not math.isnan(place[0, other]):
-                low, high = min(low, place[lane, other]), max(high, place[lane, other])
+            if not math.isnan(positions[0, other]):
+                low, high = min(low, positions[lane, other]), max(high, positions[lane, other])
         patch[lane] = (low + high) / 2
     cuda.syncthreads()
     if lane == 0:
         reach = 0.0
         for other in range(_PIXELS):
-            if not math.isnan(place[0, other]):
-                x, y, z = place[0, other] - patch[0], place[1, other] - patch[1], place[2, other] - patch[2]
+            if not math.isnan(positions[0, other]):
+                x, y, z = positions[0, other] - patch[0], positions[1, other] - patch[1], positions[2, other] - patch[2]
                 reach = max(reach, x * x + y * y + z * z)
         patch[_REACH] = math.sqrt(reach)
     cuda.syncthreads()
 
 
 @cuda.jit(device=True)
-def _offsets(lane, place, patch, near, total):  # type: ignore[no-untyped-def]
+def _offsets(lane, positions, patch, near, total):  # type: ignore[no-untyped-def]
     """Fill the offsets of a thread's pixels; a pixel without a position is summed at the origin but not written."""
     for n in range(_EACH):
         at = lane + n * ROWS * SIDE
         squared = _ZERO
         for axis in range(3):
-            offset = _ZERO if math.isnan(place[0, at]) else np.float32(place[axis, at] - patch[axis])
+            offset = _ZERO if math.isnan(positions[0, at]) else np.float32(positions[axis, at] - patch[axis])
             near[n, axis] = offset
             squared += offset * offset
         near[n, 3] = squared
@@ -244,7 +244,7 @@ def _view(p, patch, numbers, tables, shared):  # type: ignore[no-untyped-def]
 def _chunk(chunk, mine, shared, given, weighing):  # type: ignore[no-untyped-def]
     """Add a chunk of pulses to a thread's pixels; the chunk is summed in float32 first."""
     first, count = chunk
-    lane, place, near, total = mine
+    lane, positions, near, total = mine
     words, steps, patch = shared
     (antennas, start_m, cells), turn, numbers = given
     weights, weighed = weighing
@@ -269,10 +269,10 @@ def _chunk(chunk, mine, shared, given, weighing):  # type: ignore[no-untyped-def
         else:
             for n in range(_EACH):
                 pixel = lane + n * ROWS * SIDE
-                at, u = _exact(antennas[p], start_m[p], numbers, place, pixel)
+                at, u = _exact(antennas[p], start_m[p], numbers, positions, pixel)
                 if weighed:
                     centre = patch[_PATCH_CENTRE] + near[n, 4]
-                    weight = _exact_weight(p, steps[c, _ZONE], (place, pixel), centre, (antennas, weights, numbers))
+                    weight = _exact_weight(p, steps[c, _ZONE], (positions, pixel), centre, (antennas, weights, numbers))
                 _add(rows, at, u, turn, (weight, part[n]))
     for n in range(_EACH):
         total[n, 0] += part[n, 0]
@@ -297,11 +297,15 @@ def _root(s):  # type: ignore[no-untyped-def]
 
 
 @cuda.jit(device=True)
-def _exact(antennas, start_m, numbers, place, at):  # type: ignore[no-untyped-def]
+def _exact(antennas, start_m, numbers, positions, at):  # type: ignore[no-untyped-def]
     """Return cell and position in the cell of a pixel's path in float64; `_NO_CELL` if it lies outside the table."""
     path = 0.0
     for leg in range(2):
-        x, y, z = place[0, at] - antennas[leg, 0], place[1, at] - antennas[leg, 1], place[2, at] - antennas[leg, 2]
+        x, y, z = (
+            positions[0, at] - antennas[leg, 0],
+            positions[1, at] - antennas[leg, 1],
+            positions[2, at] - antennas[leg, 2],
+        )
         path += math.sqrt(x * x + y * y + z * z)
     middle = (path - start_m) * numbers[_CELLS_PER_M]
     if not -0.5 <= middle < numbers[_CELLS] - 0.5:
@@ -390,23 +394,23 @@ def spread_of_chunks(antennas, sector_axes, beam_axes, spread):  # type: ignore[
 
 
 @cuda.jit(device=True)
-def _centres(lane, place, weights, numbers, mine):  # type: ignore[no-untyped-def]
+def _centres(lane, positions, weights, numbers, mine):  # type: ignore[no-untyped-def]
     """Compute the sector centres of pixels (integration.md, eq. 4), their middle value, and offsets from it."""
     ends, (patch, centres, near) = weights[_ENDS], mine
     for n in range(_EACH):
         at = lane + n * ROWS * SIDE
-        centres[at] = _centre(place[0, at], place[1, at], place[2, at], ends, numbers)
+        centres[at] = _centre(positions[0, at], positions[1, at], positions[2, at], ends, numbers)
     cuda.syncthreads()
     if lane == 0:
         low, high = math.inf, -math.inf
         for other in range(_PIXELS):
-            if not math.isnan(place[0, other]):
+            if not math.isnan(positions[0, other]):
                 low, high = min(low, centres[other]), max(high, centres[other])
         patch[_PATCH_CENTRE], patch[_CENTRE_REACH] = (low + high) / 2, (high - low) / 2
     cuda.syncthreads()
     for n in range(_EACH):
         at = lane + n * ROWS * SIDE
-        if not math.isnan(place[0, at]):
+        if not math.isnan(positions[0, at]):
             near[n, 4] = centres[at] - patch[_PATCH_CENTRE]
 
 
@@ -575,13 +579,13 @@ def _look_up(radians, cut, gains):  # type: ignore[no-untyped-def]
 def _exact_weight(p, zone, pixel, centre, given):  # type: ignore[no-untyped-def]
     """Return the weight of a pulse at a pixel from its position, in float64."""
     antennas, (sector_axes, beam_axes, cuts, gains, _, _), numbers = given
-    place, at = pixel
+    positions, at = pixel
     s, weight = -centre, _ONE
     for leg in range(2):
         x, y, z = (
-            place[0, at] - antennas[p, leg, 0],
-            place[1, at] - antennas[p, leg, 1],
-            place[2, at] - antennas[p, leg, 2],
+            positions[0, at] - antennas[p, leg, 0],
+            positions[1, at] - antennas[p, leg, 1],
+            positions[2, at] - antennas[p, leg, 2],
         )
         if zone == _EDGE:
             axis = sector_axes[p, leg]
