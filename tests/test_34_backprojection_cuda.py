@@ -136,7 +136,7 @@ def test_weights_are_priced_and_their_error_is_in_the_prediction():
     steep = beam_of((0.5, 60.0))  # half a degree
     errors = [setting.error_db for setting in (plain, both, priced(beams=Beams(steep)))]
     assert errors[0] < errors[1] < errors[2] - 1
-    assert "weights by" in priced(beams=Beams(steep)).reasons["oversampling"]
+    assert ", weights -" in priced(beams=Beams(steep)).reasons["oversampling"]
     assert "weights" not in plain.reasons["oversampling"]
 
 

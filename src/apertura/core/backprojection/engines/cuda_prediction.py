@@ -57,7 +57,7 @@ PLACE_ERROR, PLACE_RMS = 3e-7, 3.2e-8
 
 
 def simulated() -> bool:
-    """Return True if numba's simulator replaces the device, for tests and thousands of times slower.
+    """Return True if numba's simulator replaces the device, as in tests; it is thousands of times slower.
 
     Examples
     --------
