@@ -29,7 +29,7 @@ def _as_arrays(inputs: Any, kinds: dict[str, type]) -> None:
         raise CampaignError(
             quoted(speed),
             where=f"{where}: wave_speed_m_s",
-            expected=f"a wave speed in m/s, above {slowest:.0f} and up to {SPEED_OF_LIGHT_M_S} in vacuum",
+            expected=f"a wave speed above {slowest:.0f} m/s, up to the speed of light, {SPEED_OF_LIGHT_M_S} m/s",
             remedy="Use apertura.wave_speed(N units).",
         )
     if not isinstance(inputs.aperture, Aperture):
