@@ -171,7 +171,7 @@ def test_profiles_that_end_within_the_scene_are_flagged():
     profiles = ap.range_compress(point_history(), TARGET_GRID, ap.FlatGround(0.0))
     short = replace(profiles, samples=profiles.samples[:, :60])
     assert "beyond the samples" in json.loads(ap.backproject(short, TARGET_GRID).attrs["flags"])["scene_beyond_samples"]
-    with pytest.raises(CampaignError, match=r"samples \(50, .*as many pulses"):
+    with pytest.raises(CampaignError, match=r"samples \(50, .*the same number of pulses"):
         replace(profiles, samples=profiles.samples[:50])
 
 
