@@ -209,7 +209,10 @@ def _log_effect(record: PairRecord, found: Candidates, errors: Mapping[str, Trac
 
 
 def _residuals(fits: Sequence[_Fit], log_effects: Sequence[Effect]) -> dict[str, float]:
-    """Return the residual errors at the scene's middle; shift and mean phase are the logs', absent from the offsets."""
+    """Return the residual errors at the scene's middle.
+
+    Shift and mean phase are those of the logs, as the path offsets contain neither.
+    """
     residual_rad2 = float(np.mean([fit.residual_rad2 for fit in fits]))
     mean_rad2 = float(np.mean([effect.phase_rad**2 for effect in log_effects]))
     return {

@@ -27,7 +27,7 @@ from apertura.core.windowed_sinc import kaiser_sinc
 instruction_set = compiled_for
 READS: Literal["profiles"] = "profiles"
 STANDS_IN_FOR = "native"
-"""Engine in place of which the planner selects this one, if it cannot run."""
+"""Engine that this one replaces in the planner's selection if that engine cannot run."""
 OVERSAMPLINGS = (2, 4, 6, 8, 12, 16, 24, 32)
 
 _SAMPLE_S = 3.1e-8  # seconds per pulse and table sample
