@@ -223,6 +223,18 @@ _OF_RECORDINGS = {
         "waveform.codes, waveform.carrier_is, waveform.iq, nodes.<n>.iq; the recording",
         "core/echo/sidelink_state.py",
     ),
+    "background": Flag(
+        "image noise with arcs of the background, dB above that without; why it is not removed",
+        "echoes at constant delay, such as antenna coupling, cause arcs at constant range",
+        "processing.background; isolation of the antennas",
+        "core/echo/background.py",
+    ),
+    "background_loss": Flag(
+        "largest peak loss of a target, dB",
+        "the removed background contains part of targets whose range hardly changes",
+        "processing.background: none; a longer track",
+        "core/echo/background.py",
+    ),
     "sidelink_lost": Flag(
         "pulses dropped",
         "pulses without a sidelink were dropped",

@@ -49,7 +49,7 @@ def layers(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> l
     Returns their paths. What the radio makes of bright points and of noise is in radiometry.json.
     """
     lineage = result_of(campaign, "layers", flight, pair).begin(campaign.root)
-    echo = PairEcho.opened(campaign, flight, pair).stage
+    echo = PairEcho.cleaned(campaign, flight, pair).stage
     profile = open_stage(campaign.stage("profile", flight, pair), "profile")
     scene, profiles = open_scene(campaign), profiles_of(profile, lazy=True)
     opened = open_pair(campaign, flight, pair, echo=echo)

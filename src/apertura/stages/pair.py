@@ -245,7 +245,7 @@ def open_pair(
     """
     waveform = campaign.settings.waveform
     if echo is None and recorded is None and campaign.is_current(campaign.stage("echo", flight, pair)):
-        echo = PairEcho.opened(campaign, flight, pair).stage
+        echo = PairEcho.cleaned(campaign, flight, pair).stage
     if echo is None:
         if isinstance(waveform, SampledWaveform):
             return _expected(campaign, flight, pair, waveform, recorded)

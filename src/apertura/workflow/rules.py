@@ -362,7 +362,7 @@ _ROWS = (
         "Compress a pair in range over the scene, profile.zarr.",
         _STAGES.profile.profile,
         sources=("echo", *_GROUND, inputs.patterns),
-        settings=("processing.window", "processing.integration", inputs.antennas),
+        settings=("processing.window", "processing.background", "processing.integration", inputs.antennas),
         forms=True,
         demand=Demand(500, pulse_bytes=500, recorded_s=120),
         cost=Cost(0.3, mb_s=0.001),
