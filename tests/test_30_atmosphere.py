@@ -275,6 +275,6 @@ def test_who_takes_the_speed_of_light_in_vacuum_is_listed_with_the_reason():
         for path in source.rglob("*.py")
         if "SPEED_OF_LIGHT_M_S" in path.read_text(encoding="utf-8")
     }
-    assert users == set(VACUUM), "read docs/theory/atmosphere.md, One place"
+    assert users == set(VACUUM), "read docs/theory/atmosphere.md, Wave speed of a pair"
     for path in (source / "core/backprojection/engines").rglob("*.py"):
         assert "SPEED_OF_LIGHT_M_S" not in path.read_text(encoding="utf-8"), path
