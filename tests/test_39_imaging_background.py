@@ -1,11 +1,16 @@
 """Removal of echoes at constant delay: what it restores, what targets lose by it, and when it is left out."""
 
+import shutil
 from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from folders import ROOT, copy_writable, run_steps, state
 from scenes import monostatic, straight_track
 
+import apertura as ap
+from apertura.campaign.folder import Campaign
+from apertura.campaign.store import open_stage
 from apertura.common.constants import SPEED_OF_LIGHT_M_S as C
 from apertura.core.backprojection.contributions import band_limited_image
 from apertura.core.backprojection.inputs import PhaseHistory
@@ -16,6 +21,8 @@ from apertura.core.imaging.background import BackgroundScene, decide_removal, st
 from apertura.core.imaging.range_profiles import range_compress
 from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.terrain import FlatGround
+from apertura.simulation import ImageGrid, preset, simulate
+from apertura.simulation.impairments import Leakage
 
 FREQUENCY = 1.2e9 + 3.2e6 * np.arange(128)
 GRID = SceneGrid("local", -5.0, 30.0, 0.1, (100, 100))
@@ -99,7 +106,9 @@ def median_db(recording, background=None):
     return 10 * np.log10(np.median(np.abs(recording.image(pixels, background)) ** 2))
 
 
-@pytest.mark.parametrize("level_db", [0, 20, 40, 60])
+@pytest.mark.parametrize(
+    "level_db", [0, pytest.param(20, marks=pytest.mark.slow), pytest.param(40, marks=pytest.mark.slow), 60]
+)
 def test_targets_are_restored_and_the_rest_of_the_image_does_not_depend_on_the_coupling(level_db):
     clean = recorded(straight())
     disturbed = coupled(clean, level_db)
@@ -112,7 +121,7 @@ def test_targets_are_restored_and_the_rest_of_the_image_does_not_depend_on_the_c
     )
 
 
-@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 20))])
 def test_no_background_is_found_in_a_recording_without_one(seed):
     assert recorded(straight(), seed=seed, noise=3.0 if seed % 2 else 0.1).excess_db < 0
 
@@ -194,3 +203,53 @@ def test_bursts_in_a_tenth_of_the_pulses_do_not_move_the_median():
         for of in (recording.transfer, burst)
     ]
     assert np.abs(values[1] - values[0]).max() < 1.0
+
+
+@pytest.fixture(scope="module")
+def leaking(tmp_path_factory):
+    """Campaigns whose antennas couple 40 dB above the echoes, at the delay of the scene: auto, and not removed."""
+    plan = replace(preset("demo", pulses=150), scene=ImageGrid("EPSG:32632", half_width_m=3.0, spacing_m=0.1))
+    leaks = Leakage(level_db=40.0, path_m=20.0)
+    nodes = {
+        name: replace(node, impairments=replace(node.impairments, leakage=leaks)) for name, node in plan.nodes.items()
+    }
+    folder = tmp_path_factory.mktemp("leaking")
+    simulate(folder / "auto", replace(plan, nodes=nodes), seed=7)
+    state(copy_writable(folder / "auto", folder / "none"), "processing", background="none")
+    for name in ("auto", "none"):
+        run_steps(folder / name)
+    return {name: Campaign.load(folder / name) for name in ("auto", "none")}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("pair", ["uav1-uav1", "uav1-uav2"])
+def test_the_image_of_a_campaign_is_that_of_its_echo_without_the_background(leaking, pair):
+    """Profiles, certificate and reports are of the same transfer functions; the coupling is gone from the image."""
+    images = {name: open_stage(campaign.stage("image", "f01", pair), "image") for name, campaign in leaking.items()}
+    quality = images["auto"].attrs["quality"]
+    assert quality["background"]["removed"] == "median"
+    assert quality["numerical_error_db"] <= -40
+    assert any(line["cause"] == "background removal" for line in quality["budget"])
+    powers = {name: float(np.nanmedian(np.abs(stage.image.values) ** 2)) for name, stage in images.items()}
+    assert 10 * np.log10(powers["none"] / powers["auto"]) > 3
+    assert "background" not in images["none"].attrs["flags"]
+    echo = ap.open_campaign(leaking["auto"].root).stage("echo", "f01", pair)
+    raw = ap.open_campaign(leaking["none"].root).stage("echo", "f01", pair)
+    assert float(np.abs(echo.transfer).mean()) < 0.5 * float(np.abs(raw.transfer).mean())
+
+
+@pytest.mark.slow
+def test_the_reflector_of_a_real_uav_flight_is_its_highest_peak_where_it_was_surveyed(shared, tmp_path):
+    root = tmp_path / "uav_flight"
+    shutil.copytree(ROOT / "examples" / "uav_flight", root)
+    (root / "raw" / "f01").mkdir(parents=True)
+    for name in ("radar.out", "radar.track.csv"):
+        shutil.copyfile(shared / "bwsi_uav_flight" / name, root / "raw" / "f01" / name)
+    run_steps(root)
+    stage = open_stage(Campaign.load(root).stage("image", "f01", "radar-radar"), "image")
+    power = np.abs(stage.image.values) ** 2
+    row, column = np.unravel_index(np.nanargmax(power), power.shape)
+    assert np.hypot(stage.x[column] - 1.7929, stage.y[row] - 1.81) < 0.015
+    assert 10 * np.log10(power[row, column] / np.nanmedian(power)) > 27
+    assert stage.attrs["quality"]["background"]["removed"].startswith("running median of ")
+    assert "background_loss" in stage.attrs["flags"]
