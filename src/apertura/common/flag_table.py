@@ -227,13 +227,13 @@ _OF_RECORDINGS = {
         "image noise with arcs of the background, dB above that without; why it is not removed",
         "echoes at constant delay, such as antenna coupling, cause arcs at constant range",
         "processing.background; isolation of the antennas",
-        "core/echo/background.py",
+        "core/imaging/background.py",
     ),
     "background_loss": Flag(
         "largest peak loss of a target, dB",
         "the removed background contains part of targets whose range hardly changes",
         "processing.background: none; a longer track",
-        "core/echo/background.py",
+        "core/imaging/background.py",
     ),
     "sidelink_lost": Flag(
         "pulses dropped",
