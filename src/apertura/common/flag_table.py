@@ -672,10 +672,10 @@ _OF_BENCHES = {
         "methods/bench/links.py",
     ),
     "interference": Flag(
-        "power fluctuation of a subcarrier relative to the others, dB; its frequency",
-        "a narrow-band signal in the band adds noise at every range",
-        "other transmitters; spurious signals of the node's clocks",
-        "methods/bench/links.py",
+        "noise of a subcarrier relative to its neighbours, dB; its frequency and usual service",
+        "a narrow-band signal in the band adds noise at every range; excluded subcarriers cause sidelobes",
+        "other transmitters; spurious signals of the node's clocks; processing.interference",
+        "methods/bench/links.py, core/echo/interference.py",
     ),
     "contact_intermittent": Flag(
         "change of amplitude in excess of noise; pulses lost or 6 dB low",

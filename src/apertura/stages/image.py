@@ -42,7 +42,18 @@ from apertura.workflow.lineage import result_of
 _MISSING = np.complex64(complex(np.nan, np.nan))
 """Value of a tile that no pulse illuminates; it is not stored."""
 
-_QUOTED = ("pulses", "background", "positions", "time_tags", "sidelink", "clock", "code", "calibration", "atmosphere")
+_QUOTED = (
+    "pulses",
+    "background",
+    "interference",
+    "positions",
+    "time_tags",
+    "sidelink",
+    "clock",
+    "code",
+    "calibration",
+    "atmosphere",
+)
 
 
 def image(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Path:

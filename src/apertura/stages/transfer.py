@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 from xarray.backends import BackendArray
 from xarray.core import indexing
 
@@ -62,12 +63,15 @@ class PairEcho:
         Of the samples read so far.
     removed
         Background that `stage` is without.
+    gain
+        (subcarrier,) float32, factors of `stage`: 0 where interference is excluded.
     """
 
     dataset: xr.Dataset
     source: Form
     saturation: Saturation = field(default_factory=Saturation)
     removed: Background | None = None
+    gain: NDArray[np.float32] | None = None
 
     @classmethod
     def recorded(cls, echo: xr.Dataset) -> "PairEcho":
@@ -112,14 +116,16 @@ class PairEcho:
 
     @classmethod
     def cleaned(cls, campaign: Campaign, flight: str, pair: str) -> "PairEcho":
-        """Return a finished echo less the background that stage `profile` removes, once that is finished."""
+        """Return a finished echo without what a finished stage `profile` removes: background and interference."""
         echo, folder = cls.opened(campaign, flight, pair), campaign.stage("profile", flight, pair)
         if not campaign.is_current(folder):
             return echo
         profile, removed = open_stage(folder, "profile"), None
         if "background" in profile:
             removed = Background(profile.background.values, profile.background_time.values)
-        return replace(echo, dataset=echo.dataset.assign_attrs(background=profile.attrs["background"]), removed=removed)
+        gain = profile.subcarrier_gain.values if "subcarrier_gain" in profile else None
+        reports = {name: profile.attrs[name] for name in ("background", "interference")}
+        return replace(echo, dataset=echo.dataset.assign_attrs(reports), removed=removed, gain=gain)
 
     def within(self, campaign: Campaign, flight: str, pair: str) -> "PairEcho":
         """Return the echo inside the segments of its pair."""
@@ -138,7 +144,7 @@ class PairEcho:
     @property
     def stage(self) -> xr.Dataset:
         """The stage, its `transfer` read or formed on access, less the background that is removed."""
-        if "transfer" in self.dataset and self.removed is None:
+        if "transfer" in self.dataset and self.removed is None and self.gain is None:
             return self.dataset
         return self.dataset.assign(transfer=xr.Variable(_HISTORY, indexing.LazilyIndexedArray(_Transfer(self))))
 
@@ -182,8 +188,10 @@ class PairEcho:
         return np.asarray(self.extra_s + self.dataset.reference_delay.values)
 
     def read(self, pulses: Pulses) -> Complexes:
-        """Return the transfer functions of a few pulses, ascending, less the background that is removed."""
+        """Return the transfer functions of a few pulses, ascending, without removed background and interference."""
         transfer = self.dataset.transfer[pulses].values if "transfer" in self.dataset else self.form(pulses)
+        if self.gain is not None:
+            transfer = transfer * self.gain
         if self.removed is None:
             return np.asarray(transfer)
         frequency_hz = self.dataset.frequency.values

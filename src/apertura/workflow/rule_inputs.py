@@ -379,7 +379,7 @@ def grid(place: JobPlace) -> Mapping[str, Any]:
 
 
 _BEFORE_THE_IMAGE = frozenset(
-    {"window", "sidelink", "background", "false_alarms_per_s", "autofocus", "autofocus_method", "keep"}
+    {"window", "sidelink", "background", "interference", "false_alarms_per_s", "autofocus", "autofocus_method", "keep"}
 )
 _AFTER_THE_IMAGE = frozenset({"fusion", "radiometry", "radiometric_calibration", "multilook"})
 

@@ -50,6 +50,10 @@ class Processing(ImagingChoices):
         description="echoes at constant delay (antenna coupling, airframe) removed before range compression: median or "
         "mean of all pulses, or a running median, {running_s: 2.0}; auto: the best of these, if targets gain by it",
     )
+    interference: Literal["auto", "none"] = Field(
+        "auto",
+        description="auto: subcarriers with narrow-band interference are excluded if that raises the SNR",
+    )
     fusion: Fusion = Field(default_factory=Fusion, description="how the images of a flight's pairs are added up")
     autofocus: Literal["auto", "on", "off"] = Field(
         "auto",
