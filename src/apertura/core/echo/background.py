@@ -114,8 +114,10 @@ def background_excess_db(read: Read, count: int, subcarriers: int) -> float:
     doppler = np.abs(scipy.fft.fft(profiles * window_weights("hann", len(groups))[:, None], axis=0)) ** 2
     others = doppler[np.concatenate([cells, len(groups) - cells])].mean(axis=0)
     ratio = float((doppler[0] / np.maximum(others, np.finfo(np.float64).tiny)).max())
-    # A Hann window correlates neighbouring cells: half of them are independent, each with two degrees of freedom.
-    threshold = float(scipy.stats.f.isf(_FALSE_ALARM / subcarriers, 2, 2 * len(cells)))
+    # A Hann window correlates neighbouring cells: half of them are independent, each with two degrees of freedom. The
+    # ratio of noise then has the F-distribution of 2 and d degrees of freedom, P(ratio > q) = (1 + 2q/d)^(−d/2).
+    freedom = 2 * len(cells)
+    threshold = freedom / 2 * ((_FALSE_ALARM / subcarriers) ** (-2 / freedom) - 1)
     return decibels(ratio / threshold)
 
 
