@@ -155,7 +155,7 @@ def test_frame_counters_that_wrap_decide_against_any_tag_offset_below_half_a_tur
     assert pairs.method == "frame counter"
     assert share_right(pairs, numbers) == 1.0
     assert pairs.tx_index.size == rx.size
-    assert ("time_tags_apart" in pairs.flags) == (offset_s > 0.025)
+    assert ("time_tag_offset" in pairs.flags) == (offset_s > 0.025)
 
 
 def test_a_gap_of_several_turns_of_the_counter_is_bridged():

@@ -190,7 +190,7 @@ def test_division_needs_no_clock_where_the_pulse_is_sent_once(cfo_hz):
 def test_captures_that_begin_in_the_direct_pulse_or_end_in_it_are_counted():
     held = {"lead_s": 0.2e-6, "pulse_s": 1e-6, "listen_s": 0.5e-6, "cell_s": 2.5e-9}
     assert truncation_flags(np.array([0.0, -0.2e-6, 0.5e-6, np.nan]), **held) == {}
-    assert "2 of 3 pulses" in truncation_flags(np.array([0.0, -0.25e-6, 0.75e-6]), **held)["pulse_cut"]
+    assert "2 of 3 pulses" in truncation_flags(np.array([0.0, -0.25e-6, 0.75e-6]), **held)["pulse_truncated"]
 
 
 PULSE = {

@@ -176,16 +176,16 @@ def test_what_is_no_recording_is_refused_in_one_line(name):
 
 
 FLAGGED = {
-    "conjugated": (of(transfer=ECHO.conj()), "echo_elsewhere"),
-    "I and Q swapped": (of(transfer=(ECHO.imag + 1j * ECHO.real).astype(np.complex64)), "echo_elsewhere"),
-    "paths one way": (echo_of(PATH_M / 2), "echo_elsewhere"),
-    "paths twice": (echo_of(2 * PATH_M), "echo_elsewhere"),
-    "square array transposed": (lambda: replace(SQUARE, transfer=SQUARE.transfer.T.copy()), "echo_elsewhere"),
-    "subcarriers backwards": (of(transfer=ECHO[:, ::-1].copy()), "echo_elsewhere"),
-    "delay of the other sign": (echo_of(PATH_M - 30, reference_delay_s=np.full(96, -1e-7)), "echo_elsewhere"),
-    "delay removed twice": (echo_of(PATH_M - 30, reference_delay_s=np.full(96, 2e-7)), "echo_elsewhere"),
+    "conjugated": (of(transfer=ECHO.conj()), "echo_outside_scene"),
+    "I and Q swapped": (of(transfer=(ECHO.imag + 1j * ECHO.real).astype(np.complex64)), "echo_outside_scene"),
+    "paths one way": (echo_of(PATH_M / 2), "echo_outside_scene"),
+    "paths twice": (echo_of(2 * PATH_M), "echo_outside_scene"),
+    "square array transposed": (lambda: replace(SQUARE, transfer=SQUARE.transfer.T.copy()), "echo_outside_scene"),
+    "subcarriers backwards": (of(transfer=ECHO[:, ::-1].copy()), "echo_outside_scene"),
+    "delay of the other sign": (echo_of(PATH_M - 30, reference_delay_s=np.full(96, -1e-7)), "echo_outside_scene"),
+    "delay removed twice": (echo_of(PATH_M - 30, reference_delay_s=np.full(96, 2e-7)), "echo_outside_scene"),
     "carrier 10 % off": (of(frequency_hz=FREQUENCY + 1.2e8), "defocused"),
-    "band twice as wide": (of(frequency_hz=FREQUENCY[0] + 2 * (FREQUENCY - FREQUENCY[0])), "echo_elsewhere"),
+    "band twice as wide": (of(frequency_hz=FREQUENCY[0] + 2 * (FREQUENCY - FREQUENCY[0])), "echo_outside_scene"),
     "track 5 cm wrong at random": (flown(APERTURE.tx_m + WRONG_TRACK, APERTURE.rx_m + WRONG_TRACK), "defocused"),
     "track a pulse late": (flown(np.roll(APERTURE.tx_m, 9, 0), np.roll(APERTURE.rx_m, 9, 0)), None),
     "track half as long": (
@@ -238,9 +238,9 @@ def test_an_echo_outside_is_no_fault_where_the_scene_has_points_of_its_own():
     window = np.hanning(202)[1:-1]
     house = 30 * np.exp(-2j * np.pi * FREQUENCY * (PATH_M + 40)[:, None] / SPEED_OF_LIGHT_M_S)
     beside = replace(HISTORY, transfer=(ECHO + house).astype(np.complex64), weight=window / window.sum())
-    assert "echo_elsewhere" not in json.loads(ap.backproject(beside, TARGET_GRID).attrs["flags"])
+    assert "echo_outside_scene" not in json.loads(ap.backproject(beside, TARGET_GRID).attrs["flags"])
     alone = replace(HISTORY, transfer=house.astype(np.complex64))
-    assert "echo_elsewhere" in json.loads(ap.backproject(alone, TARGET_GRID).attrs["flags"])
+    assert "echo_outside_scene" in json.loads(ap.backproject(alone, TARGET_GRID).attrs["flags"])
 
 
 def test_a_lazy_image_is_judged_when_asked_and_by_all_of_it():

@@ -169,5 +169,5 @@ def decide_antennas(
     misses = f"no pulse illuminates {100 * illumination.unilluminated:.1f} % of the scene: these pixels are zero"
     return (
         [(", ".join(with_beam), illumination.line)],
-        {"beam_misses": misses} if illumination.unilluminated else {},
+        {"outside_beam": misses} if illumination.unilluminated else {},
     )

@@ -363,7 +363,7 @@ class _Model:
         differing = [one for one, (longer_m, std_m) in longer.items() if abs(longer_m) > PATH_SIGMAS * std_m]
         if differing:
             lines = (f"{one} by {100 * longer[one][0]:+.1f} ± {100 * longer[one][1]:.1f} cm" for one in differing)
-            flags["paths_differ"] = f"against {search.problem.pairs[0].record.pair}: {', '.join(lines)}"
+            flags["path_offsets_differ"] = f"against {search.problem.pairs[0].record.pair}: {', '.join(lines)}"
         return Refinement(correction, left.std_m, evidence.accepted, evidence.why, report, flags)
 
     def evidence_against(self, plain: "_Model", cause: CauseFit) -> float:

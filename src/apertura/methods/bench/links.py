@@ -108,7 +108,7 @@ class Contact:
         steady = max(self.scatter_db, self.moves_db) <= AMPLITUDE_DB
         if self.dropouts <= DROPOUT_SHARE * self.pulses and steady:
             return {}
-        return {"contact_loose": f"{self.name}: {self.line}"}
+        return {"contact_intermittent": f"{self.name}: {self.line}"}
 
     @property
     def line(self) -> str:
@@ -336,7 +336,7 @@ class MeasuredLink:
                 f"{moved:+.1f} ± {moved_std:.1f} ps"
             )
         if self.direct_db is not None and self.direct_db > LEAKAGE_DB:
-            flags["channel_leaks"] = (
+            flags["channel_crosstalk"] = (
                 f"{self.name}: what the sidelink carries arrives at {self.direct_db:.1f} dB of the strongest path"
             )
         return Flags.merged(flags, self.contact.flags)
@@ -524,8 +524,8 @@ class BenchPathOffset:
         if abs(apart_m) <= max(PATH_CELLS * self.cell_m, SIGMAS * self.std_m):
             return {}
         return {
-            "path_disagrees": f"{name}: {self.offset_m:+.3f} ± {self.std_m:.3f} m beyond the set-up, config says "
-            f"{self.stated_m:+.3f} m"
+            "path_offset_disagrees": f"{name}: {self.offset_m:+.3f} ± {self.std_m:.3f} m beyond the set-up, "
+            f"configured {self.stated_m:+.3f} m"
         }
 
 
@@ -566,7 +566,8 @@ class SplitAgreement:
         if not off and abs(self.gain_db) <= SPLIT_DB and self.band_rad <= SPLIT_RAD and self.band_db <= SPLIT_DB:
             return {}
         return {
-            "split_disagrees": f"{name}: {self.gain_db:+.2f} dB, {self.phase_rad:+.3f} ± {self.phase_std_rad:.3f} rad; "
+            "splitter_channels_differ": f"{name}: {self.gain_db:+.2f} dB, "
+            f"{self.phase_rad:+.3f} ± {self.phase_std_rad:.3f} rad; "
             f"over the band {self.band_db:.2f} dB and {self.band_rad:.3f} rad rms"
         }
 
