@@ -114,8 +114,8 @@ def test_a_tag_that_steps_back_is_named():
 def test_tags_further_apart_than_good_ones_are_flagged_with_what_was_flown_meanwhile(offset_s, flagged):
     (tx, rx), _ = fly(np.random.default_rng(5), interval_s=0.1, offset_s=offset_s)
     flags = associate(tx, rx, repetition_interval_s=0.1, speed_m_s=12.0).flags
-    assert ("time_tags_apart" in flags) == flagged
-    assert not flagged or flags["time_tags_apart"].endswith("moved 0.25 m in that time")
+    assert ("time_tag_offset" in flags) == flagged
+    assert not flagged or flags["time_tag_offset"].endswith("moved 0.25 m in that time")
 
 
 @pytest.mark.parametrize(("late_s", "left_out"), [(0.004, False), (0.006, True)])

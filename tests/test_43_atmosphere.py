@@ -90,7 +90,7 @@ def test_the_product_says_which_air_it_took_and_what_vacuum_would_have_done(fini
     said = json.loads((finished_tiny.results / "f01/uav1-uav2/image.json").read_text())
     air = said["atmosphere"]
     assert air["source"] == "standard atmosphere, terrain height 620 m, humidity 50 %"
-    assert air["vacuum_would_move_m"] == pytest.approx(air["refractivity_n"] * 1e-6 * 12.2, rel=0.15)
+    assert air["vacuum_shift_m"] == pytest.approx(air["refractivity_n"] * 1e-6 * 12.2, rel=0.15)
     assert said["models"]["atmosphere"].startswith(f"N = {air['refractivity_n']:.1f}: standard atmosphere")
     (line,) = (line for line in said["budget"] if line["cause"] == "atmosphere")
     assert line["stated"].startswith("not stated; assumed standard atmosphere")

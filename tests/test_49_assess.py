@@ -249,8 +249,8 @@ def test_a_sum_whose_phase_nothing_tells_says_so_and_that_its_peaks_are_lost(fin
     monkeypatch.setattr("apertura.stages.assess.agreement_of", lambda *_: None)
     told = with_longer_path(root, 0.214 / 4)
     assert [*told["fusion"]["phases_rad"]] == list(PAIRS)
-    assert "is added with phase 0: it shares no features with" in told["flags"]["phase_unmeasured"]
-    assert "by a quarter of a turn the peak would be 3 dB lower" in told["flags"]["phase_unmeasured"]
+    assert "is added with phase 0: it shares no features with" in told["flags"]["phase_unobservable"]
+    assert "by a quarter of a turn the peak would be 3 dB lower" in told["flags"]["phase_unobservable"]
     assert told["coherence"]["mean"] == pytest.approx(0.5, abs=0.15)
     assert "sum_incoherent" in told["flags"]
     assert told["focus"]["verdict"] == "defocused"

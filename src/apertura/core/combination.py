@@ -166,7 +166,7 @@ class CoherentSum:
             "left_out": dict(self.left_out),
             "why": dict(self.why),
             "agreeing": list(self.agreeing),
-            "would_align_rad": {
+            "aligning_phase_rad": {
                 pair: round(-difference.phase_rad, 4) for pair, difference in self.apart.items() if difference.alignable
             },
             "unmeasured": dict(self.unmeasured),
