@@ -357,7 +357,7 @@ def test_tracks_are_moved_about_the_middle_of_the_scene():
 
 
 BAD = {
-    "through the ground": (flown(plan_of(), uav1=line(height_m=-2.0)), "in or below the ground"),
+    "through the ground": (flown(plan_of(), uav1=line(height_m=-2.0)), "at or below the terrain"),
     "too few pulses": (
         plan_of(
             waveform=plan_of()["waveform"] | {"prf_hz": 8.0},

@@ -205,7 +205,7 @@ def backproject(  # noqa: PLR0913 - each choice is a keyword, so that an editor 
         flags = Flags.merged(flags, plan.replaced_by(formation.plan.setting, "the image"))
         if error.bound_db > accuracy_db:
             sure = f"up to {error.bound_db:.1f} dB ({CONFIDENCE:.0%} sure)"
-            flags["accuracy_missed"] = f"{sure}, {accuracy_db:g} dB asked"
+            flags["accuracy_not_met"] = f"{sure}, {accuracy_db:g} dB asked"
     # Judgement of focus, and attributes.
     error_db = attributes.get("numerical_error_db")
     judged = _judged(formation, judge, error_db=error_db)

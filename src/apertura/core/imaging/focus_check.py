@@ -127,7 +127,7 @@ up to a pulse's echo and half of it may miss the count; an image 7 dB out of foc
 _BY_CHANCE = 2.0  # times ln(pixels)/pulses, the largest coherence factor of contributions with random phases
 
 
-def echo_elsewhere(
+def echo_outside_scene(
     inputs: PhaseHistory | Profiles,
     grid: SceneGrid,
     terrain: Terrain,
@@ -432,7 +432,7 @@ def focus_report(formation: Formation, target: Any) -> dict[str, Any]:
     parts = _parts(formation, points, cell_m)
     verdict = judge([(point.amplitude, focus) for point, focus in zip(points, measured, strict=True)])
     inputs, found = formation.history or formation.profiles, verdict.points > 0
-    elsewhere = echo_elsewhere(inputs, grid, formation.plan.terrain, points=terms, measured=found)
+    elsewhere = echo_outside_scene(inputs, grid, formation.plan.terrain, points=terms, measured=found)
     if elsewhere:
         measured = [None] * len(points)  # sidelobes of it
     if elsewhere or not found:
@@ -492,7 +492,7 @@ UNEXPECTED_DB = 0.2
 
 
 def focus_flags(report: dict[str, Any], expected: Effect) -> Flags:
-    """Return the flags `defocused`, `loss_unexpected` and `echo_elsewhere`.
+    """Return the flags `defocused`, `loss_unexpected` and `echo_outside_scene`.
 
     Parameters
     ----------
@@ -506,7 +506,7 @@ def focus_flags(report: dict[str, Any], expected: Effect) -> Flags:
     Source: docs/theory/focus.md, "Focus of a point". Both losses have a deviation: the measured one by its points, the
     expected one from flight to flight.
     """
-    flags = Flags({"echo_elsewhere": report["elsewhere"]} if "elsewhere" in report else {})
+    flags = Flags({"echo_outside_scene": report["elsewhere"]} if "elsewhere" in report else {})
     told = f"{abs(expected.loss_db):.1f} ± {expected.loss_std_db:.1f} dB are expected by the budget"
     if report["verdict"] == "defocused":
         flags["defocused"] = (
@@ -556,5 +556,5 @@ def _point_report(formation: Formation, point: BrightPoint, focus: PointFocus) -
         "snr_db": round(focus.snr_db, 2),
         "background": float(f"{point.background:.4g}"),
         "coherence": round(focus.coherence, 5),
-        "coherence_allowed": round(focus.coherence_allowed, 5),
+        "coherence_noise_limit": round(focus.coherence_noise_limit, 5),
     }

@@ -158,7 +158,7 @@ CHORD = 0.1
 """Share of the range to the scene over which directions of flight are taken: longer than position errors."""
 
 MOST_ASPECT = 1.5
-"""Aspect angle of a place over the integration angle above which `integration_turns` is raised: the track turns."""
+"""Aspect angle of a place over the integration angle above which `track_turns` is raised: the track turns."""
 
 _PULSES = 256  # sampled for the geometry
 _FEWEST = 3  # pulses of the place that takes most: of two there is no focus to be judged
@@ -307,7 +307,7 @@ def _integration_of(
         flags["outside_swath"] = f"{outside} is passed by no pulse inside the integration angle of {degrees:.3g}°"
     aspect_deg = _aspect_deg(sector, aperture, points[counts > 0], vertical(points_m))
     if aspect_deg > MOST_ASPECT * degrees * (1 + TAPER):
-        flags["integration_turns"] = (
+        flags["track_turns"] = (
             f"places are seen under {aspect_deg:.0f}° in all, {degrees:.3g}° are integrated of a straight pass: the "
             "track turns, or passes them more than once"
         )

@@ -232,7 +232,7 @@ class Certificate:
         A tile is worse when the mean squared difference at its pixels exceeds the accuracy times the larger of `power`,
         the mean |I|² of the image, and of what is there: a pixel on a bright target may err by more than a dark one.
         The pixels do not depend on the image, so a run that was killed while it redid tiles makes the same choice
-        again, provided the failing tiles are redone last.
+        again, provided the failing tiles are recomputed last.
         """
         squared, there = np.abs(values_at(image, self.pixels) - self.exact) ** 2, np.abs(self.exact) ** 2
         tolerated = 10 ** (accuracy_db / 10)

@@ -247,7 +247,9 @@ class Evidence:
         """Flag → measured values, of exceeded limits."""
         flags = {} if self.accepted or not self.promising else {"refinement_rejected": self.why}
         if self.inconsistent:
-            flags["prior_too_wide" if self._motion_power < 1 else "prior_inconsistent"] = self.inconsistent
+            flags["position_error_overstated" if self._motion_power < 1 else "position_error_understated"] = (
+                self.inconsistent
+            )
         if self.slip:
             flags["cycle_slip_suspected"] = self.slip
         return flags

@@ -108,7 +108,7 @@ class Contact:
         is_steady = max(self.scatter_db, self.moves_db) <= AMPLITUDE_DB
         if self.dropouts <= DROPOUT_SHARE * self.pulses and is_steady:
             return {}
-        return {"contact_loose": f"{self.name}: {self.line}"}
+        return {"contact_intermittent": f"{self.name}: {self.line}"}
 
     @property
     def line(self) -> str:
