@@ -274,7 +274,7 @@ def test_right_logs_are_left_alone():
     one = case("points-4", "short", "mono", 0.0, 10.0, 3, stated_m=0.02)
     found = refine(one.records, GRID, FlatGround(0.0), one.errors)
     assert not found.accepted
-    assert not found.flags.keys() - {"prior_too_wide"}  # which is true of logs that state 2 cm and have none
+    assert not found.flags.keys() - {"position_error_overstated"}  # which is true of logs that state 2 cm and have none
     assert "no improvement over the logs" in found.why
 
 

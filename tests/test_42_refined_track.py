@@ -257,7 +257,7 @@ def test_right_logs_that_are_said_to_err_by_2_cm_are_left_as_they_are(tmp_path, 
     image.image(campaign, "f01", "uav1-uav1")
     quality, stage = quality_of(campaign, "uav1-uav1"), open_refined(campaign, "f01").stage
     assert "no improvement over the logs" in stage.attrs["why"]
-    assert stage.attrs["flags"].keys() <= {"prior_too_wide"}
+    assert stage.attrs["flags"].keys() <= {"position_error_overstated"}
     assert quality["flags"].items() >= stage.attrs["flags"].items()
     assert quality["autofocus"]["accepted"] is False
     assert quality["models"]["autofocus"].startswith("on: asked for; ")

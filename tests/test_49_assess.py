@@ -113,7 +113,7 @@ def test_the_sign_of_a_lever_arm_is_seen_and_named(tmp_path):
     best = reports["uav1-uav1"]["hypotheses"][0]
     assert best["kind"] == "offset"  # along a straight track an arm's sign is one of several that do the same
     assert best["what"].endswith("right axis of the lever arms of uav1 has the opposite sign")
-    assert best["what"] in reports["uav1-uav1"]["flags"]["pairs_apart"]
+    assert best["what"] in reports["uav1-uav1"]["flags"]["pairs_displaced"]
     left_out = reports["fused"]["fusion"]["left_out"]
     assert len(left_out) == 1
     assert next(iter(left_out)) in reports["fused"]["models"]["fusion"]

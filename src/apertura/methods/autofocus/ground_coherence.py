@@ -438,7 +438,7 @@ def refined_by_speckle(ground: SpeckleTiles, prior: Prior, knots_s: Floats) -> R
             if len(ground.pairs) < 2
             else f"speckle refinement requires {LEAST_TILES} tiles, the scene has {count}"
         )
-        flags = {"refinement_no_bright_place": why}
+        flags = {"refinement_no_bright_point": why}
         return Refinement(TrackCorrection(knots_s, prior.tracks(unrefined)), std_m, False, why, {"tiles": count}, flags)
     held_out = np.arange(count) % _HELD_OUT == 2
     before = _coherence(ground, prior, unrefined, held_out)
