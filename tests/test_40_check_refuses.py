@@ -73,7 +73,7 @@ def dem_beside_the_track(root):
 
 SPOILT = {
     "wide scene": (wider, "echoes of the scene arrive after the cyclic prefix"),
-    "in the ground": (a_few_in_the_ground, "is in or below the ground of the scene, worst at pulse"),
+    "in the ground": (a_few_in_the_ground, "is at or below the terrain of the scene, worst at pulse"),
     "beam to the other side": (antenna([-90.0, 0.0]), "zero pulses in the beam"),
     "beam to the sky": (antenna([90.0, 80.0]), "zero pulses in the beam"),
     "sums of pulses under a beam": (antenna([90.0, 0.0], 120.0, presum=4), "presum factor 4 with antenna beams"),

@@ -168,7 +168,7 @@ def test_a_track_at_the_height_of_the_ground_is_refused_before_the_run(campaign)
 
 def test_a_log_that_does_not_cover_the_pulses_is_told_of_with_the_clock(campaign):
     message = complaint(lambda: run_steps(campaign, exports=False))
-    assert "begins 3.440 s after the first pulse" in message
+    assert "starts 3.440 s after the first pulse" in message
     assert "apertura align" in message
 
 

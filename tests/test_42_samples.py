@@ -181,7 +181,7 @@ def test_captures_that_begin_in_the_direct_pulse_or_end_in_it_are_flagged(tmp_pa
     for node in ("uav1", "uav2"):
         ingest.ingest(campaign, "f01", node)
     echo.echo(campaign, "f01", "uav1-uav2")
-    assert ("pulse_cut" in PairEcho.opened(campaign, "f01", "uav1-uav2").stage.attrs["flags"]) is cut
+    assert ("pulse_truncated" in PairEcho.opened(campaign, "f01", "uav1-uav2").stage.attrs["flags"]) is cut
 
 
 def test_captures_shorter_than_a_pulse_and_its_echoes_are_refused_by_the_step(tiny):

@@ -49,7 +49,7 @@ def certified(
     """
     count = min(max(RANDOM_PIXELS, len(formation.windows)), _MOST_TILES)
     drawn, certificate = random_pixels(formation.windows, count, np.random.default_rng(0)), None
-    settings, redone, flags = iter(formation.plan.fallbacks), [], Flags()
+    settings, recomputed, flags = iter(formation.plan.fallbacks), [], Flags()
     while True:
         brightness, setting = Brightness.of(target, formation.windows), next(settings, None)
         # Bright pixels depend on the image, random ones do not: for the first image, pulses are read once for both.
@@ -79,7 +79,7 @@ def certified(
         "numerical_error_confidence": CONFIDENCE,
         "numerical_error_estimate_db": round(error.estimate_db, 2),
         "certified_pixels": count + BRIGHT_PIXELS,
-        "redone": redone,
+        "recomputed": recomputed,
         "flags": flags,
     }
 

@@ -130,7 +130,7 @@ sum to one echo, and half of it may not be counted; an image with a peak loss of
 _BY_CHANCE = 2.0  # in units of ln(pixels)/pulses, the largest coherence factor of contributions with random phases
 
 
-def echo_elsewhere(
+def echo_outside_scene(
     inputs: PhaseHistory | Profiles,
     grid: SceneGrid,
     terrain: Terrain,
@@ -565,5 +565,5 @@ def _point_report(formation: Formation, point: BrightPoint, focus: PointFocus) -
         "snr_db": round(focus.snr_db, 2),
         "background": float(f"{point.background:.4g}"),
         "coherence": round(focus.coherence, 5),
-        "coherence_allowed": round(focus.coherence_allowed, 5),
+        "coherence_noise_limit": round(focus.coherence_noise_limit, 5),
     }

@@ -128,7 +128,7 @@ def judge(
     'focused'
     >>> conjugated = ap.PhaseHistory(echo.conj(), frequency, np.full(256, 1 / 256), np.zeros(128), aperture)
     >>> list(ap.judge(ap.backproject(conjugated, grid)).flags)
-    ['echo_elsewhere']
+    ['echo_outside_scene']
     """
     formation = _formation_of(image)
     valid = position_std_m is None or (is_number(position_std_m) and position_std_m >= 0)

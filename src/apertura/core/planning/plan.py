@@ -61,7 +61,7 @@ def check_geometry(job: Job) -> dict[str, str]:
     if missing := no_aperture(aperture, ground_m, wavelength_m=2 * SPEED_OF_LIGHT_M_S / sum(job.band_hz)):
         flags["no_aperture"] = missing
     if sparse := undersampling(job):
-        flags["pulses_sparse"] = sparse
+        flags["azimuth_undersampled"] = sparse
     beyond = _share_beyond(aperture, job.points_m, job.path_limit_m)
     if beyond:
         flags["beyond_cyclic_prefix"] = (

@@ -35,7 +35,7 @@ class SubApertures:
     drift_m: float
     drift_std_m: float
     entropy: float
-    entropy_by_chance: float
+    entropy_random_phase: float
 
 
 def compare_parts(parts: NDArray[np.complex64], *, spacing_m: float, generator: np.random.Generator) -> SubApertures:
@@ -76,7 +76,7 @@ def compare_parts(parts: NDArray[np.complex64], *, spacing_m: float, generator: 
         drift_m=float(np.sqrt((common**2).sum(axis=-1).mean())),
         drift_std_m=float(np.sqrt((spread**2).sum(axis=-1).mean() / len(parts))),
         entropy=float(np.median([_entropy(patch) for patch in full])),
-        entropy_by_chance=float(np.median([_entropy_by_chance(patch.sum(axis=0), generator) for patch in parts])),
+        entropy_random_phase=float(np.median([_entropy_by_chance(patch.sum(axis=0), generator) for patch in parts])),
     )
 
 
@@ -146,19 +146,19 @@ GEOMETRY_CONTRADICTED = frozenset(
         "attitude_suspect",
         "code_unconfirmed",
         "cycle_slip_suspected",
-        "echo_elsewhere",
-        "flights_apart",
+        "echo_outside_scene",
+        "flights_displaced",
         "loss_unexpected",
         "pair_unconfirmed",
-        "pairs_apart",
+        "pairs_displaced",
         "pairs_out_of_phase",
-        "paths_differ",
-        "phase_unmeasured",
+        "path_offsets_differ",
+        "phase_unobservable",
         "platform_below_scene",
-        "prior_inconsistent",
+        "position_error_understated",
         "reference_point",
         "refinement_rejected",
-        "time_tags_apart",
+        "time_tag_offset",
         "wrong_code",
     }
 )
@@ -194,7 +194,7 @@ class PointFocus:
     pulses: int
     snr_db: float
     coherence: float = 1.0
-    coherence_allowed: float = 1.0
+    coherence_noise_limit: float = 1.0
 
 
 def point_focus(contributions: NDArray[np.complex128]) -> PointFocus | None:
@@ -358,8 +358,8 @@ def focus_with_flags(
     'cannot tell'
     """
     against = sorted(GEOMETRY_CONTRADICTED.intersection(flags))
-    if "accuracy_missed" in flags and error_db is not None and error_db > MOST_ERROR_DB:
-        against.append("accuracy_missed")
+    if "accuracy_not_met" in flags and error_db is not None and error_db > MOST_ERROR_DB:
+        against.append("accuracy_not_met")
     if focus["verdict"] != "focused" or not against:
         return dict(focus)
     return {**focus, "verdict": "cannot tell", "why": f"{focus['why']}; contradicted by {', '.join(against)}"}

@@ -24,7 +24,7 @@ class Radiometry:
         What has the value 1, or 0 dB.
     divided_by
         Pair → largest amplitude of its image, by which it was divided before it was added.
-    phases_taken_off_rad
+    phases_removed_rad
         Pair → constant phase taken off before it was added; pairs that a coherent sum leaves out are missing.
     peak_db, noise_floor_re_peak_db
         Power of the brightest target, dB re 1; median power against the peak, dB; None where not measured.
@@ -34,7 +34,7 @@ class Radiometry:
     power: str
     one_is: str
     divided_by: Mapping[str, float] = field(default_factory=dict)
-    phases_taken_off_rad: Mapping[str, float] = field(default_factory=dict)
+    phases_removed_rad: Mapping[str, float] = field(default_factory=dict)
     peak_db: float | None = None
     noise_floor_re_peak_db: float | None = None
 
