@@ -134,7 +134,7 @@ def test_what_no_setting_meets_is_flagged():
     """Profiles without the double sum to fall back on."""
     profiles = ap.range_compress(point_history(), TARGET_GRID, ap.FlatGround(0.0))
     flags = json.loads(ap.backproject(profiles, TARGET_GRID, accuracy_db=-120.0).attrs["flags"])
-    assert "-120 dB requested" in flags["accuracy_missed"]
+    assert "-120 dB requested" in flags["accuracy_not_met"]
 
 
 def test_an_image_can_be_written_with_its_plan_and_certificate(image, tmp_path):

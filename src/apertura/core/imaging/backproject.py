@@ -208,7 +208,7 @@ def backproject(  # noqa: PLR0913 - each choice is a keyword, for completion in 
         flags = Flags.merged(flags, plan.replaced_by(formation.plan.setting, "the image"))
         if error.bound_db > accuracy_db:
             bound = f"numerical error up to {error.bound_db:.1f} dB ({CONFIDENCE:.0%} confidence)"
-            flags["accuracy_missed"] = f"{bound}, {accuracy_db:g} dB requested"
+            flags["accuracy_not_met"] = f"{bound}, {accuracy_db:g} dB requested"
     # Judgement of focus, and attributes.
     error_db = attributes.get("numerical_error_db")
     judged = _judged(formation, judge, error_db=error_db)

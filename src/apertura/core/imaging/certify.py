@@ -70,10 +70,10 @@ def certified(
         for tiles in (uncertified, worse):
             compute_tiles(image, tiles, target, threads=threads, scheduler=scheduler)
         flags = Flags.merged(flags, formation.plan.replaced_by(setting, f"{len(worse) + len(uncertified)} tiles"))
-        redone.append({"tiles": len(worse) + len(uncertified), "with": f"{setting.line}, every pulse"})
+        recomputed.append({"tiles": len(worse) + len(uncertified), "with": f"{setting.line}, every pulse"})
     if error.bound_db > accuracy_db:
         bound = f"numerical error up to {error.bound_db:.1f} dB ({CONFIDENCE:.0%} confidence)"
-        flags["accuracy_missed"] = f"{bound}, {accuracy_db:.1f} dB requested"
+        flags["accuracy_not_met"] = f"{bound}, {accuracy_db:.1f} dB requested"
     return {
         "numerical_error_db": round(error.bound_db, 2),
         "numerical_error_confidence": CONFIDENCE,

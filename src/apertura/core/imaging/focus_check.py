@@ -439,7 +439,7 @@ def focus_report(formation: Formation, target: Any) -> dict[str, Any]:
     parts = _parts(formation, points, cell_m)
     verdict = judge([(point.amplitude, focus) for point, focus in zip(points, measured, strict=True)])
     inputs, has_points = formation.history or formation.profiles, verdict.points > 0
-    elsewhere = echo_elsewhere(inputs, grid, formation.plan.terrain, points=terms, measured=has_points)
+    elsewhere = echo_outside_scene(inputs, grid, formation.plan.terrain, points=terms, measured=has_points)
     if elsewhere:
         measured = [None] * len(points)  # the points may be its sidelobes
     if elsewhere or not has_points:
@@ -499,7 +499,7 @@ UNEXPECTED_DB = 0.2
 
 
 def focus_flags(report: dict[str, Any], expected: Effect) -> Flags:
-    """Evaluate the flags `defocused`, `loss_unexpected` and `echo_elsewhere`.
+    """Evaluate the flags `defocused`, `loss_unexpected` and `echo_outside_scene`.
 
     Parameters
     ----------
@@ -513,7 +513,7 @@ def focus_flags(report: dict[str, Any], expected: Effect) -> Flags:
     Source: docs/theory/focus.md, "Focus of a point". Both losses have a standard deviation: that of the measured loss
     is estimated from its points, that of the expected loss is its variation between flights.
     """
-    flags = Flags({"echo_elsewhere": report["elsewhere"]} if "elsewhere" in report else {})
+    flags = Flags({"echo_outside_scene": report["elsewhere"]} if "elsewhere" in report else {})
     budget = f"{abs(expected.loss_db):.1f} ± {expected.loss_std_db:.1f} dB expected from the error budget"
     if report["verdict"] == "defocused":
         flags["defocused"] = (

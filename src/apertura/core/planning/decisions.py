@@ -161,7 +161,7 @@ CHORD = 0.1
 """Chord over which the direction of flight is computed, in units of the range: long relative to position errors."""
 
 MOST_ASPECT = 1.5
-"""Ratio of a point's aspect angle to the integration angle, above which `integration_turns` is raised."""
+"""Ratio of a point's aspect angle to the integration angle, above which `track_turns` is raised."""
 
 _PULSES = 256  # pulses sampled for the geometry
 _FEWEST = 3  # least pulses at the pixel with the most: focus cannot be judged from two
@@ -311,7 +311,7 @@ def _integration_of(
         flags["outside_swath"] = f"{outside} has no pulse inside the integration angle of {degrees:.3g}°"
     aspect_deg = _aspect_deg(sector, aperture, points[counts > 0], vertical(points_m))
     if aspect_deg > MOST_ASPECT * degrees * (1 + TAPER):
-        flags["integration_turns"] = (
+        flags["track_turns"] = (
             f"aspect angle of a point {aspect_deg:.0f}° in total, integration angle of a straight pass {degrees:.3g}°: "
             "the track turns, or passes the scene more than once"
         )

@@ -26,7 +26,7 @@ class SubApertures:
         SNR of a pixel, from images of even and of odd pulses.
     drift_m, drift_std_m
         RMS shift of the patch between subapertures, and its standard deviation.
-    entropy, entropy_by_chance
+    entropy, entropy_random_phase
         Shannon entropy of the patch, nats, and that of the sum of the same subapertures with random phases: if both are
         equal, the patch is not focused.
     """
@@ -185,7 +185,7 @@ class PointFocus:
         Pulses per block; faster phase errors are not measured.
     snr_db
         SNR of the point in the image, from its even and odd pulses; NaN with fewer than four pulses.
-    coherence, coherence_allowed
+    coherence, coherence_noise_limit
         |Σ s|²/(M Σ|s|²) of the contributions s of M pulses, and its value with noise alone.
     """
 
@@ -388,5 +388,5 @@ def judge_parts(parts: SubApertures, *, cell_m: float) -> Focus:
         drift = f"{parts.drift_m:.2f} ± {parts.drift_std_m:.2f} m"
         return Focus("defocused", *nothing, f"{line}, and subaperture images are displaced by {drift}")
     if np.isfinite(parts.entropy):
-        line += f"; entropy {parts.entropy:.2f}, {parts.entropy_by_chance:.2f} with random phases"
+        line += f"; entropy {parts.entropy:.2f}, {parts.entropy_random_phase:.2f} with random phases"
     return Focus("cannot tell", *nothing, line)
