@@ -73,16 +73,16 @@ def dem_beside_the_track(root):
 
 SPOILT = {
     "wide scene": (wider, "echoes of the scene arrive after the cyclic prefix"),
-    "in the ground": (a_few_in_the_ground, "is in or below the ground of the scene, worst at pulse"),
+    "in the ground": (a_few_in_the_ground, "is at or below the terrain of the scene, worst at pulse"),
     "beam to the other side": (antenna([-90.0, 0.0]), "zero pulses in the beam"),
     "beam to the sky": (antenna([90.0, 80.0]), "zero pulses in the beam"),
-    "sums of pulses under a beam": (antenna([90.0, 0.0], 120.0, presum=4), "presum is 4, and the antennas have beams"),
-    "sums of many pulses": (processing(presum=64), "presum is 64"),
-    "a DEM that is none": (processing(terrain="dem"), "terrain is dem"),
-    "an engine that is not here": (processing(engine="cuda"), "engine cuda cannot run here"),
+    "sums of pulses under a beam": (antenna([90.0, 0.0], 120.0, presum=4), "presum factor 4 with antenna beams"),
+    "sums of many pulses": (processing(presum=64), "presum factor 64"),
+    "a DEM that is none": (processing(terrain="dem"), "terrain model dem, but the scene has no DEM"),
+    "an engine that is not here": (processing(engine="cuda"), "engine cuda is not available on this machine"),
     "an angle of one pulse": (
         processing(integration={"degrees": 0.001}),
-        "no more than 2 pulses see the scene inside",
+        "at most 2 pulses illuminate a pixel inside",
     ),
     "another's scheduler": (processing(scheduler="tcp://127.0.0.1:9999"), "DASK_SCHEDULER_ADDRESS is not set"),
     "a log with a hole": (

@@ -610,7 +610,7 @@ DEMS = {
     ),
     "ground control points alone": (
         lambda path: raster(path, crs=None, transform=Affine.identity()),
-        "no CRS on Earth",
+        "no geodetic CRS",
     ),
 }
 

@@ -147,7 +147,7 @@ def test_a_mixer_of_the_other_sign_is_flagged(tmp_path):
     root = written(tmp_path, flight, iq="conjugate")
     run_steps(root, exports=False)
     raised = image_of(root).attrs["quality"]["flags"]
-    assert {"echo_elsewhere", "defocused"} & set(raised)
+    assert {"echo_outside_scene", "defocused"} & set(raised)
     assert any("change waveform.iq between complex and conjugate" in line for line in raised.values())
 
 

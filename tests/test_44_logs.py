@@ -106,10 +106,12 @@ def test_pulses_of_a_float_solution_are_left_out_unless_allowed(tmp_path):
 
     edit_track(campaign.root, "b", epochs(floated))
     dataset = echo_of(campaign)
-    left_out = dataset.attrs["pulses"]["reasons"]["fix_poor"]
+    left_out = dataset.attrs["pulses"]["reasons"]["fix_quality_low"]
     assert 10 <= left_out <= 12  # 0.6 s of 20 Hz
     assert dataset.sizes["pulse"] == dataset.attrs["pulses"]["used"] == 40 - left_out
-    assert dataset.attrs["flags"]["fix_poor"].startswith(f"b: {left_out} of 40 pulses left out: the log's solution is")
+    assert dataset.attrs["flags"]["fix_quality_low"].startswith(
+        f"b: {left_out} of 40 pulses left out: the log's solution is"
+    )
     assert flags_of(echo_of(campaign, "a-a")) == {}
     edit_config(campaign.root, lambda document: document["nodes"]["b"].update(worst_fix="float"))
     assert echo_of(campaign).attrs["pulses"]["used"] == 40
@@ -293,7 +295,8 @@ def test_an_attitude_that_looks_like_radians_is_a_flag_where_it_moves_an_antenna
     flags = place(log, log, time[5:-5]).flags
     assert ("attitude_suspect" in flags) is flagged
     if flagged:
-        assert "a: angles of attitude look in radians: yaw is 0° off the course so, 88°" in flags["attitude_suspect"]
+        measured = "yaw then deviates from the course by 0°, but by 88° as degrees clockwise from north"
+        assert f"a: attitude angles appear to be in radians: {measured}" in flags["attitude_suspect"]
 
 
 @pytest.mark.parametrize("pair", ["uav1-uav1", "uav1-uav2"])

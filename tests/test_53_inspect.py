@@ -74,7 +74,7 @@ def test_a_log_in_radians_lacks_degrees_before_any_campaign_is_made(tmp_path):
         path.write_text("\n".join(["time_utc,east_m,north_m,up_m,roll_deg,pitch_deg,yaw_deg", *rows, ""]))
         said = [line for line in look(path).missing if line.startswith("an attitude in degrees")]
         assert bool(said) is lacking
-        assert not lacking or "look in radians: yaw is 0° off the course so" in said[0]
+        assert not lacking or "appear to be in radians: yaw then deviates from the course by 0°" in said[0]
 
 
 def test_the_preview_of_a_log_names_the_axes_that_it_has(shared, tmp_path):

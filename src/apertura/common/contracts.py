@@ -228,11 +228,25 @@ STAGES: Mapping[str, Stage] = {
         {
             **_FRAME,
             **_WAVE,
+            "background": "echoes at constant delay: method requested, removed, and why",
+            "interference": "subcarriers with interference: how many, where, excluded or not",
             "step_m": "total path between range samples, m",
             "centre_frequency_hz": "f_mid, reference frequency of the profile, Hz",
             "oversampling": "samples per resolution cell c/B of total path",
             "window": "weighting over the subcarriers",
             "compression_error_db": "RMS error relative to the exact sum over subcarriers, at test samples, dB",
+        },
+        {
+            "background": Variable(
+                ("background_knot", "subcarrier"),
+                "complex64",
+                "1",
+                "removed, in delays of the recorder",
+            ),
+            "subcarrier_gain": Variable(
+                ("subcarrier",), "float32", "1", "factor of `transfer`: 0 where interference is excluded"
+            ),
+            "background_time": Variable(("background_knot",), "float64", "s", "of its knots, from the first pulse"),
         },
     ),
     "refined_track": Stage(

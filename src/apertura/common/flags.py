@@ -20,9 +20,9 @@ class Flags(dict[str, str]):
 
     Examples
     --------
-    >>> merged = Flags.merged({"fix_poor": "3 of 90 pulses of uav1"}, {"fix_poor": "7 of 90 pulses of uav2"})
-    >>> merged["fix_poor"]
-    '3 of 90 pulses of uav1; 7 of 90 pulses of uav2'
+    >>> merged = Flags.merged({"fix_quality_low": "3 of 90 pulses of a"}, {"fix_quality_low": "7 of 90 pulses of b"})
+    >>> merged["fix_quality_low"]
+    '3 of 90 pulses of a; 7 of 90 pulses of b'
     >>> Flags.merged(merged, merged) == merged
     True
     >>> Flags({"fix_pour": "9 of 90 pulses of uav1"})

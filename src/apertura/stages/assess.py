@@ -24,7 +24,9 @@ from apertura.stages.scene import settled_scene
 from apertura.workflow.lineage import result_of
 
 _PHASE = "pairs_out_of_phase"
-_LOOKS_WRONG = frozenset({"defocused", "loss_unexpected", "echo_elsewhere", "pairs_apart", _PHASE, "pair_unconfirmed"})
+_LOOKS_WRONG = frozenset(
+    {"defocused", "loss_unexpected", "echo_outside_scene", "pairs_displaced", _PHASE, "pair_unconfirmed"}
+)
 """Flags that a wrong geometry raises; hypotheses are tried where one is raised."""
 
 _TIED = "as many pairs say the opposite, and their images do not show which is wrong"
@@ -174,7 +176,7 @@ def _hypotheses(
             line = flags[pair].get(name) or images[pair].attrs["flags"][name]
             flags[pair][name] = line + told
         focus = images[pair].attrs["quality"]["focus"]
-        if named and not names and _regained(focus, named[0]["gain_of_pairs_db"][pair]):
+        if named and not names and _regained(focus, named[0]["pair_gain_db"][pair]):
             flags[pair]["loss_unexpected"] = f"{focus['why']}{told}"
     return named
 
@@ -202,7 +204,7 @@ def _disagreement(chosen: CoherentSum, pair: str, blind: Sequence[str]) -> dict[
     where = one.evidence
     if one.shifted:
         return {
-            "pairs_apart": (
+            "pairs_displaced": (
                 f"{where} of {pair} lie {100 * one.shift_m:.1f} ± {100 * one.shift_std_along_m:.1f} cm from where "
                 f"{agreeing} {'has' if len(chosen.agreeing) == 1 else 'have'} them, "
                 f"{100 * one.shift_east_m:+.1f} cm east and {100 * one.shift_north_m:+.1f} cm north"

@@ -365,11 +365,11 @@ def _flags_of_choice(fusion: Mapping[str, Any]) -> Flags:
     alone = "; ".join(f"{pair} is not in the coherent sum: {why}" for pair, why in fusion["left_out"].items())
     if ties := " or ".join(" and ".join(tie) for tie in fusion["ties"]):
         alone += f"; a tie: {ties} would make as large a sum, and the better focused one was taken"
-    chosen = {"pair_left_out": alone} if alone else {}
+    chosen = {"pair_excluded": alone} if alone else {}
     if unmeasured := fusion["unmeasured"]:
         known, unknown = len(fusion["phases_rad"]) - len(unmeasured), len(unmeasured)
         lost = [-20 * np.log10(abs(known + turn * unknown) / (known + unknown) + 1e-3) for turn in (1j, -1)]
-        chosen["phase_unmeasured"] = (
+        chosen["phase_unobservable"] = (
             "; ".join(f"{pair} is added with phase 0: {why}" for pair, why in unmeasured.items())
             + f"; wrong by a quarter of a turn the peak would be {lost[0]:.0f} dB lower, by half a turn "
             + (f"{lost[1]:.0f} dB" if known != unknown else "gone, and each target shown twice beside its place")
@@ -392,5 +392,5 @@ def _worst(images: Mapping[str, xr.Dataset], fusion: Mapping[str, Any]) -> dict[
         "numerical_error_confidence": round(1 - sum(1 - one["numerical_error_confidence"] for one in qualities), 4),
         "numerical_error_estimate_db": worst["numerical_error_estimate_db"],
         "instruction_set": ", ".join(sorted({quality["instruction_set"] for quality in qualities})),
-        "redone": [one for quality in qualities for one in quality["redone"]],
+        "recomputed": [one for quality in qualities for one in quality["recomputed"]],
     }

@@ -131,7 +131,7 @@ def hypotheses(
     -------
     list
         what, kind, gain_db and lost_db: gain of the peak power at the bright place, and what there is to gain; and
-        gain_of_pairs_db, of each pair's own peak.
+        pair_gain_db, of each pair's own peak.
     """
     waveform = campaign.settings.waveform
     if not isinstance(waveform, SampledWaveform):  # positions travel with a phase history: there are no logs to doubt
@@ -140,7 +140,7 @@ def hypotheses(
     logged = {node: open_acquisition(campaign, flight, node, sent) for node in campaign.flight(flight).nodes}
     window, track = campaign.settings.processing.window, open_refined(campaign, flight)
     found = [
-        evidence_of(logged, pair, PairEcho.opened(campaign, flight, pair).stage, window)
+        evidence_of(logged, pair, PairEcho.cleaned(campaign, flight, pair).stage, window)
         for pair in campaign.flight(flight).pairs
     ]
     nodes = {name: track.node(node) for name, node in logged.items()}
@@ -169,7 +169,7 @@ def hypotheses(
     if named:
         best = max(trials, key=lambda one: one.gain_db)
         there, there_m = _around(scene, _moved(scene, brightest, found, best), cell_m), height_m + best.height_m
-        named[0]["gain_of_pairs_db"] = {
+        named[0]["pair_gain_db"] = {
             one.pair: round(
                 decibels(joint_peak_power([after], there, there_m) / joint_peak_power([one.history], here, height_m)), 2
             )

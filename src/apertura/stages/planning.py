@@ -92,6 +92,10 @@ def budget_of(
         BudgetLine("missing pulses", stated, NO_EFFECT),
         _antenna(pair, paths),
     ]
+    background = pair.report.get("background", {})
+    if background.get("removed", "none") != "none":
+        effect = Effect(background["middle_loss_db"], 0.0, 0.0)
+        lines.append(BudgetLine("background removal", background["removed"], effect))
     if not monostatic:
         total = paths.aperture.path(paths.point_m)
         lines.append(offset_line(paths, "clock", _PPM * total, _scaled(pair.report, "clock", "std_ppm", 1), unit="ppm"))
@@ -199,7 +203,7 @@ def air_decision(pair: OpenPair) -> Decision:
     """Return the air assumed on the paths of a pair, and its effect against vacuum: one constant for all pairs."""
     air = pair.air
     cell_m = pair.wave_speed_m_s / float(np.ptp(pair.frequency_hz)) / 2
-    moved_m, left_m, other = float(air["vacuum_would_move_m"]), float(air["one_constant_leaves_m"]), "vacuum"
+    moved_m, left_m, other = float(air["vacuum_shift_m"]), float(air["constant_refractivity_error_m"]), "vacuum"
     if not air["refractivity_n"]:
         moved_m, other = 1e-6 * USUAL_N * float(air["range_m"]), f"air of N = {USUAL_N:.0f}"
     shows = "" if moved_m > _SHOWN_CELLS * cell_m else ", which does not show"
@@ -209,6 +213,17 @@ def air_decision(pair: OpenPair) -> Decision:
         f"leaves {100 * left_m:.1g} cm of path"
     )
     return Decision("atmosphere", f"N = {air['refractivity_n']:.1f}", why)
+
+
+def background_decision(pair: OpenPair) -> Decision:
+    """Return the decision on the background: from stage `profile`, or what decides it once there is one."""
+    report = pair.report.get("background")
+    if report is None:
+        return Decision("background", "auto", "decided when range profiles are formed")
+    if "removed" in report:
+        return Decision("background", report["removed"], report["reason"])
+    reason = "configured" if report["requested"] == "none" else "auto: the recording has no echo at constant delay"
+    return Decision("background", "none", reason)
 
 
 def _scaled(report: Mapping[str, Any], section: str, name: str, unit: float) -> float | None:
@@ -264,7 +279,7 @@ def plan_pair(campaign: Campaign, pair: OpenPair, scene: OpenScene, *, threads: 
     plan = plan_job(campaign, job_of(campaign, pair, scene, threads=threads), accuracy_db=float(accuracy.value))
     plan = replace(
         plan,
-        decisions=(*plan.decisions, accuracy, air_decision(pair)),
+        decisions=(*plan.decisions, accuracy, air_decision(pair), background_decision(pair)),
         flags=Flags.merged(flags, scene.flags, plan.flags),
     )
     written = campaign.is_current(campaign.stage("image", pair.flight, pair.name))

@@ -59,7 +59,7 @@ def keep_segments(campaign: Campaign, flight: str, pair: str, echo: xr.Dataset) 
 # ---- Pulses of valid positions, and the errors of these -------------------------------------------------------------
 
 _LINES = {
-    "fix_poor": "the log's solution is poorer than {poorest_fix}",
+    "fix_quality_low": "the log's solution is poorer than {poorest_fix}",
     "track_gap": "no epochs",
     "track_outlier": "outliers or steps of the log",
     "track_frozen": "epochs that repeat the position before them",

@@ -187,9 +187,9 @@ def flag_words(flags: Sequence[str], most: int) -> str:
 
     Examples
     --------
-    >>> flag_words([], 40), flag_words(["beam_misses"], 40)
-    ('no flags', '1 flag: beam_misses')
-    >>> flag_words(["sidelink_noisy", "pulses_sparse", "beam_misses"], 40)
+    >>> flag_words([], 40), flag_words(["outside_beam"], 40)
+    ('no flags', '1 flag: outside_beam')
+    >>> flag_words(["sidelink_noisy", "azimuth_undersampled", "outside_beam"], 40)
     '3 flags: sidelink_noisy, and 2 more in image.json'
     """
     if not flags:

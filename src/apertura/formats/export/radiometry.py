@@ -36,7 +36,7 @@ class Radiometry:
     power: str
     one_is: str
     divided_by: Mapping[str, float] = field(default_factory=dict)
-    phases_taken_off_rad: Mapping[str, float] = field(default_factory=dict)
+    phases_removed_rad: Mapping[str, float] = field(default_factory=dict)
     peak_db: float | None = None
     noise_floor_re_peak_db: float | None = None
 
