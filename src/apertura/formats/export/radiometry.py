@@ -26,7 +26,7 @@ class Radiometry:
         Reference with value 1, or 0 dB.
     divided_by
         Pair → largest amplitude of its image, by which it was divided before summation.
-    phases_taken_off_rad
+    phases_removed_rad
         Pair → constant phase removed before summation; pairs excluded from a coherent sum are missing.
     peak_db, noise_floor_re_peak_db
         Power of the brightest target, dB re 1; median power relative to the peak, dB; None: not measured.
