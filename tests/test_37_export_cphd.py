@@ -171,7 +171,7 @@ def test_what_is_written_in_blocks_comes_back_to_the_bit(tmp_path):
 
 
 def test_blocks_of_too_few_pulses_leave_no_file(tmp_path):
-    with pytest.raises(ValueError, match="5 pulses: must be 6"):
+    with pytest.raises(ValueError, match="5 pulses, must be 6"):
         write_cphd(tmp_path / "a.cphd", collection(), [noise(5)])
     assert list(tmp_path.iterdir()) == []
 

@@ -184,4 +184,4 @@ def test_a_raw_root_that_is_no_folder_is_one_message(tiny, stated, found):
 def test_recordings_in_two_places_are_refused(tiny, tmp_path):
     shutil.copytree(tiny / "raw", tmp_path / "archive")
     edit(tiny, "raw_root", str(tmp_path / "archive"), load=False)
-    assert any("raw/ holds files" in str(one) for one in problems(tiny))
+    assert any("raw/ contains files" in str(one) for one in problems(tiny))

@@ -274,7 +274,7 @@ def test_a_damaged_document_is_not_read(finished, file):
 
 
 def test_a_campaign_is_held_by_one_run_and_free_when_it_ends(tmp_path):
-    with hold(tmp_path), pytest.raises(CampaignError, match=f"another run holds this campaign: process {os.getpid()}"):
+    with hold(tmp_path), pytest.raises(CampaignError, match=f"locked by another run: process {os.getpid()}"):
         hold(tmp_path)
     hold(tmp_path).close()
 

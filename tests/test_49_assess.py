@@ -108,12 +108,12 @@ def test_the_sign_of_a_lever_arm_is_seen_and_named(tmp_path):
     for pair in PAIRS:
         assert reports[pair]["focus"]["loss_db"] > -0.3
         assert reports[pair]["focus"]["verdict"] == "cannot tell"
-        assert "contradicted by pairs_apart, pairs_out_of_phase" in reports[pair]["focus"]["why"]
-        assert {"pairs_apart", "pairs_out_of_phase"} <= set(reports[pair]["flags"])
+        assert "contradicted by pairs_displaced, pairs_out_of_phase" in reports[pair]["focus"]["why"]
+        assert {"pairs_displaced", "pairs_out_of_phase"} <= set(reports[pair]["flags"])
     best = reports["uav1-uav1"]["hypotheses"][0]
     assert best["kind"] == "offset"  # along a straight track an arm's sign is one of several that do the same
-    assert best["what"].endswith("right axis of the lever arms of uav1 has the other sign")
-    assert best["what"] in reports["uav1-uav1"]["flags"]["pairs_apart"]
+    assert best["what"].endswith("right axis of the lever arms of uav1 has the opposite sign")
+    assert best["what"] in reports["uav1-uav1"]["flags"]["pairs_displaced"]
     left_out = reports["fused"]["fusion"]["left_out"]
     assert len(left_out) == 1
     assert next(iter(left_out)) in reports["fused"]["models"]["fusion"]
@@ -140,7 +140,7 @@ def later(seconds):
 def test_a_log_half_a_second_late_is_seen_and_named(tmp_path):
     campaign = sample(tmp_path, lambda root: edit_track(root, "uav1", later(0.5)))
     report = reports_of(campaign)["uav1-uav2"]
-    assert {"pairs_apart", "defocused", "pairs_out_of_phase"} & set(report["flags"])
+    assert {"pairs_displaced", "defocused", "pairs_out_of_phase"} & set(report["flags"])
     assert "the times of the log of uav1 are 0.50 s late" in report["hypotheses"][0]["what"]
 
 

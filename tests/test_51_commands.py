@@ -111,7 +111,7 @@ WRONG_RUNS = {
     "--set-scatter tiles=0": "tiles=N, N >= 1",
     "--set-scat=tiles=0": "tiles=N, N >= 1",
     "--until imag": "ingest, bench, echo",
-    "cphd": "cphd: a step that runs only where its result is requested",
+    "cphd": "cphd: a step that runs only if its result is requested",
     "results/f01/uav2-uav2/echo.manifest.json": "one of fused, tracks, uav1, uav1-uav1, uav1-uav2, uav2",
     "results/f01/uav9/track.manifest.json": "f01 has no uav9",
     "results/f09/uav1-uav1/echo.manifest.json": "no flight 'f09'",
@@ -150,7 +150,7 @@ def test_after_a_part_of_the_workflow_a_run_says_what_is_finished_and_what_is_mi
     state(root, "processing", engine="numba")
     status, out, err = typed("run", root, "--cores", 1, "--until", "image")
     assert status == 0, err
-    told = r"^\d+ results finished, \d+ results stale, \d+ results missing: apertura run makes the rest$"
+    told = r"^\d+ results finished, \d+ results out of date, \d+ results missing: apertura run makes the rest$"
     assert re.search(told, out, re.MULTILINE)
     assert "error" not in err
     assert typed("summary", root)[0] == 2  # no image is there

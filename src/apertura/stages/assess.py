@@ -24,7 +24,9 @@ from apertura.stages.scene import settled_scene
 from apertura.workflow.lineage import result_of
 
 _PHASE = "pairs_out_of_phase"
-_LOOKS_WRONG = frozenset({"defocused", "loss_unexpected", "echo_elsewhere", "pairs_apart", _PHASE, "pair_unconfirmed"})
+_LOOKS_WRONG = frozenset(
+    {"defocused", "loss_unexpected", "echo_outside_scene", "pairs_displaced", _PHASE, "pair_unconfirmed"}
+)
 """Flags that a wrong geometry raises; hypotheses are tried where one is raised."""
 
 _TIED = "as many pairs contradict this, and the images do not show which pairs are wrong"

@@ -401,5 +401,5 @@ def _worst(images: Mapping[str, xr.Dataset], fusion: Mapping[str, Any]) -> dict[
         "numerical_error_confidence": round(1 - sum(1 - one["numerical_error_confidence"] for one in qualities), 4),
         "numerical_error_estimate_db": worst["numerical_error_estimate_db"],
         "instruction_set": ", ".join(sorted({quality["instruction_set"] for quality in qualities})),
-        "redone": [one for quality in qualities for one in quality["redone"]],
+        "recomputed": [one for quality in qualities for one in quality["recomputed"]],
     }

@@ -92,6 +92,10 @@ def budget_of(
         BudgetLine("missing pulses", stated, NO_EFFECT),
         _antenna(pair, paths),
     ]
+    background = pair.report.get("background", {})
+    if background.get("removed", "none") != "none":
+        effect = Effect(background["middle_loss_db"], 0.0, 0.0)
+        lines.append(BudgetLine("background removal", background["removed"], effect))
     if not monostatic:
         total = paths.aperture.path(paths.point_m)
         lines.append(offset_line(paths, "clock", _PPM * total, _scaled(pair.report, "clock", "std_ppm", 1), unit="ppm"))
@@ -213,6 +217,17 @@ def air_decision(pair: OpenPair) -> Decision:
     return Decision("atmosphere", f"N = {air['refractivity_n']:.1f}", why)
 
 
+def background_decision(pair: OpenPair) -> Decision:
+    """Return the decision on the background: from stage `profile`, or what decides it once there is one."""
+    report = pair.report.get("background")
+    if report is None:
+        return Decision("background", "auto", "decided when range profiles are formed")
+    if "removed" in report:
+        return Decision("background", report["removed"], report["reason"])
+    reason = "configured" if report["requested"] == "none" else "auto: the recording has no echo at constant delay"
+    return Decision("background", "none", reason)
+
+
 def _scaled(report: Mapping[str, Any], section: str, name: str, unit: float) -> float | None:
     value = (report.get(section) or {}).get(name)
     return None if value is None else float(value) / unit
@@ -266,7 +281,7 @@ def plan_pair(campaign: Campaign, pair: OpenPair, scene: OpenScene, *, threads: 
     plan = plan_job(campaign, job_of(campaign, pair, scene, threads=threads), accuracy_db=float(accuracy.value))
     plan = replace(
         plan,
-        decisions=(*plan.decisions, accuracy, air_decision(pair)),
+        decisions=(*plan.decisions, accuracy, air_decision(pair), background_decision(pair)),
         flags=Flags.merged(flags, scene.flags, plan.flags),
     )
     is_written = campaign.is_current(campaign.stage("image", pair.flight, pair.name))

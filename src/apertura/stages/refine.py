@@ -262,7 +262,7 @@ def clock_s(pair: OpenPair, began: np.datetime64) -> NDArray[np.float64]:
 def _sizes_cm(correction: TrackCorrection, pair: str) -> dict[str, Any]:
     """Return the RMS correction of a pair: of its nodes, or of its path."""
     if pair in correction.extra_path_m:
-        return {"further_rms_cm": _rms_cm(correction.extra_path_m[pair][:, None])}
+        return {"extra_path_rms_cm": _rms_cm(correction.extra_path_m[pair][:, None])}
     nodes = dict.fromkeys(pair.split("-"))
     return {"rms_cm": {node: _rms_cm(correction.moved_m[node]) for node in nodes if node in correction.moved_m}}
 

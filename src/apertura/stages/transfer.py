@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 from xarray.backends import BackendArray
 from xarray.core import indexing
 
@@ -15,12 +16,13 @@ from apertura.campaign.config import CONFIG, SampledWaveform
 from apertura.campaign.digests import Lineage
 from apertura.campaign.folder import Campaign
 from apertura.campaign.store import finish, open_stage, write_blocks, writing
-from apertura.common.arrays import Complexes
+from apertura.common.arrays import Complexes, Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
 from apertura.common.flags import Flags
-from apertura.common.units import nanoseconds
+from apertura.common.units import nanoseconds, seconds_since
 from apertura.core.echo.association import missing_flags
+from apertura.core.echo.background import Background
 from apertura.core.echo.captures import Pulses, Saturation, blocks_of
 from apertura.core.echo.dechirp import sweep_motion_flags
 from apertura.core.echo.demodulate import remove_path
@@ -64,6 +66,8 @@ class PairEcho:
     dataset: xr.Dataset
     source: Form
     saturation: Saturation = field(default_factory=Saturation)
+    removed: Background | None = None
+    gain: NDArray[np.float32] | None = None
 
     @classmethod
     def recorded(cls, echo: xr.Dataset) -> "PairEcho":
@@ -106,6 +110,19 @@ class PairEcho:
 
         return cls(stage, form, saturation)
 
+    @classmethod
+    def cleaned(cls, campaign: Campaign, flight: str, pair: str) -> "PairEcho":
+        """Return a finished echo without what a finished stage `profile` removes: background and interference."""
+        echo, folder = cls.opened(campaign, flight, pair), campaign.stage("profile", flight, pair)
+        if not campaign.is_current(folder):
+            return echo
+        profile, removed = open_stage(folder, "profile"), None
+        if "background" in profile:
+            removed = Background(profile.background.values, profile.background_time.values)
+        gain = profile.subcarrier_gain.values if "subcarrier_gain" in profile else None
+        reports = {name: profile.attrs[name] for name in ("background", "interference")}
+        return replace(echo, dataset=echo.dataset.assign_attrs(reports), removed=removed, gain=gain)
+
     def within(self, campaign: Campaign, flight: str, pair: str) -> "PairEcho":
         """Return the echo without the pulses outside the segments of its pair."""
         return replace(self, dataset=keep_segments(campaign, flight, pair, self.dataset))
@@ -147,6 +164,38 @@ class PairEcho:
             return remove_path(measured, frequency, delay_s=path_m[pulses] / SPEED_OF_LIGHT_M_S)
 
         return form
+
+    @property
+    def time_s(self) -> Floats:
+        """(pulse,) float64, seconds from the first pulse."""
+        time = self.dataset.time.values
+        return seconds_since(time, time[0])
+
+    @property
+    def extra_s(self) -> Floats:
+        """(pulse,) float64, delay of an echo in the recorder beyond geometry."""
+        if "path_removed" not in self.dataset:
+            return np.zeros(len(self.dataset.time))
+        return np.asarray(self.dataset.path_removed.values / SPEED_OF_LIGHT_M_S)
+
+    @property
+    def delay_s(self) -> Floats:
+        """(pulse,) float64, delay that is removed from the recorder's transfer functions."""
+        return np.asarray(self.extra_s + self.dataset.reference_delay.values)
+
+    def read(self, pulses: Pulses) -> Complexes:
+        """Return the transfer functions of a few pulses, ascending, without removed background and interference."""
+        transfer = self.dataset.transfer[pulses].values if "transfer" in self.dataset else self.form(pulses)
+        if self.gain is not None:
+            transfer = transfer * self.gain
+        if self.removed is None:
+            return np.asarray(transfer)
+        frequency_hz = self.dataset.frequency.values
+        return np.asarray(transfer - self.removed.at(self.time_s[pulses], frequency_hz, self.delay_s[pulses]))
+
+    def recorded_at(self, pulses: Pulses) -> Complexes:
+        """Return the transfer functions of a few pulses, ascending, in delays of the recorder."""
+        return remove_path(self.read(pulses), self.dataset.frequency.values, delay_s=-self.delay_s[pulses])
 
     def blocks(self) -> Iterator[Complexes]:
         """Yield `transfer` from the first pulse on, in blocks of pulses."""

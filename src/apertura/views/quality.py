@@ -20,7 +20,7 @@ Cells = tuple[str, ...]
 VERDICTS = ("image", "verdict", "peak lost", "expected", "numerical error", "pulses", "flags")
 DECISIONS = ("decision", "choice", "why")
 BUDGET = ("cause", "stated", "peak lost", "targets shifted", "phase")
-FLAGGED = ("flag", "images", "what was measured", "what it means", "what to look at first")
+FLAGGED = ("flag", "images", "measured", "meaning", "advice")
 """Headings of the tables."""
 
 
@@ -267,14 +267,14 @@ class RaisedFlag:
         Of the flag.
     measured
         What was measured → the images of which.
-    means, look
-        What it means and what to look at first; empty of a flag that another version has raised.
+    meaning, advice
+        From the table of flags; empty for a flag that another version has raised.
     """
 
     name: str
     measured: Mapping[str, Sequence[str]]
-    means: str
-    look: str
+    meaning: str
+    advice: str
 
 
 def raised_flags(reports: Mapping[str, Report], *, quotes: bool = True) -> list[RaisedFlag]:
@@ -314,15 +314,15 @@ def flag_rows(reports: Mapping[str, Report]) -> list[Cells]:
             flag.name,
             ", ".join(dict.fromkeys(image for images in flag.measured.values() for image in images)),
             "; ".join(flag.measured),
-            flag.means,
-            flag.look,
+            flag.meaning,
+            flag.advice,
         )
         for flag in raised_flags(reports)
     ]
 
 
 def explained_flags(flags: Mapping[str, str]) -> dict[str, str]:
-    """Return flag → sentences: what was measured, what it means and what to look at.
+    """Return flag → sentences: the measured value, its meaning and the advice.
 
     Examples
     --------
@@ -331,15 +331,15 @@ def explained_flags(flags: Mapping[str, str]) -> dict[str, str]:
     """
     explained = {}
     for flag, line in flags.items():
-        means, look = _explained(flag)
-        words = [line.rstrip("."), *([means, f"look at: {look}"] if means else [])]
+        meaning, advice = _explained(flag)
+        words = [line.rstrip("."), *([meaning, f"advice: {advice}"] if meaning else [])]
         explained[flag] = " ".join(f"{sentence}." for sentence in words)
     return explained
 
 
 def _explained(flag: str) -> tuple[str, str]:
     known = FLAGS.get(flag)  # an image of another version may carry one that is unknown here
-    return (known.means, known.look) if known else ("", "")
+    return (known.meaning, known.advice) if known else ("", "")
 
 
 def _size_text(value: float, unit: str) -> str:

@@ -41,7 +41,7 @@ def is_finished(campaign: Campaign) -> bool:
 
 
 def print_summary(campaign: Campaign) -> None:
-    """Print a row for each image, every flag once with what it means and what to look at, and which files to open.
+    """Print a row for each image, every flag once with its meaning and advice, and the files to open.
 
     Raises
     ------
@@ -151,7 +151,7 @@ def _print_flags(console: "Console", reports: Mapping[str, Report]) -> None:
 
     printed = dict[str, str]()  # sentence → its flag
     for flag in raised_flags(reports, quotes=False):
-        console.print(Text.assemble((flag.name, "yellow"), f": {flag.means}" if flag.means else ""))
+        console.print(Text.assemble((flag.name, "yellow"), f": {flag.meaning}" if flag.meaning else ""))
         measured = []
         for line, images in flag.measured.items():
             sentences = line.split("; ")
@@ -160,7 +160,7 @@ def _print_flags(console: "Console", reports: Mapping[str, Report]) -> None:
             told = [*(one for one in sentences if one not in again), *dict.fromkeys(above)]
             measured.append(f"{_abbreviated(images)}: {'; '.join(told)}")
             printed |= {one: flag.name for one in sentences if one not in again and len(one) >= _SENTENCE}
-        for line in [*measured, *([f"look at: {flag.look}"] if flag.look else [])]:
+        for line in [*measured, *([f"advice: {flag.advice}"] if flag.advice else [])]:
             console.print(Padding(Text(line), (0, 0, 0, 4)))
 
 

@@ -33,11 +33,26 @@ class Multilooking(Section):
     speckle_filter: Literal["none", "lee"] = Field("none", description="what is done against the speckle that is left")
 
 
+class RunningBackground(Section):
+    """Background that changes during a flight."""
+
+    running_s: float = Field(gt=0, description="length of the running median, s")
+
+
 class Processing(ImagingChoices):
     """Processing settings; every key has a default."""
 
     sidelink: Literal["auto", "divide", "wiener", "gated", "two_parameter"] = Field(
         "auto", description="correction of a secondary node by its sidelink; auto takes the cheapest adequate"
+    )
+    background: Literal["auto", "none", "median", "mean"] | RunningBackground = Field(
+        "auto",
+        description="echoes at constant delay (antenna coupling, airframe) removed before range compression: median or "
+        "mean of all pulses, or a running median, {running_s: 2.0}; auto: the best of these, if targets gain by it",
+    )
+    interference: Literal["auto", "none"] = Field(
+        "auto",
+        description="auto: subcarriers with narrow-band interference are excluded if that raises the SNR",
     )
     fusion: Fusion = Field(default_factory=Fusion, description="how the images of a flight's pairs are added up")
     autofocus: Literal["auto", "on", "off"] = Field(
@@ -77,6 +92,11 @@ class Processing(ImagingChoices):
     false_alarms_per_s: float = Field(
         1e-3, gt=0, description="how often noise alone may trigger in a continuous recording, per second"
     )
+
+    @property
+    def background_method(self) -> str | float:
+        """Name of the method, or the length of the running median, s."""
+        return self.background if isinstance(self.background, str) else self.background.running_s
 
     @field_validator("autofocus", mode="before")
     @classmethod

@@ -279,11 +279,11 @@ class Bench:
                 "path beyond the set-up",
                 f"{offset.offset_m:+.4f} ± {offset.std_m:.4f} m, config {offset.stated_m:+.4f} m",
                 f"{PATH_CELLS * offset.cell_m:.3f} m",
-                "path_disagrees",
+                "path_offset_disagrees",
             )
         if link.direct_db is not None:
             yield line(pair, "sidelink in the radar channel", f"{link.direct_db:.1f} dB of the path",
-                       f"{LEAKAGE_DB:g} dB", "channel_leaks")  # fmt: skip
+                       f"{LEAKAGE_DB:g} dB", "channel_crosstalk")  # fmt: skip
         if link.arrivals:
             others = ", ".join(f"{one.level_db:.1f} dB {one.later_m:+.2f} m" for one in link.arrivals)
             yield line(pair, "other arrivals", others, "")
@@ -295,7 +295,7 @@ class Bench:
                 f"{split.path_m:+.3f} m apart, the receiver's beyond its "
                 f"sidelink; over the band {split.band_db:.2f} dB, {split.band_rad:.3f} rad rms",
                 f"{SPLIT_DB:g} dB, {SPLIT_RAD:g} rad",
-                "split_disagrees",
+                "splitter_channels_differ",
             )
 
     @property
@@ -321,7 +321,7 @@ class Bench:
 
 
 _DOUBTS = frozenset({
-    "link_weak", "link_incoherent", "contact_loose", "delay_jumps", "wrong_code", "code_unconfirmed",
+    "link_weak", "link_incoherent", "contact_intermittent", "delay_jumps", "wrong_code", "code_unconfirmed",
     "spectrum_inverted", "saturated_radar", "saturated_sidelink", "sidelink_lost", "interference",
 })  # fmt: skip
 """Flags of a node whose measured path goes into no config."""

@@ -91,7 +91,7 @@ def _print(flight: str, report: Mapping[str, Any]) -> None:
         table.add_row(*row)
     console.print(table)
     for name, line in report["flags"].items():
-        console.print(f"{name}: {FLAGS[name].means}\n    {line}\n    look at: {FLAGS[name].look}", markup=False)
+        console.print(f"{name}: {FLAGS[name].meaning}\n    {line}\n    advice: {FLAGS[name].advice}", markup=False)
 
 
 def _rows(report: Mapping[str, Any]) -> list[tuple[str, str, str, str, str]]:
@@ -106,15 +106,11 @@ def _blocks(title: str, report: Mapping[str, Any], picture: bytes) -> Iterator[B
     flags = report["flags"]
     yield Paragraph(
         "Nothing moved: whatever changes from pulse to pulse is the radar's own. "
-        + (
-            f"{len(flags)} thing{'s' * (len(flags) > 1)} to look at, below."
-            if flags
-            else "Every line is within its limit."
-        )
+        + (f"{number_of(len(flags), 'flag')} raised, listed below." if flags else "Every line is within its limit.")
     )
     if flags:
-        rows = [(name, line, FLAGS[name].means, FLAGS[name].look) for name, line in flags.items()]
-        yield Table("What to look at.", ("flag", "measured", "what it means", "look at"), rows)
+        rows = [(name, line, FLAGS[name].meaning, FLAGS[name].advice) for name, line in flags.items()]
+        yield Table("Flags", ("flag", "measured", "meaning", "advice"), rows)
     yield Picture(
         picture,
         "Phase, delay and amplitude of the strongest path of each pair from pulse to pulse, against their mean; mean "
