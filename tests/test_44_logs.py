@@ -109,7 +109,7 @@ def test_pulses_of_a_float_solution_are_left_out_unless_allowed(tmp_path):
     left_out = dataset.attrs["pulses"]["reasons"]["fix_quality_low"]
     assert 10 <= left_out <= 12  # 0.6 s of 20 Hz
     assert dataset.sizes["pulse"] == dataset.attrs["pulses"]["used"] == 40 - left_out
-    assert dataset.attrs["flags"]["fix_poor"].startswith(
+    assert dataset.attrs["flags"]["fix_quality_low"].startswith(
         f"b: {left_out} of 40 pulses excluded: position solution poorer than"
     )
     assert flags_of(echo_of(campaign, "a-a")) == {}

@@ -82,7 +82,7 @@ def test_the_summary_says_each_flag_once_and_whole(finished_sample, capsys, tmp_
 
 def test_a_sentence_that_several_flags_have_in_common_stands_once_in_the_summary():
     cause = "4.1 of 4.5 dB are explained if the times of the log of uav1 are 0.50 s late"
-    lines = {"defocused": f"4.5 dB lost; {cause}", "pairs_apart": f"5 points lie 12 cm apart; {cause}"}
+    lines = {"defocused": f"4.5 dB lost; {cause}", "pairs_displaced": f"5 points lie 12 cm apart; {cause}"}
     reports = {"f01 a-a": {"flags": lines}, "f01 a-b": {"flags": {"defocused": f"3.2 dB lost; {cause}"}}}
     console = Console(file=StringIO(), width=200)
     _print_flags(console, reports)
@@ -249,8 +249,8 @@ def test_a_sum_whose_phase_nothing_tells_says_so_and_that_its_peaks_are_lost(fin
     monkeypatch.setattr("apertura.stages.assess.agreement_of", lambda *_: None)
     told = with_longer_path(root, 0.214 / 4)
     assert [*told["fusion"]["phases_rad"]] == list(PAIRS)
-    assert "is added with phase 0: it shares nothing with" in told["flags"]["phase_unmeasured"]
-    assert "peak loss for a phase error of a quarter cycle: 3 dB" in told["flags"]["phase_unmeasured"]
+    assert "is added with phase 0: it shares nothing with" in told["flags"]["phase_unobservable"]
+    assert "peak loss for a phase error of a quarter cycle: 3 dB" in told["flags"]["phase_unobservable"]
     assert told["coherence"]["mean"] == pytest.approx(0.5, abs=0.15)
     assert "sum_incoherent" in told["flags"]
     assert told["focus"]["verdict"] == "defocused"
@@ -309,11 +309,11 @@ def test_a_path_of_the_papers_flight_that_is_wrong_is_told_by_phase_or_place(
 ):
     root = copy_writable(papers_flight.root, tmp_path / "campaign")
     told = with_longer_path(root, wavelengths * 0.2134)
-    line = told["flags"][{"phase": "pairs_out_of_phase", "place": "pairs_apart"}[flag]]
+    line = told["flags"][{"phase": "pairs_out_of_phase", "place": "pairs_displaced"}[flag]]
     assert "do not show which pairs are wrong" in line
     assert len(told["fusion"]["left_out"]) == 1
     assert told["fusion"]["ties"] == [[*told["fusion"]["left_out"]]]
-    assert "; tie: " in told["flags"]["pair_left_out"]
+    assert "; tie: " in told["flags"]["pair_excluded"]
 
 
 @pytest.mark.parametrize("height_m", [-3.0, 0.5, 3.0])

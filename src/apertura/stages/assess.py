@@ -180,7 +180,7 @@ def _hypotheses(
             line = flags[pair].get(name) or images[pair].attrs["flags"][name]
             flags[pair][name] = line + cause
         focus = images[pair].attrs["quality"]["focus"]
-        if causes and not names and _regained(focus, causes[0]["gain_of_pairs_db"][pair]):
+        if causes and not names and _regained(focus, causes[0]["pair_gain_db"][pair]):
             flags[pair]["loss_unexpected"] = f"{focus['why']}{cause}"
     return causes
 
@@ -211,7 +211,7 @@ def _disagreement(chosen: CoherentSum, pair: str, blind: Sequence[str]) -> dict[
     where = measured.evidence
     if measured.shifted:
         return {
-            "pairs_apart": (
+            "pairs_displaced": (
                 f"{where} of {pair} displaced by {100 * measured.shift_m:.1f} ± "
                 f"{100 * measured.shift_std_along_m:.1f} cm relative to {agreeing}, "
                 f"{100 * measured.shift_east_m:+.1f} cm east and {100 * measured.shift_north_m:+.1f} cm north"

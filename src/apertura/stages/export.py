@@ -374,12 +374,12 @@ def _flags_of_choice(fusion: Mapping[str, Any]) -> Flags:
     excluded = "; ".join(f"{pair} is not in the coherent sum: {why}" for pair, why in fusion["left_out"].items())
     if ties := " or ".join(" and ".join(tie) for tie in fusion["ties"]):
         excluded += f"; tie: {ties} form an equally large set that agrees, and the better focused set was used"
-    flags = {"pair_left_out": excluded} if excluded else {}
+    flags = {"pair_excluded": excluded} if excluded else {}
     if unmeasured := fusion["unmeasured"]:
         known, unknown = len(fusion["phases_rad"]) - len(unmeasured), len(unmeasured)
         loss_db = [-20 * np.log10(abs(known + phasor * unknown) / (known + unknown) + 1e-3) for phasor in (1j, -1)]
         half_cycle = f"{loss_db[1]:.0f} dB" if known != unknown else "total, with each target split in two"
-        flags["phase_unmeasured"] = (
+        flags["phase_unobservable"] = (
             "; ".join(f"{pair} is added with phase 0: {why}" for pair, why in unmeasured.items())
             + f"; peak loss for a phase error of a quarter cycle: {loss_db[0]:.0f} dB, of half a cycle: {half_cycle}"
         )

@@ -134,7 +134,7 @@ def hypotheses(
     -------
     list
         At most one dict: what, kind, gain_db and lost_db (gain of the joint peak power at the bright point, and its
-        loss), and gain_of_pairs_db (gain of each pair's own peak).
+        loss), and pair_gain_db (gain of each pair's own peak).
     """
     waveform = campaign.settings.waveform
     if not isinstance(waveform, SampledWaveform):  # a phase history contains its positions: there are no logs to test
@@ -175,7 +175,7 @@ def hypotheses(
         best = max(trials, key=lambda trial: trial.gain_db)
         best_grid = _grid_around(scene, _displaced(scene, brightest, geometries, best), cell_m)
         best_height_m = height_m + best.height_m
-        reports[0]["gain_of_pairs_db"] = {
+        reports[0]["pair_gain_db"] = {
             geometry.pair: round(
                 decibels(
                     joint_peak_power([after], best_grid, best_height_m)

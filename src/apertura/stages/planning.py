@@ -204,7 +204,7 @@ def air_decision(pair: OpenPair) -> Decision:
     """Return the refractivity assumed on the paths of a pair, and its effect relative to vacuum."""
     air = pair.air
     cell_m = pair.wave_speed_m_s / float(np.ptp(pair.frequency_hz)) / 2
-    displaced_m, residual_m = float(air["vacuum_would_move_m"]), float(air["one_constant_leaves_m"])
+    displaced_m, residual_m = float(air["vacuum_shift_m"]), float(air["constant_refractivity_error_m"])
     reference = "vacuum"
     if not air["refractivity_n"]:
         displaced_m, reference = 1e-6 * USUAL_N * float(air["range_m"]), f"N = {USUAL_N:.0f}"

@@ -61,7 +61,7 @@ def keep_segments(campaign: Campaign, flight: str, pair: str, echo: xr.Dataset) 
 # ---- Pulses with valid positions, and position accuracy --------------------------------------------------------------
 
 _LOG_FAULTS = {
-    "fix_poor": "position solution poorer than {poorest_fix}",
+    "fix_quality_low": "position solution poorer than {poorest_fix}",
     "track_gap": "gap in the log",
     "track_outlier": "outliers or steps in the log",
     "track_frozen": "epochs that repeat the previous position",
