@@ -264,9 +264,9 @@ def gis(_: Path) -> Made:
 
 def formed(engine: str) -> None:
     """Write an image of the posts of the first page by an engine, in a process that numba may simulate a device in."""
-    from website.picture import seen
+    from website.picture import example_history
 
-    np.save(f"{engine}.npy", ap.backproject(seen()[::5], GRID_OF_POSTS, engine=engine).values)
+    np.save(f"{engine}.npy", ap.backproject(example_history()[::5], GRID_OF_POSTS, engine=engine).values)
 
 
 GRID_OF_POSTS = ap.SceneGrid("local", -5.0, 8.0, 0.1, (64, 96))
@@ -350,9 +350,9 @@ def map_(folder: Path) -> Made | None:
 
 
 def me_or_the_radar(_: Path) -> Made:
-    from website.picture import seen
+    from website.picture import example_history
 
-    grid, right = ap.SceneGrid("local", -14.0, 10.0, 0.1, (200, 280)), seen()
+    grid, right = ap.SceneGrid("local", -14.0, 10.0, 0.1, (200, 280)), example_history()
     wave_m = 0.04 * np.sin(np.arange(len(right)) / 40)[:, None] * [0, 1, 1]
     moved = ap.Aperture(right.aperture.tx_m + wave_m, right.aperture.rx_m + wave_m)
     cases = {

@@ -199,7 +199,7 @@ def test_a_stage_of_profiles_does_as_well_as_arrays_and_other_stages_are_refused
     one, other = (ap.gradient(given, patch, slope) for given in (profiles, stage))
     assert np.array_equal(one.rx_m, other.rx_m)
     for given in (point_history(), stage.drop_vars("profile")):
-        with pytest.raises(CampaignError, match="expected Profiles, or a stage profile"):
+        with pytest.raises(CampaignError, match="expected Profiles, or the dataset of stage profile"):
             ap.gradient(given, patch, slope)
 
 

@@ -58,7 +58,7 @@ def test_a_library_of_another_layout_is_refused_by_the_name_of_the_field(was, be
     contract.write_text(contract.read_text() + exports)
     subprocess.run([compiler, "-std=c++17", "-shared", "-fPIC", contract, "-o", library], check=True)
     monkeypatch.setenv("APERTURA_KERNEL", str(library))
-    with pytest.raises(CampaignError, match=rf"{named} at .*; expected {named} at byte \d+, \d+ bytes") as refused:
+    with pytest.raises(CampaignError, match=rf"{named}: .*; expected {named}: byte \d+, \d+ bytes") as refused:
         native.instruction_set()
     assert str(library) in str(refused.value)
 
@@ -71,7 +71,7 @@ def test_a_library_that_tells_no_layout_is_refused(tmp_path, monkeypatch):
     source.write_text('extern "C" const char* apertura_form(const char* name) { return name; }\n')
     subprocess.run([compiler, "-shared", "-fPIC", source, "-o", library], check=True)
     monkeypatch.setenv("APERTURA_KERNEL", str(library))
-    with pytest.raises(CampaignError, match=r"BeamJob\.axes at no place; expected .* byte 0, 8 bytes"):
+    with pytest.raises(CampaignError, match=r"BeamJob\.axes: no such field; expected .* byte 0, 8 bytes"):
         native.instruction_set()
 
 

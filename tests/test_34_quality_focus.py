@@ -124,7 +124,7 @@ def test_an_image_whose_geometry_a_flag_contradicts_is_not_called_focused(flag):
 @pytest.mark.parametrize(("error_db", "verdict"), [(-10.0, "cannot tell"), (-40.0, "focused"), (None, "focused")])
 def test_an_image_with_a_large_numerical_error_is_not_called_focused(error_db, verdict):
     focus = {"verdict": "focused", "why": "3 bright points lost 0.02 dB"}
-    assert focus_with_flags(focus, ["accuracy_missed"], error_db=error_db)["verdict"] == verdict
+    assert focus_with_flags(focus, ["accuracy_not_met"], error_db=error_db)["verdict"] == verdict
 
 
 @pytest.mark.parametrize("std_cm", [0.5, 1.0, 2.0, 4.0])

@@ -129,7 +129,7 @@ def test_one_pair_has_nothing_to_agree_with():
     assert ground.agreements(PRIOR.tracks(unknowns)) == []
     found = refined_by_speckle(ground, PRIOR, KNOTS_S)
     assert not found.accepted
-    assert "one pair" in found.flags["refinement_no_bright_place"]
+    assert "one pair" in found.flags["refinement_no_bright_point"]
 
 
 @pytest.mark.slow

@@ -60,7 +60,7 @@ def test_one_wrong_constant_is_named_and_taken_back(kind, seeds, within):
         found = refine(made.records, GRID, GROUND, made.errors, causes=causes)
         before, after = judge(made), judge(made, found.correction)
         assert before.probe_loss_db < -1, seed  # there is something to explain
-        assert list(found.flags) == ["cause_found"], seed
+        assert list(found.flags) == ["cause_corrected"], seed
         assert found.report["cause"]["kind"] == kind
         assert node == "all" or f" {node} " in found.report["cause"]["what"]
         assert found.report["cause"]["values"] == pytest.approx(values, abs=within)

@@ -222,5 +222,5 @@ def test_three_patches_are_judged_by_what_they_gain():
 def test_without_a_bright_place_there_is_nothing_to_judge_by():
     record, _ = seen(FAR, FAR_POINTS_M[:3])
     found = refine_one_phase([record], Candidates([], 0, np.eye(3)), FAR_ERRORS, method="phase_gradient")
-    assert list(found.flags) == ["refinement_no_bright_place"]
+    assert list(found.flags) == ["refinement_no_bright_point"]
     assert not found.correction.extra_path_m

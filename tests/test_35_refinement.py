@@ -224,8 +224,8 @@ def test_reference_points_put_the_image_where_it_belongs(two_centimetres, refine
 def test_a_log_that_states_four_times_its_errors_is_flagged(two_centimetres, refined):
     stated = {node: TrackErrors((0.08,) * 3) for node in two_centimetres.errors}
     found = refine(two_centimetres.records, GRID, FlatGround(0.0), stated)
-    assert "prior_too_wide" in found.flags
-    assert not {"prior_too_wide", "prior_inconsistent"} & refined.flags.keys()
+    assert "position_error_overstated" in found.flags
+    assert not {"position_error_overstated", "position_error_understated"} & refined.flags.keys()
     assert judge(two_centimetres, found.correction).probe_loss_db > -0.5  # and yet focused
 
 
@@ -253,7 +253,7 @@ def test_speckle_is_refused(two_centimetres):
         noisy.append(replace(one, profiles=replace(one.profiles, samples=noise)))
     rejected = refine(noisy, GRID, FlatGround(0.0), two_centimetres.errors)
     assert not rejected.accepted
-    assert "refinement_no_bright_place" in rejected.flags
+    assert "refinement_no_bright_point" in rejected.flags
     assert not any(moved.any() for moved in rejected.correction.moved_m.values())
 
 
@@ -274,8 +274,8 @@ def test_right_logs_are_left_alone():
     one = case("points-4", "short", "mono", 0.0, 10.0, 3, stated_m=0.02)
     found = refine(one.records, GRID, FlatGround(0.0), one.errors)
     assert not found.accepted
-    assert not found.flags.keys() - {"prior_too_wide"}  # which is true of logs that state 2 cm and have none
-    assert "the logs are as good" in found.why
+    assert not found.flags.keys() - {"position_error_overstated"}  # which is true of logs that state 2 cm and have none
+    assert "no improvement over the logs" in found.why
 
 
 def test_a_slip_of_the_tracks_is_found_by_delays_and_taken_back():

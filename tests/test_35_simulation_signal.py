@@ -149,7 +149,7 @@ def test_periodic_synthesis_is_refused_where_the_symbol_is_not_periodic():
     paths = Paths(np.full((2, 1), 1e-7), np.ones((2, 1), complex), np.zeros((2, 1)))
     channel = Channel(small_waveform(), paths, np.ones(200, complex), np.zeros(2), np.zeros(2))
     for wrong in (replace(channel, sfo_hz=10.0), replace(channel, paths=replace(paths, delay_rate=paths.delay_s))):
-        with pytest.raises(ValueError, match="needs exact synthesis"):
+        with pytest.raises(ValueError, match="requires exact synthesis"):
             periodic_samples(wrong, None, np.arange(2))
 
 

@@ -419,15 +419,15 @@ def test_flags_are_counted_and_named_as_far_as_there_is_room(size_m, count):
 def test_the_quicklook_names_the_flags_of_its_image(tmp_path, monkeypatch):
     written = []
     monkeypatch.setattr(MapLayout, "write_flags", lambda _, flags: written.append(flags))
-    for flags in ("{}", '{"sidelink_noisy":"SNR 3 dB","beam_misses":"12 %"}'):
+    for flags in ("{}", '{"sidelink_noisy":"SNR 3 dB","outside_beam":"12 %"}'):
         write_quicklook(tmp_path / "q.png", speckle(30, 40), **UTM, tags=TAGS | {"APERTURA_FLAGS": flags})
     write_quicklook(tmp_path / "q.png", speckle(30, 40), **UTM, tags=TAGS)  # not an image of a campaign
-    assert written == [[], ["sidelink_noisy", "beam_misses"]]
+    assert written == [[], ["sidelink_noisy", "outside_beam"]]
 
 
 def test_a_long_footer_ends_inside_the_picture():
     footer = (
-        "apertura 0.1.0 · focus: focused (0.0 dB lost) · geolocation uncertainty 1.5 m"
+        "apertura 0.1.0 · focus: focused (peak loss 0.0 dB) · geolocation uncertainty 1.5 m"
         " · numerical error below −77.31 dB · looks left, assumed · code 833b8269428b"
     )
     for bounds in ((0.0, 0.0, 7.0, 7.0), (0.0, 0.0, 2.0, 7.0)):

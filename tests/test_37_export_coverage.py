@@ -110,13 +110,13 @@ def drawn(monkeypatch, tmp_path, several, **how):
 
 def test_one_pair_has_one_panel_and_a_distant_scene_is_drawn_once_more(monkeypatch, tmp_path):
     labels, words, figure = drawn(monkeypatch, tmp_path, [covered()])
-    assert labels == ["Easting, m", "Northing, m", "pulses that make a pixel"]
-    assert words[-2].startswith("80.0 % of the scene is seen by 1 pair of 1 flight;")
+    assert labels == ["Easting, m", "Northing, m", "pulses per pixel"]
+    assert words[-2].startswith("80.0 % of the scene is covered by 1 pair of 1 flight;")
     assert not figure.legends
     far = np.stack([np.linspace(-400, 900, 9), np.full(9, -60.0), np.full(9, 30.0)], -1)
     one = Covered("f01", "a-a", {"transmitter": far}, 7 * RING)
     labels, _, figure = drawn(monkeypatch, tmp_path, [one])
-    assert labels[-1].replace("\n", " ") == "pulses that make a pixel, the scene alone"
+    assert labels[-1].replace("\n", " ") == "pulses per pixel, scene only"
     assert figure.axes[2].get_xlim() == (100, 120)
     figure.canvas.draw()
     wide, high = (figure.axes[2].bbox.size / figure.dpi).tolist()
@@ -132,7 +132,7 @@ def test_no_words_of_a_narrow_map_are_cut(monkeypatch, tmp_path):
     north = np.stack([np.full(9, 110.0), np.linspace(20, 85, 9), np.full(9, 30.0)], -1)
     one = Covered("f01", "a-a", {"transmitter": north}, 7 * RING, {"transmitter": [north[3:6]]})
     _, words, figure = drawn(monkeypatch, tmp_path, [one])
-    assert any(line.endswith("thick: makes the image) and footprints") for line in words)
+    assert any(line.endswith("thick: used for the image) and footprints") for line in words)
     figure.canvas.draw()
     boxes = [text.get_window_extent() for text in figure.texts if text.get_text()]
     assert all(box.x1 <= figure.bbox.x1 for box in boxes)
@@ -142,7 +142,7 @@ def test_no_words_of_a_narrow_map_are_cut(monkeypatch, tmp_path):
 def test_several_flights_have_a_legend_off_the_data_and_whole_numbers_of_pairs(monkeypatch, tmp_path):
     several = [covered(f"f{number // 5:02d}", np.roll(RING, number, axis=1)) for number in range(40)]
     _, words, figure = drawn(monkeypatch, tmp_path, several)
-    assert "seen by 40 pairs of 8 flights" in " ".join(words)
+    assert "covered by 40 pairs of 8 flights" in " ".join(words)
     (legend,) = figure.legends
     figure.canvas.draw()
     box = legend.get_window_extent()
@@ -154,14 +154,14 @@ def test_several_flights_have_a_legend_off_the_data_and_whole_numbers_of_pairs(m
 
 def test_a_number_of_pairs_that_is_the_same_everywhere_is_stated_and_not_drawn(monkeypatch, tmp_path):
     labels, words, _ = drawn(monkeypatch, tmp_path, [covered(), covered("f02")])
-    assert [label.replace("\n", " ") for label in labels[2:]] == ["pulses that make a pixel, all pairs"]
-    assert "80.0 % of the scene is seen by 2 pairs of 2 flights, each place of it by 2" in " ".join(words)
+    assert [label.replace("\n", " ") for label in labels[2:]] == ["pulses per pixel, all pairs"]
+    assert "80.0 % of the scene is covered by 2 pairs of 2 flights, every pixel by 2" in " ".join(words)
 
 
 def test_tracks_of_many_flights_are_one_colour_without_footprints_of_each(monkeypatch, tmp_path):
     several = [covered(f"f{number:02d}", np.roll(RING, number, axis=1)) for number in range(50)]
     _, words, figure = drawn(monkeypatch, tmp_path, several)
-    assert "edge of what is seen" in " ".join(words)
+    assert "edge of the covered area" in " ".join(words)
     assert not figure.legends
     lines = figure.axes[0].get_lines()
     assert len({line.get_color() for line in lines}) == 2

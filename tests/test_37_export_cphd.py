@@ -171,7 +171,7 @@ def test_what_is_written_in_blocks_comes_back_to_the_bit(tmp_path):
 
 
 def test_blocks_of_too_few_pulses_leave_no_file(tmp_path):
-    with pytest.raises(ValueError, match="5 pulses: must be 6"):
+    with pytest.raises(ValueError, match="5 pulses, must be 6"):
         write_cphd(tmp_path / "a.cphd", collection(), [noise(5)])
     assert list(tmp_path.iterdir()) == []
 
@@ -196,7 +196,7 @@ def test_cphd_is_made_when_it_is_asked_for_and_goes_stale_with_its_echo(fine_tin
     assert stale_results(fine_tiny) == {}
     path = fine_tiny.result("f01", "uav1-uav1", "phase_history.cphd")
     path.write_bytes(path.read_bytes()[:-1])
-    assert stale_results(fine_tiny) == {made[0].manifest: "phase_history.cphd is not as it was written"}
+    assert stale_results(fine_tiny) == {made[0].manifest: "phase_history.cphd has changed since it was written"}
 
 
 def test_a_scene_in_another_frame_than_the_file_is_refused_by_the_check(tmp_path):
@@ -209,4 +209,4 @@ def test_a_scene_in_another_frame_than_the_file_is_refused_by_the_check(tmp_path
     (tmp_path / "config/flights.tsv").write_text("flight\tkind\ttransmitter\tnodes\nf01\timage\ta\ta\n")
     told = [str(problem) for problem in problems(tmp_path, without=["memory"])]
     assert len(told) == 1
-    assert "local for phase history with positions on Earth; expected an EPSG code, or auto" in told[0]
+    assert "local for a phase history with positions in ECEF; expected an EPSG code, or auto" in told[0]

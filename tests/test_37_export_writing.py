@@ -55,9 +55,9 @@ def written(tmp_path):
 def test_a_raster_that_reads_back_passes_and_one_that_lacks_pixels_or_tags_does_not(written):
     checksum = added(0, power(image()))
     check_written(written, checksum, UTM["tags"])
-    with pytest.raises(OSError, match="does not read back"):
+    with pytest.raises(OSError, match="differs from the data written"):
         check_written(written, checksum + 1, UTM["tags"])
-    with pytest.raises(OSError, match="does not read back"):
+    with pytest.raises(OSError, match="differs from the data written"):
         check_written(written, checksum, {"APERTURA_FLAGS": "{}"})
 
 

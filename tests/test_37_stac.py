@@ -126,7 +126,7 @@ def test_a_broken_item_is_refused(slc, name):
 def test_an_extension_without_a_schema_here_is_not_believed(slc):
     document = item(slc)
     document["stac_extensions"].append("https://example.com/schema.json")
-    assert document_problem(document) == "no schema of https://example.com/schema.json here"
+    assert document_problem(document) == "the schema of https://example.com/schema.json is not available"
 
 
 def written(folder, images, campaign="tandem"):

@@ -89,9 +89,9 @@ def test_places_without_data_count_nothing_in_the_colours_of_a_file_and_of_a_mos
 
 def test_sums_say_what_they_were_divided_by_and_which_pairs_they_hold():
     told = of_sums({"a-a": 4.0, "a-b": 2.0, "a-c": 1.0}, {"a-a": 0.0, "a-b": 0.7})
-    assert told["coherent"].amplitude == "mean of 2 peak-normalised images, added with phase"
+    assert told["coherent"].amplitude == "coherent mean of 2 peak-normalised images"
     assert told["coherent"].divided_by == {"a-a": 4.0, "a-b": 2.0}
-    assert told["coherent"].phases_taken_off_rad == {"a-a": 0.0, "a-b": 0.7}
+    assert told["coherent"].phases_removed_rad == {"a-a": 0.0, "a-b": 0.7}
     assert told["noncoherent"].power == "mean power of 3 peak-normalised images"
     assert told["noncoherent"].divided_by == {"a-a": 4.0, "a-b": 2.0, "a-c": 1.0}
-    assert not told["noncoherent"].phases_taken_off_rad
+    assert not told["noncoherent"].phases_removed_rad

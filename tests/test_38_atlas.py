@@ -95,9 +95,9 @@ SWEEP = [
     outcome(10.0, loss_db=0.4, expected_loss_db=0.3),
     outcome(10.0, 1, loss_db=0.4, expected_loss_db=0.3),
     outcome(100.0, loss_db=3.0, expected_loss_db=1.5),
-    outcome(100.0, 1, loss_db=5.0, expected_loss_db=2.5, flags="defocused pairs_apart"),
-    outcome(1000.0, shift_m=0.06, flags="pairs_apart"),
-    outcome(1000.0, 1, shift_m=0.06, flags="pairs_apart"),
+    outcome(100.0, 1, loss_db=5.0, expected_loss_db=2.5, flags="defocused pairs_displaced"),
+    outcome(1000.0, shift_m=0.06, flags="pairs_displaced"),
+    outcome(1000.0, 1, shift_m=0.06, flags="pairs_displaced"),
 ]
 
 
@@ -109,7 +109,7 @@ def test_a_summary_counts_what_is_missed_and_what_is_false():
     assert (row.expected_over_measured, row.ratio_of) == (0.5, "loss")
     assert (row.wrong, row.missed) == (4, 0.25)  # beyond 1 dB, or half a cell
     assert (row.right, row.false) == (2, 0.5)  # 0.4 dB is neither
-    assert row.flags == "defocused pairs_apart"
+    assert row.flags == "defocused pairs_displaced"
 
 
 def test_a_flag_is_counted_over_the_causes_that_raise_it():
@@ -119,7 +119,7 @@ def test_a_flag_is_counted_over_the_causes_that_raise_it():
     assert rows["defocused"].missed == 0.75
     assert rows["defocused"].unflagged == 0.25
     assert (rows["defocused"].right, rows["defocused"].false) == (3, pytest.approx(1 / 3, rel=1e-3))
-    assert (rows["pairs_apart"].missed, rows["pairs_apart"].false) == (0.25, 0.0)
+    assert (rows["pairs_displaced"].missed, rows["pairs_displaced"].false) == (0.25, 0.0)
 
 
 def test_pictures_are_the_same_bytes_for_the_same_rows(tmp_path):

@@ -49,9 +49,9 @@ def answer(accepted, *flags, correction=UNCORRECTED):
 def test_what_the_product_said_is_one_of_four_things():
     said = [
         verdict_of(answer(True)),
-        verdict_of(answer(True, "prior_inconsistent")),
+        verdict_of(answer(True, "position_error_understated")),
         verdict_of(answer(False, "refinement_rejected", "cycle_slip_suspected")),
-        verdict_of(answer(False, "refinement_no_bright_place")),
+        verdict_of(answer(False, "refinement_no_bright_point")),
     ]
     assert said == [ACCEPTED, FLAGGED, REFUSED, TOO_FEW] == list(VERDICTS)
 

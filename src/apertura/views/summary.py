@@ -156,7 +156,7 @@ def _print_flags(console: "Console", reports: Mapping[str, Report]) -> None:
 
     printed = dict[str, str]()  # sentence → its flag
     for flag in raised_flags(reports, quotes=False):
-        console.print(Text.assemble((flag.name, "yellow"), f": {flag.means}" if flag.means else ""))
+        console.print(Text.assemble((flag.name, "yellow"), f": {flag.meaning}" if flag.meaning else ""))
         measured = []
         for line, images in flag.measured.items():
             sentences = line.split("; ")
