@@ -286,7 +286,7 @@ class Bench:
             )
         if link.direct_db is not None:
             yield line(pair, "sidelink in the radar channel", f"{link.direct_db:.1f} dB re path",
-                       f"{LEAKAGE_DB:g} dB", "channel_leaks")  # fmt: skip
+                       f"{LEAKAGE_DB:g} dB", "channel_crosstalk")  # fmt: skip
         if link.arrivals:
             others = ", ".join(f"{arrival.level_db:.1f} dB {arrival.later_m:+.2f} m" for arrival in link.arrivals)
             yield line(pair, "other arrivals", others, "")
