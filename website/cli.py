@@ -10,12 +10,18 @@ from apertura.cli import app
 
 _HEADER = """# Command line
 
-`apertura COMMAND --help` says the same. Exit codes: 0, done; 2, something for you to fix, in one message;
-130, ended by a signal; 1, what `verify`, `diff` or `reproduce` compared is not the same, or a defect of apertura.
-`[campaign]` is a campaign folder; default: the current directory. Written by `make pages` from the commands.
+`apertura COMMAND --help` shows the same text. `[campaign]` is a campaign folder (default: current directory). Generated
+by `make pages` from the commands.
+
+| exit code | meaning |
+|---|---|
+| 0 | success |
+| 1 | `verify`, `diff` or `reproduce` found a difference, or an internal error occurred |
+| 2 | an error in the input, described by one message |
+| 130 | stopped by a signal |
 """
-_SAID_ABOVE = {"campaign folder, default: current directory"}
-"""What the head says once for all commands."""
+_DESCRIBED_IN_HEADER = {"campaign folder, default: current folder", "campaign folder, default: current directory"}
+"""Help texts that the header of the page gives once for all commands."""
 
 
 def cli_page() -> str:

@@ -165,7 +165,7 @@ def _print_flags(console: "Console", reports: Mapping[str, Report]) -> None:
             parts = [*(text for text in sentences if text not in repeated), *dict.fromkeys(references)]
             measured.append(f"{_abbreviated(images)}: {'; '.join(parts)}")
             printed |= {text: flag.name for text in sentences if text not in repeated and len(text) >= _SENTENCE}
-        for line in [*measured, *([f"check: {flag.advice}"] if flag.advice else [])]:
+        for line in [*measured, *([f"advice: {flag.advice}"] if flag.advice else [])]:
             console.print(Padding(Text(line), (0, 0, 0, 4)))
 
 
