@@ -153,7 +153,7 @@ def test_what_clocks_tsv_says_of_an_offset_is_in_the_budget(campaign):
 def test_the_check_tells_of_pulses_that_no_log_places(campaign):
     told = [str(problem) for problem in problems(campaign)]
     assert len(told) == 1
-    assert "begins 3.440 s after the first pulse" in told[0]
+    assert "starts 3.440 s after the first pulse" in told[0]
     (campaign / "raw/f01/uav1.track.csv").unlink()
     assert "samples without positions" in str(problems(campaign)[0])
 
