@@ -82,7 +82,7 @@ def test_a_stage_of_a_campaign_gives_the_image_of_its_workflow(finished_tiny):
     np.testing.assert_array_equal(front.values, campaign.image(flight, pairs[0]).values)
     assert campaign.report(flight, pairs[0])["flags"] == campaign.flags(flight, pairs[0])
     told, by_workflow = ap.judge(front), campaign.report(flight, pairs[0])["focus"]
-    for name in ("verdict", "why", "points", "parts"):
+    for name in ("verdict", "reason", "points", "parts"):
         assert told.focus[name] == by_workflow[name]
 
 

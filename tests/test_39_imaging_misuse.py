@@ -224,7 +224,7 @@ def test_samples_of_the_other_sign_are_told_as_such():
 def test_what_the_pulses_cannot_tell_is_not_called_focused():
     """Half-spectra swapped: two peaks in range, and nothing that tells them from two targets."""
     swapped = replace(HISTORY, transfer=np.fft.fftshift(ECHO, axes=1))
-    assert ap.backproject(swapped, TARGET_GRID).attrs["verdict"] == "cannot tell"
+    assert ap.backproject(swapped, TARGET_GRID).attrs["verdict"] == "inconclusive"
 
 
 def test_a_right_image_is_called_focused_without_a_flag():
@@ -246,7 +246,7 @@ def test_an_echo_outside_is_no_fault_where_the_scene_has_points_of_its_own():
 def test_a_lazy_image_is_judged_when_asked_and_by_all_of_it():
     lazy = ap.backproject(HISTORY, TARGET_GRID, judge=False, tile_px=64)
     assert lazy.attrs["verdict"] == "not judged"
-    assert "apertura.judge" in lazy.attrs["verdict_why"]
+    assert "apertura.judge" in lazy.attrs["verdict_reason"]
     told = ap.judge(abs(lazy)[:9, :9])
     assert (told.verdict, dict(told.flags)) == ("focused", {})
     assert told.focus["points"][0]["x_m"] == pytest.approx(TARGET[0, 0], abs=0.03)
@@ -364,7 +364,7 @@ def test_numbers_of_few_bits_are_sizes_of_a_grid():
 
 def test_an_image_of_one_pixel_is_judged():
     one = ap.SceneGrid("local", -0.05, 0.05, 0.1, (1, 1))
-    assert ap.backproject(HISTORY, one, judge=True).attrs["verdict"] == "cannot tell"
+    assert ap.backproject(HISTORY, one, judge=True).attrs["verdict"] == "inconclusive"
 
 
 @pytest.mark.slow
@@ -378,7 +378,7 @@ def test_arrays_of_xarray_and_dask_are_arrays():
 def test_what_the_arithmetic_could_not_form_is_not_called_focused():
     """Profiles that begin a thousandth of the way out: no pixel lies in them."""
     image = ap.backproject(replace(PROFILES, start_m=PROFILES.start_m / 1e3), TARGET_GRID, judge=True)
-    assert image.attrs["verdict"] == "cannot tell"
+    assert image.attrs["verdict"] == "inconclusive"
 
 
 def test_an_image_is_of_the_track_that_was_given_whatever_becomes_of_its_array():

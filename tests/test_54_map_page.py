@@ -289,7 +289,7 @@ def test_text_of_strangers_stays_text(browser, finished, tmp_path):
     found["campaign"] = found["crs"]["name"] = HOSTILE
     found["notes"] = [HOSTILE]
     image = found["images"][0]
-    image |= {"flight": HOSTILE, "image": HOSTILE, "verdict": HOSTILE, "why": HOSTILE, "flags": {HOSTILE: HOSTILE}}
+    image |= {"flight": HOSTILE, "image": HOSTILE, "verdict": HOSTILE, "reason": HOSTILE, "flags": {HOSTILE: HOSTILE}}
     image["layers"][0] |= {"title": HOSTILE, "unit": HOSTILE}
     found["places"] = [{"name": HOSTILE, "source": HOSTILE, "image": None, "x_m": 0.0, "y_m": 0.0}]
     path.write_text(json.dumps(found))
@@ -509,7 +509,7 @@ def test_a_page_of_a_look_shows_what_came_since_and_keeps_what_the_reader_chose(
         look.show(ended=True, elapsed_s=1.0)
         changed = json.loads(document.read_text())
         assert changed["again_s"] is None
-        words = next(one["why"] for one in changed["images"] if one["image"] == "uav1-uav2")
+        words = next(one["reason"] for one in changed["images"] if one["image"] == "uav1-uav2")
         assert words not in before
         until(frame, lambda: words in frame.locator("#verdict").text_content())
         assert frame.locator("#image").input_value() == "f01/uav1-uav2"

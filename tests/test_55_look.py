@@ -264,7 +264,7 @@ def test_a_file_that_is_away_for_a_moment_ends_no_look(tiny):
     look._read()
     data.unlink()
     assert not look.pairs[1].add_next(ended=True) or look.pairs[1].counts["added"] == 0
-    assert "no such file" in look.pairs[1].why_dropped.lower()
+    assert "no such file" in look.pairs[1].drop_reason.lower()
     look._read()
     data.write_bytes(content[: len(content) // 2])
     look._read()
@@ -344,8 +344,8 @@ def test_an_image_of_hardly_any_aperture_is_shown_but_not_judged(tiny, monkeypat
         node.read()
     assert look.pairs[0].add_next(ended=True)
     told = look.pairs[0].shown.judged()
-    assert told["verdict"] == "cannot tell"
-    assert told["why"].startswith("aperture too short")
+    assert told["verdict"] == "inconclusive"
+    assert told["reason"].startswith("aperture too short")
 
 
 def test_what_the_first_pulses_could_not_tell_later_ones_do(tmp_path, monkeypatch):
@@ -474,7 +474,7 @@ def test_a_look_writes_beside_the_results_and_nowhere_else(finished_tiny, tmp_pa
     pictures = {f"f01/uav1-uav{node}{end}" for node in (1, 2) for end in (".png", "/db.0.tif")}
     assert shown == {"index.html", "status.json", "map/map.json"} | pictures
     told = json.loads((root / "results/look/status.json").read_text())["pairs"]["f01/uav1-uav1"]
-    assert told["verdict"] in {"focused", "cannot tell"}
+    assert told["verdict"] in {"focused", "inconclusive"}
     assert told["share"] == 1
 
 

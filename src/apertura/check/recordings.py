@@ -101,7 +101,7 @@ def check_intervals(examined: Examination) -> Iterator[CampaignError]:
         if whole and key not in transmitters:
             continue
         ordinal = {2: "second", 3: "third"}.get(whole, f"{whole}th")
-        why = f": only every {ordinal} pulse was recorded, or waveform.prf_hz is {whole} times the true one"
+        reason = f": only every {ordinal} pulse was recorded, or waveform.prf_hz is {whole} times the true one"
         yield CampaignError(
             f"time tag interval {interval_s:.6g} s ({1 / interval_s:.6g} Hz){why if whole else ''}",
             where=recording.files[0],

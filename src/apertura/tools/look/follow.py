@@ -435,7 +435,7 @@ class LiveMap:
             "flight": pair.flight,
             "image": pair.name,
             "verdict": report["verdict"],
-            "why": report["why"],
+            "reason": report["reason"],
             "error_db": report["error_db"],
             "flags": explained_flags(report["flags"]),
             "layers": [{**asdict(layer), "url": url_of(f"{name}/{path.name}", layer.sha256)}],
