@@ -103,7 +103,7 @@ def check_intervals(examined: Examination) -> Iterator[CampaignError]:
         ordinal = {2: "second", 3: "third"}.get(whole, f"{whole}th")
         reason = f": only every {ordinal} pulse was recorded, or waveform.prf_hz is {whole} times the true one"
         yield CampaignError(
-            f"time tag interval {interval_s:.6g} s ({1 / interval_s:.6g} Hz){why if whole else ''}",
+            f"time tag interval {interval_s:.6g} s ({1 / interval_s:.6g} Hz){reason if whole else ''}",
             where=recording.files[0],
             expected=f"{1 / waveform.prf_hz:.6g} s, 1/waveform.prf_hz ({waveform.prf_hz:g} Hz)",
             remedy=f"Correct waveform.prf_hz in {CONFIG}, or the trigger of the recorder.",

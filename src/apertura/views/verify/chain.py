@@ -467,7 +467,7 @@ def print_verified(path: Path, campaign: Path | None = None, *, quiet: bool = Fa
     for link in links:
         if link.state != "same" or not quiet:
             reason = f": {'; '.join(link.reason)}" if link.reason else ""
-            print(f"{link.state:<8} {shown(link.name + why, _LONGEST)}")
+            print(f"{link.state:<8} {shown(link.name + reason, _LONGEST)}")
     for note in chain.notes:
         print(shown(note, _LONGEST))
     counts = [(state, sum(link.state == state for link in links)) for state in reversed(_ORDER)]
