@@ -41,7 +41,7 @@ from apertura.stages.positions import inside_segments, place, scene_air
 from apertura.stages.scene import ConfiguredGround
 from apertura.stages.transfer import PairEcho
 from apertura.stages.transmitted import Transmitted
-from apertura.tools.look.node import NodeSoFar
+from apertura.tools.preview.node import NodeSoFar
 
 Axes = dict[str, NDArray[np.float64]]
 """Body axes of the antennas with beams, as required by `apertura.stages.pair.beams_of`."""
