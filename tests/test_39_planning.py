@@ -35,9 +35,9 @@ def certified(drawn) -> tuple[float, int]:
     """Return the certified error and how often a better setting was needed, as the image step goes about it."""
     planned = make_plan(drawn.job, accuracy_db=drawn.accuracy_db)
     error = error_db(drawn, formed(drawn, planned.setting, planned.inputs(drawn.profiles)))
-    for redone, better in enumerate(planned.fallbacks):
+    for recomputed, better in enumerate(planned.fallbacks):
         if error <= drawn.accuracy_db:
-            return error, redone
+            return error, recomputed
         error = error_db(drawn, formed(drawn, better, drawn.profiles))
     return error, len(planned.fallbacks)
 
@@ -82,20 +82,20 @@ def white(seed: int, window: str, generator: np.random.Generator):
 @pytest.mark.parametrize("seed", range(6))
 def test_the_certified_error_is_met_and_the_first_setting_does(seed):
     drawn = draw(np.random.default_rng(seed), pixels=48, pulses=90)
-    error, redone = certified(drawn)
+    error, recomputed = certified(drawn)
     assert error <= drawn.accuracy_db
-    assert redone == 0
+    assert recomputed == 0
 
 
 @pytest.mark.slow
 def test_over_30_random_campaigns_the_certified_error_is_met():
-    redone = 0
+    recomputed = 0
     for seed in range(30):
         drawn = draw(np.random.default_rng(seed), pixels=80, pulses=160)
         error, tries = certified(drawn)
         assert error <= drawn.accuracy_db, drawn.name
-        redone += tries
-    assert redone <= 1
+        recomputed += tries
+    assert recomputed <= 1
 
 
 @pytest.mark.slow
@@ -240,7 +240,7 @@ def test_coarse_pixels_get_a_coarser_table_that_keeps_its_windows():
     cheapest = next(setting for setting in offered if setting.engine == "native" and setting.error_db < -50)
     fine = next(s for s in offered if s.options == {"degree": 2, "oversampling": 6} and s.error_db < -70)
     assert cheapest.options["oversampling"] < 6
-    assert int(re.search(r"(\d+) % exact paths", fine.reasons["tolerance_rad"])[1]) > 90
+    assert int(re.search(r"exact paths (\d+) %", fine.reasons["tolerance_rad"])[1]) > 90
     assert cheapest.seconds < fine.seconds / 3
 
 

@@ -56,7 +56,7 @@ def test_an_aperture_is_flagged_where_its_ambiguities_show(spread, bandwidth_hz,
         rate, _ = monostatic(apart).phase_rates(ground_points().reshape(-1, 3), wavelength_m=C / 1.4e9)
         apart[:, 0] *= spread / rate
     job = planning_job(aperture=monostatic(apart), centre_hz=1.4e9 - bandwidth_hz / 2, bandwidth_hz=bandwidth_hz)
-    assert ("pulses_sparse" in check_geometry(job)) == flagged
+    assert ("azimuth_undersampled" in check_geometry(job)) == flagged
 
 
 @pytest.mark.slow
@@ -85,4 +85,4 @@ def test_missed_pulses_and_gaps_do_not_undersample_an_aperture():
     spread, widest = left.phase_rates(points, wavelength_m=C / 1.4e9)
     assert spread == pytest.approx(whole, rel=0.05)
     assert widest > 100 * whole
-    assert "pulses_sparse" not in plan(aperture=left).flags
+    assert "azimuth_undersampled" not in plan(aperture=left).flags

@@ -13,9 +13,9 @@ from apertura.stages.planning import check_fits
 def test_a_job_that_does_not_fit_is_refused_with_the_numbers():
     planned = plan(shape=(20000, 20000))
     check_fits(planned, free_disk=planned.disk_bytes, where="f01/a-b", memory=planned.memory_bytes)
-    with pytest.raises(CampaignError, match=r"f01/a-b: imaging needs .* of memory; expected at most the 1.0 MB"):
+    with pytest.raises(CampaignError, match=r"f01/a-b: image formation requires .* of memory; expected at most 1.0 MB"):
         check_fits(planned, free_disk=None, where="f01/a-b", memory=1_000_000)
-    with pytest.raises(CampaignError, match=r"the results need 30.4 GB on disk; expected at most the 5.0 GB"):
+    with pytest.raises(CampaignError, match=r"the results require 30.4 GB on disk; expected at most 5.0 GB"):
         check_fits(planned, free_disk=5_000_000_000, where="f01/a-b", memory=planned.memory_bytes)
 
 

@@ -485,7 +485,7 @@ def test_clean_of_unfinished_work_keeps_every_result(finished, capsys):
 
 def test_clean_waits_for_no_run_and_no_step(finished):
     before = files(finished.results)
-    with hold(finished.root), pytest.raises(CampaignError, match="another run holds this campaign"):
+    with hold(finished.root), pytest.raises(CampaignError, match="the campaign is locked by another run"):
         clean(finished, unfinished_only=False, agreed=True)
     from apertura.campaign.store import writing
 

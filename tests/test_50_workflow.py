@@ -216,7 +216,7 @@ def test_what_an_input_replaced_under_its_old_time_overtakes_is_made_again_and_n
     untouched = (root / "results/f01/uav1-uav1/profile.zarr/zarr.json").stat().st_mtime_ns
     code, output = run()
     assert code == 0, output
-    assert "results/f01/uav2/track.manifest.json: stale, raw/f01/uav2.track.pos has changed" in output
+    assert "results/f01/uav2/track.manifest.json: out of date, raw/f01/uav2.track.pos has changed" in output
     assert (root / "results/f01/uav1-uav1/profile.zarr/zarr.json").stat().st_mtime_ns == untouched
     assert stale_results(Campaign.load(root)) == {}
     assert "Nothing to be done" in run("-n")[1]
@@ -348,7 +348,7 @@ def test_a_run_from_any_folder_tells_each_step_and_ends_with_what_its_images_say
     assert "Building DAG" in (tiny / "results/logs/snakemake.log").read_text()
     code, output = finished(apertura("run", tiny, "-q"))
     assert code == 0
-    assert output.startswith("what to open")
+    assert output.startswith("main files")
     assert "Building DAG" in finished(apertura("run", tiny, "-v"))[1]
     assert "Building DAG" in finished(apertura("run", tiny, "-n", "-v"))[1]
     assert "digraph" in finished(apertura("run", tiny, "--forceall", "--dag"))[1]
@@ -372,7 +372,7 @@ def test_a_second_run_says_who_holds_the_campaign(tiny):
     for second in (apertura("run", tiny), snakemake(tiny)):
         code, output = finished(second)
         assert code != 0
-        assert "another run holds this campaign: process" in output
+        assert "the campaign is locked by another run: process" in output
         assert "Traceback" not in output
     assert "Building DAG" in finished(snakemake(tiny, "-n"))[1]
     run.terminate()

@@ -49,7 +49,7 @@ def certified(
     """
     count = min(max(RANDOM_PIXELS, len(formation.windows)), _MOST_TILES)
     drawn, certificate = random_pixels(formation.windows, count, np.random.default_rng(0)), None
-    settings, redone, flags = iter(formation.plan.fallbacks), [], Flags()
+    settings, recomputed, flags = iter(formation.plan.fallbacks), [], Flags()
     while True:
         brightness, setting = Brightness.of(target, formation.windows), next(settings, None)
         # Bright pixels depend on the image, random ones do not: for the first image, pulses are read once for both.
@@ -70,16 +70,16 @@ def certified(
         for tiles in (uncertified, worse):
             compute_tiles(image, tiles, target, threads=threads, scheduler=scheduler)
         flags = Flags.merged(flags, formation.plan.replaced_by(setting, f"{len(worse) + len(uncertified)} tiles"))
-        redone.append({"tiles": len(worse) + len(uncertified), "with": f"{setting.line}, every pulse"})
+        recomputed.append({"tiles": len(worse) + len(uncertified), "with": f"{setting.line}, every pulse"})
     if error.bound_db > accuracy_db:
         bound = f"numerical error up to {error.bound_db:.1f} dB ({CONFIDENCE:.0%} confidence)"
-        flags["accuracy_missed"] = f"{bound}, {accuracy_db:.1f} dB requested"
+        flags["accuracy_not_met"] = f"{bound}, {accuracy_db:.1f} dB requested"
     return {
         "numerical_error_db": round(error.bound_db, 2),
         "numerical_error_confidence": CONFIDENCE,
         "numerical_error_estimate_db": round(error.estimate_db, 2),
         "certified_pixels": count + BRIGHT_PIXELS,
-        "redone": redone,
+        "recomputed": recomputed,
         "flags": flags,
     }
 

@@ -130,7 +130,7 @@ sum to one echo, and half of it may not be counted; an image with a peak loss of
 _BY_CHANCE = 2.0  # in units of ln(pixels)/pulses, the largest coherence factor of contributions with random phases
 
 
-def echo_elsewhere(
+def echo_outside_scene(
     inputs: PhaseHistory | Profiles,
     grid: SceneGrid,
     terrain: Terrain,
@@ -439,7 +439,7 @@ def focus_report(formation: Formation, target: Any) -> dict[str, Any]:
     parts = _parts(formation, points, cell_m)
     verdict = judge([(point.amplitude, focus) for point, focus in zip(points, measured, strict=True)])
     inputs, has_points = formation.history or formation.profiles, verdict.points > 0
-    elsewhere = echo_elsewhere(inputs, grid, formation.plan.terrain, points=terms, measured=has_points)
+    elsewhere = echo_outside_scene(inputs, grid, formation.plan.terrain, points=terms, measured=has_points)
     if elsewhere:
         measured = [None] * len(points)  # the points may be its sidelobes
     if elsewhere or not has_points:
@@ -449,7 +449,7 @@ def focus_report(formation: Formation, target: Any) -> dict[str, Any]:
     return {
         "verdict": verdict.verdict,
         **({"loss_db": round(verdict.loss_db, 3), "std_db": round(verdict.std_db, 3)} if verdict.points else {}),
-        "why": verdict.why,
+        "reason": verdict.reason,
         **({"elsewhere": elsewhere} if elsewhere else {}),
         **({"conjugated": line} if conjugated and (line := _conjugated(formation, peak)) else {}),
         "cell_m": round(cell_m, 4),
@@ -499,7 +499,7 @@ UNEXPECTED_DB = 0.2
 
 
 def focus_flags(report: dict[str, Any], expected: Effect) -> Flags:
-    """Evaluate the flags `defocused`, `loss_unexpected` and `echo_elsewhere`.
+    """Evaluate the flags `defocused`, `loss_unexpected` and `echo_outside_scene`.
 
     Parameters
     ----------
@@ -513,17 +513,17 @@ def focus_flags(report: dict[str, Any], expected: Effect) -> Flags:
     Source: docs/theory/focus.md, "Focus of a point". Both losses have a standard deviation: that of the measured loss
     is estimated from its points, that of the expected loss is its variation between flights.
     """
-    flags = Flags({"echo_elsewhere": report["elsewhere"]} if "elsewhere" in report else {})
+    flags = Flags({"echo_outside_scene": report["elsewhere"]} if "elsewhere" in report else {})
     budget = f"{abs(expected.loss_db):.1f} ± {expected.loss_std_db:.1f} dB expected from the error budget"
     if report["verdict"] == "defocused":
         flags["defocused"] = (
-            f"{report['why']}; {budget}: positions, lever arms, heights or times are less accurate than configured, "
+            f"{report['reason']}; {budget}: positions, lever arms, heights or times are less accurate than configured, "
             "or their accuracy is not configured"
         )
     elif "loss_db" in report:
         beyond_db = expected.loss_db - report["loss_db"]
         if beyond_db > max(UNEXPECTED_DB, _UNEXPECTED_SIGMAS * float(np.hypot(report["std_db"], expected.loss_std_db))):
-            flags["loss_unexpected"] = f"{report['why']}; {budget}: an error source exceeds its entry in the budget"
+            flags["loss_unexpected"] = f"{report['reason']}; {budget}: an error source exceeds its entry in the budget"
     if "conjugated" in report:
         return Flags({name: f"{line}; {report['conjugated']}" for name, line in flags.items()})
     return flags
@@ -565,5 +565,5 @@ def _point_report(formation: Formation, point: BrightPoint, focus: PointFocus) -
         "snr_db": round(focus.snr_db, 2),
         "background": float(f"{point.background:.4g}"),
         "coherence": round(focus.coherence, 5),
-        "coherence_allowed": round(focus.coherence_allowed, 5),
+        "coherence_noise_limit": round(focus.coherence_noise_limit, 5),
     }
