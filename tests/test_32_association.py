@@ -114,8 +114,8 @@ def test_a_tag_that_steps_back_is_named():
 def test_tags_further_apart_than_good_ones_are_flagged_with_what_was_flown_meanwhile(offset_s, flagged):
     (tx, rx), _ = fly(np.random.default_rng(5), interval_s=0.1, offset_s=offset_s)
     flags = associate(tx, rx, repetition_interval_s=0.1, speed_m_s=12.0).flags
-    assert ("time_tags_apart" in flags) == flagged
-    assert not flagged or flags["time_tags_apart"].endswith("moved 0.25 m in that time")
+    assert ("time_tag_offset" in flags) == flagged
+    assert not flagged or flags["time_tag_offset"].endswith("moved 0.25 m in that time")
 
 
 @pytest.mark.parametrize(("late_s", "left_out"), [(0.004, False), (0.006, True)])
@@ -155,7 +155,7 @@ def test_frame_counters_that_wrap_decide_against_any_tag_offset_below_half_a_tur
     assert pairs.method == "frame counter"
     assert share_right(pairs, numbers) == 1.0
     assert pairs.tx_index.size == rx.size
-    assert ("time_tags_apart" in pairs.flags) == (offset_s > 0.025)
+    assert ("time_tag_offset" in pairs.flags) == (offset_s > 0.025)
 
 
 def test_a_gap_of_several_turns_of_the_counter_is_bridged():

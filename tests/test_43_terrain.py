@@ -197,8 +197,8 @@ def test_a_dem_without_its_datum_is_refused(tiny):
     write_plane(tiny)
     message = complaint(lambda: edit_scene(tiny, dem="dem.tif"))
     assert "dem_datum" in message
-    assert "never guessed" in message
-    assert "given without dem" in complaint(lambda: edit_scene(tiny, dem=None, dem_datum="egm96"))
+    assert "has no default" in message
+    assert "stated without dem" in complaint(lambda: edit_scene(tiny, dem=None, dem_datum="egm96"))
 
 
 def test_a_dem_that_is_not_there_is_named_before_anything_runs(tiny):
@@ -243,7 +243,7 @@ def test_a_dem_under_the_scene_alone_is_enough_where_bounds_are_stated(tiny):
         assert not np.isfinite(expected.terrain.dem.heights(under(expected.grid, seen)))
     campaign = edit_scene(tiny, bounds_m="auto")
     message = complaint(lambda: expected_plan(campaign, *PAIR))
-    assert "under the track, where scene.bounds_m: auto starts from" in message
+    assert "below the track, which scene.bounds_m: auto requires" in message
     assert "% of the scene" not in message
 
 

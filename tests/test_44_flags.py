@@ -257,4 +257,4 @@ def test_the_double_sum_meets_the_highest_accuracy_that_may_be_asked(tmp_path):
     image.image(campaign, "f01", "uav1-uav1", threads=2)
     report = quality_of(campaign, "uav1-uav1")
     assert report["numerical_error_db"] < -120
-    assert "accuracy_missed" not in report["flags"]
+    assert "accuracy_not_met" not in report["flags"]

@@ -162,12 +162,12 @@ def _angle(cosine: NDArray[np.float64]) -> NDArray[np.float64]:
 def decide_antennas(
     beams: Beams | None, illumination: Illumination | None
 ) -> tuple[list[tuple[str, str]], dict[str, str]]:
-    """Return the antennas with beams and their illumination, and the flag `beam_misses`; both empty without beams."""
+    """Return the antennas with beams and their illumination, and the flag `outside_beam`; both empty without beams."""
     if beams is None or beams.antennas is None or illumination is None:
         return [], {}
     with_beam = [name for name in ("transmit", "receive") if getattr(beams, name) is not None]
     misses = f"no pulse illuminates {100 * illumination.unilluminated:.1f} % of the scene: these pixels are zero"
     return (
         [(", ".join(with_beam), illumination.line)],
-        {"beam_misses": misses} if illumination.unilluminated else {},
+        {"outside_beam": misses} if illumination.unilluminated else {},
     )

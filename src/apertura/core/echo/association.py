@@ -375,7 +375,7 @@ def association_flags(
             "all pairs may be wrong by one pulse"
         )
     if abs(association.offset_s) > LARGEST_OFFSET_S:
-        flags["time_tags_apart"] = _offset_line(association, speed_m_s)
+        flags["time_tag_offset"] = _offset_line(association, speed_m_s)
     if conflicts:
         flags["frame_counter_conflict"] = (
             f"{number_of(conflicts, 'pulse')} excluded: frame counter and time tags disagree"

@@ -177,7 +177,7 @@ def truncation_flags(
     Examples
     --------
     >>> truncation_flags(np.array([0.1, -0.4, 1.1]), lead_s=0.2, pulse_s=1.0, listen_s=1.0, cell_s=0.05)
-    {'pulse_cut': 'captures of 2 of 3 pulses start or end within the direct pulse'}
+    {'pulse_truncated': 'captures of 2 of 3 pulses start or end within the direct pulse'}
     """
     known = delay_s[np.isfinite(delay_s)]
     length_s = lead_s + pulse_s + listen_s
@@ -185,7 +185,7 @@ def truncation_flags(
     after_s = (known + lead_s + pulse_s / 2) % length_s - pulse_s / 2
     cut = int(((after_s < -cell_s) | (after_s > lead_s + listen_s + cell_s)).sum())
     line = f"captures of {cut} of {len(delay_s)} pulses start or end within the direct pulse"
-    return {"pulse_cut": line} if cut else {}
+    return {"pulse_truncated": line} if cut else {}
 
 
 def _loss_db(spectrum: NDArray[np.complexfloating], filtered: NDArray[np.complexfloating]) -> float:

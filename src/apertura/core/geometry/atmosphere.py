@@ -252,8 +252,8 @@ class FlightAir:
             "ground_m": round(air.ground_m, 1),
             "antennas_m": round(self.antennas_m, 1),
             "range_m": round(self.path_m / 2, 2),
-            "vacuum_would_move_m": round(1e-6 * self.refractivity_n * self.path_m / 2, 4),
-            "one_constant_leaves_m": float(f"{self.left_m:.2g}"),
+            "vacuum_shift_m": round(1e-6 * self.refractivity_n * self.path_m / 2, 4),
+            "constant_refractivity_error_m": float(f"{self.left_m:.2g}"),
         }
 
 

@@ -445,7 +445,7 @@ def check_track(
 
 def _classified(time_s: Floats, position_m: Floats, poor_fix: NDArray[np.bool_]) -> tuple[NDArray[np.str_], Floats]:
     """Return the flag that excludes each epoch, '' if it is valid, and the size of its error, (epoch,) each."""
-    cause, size = np.where(poor_fix, "fix_poor", "").astype("U16"), np.zeros(len(time_s))
+    cause, size = np.where(poor_fix, "fix_quality_low", "").astype("U16"), np.zeros(len(time_s))
     cause[find_frozen(time_s, position_m) & ~poor_fix] = "track_frozen"
     for part in _parts(time_s, cause):
         for spike in find_spikes(time_s[part], position_m[part]):
@@ -479,12 +479,12 @@ def _holes(
     shortest_s = min(LONG_GAP * interval_s, longest_gap_s)
     for number in np.flatnonzero((lengths > shortest_s) | (np.diff(valid) > 1)):
         inside = set(cause[valid[number] + 1 : valid[number + 1]].tolist())
-        poor, missing = "fix_poor" in inside, max(1, round(float(lengths[number]) / interval_s) - 1)
+        poor, missing = "fix_quality_low" in inside, max(1, round(float(lengths[number]) / interval_s) - 1)
         if not poor and lengths[number] <= shortest_s:
             continue
         error_m = _gap_error_m(time, position, missing)
         if poor or error_m > limit_m or lengths[number] > longest_gap_s:
-            name = "fix_poor" if poor else min(inside, default="track_gap")
+            name = "fix_quality_low" if poor else min(inside, default="track_gap")
             holes.append(Hole(float(time[number]), float(time[number + 1]), name, error_m))
     return holes
 
