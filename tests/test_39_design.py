@@ -239,7 +239,7 @@ def test_a_refinement_needs_points_whose_cross_section_follows_from_the_radar_eq
     ("std_m", "node", "obstacle"),
     [
         (0.06, {}, "position errors of 6 cm exceed 4.4 cm"),
-        (0.02, {"position_correlation_s": 0.2}, "a correlation time of 0.2 s, less than 0.5 s"),
+        (0.02, {"position_correlation_s": 0.2}, "the correlation time of position errors, 0.2 s, is below 0.5 s"),
     ],
 )
 def test_a_refinement_beyond_its_measured_limits_does_not_count(std_m, node, obstacle):
@@ -357,7 +357,7 @@ def test_tracks_are_moved_about_the_middle_of_the_scene():
 
 
 BAD = {
-    "through the ground": (flown(plan_of(), uav1=line(height_m=-2.0)), "in or below the ground"),
+    "through the ground": (flown(plan_of(), uav1=line(height_m=-2.0)), "at or below the terrain"),
     "too few pulses": (
         plan_of(
             waveform=plan_of()["waveform"] | {"prf_hz": 8.0},
@@ -371,7 +371,7 @@ BAD = {
     "unknown key": (plan_of(requires={"nesz_db": -20}), "requires: unknown key (did you mean 'require'?)"),
     "beyond the prefix": (
         plan_of(waveform=plan_of()["waveform"] | {"cyclic_prefix_s": 1e-7}),
-        "from the tracks at least",
+        "no pulse receives an echo of the scene",
     ),
     "tracks elsewhere": (
         flown(plan_of(), uav1=line(start_m=[4840.0, 990.0], end_m=[4880.0, 990.0])),

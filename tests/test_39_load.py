@@ -74,7 +74,7 @@ def test_before_the_first_run_the_scene_says_what_is_missing_and_what_makes_it(t
     opened = open_campaign(tiny)
     for work in (lambda: opened.scene, lambda: score(opened.campaign)):
         message = complaint(work)
-        assert message.startswith(f"{tiny}/results/scene.json: not there, or not finished")
+        assert message.startswith(f"{tiny}/results/scene.json: the result is missing or unfinished")
         assert "`apertura run`" in message
     message = complaint(lambda: opened.stage("echo", *PAIR))
     assert "Run the workflow" in message

@@ -120,13 +120,13 @@ def test_samples_and_logs_may_lie_in_files(tmp_path):
         ({"samples": NODE.samples.astype(np.float64)}, "samples of float64, shape (3, 24, 1, 2); expected (sample, 1"),
         ({"samples": NODE.samples[:, :, 0]}, "samples of int16, shape (3, 24, 2)"),
         ({"channels": ("radar", "sidelink")}, "expected (sample, 2, 2) or (capture, sample, 2, 2)"),
-        ({"samples": np.zeros_like(NODE.samples)}, "3 captures of channel radar hold only zeros"),
+        ({"samples": np.zeros_like(NODE.samples)}, "3 captures of channel radar contain only zeros"),
         ({"samples": "nowhere.iq"}, "nowhere.iq: no such file"),
         ({"samples": NODE.samples.reshape(-1, 1, 2)[:-1]}, "71 samples, 3 captures; expected captures of equal length"),
         ({"time_utc": TAGS[:2]}, "2 time tags, 3 starts and 2 frame numbers"),
-        ({"time_utc": TAGS[::-1]}, "capture 1 is tagged 2025-05-14T09:30:02.5"),
-        ({"time_utc": ["yesterday"] * 3}, "time_utc: 'yesterday' is no time"),
-        ({"time_utc": [f"{tag}+02:00" for tag in TAGS]}, "time_utc: '2025-05-14T09:30:01+02:00' is no time"),
+        ({"time_utc": TAGS[::-1]}, "capture 1 has time tag 2025-05-14T09:30:02.5"),
+        ({"time_utc": ["yesterday"] * 3}, "time_utc: 'yesterday' is not a time"),
+        ({"time_utc": [f"{tag}+02:00" for tag in TAGS]}, "time_utc: '2025-05-14T09:30:01+02:00' is not a time"),
         ({"time_utc": np.array(["3025-05-14"] * 3, "datetime64[s]")}, "is not between 1980 and 2199"),
         ({"start": [0, 24, 480]}, "capture 2 starts at sample 480, the data end at 72"),
         ({"frame": [1, 2]}, "and 2 frame numbers"),
@@ -155,7 +155,7 @@ def test_a_recording_that_cannot_be_is_named_and_nothing_is_left(tmp_path, chang
         ({"codes": None}, "raw/codes.npy: no such file"),
         ({"transmitter": "uav3"}, "node 'uav3' is not in config/config.yaml: nodes"),
         ({"transmitter": "uav2"}, "uav2.sigmf-meta: no such file"),
-        ({"kind": "picture"}, "kind 'picture' is none of bench, calibration, image"),
+        ({"kind": "picture"}, "unknown kind 'picture', not one of bench, calibration, image"),
         (
             {"config": CONFIG | {"waveform": {"kind": "phase_history", "format": "afrl_mat"}}},
             "waveform.kind phase_history; expected a waveform that is recorded as samples",
@@ -179,5 +179,5 @@ def test_the_name_of_a_flight_leads_nowhere_else(tmp_path, name):
 def test_nothing_is_written_over(tmp_path):
     made = write(tmp_path / "c")
     before = contents(made)
-    assert "something is there already" in complaint(lambda: write(tmp_path / "c"))
+    assert "already exists and is not an empty folder" in complaint(lambda: write(tmp_path / "c"))
     assert contents(made) == before

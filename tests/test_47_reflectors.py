@@ -356,7 +356,7 @@ def test_a_pair_without_a_constant_is_flagged_and_the_other_one_calibrated(later
         pair: json.loads(campaign.result("f01", pair, "image.json").read_text()) for pair in campaign.images["f01"][:2]
     }
     assert "pair_uncalibrated" not in told["uav1-uav1"]["flags"]
-    assert told["uav1-uav2"]["flags"]["pair_uncalibrated"].startswith("calibration.json has no constant of uav1-uav2")
+    assert told["uav1-uav2"]["flags"]["pair_uncalibrated"].startswith("calibration.json has no constant for uav1-uav2")
     for pair, some in (("uav1-uav1", True), ("uav1-uav2", False)):
         with rasterio.open(str(campaign.result("f01", pair, "sigma0_db.tif"))) as raster:
             assert np.isfinite(raster.read(1, masked=True).filled(np.nan)).any() == some
@@ -434,7 +434,7 @@ def test_a_file_of_constants_is_checked_before_anything_runs(tiny):
     assert "calibration.json: no such file" in line
     (tiny / "calibration.json").write_text(some_constants("uav3-uav3").model_dump_json())
     (line,) = map(as_line, problems(tiny))
-    assert "no constant of uav1-uav1, uav1-uav2, but of uav3-uav3" in line
+    assert "constants of uav3-uav3 only, none of uav1-uav1, uav1-uav2" in line
     (tiny / "calibration.json").write_text(some_constants("uav1-uav1").model_dump_json())
     assert problems(tiny) == []
     change_file(tiny, lambda document: document.update(schema_version=2))
@@ -445,8 +445,11 @@ def test_a_file_of_constants_is_checked_before_anything_runs(tiny):
 @pytest.mark.parametrize(
     ("keys", "told"),
     [
-        ({"kind": "sphere", "size_m": [0.2], "azimuth_deg": 3.0}, "a sphere looks nowhere"),
-        ({"kind": "trihedral", "size_m": [0.2], "azimuth_deg": 3.0}, "a trihedral looks somewhere"),
+        ({"kind": "sphere", "size_m": [0.2], "azimuth_deg": 3.0}, "a sphere has no boresight"),
+        (
+            {"kind": "trihedral", "size_m": [0.2], "azimuth_deg": 3.0},
+            "a trihedral requires azimuth_deg and elevation_deg",
+        ),
         (
             {"kind": "dihedral", "size_m": [0.2], "azimuth_deg": 3.0, "elevation_deg": 0.0},
             "[across the seam, along it]",

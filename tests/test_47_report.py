@@ -136,5 +136,5 @@ def test_a_picture_changed_by_hand_does_not_reach_the_page(reported):
     path = reported.result("f01", "uav1-uav1", "pictures", "cuts.png")
     whole = path.read_bytes()
     path.write_bytes(whole[:-1] + b"x")
-    assert "not as it was written" in complaint(lambda: page(reported, "f01"))
+    assert "the file has changed since it was written" in complaint(lambda: page(reported, "f01"))
     path.write_bytes(whole)

@@ -111,7 +111,7 @@ WRONG_RUNS = {
     "--set-scatter tiles=0": "tiles=N, N >= 1",
     "--set-scat=tiles=0": "tiles=N, N >= 1",
     "--until imag": "ingest, bench, echo",
-    "cphd": "cphd: a step that runs only where its result is requested",
+    "cphd": "cphd: a step that runs only if its result is requested",
     "results/f01/uav2-uav2/echo.manifest.json": "one of fused, tracks, uav1, uav1-uav1, uav1-uav2, uav2",
     "results/f01/uav9/track.manifest.json": "f01 has no uav9",
     "results/f09/uav1-uav1/echo.manifest.json": "no flight 'f09'",
@@ -180,7 +180,7 @@ def test_results_are_read_where_their_recordings_are_not(finished_tiny, tmp_path
         assert re.findall(r"^(\w+) +(\S+sigmf-data):", out, re.MULTILINE) == [("missing", name) for name in SAMPLES]
         assert "changed" not in out
     elif command in {"check", "summary", "list"} and not makes:
-        assert "not there, so results are not compared with it: raw/f01/uav1.sigmf-" in out
+        assert "missing recordings, not compared with results: raw/f01/uav1.sigmf-" in out
 
 
 @pytest.mark.parametrize("node", ["uav2", "uav9"])

@@ -74,7 +74,7 @@ def test_a_log_in_radians_lacks_degrees_before_any_campaign_is_made(tmp_path):
         path.write_text("\n".join(["time_utc,east_m,north_m,up_m,roll_deg,pitch_deg,yaw_deg", *rows, ""]))
         said = [line for line in look(path).missing if line.startswith("an attitude in degrees")]
         assert bool(said) is lacking
-        assert not lacking or "look in radians: yaw is 0° off the course so" in said[0]
+        assert not lacking or "appear to be in radians: yaw then deviates from the course by 0°" in said[0]
 
 
 def test_the_preview_of_a_log_names_the_axes_that_it_has(shared, tmp_path):
@@ -253,7 +253,7 @@ def test_a_product_of_apertura_is_no_elevation_model(tmp_path):
     }
     write_power(tmp_path / "power.tif", np.ones((8, 9), "c8"), tags=tags, title="f01 uav1-uav2, power", **PRODUCT)
     write_slc(tmp_path / "slc.tif", np.ones((8, 9), "c8"), tags=tags, title="f01 uav1-uav2", **PRODUCT)
-    for name, values in (("power.tif", "linear (1)"), ("slc.tif", "carrier kept (1)")):
+    for name, values in (("power.tif", "linear (1)"), ("slc.tif", "complex, with carrier phase (1)")):
         report = look(tmp_path / name)
         assert report.kind == "product of apertura"
         assert (report.problem, report.missing) == (None, ())
@@ -378,7 +378,7 @@ def test_beats_of_a_campaign_are_reported_with_the_times_beside(tmp_path):
     np.save(raw / "uav1.time.npy", times[::-1])
     refused = look(raw / "uav1.npy")
     assert (refused.kind, refused.format) == ("phase history", "beat_npy")
-    assert "sweep 1 begins" in refused.problem.found
+    assert "sweep 1 starts" in refused.problem.found
 
 
 @pytest.mark.slow

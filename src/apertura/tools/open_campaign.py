@@ -81,7 +81,7 @@ class OpenCampaign:
             known = flight.nodes if kind == "node" else flight.pairs
             _check_name(where[1], kind, known, where=f"campaign.stage({name!r}, {flight.name!r})")
         if name == "echo":
-            return PairEcho.opened(self.campaign, where[0], where[1]).stage
+            return PairEcho.cleaned(self.campaign, where[0], where[1]).stage
         return open_stage(self.campaign.stage(name, *where), name)
 
     def image(self, flight: str, pair: str) -> "xr.DataArray":

@@ -44,14 +44,14 @@ class ImageValues:
         Upper bound of the numerical error, dB.
     used, recorded
         Numbers of pulses used in the image, and recorded.
-    coherence, left_out
+    coherence, excluded
         Coherence of the pairs of a sum, and number of pairs excluded from it.
     flags
         Flag → measurement.
     """
 
     verdict: str
-    why: str
+    reason: str
     loss_db: float | None
     expected_db: float | None
     worst_cause: str
@@ -62,7 +62,7 @@ class ImageValues:
     used: int | None
     recorded: int
     coherence: float | None
-    left_out: int
+    excluded: int
     flags: Mapping[str, str]
 
     @classmethod
@@ -76,7 +76,7 @@ class ImageValues:
         used = pulses.get("used")
         return cls(
             str(focus.get("verdict", "")),
-            str(focus.get("why", "")),
+            str(focus.get("reason", "")),
             focus.get("loss_db"),
             focus.get("expected_db"),
             most_lossy["cause"] if most_lossy else "",
@@ -87,7 +87,7 @@ class ImageValues:
             used,
             (used or 0) + (pulses.get("dropped") or 0),
             coherence.get("mean"),
-            len(fusion.get("left_out", ())),
+            len(fusion.get("excluded", ())),
             report["flags"],
         )
 
@@ -267,13 +267,13 @@ class RaisedFlag:
         Name of the flag.
     measured
         Measurement → names of its images.
-    means, advice
+    meaning, advice
         Meaning of the flag and advice; empty for a flag of another version of apertura.
     """
 
     name: str
     measured: Mapping[str, Sequence[str]]
-    means: str
+    meaning: str
     advice: str
 
 
@@ -314,7 +314,7 @@ def flag_rows(reports: Mapping[str, Report]) -> list[Cells]:
             flag.name,
             ", ".join(dict.fromkeys(image for images in flag.measured.values() for image in images)),
             "; ".join(flag.measured),
-            flag.means,
+            flag.meaning,
             flag.advice,
         )
         for flag in raised_flags(reports)
@@ -331,15 +331,15 @@ def explained_flags(flags: Mapping[str, str]) -> dict[str, str]:
     """
     explained = {}
     for flag, line in flags.items():
-        means, advice = _explained(flag)
-        sentences_of = [line.rstrip("."), *([means, f"Check: {advice}"] if means else [])]
+        meaning, advice = _explained(flag)
+        sentences_of = [line.rstrip("."), *([meaning, f"Advice: {advice}"] if meaning else [])]
         explained[flag] = " ".join(f"{sentence}." for sentence in sentences_of)
     return explained
 
 
 def _explained(flag: str) -> tuple[str, str]:
     definition = FLAGS.get(flag)  # an image of another version may have a flag that this version does not define
-    return (definition.means, definition.look) if definition else ("", "")
+    return (definition.meaning, definition.advice) if definition else ("", "")
 
 
 def _size_text(value: float, unit: str) -> str:

@@ -282,11 +282,11 @@ class Bench:
                 "path offset relative to the set-up",
                 f"{offset.offset_m:+.4f} ± {offset.std_m:.4f} m, config {offset.stated_m:+.4f} m",
                 f"{PATH_CELLS * offset.cell_m:.3f} m",
-                "path_disagrees",
+                "path_offset_disagrees",
             )
         if link.direct_db is not None:
             yield line(pair, "sidelink in the radar channel", f"{link.direct_db:.1f} dB re path",
-                       f"{LEAKAGE_DB:g} dB", "channel_leaks")  # fmt: skip
+                       f"{LEAKAGE_DB:g} dB", "channel_crosstalk")  # fmt: skip
         if link.arrivals:
             others = ", ".join(f"{arrival.level_db:.1f} dB {arrival.later_m:+.2f} m" for arrival in link.arrivals)
             yield line(pair, "other arrivals", others, "")
@@ -298,7 +298,7 @@ class Bench:
                 f"{split.path_m:+.3f} m (receiver: relative to its sidelink); over the band {split.band_db:.2f} dB, "
                 f"{split.band_rad:.3f} rad rms",
                 f"{SPLIT_DB:g} dB, {SPLIT_RAD:g} rad",
-                "split_disagrees",
+                "splitter_channels_differ",
             )
 
     @property
@@ -324,7 +324,7 @@ class Bench:
 
 
 _DOUBTS = frozenset({
-    "link_weak", "link_incoherent", "contact_loose", "delay_jumps", "wrong_code", "code_unconfirmed",
+    "link_weak", "link_incoherent", "contact_intermittent", "delay_jumps", "wrong_code", "code_unconfirmed",
     "spectrum_inverted", "saturated_radar", "saturated_sidelink", "sidelink_lost", "interference",
 })  # fmt: skip
 """Flags that exclude the measured path of a node from the config."""

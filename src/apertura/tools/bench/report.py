@@ -91,7 +91,7 @@ def _print(flight: str, report: Mapping[str, Any]) -> None:
         table.add_row(*row)
     console.print(table)
     for name, line in report["flags"].items():
-        console.print(f"{name}: {FLAGS[name].means}\n    {line}\n    check: {FLAGS[name].look}", markup=False)
+        console.print(f"{name}: {FLAGS[name].meaning}\n    {line}\n    advice: {FLAGS[name].advice}", markup=False)
 
 
 def _rows(report: Mapping[str, Any]) -> list[tuple[str, str, str, str, str]]:
@@ -113,7 +113,7 @@ def _blocks(title: str, report: Mapping[str, Any], picture: bytes) -> Iterator[B
         )
     )
     if flags:
-        rows = [(name, line, FLAGS[name].means, FLAGS[name].look) for name, line in flags.items()]
+        rows = [(name, line, FLAGS[name].meaning, FLAGS[name].advice) for name, line in flags.items()]
         yield Table("Flags raised.", ("flag", "measurement", "meaning", "advice"), rows)
     yield Picture(
         picture,

@@ -32,7 +32,7 @@ from apertura.core.scene.dem import open_dem
 from apertura.formats.names import PHASE_HISTORIES, log_format, log_suffixes
 from apertura.formats.npy import read_npy
 from apertura.formats.reading import open_recording, read_phase_history, read_track
-from apertura.formats.tracks.log_options import AS_IT_SAYS, LogOptions, QualityNumbers, TimeSystem
+from apertura.formats.tracks.log_options import DEFAULT_OPTIONS, LogOptions, QualityNumbers, TimeSystem
 from apertura.views.inspect.report import Report
 
 if TYPE_CHECKING:
@@ -81,7 +81,7 @@ class Surroundings:
     """
 
     node: str
-    options: LogOptions = AS_IT_SAYS
+    options: LogOptions = DEFAULT_OPTIONS
     waveform: Mapping[str, Any] = field(default_factory=dict)
     problem: CampaignError | None = None
     typed: Mapping[str, Any] = field(default_factory=dict)
