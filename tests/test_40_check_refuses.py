@@ -1,4 +1,4 @@
-"""What a run would refuse, `check` refuses before it, of the same functions and in the same words."""
+"""Errors that stop a run are reported by `check` beforehand, by the same functions with the same messages."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ def processing(**keys):
 
 
 def antenna(boresight_deg, width_deg=20.0, **more):
-    """Give the transmitter's antenna a beam; more keys of the processing."""
+    """Return a function that configures a beam of the transmitter's antenna and other processing keys."""
     beam = {"beamwidth_deg": [width_deg, width_deg], "boresight_deg": boresight_deg}
 
     def change(root):
@@ -34,18 +34,18 @@ def metadata(node, **keys):
     return lambda root: edit_meta(root, node, lambda meta: meta["global"].update(named))
 
 
-def wider(root):
-    """Make the scene reach beyond what is recorded."""
+def wider_scene(root):
+    """Extend the scene beyond the recorded ranges."""
     west, south, east, north = Campaign.load(root).settings.scene.bounds_m
     state(root, "scene", bounds_m=[west - 100, south - 100, east + 100, north + 100], spacing_m=1.0)
 
 
-def a_few_in_the_ground(root):
-    """Raise the ground to where a tenth of the pulses are below it."""
+def raise_terrain(root):
+    """Raise the terrain so that a tenth of the pulses are below it."""
     track = read_log(Campaign.load(root), "f01", "uav1")
     heights = map_from_frame("EPSG:32632", track.position.values)[:, 2]
-    flown = heights[(track.time.values > np.datetime64("2025-05-14T09:30:00"))]
-    state(root, "scene", height_m=float(np.quantile(flown[:40], 0.1)))
+    heights_in_flight = heights[(track.time.values > np.datetime64("2025-05-14T09:30:00"))]
+    state(root, "scene", height_m=float(np.quantile(heights_in_flight[:40], 0.1)))
 
 
 def codes(root):
@@ -61,8 +61,8 @@ def tag_twice(meta):
     meta["captures"][5]["core:datetime"] = meta["captures"][3]["core:datetime"]
 
 
-def dem_beside_the_track(root):
-    """A DEM about the scene alone, which automatic bounds do not begin at."""
+def dem_not_below_the_track(root):
+    """Write a DEM that covers the scene but not the track, which automatic bounds require."""
     west, _, _, north = Campaign.load(root).settings.scene.bounds_m
     place = from_origin(west + 400, north + 400, 1.0, 1.0)
     kind = {"width": 20, "height": 20, "count": 1, "dtype": "float64", "crs": "EPSG:32632"}
@@ -71,48 +71,48 @@ def dem_beside_the_track(root):
     state(root, "scene", dem="dem.tif", dem_datum="ellipsoid", bounds_m="auto", spacing_m="auto")
 
 
-SPOILT = {
-    "wide scene": (wider, "echoes of the scene arrive after the cyclic prefix"),
-    "in the ground": (a_few_in_the_ground, "is in or below the ground of the scene, worst at pulse"),
+INVALID = {
+    "wide scene": (wider_scene, "echoes of the scene arrive after the cyclic prefix"),
+    "in the ground": (raise_terrain, "is in or below the ground of the scene, worst at pulse"),
     "beam to the other side": (antenna([-90.0, 0.0]), "no pulse illuminates the scene"),
     "beam to the sky": (antenna([90.0, 80.0]), "no pulse illuminates the scene"),
     "sums of pulses under a beam": (antenna([90.0, 0.0], 120.0, presum=4), "presum is 4, and the antennas have beams"),
     "sums of many pulses": (processing(presum=64), "presum is 64"),
-    "a DEM that is none": (processing(terrain="dem"), "terrain is dem"),
-    "an engine that is not here": (processing(engine="cuda"), "engine cuda cannot run here"),
-    "an angle of one pulse": (
+    "terrain without a DEM": (processing(terrain="dem"), "terrain is dem"),
+    "an unavailable engine": (processing(engine="cuda"), "engine cuda cannot run here"),
+    "an integration angle of one pulse": (
         processing(integration={"degrees": 0.001}),
         "at most 2 pulses illuminate a pixel inside",
     ),
-    "another's scheduler": (processing(scheduler="tcp://127.0.0.1:9999"), "DASK_SCHEDULER_ADDRESS is not set"),
-    "a log with a hole": (
+    "a foreign scheduler": (processing(scheduler="tcp://127.0.0.1:9999"), "DASK_SCHEDULER_ADDRESS is not set"),
+    "a log with a gap": (
         lambda root: edit_track(root, "uav1", lambda lines: [*lines[:4], *lines[-3:]]),
         "no pulse has a valid position",
     ),
-    "codes too few": (codes, "complex64 of shape (1023,)"),
+    "too few codes": (codes, "complex64 of shape (1023,)"),
     "no sidelink": (metadata("uav2", apertura_channels=["radar", "spare"]), "a channel named 'sidelink'"),
     "another rate": (metadata("uav2", core_sample_rate=1e9), "recorded with sample_rate_hz"),
     "no pulse in a segment": (segment, "no pulse of flight f01, pair uav1-uav1 within"),
-    "a tag twice": (lambda root: edit_meta(root, "uav2", tag_twice), "not after the one before"),
-    "a DEM beside the track": (dem_beside_the_track, "below the track, which scene.bounds_m: auto requires"),
+    "a duplicate tag": (lambda root: edit_meta(root, "uav2", tag_twice), "not after the one before"),
+    "a DEM not below the track": (dem_not_below_the_track, "below the track, which scene.bounds_m: auto requires"),
 }
 
 
-@pytest.mark.quick("a log with a hole")
-@pytest.mark.parametrize("name", list(SPOILT))
-def test_what_a_run_refuses_is_refused_before_it_in_the_same_words(tiny, name, monkeypatch):
+@pytest.mark.quick("a log with a gap")
+@pytest.mark.parametrize("name", list(INVALID))
+def test_check_reports_errors_of_a_run_with_the_same_message(tiny, name, monkeypatch):
     monkeypatch.delenv("DASK_SCHEDULER_ADDRESS", raising=False)
-    spoil, words = SPOILT[name]
-    spoil(tiny)
-    before = [(one.found, one.expected, one.remedy) for one in problems(tiny)]
-    assert any(words in " ".join(one) for one in before), before
+    invalidate, message = INVALID[name]
+    invalidate(tiny)
+    before = [(problem.found, problem.expected, problem.remedy) for problem in problems(tiny)]
+    assert any(message in " ".join(parts) for parts in before), before
     with pytest.raises(CampaignError) as caught:
         run_steps(tiny, exports=False)
-    if name not in {"no pulse in a segment", "a DEM beside the track"}:  # whose numbers are of the pulses that are left
+    if name not in {"no pulse in a segment", "a DEM not below the track"}:  # a run counts only the remaining pulses
         assert (caught.value.found, caught.value.expected, caught.value.remedy) in before
 
 
 @pytest.mark.parametrize("change", [antenna([90.0, 0.0], 120.0), processing(presum=1, engine="native")])
-def test_what_a_run_takes_is_not_refused(tiny, change):
+def test_valid_settings_are_not_refused(tiny, change):
     change(tiny)
     assert problems(tiny) == []

@@ -1,4 +1,4 @@
-"""The graph of the workflow stands in `workflow/*.smk` for people and in `apertura.workflow.rules` for lineage: one."""
+"""The job graph of `workflow/*.smk` is that of `apertura.workflow.rules`, from which lineage is derived."""
 
 import json
 import subprocess
@@ -17,7 +17,7 @@ ON_DEMAND = ("pages", "phase_history", "whole_chart", "speed_accuracy")
 
 
 def jobs_of(root, *targets):
-    """Yield rule, wildcards, inputs and outputs of every job, as Snakemake plans them."""
+    """Yield rule, wildcards, inputs and outputs of every job that Snakemake plans."""
     script, options = (
         ROOT / "tests" / "snakemake_jobs.py",
         ["--directory", str(root), "--cores", "2", "-n", "--forceall"],
@@ -31,30 +31,31 @@ def jobs_of(root, *targets):
 
 
 def check(root, *targets):
-    """Compare inputs and outputs of every job with the rows of its rule; return the rules that have jobs."""
-    campaign, found = Campaign.load(root), set()
-    for rule, words, inputs, outputs in jobs_of(root, *targets):
+    """Compare inputs and outputs of every job with the table of rules; return the rules that have jobs."""
+    campaign, rules_with_jobs = Campaign.load(root), set()
+    for rule, wildcards, inputs, outputs in jobs_of(root, *targets):
         if rule not in RULES:
             continue
-        found.add(rule)
-        row, where = RULES[rule], [words[word] for word in RULES[rule].of.wildcards]
-        rows = [made for made in RESULTS.values() if made.name == rule] or [RESULTS[row.result]]
-        made = [result_of(campaign, one.result, *where) for one in rows]
-        sources = {str((campaign.root / name).location) for one in made for name in one.sources}
+        rules_with_jobs.add(rule)
+        row, where = RULES[rule], [wildcards[name] for name in RULES[rule].of.wildcards]
+        rows = [result for result in RESULTS.values() if result.name == rule] or [RESULTS[row.result]]
+        results = [result_of(campaign, result_row.result, *where) for result_row in rows]
+        sources = {str((campaign.root / name).location) for result in results for name in result.sources}
         read = {str((campaign.root / name).location) for name in inputs if "/tiles/" not in name}
         assert read == sources, (rule, where)
-        folder = "/".join(filter(None, ["results", row.folder])).format(**words)
-        files = {f"{folder}/{file}" for file in (*row.documents, *products_of(row))} | {one.manifest for one in made}
+        folder = "/".join(filter(None, ["results", row.folder])).format(**wildcards)
+        files = {f"{folder}/{file}" for file in (*row.documents, *products_of(row))}
+        files |= {result.manifest for result in results}
         if rule == "tiles":
             assert [Path(file).parent.name for file in outputs] == ["tiles"]
-        elif rule in {"mosaic", "pictures", "page"}:  # whose files follow from the campaign
+        elif rule in {"mosaic", "pictures", "page"}:  # which also write files that depend on the campaign
             assert files <= outputs, (rule, where)
         else:
             assert files == outputs, (rule, where)
-    return found
+    return rules_with_jobs
 
 
-def test_inputs_and_outputs_of_rules_are_those_that_lineage_has(tiny):
+def test_inputs_and_outputs_of_rules_match_lineage(tiny):
     assert check(tiny, *ON_DEMAND) == set(RULES) - {
         "bench",
         "calibrate",
@@ -66,7 +67,7 @@ def test_inputs_and_outputs_of_rules_are_those_that_lineage_has(tiny):
 
 
 @pytest.mark.slow
-def test_what_the_config_asks_for_changes_both(tiny):
+def test_configured_results_change_rules_and_lineage_alike(tiny):
     edit_config(
         tiny,
         lambda document: document.update(
@@ -79,12 +80,12 @@ def test_what_the_config_asks_for_changes_both(tiny):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["continuous", "swarm", "paper-lab", "paper-static"])
-def test_other_kinds_of_campaigns_have_the_same_graph(name, tmp_path):
+def test_rules_match_lineage_for_other_campaigns(name, tmp_path):
     simulate(tmp_path / "campaign", preset(name))
     assert check(tmp_path / "campaign")
 
 
-def test_rules_name_their_files(tmp_path):
+def test_rule_files_name_manifests_and_products(tmp_path):
     text = "\n".join(path.read_text(encoding="utf-8") for path in (ROOT / "workflow" / "rules").glob("*.smk"))
     for row in RESULTS.values():
         if row.name in RULES:

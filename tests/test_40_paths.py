@@ -1,4 +1,4 @@
-"""Nothing leaves the campaign folder: neither by a name, nor through a link, nor by what a name does elsewhere."""
+"""Confinement to the campaign folder: paths that lead outside, symbolic links, and unsafe names."""
 
 import json
 import shutil
@@ -28,8 +28,8 @@ def edit(root, key, value, *, load=True):
     path = root / "config" / "config.yaml"
     document = yaml.safe_load(path.read_text())
     section = document
-    *way, last = key.split(".")
-    for name in way:
+    *parents, last = key.split(".")
+    for name in parents:
         section = section[name]
     section[last] = value
     path.write_text(yaml.safe_dump(document))
@@ -40,7 +40,7 @@ def edit(root, key, value, *, load=True):
     "name", ["../codes.npy", "raw/../../codes.npy", "/etc/passwd", "raw\\codes.npy", "raw/\x1b[2J"]
 )
 @pytest.mark.parametrize("key", ["waveform.codes", "scene.dem", "scene.geoid"])
-def test_a_name_that_leaves_the_folder_is_refused_with_its_key(tiny, key, name):
+def test_path_outside_the_folder_is_refused_with_its_key(tiny, key, name):
     (tiny.parent / "codes.npy").write_bytes((tiny / "raw/codes.npy").read_bytes())
     if key == "scene.dem":
         edit(tiny, "scene.dem_datum", "ellipsoid", load=False)
@@ -52,7 +52,7 @@ def test_a_name_that_leaves_the_folder_is_refused_with_its_key(tiny, key, name):
 @pytest.mark.parametrize(
     "file", ["raw/f01/uav1.track.csv", "raw/f01/uav1.sigmf-data", "raw/codes.npy", "config/config.yaml", "raw/f01"]
 )
-def test_an_input_that_is_a_link_is_refused(tiny, tmp_path, file):
+def test_linked_input_is_refused(tiny, tmp_path, file):
     path, elsewhere = tiny / file, tmp_path / "elsewhere"
     shutil.move(path, elsewhere)
     path.symlink_to(elsewhere)
@@ -60,12 +60,12 @@ def test_an_input_that_is_a_link_is_refused(tiny, tmp_path, file):
         require_files(Campaign.load(tiny))
 
 
-def test_a_campaign_folder_may_itself_be_reached_through_a_link(tiny, tmp_path):
+def test_campaign_folder_may_be_a_link(tiny, tmp_path):
     (tmp_path / "link").symlink_to(tiny)
     require_files(Campaign.load(tmp_path / "link"))
 
 
-def test_nothing_is_written_or_deleted_through_linked_results(tiny, tmp_path):
+def test_linked_results_folder_is_not_written_or_deleted(tiny, tmp_path):
     elsewhere = tmp_path / "elsewhere"
     (elsewhere / "f01/uav1/raw.zarr").mkdir(parents=True)
     (tiny / "results").symlink_to(elsewhere)
@@ -77,14 +77,14 @@ def test_nothing_is_written_or_deleted_through_linked_results(tiny, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["f01", "f01/uav1-uav1/image.zarr.wip/image/c", "logs", "f01/uav1-uav1/mask.tif"])
-def test_a_link_anywhere_below_the_results_is_named(tiny, tmp_path, name):
+def test_link_below_the_results_is_reported(tiny, tmp_path, name):
     path = tiny / "results" / name
     path.parent.mkdir(parents=True)
     path.symlink_to(tmp_path)
     assert [str(found.where) for found in check_links(Examination(Campaign.load(tiny)))] == [str(path)]
 
 
-def test_results_without_links_are_let_be(finished_tiny):
+def test_results_without_links_are_accepted(finished_tiny):
     assert list(check_links(Examination(finished_tiny))) == []
 
 
@@ -92,7 +92,7 @@ def test_results_without_links_are_let_be(finished_tiny):
     "name",
     ["scene.json", "cube.manifest.json", "Fused", "cube.zarr", "x.ZARR", "a.tif", "raw.zarr.wip", "logs", "x" * 65],
 )
-def test_a_flight_named_as_a_file_of_the_results_is_refused(tiny, name):
+def test_flight_name_that_collides_with_result_files_is_refused(tiny, name):
     path = tiny / "config" / "flights.tsv"
     path.write_text(path.read_text().replace("f01", name))
     with pytest.raises(CampaignError, match=r"flights\.tsv: line 2: name"):
@@ -102,7 +102,7 @@ def test_a_flight_named_as_a_file_of_the_results_is_refused(tiny, name):
 @pytest.mark.parametrize(
     "name", ['a"],b', "<script>", "\x1b[31mred", "two\nlines", "", "x" * 121, "back\\slash", "a & b"]
 )
-def test_a_campaign_name_that_wkt_html_or_a_terminal_would_read_is_refused(tiny, name):
+def test_campaign_name_unsafe_in_wkt_html_or_terminal_is_refused(tiny, name):
     document = yaml.safe_load((tiny / "config/config.yaml").read_text()) | {"campaign": name}
     with pytest.raises(CampaignError, match="campaign") as refused:
         validated(document, where="config.yaml")
@@ -110,15 +110,15 @@ def test_a_campaign_name_that_wkt_html_or_a_terminal_would_read_is_refused(tiny,
 
 
 @pytest.mark.parametrize("name", ["Bodensee, Süd (2. Flug)", "it's", "日本", "a/b"])
-def test_other_names_stay_as_they_are(name):
+def test_safe_campaign_names_are_unchanged(name):
     assert name in local_crs(name)
 
 
-def test_a_copy_of_the_results_elsewhere_is_no_link(finished_tiny, tmp_path):
+def test_copied_results_contain_no_links(finished_tiny, tmp_path):
     assert list(check_links(Examination(Campaign.load(copy_writable(finished_tiny.root, tmp_path / "copy"))))) == []
 
 
-def test_what_lies_outside_the_folder_is_not_opened_by_a_check(tiny):
+def test_check_opens_no_file_outside_the_folder(tiny):
     (tiny.parent / "codes.npy").write_bytes(b"no codes at all")
     path = tiny / "config" / "config.yaml"
     document = yaml.safe_load(path.read_text())
@@ -128,18 +128,18 @@ def test_what_lies_outside_the_folder_is_not_opened_by_a_check(tiny):
     assert "waveform.codes: path '../codes.npy' leads out of the campaign folder" in line
 
 
-# Recordings that are kept elsewhere
+# Recordings in another folder (raw_root)
 
 
 @pytest.fixture
 def elsewhere(tiny, tmp_path):
-    """The folder of the recordings of `tiny`, outside of it, as its config states."""
+    """Move the recordings of `tiny` out of its folder, configure raw_root and return the new folder."""
     shutil.move(tiny / "raw", tmp_path / "archive")
     edit(tiny, "raw_root", str(tmp_path / "archive"), load=False)
     return tmp_path / "archive"
 
 
-def test_recordings_are_read_where_raw_root_says_and_keep_their_names(tiny, elsewhere):
+def test_recordings_are_read_from_raw_root_under_their_names(tiny, elsewhere):
     assert problems(tiny, without=["disk", "memory"]) == []
     campaign = Campaign.load(tiny)
     ingest.ingest(campaign, "f01", "uav1")
@@ -148,23 +148,23 @@ def test_recordings_are_read_where_raw_root_says_and_keep_their_names(tiny, else
     assert not (tiny / "raw").exists()
     wildcards = SimpleNamespace(flight="f01", node="uav1")
     listed = Jobs(replace(campaign, root=Path())).files(rule_inputs.recording)(wildcards)
-    assert str(elsewhere / "f01/uav1.sigmf-data") in listed  # as Snakemake looks for it
+    assert str(elsewhere / "f01/uav1.sigmf-data") in listed  # the path that Snakemake checks
 
 
-def test_where_recordings_lie_changes_no_result(tiny, tmp_path):
+def test_raw_root_does_not_change_settings_of_results(tiny, tmp_path):
     before = [result.settings_sha256 for _, result in results_of(Campaign.load(tiny))]
     shutil.move(tiny / "raw", tmp_path / "archive")
     moved = edit(tiny, "raw_root", str(tmp_path / "archive"))
     assert [result.settings_sha256 for _, result in results_of(moved)] == before
 
 
-def test_a_missing_file_of_raw_root_is_named_where_it_should_be(tiny, elsewhere):
+def test_missing_file_of_raw_root_is_reported_with_its_path(tiny, elsewhere):
     (elsewhere / "f01/uav2.sigmf-data").unlink()
-    found = [str(one) for one in problems(tiny, without=["disk", "memory"])]
-    assert [line for line in found if line.startswith(f"{elsewhere}/f01/uav2.sigmf-data: no such file")]
+    lines = [str(problem) for problem in problems(tiny, without=["disk", "memory"])]
+    assert [line for line in lines if line.startswith(f"{elsewhere}/f01/uav2.sigmf-data: no such file")]
 
 
-def test_a_link_in_raw_root_is_refused_and_its_own_path_may_be_one(tiny, elsewhere, tmp_path):
+def test_link_inside_raw_root_is_refused_but_raw_root_may_be_a_link(tiny, elsewhere, tmp_path):
     (tmp_path / "link").symlink_to(elsewhere)
     edit(tiny, "raw_root", str(tmp_path / "link"), load=False)
     assert problems(tiny, without=["disk", "memory"]) == []
@@ -174,15 +174,15 @@ def test_a_link_in_raw_root_is_refused_and_its_own_path_may_be_one(tiny, elsewhe
 
 
 @pytest.mark.parametrize(
-    ("stated", "found"),
+    ("raw_root", "found"),
     [("/proc/nowhere", "is not a folder"), ("raw", "must be the absolute path"), ("/a/../b", "without")],
 )
-def test_a_raw_root_that_is_no_folder_is_one_message(tiny, stated, found):
-    edit(tiny, "raw_root", stated, load=False)
+def test_invalid_raw_root_is_reported(tiny, raw_root, found):
+    edit(tiny, "raw_root", raw_root, load=False)
     assert any(found in str(one) and "raw_root" in str(one) for one in problems(tiny))
 
 
-def test_recordings_in_two_places_are_refused(tiny, tmp_path):
+def test_recordings_in_two_folders_are_refused(tiny, tmp_path):
     shutil.copytree(tiny / "raw", tmp_path / "archive")
     edit(tiny, "raw_root", str(tmp_path / "archive"), load=False)
     assert any("raw/ contains files" in str(one) for one in problems(tiny))

@@ -1,4 +1,4 @@
-"""One row per rule: what a row says is what its step, its campaign and the workflow have."""
+"""Table of rules: its rows agree with the steps, the commands, the products and the campaign."""
 
 import pkgutil
 from inspect import signature
@@ -14,26 +14,26 @@ from apertura.workflow.rules import RESULTS, RULES
 
 
 @pytest.mark.parametrize("rule", RULES.values(), ids=list(RULES))
-def test_the_step_of_a_row_takes_what_its_command_takes(rule):
-    campaign, *words = signature(pkgutil.resolve_name(rule.step.path)).parameters
+def test_step_and_command_of_a_rule_take_the_same_arguments(rule):
+    campaign, *parameters = signature(pkgutil.resolve_name(rule.step.path)).parameters
     assert campaign == "campaign"
-    assert len(words) == len(rule.arguments) + len(rule.last_words) + len(rule.options)
-    assert set(rule.options) <= set(words)
+    assert len(parameters) == len(rule.arguments) + len(rule.last_words) + len(rule.options)
+    assert set(rule.options) <= set(parameters)
 
 
-def test_every_rule_has_a_command_and_no_command_is_of_no_rule():
-    assert {one.name for one in step.registered_commands} == {rule.command for rule in RULES.values()}
+def test_rules_and_commands_correspond():
+    assert {command.name for command in step.registered_commands} == {rule.command for rule in RULES.values()}
 
 
-def test_products_of_rows_are_called_as_their_steps_call_them():
-    named = {name: RESULTS[name].products for name in ("coverage", "cphd", "map", "stac", "ro_crate")}
+def test_rules_name_the_products_that_steps_write():
+    products = {name: RESULTS[name].products for name in ("coverage", "cphd", "map", "stac", "ro_crate")}
     files = {"coverage": COVERAGE, "cphd": (PHASE_HISTORY,), "stac": (f"stac/{CATALOG}",), "ro_crate": (CRATE,)}
-    assert named == {**files, "map": (MAP.rpartition("/")[2],)}
+    assert products == {**files, "map": (MAP.rpartition("/")[2],)}
 
 
-def test_every_result_is_made_from_files_and_results_before_it(tiny):
-    made = set()
+def test_results_depend_only_on_earlier_results(tiny):
+    earlier = set()
     for _, _, result in places_of(Campaign.load(tiny)):
         sources = {source for source in result.sources if source.startswith("results/")}
-        assert sources <= made
-        made.add(result.manifest)
+        assert sources <= earlier
+        earlier.add(result.manifest)

@@ -1,4 +1,4 @@
-"""Nothing stale: results say what they were made from, and another file, setting or code is told by its hash."""
+"""Out-of-date results: manifests record inputs, and a changed file, setting or code is found by its hash."""
 
 import json
 import os
@@ -38,7 +38,7 @@ LOG = "raw/f01/uav2.track.pos"
 
 @pytest.fixture
 def finished(finished_tiny, tmp_path):
-    """The tiny campaign with all its results, to be spoilt at will."""
+    """Return a writable copy of the tiny campaign with all its results."""
     return copy_writable(finished_tiny.root, tmp_path / "finished")
 
 
@@ -51,21 +51,21 @@ def edit(root, change):
 
 
 def replace_keeping_times(path, data):
-    """What `rsync -a` and `cp -p` do: other bytes, the old time of modification."""
+    """Replace the content of a file and keep its modification time, like `rsync -a` and `cp -p`."""
     before = path.stat()
-    beside = path.with_name("beside")
-    beside.write_bytes(data)
-    os.utime(beside, ns=(before.st_atime_ns, before.st_mtime_ns))
-    beside.replace(path)
+    temporary = path.with_name("temporary")
+    temporary.write_bytes(data)
+    os.utime(temporary, ns=(before.st_atime_ns, before.st_mtime_ns))
+    temporary.replace(path)
     assert path.stat().st_mtime_ns == before.st_mtime_ns
 
 
 def names(stale):
-    """Which results, without their places."""
+    """Return the names of results, without flight and pair."""
     return {Path(manifest).name.partition(".")[0] for manifest in stale}
 
 
-def test_every_result_records_what_it_was_made_from_and_none_is_stale(finished_tiny):
+def test_results_record_their_inputs_and_are_up_to_date(finished_tiny):
     results = list(results_of(finished_tiny))
     assert len(results) == 23 + 4 + 9
     for name, result in results:
@@ -79,7 +79,7 @@ def test_every_result_records_what_it_was_made_from_and_none_is_stale(finished_t
 
 
 @pytest.mark.slow
-def test_a_log_replaced_under_its_old_time_is_noticed_with_all_that_stands_on_it(finished):
+def test_changed_log_with_kept_time_outdates_all_dependent_results(finished):
     campaign, path = Campaign.load(finished), finished / LOG
     data = path.read_bytes()
     replace_keeping_times(path, data.replace(b"8", b"9", 1))
@@ -96,7 +96,7 @@ def test_a_log_replaced_under_its_old_time_is_noticed_with_all_that_stands_on_it
     assert stale_results(campaign) == {}
 
 
-def test_samples_replaced_under_their_old_time_and_size_are_noticed_although_their_hash_is_kept(finished):
+def test_changed_samples_with_kept_time_and_size_are_noticed(finished):
     campaign, path = Campaign.load(finished), finished / "raw/f01/uav1.sigmf-data"
     os.utime(path, (1e9, 1e9))
     data = bytearray(path.read_bytes())
@@ -106,28 +106,28 @@ def test_samples_replaced_under_their_old_time_and_size_are_noticed_although_the
     assert "results/f01/uav1/raw.manifest.json" in stale_results(campaign)
 
 
-def test_a_hash_is_taken_once_per_state_of_a_file_and_again_when_asked(tmp_path, monkeypatch):
+def test_hash_is_cached_per_file_state_and_recomputed_on_request(tmp_path, monkeypatch):
     path = tmp_path / "raw.bin"
     path.write_bytes(bytes(100_000))
     monkeypatch.setattr("apertura.campaign.digests._SETTLED_S", -1.0)
-    first, kept = digest_of(tmp_path, "raw.bin"), tmp_path / "results/.hashes/raw.bin.json"
-    forged = json.loads(kept.read_text()) | {"sha256": "0" * 64}
-    kept.write_text(json.dumps(forged))
+    first, cached = digest_of(tmp_path, "raw.bin"), tmp_path / "results/.hashes/raw.bin.json"
+    forged = json.loads(cached.read_text()) | {"sha256": "0" * 64}
+    cached.write_text(json.dumps(forged))
     assert digest_of(tmp_path, "raw.bin") == "0" * 64
     assert digest_of(tmp_path, "raw.bin", paranoid=True) == first
     assert digest_of(tmp_path, "raw.bin") == first
-    kept.write_text('{"state": 3}')
+    cached.write_text('{"state": 3}')
     assert digest_of(tmp_path, "raw.bin") == first
 
 
-def test_a_file_that_has_just_been_written_is_hashed_each_time(tmp_path):
-    """It may change again within one tick of the clock, and no time would tell."""
+def test_hash_of_a_recently_written_file_is_not_cached(tmp_path):
+    """The file may change again within one tick of the clock, which leaves its modification time unchanged."""
     (tmp_path / "raw.bin").write_bytes(bytes(100_000))
     digest_of(tmp_path, "raw.bin")
     assert not (tmp_path / "results").exists()
 
 
-def test_what_changes_while_it_is_read_is_no_source(tmp_path):
+def test_file_changed_while_read_is_an_error(tmp_path):
     path = tmp_path / "raw.bin"
     path.write_bytes(bytes(10))
     sources = Sources.of(tmp_path, ["raw.bin"])
@@ -138,7 +138,7 @@ def test_what_changes_while_it_is_read_is_no_source(tmp_path):
 
 
 @pytest.mark.slow
-def test_results_copied_with_other_times_and_inodes_are_not_stale(finished, tmp_path):
+def test_copied_results_with_other_times_are_up_to_date(finished, tmp_path):
     copied = copy_writable(finished, tmp_path / "copied")
     for path in copied.rglob("*"):
         os.utime(path, (2e9, 2e9) if path.stat().st_ino % 2 else (1e9, 1e9))
@@ -156,13 +156,13 @@ def test_results_copied_with_other_times_and_inodes_are_not_stale(finished, tmp_
     ],
     ids=["name", "window", "node"],
 )
-def test_a_setting_makes_stale_what_it_matters_to(finished, change, expected, spared):
+def test_setting_outdates_only_the_results_that_depend_on_it(finished, change, expected, spared):
     found = names(stale_results(edit(finished, change)))
     assert expected <= found
     assert not spared & found
 
 
-def test_other_code_makes_stale_what_it_makes(finished, monkeypatch):
+def test_changed_code_outdates_its_results(finished, monkeypatch):
     def other(campaign, result, *where):
         return ("apertura.common.constants",) if result == "profile" else modules_of(campaign, result, *where)
 
@@ -172,7 +172,7 @@ def test_other_code_makes_stale_what_it_makes(finished, monkeypatch):
     assert not {"raw", "track", "echo", "scene"} & names(found)
 
 
-def test_a_result_without_its_source_or_with_a_damaged_manifest_is_stale(finished):
+def test_missing_source_or_damaged_manifest_outdates_a_result(finished):
     campaign = Campaign.load(finished)
     (finished / "results/f01/uav1/track.manifest.json").unlink()
     (finished / "results/cube.manifest.json").write_text("{")
@@ -196,7 +196,7 @@ def test_a_result_without_its_source_or_with_a_damaged_manifest_is_stale(finishe
         ("cube.zarr/zarr.json", "cube"),
     ],
 )
-def test_a_product_of_which_one_byte_differs_is_named(finished, file, manifest):
+def test_product_with_one_changed_byte_is_reported(finished, file, manifest):
     path = finished / "results" / file
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 1
@@ -209,7 +209,7 @@ def test_a_product_of_which_one_byte_differs_is_named(finished, file, manifest):
     "file", ["f01/uav1-uav1/db.tif", "f01/fused/image.json", "f01/uav1-uav1/mask.tif", "coverage.png", "scene.json"]
 )
 @pytest.mark.parametrize("how", ["edited", "gone"])
-def test_a_product_or_document_that_is_edited_or_gone_is_made_again(finished, file, how):
+def test_edited_or_missing_product_is_out_of_date(finished, file, how):
     path = finished / "results" / file
     if how == "gone":
         path.unlink()
@@ -222,7 +222,7 @@ def test_a_product_or_document_that_is_edited_or_gone_is_made_again(finished, fi
 
 @pytest.mark.quick("0")
 @pytest.mark.parametrize("before", [0, 1])
-def test_what_was_edited_by_hand_is_kept_beside_what_is_made_again(finished, before, capsys):
+def test_edited_product_is_kept_under_another_name(finished, before, capsys):
     folder = finished / "results/f01/uav1-uav1"
     for number in range(before):
         (folder / "db.edited.qml").write_text(f"mine {number}")
@@ -236,13 +236,13 @@ def test_what_was_edited_by_hand_is_kept_beside_what_is_made_again(finished, bef
     assert f"kept as results/f01/uav1-uav1/{kept}" in capsys.readouterr().err
 
 
-def test_a_stage_of_which_a_chunk_is_gone_is_made_again(finished):
+def test_stage_with_a_missing_array_is_out_of_date(finished):
     shutil.rmtree(finished / "results/f01/uav1-uav1/echo.zarr/path_removed")
     found = stale_results(Campaign.load(finished))
     assert found["results/f01/uav1-uav1/echo.manifest.json"].endswith(" is missing")
 
 
-def test_products_without_their_manifest_are_stale_and_their_report_is_not_believed(finished):
+def test_products_without_manifest_are_out_of_date_and_not_summarised(finished):
     for path in finished.rglob("*.manifest.json"):
         path.unlink()
     campaign = Campaign.load(finished)
@@ -251,7 +251,7 @@ def test_products_without_their_manifest_are_stale_and_their_report_is_not_belie
         print_summary(campaign)
 
 
-def test_a_report_that_was_edited_is_not_believed(finished):
+def test_edited_report_is_refused(finished):
     path = finished / "results/f01/fused/image.json"
     path.write_text(path.read_text().replace("focused", "perfect"))
     with pytest.raises(
@@ -262,7 +262,7 @@ def test_a_report_that_was_edited_is_not_believed(finished):
 
 
 @pytest.mark.parametrize("file", ["scene.json", "f01/assessment.json"])
-def test_a_damaged_document_is_not_read(finished, file):
+def test_damaged_document_is_refused(finished, file):
     path = finished / "results" / file
     path.write_text(path.read_text().replace("1", "2", 1))
     from apertura.stages.agreement import assessment_of
@@ -273,21 +273,21 @@ def test_a_damaged_document_is_not_read(finished, file):
         (settled_scene(campaign), assessment_of(campaign, "f01"))
 
 
-def test_a_campaign_is_held_by_one_run_and_free_when_it_ends(tmp_path):
+def test_campaign_is_locked_during_a_run(tmp_path):
     with hold(tmp_path), pytest.raises(CampaignError, match=f"locked by another run: process {os.getpid()}"):
         hold(tmp_path)
     hold(tmp_path).close()
 
 
-def test_results_moved_into_another_folder_are_not_stale(finished, tmp_path):
+def test_moved_results_are_up_to_date(finished, tmp_path):
     shutil.move(finished, tmp_path / "moved")
     assert stale_results(Campaign.load(tmp_path / "moved")) == {}
 
 
-# ---- Recordings that lie elsewhere, and what was kept of them -------------------------------------------------------
+# ---- Archived recordings and kept transfer functions ----------------------------------------------------------------
 
 SAMPLES = ["raw/f01/uav1.sigmf-data", "raw/f01/uav2.sigmf-data"]
-TOLD = "expected the recording of node uav2 in flight f01, to make results/f01/uav1-uav2/image.manifest.json again"
+REMEDY = "expected the recording of node uav2 in flight f01, to make results/f01/uav1-uav2/image.manifest.json again"
 
 
 def archive(root):
@@ -296,7 +296,7 @@ def archive(root):
     return Campaign.load(root)
 
 
-def test_recordings_that_lie_elsewhere_overtake_nothing_and_nothing_is_wrong(finished):
+def test_archived_recordings_leave_results_up_to_date(finished):
     campaign = archive(finished)
     assert stale_results(campaign) == {}
     assert (absent_files(campaign), wanted_files(campaign, {})) == (SAMPLES, {})
@@ -305,7 +305,7 @@ def test_recordings_that_lie_elsewhere_overtake_nothing_and_nothing_is_wrong(fin
     assert Resources(campaign).work("f01", None, "uav1").pulses == 40
 
 
-def test_a_check_compares_results_with_their_inputs_once(finished_tiny, monkeypatch):
+def test_check_compares_each_result_with_its_inputs_once(finished_tiny, monkeypatch):
     compared = []
     monkeypatch.setattr("apertura.workflow.stale._reasons", lambda _, result, *__, **___: compared.append(result) or ())
     assert print_findings(finished_tiny.root.real()) == 0
@@ -313,7 +313,7 @@ def test_a_check_compares_results_with_their_inputs_once(finished_tiny, monkeypa
     assert len(manifests) == len(set(manifests)) > 10
 
 
-def test_results_are_told_from_stale_ones_where_all_of_raw_was_left_behind(finished):
+def test_results_are_up_to_date_without_any_raw_file(finished):
     shutil.rmtree(finished / "raw")
     campaign = Campaign.load(finished)
     assert stale_results(campaign) == {}
@@ -321,7 +321,7 @@ def test_results_are_told_from_stale_ones_where_all_of_raw_was_left_behind(finis
 
 
 @pytest.mark.slow
-def test_an_image_is_made_again_of_what_was_kept_of_a_recording_and_of_nothing_else(finished):
+def test_image_is_recomputed_only_from_a_kept_transfer_function(finished):
     campaign = Campaign.load(finished)
     for pair in ("uav1-uav1", "uav1-uav2"):
         transfer.transfer(campaign, "f01", pair)
@@ -331,16 +331,16 @@ def test_an_image_is_made_again_of_what_was_kept_of_a_recording_and_of_nothing_e
     assert (wanted_files(campaign, stale_results(campaign)), problems(finished, without=["memory"])) == ({}, [])
     (finished / "results/f01/uav1-uav2/transfer.manifest.json").unlink()
     assert wanted_files(campaign, stale_results(campaign)) == {SAMPLES[1]: "results/f01/uav1-uav2/image.manifest.json"}
-    (told,) = map(str, problems(finished, without=["memory"]))
-    assert TOLD in told
-    assert "processing: {keep: [echo]}" in told
+    (problem,) = map(str, problems(finished, without=["memory"]))
+    assert REMEDY in problem
+    assert "processing: {keep: [echo]}" in problem
 
 
-def test_what_is_kept_overtakes_no_other_result_whether_it_is_asked_for_or_no_longer(finished):
+def test_kept_transfer_function_outdates_only_the_crate(finished):
     campaign, kept = Campaign.load(finished), "results/f01/uav1-uav2/transfer.manifest.json"
     assert on_demand(campaign, kept)
     campaign = state(finished, "processing", keep=["echo"])
-    assert names(stale_results(campaign)) == {"ro_crate"}  # which lists it, and the config
+    assert names(stale_results(campaign)) == {"ro_crate"}  # which lists the kept files and the config
     assert not on_demand(campaign, kept)
     assert any_is_missing(campaign)
     for pair in ("uav1-uav1", "uav1-uav2"):
@@ -356,8 +356,8 @@ def planned_spacing_m(campaign):
 
 
 @pytest.mark.slow
-def test_a_plan_follows_the_config_and_not_results_that_are_out_of_date(tiny, capsys):
-    """A finished grid with an automatic CRS: after an edit of the spacing the plan is of the new one, and says so."""
+def test_plan_follows_the_config_and_not_outdated_results(tiny, capsys):
+    """Automatic CRS with a finished grid: after a change of the spacing the plan uses and reports the new one."""
     campaign = state(tiny, "scene", crs="auto")
     for node in ("uav1", "uav2"):
         ingest.ingest(campaign, "f01", node)
