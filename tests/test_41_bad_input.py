@@ -1,4 +1,4 @@
-"""Each way a campaign folder can be wrong ends with one message: what, where, what was expected, what to do."""
+"""Invalid campaign folders: each error is one message with finding, location, expectation and remedy."""
 
 import hashlib
 import json
@@ -13,50 +13,50 @@ from apertura.stages import echo, ingest, profile, scene
 from apertura.stages.pair import open_pair
 
 
-def nothing_half_written(root):
-    """No stage but raw and track looks finished, and no product stands."""
+def no_later_stage_finished(root):
+    """Return True if only the stages raw and track are finished and no product exists."""
     results = root / "results"
     manifests = {path.name for path in results.rglob("*.manifest.json")}
     return manifests <= {"raw.manifest.json", "track.manifest.json"} and not list(results.rglob("*.tif"))
 
 
-def test_a_misspelt_key_is_named_with_the_nearest_valid_one(tiny):
+def test_misspelt_key_is_reported_with_the_nearest_valid_one(tiny):
     edit_config(tiny, lambda document: document["scene"].update(spacing=0.1))
     message = complaint(lambda: Campaign.load(tiny))
     assert "config.yaml" in message
     assert "scene.spacing: unknown key (did you mean 'spacing_m'?)" in message
 
 
-def test_a_value_of_the_wrong_kind_is_named(tiny):
+def test_value_of_wrong_type_is_reported(tiny):
     edit_config(tiny, lambda document: document["waveform"].update(prf_hz="fast"))
     message = complaint(lambda: Campaign.load(tiny))
     assert "waveform.prf_hz" in message
     assert "'fast'" in message
 
 
-def test_a_missing_node_file_is_named(tiny):
+def test_missing_node_file_is_reported(tiny):
     (tiny / "raw" / "f01" / "uav2.sigmf-data").unlink()
     message = complaint(lambda: require_files(Campaign.load(tiny)))
     assert "raw/f01/uav2.sigmf-data" in message
     assert "node uav2" in message
 
 
-def test_truncated_samples_are_noticed_by_their_captures(tiny):
+def test_truncated_samples_are_reported(tiny):
     path = tiny / "raw" / "f01" / "uav1.sigmf-data"
     path.write_bytes(path.read_bytes()[:-4000])
     message = complaint(lambda: ingest.ingest(Campaign.load(tiny), "f01", "uav1"))
     assert "contains 3000 samples" in message
     assert "expected 4000" in message
-    assert nothing_half_written(tiny)
+    assert no_later_stage_finished(tiny)
 
 
-def test_a_file_cut_inside_a_sample_is_truncated(tiny):
+def test_file_truncated_within_a_sample_is_reported(tiny):
     path = tiny / "raw" / "f01" / "uav2.sigmf-data"
     path.write_bytes(path.read_bytes()[:-3])
     assert "truncated" in complaint(lambda: ingest.ingest(Campaign.load(tiny), "f01", "uav2"))
 
 
-def test_a_wrong_hash_is_shown_beside_the_promised_one(tiny):
+def test_wrong_hash_is_reported_with_the_expected_one(tiny):
     path = tiny / "raw" / "f01" / "uav1.sigmf-data"
     samples = bytearray(path.read_bytes())
     samples[1000] ^= 1
@@ -66,14 +66,14 @@ def test_a_wrong_hash_is_shown_beside_the_promised_one(tiny):
     assert hashlib.sha512(samples).hexdigest()[:12] in message
 
 
-def test_a_capture_past_the_end_is_named(tiny):
+def test_capture_past_the_end_is_reported(tiny):
     edit_meta(tiny, "uav1", lambda meta: meta["captures"][-1].update({"core:sample_start": 10**9}))
     message = complaint(lambda: ingest.ingest(Campaign.load(tiny), "f01", "uav1"))
     assert "starts at sample 1000000000" in message
     assert "uav1.sigmf-meta" in message
 
 
-def test_a_track_that_ends_early_says_by_how_many_seconds(tiny):
+def test_track_that_ends_early_is_reported_with_the_seconds(tiny):
     edit_track(tiny, "uav1", lambda lines: lines[:25])
     campaign = Campaign.load(tiny)
     ingest_all(campaign)
@@ -82,10 +82,10 @@ def test_a_track_that_ends_early_says_by_how_many_seconds(tiny):
     meta = json.loads((tiny / "raw/f01/uav1.sigmf-meta").read_text())
     missing = np.datetime64(meta["captures"][-1]["core:datetime"][:23]) - last
     assert f"ends {missing / np.timedelta64(1, 's'):.3f} s before the last" in message
-    assert nothing_half_written(tiny)
+    assert no_later_stage_finished(tiny)
 
 
-def test_a_gpst_log_taken_for_utc_misses_the_pulses_by_18_seconds(tiny):
+def test_gpst_log_taken_for_utc_is_reported_with_18_seconds(tiny):
     edit_track(tiny, "uav2", lambda lines: [line.replace("GPST", "UTC ") for line in lines])
     campaign = Campaign.load(tiny)
     ingest_all(campaign)
@@ -94,28 +94,28 @@ def test_a_gpst_log_taken_for_utc_misses_the_pulses_by_18_seconds(tiny):
     assert "GPST is 18 s ahead" in message
 
 
-def test_a_doubled_epoch_is_named(tiny):
+def test_duplicate_epoch_is_reported(tiny):
     edit_track(tiny, "uav1", lambda lines: [*lines[:10], lines[9], *lines[10:]])
     message = complaint(lambda: ingest.ingest(Campaign.load(tiny), "f01", "uav1"))
     assert "epoch 9" in message
     assert "is equal to that of the previous epoch" in message
 
 
-def test_an_unsorted_log_is_named(tiny):
+def test_unsorted_log_is_reported(tiny):
     edit_track(tiny, "uav1", lambda lines: [*lines[:10], *lines[12:14], *lines[10:12]])
     assert "is before that of the previous epoch" in complaint(
         lambda: ingest.ingest(Campaign.load(tiny), "f01", "uav1")
     )
 
 
-def test_a_lever_arm_without_attitude_is_refused(tiny):
+def test_lever_arm_without_attitude_is_refused(tiny):
     edit_config(tiny, lambda document: document["nodes"]["uav1"].update(attitude="none"))
     message = complaint(lambda: Campaign.load(tiny))
     assert "nodes.uav1" in message
     assert "attitude is none" in message
 
 
-def test_a_lever_arm_with_a_log_that_holds_no_attitude_is_refused(tiny):
+def test_lever_arm_with_a_log_without_attitude_is_refused(tiny):
     edit_config(tiny, lambda document: document["nodes"]["uav1"].update(attitude="log"))
     edit_track(tiny, "uav1", lambda lines: [",".join(line.split(",")[:4]) for line in lines])
     campaign = Campaign.load(tiny)
@@ -125,7 +125,7 @@ def test_a_lever_arm_with_a_log_that_holds_no_attitude_is_refused(tiny):
     assert message.startswith("raw/f01/uav1.track.csv")
 
 
-def test_a_recording_at_another_carrier_names_its_own_files(tiny):
+def test_wrong_carrier_is_reported_with_the_recording(tiny):
     campaign = Campaign.load(tiny)
     ingest_all(campaign)
     edit_config(tiny, lambda document: document["waveform"].update(carrier_hz=1.3e9))
@@ -138,20 +138,20 @@ def test_a_recording_at_another_carrier_names_its_own_files(tiny):
 BEAM = {"boresight_deg": [90, -20], "beamwidth_deg": [40, 60]}
 
 
-def stating(antenna, node="uav1"):
+def with_antenna(antenna, node="uav1"):
     return lambda document: document["nodes"][node].update(antennas={"radar_rx": antenna})
 
 
-def test_a_beam_without_attitude_is_refused(tiny):
-    edit_config(tiny, stating(BEAM, "uav2"))
+def test_beam_without_attitude_is_refused(tiny):
+    edit_config(tiny, with_antenna(BEAM, "uav2"))
     message = complaint(lambda: Campaign.load(tiny))
     assert "nodes.uav2: antennas has a beam but attitude is none" in message
     assert "set attitude to log or course" in message
 
 
-def test_a_beam_with_a_log_that_holds_no_attitude_is_refused(tiny):
+def test_beam_with_a_log_without_attitude_is_refused(tiny):
     zero = {"radar_tx": [0, 0, 0], "radar_rx": [0, 0, 0], "sidelink": [0, 0, 0]}
-    edit_config(tiny, stating(BEAM))
+    edit_config(tiny, with_antenna(BEAM))
     edit_config(tiny, lambda document: document["nodes"]["uav1"].update(lever_arms_m=zero))
     edit_track(tiny, "uav1", lambda lines: [",".join(line.split(",")[:4]) for line in lines])
     campaign = Campaign.load(tiny)
@@ -175,13 +175,13 @@ def test_a_beam_with_a_log_that_holds_no_attitude_is_refused(tiny):
         (BEAM | {"cutof_db": -20}, "radar_rx.cutof_db: unknown key (did you mean 'cutoff_db'?)"),
     ],
 )
-def test_an_antenna_that_is_none_is_named(tiny, antenna, expected):
-    edit_config(tiny, stating(antenna))
+def test_invalid_antenna_is_reported(tiny, antenna, expected):
+    edit_config(tiny, with_antenna(antenna))
     assert expected in complaint(lambda: Campaign.load(tiny))
 
 
-def test_a_missing_pattern_is_named_with_its_key(tiny):
-    edit_config(tiny, stating({"boresight_deg": [90, -20], "pattern": "config/horn.csv"}))
+def test_missing_pattern_is_reported_with_its_key(tiny):
+    edit_config(tiny, with_antenna({"boresight_deg": [90, -20], "pattern": "config/horn.csv"}))
     message = complaint(lambda: require_files(Campaign.load(tiny)))
     assert "config/horn.csv: no such file" in message
     assert "nodes.uav1.antennas.radar_rx.pattern" in message
@@ -189,7 +189,7 @@ def test_a_missing_pattern_is_named_with_its_key(tiny):
 
 def test_phase_history_has_no_attitude_for_a_beam(tiny):
     waveform = {"kind": "phase_history", "format": "afrl_mat"}
-    edit_config(tiny, stating(BEAM))
+    edit_config(tiny, with_antenna(BEAM))
     edit_config(tiny, lambda document: document.update(waveform=waveform))
     assert "nodes.uav1.antennas has a beam, but phase histories contain no attitude" in complaint(
         lambda: Campaign.load(tiny)
@@ -204,13 +204,13 @@ def test_bounds_outside_the_area_of_use_are_refused(tiny, west):
     assert "area of use of WGS 84 / UTM zone 32N" in message
 
 
-def test_bounds_that_are_no_multiple_of_the_spacing_propose_the_nearest(tiny):
+def test_nearest_bounds_in_multiples_of_the_spacing_are_proposed(tiny):
     edit_config(tiny, lambda document: document["scene"].update(bounds_m=[570658.3, 5363704.2, 570664.34, 5363710.2]))
     message = complaint(lambda: Campaign.load(tiny))
     assert "[570658.3, 5363704.2, 570664.3, 5363710.2]" in message
 
 
-def test_a_value_of_no_alternative_is_named_by_its_key_alone(tiny):
+def test_value_outside_all_alternatives_is_reported_by_its_key(tiny):
     edit_config(tiny, lambda document: document.setdefault("processing", {}).update(presum=0))
     message = complaint(lambda: Campaign.load(tiny))
     assert (
@@ -218,19 +218,19 @@ def test_a_value_of_no_alternative_is_named_by_its_key_alone(tiny):
     )
 
 
-def test_swapped_bounds_are_refused_and_put_in_order(tiny):
+def test_swapped_bounds_are_refused_with_sorted_bounds(tiny):
     edit_config(tiny, lambda document: document["scene"].update(bounds_m=[570664.3, 5363704.2, 570658.3, 5363710.2]))
     assert "sorted: [570658.3, 5363704.2, 570664.3, 5363710.2]" in complaint(lambda: Campaign.load(tiny))
 
 
-def test_a_silent_capture_is_named(tiny):
+def test_capture_of_zeros_is_reported(tiny):
     edit_data(tiny, "uav1", lambda samples: samples.reshape(-1, 8000)[5].fill(0))
     message = complaint(lambda: ingest.ingest(Campaign.load(tiny), "f01", "uav1"))
     assert "first capture 5" in message
     assert "only zeros" in message
 
 
-def test_nan_in_phase_history_is_named(shared, tmp_path):
+def test_nan_in_phase_history_is_reported(shared, tmp_path):
     from scipy.io import loadmat, savemat
 
     from apertura.formats.reading import read_phase_history
@@ -243,7 +243,7 @@ def test_nan_in_phase_history_is_named(shared, tmp_path):
     assert "a.mat" in message
 
 
-def test_a_position_that_is_not_a_number_is_named(tiny):
+def test_nan_position_is_reported(tiny):
     edit_track(tiny, "uav1", lambda lines: [*lines[:6], lines[6].replace("48.4", "nan", 1), *lines[7:]])
     message = complaint(lambda: ingest.ingest(Campaign.load(tiny), "f01", "uav1"))
     assert "uav1.track.csv" in message
@@ -261,7 +261,7 @@ def test_echoes_beyond_the_cyclic_prefix_are_refused_with_the_worst_pulse(tiny):
 
 
 @pytest.mark.slow
-def test_path_offsets_alone_can_push_echoes_out_of_the_prefix(tiny):
+def test_path_offset_can_move_echoes_beyond_the_prefix(tiny):
     edit_config(tiny, lambda document: document["nodes"]["uav1"]["path_offset_m"].update(radar=230.0))
     campaign = Campaign.load(tiny)
     ingest_all(campaign)
@@ -280,7 +280,7 @@ def test_codes_of_the_wrong_length_are_refused(tiny):
     assert "(1024,)" in message
 
 
-def test_nodes_that_never_recorded_together_are_refused(tiny):
+def test_nodes_without_common_pulses_are_refused(tiny):
     def an_hour_later(meta):
         for capture in meta["captures"]:
             capture["core:datetime"] = capture["core:datetime"].replace("T09", "T10")
@@ -293,7 +293,7 @@ def test_nodes_that_never_recorded_together_are_refused(tiny):
     assert "uav2" in message
 
 
-def test_a_secondary_without_its_sidelink_is_refused(tiny):
+def test_secondary_without_sidelink_is_refused(tiny):
     edit_meta(tiny, "uav2", lambda meta: meta["global"].update({"apertura:channels": ["radar", "spare"]}))
     campaign = Campaign.load(tiny)
     ingest_all(campaign)
@@ -301,7 +301,7 @@ def test_a_secondary_without_its_sidelink_is_refused(tiny):
     assert "a channel named 'sidelink'" in message
 
 
-def test_a_node_with_another_sample_rate_is_refused(tiny):
+def test_node_with_another_sample_rate_is_refused(tiny):
     edit_config(tiny, lambda document: document["waveform"].update(sample_rate_hz=512e6))
     campaign = Campaign.load(tiny)
     ingest_all(campaign)
@@ -318,7 +318,7 @@ def test_a_node_with_another_sample_rate_is_refused(tiny):
         ("f01\timage\tuav1\tuav1", "second line of flight f01"),
     ],
 )
-def test_a_wrong_line_of_flights_is_named(tiny, line, expected):
+def test_invalid_line_of_flights_is_reported(tiny, line, expected):
     path = tiny / "config" / "flights.tsv"
     path.write_text(path.read_text().rstrip("\n") + "\n" + line + "\n")
     message = complaint(lambda: Campaign.load(tiny))
@@ -336,40 +336,40 @@ def test_a_wrong_line_of_flights_is_named(tiny, line, expected):
         ("f01\tuav1-uav1\t2025-05-14T09:30:01", "end '' is not a valid time"),
     ],
 )
-def test_a_wrong_line_of_segments_is_named(tiny, line, expected):
+def test_invalid_line_of_segments_is_reported(tiny, line, expected):
     (tiny / "config" / "segments.tsv").write_text(f"flight\tpair\tstart\tend\n{line}\n")
     message = complaint(lambda: Campaign.load(tiny))
     assert "segments.tsv: line 2" in message
     assert expected in message
 
 
-def test_segments_without_a_pulse_are_named_with_the_times_there_are(tiny):
+def test_segments_without_pulses_are_reported_with_recorded_times(tiny):
     line = "f01\tuav1-uav1\t2025-05-14T10:30:00\t2025-05-14T10:30:01"
     (tiny / "config" / "segments.tsv").write_text(f"flight\tpair\tstart\tend\n{line}\n")
     campaign = Campaign.load(tiny)
     ingest_all(campaign)
-    for work in (echo.echo, open_pair):
-        message = complaint(lambda work=work: work(campaign, "f01", "uav1-uav1"))
+    for read in (echo.echo, open_pair):
+        message = complaint(lambda read=read: read(campaign, "f01", "uav1-uav1"))
         assert "no pulse of flight f01, pair uav1-uav1 within 2025-05-14T10:30:00" in message
         assert "segments.tsv" in message
         assert "between 2025-05-14T09:30:00" in message
-    assert nothing_half_written(tiny)
+    assert no_later_stage_finished(tiny)
 
 
-def test_a_recording_that_changed_since_it_was_ingested_is_not_read_by_its_old_captures(tiny):
+def test_recording_changed_since_ingestion_is_refused(tiny):
     """The raw stage refers to the recorder's file under its hash; samples are not copied."""
     campaign = Campaign.load(tiny)
     ingest_all(campaign)
     stage = tiny / "results/f01/uav1/raw.zarr"
-    held = sum(path.stat().st_size for path in stage.rglob("*") if path.is_file())
-    assert held < 20_000 < (tiny / "raw/f01/uav1.sigmf-data").stat().st_size
+    stage_bytes = sum(path.stat().st_size for path in stage.rglob("*") if path.is_file())
+    assert stage_bytes < 20_000 < (tiny / "raw/f01/uav1.sigmf-data").stat().st_size
     edit_data(tiny, "uav1", lambda iq: iq.sort())
     message = complaint(lambda: echo.echo(campaign, "f01", "uav1-uav1"))
     assert "raw/f01/uav1.sigmf-data: the file has changed since it was ingested" in message
     assert not list((tiny / "results").rglob("echo*"))
 
 
-def test_a_recording_that_ends_while_it_is_read_is_an_error_and_no_signal(tiny):
+def test_recording_truncated_while_read_is_an_error(tiny):
     file = SampleFile(tiny / "raw/f01/uav1.sigmf-data", channels=1)
     whole = len(file)
     file.read(whole - 5, whole)

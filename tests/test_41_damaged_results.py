@@ -1,4 +1,4 @@
-"""A result that is not as the workflow wrote it is named, and what to do about it."""
+"""Damaged results: the message names the file and the remedy."""
 
 import re
 
@@ -18,7 +18,7 @@ DAMAGE = [b"", b"{", b"[]", b"{}", b'{"grid": 3}', b"\xff", b"null", b'{"pairs":
 
 
 @pytest.mark.parametrize("content", DAMAGE)
-def test_a_damaged_result_is_named_and_to_be_deleted(tiny, content):
+def test_damaged_result_is_reported_with_remedy(tiny, content):
     edit_config(
         tiny,
         lambda document: document.update(calibration={"flight": "c01", "reflector_m": [570660.0, 5363700.0, 620.0]}),
@@ -40,7 +40,7 @@ def test_a_damaged_result_is_named_and_to_be_deleted(tiny, content):
         manifest = manifest_of(results / name)
         if name.endswith("image.json"):
             manifest = manifest.with_name("export.manifest.json")
-        record_files(manifest, [results / name])  # as a stranger's results may
+        record_files(manifest, [results / name])  # a manifest that matches the damaged file
         message = complaint(read)
         assert f"results/{name}: " in message
         assert re.search(r"(Delete .* and r|R)un the workflow again", message) or content == b"\xff"
@@ -48,7 +48,7 @@ def test_a_damaged_result_is_named_and_to_be_deleted(tiny, content):
         assert "image.json: damaged" in complaint(lambda: open_campaign(tiny).report("f01", "uav1-uav1"))
 
 
-def test_a_scene_whose_grid_is_none_is_damaged(tmp_path):
+def test_scene_with_invalid_grid_is_damaged(tmp_path):
     grid = {
         "crs": "EPSG:32632",
         "west_m": 0,
@@ -69,6 +69,6 @@ def test_a_scene_whose_grid_is_none_is_damaged(tmp_path):
         assert "scene.json: damaged" in complaint(lambda: settled_scene(campaign))
 
 
-def test_a_truth_that_is_none_is_one_message(tiny):
+def test_damaged_truth_is_one_message(tiny):
     (tiny / "truth.json").write_text('{"targets": [{"x": "left"}]}')
     assert "truth.json: damaged" in complaint(lambda: score(Campaign.load(tiny)))

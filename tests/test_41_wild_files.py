@@ -1,4 +1,4 @@
-"""Files of a campaign that no person would write: each is one message where a traceback, or nothing, used to be."""
+"""Malformed files and files of other programs: each is read correctly or refused with one message."""
 
 import hashlib
 import io
@@ -35,10 +35,10 @@ from tests.attack import logs
 # The campaign folder
 
 
-def test_a_folder_whose_name_is_not_utf_8_is_refused_at_once(tiny):
-    named = os.fsdecode(os.fsencode(tiny.parent) + b"/S\xfcd")
-    tiny.rename(named)
-    for root in (named, f"{named}/."):
+def test_folder_name_that_is_not_utf_8_is_refused(tiny):
+    latin_1_path = os.fsdecode(os.fsencode(tiny.parent) + b"/S\xfcd")
+    tiny.rename(latin_1_path)
+    for root in (latin_1_path, f"{latin_1_path}/."):
         message = complaint(lambda root=root: Campaign.load(root))
         assert "the path is not UTF-8 text; expected names in UTF-8 of the folder and its parent folders" in message
         assert "LC_ALL=C.UTF-8" in message
@@ -49,7 +49,7 @@ def test_a_folder_whose_name_is_not_utf_8_is_refused_at_once(tiny):
 # Tables of the config
 
 
-def test_tables_that_are_not_utf8_are_refused_with_their_line(tiny):
+def test_tables_that_are_not_utf_8_are_refused_with_the_line(tiny):
     path = tiny / "config" / "flights.tsv"
     path.write_bytes(path.read_bytes() + b"f\xe9\timage\tuav1\tuav1\n")
     assert "flights.tsv: byte 0xe9 in line 3 is not UTF-8" in complaint(lambda: Campaign.load(tiny))
@@ -58,7 +58,7 @@ def test_tables_that_are_not_utf8_are_refused_with_their_line(tiny):
     assert "byte 0xff in line 2" in complaint(lambda: list(read_segments(segments, flights=())))
 
 
-def test_a_table_of_windows_is_read_as_one_of_unix(tiny):
+def test_table_with_windows_line_ends_and_bom_is_read(tiny):
     path = tiny / "config" / "flights.tsv"
     flights = Campaign.load(tiny).flights
     path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes().replace(b"\n", b"\r\n"))
@@ -67,18 +67,18 @@ def test_a_table_of_windows_is_read_as_one_of_unix(tiny):
 
 @pytest.mark.parametrize("line", ["# f02\timage\tuav1\tuav1", "#f02", "\t\t\t", "   ", "\t\t\t\t\t\t", ""])
 @pytest.mark.parametrize("first", [True, False])
-def test_comments_and_blank_lines_of_a_table_are_no_rows(tiny, line, first):
+def test_comments_and_blank_lines_of_a_table_are_skipped(tiny, line, first):
     for name in ("flights.tsv", "segments.tsv"):
         path = tiny / "config" / name
         if name == "segments.tsv":
             times = "2025-05-14T09:30:00\t2025-05-14T09:40:00"
             path.write_text(f"flight\tpair\tstart\tend\nf01\tuav1-uav1\t{times}\n")
-        whole = Campaign.load(tiny)
+        plain = Campaign.load(tiny)
         lines = path.read_text().splitlines()
         lines.insert(0 if first else 1, line)
         path.write_text("\n".join([*lines, line]) + "\n")
-        again = Campaign.load(tiny)
-        assert (again.flights, again.segments) == (whole.flights, whole.segments)
+        commented = Campaign.load(tiny)
+        assert (commented.flights, commented.segments) == (plain.flights, plain.segments)
 
 
 @pytest.mark.parametrize(
@@ -91,7 +91,7 @@ def test_comments_and_blank_lines_of_a_table_are_no_rows(tiny, line, first):
         ("f02\timage\tuav1\t" + "x" * 2000, "xxx…' is not in"),
     ],
 )
-def test_a_wild_line_of_flights_is_named(tiny, line, expected):
+def test_malformed_line_of_flights_is_reported(tiny, line, expected):
     path = tiny / "config" / "flights.tsv"
     path.write_text(path.read_text().rstrip("\n") + "\n" + line + "\n")
     message = complaint(lambda: Campaign.load(tiny))
@@ -104,7 +104,7 @@ def test_a_wild_line_of_flights_is_named(tiny, line, expected):
 @pytest.mark.parametrize(
     "time", ["0001-01-01T00:00:00+23:59", "9999-12-31T23:59:59-23:59", "1066-10-14T09:00:00", "now"]
 )
-def test_a_segment_at_a_time_that_no_flight_had_is_refused(tiny, time):
+def test_segment_at_an_impossible_time_is_refused(tiny, time):
     (tiny / "config" / "segments.tsv").write_text(f"flight\tpair\tstart\tend\nf01\tuav1-uav1\t{time}\t{time}\n")
     assert "is not a valid time" in complaint(lambda: Campaign.load(tiny))
 
@@ -151,48 +151,48 @@ def zipped():
         (header((65,))[:300], "not readable"),
     ],
 )
-def test_codes_that_are_no_complex_symbols_are_refused_before_anything_is_allocated(tmp_path, content, expected):
+def test_codes_that_are_no_complex_symbols_are_refused(tmp_path, content, expected):
     message = complaint(codes(tmp_path, content))
     assert "codes.npy: " in message
     assert expected in message
 
 
-def test_codes_beyond_any_waveform_are_refused_by_their_header_alone(tmp_path):
-    """A sparse file as large as it says: 2 TiB that would be allocated."""
+def test_oversized_codes_are_refused_by_their_header(tmp_path):
+    """Sparse file of the size in its header: reading it would allocate 2 TiB."""
     read = codes(tmp_path, header((1 << 38,)))
     os.truncate(tmp_path / "codes.npy", 128 + (8 << 38))
     assert "<c8 of shape (274877906944,)" in complaint(read)
 
 
-@pytest.mark.parametrize("kind", [np.complex64, np.complex128, ">c8"])
-def test_codes_of_any_precision_and_order_of_bytes_are_the_same(tmp_path, kind):
+@pytest.mark.parametrize("dtype", [np.complex64, np.complex128, ">c8"])
+def test_codes_of_any_precision_and_byte_order_are_read(tmp_path, dtype):
     symbols = np.exp(0.5j * np.pi * np.arange(64)).astype(np.complex64)
-    np.testing.assert_array_equal(codes(tmp_path, symbols.astype(kind))(), symbols)
+    np.testing.assert_array_equal(codes(tmp_path, symbols.astype(dtype))(), symbols)
 
 
-DESCRIBED = {"chip_samples": 2, "centre_hz": 0.0, "counter_bits": 8, "bit_chips": 3, "guard_samples": 4}
+FRAMING = {"chip_samples": 2, "centre_hz": 0.0, "counter_bits": 8, "bit_chips": 3, "guard_samples": 4}
 
 
-def test_a_preamble_is_chips_of_one_and_minus_one(tmp_path):
+def test_preamble_consists_of_chips_plus_and_minus_one(tmp_path):
     path = tmp_path / "preamble.npy"
     for chips in (np.array([1, 2]), np.array([1.0, np.nan]), np.ones((2, 2)), np.zeros(0), np.array(["1"])):
         np.save(path, chips)
-        assert "preamble.npy: " in complaint(lambda: read_framing(path, DESCRIBED, sample_rate_hz=1e6, where=path))
+        assert "preamble.npy: " in complaint(lambda: read_framing(path, FRAMING, sample_rate_hz=1e6, where=path))
     np.save(path, np.array([1.0, -1.0, 1.0]))
-    assert read_framing(path, DESCRIBED, sample_rate_hz=1e6, where=path).preamble.tolist() == [1, -1, 1]
-    endless = DESCRIBED | {"guard_samples": 1 << 39}
-    assert "samples of preamble" in complaint(lambda: read_framing(path, endless, sample_rate_hz=1e6, where=path))
+    assert read_framing(path, FRAMING, sample_rate_hz=1e6, where=path).preamble.tolist() == [1, -1, 1]
+    oversized = FRAMING | {"guard_samples": 1 << 39}
+    assert "samples of preamble" in complaint(lambda: read_framing(path, oversized, sample_rate_hz=1e6, where=path))
 
 
 # Metadata of recordings
 
 
-def described(meta, **changes):
+def set_global(meta, **changes):
     meta["global"].update({f"apertura:{name}": value for name, value in changes.items()})
 
 
 @pytest.mark.parametrize(
-    ("place", "changes", "expected"),
+    ("part", "changes", "expected"),
     [
         ("global", {"apertura:channels": 3}, "global.apertura:channels: "),
         ("global", {"apertura:channels": ["radar", "radar"]}, "one unique name per channel"),
@@ -218,16 +218,16 @@ def described(meta, **changes):
         ("capture", {"core:datetime": "2025-02-30T00:00:00Z"}, "core:datetime: "),
     ],
 )
-def test_metadata_that_no_recorder_writes_are_refused_by_key(tiny, place, changes, expected):
-    edit_meta(tiny, "uav1", lambda meta: (meta["global"] if place == "global" else meta["captures"][3]).update(changes))
+def test_malformed_metadata_are_refused_by_key(tiny, part, changes, expected):
+    edit_meta(tiny, "uav1", lambda meta: (meta["global"] if part == "global" else meta["captures"][3]).update(changes))
     message = complaint(lambda: ingest.ingest(Campaign.load(tiny), "f01", "uav1"))
     assert "uav1.sigmf-meta: " in message
     assert expected in message
     assert len(message) < 600
 
 
-def test_the_samples_of_a_recording_that_was_split_count_from_its_offset(tiny):
-    """SigMF: core:offset is the index of the file's first sample, and core:sample_start counts as it does."""
+def test_sample_starts_of_a_split_recording_count_from_its_offset(tiny):
+    """SigMF: core:offset is the index of the first sample of the file, and core:sample_start includes it."""
 
     def split(meta):
         meta["global"] |= {"core:offset": 1000, "core:extensions": [{"name": "antenna", "optional": False}]}
@@ -244,12 +244,12 @@ def test_the_samples_of_a_recording_that_was_split_count_from_its_offset(tiny):
 
 
 @pytest.mark.parametrize("name", ["/etc/passwd", "../preamble.npy", "raw/../../x.npy", "link.npy"])
-def test_a_preamble_outside_the_campaign_is_not_opened(tiny, name):
+def test_preamble_outside_the_campaign_is_not_opened(tiny, name):
     (tiny / "link.npy").symlink_to("/etc/passwd")
 
     def one_capture(meta):
         meta["captures"] = meta["captures"][:1]
-        described(meta, framing=DESCRIBED | {"preamble": name})
+        set_global(meta, framing=FRAMING | {"preamble": name})
 
     edit_meta(tiny, "uav1", one_capture)
     message = complaint(lambda: ingest.ingest(Campaign.load(tiny), "f01", "uav1"))
@@ -260,18 +260,18 @@ def test_a_preamble_outside_the_campaign_is_not_opened(tiny, name):
         assert "inside the campaign folder" in message
 
 
-# Files of other programs: ten of each class, each read rightly or refused in one message
+# Files of other programs, each read correctly or refused with one message
 
-TIMES, PLACES = logs.circle()
-ECEF = ecef_from_geodetic(*PLACES.T)
+TIMES, GEODETIC = logs.circle()
+ECEF = ecef_from_geodetic(*GEODETIC.T)
 LATER = TIMES + np.timedelta64(1, "h")
 CSV = "time_utc,latitude_deg,longitude_deg,height_m"
-PLAIN = [f"{time}Z,{a:.9f},{b:.9f},{h:.6f}" for time, (a, b, h) in zip(TIMES, PLACES, strict=True)]
+PLAIN = [f"{time}Z,{a:.9f},{b:.9f},{h:.6f}" for time, (a, b, h) in zip(TIMES, GEODETIC, strict=True)]
 LLH = "latitude(deg) longitude(deg) height(m)"
 
 
 def gns(time, geodetic):
-    """Return GNS, which some receivers send in place of GGA."""
+    """Return a GNS sentence, which some receivers send instead of GGA."""
     body = logs.gga(time, geodetic)[1:].partition("*")[0].split(",")
     return logs.sealed(",".join(["GNGNS", *body[1:6], "RR", *body[7:10], body[11], "", ""]))
 
@@ -281,32 +281,32 @@ def csv_log(*lines, heading=CSV):
 
 
 def west(longitude):
-    """Return a log of the flight 20 degrees further west, and what it must become."""
-    return PLACES * [1, 0, 1] + [0, longitude, 0]
+    """Return the geodetic positions of the flight, moved by a longitude in degrees."""
+    return GEODETIC * [1, 0, 1] + [0, longitude, 0]
 
 
 LOGS = {
     "rtklib: longitudes from 0 to 360": (
         "a.track.pos", logs.solution(TIMES, west(350.05), LLH), {}, ecef_from_geodetic(*west(-9.95).T),
     ),
-    "rtklib: status records, .stat of the same run": (
+    "rtklib: status records (.stat)": (
         "a.track.pos", "$POS,2366,293418.000,1,4177000.0,733000.0,4747000.0,0.01,0.01,0.01\n" * 9, {},
         "no header line with latitude(deg)",
     ),
-    "rtklib: heights of a geoid, its separation in a column of its own": (
-        "a.track.pos", logs.solution(TIMES, PLACES, LLH).replace("/ellipsoidal", "/geodetic"), {},
+    "rtklib: heights above the geoid, without the geoid separation": (
+        "a.track.pos", logs.solution(TIMES, GEODETIC, LLH).replace("/ellipsoidal", "/geodetic"), {},
         "nodes.a.log.height_offset_m",
     ),
     "nmea: BeiDou talkers, GGA and ZDA, below the ellipsoid": (
         "a.track.txt",
         "".join(
             f"{logs.zda(time)}\r\n{logs.gga(time, place - [0, 0, 650], talker='GB', separation='-31.2')}\r\n"
-            for time, place in zip(TIMES, PLACES, strict=True)
+            for time, place in zip(TIMES, GEODETIC, strict=True)
         ),
-        {}, ecef_from_geodetic(*(PLACES - [0, 0, 650]).T),
+        {}, ecef_from_geodetic(*(GEODETIC - [0, 0, 650]).T),
     ),
     "nmea: GNS without GGA": (
-        "a.track.nmea", "".join(f"{logs.rmc(t)}\n{gns(t, p)}\n" for t, p in zip(TIMES, PLACES, strict=True)), {},
+        "a.track.nmea", "".join(f"{logs.rmc(t)}\n{gns(t, p)}\n" for t, p in zip(TIMES, GEODETIC, strict=True)), {},
         "no GGA, but 40 GNS; expected an NMEA 0183 log with GGA. Log the unmodified GGA",
     ),
     "csv: index column of pandas, all cells quoted": (
@@ -338,15 +338,15 @@ LOGS = {
     "ardupilot: telemetry, .tlog": (
         "a.track.bin", b"\xfe\x09\x00\x01\x01\x00" * 900, {}, "without 'FMT' in its first 8192 bytes",
     ),
-    "airdata: saved by a German spreadsheet": (
-        "a.track.csv", logs.airdata(TIMES, PLACES).replace(",", ";").replace(".", ","), {"height_offset_m": 48.0},
+    "airdata: saved by a spreadsheet with German number format": (
+        "a.track.csv", logs.airdata(TIMES, GEODETIC).replace(",", ";").replace(".", ","), {"height_offset_m": 48.0},
         "are separated by semicolons",
     ),
     "airdata: two flights in one file": (
-        "a.track.csv", logs.airdata(TIMES, PLACES) + logs.airdata(LATER, PLACES).partition("\n")[2],
+        "a.track.csv", logs.airdata(TIMES, GEODETIC) + logs.airdata(LATER, GEODETIC).partition("\n")[2],
         {"height_offset_m": 48.0}, "column time(millisecond) does not increase",
     ),
-    "optitrack: a take cut at its beginning, in millimetres": (
+    "optitrack: a take that starts late, in millimetres": (
         "a.track.csv",
         logs.capture(
             20 + np.arange(12) / 360,
@@ -363,7 +363,7 @@ LOGS = {
 
 @pytest.mark.usefixtures("reader")
 @pytest.mark.parametrize("case", LOGS)
-def test_logs_of_other_programs_are_read_or_refused_in_one_message(tmp_path, case):
+def test_logs_of_other_programs_are_read_or_refused_with_one_message(tmp_path, case):
     name, content, options, expected = LOGS[case]
     path = tmp_path / name
     path.write_bytes(content if isinstance(content, bytes) else content.encode())
@@ -391,7 +391,7 @@ BEATS = np.random.default_rng(8).normal(size=(9, SWEEP.sweep_samples))
 
 
 def scans():
-    """Return three scans of a PulsON radar of 350 samples, and a fourth."""
+    """Return the bytes of four scans of 350 samples of a PulsON radar."""
     messages = np.zeros(4, MESSAGE)
     messages["type"], messages["source"], messages["step_bins"], messages["kind"] = 0xF201, 1, 32, 1
     messages["start_ps"], messages["stop_ps"] = 10_000, 10_000 + round(350 / SAMPLE_RATE_HZ * 1e12)
@@ -401,7 +401,7 @@ def scans():
     return bytes(32) + messages.tobytes()
 
 
-def saved(array, **more):
+def npy_bytes(array, **more):
     """Return the bytes of a .npy file."""
     stream = io.BytesIO()
     np.save(stream, array, **more)
@@ -428,14 +428,16 @@ def sound(dtype, channels=2, rate=44_100):
 
 
 def of_24_bits(wav):
-    """Return the .wav file of 32 bits with 24, in the extensible form that recorders write."""
+    """Convert a .wav file of 32 bits to 24 bits with the extensible header that recorders write."""
     numbers = np.frombuffer(wav[44:], "<i4").view(np.uint8).reshape(-1, 4)[:, 1:].tobytes()
-    form = (
+    fmt_chunk = (
         struct.pack("<HHIIHHHHI", 0xFFFE, 2, 44_100, 44_100 * 6, 6, 24, 22, 24, 3)
         + b"\x01\x00"
         + bytes.fromhex("000000001000800000aa00389b71")
     )
-    chunks = b"fmt " + struct.pack("<I", len(form)) + form + b"data" + struct.pack("<I", len(numbers)) + numbers
+    chunks = (
+        b"fmt " + struct.pack("<I", len(fmt_chunk)) + fmt_chunk + b"data" + struct.pack("<I", len(numbers)) + numbers
+    )
     return b"RIFF" + struct.pack("<I", 4 + len(chunks)) + b"WAVE" + chunks
 
 
@@ -450,14 +452,14 @@ def gotcha(**changes):
 
 
 RECORDINGS = {
-    "npy: columns first in memory (Fortran)": ("beat_npy", "npy", saved(np.asfortranarray(BEATS)), 9),
-    "npy: big-endian doubles": ("beat_npy", "npy", saved(BEATS.astype(">f8")), 9),
+    "npy: columns first in memory (Fortran)": ("beat_npy", "npy", npy_bytes(np.asfortranarray(BEATS)), 9),
+    "npy: big-endian doubles": ("beat_npy", "npy", npy_bytes(BEATS.astype(">f8")), 9),
     "npy: a list of sweeps (pickled objects)": (
-        "beat_npy", "npy", saved(np.array([*BEATS, [1]], object), allow_pickle=True), "not readable",
+        "beat_npy", "npy", npy_bytes(np.array([*BEATS, [1]], object), allow_pickle=True), "not readable",
     ),
-    "npy: frames × receivers × samples": ("beat_npy", "npy", saved(BEATS[:, None]), "of shape (9, 1, 88)"),
+    "npy: frames × receivers × samples": ("beat_npy", "npy", npy_bytes(BEATS[:, None]), "of shape (9, 1, 88)"),
     "npy: complex samples where waveform.iq is real": (
-        "beat_npy", "npy", saved(BEATS.astype(complex)), "complex128 samples, but waveform.iq is real",
+        "beat_npy", "npy", npy_bytes(BEATS.astype(complex)), "complex128 samples, but waveform.iq is real",
     ),
     "mat: version 4": ("beat_mat", "mat", matlab("4", beat=BEATS), 9),
     "mat: times as days of MATLAB": (
@@ -465,7 +467,7 @@ RECORDINGS = {
         "times in days (MATLAB datenum); expected seconds since 1970",
     ),
     "mat: a table in place of the structure": ("afrl_mat", "mat", matlab(data=BEATS), "no structure data"),
-    "mat: phase history in single precision, positions whole": (
+    "mat: phase history in single precision, integer positions": (
         "afrl_mat", "mat", gotcha(fp=np.ones((8, 5), np.complex64), x=np.arange(7000, 7005, dtype=np.int16)), 5,
     ),
     "mat: frequencies that descend": (
@@ -490,7 +492,7 @@ RECORDINGS = {
 
 @pytest.mark.usefixtures("reader")
 @pytest.mark.parametrize("case", RECORDINGS)
-def test_recordings_of_other_programs_are_read_or_refused_in_one_message(tmp_path, case):
+def test_recordings_of_other_programs_are_read_or_refused_with_one_message(tmp_path, case):
     kind, suffix, content, expected = RECORDINGS[case]
     path = tmp_path / f"a.{suffix}"
     path.write_bytes(content)
@@ -508,10 +510,10 @@ def test_recordings_of_other_programs_are_read_or_refused_in_one_message(tmp_pat
     assert echo.sizes["pulse"] == expected
     if kind.startswith("beat"):
         late_s = np.full(9, 0.5 / SWEEP.sample_rate_hz) if kind == "beat_wav" else None  # sync rises between samples
-        right = transfer_of(BEATS, SWEEP, late_s=late_s)
-        scale = np.vdot(echo.transfer.values, right) / np.vdot(echo.transfer.values, echo.transfer.values)
-        apart = np.abs(scale * echo.transfer.values - right).max() / np.abs(right).max()
-        assert apart < (0.1 if "eight bits" in case else 1e-3)
+        expected_transfer = transfer_of(BEATS, SWEEP, late_s=late_s)
+        scale = np.vdot(echo.transfer.values, expected_transfer) / np.vdot(echo.transfer.values, echo.transfer.values)
+        error = np.abs(scale * echo.transfer.values - expected_transfer).max() / np.abs(expected_transfer).max()
+        assert error < (0.1 if "eight bits" in case else 1e-3)
 
 
 RASTER = {"count": 1, "dtype": "float32", "crs": "EPSG:32632", "transform": from_origin(500000, 5400100, 2, 2)}
@@ -529,17 +531,17 @@ def raster(path, heights=GROUND, *, write=None, **profile):
             write(file)
 
 
-def turned():
-    """Return heights on posts of 1 m that are turned by 30°, and their transform."""
-    place = (
+def rotated():
+    """Return heights on a grid of 1 m that is rotated by 30°, and its transform."""
+    transform = (
         Affine.translation(500045, 5400055)
         @ Affine.rotation(-30)
         @ Affine.scale(1, -1)
         @ Affine.translation(-100, -100)
     )
     columns, rows = np.meshgrid(np.arange(200) + 0.5, np.arange(200) + 0.5)
-    x, y = place @ (columns, rows)
-    return 600 + 0.1 * (5400099 - y) + 0.15 * (x - 500001), place
+    x, y = transform @ (columns, rows)
+    return 600 + 0.1 * (5400099 - y) + 0.15 * (x - 500001), transform
 
 
 def in_web_mercator():
@@ -558,7 +560,7 @@ def coloured(file):
 
 
 DEMS = {
-    "differences of floats (predictor 3) in DEFLATE, heights about 0": (
+    "floating-point predictor with DEFLATE, heights about 0": (
         lambda path: raster(path, GROUND - 600, dtype="float32", predictor=3, compress="deflate"),
         -600.0,
     ),
@@ -566,7 +568,7 @@ DEMS = {
         lambda path: raster(path, BIGTIFF="YES", tiled=True, blockxsize=16, blockysize=16, compress="zstd"),
         0.0,
     ),
-    "int16 of decimetres less 500 m": (
+    "int16 in decimetres with an offset of 500 m": (
         lambda path: raster(
             path,
             np.rint(10 * (GROUND - 500)),
@@ -575,7 +577,7 @@ DEMS = {
         ),
         0.0,
     ),
-    "turned by 30 degrees": (lambda path: raster(path, turned()[0], transform=turned()[1]), 0.0),
+    "rotated by 30 degrees": (lambda path: raster(path, rotated()[0], transform=rotated()[1]), 0.0),
     "Web Mercator": (
         lambda path: raster(path, in_web_mercator()[0], transform=in_web_mercator()[1], crs="EPSG:3857"),
         0.0,
@@ -584,8 +586,8 @@ DEMS = {
         lambda path: raster(path, crs="EPSG:32633", transform=from_origin(60000, 5420000, 2, 2)),
         "% of the scene lies outside",
     ),
-    "a mask within the file": (lambda path: raster(path, write=masked), "no height at"),
-    "no data that is NaN by name alone": (
+    "internal mask": (lambda path: raster(path, write=masked), "no height at"),
+    "NaN as no-data value": (
         lambda path: raster(
             path, np.where(np.pad(np.ones((3, 3)), ((20, 37), (20, 37))) > 0, np.nan, GROUND), nodata=np.nan
         ),
@@ -608,7 +610,7 @@ DEMS = {
         lambda path: path.write_bytes(b"\0\0\0\x0cjP  \r\n\x87\n" + bytes(900)),
         "not readable as GeoTIFF",
     ),
-    "ground control points alone": (
+    "no geotransform and no CRS": (
         lambda path: raster(path, crs=None, transform=Affine.identity()),
         "no geodetic CRS",
     ),
@@ -617,7 +619,7 @@ DEMS = {
 
 @pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 @pytest.mark.parametrize("case", DEMS)
-def test_elevation_models_of_other_programs_are_read_or_refused_in_one_message(tmp_path, case):
+def test_dems_of_other_programs_are_read_or_refused_with_one_message(tmp_path, case):
     write, expected = DEMS[case]
     path = tmp_path / "dem.tif"
     write(path)
@@ -633,12 +635,12 @@ def test_elevation_models_of_other_programs_are_read_or_refused_in_one_message(t
         assert message.isprintable()
         assert len(message) < 800
     else:
-        right = 600 + 0.1 * (5400099 - GRID.y_m)[:, None] + 0.15 * (GRID.x_m - 500001) + expected
-        np.testing.assert_allclose(read(), right, atol=0.06)
+        expected_m = 600 + 0.1 * (5400099 - GRID.y_m)[:, None] + 0.15 * (GRID.x_m - 500001) + expected
+        np.testing.assert_allclose(read(), expected_m, atol=0.06)
 
 
-def described_by(meta, changes):
-    """Change metadata by ``part.key`` → value, where part is global or the number of a capture."""
+def with_changes(meta, changes):
+    """Set ``part.key`` of the metadata to values, where part is global or the index of a capture."""
     for name, value in changes.items():
         part, _, key = name.partition(".")
         (meta["global"] if part == "global" else meta["captures"][int(part)])[key] = value
@@ -648,7 +650,7 @@ def described_by(meta, changes):
 COUNTS = np.arange(128, dtype="<i2")
 NOTES = '[{"core:sample_start": 0, "core:label": "\\u0000"}]'
 SIGMF = {
-    "byte-order mark and blanks between all": ({}, lambda text: ("\ufeff" + text.replace(",", " ,\r\n\t")).encode(), 4),
+    "byte-order mark and extra white space": ({}, lambda text: ("\ufeff" + text.replace(",", " ,\r\n\t")).encode(), 4),
     "keys of other programs, geolocation, annotations": (
         {"global.core:geolocation": {"type": "Point", "coordinates": [9.9, 48.4]}, "global.gnuradio:block": [1, {}]},
         lambda text: text.replace('"captures"', f'"annotations": {NOTES}, "captures"').encode(), 4,
@@ -669,16 +671,16 @@ SIGMF = {
 
 
 @pytest.mark.parametrize("case", SIGMF)
-def test_sigmf_of_other_programs_is_read_or_refused_in_one_message(tmp_path, case):
-    """Four captures of 16 samples."""
+def test_sigmf_of_other_programs_is_read_or_refused_with_one_message(tmp_path, case):
+    """Read a recording of four captures of 16 samples."""
     changes, text_of, expected = SIGMF[case]
     captures = [
         {"core:sample_start": 16 * n, "core:datetime": f"2025-05-14T09:30:0{n}Z", "core:frequency": 1.2e9}
         for n in range(4)
     ]
-    known = {"core:datatype": "ci16_le", "core:version": "1.2.0", "core:sample_rate": 1e6}
+    fields = {"core:datatype": "ci16_le", "core:version": "1.2.0", "core:sample_rate": 1e6}
     meta, data = tmp_path / "a.sigmf-meta", tmp_path / "a.sigmf-data"
-    meta.write_bytes(text_of(json.dumps(described_by({"global": known, "captures": captures}, changes))))
+    meta.write_bytes(text_of(json.dumps(with_changes({"global": fields, "captures": captures}, changes))))
     data.write_bytes(COUNTS.tobytes())
     if isinstance(expected, str):
         message = complaint(lambda: open_sigmf(meta, data))

@@ -1,4 +1,4 @@
-"""A radar on the bench: a right set-up carries no flag, every spoilt one the flag of what is wrong with it."""
+"""Bench measurement of a radar: a correct set-up raises no flag, each defect raises its own."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -34,8 +34,8 @@ def measured(setup: Setup, folder: Path, seed: int = 3) -> Bench:
     return measure_bench(Campaign.load(setup.write(folder, seed)), FLIGHT)
 
 
-def of(snr_db: float) -> Setup:
-    """Return a right set-up whose compressed pulses have a signal to noise ratio, by noise of the radar channels."""
+def with_snr(snr_db: float) -> Setup:
+    """Return a correct set-up with a signal-to-noise ratio of the compressed pulses, by noise of the radar channels."""
     per_subcarrier_db = snr_db - 10 * np.log10(512)
     own = Impairments(radar_snr_db=per_subcarrier_db)
     return replace(RIGHT, specification=cabled(own, replace(RECEIVED, radar_snr_db=per_subcarrier_db)))
@@ -44,23 +44,23 @@ def of(snr_db: float) -> Setup:
 @pytest.mark.parametrize(
     "name", [*QUICK, *(pytest.param(name, marks=pytest.mark.slow) for name in SPOILT if name not in QUICK)]
 )
-def test_a_spoilt_set_up_is_named(name: str, tmp_path):
+def test_defective_set_up_raises_its_flag(name: str, tmp_path):
     bench = measured(SPOILT[name], tmp_path / "bench")
     assert SPOILT[name].flags & bench.flags.keys(), dict(bench.flags)
     assert any(set(line.flags) & SPOILT[name].flags for line in bench.lines)
 
 
 @pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 21))])
-def test_a_right_set_up_is_never_flagged(seed: int, tmp_path):
+def test_correct_set_up_raises_no_flag(seed: int, tmp_path):
     snr_db = float(np.random.default_rng(seed).uniform(18.5, 45.0))
-    assert not measured(of(snr_db), tmp_path / "bench", seed).flags
+    assert not measured(with_snr(snr_db), tmp_path / "bench", seed).flags
 
 
 @pytest.mark.quick("18.5-0.986")
 @pytest.mark.parametrize(("snr_db", "printed"), [(18.5, 0.986), (33.0, 0.9995), (40.0, 0.9999)])
-def test_coherence_over_a_cable_is_what_its_snr_allows(snr_db: float, printed: float, tmp_path):
-    """Γ of both pairs as the source paper prints it for its three recordings, within what chance and print leave."""
-    for node in measured(of(snr_db), tmp_path / "bench").nodes:
+def test_coherence_over_a_cable_is_limited_by_its_snr(snr_db: float, printed: float, tmp_path):
+    """Γ of both pairs equals that of the paper for its three recordings, within 4σ and the rounding in print."""
+    for node in measured(with_snr(snr_db), tmp_path / "bench").nodes:
         digit = 10.0 ** -len(str(printed).partition(".")[2])
         assert abs(node.link.coherence - printed) < 4 * node.link.coherence_std + digit / 2
         assert abs(10 * np.log10(node.link.snr) - snr_db) < 0.3
@@ -70,11 +70,11 @@ def test_coherence_over_a_cable_is_what_its_snr_allows(snr_db: float, printed: f
 def test_paths_of_cables_are_measured(tmp_path):
     offsets = measured(RIGHT, tmp_path / "bench").offsets
     for node, true_m in (("uav1", 0.0), ("uav2", 0.911)):
-        assert abs(offsets[node].offset_m - true_m) < max(4 * offsets[node].std_m, 2e-3)  # 1/25 of a count of phase
+        assert abs(offsets[node].offset_m - true_m) < max(4 * offsets[node].std_m, 2e-3)  # 2 mm: phase error of 3°
 
 
 @pytest.mark.parametrize(("stuck", "shift", "bits"), [(0, 0, ()), (0, 2, ()), (16, 0, (4,)), (16, 2, (6,)), (1, 0, ())])
-def test_a_bit_that_never_changes_is_told_from_samples_shifted_up(stuck: int, shift: int, bits: tuple[int, ...]):
+def test_stuck_bit_is_distinguished_from_shifted_samples(stuck: int, shift: int, bits: tuple[int, ...]):
     numerology = Numerology(1.2e9, 64e6, np.arange(32), prefix_samples=16, dft_samples=64)
     iq = np.random.default_rng(1).normal(scale=300, size=(20, 80, 2)).astype(np.int16)
     assert measure_channel("radar", [(iq | stuck) << shift], numerology).stuck == bits
@@ -85,28 +85,28 @@ def test_white_phase_noise_has_the_allan_deviation_of_its_snr():
     numerology = Numerology(1.2e9, 64e6, np.arange(32), prefix_samples=16, dft_samples=64)
     noise = 0.3 * (rng.normal(size=(pulses, 32)) + 1j * rng.normal(size=(pulses, 32)))
     echo = (1 + noise).astype(np.complex64)
-    link = measure_link("a", lambda some: echo[some], 0.1 * np.arange(pulses), numerology, divided=False)
+    link = measure_link("a", lambda pulse: echo[pulse], 0.1 * np.arange(pulses), numerology, divided=False)
     white = np.sqrt(3) * link.noise_rad / (2 * np.pi * link.frequency_hz)
     for averaged_s, deviation in link.deviation(0.1)[:4]:
         assert deviation == pytest.approx(white / averaged_s, rel=0.1)
 
 
-def test_a_bench_needs_no_log_and_makes_no_image(tmp_path, capsys, monkeypatch):
+def test_bench_needs_no_log_and_forms_no_image(tmp_path, capsys, monkeypatch):
     campaign = Campaign.load(SPOILT["cable warms up"].write(tmp_path / "bench", 1))
     assert not problems(campaign.root)
     monkeypatch.setattr("sys.argv", ["apertura", "bench", str(campaign.root)])
     with pytest.raises(SystemExit, match="2"):
         main()
     assert FLAGS["link_drifts"].advice in capsys.readouterr().out
-    made = sorted(path.name for path in campaign.result(FLIGHT).iterdir())
-    assert made == sorted([REPORT, PAGE, PICTURE, "bench.manifest.json"])
+    names = sorted(path.name for path in campaign.result(FLIGHT).iterdir())
+    assert names == sorted([REPORT, PAGE, PICTURE, "bench.manifest.json"])
     with pytest.raises(CampaignError, match="a flight of kind image"):
         campaign.check_images()
 
 
-def test_one_signal_in_two_channels_agrees_whatever_the_noise(tmp_path):
-    """Noise of 20 pulses at 18.5 dB scatters phases over the band by 0.3 rad and more: no disagreement."""
-    noisy = of(18.5)
+def test_common_signal_of_two_channels_agrees_despite_noise(tmp_path):
+    """Noise of 20 pulses at 18.5 dB scatters phases over the band by 0.3 rad or more, which is no disagreement."""
+    noisy = with_snr(18.5)
     short = replace(
         noisy, specification=replace(noisy.specification, flights=(replace(noisy.specification.flights[0], pulses=20),))
     )
@@ -116,7 +116,7 @@ def test_one_signal_in_two_channels_agrees_whatever_the_noise(tmp_path):
 
 
 @pytest.mark.slow
-def test_no_path_of_a_link_that_carries_a_flag_goes_into_the_config(tmp_path, capsys):
+def test_path_of_a_flagged_link_is_not_written_to_the_config(tmp_path, capsys):
     root = SPOILT["clocks of the two channels apart"].write(tmp_path / "bench", 1)
     edit_config(root, lambda config: config["nodes"]["uav2"]["path_offset_m"].update(radar=0.5))
     before = (root / "config/config.yaml").read_text()
@@ -125,7 +125,7 @@ def test_no_path_of_a_link_that_carries_a_flag_goes_into_the_config(tmp_path, ca
     assert (root / "config/config.yaml").read_text() == before
 
 
-def test_measured_paths_go_into_the_config_and_nothing_else_changes(tmp_path):
+def test_only_measured_paths_are_written_to_the_config(tmp_path):
     root = RIGHT.write(tmp_path / "bench", 1)
     edit_config(root, lambda config: config["nodes"]["uav2"]["path_offset_m"].update(radar=0.5))
     path = root / "config" / "config.yaml"
@@ -144,7 +144,7 @@ def test_measured_paths_go_into_the_config_and_nothing_else_changes(tmp_path):
 # Images need an aperture
 
 
-def test_a_radar_that_stands_still_is_refused_as_a_flight_with_the_question_whether_it_is_a_bench(tmp_path):
+def test_stationary_radar_is_refused_as_an_image_flight(tmp_path):
     specification = cabled()
     flight = replace(specification.flights[0], kind="image")
     root = write_campaign(tmp_path / "c", replace(specification, flights=(flight,)), np.random.default_rng(1))
@@ -153,20 +153,20 @@ def test_a_radar_that_stands_still_is_refused_as_a_flight_with_the_question_whet
 
 
 @pytest.mark.parametrize(("length_m", "flagged"), [(0.3, True), (2.0, False)])
-def test_an_aperture_too_short_for_its_scene_is_flagged(length_m: float, flagged: bool):
-    """λR/2L against the scene: 4.2 m of 6 m for 0.3 m of track at 10 m, 0.6 m for 2 m."""
+def test_aperture_too_short_for_its_scene_is_flagged(length_m: float, flagged: bool):
+    """Resolution λR/2L in a scene of 6 m: 4.2 m for a track of 0.3 m at a range of 10 m, 0.6 m for 2 m."""
     track = np.stack([np.linspace(0, length_m, 50) - length_m / 2, np.full(50, -10.0), np.full(50, 1.0)], -1)
     ground = np.stack(np.meshgrid(np.linspace(-3, 3, 5), np.linspace(3, -3, 5), indexing="xy"), -1)
     ground = np.concatenate([ground, np.zeros((5, 5, 1))], -1)
-    flown, wavelength = Aperture(track, track), 0.25
-    assert flown.cross_cell_m(ground, wavelength_m=wavelength) == pytest.approx(
+    aperture, wavelength = Aperture(track, track), 0.25
+    assert aperture.cross_cell_m(ground, wavelength_m=wavelength) == pytest.approx(
         wavelength * 10.1 / (2 * length_m), rel=0.05
     )
-    assert bool(no_aperture(flown, ground, wavelength_m=wavelength)) is flagged
+    assert bool(no_aperture(aperture, ground, wavelength_m=wavelength)) is flagged
 
 
 @pytest.mark.slow
-def test_a_hover_inside_a_flight_is_left_out_unless_segments_say_what_images(tmp_path):
+def test_hover_is_excluded_unless_segments_are_configured(tmp_path):
     plan = preset("demo", pulses=400)
     times = (-2.0, 5.0, 15.0, 22.0)
     tracks = {
@@ -189,14 +189,14 @@ def test_a_hover_inside_a_flight_is_left_out_unless_segments_say_what_images(tmp
 
 
 @pytest.mark.slow
-def test_an_image_without_an_aperture_cannot_tell_its_focus():
-    """Antennas that stand: an echo per range, told by no aperture and by nothing else."""
+def test_image_without_aperture_is_inconclusive_about_focus():
+    """Stationary antennas: the echo resolves range only, and no_aperture is the only flag of its focus."""
     frequency, still = 1.2e9 + 1e6 * np.arange(128), np.tile([0.0, -20.0, 10.0], (64, 1))
-    flown, grid = Aperture(still, still), ap.SceneGrid("local", -5.0, 5.0, 0.1, (100, 100))
-    echo = np.exp(-2j * np.pi * frequency * flown.path(np.zeros((1, 3))) / 299792458.0).astype(np.complex64)
-    image = ap.backproject(ap.PhaseHistory(echo, frequency, np.full(128, 1 / 128), np.zeros(64), flown), grid)
-    told = ap.judge(image)
-    assert told.verdict == "inconclusive"
-    assert told.reason.startswith("no aperture: antennas moved 0 m: no resolution")
+    aperture, grid = Aperture(still, still), ap.SceneGrid("local", -5.0, 5.0, 0.1, (100, 100))
+    echo = np.exp(-2j * np.pi * frequency * aperture.path(np.zeros((1, 3))) / 299792458.0).astype(np.complex64)
+    image = ap.backproject(ap.PhaseHistory(echo, frequency, np.full(128, 1 / 128), np.zeros(64), aperture), grid)
+    focus = ap.judge(image)
+    assert focus.verdict == "inconclusive"
+    assert focus.reason.startswith("no aperture: antennas moved 0 m: no resolution")
     assert "no_aperture" in image.attrs["flags"]
-    assert not told.flags.keys() & {"defocused", "echo_outside_scene"}
+    assert not focus.flags.keys() & {"defocused", "echo_outside_scene"}

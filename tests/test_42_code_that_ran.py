@@ -1,4 +1,4 @@
-"""A result's code hash covers what its step runs: every module whose functions the step calls, and no more."""
+"""Code hash of a result: it covers every module whose functions the step calls, and no other."""
 
 import pkgutil
 import shutil
@@ -14,7 +14,7 @@ from apertura.workflow.lineage import places_of, result_of
 from apertura.workflow.rules import RESULTS
 
 NOT_RUN = {"track", "report", "speed_accuracy", "whole"}
-"""Made by the step of another result, by Snakemake itself, or by whole runs."""
+"""Results written by the step of another result, by Snakemake itself, or by whole runs."""
 
 
 def module_of(frame):
@@ -22,7 +22,7 @@ def module_of(frame):
 
 
 def called(step, *arguments):
-    """Run a step; return the modules of apertura whose functions it called, in any thread."""
+    """Run a step and return the modules of apertura whose functions it called in any thread."""
     modules = set()
 
     def note(frame, event, _):
@@ -44,18 +44,18 @@ def called(step, *arguments):
 
 
 @pytest.mark.slow
-def test_every_module_that_a_step_calls_is_code_of_its_result(tiny):
+def test_code_hash_covers_every_called_module(tiny):
     campaign = Campaign.load(tiny)
     missing = {}
     for name, where, result in places_of(campaign):
         if name not in NOT_RUN:
-            known = set(import_closure(result.modules))
-            if name == "raw":  # one step makes both
-                known |= set(import_closure(result_of(campaign, "track", *where).modules))
+            covered = set(import_closure(result.modules))
+            if name == "raw":  # the same step writes raw and track
+                covered |= set(import_closure(result_of(campaign, "track", *where).modules))
             step = pkgutil.resolve_name(RESULTS[name].step.path)
-            further = called(step, campaign, *where, *RESULTS[name].last_words) - known
-            if further:
-                missing[name, *where] = sorted(further)
+            uncovered = called(step, campaign, *where, *RESULTS[name].last_words) - covered
+            if uncovered:
+                missing[name, *where] = sorted(uncovered)
     assert missing == {}
 
 
@@ -65,17 +65,17 @@ READ = FOCUSED | {"pictures", "raw", "track", "echo", "transfer", "profile", "la
 
 
 CHANGES = [
-    ("formats/tracks/px4_ulog.py", "code", set()),  # no log of the campaign is of that format
+    ("formats/tracks/px4_ulog.py", "code", set()),  # no log of the campaign has that format
     ("formats/tracks/csv_track.py", "comment", set()),
     ("formats/tracks/csv_track.py", "code", READ - {"raw", "transfer"} | {"pictures_fused"}),
     ("formats/recordings/sigmf.py", "code", READ - {"track", "tracks"} | {"cphd", "pictures_fused"}),
-    ("views/webmap/server.py", "code", set()),  # what a browser is shown, of results that are there
+    ("views/webmap/server.py", "code", set()),  # serves finished results only
     ("common/flag_table.py", "code", set()),
     ("common/errors.py", "code", set()),
     ("campaign/config/nodes.py", "docstring", set()),
     ("core/echo/dechirp.py", "docstring", set()),
     ("formats/export/cog.py", "code", {"export", "fused", "layers", "mosaic", "pictures", "pictures_fused"}),
-    ("workflow/rules.py", "code", set()),  # sources and settings are compared for themselves
+    ("workflow/rules.py", "code", set()),  # sources and settings are compared separately
     ("core/backprojection/engines/numba.py", "comment", set()),
     ("core/backprojection/engines/numba.py", "code", FOCUSED | {"pictures", "pictures_fused", "tracks"}),
     ("common/constants.py", "code", EVERY),
@@ -84,7 +84,7 @@ EDITS = {"code": "EDITED = 1\n", "comment": "# Edited.\n", "docstring": '"""Edit
 
 
 @pytest.mark.slow
-def test_a_change_makes_again_what_runs_it_and_nothing_else(tiny, tmp_path):
+def test_code_change_outdates_only_the_results_that_run_it(tiny, tmp_path):
     copied = shutil.copytree(
         PACKAGE, tmp_path / "package", ignore=shutil.ignore_patterns("__pycache__", "*.so", "page")
     )
@@ -93,10 +93,10 @@ def test_a_change_makes_again_what_runs_it_and_nothing_else(tiny, tmp_path):
     def hashes():
         return {(name, code_sha256(*run, package=copied)) for name, run in modules}
 
-    before, found = hashes(), []
+    before, changed = hashes(), []
     for file, edit, _ in CHANGES:
         source = (copied / file).read_text()
         (copied / file).write_text(source + EDITS[edit])
-        found.append((file, edit, {name for name, _ in hashes() - before}))
+        changed.append((file, edit, {name for name, _ in hashes() - before}))
         (copied / file).write_text(source)
-    assert found == [(file, edit, again & {name for name, _ in modules}) for file, edit, again in CHANGES]
+    assert changed == [(file, edit, expected & {name for name, _ in modules}) for file, edit, expected in CHANGES]

@@ -1,4 +1,4 @@
-"""Beat signals of an FMCW radar, from their files to images: targets, sweeps that fall, mixers, motion."""
+"""Beat signals of an FMCW radar, from files to images: target positions, falling sweeps, mixers, motion."""
 
 import functools
 import re
@@ -21,13 +21,13 @@ from apertura.stages.scene import open_scene
 from apertura.stages.transfer import recorded_echo
 
 FAST = FrequencySweep(2.2e9, 400e6, 20e-6, 25e6)
-"""400 MHz about 2.4 GHz in 20 µs: gamma 2e13 Hz/s, real beats to 12.5 MHz, which are 187 m of path."""
+"""400 MHz centred on 2.4 GHz in 20 µs: chirp rate 2e13 Hz/s, beat frequencies to 12.5 MHz, 187 m of path."""
 
 NEAR = ((0.0, 0.0, 0.0), (-2.0, 2.0, 0.0), (2.5, -1.5, 0.0))
 FLIGHT = FmcwFlight(FAST, 100.0, 200, {"uav1": (0.0, -20.0, 10.0)}, NEAR, spacing_m=0.0625, half_width_m=3.5)
 
 
-def written(tmp_path, flight=FLIGHT, **waveform):
+def write_campaign(tmp_path, flight=FLIGHT, **waveform):
     root = write_fmcw_campaign(tmp_path / "campaign", flight, waveform=waveform)
     edit_config(root, lambda document: document.update(processing={"autofocus": False}))
     return root
@@ -38,7 +38,7 @@ def image_of(root, pair="uav1-uav1"):
 
 
 def peaks(root, flight, targets=None, pair="uav1-uav1"):
-    """East, north (m) from the origin and magnitude at the peak next to each target."""
+    """Return east, north (m, from the origin) and magnitude of the peak next to each target."""
     grid, pixels = open_scene(Campaign.load(root)).grid, image_of(root, pair).image.values
     found = []
     for east, north, _ in targets or flight.targets:
@@ -54,9 +54,9 @@ def peaks(root, flight, targets=None, pair="uav1-uav1"):
     return np.array(found)
 
 
-def off(root, flight, pair="uav1-uav1"):
-    found = peaks(root, flight, pair=pair)
-    return np.abs(found[:, :2] - np.array(flight.targets)[:, :2]).max(), found[:, 2]
+def error_and_magnitudes(root, flight, pair="uav1-uav1"):
+    measured = peaks(root, flight, pair=pair)
+    return np.abs(measured[:, :2] - np.array(flight.targets)[:, :2]).max(), measured[:, 2]
 
 
 @pytest.mark.quick("complex")
@@ -70,19 +70,19 @@ def off(root, flight, pair="uav1-uav1"):
     ],
     ids=["real", "complex", "conjugate falling", "real falling"],
 )
-def test_targets_are_within_a_centimetre(tmp_path, sweep):
+def test_target_position_errors_are_below_a_centimetre(tmp_path, sweep):
     flight = replace(FLIGHT, sweep=sweep)
-    root = written(tmp_path, flight)
+    root = write_campaign(tmp_path, flight)
     assert problems(root) == []
     run_steps(root, exports=False)
-    error_m, heights = off(root, flight)
+    error_m, heights = error_and_magnitudes(root, flight)
     assert error_m < 0.01
     assert heights == pytest.approx(1.0, abs=0.05)
     assert set(image_of(root).attrs["quality"]["flags"]) <= {"sub_apertures"}
 
 
 @pytest.mark.parametrize("example", range(2))
-def test_the_configs_of_the_how_to_are_valid(example):
+def test_configs_of_the_how_to_are_valid(example):
     blocks = re.findall(r"```yaml\n(.*?)```", (ROOT / "docs/howto/fmcw.md").read_text(encoding="utf-8"), re.S)
     assert len(blocks) == 2
     document = {"campaign": "c", "nodes": {"a": {}}, **yaml.safe_load(blocks[example])}
@@ -90,7 +90,7 @@ def test_the_configs_of_the_how_to_are_valid(example):
 
 
 @pytest.mark.parametrize(
-    ("changes", "told"),
+    ("changes", "message"),
     [
         ({"bandwidth_hz": 0}, "not a band above 0 Hz"),
         ({"bandwidth_hz": -3e9}, "not a band above 0 Hz"),
@@ -100,25 +100,25 @@ def test_the_configs_of_the_how_to_are_valid(example):
         ({"iq": "imaginary"}, "waveform.*iq"),
     ],
 )
-def test_a_sweep_that_cannot_be_is_refused_by_its_key(tmp_path, changes, told):
-    root = written(tmp_path, replace(FLIGHT, sweeps=2), **changes)
-    assert re.search(told, complaint(lambda: Campaign.load(root)))
+def test_impossible_sweep_is_refused_by_its_key(tmp_path, changes, message):
+    root = write_campaign(tmp_path, replace(FLIGHT, sweeps=2), **changes)
+    assert re.search(message, complaint(lambda: Campaign.load(root)))
 
 
 @pytest.mark.slow
-def test_a_second_node_on_the_same_clock_sees_the_same_targets(tmp_path):
+def test_second_node_on_the_same_clock_images_the_same_targets(tmp_path):
     flight = replace(FLIGHT, nodes={"uav1": (0.0, -20.0, 10.0), "uav2": (3.0, -21.0, 11.0)})
-    root = written(tmp_path, flight)
+    root = write_campaign(tmp_path, flight)
     run_steps(root, exports=False)
     for pair in ("uav1-uav1", "uav1-uav2"):
-        error_m, heights = off(root, flight, pair)
+        error_m, heights = error_and_magnitudes(root, flight, pair)
         assert error_m < 0.01
         assert heights == pytest.approx(1.0, abs=0.05)
 
 
 @pytest.mark.slow
-def test_with_residual_video_phase_a_far_target_is_where_theory_puts_it(tmp_path, monkeypatch):
-    """The frequency of its phase is gamma*tau lower: it stands at that much less of its distance along the track."""
+def test_residual_video_phase_displaces_a_far_target_as_predicted(tmp_path, monkeypatch):
+    """Its phase has a frequency lower by γτ, which reduces its along-track distance in the same proportion."""
     east = 12.0
     flight = replace(
         FLIGHT,
@@ -127,40 +127,40 @@ def test_with_residual_video_phase_a_far_target_is_where_theory_puts_it(tmp_path
         middle=(east, 4.0),
         half_width_m=2.0,
     )
-    root = written(tmp_path, flight)
+    root = write_campaign(tmp_path, flight)
     run_steps(root, exports=False)
-    assert off(root, flight)[0] < 0.01
+    assert error_and_magnitudes(root, flight)[0] < 0.01
     monkeypatch.setattr(
         "apertura.formats.phase_histories.fmcw.transfer_of", functools.partial(transfer_of, deskewed=False)
     )
-    kept = written(tmp_path / "kept", flight)
-    run_steps(kept, exports=False)
+    uncorrected = write_campaign(tmp_path / "uncorrected", flight)
+    run_steps(uncorrected, exports=False)
     delay_s = 2 * np.linalg.norm(np.subtract(flight.targets[0], (0.0, -60.0, 10.0))) / SPEED_OF_LIGHT_M_S
-    short_m = east * FAST.slope_hz_s * delay_s / 2.4e9
-    assert short_m > 0.04
-    assert peaks(kept, flight)[0, 0] == pytest.approx(east - short_m, abs=0.005)
+    displacement_m = east * FAST.slope_hz_s * delay_s / 2.4e9
+    assert displacement_m > 0.04
+    assert peaks(uncorrected, flight)[0, 0] == pytest.approx(east - displacement_m, abs=0.005)
 
 
 @pytest.mark.slow
-def test_a_mixer_of_the_other_sign_is_flagged(tmp_path):
+def test_mixer_of_opposite_sign_is_flagged(tmp_path):
     flight = replace(FLIGHT, sweep=replace(FAST, iq="complex"))
-    root = written(tmp_path, flight, iq="conjugate")
+    root = write_campaign(tmp_path, flight, iq="conjugate")
     run_steps(root, exports=False)
-    raised = image_of(root).attrs["quality"]["flags"]
-    assert {"echo_outside_scene", "defocused"} & set(raised)
-    assert any("change waveform.iq between complex and conjugate" in line for line in raised.values())
+    flags = image_of(root).attrs["quality"]["flags"]
+    assert {"echo_outside_scene", "defocused"} & set(flags)
+    assert any("change waveform.iq between complex and conjugate" in line for line in flags.values())
 
 
-def test_sweeps_so_slow_that_the_antenna_moves_are_flagged(tmp_path):
+def test_antenna_motion_during_a_slow_sweep_is_flagged(tmp_path):
     slow = replace(FLIGHT, sweep=FrequencySweep(2.2e9, 400e6, 8e-3, 100e3), sweeps=120)
-    campaign = Campaign.load(written(tmp_path, slow))
+    campaign = Campaign.load(write_campaign(tmp_path, slow))
     flags = recorded_echo(campaign, "f01", "uav1-uav1").attrs["flags"]
     assert set(flags) == {"sweep_motion"}
     assert "0.64 wavelengths" in flags["sweep_motion"]
 
 
 def test_missing_sweeps_are_counted_and_flagged(tmp_path):
-    root = written(tmp_path)
+    root = write_campaign(tmp_path)
     beat = np.load(root / "raw/f01/uav1.npy")
     beat[60:100] = 0
     np.save(root / "raw/f01/uav1.npy", beat)

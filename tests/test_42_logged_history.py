@@ -1,4 +1,4 @@
-"""Phase history whose positions lie in a flight log, and whose clock is not the log's."""
+"""Phase history with positions in a flight log whose clock differs from the recorder's."""
 
 import json
 
@@ -21,12 +21,12 @@ from apertura.tools.preview.follow import Preview
 CRS = "EPSG:32632"
 EAST, NORTH = 570_000.0, 5_363_000.0
 FREQUENCY = 1.2e9 + 2e6 * np.arange(200)
-BEGAN = np.datetime64("2025-05-14T09:30", "ns")
-BEHIND_S = 4.44
-"""By which the recorder's clock is behind the log's."""
+START = np.datetime64("2025-05-14T09:30", "ns")
+CLOCK_OFFSET_S = 4.44
+"""Delay of the recorder's clock relative to the log's, in seconds."""
 
 
-def place(east, north, up):
+def position_ecef(east, north, up):
     return ecef_from_projected(CRS, EAST + np.asarray(east), NORTH + np.asarray(north), np.asarray(up) + 500.0)
 
 
@@ -47,25 +47,25 @@ def read_toy_history(paths, *, pair):
 
 @pytest.fixture
 def campaign(tmp_path, monkeypatch):
-    """Twelve metres flown in twelve seconds, unevenly, past one target; 1.5 m of cable."""
+    """Write a flight of 12 m in 12 s at varying speed past one target, with 1.5 m of cable."""
     monkeypatch.setitem(PHASE_HISTORIES, "toy", HistoryFormat(".npz", read_toy_history))
     root = tmp_path / "campaign"
     (root / "raw" / "f01").mkdir(parents=True)
     (root / "config").mkdir()
     epoch_s, pulse_s = np.arange(0, 14, 0.1), np.arange(1, 13, 0.02)
 
-    def flown(time_s):
-        return place(time_s - 7 + 0.3 * np.sin(time_s), np.zeros_like(time_s), np.full_like(time_s, 10.0))
+    def position_m(time_s):
+        return position_ecef(time_s - 7 + 0.3 * np.sin(time_s), np.zeros_like(time_s), np.full_like(time_s, 10.0))
 
     rows = [
-        f"{BEGAN + np.timedelta64(round(t * 1e9), 'ns')}Z,{lat:.10f},{lon:.10f},{height:.5f}"
-        for t, (lat, lon, height) in zip(epoch_s, geodetic_from_ecef(flown(epoch_s)), strict=True)
+        f"{START + np.timedelta64(round(t * 1e9), 'ns')}Z,{lat:.10f},{lon:.10f},{height:.5f}"
+        for t, (lat, lon, height) in zip(epoch_s, geodetic_from_ecef(position_m(epoch_s)), strict=True)
     ]
     head = "time_utc,latitude_deg,longitude_deg,height_m"
     (root / "raw/f01/uav1.track.csv").write_text("\n".join([head, *rows]) + "\n")
-    path_m = 2 * np.linalg.norm(flown(pulse_s) - place(1.0, 20.0, 0.0), axis=1) + 1.5
+    path_m = 2 * np.linalg.norm(position_m(pulse_s) - position_ecef(1.0, 20.0, 0.0), axis=1) + 1.5
     transfer = np.exp(-2j * np.pi * FREQUENCY * path_m[:, None] / SPEED_OF_LIGHT_M_S).astype(np.complex64)
-    clock = BEGAN + np.round((pulse_s - BEHIND_S) * 1e9).astype("timedelta64[ns]")
+    clock = START + np.round((pulse_s - CLOCK_OFFSET_S) * 1e9).astype("timedelta64[ns]")
     np.savez(root / "raw/f01/uav1.npz", time=clock, transfer=transfer)
     config = {
         "campaign": "rail",
@@ -84,7 +84,7 @@ def campaign(tmp_path, monkeypatch):
     return root
 
 
-def keep_time(root, offset_s=BEHIND_S, **cells):
+def write_clocks(root, offset_s=CLOCK_OFFSET_S, **cells):
     cells = {"flight": "f01", "node": "uav1", "offset_s": offset_s, "drift_ppm": 0, "std_s": 1e-3} | cells
     table = "\n".join("\t".join(map(str, row)) for row in (cells.keys(), cells.values()))
     (root / "config/clocks.tsv").write_text(table + "\n")
@@ -96,8 +96,8 @@ def brightest(root):
     return float(image.x[peak["x"]]) - EAST, float(image.y[peak["y"]]) - NORTH, float(image.max())
 
 
-def test_a_target_is_where_it_stands_by_the_log_and_its_clock(campaign):
-    keep_time(campaign)
+def test_clock_offset_puts_the_target_at_its_position(campaign):
+    write_clocks(campaign)
     assert problems(campaign) == []
     run_steps(campaign, exports=False)
     east, north, peak = brightest(campaign)
@@ -109,8 +109,8 @@ def test_a_target_is_where_it_stands_by_the_log_and_its_clock(campaign):
 
 
 @pytest.mark.slow
-def test_refined_tracks_of_a_phase_history_are_written_for_its_log(campaign):
-    keep_time(campaign)
+def test_refined_tracks_of_a_phase_history_are_written(campaign):
+    write_clocks(campaign)
     edit_config(campaign, lambda document: document.update(processing={"autofocus": "off"}))
     opened = run_steps(campaign, exports=False)
     written = {path.name for path in tracks.tracks(opened, "f01")}
@@ -123,8 +123,8 @@ def test_refined_tracks_of_a_phase_history_are_written_for_its_log(campaign):
 
 
 @pytest.mark.slow
-def test_a_history_whose_phases_count_upwards_is_imaged_by_the_key(campaign):
-    keep_time(campaign)
+def test_phase_history_of_opposite_sign_is_imaged_with_iq_conjugate(campaign):
+    write_clocks(campaign)
     file = campaign / "raw/f01/uav1.npz"
     stored = dict(np.load(file))
     np.savez(file, **stored | {"transfer": stored["transfer"].conj()})
@@ -134,15 +134,15 @@ def test_a_history_whose_phases_count_upwards_is_imaged_by_the_key(campaign):
 
 
 @pytest.mark.slow
-def test_by_a_clock_half_a_second_off_the_target_is_as_far_off_as_was_flown_meanwhile(campaign):
-    keep_time(campaign, BEHIND_S + 0.5)
+def test_clock_error_displaces_the_target_along_the_track(campaign):
+    write_clocks(campaign, CLOCK_OFFSET_S + 0.5)
     run_steps(campaign, exports=False)
     assert abs(brightest(campaign)[0] - 1.5) < 0.25
 
 
 @pytest.mark.slow
-def test_what_clocks_tsv_says_of_an_offset_is_in_the_budget(campaign):
-    keep_time(campaign, std_s=0.05)
+def test_uncertainty_of_a_clock_offset_is_in_the_budget(campaign):
+    write_clocks(campaign, std_s=0.05)
     run_steps(campaign, exports=False)
     quality = open_stage(Campaign.load(campaign).stage("image", "f01", "uav1-uav1"), "image").attrs["quality"]
     tags = next(line for line in quality["budget"] if line["cause"] == "time tags")
@@ -150,54 +150,54 @@ def test_what_clocks_tsv_says_of_an_offset_is_in_the_budget(campaign):
     assert tags["shift_m"] > 0.01
 
 
-def test_the_check_tells_of_pulses_that_no_log_places(campaign):
-    told = [str(problem) for problem in problems(campaign)]
-    assert len(told) == 1
-    assert "starts 3.440 s after the first pulse" in told[0]
+def test_check_reports_pulses_outside_the_log(campaign):
+    lines = [str(problem) for problem in problems(campaign)]
+    assert len(lines) == 1
+    assert "starts 3.440 s after the first pulse" in lines[0]
     (campaign / "raw/f01/uav1.track.csv").unlink()
     assert "samples without positions" in str(problems(campaign)[0])
 
 
-def test_a_track_at_the_height_of_the_ground_is_refused_before_the_run(campaign):
-    """A planar rail: its log alone tells that the antenna lies in the ground."""
+def test_track_at_terrain_height_is_refused_before_the_run(campaign):
+    """Planar rail: the log alone determines that the antenna is at the terrain surface."""
     edit_config(campaign, lambda document: document["scene"].update(height_m=510.0))
-    told = [str(problem) for problem in problems(campaign)]
+    lines = [str(problem) for problem in problems(campaign)]
     heights = [f"uav1: median height above the terrain {height} m" for height in ("0.0", "-0.0")]
-    assert any(height in one for one in told for height in heights)
+    assert any(height in line for line in lines for height in heights)
 
 
-def test_a_log_that_does_not_cover_the_pulses_is_told_of_with_the_clock(campaign):
+def test_log_that_misses_pulses_is_reported_with_the_clock_remedy(campaign):
     message = complaint(lambda: run_steps(campaign, exports=False))
     assert "starts 3.440 s after the first pulse" in message
     assert "apertura align" in message
 
 
 @pytest.mark.parametrize(
-    ("cells", "told"),
+    ("cells", "expected"),
     [
         ({"node": "uav7"}, "flight f01 has no node 'uav7'"),
         ({"offset_s": "soon"}, "offset_s 'soon'"),
         ({"drift_ppm": 5000}, "drift_ppm '5000'"),
     ],
 )
-def test_a_line_of_clocks_that_makes_no_sense_is_named(campaign, cells, told):
-    keep_time(campaign, **cells)
+def test_invalid_line_of_clocks_is_reported(campaign, cells, expected):
+    write_clocks(campaign, **cells)
     message = complaint(lambda: Campaign.load(campaign))
     assert "clocks.tsv: line 2" in message
-    assert told in message
+    assert expected in message
 
 
-def test_samples_without_any_positions_are_refused(campaign):
+def test_samples_without_positions_are_refused(campaign):
     (campaign / "raw/f01/uav1.track.csv").unlink()
     message = complaint(lambda: run_steps(campaign, exports=False))
     assert "samples without positions" in message
 
 
 @pytest.mark.slow
-def test_it_is_looked_at_as_it_is_but_not_followed(campaign):
-    keep_time(campaign)
+def test_preview_of_a_phase_history_works_without_follow(campaign):
+    write_clocks(campaign)
     Preview(Campaign.load(campaign), follow=False).run()
-    told = json.loads((campaign / "results/preview/status.json").read_text())["pairs"]["f01/uav1-uav1"]
-    assert (told["peak"]["x_m"] - EAST, told["peak"]["y_m"] - NORTH) == (1.0, 20.0)
-    assert (told["verdict"], told["pulses"]["added"]) == ("focused", 600)
+    status = json.loads((campaign / "results/preview/status.json").read_text())["pairs"]["f01/uav1-uav1"]
+    assert (status["peak"]["x_m"] - EAST, status["peak"]["y_m"] - NORTH) == (1.0, 20.0)
+    assert (status["verdict"], status["pulses"]["added"]) == ("focused", 600)
     assert "waveform.kind phase_history" in complaint(lambda: Preview(Campaign.load(campaign), follow=True))

@@ -1,4 +1,4 @@
-"""A campaign far from its scene: one phase per pulse is what is refined, and what its images are formed with."""
+"""Campaign far from its scene: autofocus estimates one phase per pulse, and images are formed with it."""
 
 from dataclasses import replace
 from typing import get_args
@@ -25,12 +25,12 @@ from apertura.views.score import score
 from apertura.workflow.stale import stale_results
 
 PAIRS = ("uav1-uav1", "uav1-uav2")
-ENOUGH, LACKING = SpaceVariance(0.2, -MOST_LOSS_DB + 0.01), SpaceVariance(0.3, -MOST_LOSS_DB - 0.01)
-PLACES_M = ((-9, -8.5), (0, -10), (8, -6), (-5, -3), (4, -1), (-10, 2), (10, 4), (-1, 5.5), (5, 9.5), (-8, 10.5))
+SUFFICIENT, INSUFFICIENT = SpaceVariance(0.2, -MOST_LOSS_DB + 0.01), SpaceVariance(0.3, -MOST_LOSS_DB - 0.01)
+POINTS_M = ((-9, -8.5), (0, -10), (8, -6), (-5, -3), (4, -1), (-10, 2), (10, 4), (-1, 5.5), (5, 9.5), (-8, 10.5))
 
 
 def far_away():
-    """Ten points on 24 m × 24 m, 300 m away from 60 m of flight in 15 s."""
+    """Return a specification: ten points on 24 m × 24 m at 300 m from a track of 60 m, flown in 15 s."""
     demo, pulses, speed_m_s = preset("demo"), 300, 4.0
     half_m = speed_m_s * (pulses - 1) / demo.waveform.prf_hz / 2
     tracks = {
@@ -40,7 +40,7 @@ def far_away():
     return replace(
         demo,
         waveform=replace(demo.waveform, cyclic_prefix_s=2.5e-6),
-        targets=tuple(PointTarget((*place, 0.0)) for place in PLACES_M),
+        targets=tuple(PointTarget((*place, 0.0)) for place in POINTS_M),
         flights=(SimulatedFlight("f01", "uav1", tracks, pulses),),
         scene=ImageGrid("EPSG:32632", half_width_m=12.0, spacing_m=0.1),
     )
@@ -48,10 +48,10 @@ def far_away():
 
 @pytest.fixture(scope="module")
 def campaigns(tmp_path_factory):
-    """The far campaign: as it was flown, and with logs that err by 2 cm, refined as `auto` does."""
+    """Return the far campaign with correct logs, and with log errors of 2 cm refined by `auto`."""
     folder = tmp_path_factory.mktemp("far")
     right = simulate(folder / "right", far_away(), seed=7)
-    corrected = copy_writable(right, folder / "mended")
+    corrected = copy_writable(right, folder / "corrected")
     for path in sorted((corrected / "raw" / "f01").glob("*.track.*")):
         log = noisy(0.02, seed=3)(read_log(path))
         write_log(path, log if log.attitude_deg is not None else saying(0.02)(log))
@@ -61,7 +61,7 @@ def campaigns(tmp_path_factory):
 
 
 def opened(campaign):
-    """Every pair of the flight with its profiles, and the scene."""
+    """Return the pairs of the flight with their profiles, and the scene."""
     pairs = [open_pair(campaign, "f01", name) for name in PAIRS]
     stages = [open_stage(campaign.stage("profile", "f01", name), "profile") for name in PAIRS]
     return {pair: profiles_of(stage, lazy=True) for pair, stage in zip(pairs, stages, strict=True)}, open_scene(
@@ -71,9 +71,9 @@ def opened(campaign):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("pair", PAIRS)
-def test_images_of_a_far_scene_are_mended_by_one_phase_per_pulse(campaigns, pair):
-    right, corrected = (np.abs(image_of(one, pair)).max() for one in campaigns.values())
-    quality = quality_of(campaigns["mended"], pair)
+def test_one_phase_per_pulse_focuses_images_of_a_far_scene(campaigns, pair):
+    right, corrected = (np.abs(image_of(campaign, pair)).max() for campaign in campaigns.values())
+    quality = quality_of(campaigns["corrected"], pair)
     assert quality["autofocus"]["gain_held_out_db"] > 3
     assert 20 * np.log10(corrected / right) > -0.2
     assert quality["autofocus"]["accepted"]
@@ -86,24 +86,24 @@ def test_images_of_a_far_scene_are_mended_by_one_phase_per_pulse(campaigns, pair
 
 
 @pytest.mark.slow
-def test_one_phase_leaves_the_image_where_the_logs_have_it(campaigns):
-    """What it leaves the image to be moved by is what the budget says of the logs, one sigma."""
-    (line,) = [one for one in quality_of(campaigns["mended"], PAIRS[0])["budget"] if one["cause"] == "positions"]
-    assert max(one.error_m for one in score(campaigns["mended"])) < 2 * line["shift_m"]
+def test_residual_displacement_is_that_of_the_budget(campaigns):
+    """One phase per pulse leaves a displacement, which the budget attributes to the logs (1σ)."""
+    (line,) = [line for line in quality_of(campaigns["corrected"], PAIRS[0])["budget"] if line["cause"] == "positions"]
+    assert max(finding.error_m for finding in score(campaigns["corrected"])) < 2 * line["shift_m"]
     assert line["shift_m"] == pytest.approx(0.087, rel=0.05)
 
 
 @pytest.mark.slow
-def test_what_was_found_is_what_images_use(campaigns):
-    campaign = campaigns["mended"]
+def test_images_use_the_estimated_phases(campaigns):
+    campaign = campaigns["corrected"]
     pairs, scene = opened(campaign)
-    given, track = refinement_inputs(campaign, pairs, scene), open_refined(campaign, "f01")
-    candidates = Candidates.of(given.records, scene.grid, scene.terrain, given.errors)
-    found = refine_one_phase(given.records, candidates, given.errors, method=ONE_PHASE)
+    inputs, track = refinement_inputs(campaign, pairs, scene), open_refined(campaign, "f01")
+    candidates = Candidates.of(inputs.records, scene.grid, scene.terrain, inputs.errors)
+    refinement = refine_one_phase(inputs.records, candidates, inputs.errors, method=ONE_PHASE)
     assert track.stage.attrs["pairs"] == list(PAIRS)
     assert not track.stage.correction.values.any()
     for pair, profiles in pairs.items():
-        extra_path_m = found.correction.longer_m(pair.name, clock_s(pair, given.began), pair.sidelink_m)
+        extra_path_m = refinement.correction.longer_m(pair.name, clock_s(pair, inputs.began), pair.sidelink_m)
         imaged, moved = track.pair(pair), track.profiles(pair, profiles)
         assert np.std(extra_path_m) > 0.01
         np.testing.assert_allclose(moved.start_m - profiles.start_m, extra_path_m, atol=1e-8)
@@ -113,37 +113,37 @@ def test_what_was_found_is_what_images_use(campaigns):
 
 
 @pytest.mark.slow
-def test_a_method_that_is_asked_for_is_taken(campaigns, tmp_path):
-    root = copy_writable(campaigns["mended"].root, tmp_path / "campaign")
+def test_configured_method_is_used(campaigns, tmp_path):
+    root = copy_writable(campaigns["corrected"].root, tmp_path / "campaign")
     campaign = state(root, "processing", autofocus_method="phase_gradient")
     refine.refine(campaign, "f01")
-    told = open_refined(campaign, "f01").stage.attrs
-    assert told["decisions"]["autofocus_method"] == {"value": "phase_gradient", "reason": "configured"}
-    assert told["report"]["method"] == "phase_gradient"
-    assert told["accepted"]
+    attrs = open_refined(campaign, "f01").stage.attrs
+    assert attrs["decisions"]["autofocus_method"] == {"value": "phase_gradient", "reason": "configured"}
+    assert attrs["report"]["method"] == "phase_gradient"
+    assert attrs["accepted"]
 
 
 @pytest.mark.parametrize(
-    ("asked", "second", "known_points", "value"),
+    ("configured", "second", "known_points", "value"),
     [
-        ("auto", ENOUGH, False, "minimum_entropy"),
-        ("auto", LACKING, False, "tracks"),
-        ("auto", ENOUGH, True, "tracks"),
-        ("tracks", ENOUGH, False, "tracks"),
-        ("phase_gradient", LACKING, True, "phase_gradient"),
+        ("auto", SUFFICIENT, False, "minimum_entropy"),
+        ("auto", INSUFFICIENT, False, "tracks"),
+        ("auto", SUFFICIENT, True, "tracks"),
+        ("tracks", SUFFICIENT, False, "tracks"),
+        ("phase_gradient", INSUFFICIENT, True, "phase_gradient"),
     ],
 )
-def test_one_phase_is_taken_where_it_suffices_for_every_pair(asked, second, known_points, value):
+def test_one_phase_is_chosen_if_it_suffices_for_every_pair(configured, second, known_points, value):
     variances = {"a-a": SpaceVariance(0.1, -0.01), "a-b": second}
-    decision = decide_method(asked, variances, known_points=known_points)
+    decision = decide_method(configured, variances, known_points=known_points)
     assert decision.value == value
-    assert ("in a-b one phase per pulse leaves" in decision.reason) is (asked == "auto" and not known_points)
+    assert ("in a-b one phase per pulse leaves" in decision.reason) is (configured == "auto" and not known_points)
 
 
 @pytest.mark.slow
 def test_near_scenes_need_tracks_and_far_ones_one_phase(campaigns, finished_tiny, tmp_path):
     near = state(copy_writable(finished_tiny.root, tmp_path / "near"), "processing", autofocus="on")
-    for campaign, value in ((near, "tracks"), (campaigns["mended"], ONE_PHASE)):
+    for campaign, value in ((near, "tracks"), (campaigns["corrected"], ONE_PHASE)):
         pairs, scene = opened(campaign)
         autofocus, method = autofocus_of(campaign, list(pairs), scene)
         assert (autofocus.value, method.name, method.value) == ("on", "autofocus_method", value)
@@ -151,7 +151,7 @@ def test_near_scenes_need_tracks_and_far_ones_one_phase(campaigns, finished_tiny
     assert len(autofocus_of(campaigns["right"], list(pairs), scene)) == 1
 
 
-def test_every_method_may_be_asked_for_and_makes_again_what_stands_on_it(finished_tiny, tmp_path):
+def test_every_method_is_configurable_and_outdates_dependent_results(finished_tiny, tmp_path):
     assert get_args(Processing.model_fields["autofocus_method"].annotation) == ("auto", "tracks", *METHODS)
     root = copy_writable(finished_tiny.root, tmp_path / "campaign")
     campaign = state(root, "processing", autofocus_method="tracks")

@@ -1,4 +1,4 @@
-"""The pipeline in one process: real and independent recordings in, images that are where and what they should be."""
+"""The pipeline in one process: image positions, resolution, phases and reproducibility from independent recordings."""
 
 import json
 
@@ -31,7 +31,7 @@ def findings(campaign, image):
 
 
 @pytest.mark.parametrize("image", ["uav1-uav1", "uav1-uav2", "fused"])
-def test_every_target_of_the_sample_focuses_within_3_cm(finished_sample, image):
+def test_targets_of_the_sample_focus_within_3_cm(finished_sample, image):
     targets = findings(finished_sample, image)
     assert len(targets) == 4
     assert max(finding.error_m for finding in targets) < 0.03
@@ -48,7 +48,7 @@ def test_coherent_fusion_is_narrower_than_either_pair(finished_sample):
 
 
 def test_mono_and_bistatic_phases_agree_at_the_targets(finished_sample):
-    """What lets the pairs add coherently; the sample's own model agrees within 0.06 rad."""
+    """Condition of the coherent sum; the generating model of the sample agrees within 0.06 rad."""
     cube = open_stage(finished_sample.stage("cube"), "cube").image.values[0]
     grid = open_scene(finished_sample).grid
     truth = json.loads((finished_sample.root / "truth.json").read_text())["targets"]
@@ -60,8 +60,8 @@ def test_mono_and_bistatic_phases_agree_at_the_targets(finished_sample):
 
 
 @pytest.mark.slow
-def test_without_the_sidelink_the_bistatic_image_falls_apart(finished_sample, monkeypatch, tmp_path):
-    """Both phase histories scaled to equal RMS; the peak drops by at least 15 dB."""
+def test_bistatic_image_requires_the_sidelink(finished_sample, monkeypatch, tmp_path):
+    """Without sidelink correction, at equal RMS of the phase histories, the peak drops by at least 15 dB."""
     pair = ("f01", "uav1-uav2")
     scene = open_scene(finished_sample)
     grid, ground = scene.grid, scene.terrain
@@ -98,7 +98,7 @@ def test_without_the_sidelink_the_bistatic_image_falls_apart(finished_sample, mo
 
 @pytest.mark.slow
 def test_gotcha_trihedrals_focus_within_30_cm(shared, tmp_path):
-    """Two degrees of aperture of the airborne X-band circle, by the same steps, in a frame without a place on Earth."""
+    """Two degrees of the airborne circular X-band aperture, by the same steps, in a local frame."""
     root = tmp_path / "gotcha"
     (root / "config").mkdir(parents=True)
     (root / "raw" / "pass1").mkdir(parents=True)
@@ -127,7 +127,7 @@ def test_gotcha_trihedrals_focus_within_30_cm(shared, tmp_path):
 
 @pytest.mark.parametrize("window", ["hann", "none"])
 @pytest.mark.parametrize("pair", ["uav1-uav1", "uav1-uav2"])
-def test_the_table_engine_meets_its_error(finished_sample, window, pair):
+def test_table_engine_meets_its_error_bound(finished_sample, window, pair):
     dataset = PairEcho.opened(finished_sample, "f01", pair).stage
     scene = open_scene(finished_sample)
     grid, ground = scene.grid, scene.terrain
@@ -146,10 +146,10 @@ def test_the_table_engine_meets_its_error(finished_sample, window, pair):
     assert numerical_error_db(computed, reference.form(spectra, pixels)) < -50
 
 
-def test_what_the_product_says_of_its_error_is_true(finished_tiny):
-    """Recomputed here at other pixels than those it was certified on."""
+def test_stated_numerical_error_is_confirmed(finished_tiny):
+    """Recomputed at other pixels than those of the certificate."""
     pair = ("f01", "uav1-uav2")
-    said = json.loads((finished_tiny.results / "f01" / "uav1-uav2" / "image.json").read_text())
+    report = json.loads((finished_tiny.results / "f01" / "uav1-uav2" / "image.json").read_text())
     dataset = PairEcho.opened(finished_tiny, *pair).stage
     formed = open_stage(finished_tiny.stage("image", *pair), "image").image.values
     frequency, places = dataset.frequency.values, (dataset.tx_position.values, dataset.rx_position.values)
@@ -159,11 +159,11 @@ def test_what_the_product_says_of_its_error_is_true(finished_tiny):
     scene = open_scene(finished_tiny)
     exact = reference.form(spectra, scene.terrain.positions_at(scene.grid, rows, columns))
     measured = numerical_error_db(formed[rows, columns], exact)
-    assert said["numerical_error_estimate_db"] == pytest.approx(measured, abs=3)
+    assert report["numerical_error_estimate_db"] == pytest.approx(measured, abs=3)
 
 
 @pytest.mark.slow
-def test_two_runs_give_the_same_bytes(tiny, finished_tiny):
+def test_two_runs_write_identical_bytes(tiny, finished_tiny):
     run_steps(tiny)
     products = sorted(
         path for path in finished_tiny.results.rglob("*") if path.suffix in {".tif", ".png", ".qml", ".vrt", ".geojson"}
@@ -173,13 +173,13 @@ def test_two_runs_give_the_same_bytes(tiny, finished_tiny):
         other = tiny / "results" / product.relative_to(finished_tiny.results)
         assert other.read_bytes() == product.read_bytes(), product.name
     manifests = sorted(finished_tiny.results.rglob("*.manifest.json"))
-    assert len(manifests) == 25  # two nodes, two pairs, the flight, what they add up to, and the campaign
+    assert len(manifests) == 25  # of two nodes, two pairs, the flight, its sums and the campaign
     for manifest in manifests:
         assert (tiny / "results" / manifest.relative_to(finished_tiny.results)).read_bytes() == manifest.read_bytes()
 
 
 @pytest.mark.slow
-def test_a_threefold_thread_count_changes_nothing(tiny, finished_tiny):
+def test_thread_count_does_not_change_the_image(tiny, finished_tiny):
     campaign = Campaign.load(tiny)
     run_steps(tiny, exports=False)
     from apertura.stages import image

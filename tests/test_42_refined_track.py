@@ -1,4 +1,4 @@
-"""Tracks refined by the images: whether it is done, what images are then formed from, and what they say of it."""
+"""Track refinement from images: the decision, image formation with refined tracks, and the reports."""
 
 import csv
 import json
@@ -38,11 +38,11 @@ from apertura.views.score import score
 from apertura.workflow.stale import stale_results
 
 PAIRS = ("uav1-uav1", "uav1-uav2")
-FOUND = (Decision("autofocus", "on", "asked for"), Decision("autofocus_method", "tracks", "asked for"))
+DECISIONS = (Decision("autofocus", "on", "asked for"), Decision("autofocus_method", "tracks", "asked for"))
 
 
-def refresh(campaign):
-    """Make what images of the first flight begin with."""
+def run_steps_before_image(campaign):
+    """Run the steps before image formation for the first flight."""
     ingest_all(campaign)
     for pair in PAIRS:
         echo.echo(campaign, "f01", pair)
@@ -52,7 +52,7 @@ def refresh(campaign):
 
 
 @pytest.mark.parametrize(
-    ("asked", "loss_db", "silent", "value"),
+    ("configured", "loss_db", "unstated_nodes", "value"),
     [
         ("auto", -TOLERATED_LOSS_DB - 0.01, [], "on"),
         ("auto", -TOLERATED_LOSS_DB + 0.01, [], "off"),
@@ -61,15 +61,13 @@ def refresh(campaign):
         ("off", -5.0, [], "off"),
     ],
 )
-def test_tracks_are_refined_where_that_is_asked_or_errors_that_are_stated_cost_more_than_is_borne(
-    asked, loss_db, silent, value
-):
-    decision = decide_autofocus(asked, {"a-a": 0.0, "a-b": loss_db}, silent)
+def test_tracks_are_refined_if_configured_or_if_errors_exceed_tolerance(configured, loss_db, unstated_nodes, value):
+    decision = decide_autofocus(configured, {"a-a": 0.0, "a-b": loss_db}, unstated_nodes)
     assert decision.value == value
-    assert ("position_std_m" in decision.reason) is (silent == ["b"])
+    assert ("position_std_m" in decision.reason) is (unstated_nodes == ["b"])
 
 
-def test_tracks_left_alone_have_no_knots_and_their_images_say_why(finished_tiny):
+def test_unrefined_tracks_have_no_knots_and_the_reason_is_reported(finished_tiny):
     stage = open_campaign(finished_tiny.root).stage("refined_track", "f01")
     assert dict(stage.sizes) == {"node": 2, "knot": 0, "axis": 3, "pair": 0}
     assert stage.attrs["nodes"] == ["uav1", "uav2"]
@@ -83,7 +81,7 @@ def test_tracks_left_alone_have_no_knots_and_their_images_say_why(finished_tiny)
     assert quality["models"]["autofocus"].startswith("off: auto: position accuracy")
 
 
-def test_where_nothing_is_corrected_images_are_formed_from_the_very_same_arrays(finished_tiny):
+def test_without_correction_images_use_the_original_arrays(finished_tiny):
     track, pair = open_refined(finished_tiny, "f01"), open_pair(finished_tiny, "f01", "uav1-uav2")
     profiles = profiles_of(open_stage(finished_tiny.stage("profile", "f01", "uav1-uav2"), "profile"))
     assert track.pair(pair) is pair
@@ -91,49 +89,51 @@ def test_where_nothing_is_corrected_images_are_formed_from_the_very_same_arrays(
 
 
 @pytest.fixture(scope="module")
-def spoilt(finished_tiny, tmp_path_factory):
-    """A campaign whose transmitter's log is wrong by centimetres, profiles made, and what would mend it."""
-    root = copy_writable(finished_tiny.root, tmp_path_factory.mktemp("spoilt") / "campaign")
+def erroneous(finished_tiny, tmp_path_factory):
+    """Return a campaign with errors of centimetres in the transmitter's log, profiles formed, and their correction."""
+    root = copy_writable(finished_tiny.root, tmp_path_factory.mktemp("erroneous") / "campaign")
     path = root / "raw" / "f01" / "uav1.track.csv"
     log = read_log(path)
     error_m = 0.03 * np.sin(2 * np.pi * log.time_s[:, None] / np.array([2.1, 1.7, 2.4]) + np.array([0.0, 1.0, 2.0]))
     moved = log.moved(error_m)
     write_log(path, moved)
     campaign = Campaign.load(root)
-    refresh(campaign)
+    run_steps_before_image(campaign)
     back_m = ecef_from_geodetic(*log.geodetic.T) - ecef_from_geodetic(*moved.geodetic.T)
     return campaign, (log.begun, TrackCorrection(log.time_s, {"uav1": back_m, "uav2": np.zeros_like(back_m)}))
 
 
-def write_track(campaign, began, correction, *, accepted=True, flags=None):
-    """Write the stage that a refinement would, which has found this."""
+def write_track(campaign, start, correction, *, accepted=True, flags=None):
+    """Write the stage of a refinement with this correction."""
     opened = open_scene(campaign)
     records = []
     for name in PAIRS:
         pair = open_pair(campaign, "f01", name)
         profiles = profiles_of(open_stage(campaign.stage("profile", "f01", name), "profile"))
-        records.append(PairRecord(name, profiles, clock_s(pair, began), pair.sidelink_m))
+        records.append(PairRecord(name, profiles, clock_s(pair, start), pair.sidelink_m))
     std_m = {node: np.full_like(moved, 1e-3) for node, moved in correction.moved_m.items()}
     report = {"gain_held_out_db": 3.0, "left_db": -0.05, "left_rad": 0.1, "gauge_shift_m": 0.01}
-    found = Refinement(correction, std_m, accepted, "as told", report, flags or {})
-    given = RefinementInputs(tuple(records), {}, (), began)
-    stage = refine.refined_stage(found, FOUND, given, opened)
+    refinement = Refinement(correction, std_m, accepted, "as told", report, flags or {})
+    inputs = RefinementInputs(tuple(records), {}, (), start)
+    stage = refine.refined_stage(refinement, DECISIONS, inputs, opened)
     save_stage(stamped(stage, "refined_track", modules=[refine.__name__]), campaign.stage("refined_track", "f01"))
 
 
 @pytest.mark.slow
-def test_images_of_a_corrected_track_are_those_of_the_true_one(spoilt, finished_tiny):
-    campaign, found = spoilt
-    likeness = {}
+def test_corrected_track_gives_the_images_of_the_true_track(erroneous, finished_tiny):
+    campaign, correction = erroneous
+    correlation = {}
     for accepted in (False, True):
-        write_track(campaign, *found, accepted=accepted, flags={"position_error_understated": "told so"})
+        write_track(campaign, *correction, accepted=accepted, flags={"position_error_understated": "told so"})
         for pair in PAIRS:
             image.image(campaign, "f01", pair)
-            right, now = (image_of(one, pair) for one in (finished_tiny, campaign))
-            likeness[pair, accepted] = abs(np.vdot(right, now)) / np.linalg.norm(right) / np.linalg.norm(now)
+            true, corrected = (image_of(which, pair) for which in (finished_tiny, campaign))
+            correlation[pair, accepted] = (
+                abs(np.vdot(true, corrected)) / np.linalg.norm(true) / np.linalg.norm(corrected)
+            )
     for pair in PAIRS:
-        assert likeness[pair, False] < 0.9
-        assert likeness[pair, True] > 0.9999
+        assert correlation[pair, False] < 0.9
+        assert correlation[pair, True] > 0.9999
         quality = quality_of(campaign, pair)
         assert quality["autofocus"]["rms_cm"]["uav1"] == pytest.approx(3 * np.sqrt(3 / 2), rel=0.15)
         assert quality["autofocus"]["gain_held_out_db"] == 3.0
@@ -151,37 +151,37 @@ def test_images_of_a_corrected_track_are_those_of_the_true_one(spoilt, finished_
 
 
 @pytest.mark.slow
-def test_a_campaign_that_is_given_its_refined_logs_makes_the_same_images(spoilt, tmp_path):
-    """Tracks as delivered are what images were formed from: of the table with attitude, of the solution without."""
-    campaign, (began, mending) = spoilt
-    wave_m = 0.02 * np.sin(mending.time_s[:, None] / np.array([0.4, 0.5, 0.3]))
-    both = TrackCorrection(mending.time_s, {"uav1": mending.moved_m["uav1"], "uav2": wave_m})
-    write_track(campaign, began, both)
+def test_delivered_refined_logs_give_the_same_images(erroneous, tmp_path):
+    """Images are formed from the delivered tracks: a CSV table with attitude, and a .pos solution without."""
+    campaign, (start, correction) = erroneous
+    wave_m = 0.02 * np.sin(correction.time_s[:, None] / np.array([0.4, 0.5, 0.3]))
+    both = TrackCorrection(correction.time_s, {"uav1": correction.moved_m["uav1"], "uav2": wave_m})
+    write_track(campaign, start, both)
     tracks.tracks(campaign, "f01")
     logged = copy_writable(campaign.root, tmp_path / "logged")
-    given = copy_writable(campaign.root, tmp_path / "given")
+    delivered = copy_writable(campaign.root, tmp_path / "delivered")
     for node, suffix in (("uav1", "csv"), ("uav2", "pos")):
-        (given / "raw" / "f01" / f"{node}.track.{suffix}").write_bytes(
+        (delivered / "raw" / "f01" / f"{node}.track.{suffix}").write_bytes(
             (campaign.results / "f01" / "tracks" / f"{node}.{suffix}").read_bytes()
         )
-    for root in (logged, given):
+    for root in (logged, delivered):
         off = state(root, "processing", autofocus="off")
-        refresh(off)
+        run_steps_before_image(off)
         refine.refine(off, "f01")
     for pair in PAIRS:
-        made = []
-        for one in (campaign, Campaign.load(logged), Campaign.load(given)):
-            image.image(one, "f01", pair)
-            made.append(image_of(one, pair) / np.linalg.norm(image_of(one, pair)))
-        refined, as_logged, from_files = made
+        images = []
+        for which in (campaign, Campaign.load(logged), Campaign.load(delivered)):
+            image.image(which, "f01", pair)
+            images.append(image_of(which, pair) / np.linalg.norm(image_of(which, pair)))
+        refined, as_logged, from_files = images
         assert abs(np.vdot(refined, as_logged)) < 0.9
         assert abs(np.vdot(refined, from_files)) > 0.9999
 
 
 @pytest.mark.slow
-def test_hypotheses_begin_where_the_images_do(spoilt):
-    campaign, found = spoilt
-    write_track(campaign, *found)
+def test_hypotheses_start_from_the_refined_tracks(erroneous):
+    campaign, correction = erroneous
+    write_track(campaign, *correction)
     track, waveform = open_refined(campaign, "f01"), campaign.settings.waveform
     logged = {
         node: open_acquisition(campaign, "f01", node, transmitted(campaign, waveform)) for node in ("uav1", "uav2")
@@ -189,15 +189,15 @@ def test_hypotheses_begin_where_the_images_do(spoilt):
     nodes = {name: track.node(node) for name, node in logged.items()}
     for name in PAIRS:
         pair = open_pair(campaign, "f01", name)
-        told = subset_geometry(logged, name, PairEcho.opened(campaign, "f01", name).stage, "hann")
-        (moved,) = with_logs(nodes, [told])
+        geometry = subset_geometry(logged, name, PairEcho.opened(campaign, "f01", name).stage, "hann")
+        (moved,) = with_logs(nodes, [geometry])
         imaged = track.pair(pair).history
         assert np.abs(imaged.aperture.tx_m - pair.aperture.tx_m).max() > 0.02
         np.testing.assert_allclose(moved.history.aperture.tx_m, imaged.aperture.tx_m, atol=1e-3)
         np.testing.assert_allclose(moved.history.reference_delay_s, imaged.reference_delay_s, atol=1e-3 / 3e8)
 
 
-def test_what_refinement_costs_or_knows_makes_again_only_what_stands_on_it(finished_tiny, tmp_path):
+def test_settings_of_refinement_outdate_only_dependent_results(finished_tiny, tmp_path):
     root = copy_writable(finished_tiny.root, tmp_path / "campaign")
     x, y = np.mean(np.reshape(finished_tiny.settings.scene.bounds_m, (2, 2)), axis=0).tolist()
     known = [{"name": "corner", "position_m": [x, y, 620.0], "std_m": 0.01}]
@@ -210,49 +210,49 @@ def test_what_refinement_costs_or_knows_makes_again_only_what_stands_on_it(finis
 
 
 @pytest.mark.parametrize(
-    ("by_m", "told"),
+    ("by_m", "message"),
     [((4.0, 0.0, 0.0), "outside the scene"), ((0.0, 0.0, 2000.0), "close to the terrain of the scene, about 620.0 m")],
 )
-def test_a_reference_point_outside_the_scene_is_told(finished_tiny, tmp_path, by_m, told):
+def test_reference_point_outside_the_scene_is_reported(finished_tiny, tmp_path, by_m, message):
     root = copy_writable(finished_tiny.root, tmp_path / "campaign")
     x, y = np.mean(np.reshape(finished_tiny.settings.scene.bounds_m, (2, 2)), axis=0).tolist()
     place = [x + by_m[0], y + by_m[1], 620.0 + by_m[2]]
     state(root, "scene", reference_points=[{"name": "corner", "position_m": place, "std_m": 0.01}])
     (line,) = map(as_line, problems(root))
     assert line.startswith("config/config.yaml: scene.reference_points[0]: corner")
-    assert told in line
+    assert message in line
     with pytest.raises(CampaignError, match="positions of reference_points refer to crs, which is auto"):
         state(root, "scene", crs="auto")
 
 
-def test_on_and_off_are_words_though_yaml_takes_them_for_truth(tiny):
+def test_on_and_off_are_read_as_text_and_not_as_booleans(tiny):
     for word in ("on", "off", "auto"):
         path = tiny / "config" / "config.yaml"
         path.write_text(path.read_text().partition("processing:")[0] + f"processing:\n  autofocus: {word}\n")
         assert Campaign.load(tiny).settings.processing.autofocus == word
 
 
-def test_the_plan_says_whether_tracks_will_be_refined_and_then_what_became_of_it(tiny, capsys):
+def test_plan_reports_the_autofocus_decision(tiny, capsys):
     edit_config(tiny, lambda document: [node.update(position_std_m=0.02) for node in document["nodes"].values()])
     print_plan(Campaign.load(tiny))
-    told = " ".join(capsys.readouterr().out.replace("│", " ").split())
-    assert told.count("autofocus on auto: configured position errors cost") == 2
+    printed = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert printed.count("autofocus on auto: configured position errors cost") == 2
 
 
-def asked_on(folder, *, pulses, half_m, std_m=0.0, said_m=0.02):
-    """A flight of so many pulses, with errors of its logs said to be so large, to be refined; profiles made."""
+def campaign_to_refine(folder, *, pulses, half_m, std_m=0.0, stated_m=0.02):
+    """Return a flight with true and stated log errors and autofocus on; its profiles are formed."""
     plan = replace(preset("demo", pulses=pulses), scene=ImageGrid("EPSG:32632", half_width_m=half_m, spacing_m=0.1))
     root = simulate(folder / "campaign", plan, seed=7)
-    spoil_logs(root, std_m, said_m)
+    add_noise(root, std_m, stated_m)
     campaign = state(root, "processing", autofocus="on")
-    refresh(campaign)
+    run_steps_before_image(campaign)
     return campaign
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("pulses", "half_m"), [(40, 3.0), (200, 6.0)])
-def test_right_logs_that_are_said_to_err_by_2_cm_are_left_as_they_are(tmp_path, pulses, half_m):
-    campaign = asked_on(tmp_path, pulses=pulses, half_m=half_m)
+def test_correct_logs_with_a_stated_error_of_2_cm_are_unchanged(tmp_path, pulses, half_m):
+    campaign = campaign_to_refine(tmp_path, pulses=pulses, half_m=half_m)
     refine.refine(campaign, "f01")
     image.image(campaign, "f01", "uav1-uav1")
     quality, stage = quality_of(campaign, "uav1-uav1"), open_refined(campaign, "f01").stage
@@ -271,18 +271,18 @@ def test_right_logs_that_are_said_to_err_by_2_cm_are_left_as_they_are(tmp_path, 
     assert open_refined(campaign, "f01").pair(pair) is pair
 
 
-def spoil_logs(root, std_m, said_m):
-    """Add noise that lasts a second to both logs, and say how large it is."""
+def add_noise(root, std_m, stated_m):
+    """Add noise with a correlation time of 1 s to both logs and state its standard deviation."""
     for path in sorted((root / "raw" / "f01").glob("*.track.*")):
         log = noisy(std_m, seed=3)(read_log(path))
-        write_log(path, log if log.attitude_deg is not None else saying(said_m)(log))
-    edit_config(root, lambda document: [node.update(position_std_m=said_m) for node in document["nodes"].values()])
+        write_log(path, log if log.attitude_deg is not None else saying(stated_m)(log))
+    edit_config(root, lambda document: [node.update(position_std_m=stated_m) for node in document["nodes"].values()])
 
 
 @pytest.mark.slow
-def test_errors_of_a_quarter_of_the_wavelength_are_mended_or_told(tmp_path):
-    """At the edge of the method: tracks may be a wavelength off over a part, and are then not taken."""
-    campaign = asked_on(tmp_path, pulses=600, half_m=6.0, std_m=0.05, said_m=0.05)
+def test_errors_of_a_quarter_wavelength_are_corrected_or_flagged(tmp_path):
+    """Limit of the method: a section of the track may be wrong by a wavelength, and is then rejected."""
+    campaign = campaign_to_refine(tmp_path, pulses=600, half_m=6.0, std_m=0.05, stated_m=0.05)
     refine.refine(campaign, "f01")
     stage = open_refined(campaign, "f01").stage
     assert stage.attrs["report"]["gain_held_out_db"] > 6
@@ -294,13 +294,13 @@ def test_errors_of_a_quarter_of_the_wavelength_are_mended_or_told(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_campaign_whose_logs_err_by_2_cm_refines_itself(tmp_path):
-    right, spoilt = (tmp_path / name for name in ("right", "spoilt"))
+def test_log_errors_of_2_cm_are_refined_automatically(tmp_path):
+    right, erroneous = (tmp_path / name for name in ("right", "erroneous"))
     simulate(right, preset("demo", pulses=600), seed=7)
-    copy_writable(right, spoilt)
-    spoil_logs(spoilt, 0.02, 0.02)
+    copy_writable(right, erroneous)
+    add_noise(erroneous, 0.02, 0.02)
     found = {}
-    for name, root in (("off", copy_writable(spoilt, tmp_path / "off")), ("auto", spoilt)):
+    for name, root in (("off", copy_writable(erroneous, tmp_path / "off")), ("auto", erroneous)):
         state(root, "processing", autofocus=name)
         campaign = run_steps(root)
         found[name] = {pair: quality_of(campaign, pair)["focus"]["loss_db"] for pair in PAIRS}
@@ -316,22 +316,22 @@ def test_a_campaign_whose_logs_err_by_2_cm_refines_itself(tmp_path):
     report = json.loads((campaign.results / "f01" / "uav1-uav1" / "image.json").read_text())
     assert report["autofocus"]["gain_held_out_db"] > 0.3
     runspec = json.loads(open_stage(campaign.stage("image", "f01", "uav1-uav1"), "image").attrs["runspec"])
-    assert runspec["uav1-uav2"]["nodes"].keys() == {"uav1", "uav2"}  # the image stands on the other pair, too
+    assert runspec["uav1-uav2"]["nodes"].keys() == {"uav1", "uav2"}  # the image depends on the other pair, too
     assert runspec["refined"] is True
     for node in ("uav1", "uav2"):
         check_delivered(campaign, node, right)
 
 
 def check_delivered(campaign, node, right):
-    """Check that a log as delivered is nearer to the one without errors, and errs by as much as it says."""
+    """Check that the error of a delivered log is smaller than before and agrees with its stated deviation."""
     (name,) = (path.name for path in (right / "raw" / "f01").glob(f"{node}.track.*"))
     true_m, logged_m = (
         ecef_from_geodetic(*read_log(root / "raw" / "f01" / name).geodetic.T) for root in (right, campaign.root)
     )
     with (campaign.results / "f01" / "tracks" / f"{node}.csv").open() as stream:
         table = list(csv.DictReader(stream))
-    words = {"time_utc", "quality"}
-    delivered = {column: np.array([float(row[column]) for row in table]) for column in table[0] if column not in words}
+    texts = {"time_utc", "quality"}
+    delivered = {column: np.array([float(row[column]) for row in table]) for column in table[0] if column not in texts}
     written_m = ecef_from_geodetic(*(delivered[name] for name in ("latitude_deg", "longitude_deg", "height_m")))
     enu = ned_axes(true_m)[..., [1, 0, 2]] * [1.0, 1.0, -1.0]
     before_m, after_m = (np.einsum("nai,na->ni", enu, one - true_m) for one in (logged_m, written_m))
@@ -348,10 +348,10 @@ def rms(values, axis=0):
     return np.sqrt((values**2).mean(axis=axis))
 
 
-def test_a_track_may_be_refined_without_its_sidelink_being_known(spoilt):
-    """Phase histories have none: their paths were given back no length."""
-    campaign, (began, correction) = spoilt
-    write_track(campaign, began, correction)
+def test_refined_track_applies_to_a_pair_without_sidelink(erroneous):
+    """Phase histories have no sidelink, whose length would be added to the paths."""
+    campaign, (start, correction) = erroneous
+    write_track(campaign, start, correction)
     track, pair = open_refined(campaign, "f01"), open_pair(campaign, "f01", "uav1-uav2")
     alone = track.pair(replace(pair, sidelink_m=None))
     np.testing.assert_array_equal(alone.history.reference_delay_s, pair.history.reference_delay_s)
@@ -360,18 +360,18 @@ def test_a_track_may_be_refined_without_its_sidelink_being_known(spoilt):
 
 
 @pytest.mark.slow
-def test_a_log_that_is_late_is_named_and_the_images_are_as_with_its_right_times(tmp_path):
-    """From raw samples: on bows flown at changing speed 0.1 s costs the images 6 dB and moves targets by 40 cm."""
+def test_delayed_log_is_identified_and_corrected(tmp_path):
+    """From raw samples: on curves at varying speed 0.1 s costs 6 dB and displaces targets by 40 cm."""
     campaign = Campaign.load(curved(tmp_path / "campaign"))
     path = campaign.root / "raw" / "f01" / "uav1.track.csv"
     write_log(path, late(0.1)(read_log(path)))
-    stated = {"position_std_m": 0.01}
-    edit_config(campaign.root, lambda document: [node.update(stated) for node in document["nodes"].values()])
+    accuracy = {"position_std_m": 0.01}
+    edit_config(campaign.root, lambda document: [node.update(accuracy) for node in document["nodes"].values()])
     campaign = run_steps(campaign.root)
-    found = open_refined(campaign, "f01").stage.attrs
-    assert list(found["flags"]) == ["cause_corrected"]
-    assert found["report"]["cause"]["what"].startswith("the times of the log of uav1 are ")
-    assert found["report"]["cause"]["values"] == pytest.approx([0.1], abs=0.01)
+    attrs = open_refined(campaign, "f01").stage.attrs
+    assert list(attrs["flags"]) == ["cause_corrected"]
+    assert attrs["report"]["cause"]["what"].startswith("the times of the log of uav1 are ")
+    assert attrs["report"]["cause"]["values"] == pytest.approx([0.1], abs=0.01)
     assert max(one.error_m for one in score(campaign)) < 0.03
     for pair in PAIRS:
         assert quality_of(campaign, pair)["focus"]["loss_db"] > -0.3

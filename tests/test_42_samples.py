@@ -1,4 +1,4 @@
-"""Campaigns whose waveform is a pulse given by its samples: from the recording to images, as with OFDM."""
+"""Waveforms given by the samples of a pulse: from the recording to images."""
 
 import json
 import re
@@ -40,7 +40,7 @@ PULSES = {
 
 @pytest.fixture(scope="module", params=[pytest.param(name, marks=pytest.mark.slow) for name in PULSES])
 def imaged(request, tmp_path_factory):
-    """Two nodes with noise, clocks of their own, missed triggers, random phases and starts; three targets."""
+    """Image three targets from two nodes with noise, own clocks, missed triggers, random phases and start times."""
     root = tmp_path_factory.mktemp(request.param) / "campaign"
     simulate(root, preset("demo", pulses=150), waveform=PULSES[request.param], targets=TARGETS)
     return run_steps(root, exports=False)
@@ -48,19 +48,19 @@ def imaged(request, tmp_path_factory):
 
 @pytest.fixture
 def tiny(tmp_path):
-    """Six pulses of a chirp, not yet ingested."""
+    """Write a campaign of six chirp pulses."""
     return simulate(tmp_path / "campaign", preset("demo", pulses=6), waveform=PULSES["chirp"], targets=TARGETS)
 
 
 def targets(campaign):
-    """Pixels of the targets."""
+    """Return the grid and the pixels of the targets."""
     grid = open_scene(campaign).grid
     truth = json.loads((campaign.root / "truth.json").read_text())["targets"]
     return grid, [tuple(float(value) for value in grid.pixel_of(one["x"], one["y"])) for one in truth]
 
 
 @pytest.mark.parametrize("pair", PAIRS)
-def test_every_target_of_a_pulse_focuses_within_a_centimetre(imaged, pair):
+def test_targets_of_a_pulse_focus_within_a_centimetre(imaged, pair):
     image = open_stage(imaged.stage("image", "f01", pair), "image").image.values
     grid, places = targets(imaged)
     assert len(places) == 3
@@ -69,7 +69,7 @@ def test_every_target_of_a_pulse_focuses_within_a_centimetre(imaged, pair):
         assert grid.spacing_m * np.hypot(peak.row - row, peak.column - column) < 0.01
 
 
-def test_pairs_of_a_pulse_cohere_by_the_sidelink(imaged):
+def test_pairs_of_a_pulse_are_coherent(imaged):
     images = [open_stage(imaged.stage("image", "f01", pair), "image").image.values for pair in PAIRS]
     _, places = targets(imaged)
     for row, column in places:
@@ -79,7 +79,7 @@ def test_pairs_of_a_pulse_cohere_by_the_sidelink(imaged):
 
 @pytest.fixture(scope="module", params=PULSES)
 def alone(request, tmp_path_factory):
-    """Echoes of one target, without noise."""
+    """Form the echoes of one target without noise."""
     root = tmp_path_factory.mktemp(f"{request.param}-alone") / "campaign"
     quiet = {"uav1": Impairments(), "uav2": Impairments(timing=Timing(half_width_s=20e-9))}
     simulate(root, preset("demo", pulses=20), waveform=PULSES[request.param], targets=TARGETS[:1], impairments=quiet)
@@ -93,18 +93,18 @@ def alone(request, tmp_path_factory):
 
 @pytest.mark.quick("chirp-*")
 @pytest.mark.parametrize("pair", PAIRS)
-def test_range_profiles_of_a_pulse_have_the_sidelobes_of_the_window_at_every_delay(alone, pair):
+def test_range_sidelobes_of_a_pulse_are_those_of_the_window(alone, pair):
     stage = PairEcho.opened(alone, "f01", pair).stage
     place = preset("demo").origin.ecef(np.zeros(3))
     path = sum(np.linalg.norm(stage[leg].values - place, axis=1) for leg in ("tx_position", "rx_position"))
-    turn = np.exp(2j * np.pi * np.outer(path / 299792458, stage.frequency.values))
-    mean = (stage.transfer.values * turn).mean(0)
+    phase = np.exp(2j * np.pi * np.outer(path / 299792458, stage.frequency.values))
+    mean = (stage.transfer.values * phase).mean(0)
     level = np.abs(np.fft.ifft(mean * window_weights("hann", mean.size), 16 * mean.size))
     assert level[0] > 0.999 * level.max()
     assert 20 * np.log10(level[38:-38].max() / level[0]) == pytest.approx(-31.5, abs=1.0)
 
 
-def test_the_echo_says_which_filter_and_why(imaged):
+def test_echo_reports_its_filter(imaged):
     for pair in PAIRS:
         attrs = PairEcho.opened(imaged, "f01", pair).stage.attrs
         assert attrs["waveform"]["filter"] == "inverse"
@@ -114,12 +114,12 @@ def test_the_echo_says_which_filter_and_why(imaged):
 
 
 @pytest.mark.slow
-def test_what_the_logs_promise_is_what_the_echo_has(tiny):
+def test_planned_pair_agrees_with_the_formed_echo(tiny):
     campaign = Campaign.load(tiny)
-    promised = [open_pair(campaign, "f01", pair) for pair in PAIRS]
+    planned = [open_pair(campaign, "f01", pair) for pair in PAIRS]
     for node in ("uav1", "uav2"):
         ingest.ingest(campaign, "f01", node)
-    for pair, before in zip(PAIRS, promised, strict=True):
+    for pair, before in zip(PAIRS, planned, strict=True):
         echo.echo(campaign, "f01", pair)
         formed = open_pair(campaign, "f01", pair)
         np.testing.assert_allclose(before.frequency_hz, formed.frequency_hz, rtol=1e-12)
@@ -131,31 +131,31 @@ def test_what_the_logs_promise_is_what_the_echo_has(tiny):
             )
 
 
-def test_a_point_moves_while_the_pulse_lasts_and_no_longer(imaged):
-    """Stop and go: half of 1 µs, at a few decimetres of path per second."""
+def test_stop_and_go_error_is_that_of_the_pulse_duration(imaged):
+    """Half of the pulse of 1 µs at a path rate of a few decimetres per second."""
     lines = {line.cause: line for line in budget_of(imaged, open_pair(imaged, "f01", PAIRS[0]), open_scene(imaged))}
     assert 0 < lines["stop and go"].effect.shift_m < 1e-6
 
 
 @pytest.mark.slow
-def test_no_hypothesis_improves_what_is_right(imaged):
+def test_no_hypothesis_improves_a_correct_image(imaged):
     grid, places = targets(imaged)
     x, y = grid.map_at(*places[0])
     assert hypotheses(imaged, "f01", brightest=(float(x), float(y)), cell_m=0.3) == []
 
 
-def test_a_campaign_of_a_pulse_passes_the_checks_and_asks_for_little(tiny):
+def test_campaign_of_a_pulse_passes_the_checks_with_little_memory(tiny):
     assert problems(tiny) == []
-    asked = Resources(Campaign.load(tiny))["echo"]
+    resources = Resources(Campaign.load(tiny))["echo"]
 
     class Wildcards:
         flight, pair = "f01", "uav1-uav2"
 
-    assert 400 < asked.mem_mb(Wildcards(), 1) < 1500
+    assert 400 < resources.mem_mb(Wildcards(), 1) < 1500
 
 
 @pytest.mark.parametrize(
-    ("changed", "told"),
+    ("changed", "message"),
     [
         ({"listen_s": 0.6e-6}, "or the sum of lead_s, pulse_s and listen_s"),
         ({"pulse_s": 0.9e-6}, "complex64 of shape (1024,)"),
@@ -165,16 +165,16 @@ def test_a_campaign_of_a_pulse_passes_the_checks_and_asks_for_little(tiny):
         ({"listen_s": 0.02e-6}, "the limit by waveform.listen_s"),
     ],
 )
-def test_what_does_not_fit_the_recording_is_told_before_anything_runs(tiny, changed, told):
+def test_waveform_inconsistent_with_the_recording_is_reported_by_check(tiny, changed, message):
     edit_config(tiny, lambda document: document["waveform"].update(changed))
     lines = [str(problem) for problem in problems(tiny)]
-    assert any(told in line for line in lines), lines
+    assert any(message in line for line in lines), lines
 
 
 @pytest.mark.quick("2.5e-07-True")
 @pytest.mark.parametrize(("late_s", "cut"), [(0.05e-6, False), (0.25e-6, True), (-0.6e-6, True)])
-def test_captures_that_begin_in_the_direct_pulse_or_end_in_it_are_flagged(tmp_path, late_s, cut):
-    """They begin 0.1 µs before it, less what the recorder is late by, and end 0.5 µs after it."""
+def test_captures_that_truncate_the_direct_pulse_are_flagged(tmp_path, late_s, cut):
+    """A capture begins 0.1 µs before the pulse, less the delay of the recorder, and ends 0.5 µs after it."""
     root, timing = tmp_path / "campaign", {"uav2": Impairments(timing=Timing(offset_s=late_s))}
     simulate(root, preset("demo", pulses=20), waveform=PULSES["pn"], targets=TARGETS, impairments=timing)
     campaign = Campaign.load(root)
@@ -184,7 +184,7 @@ def test_captures_that_begin_in_the_direct_pulse_or_end_in_it_are_flagged(tmp_pa
     assert ("pulse_truncated" in PairEcho.opened(campaign, "f01", "uav1-uav2").stage.attrs["flags"]) is cut
 
 
-def test_captures_shorter_than_a_pulse_and_its_echoes_are_refused_by_the_step(tiny):
+def test_too_short_captures_are_refused_by_the_echo_step(tiny):
     for node in ("uav1", "uav2"):
         ingest.ingest(Campaign.load(tiny), "f01", node)
     edit_config(tiny, lambda document: document["waveform"].update(listen_s=0.7e-6))
@@ -192,8 +192,8 @@ def test_captures_shorter_than_a_pulse_and_its_echoes_are_refused_by_the_step(ti
         echo.echo(Campaign.load(tiny), "f01", "uav1-uav2")
 
 
-def test_a_recording_that_never_stopped_begins_with_the_pulse(tmp_path):
-    """Where the trigger says; a lead would be taken for a part of the delay."""
+def test_lead_is_refused_for_a_continuous_recording(tmp_path):
+    """Captures start at the trigger; a lead would be taken as a part of the delay."""
     root = simulate(tmp_path / "campaign", preset("continuous", pulses=2))
     waveform = {"kind": "samples", "carrier_hz": 1.2e9, "sample_rate_hz": 64e6, "prf_hz": 1000.0}
     waveform |= {"pulse_s": 4e-6, "listen_s": 2e-6, "lead_s": 1e-6}
@@ -202,7 +202,7 @@ def test_a_recording_that_never_stopped_begins_with_the_pulse(tmp_path):
         ingest.ingest(Campaign.load(root), "f01", "uav1")
 
 
-def test_a_specification_of_a_pulse_is_read_back_as_it_was(tmp_path):
+def test_pulse_specification_is_read_back_unchanged(tmp_path):
     whole = preset("demo", pulses=3)
     changed = type(whole)(**{**vars(whole), "waveform": PULSES["pn"]})
     (tmp_path / "spec.yaml").write_text(specification_text(changed))
@@ -210,15 +210,15 @@ def test_a_specification_of_a_pulse_is_read_back_as_it_was(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("changed", "told"),
+    ("changed", "message"),
     [({"bandwidth_hz": 2e9}, "exceeds sample_rate_hz"), ({"pulse": "pn", "bandwidth_hz": 300e6}, "whole samples")],
 )
-def test_a_pulse_that_cannot_be_sampled_is_refused(changed, told):
-    with pytest.raises(ValueError, match=told):
+def test_pulse_that_cannot_be_sampled_is_refused(changed, message):
+    with pytest.raises(ValueError, match=message):
         PulseSpecification(**({"pulse": "chirp", "bandwidth_hz": 400e6, "pulse_s": 1e-6, **SIZES} | changed))
 
 
-def test_the_pulse_of_the_how_to_is_the_one_that_its_config_states(tmp_path, monkeypatch):
+def test_pulse_of_the_how_to_agrees_with_its_config(tmp_path, monkeypatch):
     text = (ROOT / "docs/howto/samples.md").read_text(encoding="utf-8")
     code, config = (re.findall(rf"```{name}\n(.*?)```", text, re.S) for name in ("python", "yaml"))
     assert (len(code), len(config)) == (1, 1)
@@ -234,5 +234,5 @@ def test_the_pulse_of_the_how_to_is_the_one_that_its_config_states(tmp_path, mon
     frequency_hz = np.fft.fftfreq(waveform.capture_samples, 1 / waveform.sample_rate_hz)
     inside = (frequency_hz >= waveform.band_hz[0]) & (frequency_hz <= waveform.band_hz[1])
     assert spectrum[inside].sum() > 0.95 * spectrum.sum()
-    told_m = float(re.search(r"up to (\d+) m of total path", text)[1])
-    assert told_m == pytest.approx(299792458 * waveform.longest_delay_s, rel=0.01)
+    stated_m = float(re.search(r"up to (\d+) m of total path", text)[1])
+    assert stated_m == pytest.approx(299792458 * waveform.longest_delay_s, rel=0.01)
