@@ -1,4 +1,4 @@
-"""A campaign's air, from its config to the image: what is stated, what it is taken for, where targets lie."""
+"""Atmosphere of a campaign, from the config to the image: refractivity, wave speed, target positions."""
 
 import json
 from dataclasses import replace
@@ -25,7 +25,7 @@ C = SPEED_OF_LIGHT_M_S
 
 
 @pytest.mark.parametrize(
-    ("air", "found"),
+    ("atmosphere", "message"),
     [
         ("space", "auto"),
         ({"refractivity_n": 1000.0}, "less than or equal to 500"),
@@ -40,61 +40,61 @@ C = SPEED_OF_LIGHT_M_S
         (290, "atmosphere"),
     ],
 )
-def test_a_wrong_atmosphere_is_one_message_that_names_the_key(tiny, air, found):
-    said = complaint(lambda: state(tiny, "scene", atmosphere=air))
-    assert "scene.atmosphere" in said
-    assert found in said
+def test_invalid_atmosphere_is_one_message_with_the_key(tiny, atmosphere, message):
+    printed = complaint(lambda: state(tiny, "scene", atmosphere=atmosphere))
+    assert "scene.atmosphere" in printed
+    assert message in printed
 
 
 def positions(campaign):
     return raw_log(campaign, "f01", "uav1", 0.2).track.position.values
 
 
-def test_the_air_is_that_of_the_config_at_the_ground_of_the_scene(tiny):
-    """The ground is 620 m high; antennas fly 4.8 m above it."""
+def test_atmosphere_is_that_of_the_config_at_terrain_height(tiny):
+    """Terrain height 620 m, antennas 4.8 m above it: N is smaller along the path by the factor exp(−2.4/7350)."""
     weather = {"temperature_c": 25.0, "pressure_hpa": 930.0, "relative_humidity": 70.0}
-    for stated, expected in (
+    for configured, expected in (
         ("auto", Atmosphere.standard(620.0)),
         (weather, Atmosphere.of_weather(25.0, 930.0, 70.0, ground_m=620.0)),
         ({"refractivity_n": 333.0}, Atmosphere.stated(333.0, ground_m=620.0)),
         ("vacuum", Atmosphere.vacuum()),
     ):
-        campaign = state(tiny, "scene", atmosphere=stated)
+        campaign = state(tiny, "scene", atmosphere=configured)
         assert scene_air(campaign, positions(campaign)).atmosphere == expected
         opened = open_pair(campaign, "f01", "uav1-uav2")
-        thinner = np.exp(-2.4 / 7350)
-        assert opened.air["refractivity_n"] == pytest.approx(thinner * expected.refractivity_n, rel=1e-4)
+        along_path = np.exp(-2.4 / 7350)
+        assert opened.air["refractivity_n"] == pytest.approx(along_path * expected.refractivity_n, rel=1e-4)
         assert opened.wave_speed_m_s == pytest.approx(C / (1 + 1e-6 * opened.air["refractivity_n"]), rel=1e-9)
         assert expected.source in air_decision(opened).reason
     assert opened.wave_speed_m_s == C
 
 
-def test_a_height_of_focus_that_moves_the_ground_by_a_metre_leaves_the_air_as_it_is(tiny):
+def test_atmosphere_is_unchanged_by_a_focus_height_of_one_metre(tiny):
     campaign = state(tiny, "scene", height_m=621.0)
     assert scene_air(campaign, positions(campaign)).atmosphere == Atmosphere.standard(620.0)
 
 
-def test_a_sidelink_is_as_long_as_its_air_at_the_height_of_the_antennas_makes_it(tiny):
+def test_electrical_length_of_the_sidelink_depends_on_its_height(tiny):
     campaign = state(tiny, "scene", atmosphere={"refractivity_n": 300.0})
     air = scene_air(campaign, positions(campaign))
-    some = positions(campaign)[:5]
-    up = some / np.linalg.norm(some, axis=1, keepdims=True)
-    high, other = some + 2000 * up, some + 2000 * up + np.array([0.0, 30.0, 0.0])
+    start = positions(campaign)[:5]
+    up = start / np.linalg.norm(start, axis=1, keepdims=True)
+    high, other = start + 2000 * up, start + 2000 * up + np.array([0.0, 30.0, 0.0])
     height_m = geodetic_from_ecef(high)[:, 2]
     np.testing.assert_allclose(
         air.electrical_m(high, other), 30 + 30 * 300e-6 * np.exp((620 - height_m) / 7350), rtol=1e-7
     )
 
 
-def test_the_product_says_which_air_it_took_and_what_vacuum_would_have_done(finished_tiny):
-    said = json.loads((finished_tiny.results / "f01/uav1-uav2/image.json").read_text())
-    air = said["atmosphere"]
+def test_product_reports_its_atmosphere_and_the_shift_in_vacuum(finished_tiny):
+    report = json.loads((finished_tiny.results / "f01/uav1-uav2/image.json").read_text())
+    air = report["atmosphere"]
     assert air["source"] == "standard atmosphere, terrain height 620 m, humidity 50 %"
     assert air["vacuum_shift_m"] == pytest.approx(air["refractivity_n"] * 1e-6 * 12.2, rel=0.15)
-    assert said["models"]["atmosphere"].startswith(f"N = {air['refractivity_n']:.1f}: standard atmosphere")
-    (line,) = (line for line in said["budget"] if line["cause"] == "atmosphere")
+    assert report["models"]["atmosphere"].startswith(f"N = {air['refractivity_n']:.1f}: standard atmosphere")
+    (line,) = (line for line in report["budget"] if line["cause"] == "atmosphere")
     assert line["stated"].startswith("not stated; assumed standard atmosphere")
-    assert 1e-4 < line["shift_m"] < 1e-3  # 25 N of 12 m
+    assert 1e-4 < line["shift_m"] < 1e-3  # 25 N over a path of 12 m
     assert 0 < line["phase_rad"] < 0.02
     stage = open_stage(finished_tiny.stage("profile", "f01", "uav1-uav2"), "profile")
     assert stage.attrs["wave_speed_m_s"] == pytest.approx(C / (1 + 1e-6 * air["refractivity_n"]), rel=1e-9)
@@ -103,16 +103,16 @@ def test_the_product_says_which_air_it_took_and_what_vacuum_would_have_done(fini
 # ---- Phase histories --------------------------------------------------------------------------------------------
 
 
-OF_400_M = 1 + 300e-6 * (1 - np.exp(-400 / 7350)) / (400 / 7350)
-"""Index on the way from 400 m, where N is 300 at the ground."""
+MEAN_INDEX = 1 + 300e-6 * (1 - np.exp(-400 / 7350)) / (400 / 7350)
+"""Mean refractive index between the terrain, where N is 300, and a height of 400 m."""
 
 
-def recorded(reference):
-    place = np.array([[0.0, -500.0, 400.0], [5.0, -500.0, 400.0]])
+def phase_history(reference):
+    position = np.array([[0.0, -500.0, 400.0], [5.0, -500.0, 400.0]])
     return xr.Dataset(
         {
-            "tx_position": (("pulse", "axis"), place),
-            "rx_position": (("pulse", "axis"), place),
+            "tx_position": (("pulse", "axis"), position),
+            "rx_position": (("pulse", "axis"), position),
             "reference_delay": ("pulse", np.full(2, 1000.0 / C)),
         },
         attrs={"reference": reference},
@@ -120,36 +120,36 @@ def recorded(reference):
 
 
 @pytest.mark.parametrize(
-    ("asked", "given", "path_m", "slower"),
+    ("configured", "reference", "path_m", "slower"),
     [
         ("auto", "point", 1000.0, True),
-        ("auto", "delay", 1000.0 / OF_400_M, True),
+        ("auto", "delay", 1000.0 / MEAN_INDEX, True),
         ("point", "delay", 1000.0, True),
-        ("measured", "point", 1000.0 / OF_400_M, True),
+        ("measured", "point", 1000.0 / MEAN_INDEX, True),
         ("corrected", "point", 1000.0, False),
     ],
 )
-def test_a_phase_history_is_referred_to_a_point_or_to_a_delay(tmp_path, asked, given, path_m, slower):
+def test_phase_history_is_referenced_to_a_point_or_a_delay(tmp_path, configured, reference, path_m, slower):
     (tmp_path / "config").mkdir()
     (tmp_path / "config/config.yaml").write_text(
-        "campaign: c\nwaveform: {kind: phase_history, format: hdf5, air: " + asked + "}\nnodes: {radar: {}}\n"
+        "campaign: c\nwaveform: {kind: phase_history, format: hdf5, air: " + configured + "}\nnodes: {radar: {}}\n"
         "scene: {crs: local, bounds_m: [-5, -5, 5, 5], spacing_m: 0.5, atmosphere: {refractivity_n: 300}}\n"
     )
     (tmp_path / "config/flights.tsv").write_text("flight\tkind\ttransmitter\tnodes\nf01\timage\tradar\tradar\n")
-    history = in_air(Campaign.load(tmp_path), recorded(given))
+    history = in_air(Campaign.load(tmp_path), phase_history(reference))
     speed = history.attrs["wave_speed_m_s"]
     np.testing.assert_allclose(history.reference_delay * speed, path_m, rtol=1e-12)
     assert (speed < C) == slower
 
 
-# ---- A flight through air -------------------------------------------------------------------------------------------
+# ---- A flight in the atmosphere -------------------------------------------------------------------------------------
 
 HEIGHT_M = 300.0
 
 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory):
-    """Two nodes at 300 m past targets 300 m aside, through air 10 K warmer and 20 hPa denser than the standard's."""
+    """Write a flight at 300 m height past a target at 300 m, 10 K and 20 hPa above the standard atmosphere."""
     base = preset("demo")
     range_m, pulses = HEIGHT_M * np.sqrt(2), 120
     waveform = WaveformSpecification(200, 1.3e9, 1e6, 1e-6, 4e-6, 256e6, 20.0)
@@ -172,8 +172,8 @@ def flown(tmp_path_factory):
     return simulate(tmp_path_factory.mktemp("air") / "campaign", specification, seed=1), warm
 
 
-def off_m(campaign, pair):
-    """Return how far north of its place the target is found."""
+def north_error_m(campaign, pair):
+    """Return the northward displacement of the target in the image."""
     image = image_of(campaign, pair)
     row, column = np.unravel_index(int(np.abs(image).argmax()), image.shape)
     peak = find_peak(image, int(row), int(column))
@@ -183,23 +183,27 @@ def off_m(campaign, pair):
 
 
 @pytest.mark.slow
-def test_targets_seen_through_air_lie_where_they_stand_and_beyond_in_vacuum(flown, tmp_path):
-    """Stated air: to a centimetre of 75; `auto`: within what its budget says; vacuum: by eq. 5; in phase in all."""
+def test_configured_atmosphere_puts_targets_at_their_positions(flown, tmp_path):
+    """Errors: configured air 1 cm of 75 cm; `auto` within its budget; vacuum by eq. 5; pairs in phase in each case."""
     root, warm = flown
     pairs, expected_m = ("uav1-uav1", "uav1-uav2"), 1e-6 * warm * HEIGHT_M * np.sqrt(2) * np.sqrt(2)
-    found = {}
+    results = {}
     for name, air in (("stated", {"refractivity_n": warm}), ("auto", "auto"), ("vacuum", "vacuum")):
         copy = copy_writable(root, tmp_path / name)
         state(copy, "scene", atmosphere=air)
         campaign = run_steps(copy)
-        said = {pair: json.loads((campaign.results / f"f01/{pair}/image.json").read_text()) for pair in pairs}
-        budget = next(line for line in said["uav1-uav1"]["budget"] if line["cause"] == "atmosphere")
+        reports = {pair: json.loads((campaign.results / f"f01/{pair}/image.json").read_text()) for pair in pairs}
+        budget = next(line for line in reports["uav1-uav1"]["budget"] if line["cause"] == "atmosphere")
         fused = json.loads((campaign.results / "f01/fused/image.json").read_text())
-        found[name] = {pair: off_m(campaign, pair) for pair in pairs}, budget["shift_m"], fused["coherence"]["mean"]
+        results[name] = (
+            {pair: north_error_m(campaign, pair) for pair in pairs},
+            budget["shift_m"],
+            fused["coherence"]["mean"],
+        )
         assert fused["coherence"]["mean"] > 0.98
-    assert max(map(abs, found["stated"][0].values())) < 0.01
-    auto, shift_m = found["auto"][0], found["auto"][1]
+    assert max(map(abs, results["stated"][0].values())) < 0.01
+    auto, shift_m = results["auto"][0], results["auto"][1]
     assert 0.003 < max(map(abs, auto.values())) < 2 * shift_m < 0.04
-    for off in found["vacuum"][0].values():
-        assert -off == pytest.approx(expected_m, rel=0.08)
-        assert abs(off) < 1.2 * found["vacuum"][1]  # which the budget states, as of air of N = 300
+    for error_m in results["vacuum"][0].values():
+        assert -error_m == pytest.approx(expected_m, rel=0.08)
+        assert abs(error_m) < 1.2 * results["vacuum"][1]  # the budget assumes N = 300

@@ -1,4 +1,4 @@
-"""The speed-accuracy chart: what is on the front, what is marked, and that its page needs nothing from elsewhere."""
+"""Speed-accuracy chart: Pareto front, marked settings, measured errors, and a self-contained page."""
 
 import csv
 import re
@@ -26,7 +26,7 @@ from apertura.tools.chart.speed_accuracy import LEAST_ROWS, Part, measure, speed
 
 @pytest.fixture(scope="module")
 def charted(finished_tiny, tmp_path_factory):
-    """Files of a chart that had a second for its measurements, and its rows."""
+    """Return the files and rows of a chart measured within one second."""
     root = copy_writable(finished_tiny.root, tmp_path_factory.mktemp("charted") / "campaign")
     paths = speed_accuracy(Campaign.load(root), "f01", "uav1-uav2", seconds=1.0)
     return paths, list(csv.DictReader(paths[0].read_text(encoding="utf-8").splitlines()))
@@ -36,34 +36,34 @@ def error_db(row):
     return float(row["error_db"] or "-inf")
 
 
-def test_the_front_holds_what_nothing_faster_beats(charted):
+def test_front_contains_settings_not_dominated_by_faster_ones(charted):
     rows = charted[1]
     seconds = [float(row["seconds"]) for row in rows]
     assert {row["on_front"] for row in rows} == {"True", "False"}
     assert seconds == sorted(seconds)
     for number, row in enumerate(rows):
-        beaten = any(error_db(faster) <= error_db(row) for faster in rows[:number])
-        assert (row["on_front"] == "True") == (not beaten)
+        dominated = any(error_db(faster) <= error_db(row) for faster in rows[:number])
+        assert (row["on_front"] == "True") == (not dominated)
 
 
-def test_the_planners_choice_and_the_reference_are_there_however_short_the_time(charted):
+def test_planned_setting_and_reference_are_always_measured(charted):
     rows = charted[1]
     planned = [row for row in rows if row["planned"] == "True"]
     assert len(planned) == 1
     plan = expected_plan(Campaign.load(charted[0][0].parents[2]), "f01", "uav1-uav2")
     assert float(planned[0]["error_db"]) <= plan.accuracy_db
-    assert planned[0]["setting"] == plan.setting.line  # the image's own
+    assert planned[0]["setting"] == plan.setting.line  # the setting of the image
     assert [row["engine"] for row in rows if row["error_db"] == ""] == ["reference"]  # not measured against itself
 
 
 def test_measured_errors_are_no_worse_than_predicted(charted):
-    """Predictions hold for white echoes; these are of a few targets, and bounds lie above what they bound."""
+    """Predictions hold for white echoes, and bounds exceed the actual errors; these echoes are of single targets."""
     for row in charted[1]:
         if row["engine"] != "reference":
             assert float(row["error_db"]) <= float(row["predicted_error_db"]) + 9
 
 
-def test_the_page_holds_every_point_and_asks_no_other_machine(charted):
+def test_page_contains_every_point_and_loads_nothing(charted):
     paths, rows = charted
     page = paths[2].read_text(encoding="utf-8")
     assert page.count('"setting": "') == len(rows)
@@ -71,23 +71,23 @@ def test_the_page_holds_every_point_and_asks_no_other_machine(charted):
     assert paths[1].read_bytes().startswith(b"\x89PNG")
 
 
-def test_a_point_as_exact_as_a_faster_one_is_not_on_the_front(tmp_path):
+def test_point_as_accurate_as_a_faster_one_is_not_on_the_front(tmp_path):
     point = Point("native", "a", 1, 1.0, 1e9, -60.0, 1.0, -60.0, on_front=False, planned=False)
     points = [point, replace(point, seconds=2.0), replace(point, seconds=3.0, error_db=-60.1)]
     marked = with_front(points)
-    assert [one.on_front for one in marked] == [True, False, True]
+    assert [point.on_front for point in marked] == [True, False, True]
     write_table(tmp_path / "points.csv", marked)
     assert np.genfromtxt(tmp_path / "points.csv", delimiter=",", skip_header=1, usecols=3).tolist() == [1.0, 2.0, 3.0]
 
 
 @pytest.mark.slow
-def test_a_toy_engine_is_configured_planned_charted_run_and_written(finished_tiny, tmp_path, toy):
-    """One file and one row: the config knows its name and options, the plan its prediction, the product its report."""
+def test_toy_engine_is_configured_planned_charted_and_run(finished_tiny, tmp_path, toy):
+    """An engine of one file and one table row has config options, a prediction in the plan, and a product report."""
     root = copy_writable(finished_tiny.root, tmp_path / "campaign")
     config = root / "config" / "config.yaml"
     document = yaml.safe_load(config.read_text())
-    asked = {"engine": "toy", "engine_options": {"toy": {"refine": 2}}, "accuracy_db": -20.0}
-    config.write_text(yaml.safe_dump(document | {"processing": asked}))
+    processing = {"engine": "toy", "engine_options": {"toy": {"refine": 2}}, "accuracy_db": -20.0}
+    config.write_text(yaml.safe_dump(document | {"processing": processing}))
     campaign = Campaign.load(root)
     assert expected_plan(campaign, "f01", "uav1-uav2").setting.line == "toy refine=2"
     image.image(campaign, "f01", "uav1-uav2")
@@ -104,23 +104,23 @@ def test_a_toy_engine_is_configured_planned_charted_run_and_written(finished_tin
 
 @pytest.fixture
 def part():
-    """All of a small image, which some pulses see."""
+    """Return a small image as a part to be measured."""
     history, pixels = point_history(24), TARGET_GRID.positions(0.0)
-    picked = np.random.default_rng(1).integers(0, (LEAST_ROWS, 160), (50, 2))
-    exact = reference.form(history, pixels[tuple(picked.T)])
+    indices = np.random.default_rng(1).integers(0, (LEAST_ROWS, 160), (50, 2))
+    exact = reference.form(history, pixels[tuple(indices.T)])
     profiles = range_compress(history, TARGET_GRID, FlatGround(0.0))
-    return Part(history, profiles, pixels, picked, np.full(50, 50 / (LEAST_ROWS * 160)), exact, 160 * 160, 0.1)
+    return Part(history, profiles, pixels, indices, np.full(50, 50 / (LEAST_ROWS * 160)), exact, 160 * 160, 0.1)
 
 
 def measured_by_toy(part, seconds):
-    asked = plan(overrides={"engine": "numba", "presum": 1})
-    points = measure(part, asked, [Setting("toy", {"refine": 4}, {}, -38.0, seconds)], seconds=60.0)
+    reference_plan = plan(overrides={"engine": "numba", "presum": 1})
+    points = measure(part, reference_plan, [Setting("toy", {"refine": 4}, {}, -38.0, seconds)], seconds=60.0)
     return next(point for point in points if point.engine == "toy")
 
 
 @pytest.mark.quick("0.6-80")
 @pytest.mark.parametrize(("seconds", "rows"), [(1e-6, 160), (0.6, 80), (1e6, LEAST_ROWS)])
-def test_whatever_engine_is_predicted_to_be_slow_is_timed_on_fewer_rows(part, toy, monkeypatch, seconds, rows):
+def test_slow_engine_is_timed_on_fewer_rows(part, toy, monkeypatch, seconds, rows):
     shapes, form = set(), toy_engine.form
 
     def recorded(prepared, pixels, *, beams=None):
@@ -128,21 +128,21 @@ def test_whatever_engine_is_predicted_to_be_slow_is_timed_on_fewer_rows(part, to
         return form(prepared, pixels)
 
     monkeypatch.setattr(toy_engine, "form", recorded)
-    assert measured_by_toy(part, seconds).error_db < -10  # where there is next to nothing but sidelobes
+    assert measured_by_toy(part, seconds).error_db < -10  # the part contains little but sidelobes
     assert shapes == {(rows, 160, 3)}
 
 
-def test_an_engine_that_reads_the_phase_history_is_charted_on_it(part, toy, monkeypatch):
-    given = []
+def test_engine_of_phase_histories_is_charted_on_them(part, toy, monkeypatch):
+    inputs = []
     monkeypatch.setattr(toy_engine, "READS", "phase_history")
-    monkeypatch.setattr(toy_engine, "prepare", lambda history, **_: given.append(history) or history)
+    monkeypatch.setattr(toy_engine, "prepare", lambda history, **_: inputs.append(history) or history)
     monkeypatch.setattr(toy_engine, "form", reference.form)
     assert measured_by_toy(part, 1e6).error_db < -130
-    assert {type(history) for history in given} == {PhaseHistory}
+    assert {type(history) for history in inputs} == {PhaseHistory}
 
 
 @pytest.mark.parametrize(("exact_s", "shown"), [(10.0, True), (3600.0, False)])
-def test_a_double_sum_far_beyond_the_settings_does_not_stretch_the_axis(tmp_path, monkeypatch, exact_s, shown):
+def test_much_slower_double_sum_does_not_extend_the_axis(tmp_path, monkeypatch, exact_s, shown):
     drawn = []
     monkeypatch.setattr("apertura.tools.chart.pareto.save_png", lambda figure, _: drawn.append(figure))
     rest = {"presum": 1, "pixel_pulses_per_s": 1e9, "predicted_seconds": 1.0, "predicted_error_db": -60.0}

@@ -1,4 +1,4 @@
-"""A campaign on terrain, from its folder to its products: DEM, datum and provenance by the same steps as any other."""
+"""Campaigns with terrain, from folder to products: DEM, datum, geometry layers, provenance and bad input."""
 
 import hashlib
 import json
@@ -42,7 +42,7 @@ from apertura.stages.scene import ConfiguredGround, OpenScene, expected_scene, o
 from apertura.stages.transfer import PairEcho
 from apertura.views.score import score
 
-UNDULATION_M = 47.392  # of EGM96 at the demo's origin, read from egm96_15.gtx with rasterio
+UNDULATION_M = 47.392  # EGM96 at the demo's origin, read from egm96_15.gtx with rasterio
 PAIR = ("f01", "uav1-uav2")
 
 
@@ -56,11 +56,11 @@ def edit_scene(root, **keys):
 
 @pytest.fixture(scope="module")
 def hillside(tmp_path_factory):
-    """The tiny campaign with three targets on a plane tilted by 20°, imaged with its DEM."""
+    """Image the tiny campaign with three targets on a plane tilted by 20° with its DEM."""
     plan = replace(preset("demo", pulses=60), scene=ImageGrid("EPSG:32632", half_width_m=3.0, spacing_m=0.1))
-    right = np.array([ALONG[1], -ALONG[0]])  # apart in range, so that a short aperture does not mix them
-    places = [across * right + along * ALONG for across, along in ((0.0, 0.0), (2.0, 0.8), (-2.0, -0.6))]
-    targets = tuple(PointTarget((x, y, SLOPE * float(UPHILL @ (x, y)))) for x, y in places)
+    right = np.array([ALONG[1], -ALONG[0]])  # separated in range, which a short aperture resolves
+    offsets = [across * right + along * ALONG for across, along in ((0.0, 0.0), (2.0, 0.8), (-2.0, -0.6))]
+    targets = tuple(PointTarget((x, y, SLOPE * float(UPHILL @ (x, y)))) for x, y in offsets)
     root = simulate(tmp_path_factory.mktemp("hillside") / "campaign", plan, targets=targets, seed=7)
     write_plane(root)
     edit_scene(root, dem="dem.tif", dem_datum="ellipsoid")
@@ -68,27 +68,27 @@ def hillside(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_every_target_on_a_hillside_is_where_it_stands(hillside):
+def test_targets_on_a_hillside_are_at_their_positions(hillside):
     findings = score(hillside)
     assert len(findings) == 9
     assert max(finding.error_m for finding in findings) < 0.03
 
 
 @pytest.mark.slow
-def test_flat_ground_puts_them_elsewhere(hillside, tmp_path):
+def test_flat_terrain_displaces_targets_of_a_hillside(hillside, tmp_path):
     root = copy_writable(hillside.root, tmp_path / "campaign")
     shutil.rmtree(root / "results")
     edit_scene(root, dem=None, dem_datum=None)
     findings = score(run_steps(root))
-    off = [finding.error_m for finding in findings if finding.target and finding.image == "uav1-uav1"]
-    assert min(off) > 0.1
+    errors_m = [finding.error_m for finding in findings if finding.target and finding.image == "uav1-uav1"]
+    assert min(errors_m) > 0.1
 
 
-def test_a_step_of_the_dem_flags_images_of_the_scene():
+def test_step_of_the_dem_flags_images_of_the_scene():
     grid, level = SceneGrid("local", 0.0, 8.0, 0.5, (16, 16)), FlatGround(0.0)
     step = {"height_m": 618.4, "over_m": 20.0, "x_m": 500041.0, "y_m": 5400040.0}
-    for found, flagged in ((step, True), (None, False)):
-        stage = xr.Dataset(attrs={"terrain": {"dem": "dem.tif", "steepest_step": found}})
+    for steepest, flagged in ((step, True), (None, False)):
+        stage = xr.Dataset(attrs={"terrain": {"dem": "dem.tif", "steepest_step": steepest}})
         flags = OpenScene(grid, level, level, (stage,), {}, {}).flags
         line = "the DEM has a step of 618 m over 20 m at x 500041.0, y 5400040.0"
         assert flags == ({"terrain_step": line} if flagged else {})
@@ -96,24 +96,24 @@ def test_a_step_of_the_dem_flags_images_of_the_scene():
 
 
 @pytest.mark.slow
-def test_a_product_on_terrain_says_so_and_names_the_dem(hillside):
+def test_product_on_terrain_names_the_dem(hillside):
     report = json.loads((hillside.results / "f01" / "uav1-uav2" / "image.json").read_text())
     assert report["terrain"]["dem"] == "dem.tif"
     assert report["terrain"]["datum"] == "ellipsoid"
     assert report["numerical_error_db"] < -50
     assert report["terrain"]["lowest_m"] < settled_scene(hillside).level.height_m < report["terrain"]["highest_m"]
     digest = hashlib.sha256((hillside.root / "dem.tif").read_bytes()).hexdigest()
-    apart = {"f01/uav1-uav2/slc.tif": None, "f01/fused/coherent_db.tif": "uav1-uav2", "f01/uav1-uav2/mask.tif": None}
-    for name, stage in apart.items():
+    pair_of = {"f01/uav1-uav2/slc.tif": None, "f01/fused/coherent_db.tif": "uav1-uav2", "f01/uav1-uav2/mask.tif": None}
+    for name, pair in pair_of.items():
         with rasterio.open(str(hillside.results / name)) as raster:
             assert json.loads(raster.tags()["APERTURA_INPUTS"])["dem"] == digest
             runspec = json.loads(raster.tags()["APERTURA_RUNSPEC"])
-            runspec = runspec[stage] if stage else runspec
+            runspec = runspec[pair] if pair else runspec
             assert (runspec["dem"], runspec["dem_datum"]) == ("dem.tif", "ellipsoid")
 
 
 @pytest.mark.slow
-def test_layers_lie_on_the_grid_and_hold_the_angles_of_the_slope(hillside):
+def test_layers_contain_the_angles_of_the_slope_on_the_grid(hillside):
     grid = settled_scene(hillside).grid
     heights = open_stage(hillside.stage("terrain"), "terrain").height.values
     values = {}
@@ -126,7 +126,7 @@ def test_layers_lie_on_the_grid_and_hold_the_angles_of_the_slope(hillside):
     middle = tuple(size // 2 for size in grid.shape)
     place = grid.positions_at(*middle, heights[middle])
     legs = [echo[name].values for name in ("tx_position", "rx_position")]
-    # Its wobble moves the closest approach of so short a track to and fro: the angles with it, by some tenths.
+    # Track wobble displaces the closest approach of a short track, which changes the angles by tenths of a degree.
     closest = sum(np.linalg.norm(leg - place, axis=1) for leg in legs).argmin()
     tx, rx = (leg[closest] for leg in legs)
     to_tx, to_rx = ((leg - place) / np.linalg.norm(leg - place) for leg in (tx, rx))
@@ -134,11 +134,11 @@ def test_layers_lie_on_the_grid_and_hold_the_angles_of_the_slope(hillside):
     normal = np.array([-SLOPE * UPHILL[0], -SLOPE * UPHILL[1], 1.0]) / np.hypot(1, SLOPE)
     assert values["incidence"][middle] == pytest.approx(np.degrees(np.arccos([east, north, up] @ normal)), abs=0.5)
     assert values["bistatic_angle"][middle] == pytest.approx(np.degrees(np.arccos(to_tx @ to_rx)), abs=0.3)
-    assert not values["mask"].any()  # a plane facing the radar by less than its incidence
+    assert not values["mask"].any()  # the slope is smaller than the incidence angle: no layover
 
 
 @pytest.mark.slow
-def test_a_constant_dem_gives_the_image_of_flat_ground(finished_tiny, tmp_path):
+def test_constant_dem_gives_the_image_of_flat_terrain(finished_tiny, tmp_path):
     root = copy_writable(finished_tiny.root, tmp_path / "campaign")
     shutil.rmtree(root / "results")
     write_plane(root, slope=0.0)
@@ -151,7 +151,7 @@ def test_a_constant_dem_gives_the_image_of_flat_ground(finished_tiny, tmp_path):
     assert np.abs(one - other).max() < 1e-3 * np.abs(other).max()
 
 
-def test_geoid_heights_of_flat_ground_count_by_the_undulation(shared, tiny):
+def test_undulation_is_added_to_geoid_heights(shared, tiny):
     shutil.copyfile(shared / "dem_isce3" / "egm96_15.gtx", tiny / "egm96_15.gtx")
     campaign = edit_scene(tiny, height_m=572.0, height_datum="egm96", geoid="egm96_15.gtx")
     path = scene.scene(campaign)
@@ -161,26 +161,26 @@ def test_geoid_heights_of_flat_ground_count_by_the_undulation(shared, tiny):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("made", [True, False])
-def test_the_plan_predicts_the_profiles_of_a_hillside(hillside, made, tmp_path):
-    """Samples and bytes of tables are those of its ground, whether stage `terrain` is made or only its DEM is there."""
+@pytest.mark.parametrize("has_stage", [True, False])
+def test_plan_predicts_the_profiles_of_a_hillside(hillside, has_stage, tmp_path):
+    """Numbers of samples and table bytes are those of the terrain, from the stage or from the DEM alone."""
     root = copy_writable(hillside.root, tmp_path / "campaign")
-    if not made:
+    if not has_stage:
         (root / "results" / "terrain.manifest.json").unlink()
     campaign, pair = Campaign.load(root), ("f01", "uav1-uav2")
-    seen, profiles = open_pair(campaign, *pair), open_stage(campaign.stage("profile", *pair), "profile")
-    hill = expected_scene(campaign, partial(getattr, seen, "flown"))
+    opened, profiles = open_pair(campaign, *pair), open_stage(campaign.stage("profile", *pair), "profile")
+    hill = expected_scene(campaign, partial(getattr, opened, "flown"))
     level = replace(hill, terrain=hill.level)
-    assert job_of(campaign, seen, hill).signal.samples == profiles.sizes["range"]
-    assert job_of(campaign, seen, level).signal.samples != profiles.sizes["range"]
+    assert job_of(campaign, opened, hill).signal.samples == profiles.sizes["range"]
+    assert job_of(campaign, opened, level).signal.samples != profiles.sizes["range"]
     plan = expected_plan(campaign, *pair)
     tables = load_engine(plan.engine).prepare(plan.inputs(profiles_of(profiles)), **plan.setting.options)
     assert plan.setting.table_bytes == (tables.cells if plan.engine == "native" else tables.samples).nbytes
 
 
 @pytest.mark.slow
-def test_an_echo_that_is_open_is_not_read_again(hillside, tmp_path):
-    """Its stage may even be gone: the pair is opened and planned from the arrays that are held."""
+def test_opened_echo_is_not_read_again(hillside, tmp_path):
+    """The pair is opened and planned from the arrays in memory, even if the stage is deleted."""
     campaign = Campaign.load(copy_writable(hillside.root, tmp_path / "campaign"))
     echo = PairEcho.opened(campaign, *PAIR).stage.load()
     shutil.rmtree(str(campaign.stage("echo", *PAIR)))
@@ -193,7 +193,7 @@ def test_an_echo_that_is_open_is_not_read_again(hillside, tmp_path):
 # Bad input
 
 
-def test_a_dem_without_its_datum_is_refused(tiny):
+def test_dem_without_datum_is_refused(tiny):
     write_plane(tiny)
     message = complaint(lambda: edit_scene(tiny, dem="dem.tif"))
     assert "dem_datum" in message
@@ -201,14 +201,14 @@ def test_a_dem_without_its_datum_is_refused(tiny):
     assert "stated without dem" in complaint(lambda: edit_scene(tiny, dem=None, dem_datum="egm96"))
 
 
-def test_a_dem_that_is_not_there_is_named_before_anything_runs(tiny):
+def test_missing_dem_is_reported_before_a_run(tiny):
     campaign = edit_scene(tiny, dem="terrain/dem.tif", dem_datum="ellipsoid")
     message = complaint(lambda: require_files(campaign))
     assert "terrain/dem.tif: no such file" in message
     assert "scene.dem" in message
 
 
-def test_a_void_in_the_scene_is_counted_and_placed(tiny):
+def test_void_in_the_scene_is_reported_with_count_and_position(tiny):
     write_plane(tiny, void=np.nan)
     campaign = edit_scene(tiny, dem="dem.tif", dem_datum="ellipsoid")
     planned = complaint(lambda: expected_plan(campaign, *PAIR))  # before anything ran
@@ -217,12 +217,12 @@ def test_a_void_in_the_scene_is_counted_and_placed(tiny):
     assert "of 3600 pixels" in message
     assert "first at x " in message
     assert not (tiny / "results" / "terrain.zarr").exists()
-    write_plane(tiny)  # corrected: the work in progress of the old DEM is not taken up
+    write_plane(tiny)  # corrected DEM: unfinished work with the old one is discarded
     settle_ground(campaign)
     assert np.isfinite(open_stage(campaign.stage("terrain"), "terrain").height.values).all()
 
 
-def test_a_dem_that_misses_part_of_the_scene_is_refused_when_the_grid_is_settled(tiny):
+def test_dem_that_misses_part_of_the_scene_is_refused(tiny):
     write_plane(tiny)
     bounds = Campaign.load(tiny).settings.scene.bounds_m
     campaign = edit_scene(
@@ -232,29 +232,29 @@ def test_a_dem_that_misses_part_of_the_scene_is_refused_when_the_grid_is_settled
     assert "% of the scene lies outside the DEM, to the east" in message
 
 
-def test_a_dem_under_the_scene_alone_is_enough_where_bounds_are_stated(tiny):
-    """The height under the track is asked for only where the track decides where the scene lies."""
+def test_dem_of_the_scene_suffices_with_configured_bounds(tiny):
+    """The terrain height below the track is needed only for automatic bounds."""
     write_plane(tiny, keep=slice(16, 25))
     for spacing_m in (Campaign.load(tiny).settings.scene.spacing_m, "auto"):
         campaign = edit_scene(tiny, dem="dem.tif", dem_datum="ellipsoid", spacing_m=spacing_m)
-        seen = open_pair(campaign, *PAIR)
-        expected = expected_scene(campaign, partial(getattr, seen, "flown"))
+        opened = open_pair(campaign, *PAIR)
+        expected = expected_scene(campaign, partial(getattr, opened, "flown"))
         assert expected.level.height_m == pytest.approx(620.0, abs=0.1)
-        assert not np.isfinite(expected.terrain.dem.heights(under(expected.grid, seen)))
+        assert not np.isfinite(expected.terrain.dem.heights(pixel_below_track(expected.grid, opened)))
     campaign = edit_scene(tiny, bounds_m="auto")
     message = complaint(lambda: expected_plan(campaign, *PAIR))
     assert "below the track, which scene.bounds_m: auto requires" in message
     assert "% of the scene" not in message
 
 
-def under(grid, seen):
-    """A pixel below the middle of the track."""
-    x, y, _ = projected_from_ecef(grid.crs, np.median(np.concatenate(seen.aperture.legs), axis=0))
+def pixel_below_track(grid, opened):
+    """Return the grid of one pixel below the middle of the track."""
+    x, y, _ = projected_from_ecef(grid.crs, np.median(np.concatenate(opened.aperture.legs), axis=0))
     return SceneGrid(grid.crs, x - 0.5, y + 0.5, 1.0, (1, 1))
 
 
 @pytest.mark.parametrize("spacing_m", [0.1, "auto"])
-def test_plan_and_run_give_the_same_message_about_half_a_scene_without_dem(tiny, spacing_m):
+def test_plan_and_run_report_a_partial_dem_alike(tiny, spacing_m):
     write_plane(tiny, keep=(slice(None), slice(20, None)))
     campaign = edit_scene(tiny, dem="dem.tif", dem_datum="ellipsoid", spacing_m=spacing_m)
     message = complaint(lambda: expected_plan(campaign, *PAIR))
@@ -266,31 +266,31 @@ def test_plan_and_run_give_the_same_message_about_half_a_scene_without_dem(tiny,
         assert complaint(lambda: scene.scene(campaign)) == message
 
 
-def test_a_scene_much_longer_than_wide_lies_at_the_mean_of_its_dem(tiny):
+def test_narrow_scene_has_the_mean_height_of_its_dem(tiny):
     write_plane(tiny, slope=0.0, height_m=623.0)
-    middle = Campaign.load(tiny).settings.scene.bounds_m
-    asked = edit_scene(tiny, dem="dem.tif", dem_datum="ellipsoid").settings.scene
-    strip = SceneGrid("EPSG:32632", middle[0], middle[3], 0.1, (1, 100))
-    assert ConfiguredGround.of(asked, {"dem": tiny / asked.dem}, crs=strip.crs).level(strip).height_m == 623.0
+    bounds_m = Campaign.load(tiny).settings.scene.bounds_m
+    settings = edit_scene(tiny, dem="dem.tif", dem_datum="ellipsoid").settings.scene
+    strip = SceneGrid("EPSG:32632", bounds_m[0], bounds_m[3], 0.1, (1, 100))
+    assert ConfiguredGround.of(settings, {"dem": tiny / settings.dem}, crs=strip.crs).level(strip).height_m == 623.0
 
 
-def test_a_void_undeclared_is_no_height_on_earth(tiny):
-    """-9999 without nodata is refused as it stands, wherever the DEM is first read."""
+def test_undeclared_void_is_an_impossible_height(tiny):
+    """A value of -9999 without a nodata tag is refused wherever the DEM is first read."""
     write_plane(tiny, void=-9999.0)
     campaign = edit_scene(tiny, dem="dem.tif", dem_datum="ellipsoid")
-    for work in (lambda: expected_plan(campaign, *PAIR), lambda: settle_ground(campaign)):
-        message = complaint(work)
+    for read in (lambda: expected_plan(campaign, *PAIR), lambda: settle_ground(campaign)):
+        message = complaint(read)
         assert "dem.tif: 1 of the " in message
         assert "impossible heights, most frequently -9999 m" in message
         assert "nodata" in message
 
 
 @pytest.mark.slow
-def test_a_dem_above_the_antennas_is_flagged_and_flat_ground_refused(tiny):
-    """620 m are 2034 ft: but from beside a DEM a radar may look up, so it is no error."""
+def test_dem_above_the_antennas_is_flagged_and_flat_terrain_refused(tiny):
+    """A radar next to a hill may look up, so that a DEM above it is no error; 620 m are 2034 ft."""
     write_plane(tiny, height_m=620.0 / 0.3048)
     campaign = edit_scene(tiny, dem="dem.tif", dem_datum="ellipsoid")
-    message = complaint(lambda: expected_plan(campaign, *PAIR))  # no echo comes from so far
+    message = complaint(lambda: expected_plan(campaign, *PAIR))  # out of range of the echoes
     assert "unit and datum of scene.dem" in message
     write_plane(tiny, height_m=680.0)
     assert "below the lowest terrain of the scene" in expected_plan(campaign, *PAIR).flags["platform_below_scene"]
@@ -300,8 +300,8 @@ def test_a_dem_above_the_antennas_is_flagged_and_flat_ground_refused(tiny):
     assert "the ground has 2034.00 m" in message
 
 
-def test_the_command_line_says_in_which_file_a_key_stands(tiny, monkeypatch, capsys):
-    """A wing knows the key alone: who calls it from Python has no such file."""
+def test_command_line_names_the_file_of_a_key(tiny, monkeypatch, capsys):
+    """Library functions name the key only, because their Python callers have no config file."""
     edit_scene(tiny, height_m=2034.0)
     monkeypatch.setattr("sys.argv", ["apertura", "plan", str(tiny)])
     with pytest.raises(SystemExit, match="2"):
@@ -310,8 +310,8 @@ def test_the_command_line_says_in_which_file_a_key_stands(tiny, monkeypatch, cap
 
 
 @pytest.mark.slow
-def test_a_platform_below_the_terrain_is_refused_with_its_pulse(hillside, tmp_path):
-    """The hill is moved over the track; the scene is widened to hold it."""
+def test_platform_below_the_terrain_is_refused_with_its_pulse(hillside, tmp_path):
+    """Move the hill above the track and extend the scene to cover it."""
     root = copy_writable(hillside.root, tmp_path / "campaign")
     bounds = [
         round(edge + by, 6) for edge, by in zip(hillside.settings.scene.bounds_m, (-12, -12, 12, 12), strict=True)
@@ -330,7 +330,7 @@ def test_a_platform_below_the_terrain_is_refused_with_its_pulse(hillside, tmp_pa
     assert "worst at pulse" in message
 
 
-def test_a_stage_terrain_without_a_dem_says_so(tiny):
+def test_terrain_step_without_dem_is_refused(tiny):
     campaign = Campaign.load(tiny)
     scene.scene(campaign)
     assert "scene.dem: no DEM" in complaint(lambda: scene.terrain(campaign))

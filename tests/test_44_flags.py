@@ -1,4 +1,4 @@
-"""Each failure edge raises its flag in the product, and only beyond the edge: recordings with one impairment each."""
+"""Flags of signal impairments: each is raised beyond its threshold and not below, one impairment per recording."""
 
 from dataclasses import replace
 
@@ -14,12 +14,14 @@ from apertura.stages import echo, image, profile, refine, scene
 from apertura.stages.transfer import PairEcho
 
 
-def flown(folder, node="uav2", *, pulses=40, **impairments):
-    """A tandem flight whose one node has other impairments; its echo stages made."""
+def simulated(folder, node="uav2", *, pulses=40, **impairments):
+    """Return an ingested tandem flight with additional impairments of one node."""
     plan = replace(preset("demo", pulses=pulses), scene=ImageGrid("EPSG:32632", half_width_m=3.0, spacing_m=0.1))
     changed = {node: replace(plan.nodes[node].impairments, **impairments)}
     root = simulate(folder / "campaign", plan, impairments=changed, seed=11)
-    edit_config(root, lambda document: document.update(processing={"autofocus": False}))  # one pair alone is imaged
+    edit_config(
+        root, lambda document: document.update(processing={"autofocus": False})
+    )  # autofocus needs both pairs, and only one is imaged
     campaign = Campaign.load(root)
     ingest_all(campaign)
     return campaign
@@ -32,7 +34,7 @@ def echo_of(campaign, pair="uav1-uav2"):
 
 @pytest.fixture(scope="module")
 def _undisturbed(tmp_path_factory):
-    campaign = flown(tmp_path_factory.mktemp("undisturbed"))
+    campaign = simulated(tmp_path_factory.mktemp("undisturbed"))
     for pair in ("uav1-uav1", "uav1-uav2"):
         echo.echo(campaign, "f01", pair)
     return campaign
@@ -40,11 +42,11 @@ def _undisturbed(tmp_path_factory):
 
 @pytest.fixture
 def undisturbed(_undisturbed, tmp_path):
-    """A flight without further impairments, with its echo stages, to be spoilt at will."""
+    """Return a writable copy of a flight without additional impairments, with its echo stages."""
     return Campaign.load(copy_writable(_undisturbed.root, tmp_path / "campaign"))
 
 
-def test_an_undisturbed_flight_raises_no_flag(undisturbed):
+def test_undisturbed_flight_raises_no_flag(undisturbed):
     for pair in ("uav1-uav1", "uav1-uav2"):
         dataset = PairEcho.opened(undisturbed, "f01", pair).stage
         assert dataset.attrs["flags"] == {}
@@ -53,7 +55,7 @@ def test_an_undisturbed_flight_raises_no_flag(undisturbed):
     assert dataset.attrs["clock"]["corrected"] is False
 
 
-def test_an_echo_stage_says_what_its_sidelink_its_clock_and_its_code_are(undisturbed):
+def test_echo_stage_reports_sidelink_clock_and_code(undisturbed):
     own, secondary = (PairEcho.opened(undisturbed, "f01", pair).stage for pair in ("uav1-uav1", "uav1-uav2"))
     assert set(secondary.attrs["sidelink"]) >= {"method", "snr_db", "echo_db", "ripple_db", "lock_rate"}
     assert secondary.attrs["sidelink"]["snr_db"] == pytest.approx(30, abs=0.5)
@@ -63,26 +65,26 @@ def test_an_echo_stage_says_what_its_sidelink_its_clock_and_its_code_are(undistu
     assert own.attrs["own_phase"]["second_difference_rad"] < 0.5
     assert "sidelink_delay" not in own
     assert secondary.sidelink_delay.attrs["units"] == "m"
-    # a trigger within 40 ns of 12 ns, whatever the path: 12 m of scatter
+    # trigger times scatter by 40 ns, which is 12 m of path
     assert 5 < float(secondary.sidelink_delay.std()) < 9
 
 
-def test_a_node_that_sends_with_a_random_phase_is_flagged_in_its_own_image(tmp_path):
-    flags = echo_of(flown(tmp_path, "uav1", carrier_phase=UniformPhase()), "uav1-uav1").attrs["flags"]
+def test_random_transmit_phase_is_flagged_in_the_monostatic_image(tmp_path):
+    flags = echo_of(simulated(tmp_path, "uav1", carrier_phase=UniformPhase()), "uav1-uav1").attrs["flags"]
     assert set(flags) == {"phase_unstable"}
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("peak_to_peak_db", "flagged"), [(1.5, False), (2.5, True)])
-def test_ripple_that_may_be_an_echo_is_flagged(tmp_path, peak_to_peak_db, flagged):
-    flags = echo_of(flown(tmp_path, "uav1", transmit_ripple=Ripple(peak_to_peak_db, 5e-9))).attrs["flags"]
+def test_ripple_that_may_be_an_echo_is_flagged_beyond_2_db(tmp_path, peak_to_peak_db, flagged):
+    flags = echo_of(simulated(tmp_path, "uav1", transmit_ripple=Ripple(peak_to_peak_db, 5e-9))).attrs["flags"]
     assert ("sidelink_ripple_or_echo" in flags) is flagged
 
 
 @pytest.mark.quick("4.0-True")
 @pytest.mark.parametrize(("backoff_db", "flagged"), [(4.0, True), (14.0, False)])
-def test_a_saturated_converter_is_flagged(tmp_path, backoff_db, flagged):
-    campaign = flown(tmp_path, adc=Adc(backoff_db=backoff_db))
+def test_saturated_converter_is_flagged(tmp_path, backoff_db, flagged):
+    campaign = simulated(tmp_path, adc=Adc(backoff_db=backoff_db))
     echo.echo(campaign, "f01", "uav1-uav2")
     opened = PairEcho.opened(campaign, "f01", "uav1-uav2")
     opened.stage.transfer.load()
@@ -96,8 +98,8 @@ def test_a_saturated_converter_is_flagged(tmp_path, backoff_db, flagged):
     ("snr_db", "method"),
     [(30.0, "divide"), (8.0, "wiener"), (-5.0, "two_parameter"), (-14.0, "two_parameter")],
 )
-def test_auto_takes_the_cheapest_adequate_correction_and_flags_none(tmp_path, snr_db, method):
-    attrs = echo_of(flown(tmp_path, sidelink_snr_db=snr_db)).attrs
+def test_auto_chooses_the_cheapest_adequate_correction(tmp_path, snr_db, method):
+    attrs = echo_of(simulated(tmp_path, sidelink_snr_db=snr_db)).attrs
     assert attrs["sidelink"]["method"] == method
     assert float(attrs["sidelink"]["reason"].split()[1]) == pytest.approx(snr_db, abs=0.5)
     assert "sidelink_noisy" not in attrs["flags"]
@@ -105,8 +107,8 @@ def test_auto_takes_the_cheapest_adequate_correction_and_flags_none(tmp_path, sn
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("snr_db", "flagged"), [(8.0, True), (12.0, False)])
-def test_a_correction_asked_for_beyond_its_edge_is_flagged(tmp_path, snr_db, flagged):
-    campaign = flown(tmp_path, sidelink_snr_db=snr_db)
+def test_configured_correction_below_its_snr_limit_is_flagged(tmp_path, snr_db, flagged):
+    campaign = simulated(tmp_path, sidelink_snr_db=snr_db)
     edit_config(campaign.root, lambda document: document.update(processing={"sidelink": "divide"}))
     attrs = echo_of(Campaign.load(campaign.root)).attrs
     assert attrs["sidelink"]["method"] == "divide"
@@ -115,51 +117,51 @@ def test_a_correction_asked_for_beyond_its_edge_is_flagged(tmp_path, snr_db, fla
 
 @pytest.mark.quick("0.3-True")
 @pytest.mark.parametrize(("amplitude", "flagged"), [(0.3, True), (0.03, False)])
-def test_an_echo_in_the_sidelink_is_flagged_where_division_is_asked_for(tmp_path, amplitude, flagged):
-    campaign = flown(tmp_path, sidelink_multipath=(Reflection(excess_m=9.0, amplitude=amplitude),))
+def test_echo_in_the_sidelink_is_flagged_with_configured_division(tmp_path, amplitude, flagged):
+    campaign = simulated(tmp_path, sidelink_multipath=(Reflection(excess_m=9.0, amplitude=amplitude),))
     edit_config(campaign.root, lambda document: document.update(processing={"sidelink": "divide"}))
     assert ("sidelink_echo" in echo_of(Campaign.load(campaign.root)).attrs["flags"]) is flagged
 
 
 @pytest.mark.slow
 def test_auto_avoids_ghosts_of_an_echo_in_the_sidelink(tmp_path):
-    attrs = echo_of(flown(tmp_path, sidelink_multipath=(Reflection(excess_m=9.0, amplitude=0.3),))).attrs
+    attrs = echo_of(simulated(tmp_path, sidelink_multipath=(Reflection(excess_m=9.0, amplitude=0.3),))).attrs
     assert attrs["sidelink"]["method"] == "two_parameter"
 
 
 @pytest.mark.slow
-def test_ripple_of_the_transmitter_keeps_the_division(tmp_path):
-    attrs = echo_of(flown(tmp_path, "uav1", transmit_ripple=Ripple(1.0, 5e-9))).attrs
+def test_transmitter_ripple_does_not_prevent_division(tmp_path):
+    attrs = echo_of(simulated(tmp_path, "uav1", transmit_ripple=Ripple(1.0, 5e-9))).attrs
     assert attrs["sidelink"]["method"] == "divide"
     assert attrs["flags"] == {}
 
 
 def test_pulses_without_sidelink_are_dropped_counted_and_flagged(tmp_path):
-    dataset = echo_of(flown(tmp_path, sidelink_blockage=Blockage(0.3, mean_pulses=5)))
-    lost = dataset.attrs["flags"]["sidelink_lost"]
+    dataset = echo_of(simulated(tmp_path, sidelink_blockage=Blockage(0.3, mean_pulses=5)))
+    flag = dataset.attrs["flags"]["sidelink_lost"]
     rate = dataset.attrs["sidelink"]["lock_rate"]
     assert 0.4 < rate < 0.95
-    assert int(lost.split()[0]) == round((1 - rate) * int(lost.split()[2]))
+    assert int(flag.split()[0]) == round((1 - rate) * int(flag.split()[2]))
     assert len(dataset.pulse) == dataset.attrs["pulses"]["used"]
     assert len(dataset.pulse) < 38
 
 
-def test_a_sidelink_that_never_locks_is_refused(tmp_path):
-    campaign = flown(tmp_path, sidelink_snr_db=-60.0)
+def test_sidelink_without_lock_is_refused(tmp_path):
+    campaign = simulated(tmp_path, sidelink_snr_db=-60.0)
     message = complaint(lambda: echo.echo(campaign, "f01", "uav1-uav2"))
     assert "uav2: sidelink" in message
 
 
 @pytest.mark.quick("8.0-True")
 @pytest.mark.parametrize(("ppm", "corrected"), [(8.0, True), (0.5, False)])
-def test_a_clock_is_corrected_in_the_samples_only_where_it_matters(tmp_path, ppm, corrected):
+def test_clock_is_corrected_in_samples_only_if_significant(tmp_path, ppm, corrected):
     clock = Clock(cfo_hz=ppm * 1200.0, sfo_hz=ppm * 1024.0)
-    attrs = echo_of(flown(tmp_path, clock=clock)).attrs
+    attrs = echo_of(simulated(tmp_path, clock=clock)).attrs
     assert attrs["clock"]["corrected"] is corrected
     assert float(attrs["clock"]["reason"].split()[1]) == pytest.approx(ppm, abs=0.1)
 
 
-def test_a_wrong_code_is_flagged_in_a_monostatic_image(undisturbed):
+def test_wrong_code_is_flagged_in_a_monostatic_image(undisturbed):
     campaign = undisturbed
     codes = np.load(str(campaign.root / "raw" / "codes.npy"))
     assert "code_unconfirmed" not in PairEcho.opened(campaign, "f01", "uav1-uav1").stage.attrs["flags"]
@@ -181,9 +183,9 @@ def conjugate(samples):
 
 @pytest.mark.quick("swap-swapped")
 @pytest.mark.parametrize(("change", "order"), [(swap, "swapped"), (conjugate, "conjugate")])
-def test_i_and_q_in_another_order_are_named_and_taken_by_the_key(undisturbed, change, order):
+def test_other_i_q_order_is_reported_and_configurable(undisturbed, change, order):
     campaign, pairs = undisturbed, ("uav1-uav1", "uav1-uav2")
-    right = {pair: PairEcho.opened(campaign, "f01", pair).stage.transfer.values for pair in pairs}
+    expected = {pair: PairEcho.opened(campaign, "f01", pair).stage.transfer.values for pair in pairs}
     for node in ("uav1", "uav2"):
         edit_data(campaign.root.real(), node, change)
     ingest_all(campaign)
@@ -196,55 +198,55 @@ def test_i_and_q_in_another_order_are_named_and_taken_by_the_key(undisturbed, ch
     edit_config(campaign.root.real(), lambda document: document["waveform"].update(iq=order))
     campaign = Campaign.load(campaign.root)
     ingest_all(campaign)
-    for pair, transfer in right.items():
-        found = echo_of(campaign, pair)
-        assert found.attrs["flags"] == {}
-        np.testing.assert_array_equal(found.transfer.values, transfer)
+    for pair, transfer in expected.items():
+        stage = echo_of(campaign, pair)
+        assert stage.attrs["flags"] == {}
+        np.testing.assert_array_equal(stage.transfer.values, transfer)
 
 
 @pytest.mark.quick("swap-swapped")
 @pytest.mark.parametrize(("change", "order"), [(swap, "swapped"), (conjugate, "conjugate")])
-def test_i_and_q_of_one_node_alone_are_taken_by_its_own_key(undisturbed, change, order):
+def test_i_q_order_is_configurable_per_node(undisturbed, change, order):
     campaign, pair = undisturbed, "uav1-uav2"
-    right = PairEcho.opened(campaign, "f01", pair).stage.transfer.values
+    expected = PairEcho.opened(campaign, "f01", pair).stage.transfer.values
     edit_data(campaign.root.real(), "uav2", change)
     ingest_all(campaign)
     assert "nodes.<n>.iq" in complaint(lambda: echo_of(campaign, pair))
     edit_config(campaign.root.real(), lambda document: document["nodes"]["uav2"].update(iq=order))
     campaign = Campaign.load(campaign.root)
     ingest_all(campaign)
-    found = echo_of(campaign, pair)
-    assert found.attrs["flags"] == {}
-    np.testing.assert_array_equal(found.transfer.values, right)
+    stage = echo_of(campaign, pair)
+    assert stage.attrs["flags"] == {}
+    np.testing.assert_array_equal(stage.transfer.values, expected)
     assert campaign.settings.iq_of("uav1") == "complex"
 
 
 @pytest.mark.quick("0.022-True")
 @pytest.mark.parametrize(("offset_s", "flagged"), [(22e-3, True), (4e-3, False)])
-def test_a_tag_offset_near_half_an_interval_is_flagged(tmp_path, offset_s, flagged):
-    flags = echo_of(flown(tmp_path, time_tag=TimeTag(offset_s=offset_s))).attrs["flags"]
+def test_tag_offset_near_half_an_interval_is_flagged(tmp_path, offset_s, flagged):
+    flags = echo_of(simulated(tmp_path, time_tag=TimeTag(offset_s=offset_s))).attrs["flags"]
     assert ("association_ambiguous" in flags) is flagged
 
 
 @pytest.mark.slow
 def test_flags_reach_image_json(tmp_path):
-    campaign = flown(tmp_path, adc=Adc(backoff_db=4.0))
+    campaign = simulated(tmp_path, adc=Adc(backoff_db=4.0))
     echo_of(campaign)
     scene.scene(campaign)
     profile.profile(campaign, "f01", "uav1-uav2")
-    told = open_stage(campaign.stage("profile", "f01", "uav1-uav2"), "profile").attrs["flags"]
+    flags = open_stage(campaign.stage("profile", "f01", "uav1-uav2"), "profile").attrs["flags"]
     refine.refine(campaign, "f01")
     image.image(campaign, "f01", "uav1-uav2")
     report = quality_of(campaign, "uav1-uav2")
-    assert report["flags"] == told
-    assert {"saturated_radar", "saturated_sidelink"} <= told.keys()
+    assert report["flags"] == flags
+    assert {"saturated_radar", "saturated_sidelink"} <= flags.keys()
     assert report["sidelink"]["lock_rate"] == 1.0
     assert report["clock"]["corrected"] is False
 
 
 @pytest.mark.slow
-def test_the_double_sum_meets_the_highest_accuracy_that_may_be_asked(tmp_path):
-    campaign = flown(tmp_path)
+def test_double_sum_meets_the_highest_configurable_accuracy(tmp_path):
+    campaign = simulated(tmp_path)
     edit_config(
         campaign.root,
         lambda document: document.update(processing={"engine": "reference", "accuracy_db": -120, "autofocus": "off"}),

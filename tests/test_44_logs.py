@@ -1,4 +1,4 @@
-"""Logs and time tags in the echo of a campaign: what is left out is counted and said, what is right raises nothing."""
+"""Logs and time tags in the echo stage: excluded pulses are counted and flagged, correct logs raise no flag."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -26,15 +26,15 @@ from apertura.stages.transfer import PairEcho
 
 
 def small_campaign(folder, *, pulses=40, prf_hz=20.0, **changes):
-    """Two nodes that fly 5 m/s, both logged by RTKLIB in UTC, ten epochs a second."""
+    """Return a campaign of two nodes at 5 m/s with RTKLIB logs in UTC at 10 Hz."""
     plan = small_simulation(pulses=pulses)
     nodes = {name: replace(node, log_format="pos_utc", lever_arms_m={}) for name, node in plan.nodes.items()}
     plan = replace(plan, nodes=nodes, waveform=replace(plan.waveform, prf_hz=prf_hz), **changes)
     return Campaign.load(simulate(folder / "campaign", plan, seed=3))
 
 
-def turned(row, degrees):
-    """Return an epoch of a CSV log with another yaw, its last column."""
+def with_yaw_offset(row, degrees):
+    """Return an epoch of a CSV log with an offset of yaw, its last column."""
     *others, yaw = row.split(",")
     return ",".join([*others, f"{float(yaw) + degrees:.4f}"])
 
@@ -47,12 +47,12 @@ def echo_of(campaign, pair="a-b"):
 
 
 def flags_of(dataset):
-    """What was flagged but for converters, which the small campaign drives high."""
+    """Return the flags except those of saturated converters, which the small campaign drives hard."""
     return {name: line for name, line in dataset.attrs["flags"].items() if not name.startswith("saturated")}
 
 
 def epochs(change):
-    """Return an edit of the epochs of a log, whose header stays."""
+    """Return a function that edits the epochs of a log and keeps its header."""
 
     def edit(lines):
         header = [line for line in lines if line.startswith("%")]
@@ -65,7 +65,7 @@ def rows(table):
     return ["   ".join(cells) for cells in table]
 
 
-def test_a_good_log_leaves_nothing_out_and_states_its_error(tmp_path):
+def test_good_log_excludes_no_pulses_and_states_its_accuracy(tmp_path):
     campaign = small_campaign(tmp_path)
     for pair in ("a-a", "a-b"):
         dataset = echo_of(campaign, pair)
@@ -83,34 +83,34 @@ def test_a_good_log_leaves_nothing_out_and_states_its_error(tmp_path):
 
 @pytest.mark.quick("0.02-expected1")
 @pytest.mark.parametrize(
-    ("asked", "expected"),
+    ("configured", "expected"),
     [(None, (None, "none")), (0.02, ([0.02] * 3, "config")), ([0.01, 0.02, 0.03], ([0.01, 0.02, 0.03], "config"))],
 )
-def test_the_config_states_the_error_where_the_log_does_not(tmp_path, asked, expected):
+def test_config_states_the_accuracy_if_the_log_does_not(tmp_path, configured, expected):
     campaign = small_campaign(tmp_path)
     edit_track(campaign.root, "a", lambda lines: [line.replace("sdn(m)", "sd(m)") for line in lines])
-    edit_config(campaign.root, lambda document: document["nodes"]["a"].update(position_std_m=asked))
+    edit_config(campaign.root, lambda document: document["nodes"]["a"].update(position_std_m=configured))
     stated = echo_of(campaign, "a-b").attrs["positions"]
     assert (stated["tx"]["std_m"], stated["tx"]["stated_by"]) == expected
     assert stated["rx"]["stated_by"] == "log"
 
 
 @pytest.mark.slow
-def test_pulses_of_a_float_solution_are_left_out_unless_allowed(tmp_path):
+def test_pulses_with_float_solution_are_excluded_unless_allowed(tmp_path):
     campaign = small_campaign(tmp_path)
 
-    def floated(table):
+    def with_float_solution(table):
         for cells in table[25:30]:  # the log begins 2 s early
             cells[5] = "2"
         return rows(table)
 
-    edit_track(campaign.root, "b", epochs(floated))
+    edit_track(campaign.root, "b", epochs(with_float_solution))
     dataset = echo_of(campaign)
-    left_out = dataset.attrs["pulses"]["reasons"]["fix_quality_low"]
-    assert 10 <= left_out <= 12  # 0.6 s of 20 Hz
-    assert dataset.sizes["pulse"] == dataset.attrs["pulses"]["used"] == 40 - left_out
+    excluded = dataset.attrs["pulses"]["reasons"]["fix_quality_low"]
+    assert 10 <= excluded <= 12  # 0.6 s of 20 Hz
+    assert dataset.sizes["pulse"] == dataset.attrs["pulses"]["used"] == 40 - excluded
     assert dataset.attrs["flags"]["fix_quality_low"].startswith(
-        f"b: {left_out} of 40 pulses excluded: position solution poorer than"
+        f"b: {excluded} of 40 pulses excluded: position solution poorer than"
     )
     assert flags_of(echo_of(campaign, "a-a")) == {}
     edit_config(campaign.root, lambda document: document["nodes"]["b"].update(worst_fix="float"))
@@ -118,7 +118,7 @@ def test_pulses_of_a_float_solution_are_left_out_unless_allowed(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_log_of_a_poor_fix_throughout_is_refused_and_one_without_rtk_is_not(tmp_path):
+def test_log_with_float_solutions_only_is_refused(tmp_path):
     campaign = small_campaign(tmp_path)
     for quality, refused in (("2", True), ("5", False)):
         edit_track(
@@ -136,7 +136,7 @@ def test_a_log_of_a_poor_fix_throughout_is_refused_and_one_without_rtk_is_not(tm
     assert "poorer than fix" in complaint(lambda: echo_of(campaign))
 
 
-def test_pulses_in_a_gap_of_the_log_are_left_out_with_its_place_and_length(tmp_path):
+def test_pulses_in_a_log_gap_are_excluded(tmp_path):
     plan = small_simulation().flights[0]
     swaying = replace(plan.tracks["a"], wobble=Wobble((0.3, 0.3, 0.3), smoothing_s=0.3))
     campaign = small_campaign(tmp_path, flights=(replace(plan, pulses=40, tracks={**plan.tracks, "a": swaying}),))
@@ -149,7 +149,7 @@ def test_pulses_in_a_gap_of_the_log_are_left_out_with_its_place_and_length(tmp_p
 
 
 @pytest.mark.slow
-def test_a_single_outlier_is_mended_and_counted(tmp_path):
+def test_single_outlier_is_corrected_and_counted(tmp_path):
     campaign = small_campaign(tmp_path)
     clean = echo_of(campaign).tx_position.values
 
@@ -165,7 +165,7 @@ def test_a_single_outlier_is_mended_and_counted(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_log_that_repeats_positions_is_read_through_those_that_are_new(tmp_path):
+def test_repeated_positions_of_a_log_are_skipped(tmp_path):
     campaign = small_campaign(tmp_path)
     clean = echo_of(campaign).rx_position.values
 
@@ -180,8 +180,8 @@ def test_a_log_that_repeats_positions_is_read_through_those_that_are_new(tmp_pat
 
 @pytest.mark.quick("0.2-True")
 @pytest.mark.parametrize(("grain_s", "flagged"), [(0.1, False), (0.2, True)])
-def test_a_log_with_rounded_times_is_flagged_with_how_far_that_moves_its_positions(tmp_path, grain_s, flagged):
-    """Epochs every 0.3 s at 5 m/s: 5 m/s · 0.2 s/√12 = 0.29 m."""
+def test_log_with_rounded_times_is_flagged_with_the_position_error(tmp_path, grain_s, flagged):
+    """Position error with times rounded to 0.2 s at 5 m/s: 5 m/s · 0.2 s/√12 = 0.29 m."""
     campaign = small_campaign(tmp_path)
 
     def rounded(table):
@@ -198,7 +198,7 @@ def test_a_log_with_rounded_times_is_flagged_with_how_far_that_moves_its_positio
 
 
 def logged_flags(position, *, damage=""):
-    """Return the flags of pulses between the epochs of a node's log, 10 Hz, at 1.2 GHz."""
+    """Return the flags of a 10 Hz log for pulses between its epochs at 1.2 GHz."""
     times = np.datetime64("2025-05-14T09:30", "ns") + np.arange(len(position)) * np.timedelta64(100, "ms")
     where = Path("a.track.ulg")
     track = damaged(make_track(times, position, frame="local", node="a", where=where), damage, where)
@@ -206,27 +206,27 @@ def logged_flags(position, *, damage=""):
     return place(log, log, times[20:-20] + np.timedelta64(50, "ms")).flags
 
 
-def test_a_log_on_a_coarse_grid_is_flagged_with_how_far_its_positions_err():
+def test_log_with_rounded_positions_is_flagged_with_their_error():
     time_s = np.arange(400) * 0.1
-    flown = np.stack([5 * time_s, 3 * np.sin(time_s), 5 + np.sin(0.7 * time_s)], -1)
-    assert logged_flags(flown) == {}
-    flags = logged_flags(np.round(flown / [0.2, 0.1, 0.01]) * [0.2, 0.1, 0.01])
+    position_m = np.stack([5 * time_s, 3 * np.sin(time_s), 5 + np.sin(0.7 * time_s)], -1)
+    assert logged_flags(position_m) == {}
+    flags = logged_flags(np.round(position_m / [0.2, 0.1, 0.01]) * [0.2, 0.1, 0.01])
     assert "a: rounded coordinates of the log cause position errors of 0.065 m" in flags["track_positions"]
 
 
-def test_a_damaged_log_is_flagged():
+def test_damaged_log_is_flagged():
     time_s = np.arange(400) * 0.1
-    flown = np.stack([5 * time_s, 3 * np.sin(time_s), 5 + np.sin(0.7 * time_s)], -1)
-    found = "259 of 6873 bytes are not valid messages, from byte 2602 on; their epochs are lost"
-    assert logged_flags(flown, damage=found) == {"track_log_damaged": f"a: {found}"}
+    position_m = np.stack([5 * time_s, 3 * np.sin(time_s), 5 + np.sin(0.7 * time_s)], -1)
+    damage = "259 of 6873 bytes are not valid messages, from byte 2602 on; their epochs are lost"
+    assert logged_flags(position_m, damage=damage) == {"track_log_damaged": f"a: {damage}"}
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("offset_s", [0.0, 1e-3, -4e-3])
-def test_an_offset_between_the_nodes_tags_does_not_turn_the_bistatic_phase(tmp_path, offset_s):
-    """12 m/s, 9.5 GHz, receiver 4.7 m ahead: placed at its own tag, 1 ms late, R_sl would err by 1.2 cm, -2.27 rad.
+def test_tag_offset_between_nodes_does_not_change_the_bistatic_phase(tmp_path, offset_s):
+    """Positions of both nodes are interpolated at the transmitter's tag, so that the target has one phase in both pairs.
 
-    Both nodes are placed at the transmitter's tag, so that the target has one phase in both pairs.
+    At 12 m/s and 9.5 GHz, the receiver's own tag, 1 ms late, would cause an error of R_sl of 1.2 cm, -2.27 rad.
     """
     speed = (12.0, 0.0, 0.0)
     tracks = {"a": Straight((-2.0, -11.0, 5.0), speed), "b": Straight((2.7, -11.0, 5.0), speed)}
@@ -245,16 +245,16 @@ def test_an_offset_between_the_nodes_tags_does_not_turn_the_bistatic_phase(tmp_p
     for pair in ("a-a", "a-b"):
         data = echo_of(campaign, pair)
         path_m = Aperture(data.tx_position.values, data.rx_position.values).path(target)
-        turns = np.outer(path_m, data.frequency.values) / C
-        phases.append(np.angle((data.transfer.values * np.exp(2j * np.pi * turns)).sum()))
+        cycles = np.outer(path_m, data.frequency.values) / C
+        phases.append(np.angle((data.transfer.values * np.exp(2j * np.pi * cycles)).sum()))
     assert data.attrs["time_tags"]["offset_s"] == pytest.approx(offset_s, abs=1e-5)
     assert abs(np.angle(np.exp(1j * (phases[1] - phases[0])))) < 0.05
 
 
 @pytest.mark.quick("b")
 @pytest.mark.parametrize("node", ["a", "b"])
-def test_captures_that_repeat_earlier_ones_are_left_out(tmp_path, node):
-    """Eight captures hold the samples of the eight before them: those are of other positions, and make a ghost."""
+def test_repeated_captures_are_excluded(tmp_path, node):
+    """Eight captures contain the samples of the eight before them, from other positions, and would form a ghost."""
     campaign = small_campaign(tmp_path)
 
     def repeat(samples):
@@ -268,7 +268,7 @@ def test_captures_that_repeat_earlier_ones_are_left_out(tmp_path, node):
 
 
 @pytest.mark.slow
-def test_a_single_wrong_tag_is_left_out(tmp_path):
+def test_single_wrong_tag_is_excluded(tmp_path):
     campaign = small_campaign(tmp_path)
     from folders import edit_meta
 
@@ -284,12 +284,12 @@ def test_a_single_wrong_tag_is_left_out(tmp_path):
 
 
 @pytest.mark.parametrize(("arm_m", "flagged"), [(0.3, True), (0.0, False)])
-def test_an_attitude_that_looks_like_radians_is_a_flag_where_it_moves_an_antenna(arm_m, flagged):
-    """40 m flown east, yaw logged as π/2."""
+def test_attitude_in_radians_is_flagged_with_a_lever_arm(arm_m, flagged):
+    """40 m position_m east, yaw logged as π/2."""
     time = np.datetime64("2026-05-14T09:30", "ns") + np.arange(80) * np.timedelta64(100, "ms")
-    place_m = np.column_stack([0.5 * np.arange(80), np.zeros(80), np.full(80, 20.0)])
+    position_m = np.column_stack([0.5 * np.arange(80), np.zeros(80), np.full(80, 20.0)])
     angles = np.column_stack([0.02 * np.sin(np.arange(80)), np.full(80, -0.07), np.full(80, np.pi / 2)])
-    track = make_track(time, place_m, frame="local", attitude_deg=angles, node="a", where=Path("a.csv"))
+    track = make_track(time, position_m, frame="local", attitude_deg=angles, node="a", where=Path("a.csv"))
     arms = {"radar_tx": [arm_m, 0, 0]}
     log = NodeLog("a", Node(attitude="log", lever_arms_m=arms), track, "a.csv", 0.2)
     flags = place(log, log, time[5:-5]).flags
@@ -300,27 +300,27 @@ def test_an_attitude_that_looks_like_radians_is_a_flag_where_it_moves_an_antenna
 
 
 @pytest.mark.parametrize("pair", ["uav1-uav1", "uav1-uav2"])
-def test_the_budget_of_a_campaign_expects_what_a_log_with_another_heading_does(tiny, pair):
-    """3° of yaw in the log of uav1 move its antennas on their arms, the sidelink's, too: paths change as stated."""
+def test_budget_predicts_the_phase_error_of_a_yaw_offset(tiny, pair):
+    """Yaw offset of 3° in the log of uav1 displaces its antennas, and the paths change as the budget predicts."""
 
     def nodes(document):
         document["nodes"]["uav1"].update(attitude_std_deg=[1e-6, 3.0], attitude_correlation_s=1e9, lever_arm_std_m=1e-6)
 
     def paths():
-        """Total paths to the middle of the scene, less the sidelink's length where one is divided by."""
+        """Return total paths to the scene centre, less the sidelink length of a bistatic pair."""
         opened = open_pair(Campaign.load(tiny), "f01", pair)
         tx, rx = (raw_log(campaign, "f01", name, 0.2) for name in pair.split("-"))
         at = opened.began + (1e9 * opened.time_s).round().astype("timedelta64[ns]")
-        between = np.linalg.norm(tx.antenna("sidelink", at) - rx.antenna("sidelink", at), axis=1)
-        return opened.aperture.path(scene.middle_m[None])[:, 0] - between * (not opened.monostatic)
+        sidelink_m = np.linalg.norm(tx.antenna("sidelink", at) - rx.antenna("sidelink", at), axis=1)
+        return opened.aperture.path(scene.middle_m[None])[:, 0] - sidelink_m * (not opened.monostatic)
 
     edit_config(tiny, nodes)
     campaign = Campaign.load(tiny)
-    scene = expected_scene(campaign, lambda: open_pair(campaign, "f01", pair).flown)
+    scene = expected_scene(campaign, lambda: open_pair(campaign, "f01", pair).position_m)
     before, opened = paths(), open_pair(campaign, "f01", pair)
     lines = {(line.cause, line.stated is None): line for line in budget_of(campaign, opened, scene)}
-    edit_track(tiny, "uav1", lambda rows: [rows[0], *(turned(row, 3.0) for row in rows[1:])])
+    edit_track(tiny, "uav1", lambda rows: [rows[0], *(with_yaw_offset(row, 3.0) for row in rows[1:])])
     wavenumber = 2 * np.pi * opened.frequency_hz.mean() / opened.wave_speed_m_s
-    moved_rad = wavenumber * abs((paths() - before).mean())
-    assert moved_rad > 0.02
-    assert lines["attitude", False].effect.phase_rad == pytest.approx(moved_rad, rel=0.1)
+    phase_rad = wavenumber * abs((paths() - before).mean())
+    assert phase_rad > 0.02
+    assert lines["attitude", False].effect.phase_rad == pytest.approx(phase_rad, rel=0.1)
