@@ -224,7 +224,7 @@ def test_damaged_log_is_flagged():
 @pytest.mark.slow
 @pytest.mark.parametrize("offset_s", [0.0, 1e-3, -4e-3])
 def test_tag_offset_between_nodes_does_not_change_the_bistatic_phase(tmp_path, offset_s):
-    """Positions of both nodes are interpolated at the transmitter's tag, so that the target has one phase in both pairs.
+    """Positions of both nodes are taken at the transmitter's tag: the target has the same phase in both pairs.
 
     At 12 m/s and 9.5 GHz, the receiver's own tag, 1 ms late, would cause an error of R_sl of 1.2 cm, -2.27 rad.
     """
@@ -285,7 +285,7 @@ def test_single_wrong_tag_is_excluded(tmp_path):
 
 @pytest.mark.parametrize(("arm_m", "flagged"), [(0.3, True), (0.0, False)])
 def test_attitude_in_radians_is_flagged_with_a_lever_arm(arm_m, flagged):
-    """40 m position_m east, yaw logged as π/2."""
+    """Track of 40 m to the east with a logged yaw of π/2."""
     time = np.datetime64("2026-05-14T09:30", "ns") + np.arange(80) * np.timedelta64(100, "ms")
     position_m = np.column_stack([0.5 * np.arange(80), np.zeros(80), np.full(80, 20.0)])
     angles = np.column_stack([0.02 * np.sin(np.arange(80)), np.full(80, -0.07), np.full(80, np.pi / 2)])

@@ -1,4 +1,4 @@
-"""A finished campaign as STAC and as RO-Crate: who made what from what, by which code, and whether it still is so."""
+"""STAC catalog and RO-Crate of a finished campaign: files, hashes, jobs, software and out-of-date results."""
 
 import json
 import re
@@ -33,13 +33,13 @@ ROOT = Path(__file__).parents[1]
 
 @pytest.fixture
 def finished(finished_tiny, tmp_path):
-    """The tiny campaign with all its results, to be spoilt at will."""
+    """Return a writable copy of the tiny campaign with all its results."""
     return copy_writable(finished_tiny.root, tmp_path / "campaign")
 
 
 @pytest.fixture(scope="module")
-def told(finished_tiny):
-    """Identifier → entity of the crate."""
+def crate_entities(finished_tiny):
+    """Return the entities of the crate by identifier."""
     document = json.loads((finished_tiny.results / CRATE).read_text())
     entities = {entity["@id"]: entity for entity in document["@graph"]}
     assert len(entities) == len(document["@graph"])
@@ -47,16 +47,16 @@ def told(finished_tiny):
 
 
 def ids(references):
-    return [one["@id"] for one in ([references] if isinstance(references, dict) else references)]
+    return [reference["@id"] for reference in ([references] if isinstance(references, dict) else references)]
 
 
-def edit(path):
+def change_byte(path):
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 1
     path.write_bytes(data)
 
 
-def test_every_image_has_an_item_whose_files_are_those_on_the_disk(finished_tiny):
+def test_every_image_has_an_item_with_existing_files(finished_tiny):
     assert stac_problems(finished_tiny.results / "stac") == []
     items = list(pystac.Catalog.from_file(str(finished_tiny.results / "stac" / CATALOG)).get_items(recursive=True))
     assert sorted(item.id for item in items) == ["f01-coherent", "f01-noncoherent", "f01-uav1-uav1", "f01-uav1-uav2"]
@@ -70,7 +70,7 @@ def test_every_image_has_an_item_whose_files_are_those_on_the_disk(finished_tiny
     assert not [name for name in files if name.startswith("noncoherent")]
 
 
-def test_an_item_lies_where_its_raster_lies(finished_tiny):
+def test_item_has_the_footprint_of_its_raster(finished_tiny):
     item = pystac.Item.from_file(str(finished_tiny.results / "stac/images/f01/uav1-uav2.json"))
     with rasterio.open(str(finished_tiny.result("f01", "uav1-uav2", "db.tif"))) as raster:
         assert item.properties["proj:code"] == str(raster.crs)
@@ -82,7 +82,7 @@ def test_an_item_lies_where_its_raster_lies(finished_tiny):
         assert item.bbox == pytest.approx(transform_bounds(raster.crs, "OGC:CRS84", *raster.bounds), abs=2e-7)
 
 
-def test_an_item_tells_time_and_band_of_what_was_recorded(finished_tiny):
+def test_item_states_time_and_band_of_the_recording(finished_tiny):
     item = pystac.Item.from_file(str(finished_tiny.results / "stac/images/f01/uav1-uav2.json"))
     meta = json.loads((finished_tiny.root / "raw/f01/uav1.sigmf-meta").read_text())
     first = pystac.utils.str_to_datetime(meta["captures"][0]["core:datetime"])
@@ -95,65 +95,69 @@ def test_an_item_tells_time_and_band_of_what_was_recorded(finished_tiny):
     assert item.properties["sar:center_frequency"] == pytest.approx(middle_hz / 1e9)
 
 
-def test_every_file_of_every_result_is_in_the_crate_with_its_hash_and_size(finished_tiny, told):
+def test_crate_lists_every_result_file_with_hash_and_size(finished_tiny, crate_entities):
     expected = {}
     for name, result in results_of(finished_tiny):
         if name != "ro_crate" and not on_demand(finished_tiny, result.manifest):
             manifest = finished_tiny.root / result.manifest
             paths = [manifest, *(manifest.parent / file for file in read_manifest(manifest)["files"])]
             expected |= {path.relative_to(finished_tiny.results).as_posix(): path for path in paths}
-    files = {unquote(name): one for name, one in told.items() if "File" in one["@type"]}
+    files = {unquote(name): entity for name, entity in crate_entities.items() if "File" in entity["@type"]}
     assert set(files) == set(expected) | {name for name in files if name.startswith("workflow/")}
     for name, path in expected.items():
         assert files[name]["sha256"] == sha256_file(path)
         assert files[name]["contentSize"] == str(path.stat().st_size)
-    loose = {unquote(part) for part in ids(told["./"]["hasPart"])}
-    inner = {unquote(part) for one in told.values() if one["@id"].endswith(".zarr/") for part in ids(one["hasPart"])}
+    loose = {unquote(part) for part in ids(crate_entities["./"]["hasPart"])}
+    stores = [entity for entity in crate_entities.values() if entity["@id"].endswith(".zarr/")]
+    inner = {unquote(part) for store in stores for part in ids(store["hasPart"])}
     assert set(files) <= loose | inner
 
 
-def test_recordings_and_config_are_named_by_their_hashes(finished_tiny, told):
-    inputs = {name.removeprefix("#input/"): one for name, one in told.items() if name.startswith("#input/")}
-    there = [path.relative_to(finished_tiny.root).as_posix() for path in (finished_tiny.root / "raw").rglob("*.*")]
-    assert set(inputs) == {*there, "config/config.yaml", "config/flights.tsv", "truth.json"}
+def test_crate_lists_recordings_and_config_with_their_hashes(finished_tiny, crate_entities):
+    inputs = {name.removeprefix("#input/"): one for name, one in crate_entities.items() if name.startswith("#input/")}
+    raw_files = [path.relative_to(finished_tiny.root).as_posix() for path in (finished_tiny.root / "raw").rglob("*.*")]
+    assert set(inputs) == {*raw_files, "config/config.yaml", "config/flights.tsv", "truth.json"}
     assert all(one["sha256"] == sha256_file(finished_tiny.root / name) for name, one in inputs.items())
 
 
-def test_every_job_says_its_command_parameters_code_sources_and_results(told, finished_tiny):
-    job = told["#job/image/f01/uav1-uav2"]
+def test_job_states_command_parameters_code_sources_and_results(crate_entities, finished_tiny):
+    job = crate_entities["#job/image/f01/uav1-uav2"]
     assert job["name"] == "apertura step image f01 uav1-uav2"
-    tool = told[job["instrument"]["@id"]]
+    tool = crate_entities[job["instrument"]["@id"]]
     assert tool["identifier"] == f"sha256:{result_of(finished_tiny, 'image', 'f01', 'uav1-uav2').code_sha256}"
     assert {"f01/uav1-uav2/profile.manifest.json", "f01/refined_track.manifest.json"} < set(ids(job["object"]))
-    settings = [told[one] for one in ids(job["object"]) if one.startswith("#setting/")]
-    assert {one["name"]: one["value"] for one in settings}["accuracy_db"] == "auto"
+    settings = [crate_entities[name] for name in ids(job["object"]) if name.startswith("#setting/")]
+    assert {setting["name"]: setting["value"] for setting in settings}["accuracy_db"] == "auto"
     assert ids(job["result"]) == ["f01/uav1-uav2/image.zarr/", "f01/uav1-uav2/image.manifest.json"]
-    assert "#input/raw/f01/uav2.sigmf-data" in ids(told["#job/ingest/f01/uav2"]["object"])
+    assert "#input/raw/f01/uav2.sigmf-data" in ids(crate_entities["#job/ingest/f01/uav2"]["object"])
     assert all(
-        told[one] for action in told.values() if "Action" in str(action["@type"]) for one in ids(action["object"])
+        crate_entities[one]
+        for action in crate_entities.values()
+        if "Action" in str(action["@type"])
+        for one in ids(action["object"])
     )
 
 
-def test_environment_lock_and_code_stand_in_the_crate(told):
-    found = {one["name"]: one["version"] for name, one in told.items() if name.startswith("#software/")}
-    assert found == software()
-    assert {"python", "gdal", "proj", "numpy"} < set(found)
-    assert told["#lock"]["value"] == lock_sha256()
-    assert ids(told["#job/cube"]["environment"]) == ["#lock"]
-    assert ids(told["#control/cube"]["object"]) == ["#job/cube"]
+def test_crate_contains_environment_lock_and_code(crate_entities):
+    versions = {one["name"]: one["version"] for name, one in crate_entities.items() if name.startswith("#software/")}
+    assert versions == software()
+    assert {"python", "gdal", "proj", "numpy"} < set(versions)
+    assert crate_entities["#lock"]["value"] == lock_sha256()
+    assert ids(crate_entities["#job/cube"]["environment"]) == ["#lock"]
+    assert ids(crate_entities["#control/cube"]["object"]) == ["#job/cube"]
 
 
-def test_a_product_made_by_other_code_or_settings_says_so(finished):
+def test_crate_reports_products_of_other_code_or_settings(finished):
     manifest = finished / "results/f01/uav1-uav2/layers.manifest.json"
     document = json.loads(manifest.read_text())
     manifest.write_text(json.dumps({**document, "code": "0" * 64, "settings": "1" * 64}))
     ro_crate(Campaign.load(finished))
     graph = json.loads((finished / "results" / CRATE).read_text())["@graph"]
     described = {one["@id"]: one["description"] for one in graph if one["@id"].startswith("#job/")}
-    said = described["#job/layers/f01/uav1-uav2"]
+    description = described["#job/layers/f01/uav1-uav2"]
     installed = result_of(Campaign.load(finished), "layers", "f01", "uav1-uav2").code_sha256
-    assert f"written by code other than the installed one, whose sha256 is {installed}" in said
-    assert f"written with other settings, of sha256 {'1' * 64}" in said
+    assert f"written by code other than the installed one, whose sha256 is {installed}" in description
+    assert f"written with other settings, of sha256 {'1' * 64}" in description
     assert "results/f01/uav1-uav2/layers.manifest.json" in described["#job/coverage"]
     assert described["#job/echo/f01/uav1-uav2"] == "Up to date with the current code and settings."
 
@@ -171,9 +175,9 @@ def test_a_product_made_by_other_code_or_settings_says_so(finished):
         "config/flights.tsv",
     ],
 )
-def test_a_file_changed_or_gone_is_named(finished, name):
+def test_changed_or_missing_file_is_reported(finished, name):
     assert changed_files(finished / "results") == {}
-    edit(finished / name)
+    change_byte(finished / name)
     assert changed_files(finished / "results") == {name.removeprefix("results/"): "changed"}
     (finished / name).unlink()
     assert changed_files(finished / "results") == {name.removeprefix("results/"): "missing"}
@@ -183,7 +187,7 @@ def test_a_file_changed_or_gone_is_named(finished, name):
 @pytest.mark.parametrize(
     "name", ["../config/config.yaml", "%2E%2E/config/config.yaml", "/etc/passwd", "a%00b", "#input/../x"]
 )
-def test_a_crate_that_leads_out_of_its_folder_is_refused(finished, name):
+def test_crate_with_paths_outside_its_folder_is_refused(finished, name):
     path = finished / "results" / CRATE
     document = json.loads(path.read_text())
     document["@graph"].append({"@id": name, "@type": "File", "sha256": "0"})
@@ -193,26 +197,26 @@ def test_a_crate_that_leads_out_of_its_folder_is_refused(finished, name):
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{}", '{"@graph": [{"sha256": 1}]}', '{"@graph": 3}'])
-def test_a_damaged_crate_is_one_message(finished, text):
+def test_damaged_crate_is_one_message(finished, text):
     (finished / "results" / CRATE).write_text(text)
     with pytest.raises(CampaignError, match="damaged"):
         changed_files(finished / "results")
 
 
-def test_catalog_and_crate_have_the_same_bytes_from_another_folder(finished_tiny, finished):
+def test_catalog_and_crate_do_not_depend_on_the_folder(finished_tiny, finished):
     names = ("stac/", "workflow/", CRATE)
     campaign = Campaign.load(finished)
     shutil.rmtree(finished / "results/stac")
     stac(campaign)
     ro_crate(campaign)
-    made, expected = contents(finished / "results"), contents(finished_tiny.results)
-    some = [name for name in expected if name.startswith(names)]
-    assert len(some) > 10
-    assert [name for name in some if made.get(name) != expected[name]] == []
+    written, expected = contents(finished / "results"), contents(finished_tiny.results)
+    compared = [name for name in expected if name.startswith(names)]
+    assert len(compared) > 10
+    assert [name for name in compared if written.get(name) != expected[name]] == []
 
 
 @pytest.mark.slow
-def test_hostile_campaign_names_stay_text(finished):
+def test_hostile_campaign_name_is_plain_text(finished):
     name = "../../x $(id) %2F {0} 'quoted'"
     config = finished / "config" / "config.yaml"
     config.write_text(re.sub("(?m)^campaign:.*$", lambda _: f"campaign: {json.dumps(name)}", config.read_text()))
@@ -226,11 +230,11 @@ def test_hostile_campaign_names_stay_text(finished):
     assert stac_problems(finished / "results" / "stac") == []
 
 
-def test_the_crate_is_read_by_its_library(finished_tiny):
+def test_crate_is_read_by_the_rocrate_library(finished_tiny):
     crate = ROCrate(finished_tiny.results)
     assert crate.mainEntity.id == "workflow/Snakefile"
-    made = [action for action in crate.root_dataset["mentions"] if action.type == "CreateAction"]
-    assert {action["instrument"].type for action in made if action.id != "#run"} == {"SoftwareApplication"}
+    actions = [action for action in crate.root_dataset["mentions"] if action.type == "CreateAction"]
+    assert {action["instrument"].type for action in actions if action.id != "#run"} == {"SoftwareApplication"}
 
 
 def test_jobs_are_the_rules_of_the_workflow(finished_tiny):
@@ -244,7 +248,7 @@ def test_jobs_are_the_rules_of_the_workflow(finished_tiny):
             assert rule.command_line(rule.of.wildcards) == f"apertura {rules[rule.name]}"
 
 
-def test_the_how_to_does_what_it_says(finished, monkeypatch, capsys):
+def test_how_to_prints_what_it_shows(finished, monkeypatch, capsys):
     monkeypatch.chdir(finished.parent)
     page = (ROOT / "docs/howto/catalog.md").read_text()
     blocks = re.findall(r"```python\n(.*?)```(?:\n\n```text\n(.*?)```)?", page, flags=re.DOTALL)
@@ -252,23 +256,23 @@ def test_the_how_to_does_what_it_says(finished, monkeypatch, capsys):
     names = {}
     for code, printed in blocks:
         exec(compile(code, "catalog.md", "exec"), names)
-        said, expected = capsys.readouterr().out, printed.partition("    ...\n")[0]
-        assert said.startswith(expected)
+        output, expected = capsys.readouterr().out, printed.partition("    ...\n")[0]
+        assert output.startswith(expected)
 
 
-def test_a_frequency_is_the_same_number_in_every_product(finished_tiny):
+def test_frequency_is_equal_in_all_products(finished_tiny):
     item = pystac.Item.from_file(str(finished_tiny.results / "stac/images/f01/uav1-uav2.json"))
     report = json.loads((finished_tiny.result("f01", "uav1-uav2", "image.json")).read_text())
     cube = open_stage(finished_tiny.stage("cube"), "cube")
-    stated = float(cube.centre_frequency.sel(flight="f01", pair="uav1-uav2"))
+    centre_hz = float(cube.centre_frequency.sel(flight="f01", pair="uav1-uav2"))
     profile = open_stage(finished_tiny.stage("profile", "f01", "uav1-uav2"), "profile")
-    assert item.properties["sar:center_frequency"] == round(stated / 1e9, 9)
-    assert report["view"]["centre_hz"] == stated == profile.attrs["centre_frequency_hz"]
+    assert item.properties["sar:center_frequency"] == round(centre_hz / 1e9, 9)
+    assert report["view"]["centre_hz"] == centre_hz == profile.attrs["centre_frequency_hz"]
 
 
 @pytest.mark.slow
-def test_a_verdict_is_the_same_word_in_every_product(finished, monkeypatch):
-    """A wrong code of a sharp pair: neither its image nor the sum that holds it is called focused anywhere."""
+def test_verdict_is_equal_in_all_products(finished, monkeypatch):
+    """A focused pair with a wrong code: no product reports its image, or a sum with it, as focused."""
     line = [("uav1-uav2", "wrong_code", "another code")]
     monkeypatch.setattr("apertura.stages.assess.wrong_codes", lambda _: line)
     campaign = Campaign.load(finished)
@@ -292,13 +296,13 @@ def test_a_verdict_is_the_same_word_in_every_product(finished, monkeypatch):
             assert str(stated.values) == verdict
 
 
-def test_a_crate_states_author_licence_and_doi_where_the_campaign_does():
+def test_crate_states_author_licence_and_doi_if_configured():
     rules = [Listed("workflow/Snakefile", "2" * 64, 10)]
     versions = {"apertura": "1", "snakemake": "9"}
     run = CrateRun("tandem", "2025-05-14T09:30:00Z", versions, "3" * 64, [], [], rules)
-    for stated, licence in (({}, "#licence"), ({"licence": "CC-BY-4.0"}, "https://spdx.org/licenses/CC-BY-4.0")):
-        found = crate_document(replace(run, author="A. Nother", doi="10.5281/zenodo.1", **stated))
-        entities = {entity["@id"]: entity for entity in found["@graph"]}
+    for options, licence in (({}, "#licence"), ({"licence": "CC-BY-4.0"}, "https://spdx.org/licenses/CC-BY-4.0")):
+        document = crate_document(replace(run, author="A. Nother", doi="10.5281/zenodo.1", **options))
+        entities = {entity["@id"]: entity for entity in document["@graph"]}
         assert entities["./"]["license"] == {"@id": licence}
         assert entities["./"]["identifier"] == "https://doi.org/10.5281/zenodo.1"
         assert entities[entities["./"]["author"]["@id"]]["name"] == "A. Nother"

@@ -1,4 +1,4 @@
-"""Tiles that no pulse sees: not stored, NaN in the cube and in the files of the image and of the sums."""
+"""Tiles outside all beams: not stored, and NaN in the cube and in the files of images and sums."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ EMPTY = {"uav1-uav1": [(0, 0)], "uav1-uav2": [(0, 0), (1, 1)]}
 
 
 def without_tiles(campaign, pair):
-    """Write an image of a pair again, without some of its tiles."""
+    """Rewrite the image of a pair without its tiles in EMPTY; return the complete image."""
     folder = campaign.stage("image", "f01", pair)
     image = open_stage(folder, "image").load()
     folder.remove()
@@ -35,11 +35,11 @@ def emptied(finished_tiny, tmp_path_factory):
     root = copy_writable(finished_tiny.root, tmp_path_factory.mktemp("emptied") / "campaign")
     edit_config(root, lambda document: document.update(processing={"tile_px": SIDE}))
     campaign = Campaign.load(root)
-    whole = {pair: without_tiles(campaign, pair) for pair in EMPTY}
+    complete = {pair: without_tiles(campaign, pair) for pair in EMPTY}
     cube.cube(campaign)
     export.export(campaign, "f01", "uav1-uav2")
     export.export_fused(campaign, "f01")
-    return campaign, whole
+    return campaign, complete
 
 
 def tiles_of(folder):
@@ -48,28 +48,28 @@ def tiles_of(folder):
     }
 
 
-def test_a_tile_that_a_pair_does_not_see_is_not_stored_in_the_cube(emptied):
+def test_empty_tile_is_not_stored_in_the_cube(emptied):
     campaign, _ = emptied
     folder = campaign.stage("cube")
     assert tiles_of(folder / "image" / "c" / "0" / "1") == {(0, 1), (1, 0)}
     assert tiles_of(folder / "coherent" / "c" / "0") == {(0, 1), (1, 0), (1, 1)}
-    held = open_stage(folder, "cube")
-    assert np.isnan(held.image.values[0, 1, SIDE:, SIDE:]).all()
-    assert np.isnan(held.noncoherent.values[0, :SIDE, :SIDE]).all()
+    opened = open_stage(folder, "cube")
+    assert np.isnan(opened.image.values[0, 1, SIDE:, SIDE:]).all()
+    assert np.isnan(opened.noncoherent.values[0, :SIDE, :SIDE]).all()
 
 
-def test_a_sum_takes_what_a_pair_does_not_see_as_nothing(emptied):
-    campaign, whole = emptied
-    held = open_stage(campaign.stage("cube"), "cube")
+def test_empty_tile_counts_as_zero_in_a_sum(emptied):
+    campaign, complete = emptied
+    opened = open_stage(campaign.stage("cube"), "cube")
     alone = (slice(SIDE, None), slice(SIDE, None))
     image = open_stage(campaign.stage("image", "f01", "uav1-uav1"), "image")
-    mono = np.abs(whole["uav1-uav1"][alone]) / image.attrs["quality"]["brightest"]["amplitude"]
-    np.testing.assert_allclose(held.noncoherent.values[0][alone], mono**2 / 2, rtol=1e-5)
-    assert np.isfinite(held.coherent.values[0, :SIDE, SIDE:]).all()
+    mono = np.abs(complete["uav1-uav1"][alone]) / image.attrs["quality"]["brightest"]["amplitude"]
+    np.testing.assert_allclose(opened.noncoherent.values[0][alone], mono**2 / 2, rtol=1e-5)
+    assert np.isfinite(opened.coherent.values[0, :SIDE, SIDE:]).all()
 
 
 @pytest.mark.parametrize("name", ["uav1-uav2/slc.tif", "uav1-uav2/db.tif", "fused/coherent_power.tif"])
-def test_a_file_has_no_data_where_nothing_was_formed(emptied, name):
+def test_file_has_no_data_in_empty_tiles(emptied, name):
     campaign, _ = emptied
     with rasterio.open(str(campaign.results / "f01" / name)) as raster:
         pixels, valid = raster.read(1), raster.dataset_mask() > 0

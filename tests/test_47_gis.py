@@ -1,4 +1,4 @@
-"""Programs that open our rasters agree on where they lie, on what is no data, and on each pixel to the millimetre."""
+"""GIS programs read the same geotransform, CRS, no-data value and pixel positions from the rasters."""
 
 import json
 
@@ -34,18 +34,18 @@ from apertura.workflow.stale import damaged_results
 FLOWN = {"f01": ("uav1-uav1", "uav1-uav2", "fused")}
 RASTERS = [name for name in product_files(FLOWN) if name.endswith((".tif", ".vrt"))]
 STYLED = [name for name in product_files(FLOWN) if name.endswith(".qml")]
-needs_gdal = pytest.mark.skipif(not have_gdal(), reason="no programs of GDAL here: gdalinfo, gdallocationinfo")
-needs_qgis = pytest.mark.skipif(not have_qgis(), reason="no QGIS here")
+needs_gdal = pytest.mark.skipif(not have_gdal(), reason="gdalinfo and gdallocationinfo are not installed")
+needs_qgis = pytest.mark.skipif(not have_qgis(), reason="QGIS is not installed")
 
 MILLIMETRE, SPACING_M, SHAPE = 0.001, 0.05, (40, 60)
 ROW, COLUMN = 11, 37
 
 
-def agree(told, expected):
-    assert told["transform"] == pytest.approx(expected["transform"], rel=0, abs=1e-8)
-    assert tuple(told["shape"]) == tuple(expected["shape"])
-    assert told["nodata"] == pytest.approx(expected["nodata"], nan_ok=True)
-    one, other = (CRS.from_wkt(place["wkt"]) for place in (told, expected))
+def agree(reported, expected):
+    assert reported["transform"] == pytest.approx(expected["transform"], rel=0, abs=1e-8)
+    assert tuple(reported["shape"]) == tuple(expected["shape"])
+    assert reported["nodata"] == pytest.approx(expected["nodata"], nan_ok=True)
+    one, other = (CRS.from_wkt(raster["wkt"]) for raster in (reported, expected))
     assert one.is_engineering == other.is_engineering
     assert one.name == other.name if one.is_engineering else one.to_epsg() == other.to_epsg() is not None
 
@@ -56,42 +56,40 @@ def test_rioxarray_agrees_with_rasterio_on_every_raster(finished_tiny):
 
 
 @needs_gdal
-def test_another_gdal_agrees_with_rasterio_on_every_raster(finished_tiny):
+def test_gdal_programs_agree_with_rasterio_on_every_raster(finished_tiny):
     for name in RASTERS:
         agree(by_gdal(finished_tiny.results / name), by_rasterio(finished_tiny.results / name))
 
 
 @needs_qgis
-def test_qgis_agrees_with_rasterio_on_every_raster_finds_every_style_and_changes_none(finished_tiny, tmp_path):
+def test_qgis_agrees_with_rasterio_and_uses_every_style(finished_tiny, tmp_path):
     results = copy_writable(finished_tiny.root, tmp_path / "campaign") / "results"
     paths = {name: results / name for name in RASTERS}
-    told = ask_qgis(tell=[str(path) for path in paths.values()])["told"]
+    reports = ask_qgis(tell=[str(path) for path in paths.values()])["told"]
     assert not damaged_results(Campaign.load(results.parent))
     for name, path in paths.items():
-        found = told[str(path)]
-        assert found["valid"], name
-        assert found["crs"] == "EPSG:32632"
-        agree(found, by_rasterio(path))
+        report = reports[str(path)]
+        assert report["valid"], name
+        assert report["crs"] == "EPSG:32632"
+        agree(report, by_rasterio(path))
         if name.endswith("db.tif"):
             radiometry = json.loads(rasterio.open(path).tags()["APERTURA_RADIOMETRY"])
             top = radiometry["peak_db"]
-            assert found["stretch"] == pytest.approx([top + radiometry["noise_floor_re_peak_db"], top], abs=0.01)
-            assert found["legend"] == [" dB"]  # after each end of the ramp
+            assert report["stretch"] == pytest.approx([top + radiometry["noise_floor_re_peak_db"], top], abs=0.01)
+            assert report["legend"] == [" dB"]  # suffix of both ends of the ramp
         if name.endswith("nesz.tif"):
-            assert len(found["legend"]) == 5
-            assert all(label.endswith(" dB") for label in found["legend"])
+            assert len(report["legend"]) == 5
+            assert all(label.endswith(" dB") for label in report["legend"])
         if name.endswith("mask.tif"):
-            assert found["classes"]["2"] == ["layover", 255]
-            assert found["classes"]["0"] == ["valid", 0]
+            assert report["classes"]["2"] == ["layover", 255]
+            assert report["classes"]["0"] == ["valid", 0]
         if path.with_suffix(".qml").name in {"incidence.qml", "looks.qml"}:
-            assert found["renderer"] == "singlebandpseudocolor"
-    assert (
-        len(STYLED) == (2 * 7 + 5) * 2
-    )  # of each pair two and five layers, of sums five; in the flight, in the mosaic
+            assert report["renderer"] == "singlebandpseudocolor"
+    assert len(STYLED) == (2 * 7 + 5) * 2  # per pair 2 + 5 layers, sums 5; in the flight and in the mosaic
 
 
 def known_rasters():
-    """Return rasters that differ from their ground at one pixel alone."""
+    """Return rasters that differ from their background at one pixel only."""
     rasters = {source: np.ones(SHAPE, np.complex64) for source in ("image", "coherent", "noncoherent")}
     rasters |= {source: np.ones(SHAPE, np.float32) for source in ("magnitude", "incidence", "bistatic_angle")}
     rasters |= {
@@ -106,7 +104,7 @@ def known_rasters():
 
 @pytest.fixture(scope="module", params=["EPSG:32632", pytest.param(LOCAL, marks=pytest.mark.slow)])
 def control(request, tmp_path_factory):
-    """Every kind of raster with a control point in it, and where that is."""
+    """Write every kind of raster with a control point; return their paths and its map position."""
     north_m = 5363701.65 if request.param != LOCAL else 40.0
     west_m = 570656.9 if request.param != LOCAL else -30.0
     grid = SceneGrid(request.param, west_m, north_m, SPACING_M, SHAPE)
@@ -130,14 +128,14 @@ def control(request, tmp_path_factory):
     return sorted([*folder.parent.rglob("*.tif"), *folder.parent.rglob("*.vrt")]), (x, y)
 
 
-def test_control_points_lie_where_the_pixel_is_centred(control):
+def test_control_points_lie_at_pixel_centres(control):
     paths, (x, y) = control
-    assert len(paths) == (3 + 5 + 6) + (2 + 5 + 5)  # of pair, layers and sums; in the mosaic none that is complex
+    assert len(paths) == (3 + 5 + 6) + (2 + 5 + 5)  # pair, layers and sums; the mosaic has no complex raster
     for path in paths:
         with rasterio.open(path) as raster:
             values = np.abs(raster.read(1))
-            there = raster.xy(*np.unravel_index(values.argmax(), values.shape))
-        assert there == pytest.approx((x, y), rel=0, abs=MILLIMETRE / 10)
+            position = raster.xy(*np.unravel_index(values.argmax(), values.shape))
+        assert position == pytest.approx((x, y), rel=0, abs=MILLIMETRE / 10)
 
 
 @pytest.mark.quick("EPSG:32632-*")
@@ -150,47 +148,48 @@ def test_control_points_lie_where_the_pixel_is_centred(control):
         pytest.param(sampled_by_qgis, marks=needs_qgis),
     ],
 )
-def test_a_control_point_reads_back_within_a_millimetre(control, sampled):
-    """A place a millimetre inside each edge of its pixel has its value, one a millimetre outside has not."""
+def test_control_point_is_read_within_a_millimetre(control, sampled):
+    """Points 1 mm inside each edge of the pixel have its value, points 1 mm outside do not."""
     paths, (x, y) = control
-    ways = [(1, 0), (-1, 0), (0, 1), (0, -1)]
+    directions = [(1, 0), (-1, 0), (0, 1), (0, -1)]
     reach = [SPACING_M / 2 - MILLIMETRE, SPACING_M / 2 + MILLIMETRE]
-    places = [(x + east * far, y + north * far) for far in reach for east, north in ways]
-    found = sampled(dict.fromkeys(paths, places))
-    assert len(found) >= len(paths) - 2
-    for path, values in found.items():
+    points = [(x + east * far, y + north * far) for far in reach for east, north in directions]
+    samples = sampled(dict.fromkeys(paths, points))
+    assert len(samples) >= len(paths) - 2
+    for path, values in samples.items():
         inside, outside = np.split(np.array(values), 2)
         with rasterio.open(path) as raster:
-            point, ground = (raster.read(1)[at] for at in ((ROW, COLUMN), (0, 0)))
+            point, background = (raster.read(1)[at] for at in ((ROW, COLUMN), (0, 0)))
         np.testing.assert_allclose(inside, point, rtol=1e-6, err_msg=str(path))
-        np.testing.assert_allclose(outside, ground, rtol=1e-6, atol=1e-6, err_msg=str(path))
+        np.testing.assert_allclose(outside, background, rtol=1e-6, atol=1e-6, err_msg=str(path))
 
 
 @needs_qgis
-def test_qgis_paints_the_brightest_place_white_and_the_noise_floor_black(finished_tiny, tmp_path):
+def test_qgis_renders_peak_white_and_noise_floor_black(finished_tiny, tmp_path):
     db, picture = finished_tiny.results / "f01/uav1-uav1/db.tif", tmp_path / "db.png"
     assert ask_qgis(draw={str(db): [str(picture), 240]})["errors"][str(db)] == []
     with rasterio.open(db) as raster:
         decibel, radiometry = raster.read(1), json.loads(raster.tags()["APERTURA_RADIOMETRY"])
     with pytest.warns(rasterio.errors.NotGeoreferencedWarning), rasterio.open(picture) as png:
-        grey = png.read(1)[2::4, 2::4].astype(float)  # 60 pixels, four dots each
+        grey = png.read(1)[2::4, 2::4].astype(float)  # 60 pixels of 4 × 4 dots
     floor_db = radiometry["peak_db"] + radiometry["noise_floor_re_peak_db"]
     expected = np.clip((decibel - floor_db) / -radiometry["noise_floor_re_peak_db"], 0, 1) * 255
     assert np.abs(grey - expected).max() < 3
 
 
-def test_every_image_and_sum_says_what_its_values_mean(finished_tiny):
-    said = {}
+def test_every_image_and_sum_states_its_quantity(finished_tiny):
+    quantities = {}
     for name in (name for name in RASTERS if name.endswith(".tif")):
         with rasterio.open(str(finished_tiny.results / name)) as raster:
             radiometry = json.loads(raster.tags()["APERTURA_RADIOMETRY"])
             assert (raster.descriptions[0], raster.units[0]) == (radiometry["quantity"], radiometry["unit"])
-        said[name.removeprefix("f01/")] = radiometry
-    assert said["uav1-uav1/power.tif"]["quantity"] == "echo power, linear"
-    assert not said["uav1-uav1/power.tif"]["divided_by"]
+        quantities[name.removeprefix("f01/")] = radiometry
+    assert quantities["uav1-uav1/power.tif"]["quantity"] == "echo power, linear"
+    assert not quantities["uav1-uav1/power.tif"]["divided_by"]
     sums = [f"fused/{row.file}" for row in exports_in("fused") if row.file.endswith(".tif")]
     assert (
-        len({said[name]["quantity"] for name in [*sums, "uav1-uav1/slc.tif", "uav1-uav1/power.tif"]}) == len(sums) + 2
+        len({quantities[name]["quantity"] for name in [*sums, "uav1-uav1/slc.tif", "uav1-uav1/power.tif"]})
+        == len(sums) + 2
     )
     reports = {
         name: json.loads((finished_tiny.results / f"f01/{name}/image.json").read_text()) for name in FLOWN["f01"]
@@ -200,11 +199,11 @@ def test_every_image_and_sum_says_what_its_values_mean(finished_tiny):
     for source in ("coherent", "noncoherent", "magnitude"):
         assert fused["radiometry"][source]["divided_by"] == peaks
     for name in sums:
-        assert said[name]["divided_by"] == peaks
-    assert said["fused/coherent_db.tif"]["phases_removed_rad"] == fused["fusion"]["phases_rad"]
+        assert quantities[name]["divided_by"] == peaks
+    assert quantities["fused/coherent_db.tif"]["phases_removed_rad"] == fused["fusion"]["phases_rad"]
 
 
-def test_a_sum_times_its_factor_is_the_echo_again(finished_tiny):
+def test_sum_times_its_divisor_is_the_echo(finished_tiny):
     folder = finished_tiny.results / "f01"
     with rasterio.open(str(folder / "fused" / "noncoherent_power.tif")) as raster:
         mean, peaks = raster.read(1), json.loads(raster.tags()["APERTURA_RADIOMETRY"])["divided_by"]
@@ -212,7 +211,7 @@ def test_a_sum_times_its_factor_is_the_echo_again(finished_tiny):
     np.testing.assert_allclose(mean, np.mean(powers, axis=0), rtol=1e-5)
 
 
-def test_a_mosaic_of_a_product_that_was_edited_or_is_gone_is_refused(finished_tiny, tmp_path):
+def test_mosaic_of_an_edited_or_missing_product_is_refused(finished_tiny, tmp_path):
     root = copy_writable(finished_tiny.root, tmp_path / "campaign")
     path = root / "results" / "f01" / "fused" / "coherent_db.tif"
     path.write_bytes(path.read_bytes()[:-1] + b"x")
@@ -227,13 +226,13 @@ def test_a_mosaic_of_a_product_that_was_edited_or_is_gone_is_refused(finished_ti
 
 @pytest.mark.slow
 @needs_qgis
-def test_qgis_draws_decibels_of_the_sample_where_the_sample_lies(finished_sample, tmp_path):
+def test_qgis_renders_the_sample_at_its_position(finished_sample, tmp_path):
     db, picture = finished_sample.results / "f01/uav1-uav1/db.tif", tmp_path / "db.png"
     answer = ask_qgis(tell=[str(db)], draw={str(db): [str(picture), 560]})
-    told, (west, south, east, north) = answer["told"][str(db)], finished_sample.settings.scene.bounds_m
-    assert (told["crs"], answer["errors"][str(db)]) == ("EPSG:32632", [])
-    right, _, left, _, down, top = told["transform"]
-    rows, columns = told["shape"]
+    report, (west, south, east, north) = answer["told"][str(db)], finished_sample.settings.scene.bounds_m
+    assert (report["crs"], answer["errors"][str(db)]) == ("EPSG:32632", [])
+    right, _, left, _, down, top = report["transform"]
+    rows, columns = report["shape"]
     edges = (left, top + rows * down, left + columns * right, top)
     assert edges == pytest.approx((west, south, east, north), rel=0, abs=MILLIMETRE)
     truth = json.loads((finished_sample.root / "truth.json").read_text())["targets"]

@@ -1,4 +1,4 @@
-"""Every file a user gets is valid, lies where the config says and says where it comes from."""
+"""Products: validity, position on the configured grid, provenance tags, numerical error and flags."""
 
 import json
 import re
@@ -37,16 +37,18 @@ def tags_of(campaign, name):
         return raster.tags()
 
 
-def test_every_product_of_the_table_is_there_and_no_other(finished_tiny):
+def test_products_are_exactly_those_of_the_table(finished_tiny):
     results = finished_tiny.results
-    opened = {".tif", ".png", ".geojson", ".qml", ".vrt"}
-    named = {path for path in results.rglob("*") if path.suffix in opened or path.name in {"image.json", "map.json"}}
+    suffixes = {".tif", ".png", ".geojson", ".qml", ".vrt"}
+    products = {
+        path for path in results.rglob("*") if path.suffix in suffixes or path.name in {"image.json", "map.json"}
+    }
     assert (len(RASTERS), len(LAYERS)) == (12, 10)
-    assert {path.relative_to(results).as_posix() for path in named} == {*PRODUCTS, "f01/tracks/tracks.png"}
+    assert {path.relative_to(results).as_posix() for path in products} == {*PRODUCTS, "f01/tracks/tracks.png"}
 
 
 @pytest.mark.parametrize("name", [*RASTERS, *LAYERS])
-def test_a_raster_is_a_valid_cog_on_the_campaigns_grid(finished_tiny, name):
+def test_raster_is_a_valid_cog_on_the_configured_grid(finished_tiny, name):
     path = finished_tiny.results / name
     valid, errors, warnings = cog_validate(str(path), strict=True, quiet=True)
     assert valid, (errors, warnings)
@@ -59,7 +61,7 @@ def test_a_raster_is_a_valid_cog_on_the_campaigns_grid(finished_tiny, name):
 
 
 @pytest.mark.parametrize("name", [*RASTERS, *LAYERS])
-def test_a_raster_says_where_it_comes_from(finished_tiny, name):
+def test_raster_tags_state_settings_and_inputs(finished_tiny, name):
     tags, pair = tags_of(finished_tiny, name), name.split("/")[1]
     spec = json.loads(tags["APERTURA_RUNSPEC"])
     assert ("fusion" in spec) == (pair == "fused")
@@ -74,7 +76,7 @@ def test_a_raster_says_where_it_comes_from(finished_tiny, name):
 
 
 @pytest.mark.parametrize("name", [*RASTERS, *LAYERS])
-def test_a_raster_names_what_it_was_made_from_and_with(finished_tiny, name):
+def test_raster_tags_state_sources_and_software(finished_tiny, name):
     tags, folder = tags_of(finished_tiny, name), (finished_tiny.results / name).parent
     manifest = folder / ("layers.manifest.json" if name in LAYERS else "export.manifest.json")
     sources = json.loads(tags["APERTURA_SOURCES"])
@@ -89,7 +91,7 @@ def test_a_raster_names_what_it_was_made_from_and_with(finished_tiny, name):
 
 
 @pytest.mark.slow
-def test_a_raster_of_one_flight_names_no_recording_of_another(tmp_path):
+def test_raster_tags_name_only_recordings_of_their_flight(tmp_path):
     plan = replace(preset("demo", pulses=20), scene=ImageGrid("EPSG:32632", half_width_m=1.5, spacing_m=0.1))
     (flight,) = plan.flights
     campaign = run_steps(
@@ -101,7 +103,7 @@ def test_a_raster_of_one_flight_names_no_recording_of_another(tmp_path):
             assert {role.split("/")[1] for role in inputs} == {"codes.npy", name.split("/")[0]}
 
 
-def test_a_product_that_stands_on_a_stage_of_other_versions_names_both(finished_tiny):
+def test_provenance_lists_differing_software_versions(finished_tiny):
     image = open_stage(finished_tiny.stage("image", "f01", "uav1-uav1"), "image")
     assert image.attrs["software"] == packages()
     older = xr.Dataset(attrs=image.attrs | {"software": packages() | {"numpy": "0.1"}})
@@ -111,7 +113,7 @@ def test_a_product_that_stands_on_a_stage_of_other_versions_names_both(finished_
 
 
 @pytest.mark.parametrize("name", RASTERS)
-def test_a_raster_says_how_exact_it_is(finished_tiny, name):
+def test_raster_tags_state_the_numerical_error(finished_tiny, name):
     tags = tags_of(finished_tiny, name)
     report = json.loads((finished_tiny.results / name).with_name("image.json").read_text())
     for tag, key in (("ERROR_DB", "numerical_error_db"), ("ERROR_CONFIDENCE", "numerical_error_confidence")):
@@ -122,15 +124,15 @@ def test_a_raster_says_how_exact_it_is(finished_tiny, name):
     assert "APERTURA_REDONE" not in tags
 
 
-def test_a_fused_raster_keeps_the_settings_of_its_pairs_apart(finished_tiny):
-    apart = json.loads(tags_of(finished_tiny, "f01/fused/coherent_db.tif")["APERTURA_RUNSPEC"])
+def test_fused_raster_states_the_settings_of_each_pair(finished_tiny):
+    runspec = json.loads(tags_of(finished_tiny, "f01/fused/coherent_db.tif")["APERTURA_RUNSPEC"])
     for pair in PAIRS:
-        assert apart[pair] == json.loads(tags_of(finished_tiny, f"f01/{pair}/db.tif")["APERTURA_RUNSPEC"])
-    assert set(apart) == {*PAIRS, "fusion"}
-    assert apart["uav1-uav1"] != apart["uav1-uav2"]
+        assert runspec[pair] == json.loads(tags_of(finished_tiny, f"f01/{pair}/db.tif")["APERTURA_RUNSPEC"])
+    assert set(runspec) == {*PAIRS, "fusion"}
+    assert runspec["uav1-uav1"] != runspec["uav1-uav2"]
 
 
-def test_a_title_says_what_was_added_up(finished_tiny):
+def test_title_names_the_kind_of_sum(finished_tiny):
     for name, words in (("coherent", "coherent sum"), ("noncoherent", "non-coherent sum")):
         title = tags_of(finished_tiny, f"f01/fused/{name}_db.tif")["TIFFTAG_IMAGEDESCRIPTION"]
         assert title.split(" · ")[1:] == ["flight f01", f"{words} of uav1-uav1 + uav1-uav2"]
@@ -143,7 +145,7 @@ def test_power_and_db_are_the_slc_squared(finished_tiny):
     np.testing.assert_allclose(db, 20 * np.log10(np.abs(slc)), atol=1e-3)
 
 
-def test_the_cube_opens_with_xarray_and_holds_every_image(finished_tiny):
+def test_cube_opens_with_xarray_and_contains_every_image(finished_tiny):
     cube = xr.open_zarr(str(finished_tiny.results / "cube.zarr"), consolidated=False, chunks=None)
     assert cube.image.dims == ("flight", "pair", "y", "x")
     assert cube.image.attrs["grid_mapping"] == "spatial_ref"
@@ -152,7 +154,7 @@ def test_the_cube_opens_with_xarray_and_holds_every_image(finished_tiny):
     np.testing.assert_array_equal(cube.image.values[0, cube.attrs["pairs"].index("uav1-uav2")], slc)
 
 
-def test_coverage_lies_where_the_campaign_was_flown(finished_tiny):
+def test_coverage_contains_tracks_and_footprints(finished_tiny):
     features = json.loads((finished_tiny.results / "coverage.geojson").read_text())["features"]
     kinds = [(feature["properties"]["kind"], feature["properties"]["pair"]) for feature in features]
     assert kinds == [("track", PAIRS[0]), ("footprint", PAIRS[0]), *2 * [("track", PAIRS[1])], ("footprint", PAIRS[1])]
@@ -168,7 +170,7 @@ def test_coverage_lies_where_the_campaign_was_flown(finished_tiny):
         assert np.abs(np.stack(ecef, -1)[0] - echo[name].values[0]).max() < 0.01
 
 
-def test_a_layer_of_noise_lies_below_its_image(finished_tiny):
+def test_noise_layer_lies_below_its_image(finished_tiny):
     folder = finished_tiny.results / "f01" / "uav1-uav1"
     db, nesz, looks, mask = (
         rasterio.open(str(folder / f"{name}.tif")).read(1) for name in ("db", "nesz", "looks", "mask")
@@ -178,7 +180,7 @@ def test_a_layer_of_noise_lies_below_its_image(finished_tiny):
     assert not mask.any()
 
 
-def test_tags_hold_the_flags_that_an_image_has(finished_tiny):
+def test_tags_contain_the_flags_of_an_image(finished_tiny):
     report = json.loads((finished_tiny.results / "f01/uav1-uav1/image.json").read_text())
     flags = {"track_gap": "uav1: a gap of 1.2 s"}
     assert json.loads(quality_tags(report | {"flags": flags})["APERTURA_FLAGS"]) == flags

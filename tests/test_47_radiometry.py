@@ -1,4 +1,4 @@
-"""A flight whose radio is stated: cross-sections and σ⁰ of its images against what was simulated."""
+"""Radiometric calibration from the configured radio: cross-sections and σ⁰ compared with the simulation."""
 
 import json
 from dataclasses import replace
@@ -28,13 +28,13 @@ from apertura.views.webmap.document import webmap
 from apertura.workflow.lineage import result_of
 
 RCS_M2 = (0.1, 1.0, 10.0)
-PLACES = ((-2.0, -1.5, 0.0), (0.0, 1.2, 0.0), (2.0, -0.5, 0.0))
+POSITIONS = ((-2.0, -1.5, 0.0), (0.0, 1.2, 0.0), (2.0, -0.5, 0.0))
 RADIO = Radio(10.0, 8.0, 9.0, full_scale_dbm=4.0, gain_db=40.0, noise_figure_db=6.0, amplitude_std_db=0.5)
 PAIRS = ("uav1-uav1", "uav1-uav2")
 
 
 def plan(radio=RADIO, **grid):
-    """The demo's two nodes over three points; beams look to the right, where the scene is."""
+    """Return a specification: two nodes with beams to the right, towards a scene with three points."""
     base = preset("demo", pulses=120)
     beams = {name: GaussianBeam((90.0, -22.0), (70.0, 50.0)) for name in ("radar_tx", "radar_rx")}
     nodes = {
@@ -48,44 +48,44 @@ def plan(radio=RADIO, **grid):
         )
         for name, node in base.nodes.items()
     }
-    targets = tuple(PointTarget(place, rcs**0.5) for place, rcs in zip(PLACES, RCS_M2, strict=True))
+    targets = tuple(PointTarget(place, rcs**0.5) for place, rcs in zip(POSITIONS, RCS_M2, strict=True))
     return replace(base, nodes=nodes, targets=targets, scene=ImageGrid("EPSG:32632", half_width_m=3.0, spacing_m=0.05))
 
 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory):
-    """The flight, imaged and exported."""
+    """Image and export the flight."""
     campaign = run_steps(simulate(tmp_path_factory.mktemp("radio") / "campaign", plan(), seed=3), exports=False)
     export_flight(campaign, "f01")
     return campaign
 
 
-def said(campaign, pair, name="radiometry.json"):
+def report_of(campaign, pair, name="radiometry.json"):
     return json.loads(campaign.result("f01", pair, name).read_text())
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("pair", PAIRS)
-def test_cross_sections_of_a_simulated_flight_are_those_of_its_targets(flown, pair):
-    """From samples of a 14-bit converter, by two beams, from power, gains and receiver that the config states."""
-    found = [one for one in score(flown) if one.image == pair]
-    assert [one.rcs_put_dbsm for one in found] == pytest.approx([-10, 0, 10])
-    for one in found:
-        assert abs(one.rcs_dbsm - one.rcs_put_dbsm) < max(0.3, one.rcs_std_db)
-    listed = said(flown, pair, "image.json")["cross_sections"]["points_listed"]
+def test_measured_cross_sections_are_those_of_the_targets(flown, pair):
+    """Samples of a 14-bit converter, two beams, and configured power, gains and receiver."""
+    findings = [finding for finding in score(flown) if finding.image == pair]
+    assert [finding.rcs_put_dbsm for finding in findings] == pytest.approx([-10, 0, 10])
+    for finding in findings:
+        assert abs(finding.rcs_dbsm - finding.rcs_put_dbsm) < max(0.3, finding.rcs_std_db)
+    listed = report_of(flown, pair, "image.json")["cross_sections"]["points_listed"]
     assert listed == {"most": 50, "below_brightest_db": -12.0, "above_surroundings_db": 12.2}
-    brightest = said(flown, pair, "image.json")["cross_sections"]["points"][0]
+    brightest = report_of(flown, pair, "image.json")["cross_sections"]["points"][0]
     assert brightest["rcs_dbsm"] == pytest.approx(10, abs=0.3)
-    *_, pointing, amplitude = said(flown, pair, "image.json")["budget"]
+    *_, pointing, amplitude = report_of(flown, pair, "image.json")["budget"]
     assert (pointing["cause"], amplitude["cause"]) == ("pointing", "amplitude")
-    assert 0 < said(flown, pair)["pointing_std_db"] < 2
+    assert 0 < report_of(flown, pair)["pointing_std_db"] < 2
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("pair", PAIRS)
-def test_the_noise_of_a_calibrated_image_is_that_of_the_noise_figure(flown, pair):
-    """Eqs. 7 to 8b: the receiver's 6 dB are what a recording has, its sidelink's own noise on the echoes taken off."""
-    noise = said(flown, pair)["noise"]
+def test_noise_of_a_calibrated_image_agrees_with_the_noise_figure(flown, pair):
+    """Eqs. 7 to 8b: the measured noise figure is 6 dB after subtraction of the sidelink noise."""
+    noise = report_of(flown, pair)["noise"]
     assert abs(noise["noise_figure_measured_db"] - 6) < 3 * noise["std_db"] < 1.0
     assert (noise["sidelink"] is None) is (pair == "uav1-uav1")
     with rasterio.open(str(flown.result("f01", pair, "nesz.tif"))) as raster:
@@ -94,9 +94,9 @@ def test_the_noise_of_a_calibrated_image_is_that_of_the_noise_figure(flown, pair
 
 
 @pytest.mark.slow
-def test_a_receiver_stated_wrong_by_six_decibels_is_told_by_its_noise(flown, tmp_path):
-    """Eq. 8b: by its noise against the figure stated; without one, where it is below any receiver's."""
-    assert not any("noise_disagrees" in said(flown, pair)["flags"] for pair in PAIRS)
+def test_receiver_gain_error_of_6_db_is_flagged_from_noise(flown, tmp_path):
+    """Eq. 8b: noise compared with the configured figure, or without one with the physical limit of 0 dB."""
+    assert not any("noise_disagrees" in report_of(flown, pair)["flags"] for pair in PAIRS)
     root = copy_writable(flown.root, tmp_path / "campaign")
     for wrong_db, figure_db, flagged in ((6.0, 6.0, True), (-6.0, 6.0, True), (6.0, None, False), (12.0, None, True)):
 
@@ -108,11 +108,11 @@ def test_a_receiver_stated_wrong_by_six_decibels_is_told_by_its_noise(flown, tmp
         campaign = Campaign.load(root)
         for pair in PAIRS:
             layers(campaign, "f01", pair)
-            assert ("noise_disagrees" in said(campaign, pair)["flags"]) is flagged, (pair, wrong_db, figure_db)
+            assert ("noise_disagrees" in report_of(campaign, pair)["flags"]) is flagged, (pair, wrong_db, figure_db)
 
 
 @pytest.mark.slow
-def test_sigma0_says_what_it_is_and_times_its_cell_is_the_image(flown):
+def test_sigma0_states_its_quantity_and_scales_with_the_image(flown):
     with rasterio.open(str(flown.result("f01", "uav1-uav1", "sigma0_db.tif"))) as raster:
         means, sigma0_db = json.loads(raster.tags()["APERTURA_RADIOMETRY"]), raster.read(1)
         assert raster.units == ("dB",)
@@ -125,7 +125,7 @@ def test_sigma0_says_what_it_is_and_times_its_cell_is_the_image(flown):
     assert not flown.result("f01", "uav1-uav1", "gamma0_db.tif").exists()
 
 
-def test_nothing_is_calibrated_of_a_radio_that_nobody_states(finished_tiny):
+def test_no_calibrated_products_without_a_configured_radio(finished_tiny):
     folder = finished_tiny.result("f01", "uav1-uav1")
     assert not list(folder.glob("*0_db.tif"))
     assert not (folder / "radiometry.json").exists()
@@ -133,60 +133,60 @@ def test_nothing_is_calibrated_of_a_radio_that_nobody_states(finished_tiny):
         assert "relative" in raster.descriptions[0]
 
 
-def with_radio(root, *, left_out=()):
-    """State the radio of both nodes in the config of a campaign."""
+def with_radio(root, *, omitted=()):
+    """Configure the radio of both nodes of a campaign, except omitted keys."""
 
     def change(document):
         for node in document["nodes"].values():
             gains = {"radar_tx_gain_dbi": 8.0, "radar_rx_gain_dbi": 9.0}
             receiver = {"full_scale_counts": 8192, "full_scale_v": 0.5, "gain_db": 40.0}
             stated = {"antennas": gains, "transmit_power_dbm": 10.0, "receiver": receiver}
-            node.update({key: value for key, value in stated.items() if key not in left_out})
+            node.update({key: value for key, value in stated.items() if key not in omitted})
 
     edit_config(root, change)
     return Campaign
 
 
-def test_coefficients_are_products_where_they_are_written():
+def test_radiometric_coefficients_are_products():
     files = set(product_files({"f01": ["a-b"]}, ["gamma0"]))
     assert {"f01/a-b/gamma0_db.tif", "f01/a-b/gamma0_db.qml", "mosaic/a-b/gamma0_db.vrt"} <= files
     assert not any("sigma0" in name for name in files)
 
 
-def test_a_radio_stated_in_parts_is_one_message(tiny):
-    message = complaint(lambda: with_radio(tiny, left_out=["receiver"]).load(tiny))
+def test_incomplete_radio_is_one_message(tiny):
+    message = complaint(lambda: with_radio(tiny, omitted=["receiver"]).load(tiny))
     assert "nodes.uav1.receiver, nodes.uav2.receiver are not configured" in message
     assert "of every pair, or none of these" in message
 
 
-def test_a_receiver_states_its_full_scale_once(tiny):
+def test_receiver_has_a_single_full_scale(tiny):
     with_radio(tiny).load(tiny)
     edit_config(tiny, lambda document: document["nodes"]["uav1"]["receiver"].update(full_scale_dbm=4.0))
     assert "either full_scale_dbm or full_scale_v" in complaint(lambda: Campaign.load(tiny))
 
 
-def test_a_radio_forms_no_image_again(tiny):
-    """It matters to layers and reports alone: the settings of all that is before them stay as they were."""
-    made = ("echo", "profile", "image", "layers")
-    before = {name: result_of(Campaign.load(tiny), name, "f01", "uav1-uav2") for name in made}
-    after = {name: result_of(with_radio(tiny).load(tiny), name, "f01", "uav1-uav2") for name in made}
-    changed = {name for name in made if before[name].settings != after[name].settings}
+def test_configuring_a_radio_does_not_outdate_images(tiny):
+    """A radio changes the settings of layers and reports only."""
+    results = ("echo", "profile", "image", "layers")
+    before = {name: result_of(Campaign.load(tiny), name, "f01", "uav1-uav2") for name in results}
+    after = {name: result_of(with_radio(tiny).load(tiny), name, "f01", "uav1-uav2") for name in results}
+    changed = {name for name in results if before[name].settings != after[name].settings}
     assert changed == {"layers"}
     assert "results/f01/uav1-uav2/image.manifest.json" in after["layers"].sources
 
 
 @pytest.mark.slow
-def test_a_peak_of_noise_has_no_cross_section(flown):
+def test_noise_peak_has_no_cross_section(flown):
     scene = open_scene(flown)
     calibrated = calibrated_pair(flown, open_pair(flown, "f01", "uav1-uav1"), scene)
     points = [BrightPoint(60.0, 60.0, amplitude=1.0, background=share) for share in (0.05, 0.2)]
-    told, untold = calibrated.points(points, scene, 1e-9)
-    assert told["std_db"] > 1
-    assert untold["rcs_m2"] is None
+    detected, undetected = calibrated.points(points, scene, 1e-9)
+    assert detected["std_db"] > 1
+    assert undetected["rcs_m2"] is None
 
 
 @pytest.mark.slow
-def test_mean_power_is_that_of_echoes_where_no_coefficient_is_asked_for(flown, tmp_path):
+def test_mean_power_without_coefficients_is_echo_power(flown, tmp_path):
     root = copy_writable(flown.root, tmp_path / "campaign")
     campaign = state(root, "processing", radiometry=[], multilook={"spacing_m": 100.0})
     assert campaign.coefficients == ("multilook", "multilook_coherent", "multilook_noncoherent")
@@ -198,8 +198,8 @@ def test_mean_power_is_that_of_echoes_where_no_coefficient_is_asked_for(flown, t
 
 
 @pytest.mark.slow
-def test_a_coefficient_that_is_no_longer_asked_for_goes(flown, tmp_path):
-    """Of an old radio it would lie beside an image of the new one."""
+def test_coefficient_no_longer_configured_is_removed(flown, tmp_path):
+    """A leftover file would belong to an earlier radio."""
     root = copy_writable(flown.root, tmp_path / "campaign")
     edit_config(root, lambda document: document.setdefault("processing", {}).update(radiometry=["gamma0"]))
     campaign = Campaign.load(root)
@@ -209,26 +209,29 @@ def test_a_coefficient_that_is_no_longer_asked_for_goes(flown, tmp_path):
 
 
 @pytest.mark.slow
-def test_mean_power_lies_on_a_coarser_grid_and_says_what_it_is(flown, tmp_path):
-    """Linear and in dB, of the coefficients asked for; with its mean kept, noise subtracted, speckle filtered."""
+def test_mean_power_is_on_a_coarser_grid_and_states_its_quantity(flown, tmp_path):
+    """Linear and in dB, for the configured coefficients: mean preserved, noise subtracted, speckle filtered."""
     root = copy_writable(flown.root, tmp_path / "campaign")
     products = {f"multilook_sigma0{end}" for end in ("_power.tif", "_power.qml", "_db.tif", "_db.qml")}
     means = {}
     for subtract in (False, True):
-        asked = {"spacing_m": 0.31, "subtract_noise": subtract, "speckle_filter": "lee"}
-        edit_config(root, lambda document, asked=asked: document.setdefault("processing", {}).update(multilook=asked))
+        multilook = {"spacing_m": 0.31, "subtract_noise": subtract, "speckle_filter": "lee"}
+        edit_config(
+            root,
+            lambda document, multilook=multilook: document.setdefault("processing", {}).update(multilook=multilook),
+        )
         campaign = Campaign.load(root)
         folder = campaign.result("f01", "uav1-uav1")
         assert products <= {path.name for path in layers(campaign, "f01", "uav1-uav1")}
         with rasterio.open(str(folder / "multilook_sigma0_power.tif")) as raster:
             assert (raster.res, raster.shape) == ((pytest.approx(0.3), pytest.approx(0.3)), (20, 20))
-            mean, said = raster.read(1), json.loads(raster.tags()["APERTURA_RADIOMETRY"])
+            mean, radiometry = raster.read(1), json.loads(raster.tags()["APERTURA_RADIOMETRY"])
             assert raster.descriptions[0].startswith("mean sigma0, radar cross-section per ground area of 6 x 6 pix")
         with rasterio.open(str(folder / "multilook_sigma0_db.tif")) as raster:
             decibels = raster.read(1)
             assert raster.units == ("dB",)
-        assert (said["speckle_filter"], said["noise"]) == ("Lee", "subtracted" if subtract else "in it")
-        assert 1 < said["equivalent_looks"] < 36
+        assert (radiometry["speckle_filter"], radiometry["noise"]) == ("Lee", "subtracted" if subtract else "in it")
+        assert 1 < radiometry["equivalent_looks"] < 36
         positive = mean > 0
         np.testing.assert_allclose(decibels[positive], 10 * np.log10(mean[positive]), atol=1e-3)
         assert np.isnan(decibels[~positive]).all()
@@ -237,7 +240,7 @@ def test_mean_power_lies_on_a_coarser_grid_and_says_what_it_is(flown, tmp_path):
         sigma0 = 10 ** (raster.read(1) / 10)
     with rasterio.open(str(folder / "nesz.tif")) as raster:
         noise = (10 ** (raster.read(1).astype(np.float64) / 10)).reshape(20, 6, 20, 6).mean(axis=(1, 3))
-    dim = means[False] < np.median(means[False])  # of bright ones float32 does not tell it
+    dim = means[False] < np.median(means[False])  # in bright pixels it is below the precision of float32
     np.testing.assert_allclose((means[False] - means[True])[dim], noise[dim], rtol=0.01)
     assert means[False].mean() == pytest.approx(np.nanmean(sigma0), rel=0.05)
     edit_config(root, lambda document: document["processing"].pop("multilook"))
@@ -245,12 +248,12 @@ def test_mean_power_lies_on_a_coarser_grid_and_says_what_it_is(flown, tmp_path):
     assert not list(folder.glob("multilook*"))
 
 
-def test_mean_power_of_a_relative_image_is_that_of_its_echoes(finished_tiny, tmp_path):
-    """Of squares of pixels as they are in power.tif, those at the edge too; no image is formed again."""
+def test_mean_power_of_a_relative_image_is_its_pixel_mean(finished_tiny, tmp_path):
+    """Mean of the pixels of power.tif, also in blocks at the edge; the image stays up to date."""
     root = copy_writable(finished_tiny.root, tmp_path / "campaign")
     campaign = state(root, "processing", multilook={"spacing_m": 0.4})
-    made = [result_of(one, "image", "f01", "uav1-uav1").settings for one in (finished_tiny, campaign)]
-    assert made[0] == made[1]
+    settings = [result_of(which, "image", "f01", "uav1-uav1").settings for which in (finished_tiny, campaign)]
+    assert settings[0] == settings[1]
     for pair in PAIRS:
         layers(campaign, "f01", pair)
     folder = campaign.result("f01", "uav1-uav1")
@@ -261,8 +264,8 @@ def test_mean_power_of_a_relative_image_is_that_of_its_echoes(finished_tiny, tmp
 
 
 @pytest.mark.slow
-def test_mean_power_of_sums_is_told_without_the_noise_of_their_pairs(finished_tiny, tmp_path):
-    """Eq. 6 of docs/theory/speckle.md, by Σw² of the pairs and the noise of their pulses."""
+def test_mean_power_of_sums_subtracts_the_noise_of_their_pairs(finished_tiny, tmp_path):
+    """Eq. 6 of docs/theory/speckle.md, from Σw² of the pairs and the noise of their pulses."""
     root = copy_writable(finished_tiny.root, tmp_path / "campaign")
     results = Campaign.load(root).results / "f01"
 
@@ -281,7 +284,7 @@ def test_mean_power_of_sums_is_told_without_the_noise_of_their_pairs(finished_ti
         export_fused(campaign, "f01")
         for source in ("coherent", "noncoherent"):
             pixels = read(f"fused/{source}_power.tif")[0]
-            squares, said, _ = read(f"fused/multilook_{source}_power.tif")
+            squares, radiometry, _ = read(f"fused/multilook_{source}_power.tif")
             if subtracted:
                 peaks, n = read(f"fused/{source}_power.tif")[1]["divided_by"], 2
                 for pair, peak in peaks.items():
@@ -289,15 +292,15 @@ def test_mean_power_of_sums_is_told_without_the_noise_of_their_pairs(finished_ti
                     noise[source] += float(tags["APERTURA_PULSE_NOISE"]) / looks[5, 9] / peak**2
                 noise[source] /= n**2 if source == "coherent" else n
             assert squares[1, 2] == pytest.approx(pixels[4:8, 8:12].mean() - noise[source], rel=1e-3)
-            assert said["noise"] == ("subtracted" if subtracted else "in it")
+            assert radiometry["noise"] == ("subtracted" if subtracted else "in it")
     campaign = state(root, "processing", multilook=None)
     export_fused(campaign, "f01")
     assert not list((results / "fused").glob("multilook*"))
 
 
 @pytest.mark.slow
-def test_mean_power_is_mosaicked_and_in_the_catalog_at_its_own_place(finished_tiny, tmp_path):
-    """But on no map, whose layers lie on one grid."""
+def test_mean_power_is_in_the_mosaic_and_the_catalog(finished_tiny, tmp_path):
+    """The map omits it, because its layers share one grid."""
     root = copy_writable(finished_tiny.root, tmp_path / "campaign")
     campaign = state(root, "processing", multilook={"spacing_m": 0.4})
     files = {f"uav1-uav1/multilook_{name}" for name in ("power.tif", "power.qml", "db.tif", "db.qml")}
@@ -319,16 +322,16 @@ def test_mean_power_is_mosaicked_and_in_the_catalog_at_its_own_place(finished_ti
 
 
 @pytest.mark.slow
-def test_no_sigma0_is_told_where_the_mask_says_why(flown, tmp_path):
-    """A ridge lays its front over the ground before it and shades what is behind: eq. 10."""
+def test_sigma0_is_nan_in_layover_and_shadow(flown, tmp_path):
+    """Ridge with layover in front of it and shadow behind it: eq. 10."""
     root = copy_writable(flown.root, tmp_path / "campaign")
     east, north, _ = projected_from_ecef("EPSG:32632", DEMO_ORIGIN.ecef(np.zeros(3)))
     west, top = np.floor(east) - 10, np.ceil(north) + 10
     x, y = np.meshgrid(west + 0.1 * (0.5 + np.arange(200)), top - 0.1 * (0.5 + np.arange(200)))
     away = (x - east) * np.cos(np.radians(40)) - (y - north) * np.sin(np.radians(40))  # from the track
     ridge = 620.0 + np.maximum(0, 1.5 - 4 * np.abs(away))
-    place = {"crs": "EPSG:32632", "transform": rasterio.transform.from_origin(west, top, 0.1, 0.1)}
-    with rasterio.open(str(root / "dem.tif"), "w", "GTiff", 200, 200, 1, dtype="float64", **place) as raster:
+    georeference = {"crs": "EPSG:32632", "transform": rasterio.transform.from_origin(west, top, 0.1, 0.1)}
+    with rasterio.open(str(root / "dem.tif"), "w", "GTiff", 200, 200, 1, dtype="float64", **georeference) as raster:
         raster.write(ridge, 1)
     state(root, "processing", radiometry=["sigma0", "beta0"], multilook={"spacing_m": 0.2})
     state(root, "scene", dem="dem.tif", dem_datum="ellipsoid")
@@ -341,7 +344,7 @@ def test_no_sigma0_is_told_where_the_mask_says_why(flown, tmp_path):
     assert np.isnan(sigma0[mask != 0]).all()
     assert np.isnan(beta0[mask != 0]).all()
     assert np.isfinite(beta0[mask == 0]).all()
-    assert np.isfinite(sigma0[mask == 0]).mean() > 0.95  # but for slopes that are nearly laid over
-    nesz = rasterio.open(str(folder / "nesz.tif")).read(1)  # of the facet, as σ⁰ is
+    assert np.isfinite(sigma0[mask == 0]).mean() > 0.95  # except slopes close to layover
+    nesz = rasterio.open(str(folder / "nesz.tif")).read(1)  # per facet, like σ⁰
     assert np.array_equal(np.isfinite(nesz)[mask == 0], np.isfinite(sigma0)[mask == 0])
     assert np.isnan(squares[(np.isnan(sigma0).reshape(30, 4, 30, 4).sum(axis=(1, 3)) > 8)]).all()

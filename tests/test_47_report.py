@@ -1,4 +1,4 @@
-"""The report of a finished campaign: what it shows agrees with what its images say."""
+"""Report of a finished campaign: its plots and values agree with the images."""
 
 import json
 
@@ -16,7 +16,7 @@ from apertura.views.report.step import landing, page
 from apertura.views.verify.products import read_tags
 
 NAME = "`x`_ |y| .. raw:: html {{ 7*7 }} $\u00b5_\u03b1$ ../../etc 'a'"
-"""All that a campaign's name may hold."""
+"""Campaign name with markup characters of reStructuredText, HTML, Jinja and LaTeX."""
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +32,7 @@ def reported(finished_tiny, tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_every_picture_and_the_page_are_written_and_listed_with_what_they_are_made_from(reported):
+def test_plots_and_page_are_written_with_manifests(reported):
     listed = read_manifest(reported.result("f01", "uav1-uav2", "pictures.manifest.json"))
     assert set(listed["files"]) == {f"pictures/{name}.png" for name in PICTURES}
     assert "results/f01/uav1/raw.manifest.json" in listed["sources"]
@@ -45,7 +45,7 @@ def test_every_picture_and_the_page_are_written_and_listed_with_what_they_are_ma
 
 @pytest.mark.slow
 @pytest.mark.parametrize("manifest", ["uav1-uav2/pictures", "fused/pictures"])
-def test_every_picture_says_what_it_was_made_from(reported, manifest):
+def test_every_plot_states_its_sources(reported, manifest):
     path = reported.result("f01", f"{manifest}.manifest.json")
     listed = read_manifest(path)
     for name in listed["files"]:
@@ -54,7 +54,7 @@ def test_every_picture_says_what_it_was_made_from(reported, manifest):
 
 
 @pytest.mark.slow
-def test_the_page_holds_every_picture_every_decision_and_the_campaigns_name_as_text(reported):
+def test_page_contains_plots_decisions_and_the_name_as_text(reported):
     html = reported.result("f01", "report.html").read_text()
     report = reported.result("f01", "uav1-uav2", "image.json")
     assert html.count('src="data:image/png;base64,') == 2 * (len(PICTURES) + 1) + 2
@@ -79,10 +79,10 @@ def test_the_same_results_give_the_same_bytes(reported):
 
 
 @pytest.mark.slow
-def test_the_landing_text_is_no_markup_but_its_tables(reported):
-    told = landing(reported)
+def test_landing_text_contains_no_markup_except_tables(reported):
+    texts = landing(reported)
     body = publish_parts(
-        "\n\n".join([told["title"], told["asked"], told["verdicts"], told["decisions"]]), writer="html"
+        "\n\n".join([texts["title"], texts["asked"], texts["verdicts"], texts["decisions"]]), writer="html"
     )
     assert "system-message" not in body["body"]
     assert "<a " not in body["body"]
@@ -92,16 +92,16 @@ def test_the_landing_text_is_no_markup_but_its_tables(reported):
 
 
 @pytest.mark.slow
-def test_the_brightest_target_adds_up_once_the_sidelink_took_the_clocks_out(reported):
-    found = Shown(reported, "f01", "uav1-uav2").phasors()
-    before, after = (steadiness(phasors) for phasors in found.values())
+def test_sidelink_correction_makes_the_brightest_target_coherent(reported):
+    phasors_of = Shown(reported, "f01", "uav1-uav2").phasors()
+    before, after = (steadiness(phasors) for phasors in phasors_of.values())
     assert before[1] < 0.4
     assert after[1] > 0.9
     assert list(Shown(reported, "f01", "uav1-uav1").phasors()) == ["as recorded, tracks from the logs"]
 
 
 @pytest.mark.slow
-def test_pulses_left_out_are_those_that_the_image_counts(reported):
+def test_excluded_pulses_are_those_counted_by_the_image(reported):
     for pair in ("uav1-uav1", "uav1-uav2"):
         shown = Shown(reported, "f01", pair)
         record, counted = shown.record(), shown.echo.attrs["pulses"]
@@ -110,7 +110,7 @@ def test_pulses_left_out_are_those_that_the_image_counts(reported):
 
 
 @pytest.mark.slow
-def test_widths_of_the_cuts_are_those_that_the_image_states(reported):
+def test_widths_of_the_cuts_are_those_stated_by_the_image(reported):
     shown = Shown(reported, "f01", "uav1-uav2")
     stated = shown.image.attrs["quality"]["brightest"]
     for cut, name in zip(shown.cuts(), ("cross_range", "ground_range"), strict=True):
@@ -119,20 +119,20 @@ def test_widths_of_the_cuts_are_those_that_the_image_states(reported):
 
 
 @pytest.mark.slow
-def test_tracks_are_drawn_where_the_flight_was(reported):
-    flown = Shown(reported, "f01", "uav1-uav2").geometry()
-    west, south, east, north = flown.bounds_m
-    assert set(flown.tracks_m) == {"transmitter", "receiver"}
-    assert west < flown.target_m[0] < east
-    assert south < flown.target_m[1] < north
-    assert abs(flown.target_m[2] - flown.ground_m) < 1e-3
-    heights = flown.tracks_m["transmitter"][:, 2] - flown.ground_m
+def test_plotted_tracks_are_at_their_positions(reported):
+    geometry = Shown(reported, "f01", "uav1-uav2").geometry()
+    west, south, east, north = geometry.bounds_m
+    assert set(geometry.tracks_m) == {"transmitter", "receiver"}
+    assert west < geometry.target_m[0] < east
+    assert south < geometry.target_m[1] < north
+    assert abs(geometry.target_m[2] - geometry.ground_m) < 1e-3
+    heights = geometry.tracks_m["transmitter"][:, 2] - geometry.ground_m
     assert (heights > 2).all()
     assert (heights < 8).all()
 
 
 @pytest.mark.slow
-def test_a_picture_changed_by_hand_does_not_reach_the_page(reported):
+def test_edited_plot_is_refused_by_the_page(reported):
     path = reported.result("f01", "uav1-uav1", "pictures", "cuts.png")
     whole = path.read_bytes()
     path.write_bytes(whole[:-1] + b"x")

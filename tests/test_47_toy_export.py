@@ -1,4 +1,4 @@
-"""A format of another package: one function and one row make it a product of every pair."""
+"""Export format of another package: one function and one table row add a product to every pair."""
 
 import json
 import os
@@ -42,7 +42,7 @@ def output_of(package, *command):
 
 
 @pytest.mark.slow
-def test_the_step_writes_a_toy_product_with_the_others(finished_tiny, toy_package, tmp_path):
+def test_step_writes_a_toy_product_with_the_others(finished_tiny, toy_package, tmp_path):
     root = copy_writable(finished_tiny.root, tmp_path / "campaign")
     written = output_of(toy_package, "apertura", "step", "export", "f01", "uav1-uav1", "--campaign", str(root))
     folder = root / "results" / "f01" / "uav1-uav1"
@@ -59,6 +59,6 @@ def test_the_step_writes_a_toy_product_with_the_others(finished_tiny, toy_packag
 
 
 @pytest.mark.slow
-def test_the_workflow_lists_a_toy_product_of_every_pair(tiny, toy_package):
+def test_workflow_lists_a_toy_product_of_every_pair(tiny, toy_package):
     planned = output_of(toy_package, "snakemake", "-n", "--directory", str(tiny), "--quiet", "progress")
     assert {name for name in PRODUCTS if name in planned} == PRODUCTS
