@@ -1,4 +1,4 @@
-"""Constants measured at reflectors in one campaign, taken up by another of the same radar whose radio nobody states."""
+"""Calibration constants measured at reflectors in one campaign and used by another of the same radar."""
 
 import hashlib
 import json
@@ -27,16 +27,16 @@ from apertura.workflow.stale import stale_results
 
 RADIO = Radio(10.0, 8.0, 9.0, full_scale_dbm=4.0, gain_db=37.3, noise_figure_db=6.0, amplitude_std_db=0.5)
 PAIRS = ("uav1-uav1", "uav1-uav2")
-WAVELENGTH_M = SPEED_OF_LIGHT_M_S / 1.4046e9  # of the middle of the demo's band
-BACK = np.array([-0.705, 0.592, 0.39]) / np.linalg.norm([-0.705, 0.592, 0.39])  # east, north, up: to the track
-LEG_M, RADIUS_M = 0.25, 0.13  # a radius at which both pairs see the same to 0.1 dB
-CORNER, BALL = (-1.5, 0.8, 0.0), (1.5, -0.7, 0.3)  # the latter on a stand
+WAVELENGTH_M = SPEED_OF_LIGHT_M_S / 1.4046e9  # at the centre of the demo's band
+BACK = np.array([-0.705, 0.592, 0.39]) / np.linalg.norm([-0.705, 0.592, 0.39])  # east, north, up: towards the track
+LEG_M, RADIUS_M = 0.25, 0.13  # cross-sections of both pairs agree to 0.1 dB
+CORNER, BALL = (-1.5, 0.8, 0.0), (1.5, -0.7, 0.3)  # the ball is on a stand
 LOOKS = {"azimuth_deg": 310.0, "elevation_deg": 23.0}
-FOUND_M2 = (0.2, 1.0)
+RCS_M2 = (0.2, 1.0)
 
 
 def plan(name, targets, flights, radio=RADIO):
-    """The demo's nodes; beams look to the right, where the scene is."""
+    """Return a specification: the demo's nodes with beams to the right, towards the scene."""
     base = preset("demo", pulses=120)
     beams = {name: GaussianBeam((90.0, -22.0), (70.0, 50.0)) for name in ("radar_tx", "radar_rx")}
     nodes = {
@@ -66,8 +66,8 @@ def plan(name, targets, flights, radio=RADIO):
     return replace(base, campaign=name, nodes=nodes, targets=targets, scene=scene, flights=flown)
 
 
-def unknown_radio(root):
-    """Take the radio out of a config: nobody has measured it."""
+def remove_radio(root):
+    """Remove the radio from a config."""
 
     def change(document):
         for node in document["nodes"].values():
@@ -81,17 +81,17 @@ def unknown_radio(root):
 
 
 def ball_m2():
-    """The sphere straight back, at the middle of the band."""
+    """Return the monostatic cross-section of the sphere at the centre of the band."""
     ahead = np.eye(3)[:1]
     (rcs_m2,), _ = Reflector("sphere", (RADIUS_M,), np.eye(3)).cross_section(ahead, ahead, wavelength_m=WAVELENGTH_M)
     return rcs_m2
 
 
 def corner_m2():
-    """The trihedral as the pass of f01 sees it on the mean: a simulated point is the same from everywhere."""
+    """Return the mean cross-section of the trihedral over f01: a simulated point has the same in all directions."""
     track = preset("demo", pulses=120).flights[0].tracks["uav1"]
-    flown = np.array(track.start_m) + np.outer(np.arange(120) / 20, track.velocity_m_s)
-    away = flown - CORNER
+    position_m = np.array(track.start_m) + np.outer(np.arange(120) / 20, track.velocity_m_s)
+    away = position_m - CORNER
     range_m = np.linalg.norm(away, axis=1)
     azimuth, elevation = np.radians([LOOKS["azimuth_deg"], LOOKS["elevation_deg"]])
     level = np.array([np.sin(azimuth), np.cos(azimuth), 0.0])
@@ -106,17 +106,24 @@ def corner_m2():
 
 @pytest.fixture(scope="module")
 def measured(tmp_path_factory):
-    """A campaign of two flights over a trihedral and a sphere, imaged, of a radio that its config does not state."""
-    skin = tuple(np.array(BALL) + RADIUS_M * BACK)  # where a sphere shines
+    """Image two flights over a trihedral and a sphere, without a configured radio."""
+    skin = tuple(np.array(BALL) + RADIUS_M * BACK)  # the specular point of the sphere
     targets = PointTarget(CORNER, corner_m2() ** 0.5), PointTarget(skin, ball_m2() ** 0.5)
     spec = plan("over_reflectors", targets, {"f01": (0.0, 0.0, 0.0), "f02": (-1.0, 0.8, 1.0)})
-    root = unknown_radio(simulate(tmp_path_factory.mktemp("reflectors") / "campaign", spec, seed=3))
-    known = json.loads((root / "truth.json").read_text())["targets"]
-    places = [[one[name] for name in ("x", "y", "height_m")] for one in known]
-    places[1] = np.subtract(places[1], RADIUS_M * BACK).tolist()
+    root = remove_radio(simulate(tmp_path_factory.mktemp("reflectors") / "campaign", spec, seed=3))
+    truth = json.loads((root / "truth.json").read_text())["targets"]
+    positions_m = [[target[name] for name in ("x", "y", "height_m")] for target in truth]
+    positions_m[1] = np.subtract(positions_m[1], RADIUS_M * BACK).tolist()
     reflectors = [
-        {"name": "corner", "kind": "trihedral", "size_m": [LEG_M], "position_m": places[0], "std_m": 0.02, **LOOKS},
-        {"name": "ball", "kind": "sphere", "size_m": [RADIUS_M], "position_m": places[1], "std_m": 0.02},
+        {
+            "name": "corner",
+            "kind": "trihedral",
+            "size_m": [LEG_M],
+            "position_m": positions_m[0],
+            "std_m": 0.02,
+            **LOOKS,
+        },
+        {"name": "ball", "kind": "sphere", "size_m": [RADIUS_M], "position_m": positions_m[1], "std_m": 0.02},
     ]
     state(root, "scene", reflectors=reflectors)
     campaign = run_steps(root, exports=False)
@@ -127,12 +134,12 @@ def measured(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def later(measured, tmp_path_factory):
-    """Another campaign of the same radar, other tracks and targets, which takes up the file."""
+    """Image another campaign of the same radar, with other tracks and targets, calibrated by the file."""
     targets = tuple(
-        PointTarget(at, rcs**0.5) for at, rcs in zip(((-1.0, -1.2, 0.0), (0.5, 1.2, 0.0)), FOUND_M2, strict=True)
+        PointTarget(at, rcs**0.5) for at, rcs in zip(((-1.0, -1.2, 0.0), (0.5, 1.2, 0.0)), RCS_M2, strict=True)
     )
     spec = plan("later", targets, {"f01": (-2.0, 1.5, 1.5)})
-    root = unknown_radio(simulate(tmp_path_factory.mktemp("later") / "campaign", spec, seed=5))
+    root = remove_radio(simulate(tmp_path_factory.mktemp("later") / "campaign", spec, seed=5))
     shutil.copy(str(write_constants(measured)), root / "calibration.json")
     state(root, "processing", radiometric_calibration="calibration.json")
     campaign = run_steps(root, exports=False)
@@ -141,67 +148,67 @@ def later(measured, tmp_path_factory):
 
 
 def true_constant_db(campaign, pair):
-    """K by the radar equation from the radio that was simulated."""
+    """Return K of the simulated radio from the radar equation."""
     sent = Radar.of(campaign, open_pair(campaign, "f01", pair)).sent_power
     received = 10 ** ((10.0 - 30 + 8.0 + 9.0 + 37.3 - (4.0 - 30)) / 10) * WAVELENGTH_M**2 / (4 * np.pi) ** 3
     return 10 * np.log10(received * 8192**2 / sent)
 
 
 @pytest.mark.slow
-def test_each_reflector_says_the_constant_of_the_radio_that_was_simulated(measured):
-    """Within its deviation, and closer than that: the points put have the cross-sections of the formulas."""
-    constants, left_out = measured_constants(measured)
-    at = {(one["flight"], one["pair"], one["reflector"]): one for one in constants.measurements}
-    assert set(at) == {
+def test_each_reflector_yields_the_constant_of_the_simulated_radio(measured):
+    """The error is below the stated deviation, because simulated points have the theoretical cross-sections."""
+    constants, excluded = measured_constants(measured)
+    by_reflector = {(one["flight"], one["pair"], one["reflector"]): one for one in constants.measurements}
+    assert set(by_reflector) == {
         *((flight, "uav1-uav1", name) for flight in ("f01", "f02") for name in ("corner", "ball")),
         *((flight, "uav1-uav2", "ball") for flight in ("f01", "f02")),
     }
-    for (_, pair, _), one in at.items():
+    for (_, pair, _), one in by_reflector.items():
         assert one["constant_db"] == pytest.approx(true_constant_db(measured, pair), abs=0.3), one
         assert one["off_m"] < 0.03
-    assert [line.split(":")[0] for line in left_out] == [f"{flight} uav1-uav2 corner" for flight in ("f01", "f02")]
+    assert [line.split(":")[0] for line in excluded] == [f"{flight} uav1-uav2 corner" for flight in ("f01", "f02")]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("pair", PAIRS)
-def test_a_constant_lies_within_its_deviation(measured, pair):
+def test_constant_is_within_its_deviation(measured, pair):
     constants, _ = measured_constants(measured)
-    found = constants.pairs[pair]
-    assert abs(found.constant_db - true_constant_db(measured, pair)) < found.std_db < 0.7
-    assert (found.flights, found.flags) == (2, {})
-    if pair != constants.reference:  # path offsets are stated: nothing is left between the channels
-        assert abs(found.phase_rad) < 2 * found.phase_std_rad < 0.5
+    constant = constants.pairs[pair]
+    assert abs(constant.constant_db - true_constant_db(measured, pair)) < constant.std_db < 0.7
+    assert (constant.flights, constant.flags) == (2, {})
+    if pair != constants.reference:  # path offsets are configured: no phase between the channels
+        assert abs(constant.phase_rad) < 2 * constant.phase_std_rad < 0.5
 
 
 @pytest.mark.slow
-def test_another_flight_has_the_cross_sections_of_its_targets(later):
-    """Another track, other targets, no radio stated: calibrated by the file alone."""
-    found = [one for one in score(later) if one.image in PAIRS]
-    assert len(found) == 4
-    for one in found:
-        assert abs(one.rcs_dbsm - one.rcs_put_dbsm) < one.rcs_std_db < 0.8
-    said = json.loads(later.result("f01", "uav1-uav1", "radiometry.json").read_text())
-    assert said["calibrated_by"] == "reflectors of campaign over_reflectors, 2025-05-14"
-    assert said["link"] is None
-    assert said["flags"] == {}
+def test_cross_sections_of_another_flight_are_calibrated(later):
+    """Another track and other targets without a configured radio: calibrated by the file alone."""
+    findings = [finding for finding in score(later) if finding.image in PAIRS]
+    assert len(findings) == 4
+    for finding in findings:
+        assert abs(finding.rcs_dbsm - finding.rcs_put_dbsm) < finding.rcs_std_db < 0.8
+    report = json.loads(later.result("f01", "uav1-uav1", "radiometry.json").read_text())
+    assert report["calibrated_by"] == "reflectors of campaign over_reflectors, 2025-05-14"
+    assert report["link"] is None
+    assert report["flags"] == {}
 
 
 @pytest.mark.slow
-def test_the_budget_has_the_deviation_of_the_file(later):
+def test_budget_contains_the_deviation_of_the_file(later):
     image = json.loads(later.result("f01", "uav1-uav2", "image.json").read_text())
     std_db = read_constants(later.root / "calibration.json").pairs["uav1-uav2"].std_db
     assert (image["budget"][-1]["cause"], image["budget"][-1]["stated"]) == ("amplitude", f"{std_db:.2g} dB")
 
 
 @pytest.mark.slow
-def test_a_calibrated_product_is_followed_to_the_file_and_to_the_raw_samples(later):
+def test_calibrated_product_is_verified_down_to_the_file_and_samples(later):
     chain = verify(later.result("f01", "uav1-uav1", "sigma0_db.tif"))
     assert {link.state for link in chain.links} == {"same"}
     assert {"calibration.json", "raw/f01/uav1.sigmf-data"} <= {link.name for link in chain.links}
 
 
 @pytest.mark.slow
-def test_the_file_is_a_source_of_the_layers_and_another_makes_them_again(later, tmp_path):
+def test_changed_calibration_file_outdates_the_layers(later, tmp_path):
     root = copy_writable(later.root, tmp_path / "campaign")
     campaign = Campaign.load(root)
     assert "calibration.json" in result_of(campaign, "layers", "f01", "uav1-uav1").sources
@@ -212,15 +219,15 @@ def test_the_file_is_a_source_of_the_layers_and_another_makes_them_again(later, 
 
 
 @pytest.mark.slow
-def test_a_radio_that_is_stated_wrong_is_flagged_and_not_used(later, tmp_path):
-    """Receiver gain 4 dB off: eight standard deviations of what the config says of it."""
+def test_wrongly_configured_radio_is_flagged_and_not_used(later, tmp_path):
+    """Receiver gain wrong by 4 dB, eight of the configured standard deviations."""
     root = copy_writable(later.root, tmp_path / "campaign")
     pair, scene = open_pair(later, "f01", "uav1-uav1"), open_scene(later)
-    found = {}
+    by_gain = {}
     for gain_db in (37.3, 41.3):
-        state_radio(root, gain_db)
-        found[gain_db] = calibrated_pair(Campaign.load(root), pair, scene)
-    right, wrong = found.values()
+        configure_radio(root, gain_db)
+        by_gain[gain_db] = calibrated_pair(Campaign.load(root), pair, scene)
+    right, wrong = by_gain.values()
     assert wrong.calibration.constant == right.calibration.constant
     assert (list(right.flags), list(wrong.flags)) == ([], ["constant_disagrees"])
     assert float(wrong.flags["constant_disagrees"].split(" dB")[0].split()[-1]) == pytest.approx(4, abs=0.4)
@@ -231,8 +238,8 @@ def test_a_radio_that_is_stated_wrong_is_flagged_and_not_used(later, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_receiver_that_loses_gain_between_flights_is_flagged_in_its_own_pair(measured, tmp_path):
-    """Samples of uav1 are a fifth lower in f02, 1.94 dB; uav2 divides by its sidelink, and records as before."""
+def test_gain_loss_between_flights_is_flagged_in_its_pair(measured, tmp_path):
+    """Samples of uav1 are lower by a fifth (1.94 dB) in f02; those of uav2 are unchanged."""
     root = copy_writable(measured.root, tmp_path / "campaign")
     shutil.rmtree(root / "results")
     path = root / "raw/f02/uav1.sigmf-data"
@@ -253,7 +260,7 @@ def test_a_receiver_that_loses_gain_between_flights_is_flagged_in_its_own_pair(m
 
 
 @pytest.mark.slow
-def test_a_constant_that_is_not_the_earlier_one_has_drifted(measured, tmp_path):
+def test_constant_that_differs_from_an_earlier_one_is_flagged(measured, tmp_path):
     root = copy_writable(measured.root, tmp_path / "campaign")
     write_constants(measured, root / "earlier.json")
     change_file(root, lambda document: document["pairs"]["uav1-uav2"].update(constant_db=50.0), "earlier.json")
@@ -266,7 +273,7 @@ def test_a_constant_that_is_not_the_earlier_one_has_drifted(measured, tmp_path):
 
 
 @pytest.mark.slow
-def test_nothing_is_measured_in_images_of_other_settings(measured, tmp_path):
+def test_outdated_images_are_refused_for_calibration(measured, tmp_path):
     root = copy_writable(measured.root, tmp_path / "campaign")
     campaign = state(root, "processing", window="none")
     assert "4 of 4 images out of date" in complaint(lambda: write_constants(campaign, root / "new.json"))
@@ -274,14 +281,14 @@ def test_nothing_is_measured_in_images_of_other_settings(measured, tmp_path):
 
 
 @pytest.mark.slow
-def test_reflectors_stand_on_a_dem_or_are_left_out_beside_it(measured, tmp_path):
-    """The ground 0.5 m below both: they are looked for where they are imaged, and lose to focus what that costs."""
+def test_reflectors_outside_the_image_are_excluded_with_a_dem(measured, tmp_path):
+    """Terrain 0.5 m below both reflectors: they are measured where they are imaged, with the loss of focus."""
     root = copy_writable(measured.root, tmp_path / "campaign")
     shutil.rmtree(root / "results")
     scene = measured.settings.scene
     west, south, east, north = scene.bounds_m
     ground = np.full((20, 20), measured.settings.scene.reflectors[0].position_m[2] - 0.5, np.float32)
-    placed = rasterio.transform.from_bounds(west - 7, south - 7, east + 7, north + 7, 20, 20)
+    transform = rasterio.transform.from_bounds(west - 7, south - 7, east + 7, north + 7, 20, 20)
     with rasterio.open(
         root / "dem.tif",
         "w",
@@ -291,7 +298,7 @@ def test_reflectors_stand_on_a_dem_or_are_left_out_beside_it(measured, tmp_path)
         count=1,
         dtype="float32",
         crs=scene.crs,
-        transform=placed,
+        transform=transform,
     ) as raster:
         raster.write(ground, 1)
     far = measured.values["scene"]["reflectors"][1] | {"name": "far", "position_m": [east + 5, north + 5, 620.0]}
@@ -302,16 +309,16 @@ def test_reflectors_stand_on_a_dem_or_are_left_out_beside_it(measured, tmp_path)
     campaign = run_steps(root, exports=False)
     layers.layers(campaign, "f01", "uav1-uav1")
     layers.layers(campaign, "f01", "uav1-uav2")
-    constants, left_out = measured_constants(campaign)
+    constants, excluded = measured_constants(campaign)
     for one in constants.measurements:
         assert one["constant_db"] == pytest.approx(true_constant_db(measured, one["pair"]), abs=0.3), one
         assert one["off_m"] < 0.03
-    assert "f01 uav1-uav1 far: outside the image" in left_out
+    assert "f01 uav1-uav1 far: outside the image" in excluded
 
 
 @pytest.mark.slow
-def test_a_phase_history_is_calibrated_by_its_own_images(measured, tmp_path):
-    """As CPHD, without a scale and without beams: the constant is that towards the reflectors."""
+def test_phase_history_is_calibrated_from_its_images(measured, tmp_path):
+    """CPHD without amplitude scale and beams: the constant includes the gain towards the reflectors."""
     (tmp_path / "config").mkdir()
     scene = measured.values["scene"]
     waveform = {"kind": "phase_history", "format": "cphd"}
@@ -323,9 +330,9 @@ def test_a_phase_history_is_calibrated_by_its_own_images(measured, tmp_path):
     shutil.copy(str(written), tmp_path / "raw/f01/uav1.cphd")
     campaign = run_steps(tmp_path, exports=False)
     layers.layers(campaign, "f01", "uav1-uav1")
-    found = read_constants(write_constants(campaign)).pairs["uav1-uav1"]
-    assert found.radar.sent_power is None
-    assert -3 < found.constant_db - true_constant_db(measured, "uav1-uav1") < 0  # what the beams lack there
+    constant = read_constants(write_constants(campaign)).pairs["uav1-uav1"]
+    assert constant.radar.sent_power is None
+    assert -3 < constant.constant_db - true_constant_db(measured, "uav1-uav1") < 0  # beam gain below boresight
     campaign = state(tmp_path, "processing", radiometric_calibration="calibration.json")
     layers.layers(campaign, "f01", "uav1-uav1")
     points = json.loads(campaign.result("f01", "uav1-uav1", "radiometry.json").read_text())["points"]
@@ -344,22 +351,24 @@ def test_constants_of_another_radar_are_refused(later, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_pair_without_a_constant_is_flagged_and_the_other_one_calibrated(later, tmp_path):
-    """A trihedral serves the monostatic pair alone: the run goes on, the bistatic pair holds no σ⁰ and says why."""
+def test_pair_without_a_constant_is_flagged(later, tmp_path):
+    """A trihedral calibrates only the monostatic pair: the run continues, and the bistatic pair has no σ⁰."""
     root = copy_writable(later.root, tmp_path / "campaign")
     change_file(root, lambda document: document["pairs"].pop("uav1-uav2"))
     campaign = Campaign.load(root)
     for pair in ("uav1-uav1", "uav1-uav2"):
         layers.layers(campaign, "f01", pair)
         export.export(campaign, "f01", pair)
-    told = {
+    reports = {
         pair: json.loads(campaign.result("f01", pair, "image.json").read_text()) for pair in campaign.images["f01"][:2]
     }
-    assert "pair_uncalibrated" not in told["uav1-uav1"]["flags"]
-    assert told["uav1-uav2"]["flags"]["pair_uncalibrated"].startswith("calibration.json has no constant for uav1-uav2")
-    for pair, some in (("uav1-uav1", True), ("uav1-uav2", False)):
+    assert "pair_uncalibrated" not in reports["uav1-uav1"]["flags"]
+    assert reports["uav1-uav2"]["flags"]["pair_uncalibrated"].startswith(
+        "calibration.json has no constant for uav1-uav2"
+    )
+    for pair, has_values in (("uav1-uav1", True), ("uav1-uav2", False)):
         with rasterio.open(str(campaign.result("f01", pair, "sigma0_db.tif"))) as raster:
-            assert np.isfinite(raster.read(1, masked=True).filled(np.nan)).any() == some
+            assert np.isfinite(raster.read(1, masked=True).filled(np.nan)).any() == has_values
 
 
 # ---- Without recordings ---------------------------------------------------------------------------------------------
@@ -371,8 +380,8 @@ def change_file(root, change, name="calibration.json"):
     (root / name).write_text(json.dumps(document))
 
 
-def state_radio(root, gain_db):
-    """State the simulated radio in a config, but for the receivers' gain."""
+def configure_radio(root, gain_db):
+    """Configure the simulated radio with a receiver gain in dB."""
 
     def change(document):
         for node in document["nodes"].values():
@@ -383,7 +392,7 @@ def state_radio(root, gain_db):
     edit_config(root, change)
 
 
-def some_constants(*pairs):
+def constants_of(*pairs):
     radar = Radar(centre_hz=1.4e9, bandwidth_hz=4e8, subcarriers=1024, sent_power=1024.0, antennas={})
     one = PairConstant(
         radar=radar,
@@ -407,35 +416,35 @@ def some_constants(*pairs):
     )
 
 
-def test_a_measured_constant_needs_no_radio_and_forms_no_image_again(tiny):
-    (tiny / "calibration.json").write_text(some_constants("uav1-uav1", "uav1-uav2").model_dump_json())
-    made = ("echo", "profile", "image", "layers", "export")
-    before = {name: result_of(Campaign.load(tiny), name, "f01", "uav1-uav2") for name in made}
+def test_measured_constant_outdates_only_the_layers(tiny):
+    (tiny / "calibration.json").write_text(constants_of("uav1-uav1", "uav1-uav2").model_dump_json())
+    results = ("echo", "profile", "image", "layers", "export")
+    before = {name: result_of(Campaign.load(tiny), name, "f01", "uav1-uav2") for name in results}
     campaign = state(tiny, "processing", radiometric_calibration="calibration.json")
-    after = {name: result_of(campaign, name, "f01", "uav1-uav2") for name in made}
+    after = {name: result_of(campaign, name, "f01", "uav1-uav2") for name in results}
     assert campaign.calibrated
-    assert {name for name in made if before[name].settings != after[name].settings} == {"layers"}
+    assert {name for name in results if before[name].settings != after[name].settings} == {"layers"}
     assert "calibration.json" in after["layers"].sources
 
 
-def test_a_reflector_makes_nothing_again(tiny):
-    made = ("scene", "echo", "profile", "refined_track", "image", "layers", "export", "map")
+def test_reflectors_do_not_outdate_results(tiny):
+    results = ("scene", "echo", "profile", "refined_track", "image", "layers", "export", "map")
     places = {"scene": (), "map": (), "refined_track": ("f01",)}
-    before = {name: result_of(Campaign.load(tiny), name, *places.get(name, ("f01", "uav1-uav2"))) for name in made}
+    before = {name: result_of(Campaign.load(tiny), name, *places.get(name, ("f01", "uav1-uav2"))) for name in results}
     ball = {"name": "ball", "position_m": [0.0, 0.0, 0.0], "std_m": 0.01, "kind": "sphere", "size_m": [0.2]}
     campaign = state(tiny, "scene", reflectors=[ball])
-    for name in made:
+    for name in results:
         assert result_of(campaign, name, *places.get(name, ("f01", "uav1-uav2"))) == before[name]
 
 
-def test_a_file_of_constants_is_checked_before_anything_runs(tiny):
+def test_calibration_file_is_checked_before_a_run(tiny):
     state(tiny, "processing", radiometric_calibration="calibration.json")
     (line,) = map(as_line, problems(tiny))
     assert "calibration.json: no such file" in line
-    (tiny / "calibration.json").write_text(some_constants("uav3-uav3").model_dump_json())
+    (tiny / "calibration.json").write_text(constants_of("uav3-uav3").model_dump_json())
     (line,) = map(as_line, problems(tiny))
     assert "constants of uav3-uav3 only, none of uav1-uav1, uav1-uav2" in line
-    (tiny / "calibration.json").write_text(some_constants("uav1-uav1").model_dump_json())
+    (tiny / "calibration.json").write_text(constants_of("uav1-uav1").model_dump_json())
     assert problems(tiny) == []
     change_file(tiny, lambda document: document.update(schema_version=2))
     (line,) = map(as_line, problems(tiny))
@@ -443,7 +452,7 @@ def test_a_file_of_constants_is_checked_before_anything_runs(tiny):
 
 
 @pytest.mark.parametrize(
-    ("keys", "told"),
+    ("keys", "message"),
     [
         ({"kind": "sphere", "size_m": [0.2], "azimuth_deg": 3.0}, "a sphere has no boresight"),
         (
@@ -456,21 +465,21 @@ def test_a_file_of_constants_is_checked_before_anything_runs(tiny):
         ),
     ],
 )
-def test_a_reflector_is_stated_whole(tiny, keys, told):
-    one = {"name": "r", "position_m": [0.0, 0.0, 0.0], "std_m": 0.01, **keys}
-    assert told in complaint(lambda: state(tiny, "scene", reflectors=[one]))
+def test_incomplete_reflector_is_refused(tiny, keys, message):
+    reflector = {"name": "r", "position_m": [0.0, 0.0, 0.0], "std_m": 0.01, **keys}
+    assert message in complaint(lambda: state(tiny, "scene", reflectors=[reflector]))
 
 
-def test_reflectors_are_stated_before_they_are_measured(tiny):
+def test_calibration_without_configured_reflectors_is_refused(tiny):
     assert "no reflectors" in complaint(lambda: measured_constants(Campaign.load(tiny)))
 
 
 @pytest.mark.slow
-def test_a_reflector_measures_no_polarisation_that_it_does_not_return(measured, tmp_path):
-    """What a trihedral or sphere sends back of H is H: in HV only leaks are seen, and no constant follows."""
+def test_reflector_is_refused_for_a_polarisation_it_does_not_return(measured, tmp_path):
+    """Trihedrals and spheres return H as H: HV contains only leakage, which yields no constant."""
     root = copy_writable(measured.root, tmp_path / "campaign")
 
-    def received(letter):
+    def with_receive_polarisation(letter):
         def change(document):
             for node in document["nodes"].values():
                 node["antennas"] |= {"radar_tx_polarisation": "H", "radar_rx_polarisation": letter}
@@ -478,8 +487,8 @@ def test_a_reflector_measures_no_polarisation_that_it_does_not_return(measured, 
         edit_config(root, change)
         return Campaign.load(root)
 
-    assert "returns no echo in polarisation HV" in complaint(lambda: measured_constants(received("V")))
-    constants, _ = measured_constants(received("H"))
+    assert "returns no echo in polarisation HV" in complaint(lambda: measured_constants(with_receive_polarisation("V")))
+    constants, _ = measured_constants(with_receive_polarisation("H"))
     own = constants.pairs["uav1-uav1"].radar
     assert own.polarisation == "HH"
     assert own.differs(own.model_copy(update={"polarisation": "VV"})) == "polarisation is VV and was HH"
@@ -487,17 +496,17 @@ def test_a_reflector_measures_no_polarisation_that_it_does_not_return(measured, 
 
 
 @pytest.mark.slow
-def test_a_receiver_whose_gain_was_changed_since_is_told_by_its_noise(later, tmp_path):
-    """The file is of a gain 6 dB higher or lower: every cross-section would be wrong by as much."""
-    for wrong, flagged in ((1.0, False), (4.0, True), (0.25, True)):
-        root = copy_writable(later.root, tmp_path / f"{wrong:g}")
+def test_receiver_gain_change_is_flagged_from_noise(later, tmp_path):
+    """The file is of a gain higher or lower by 6 dB, which makes all cross-sections wrong by 6 dB."""
+    for factor, flagged in ((1.0, False), (4.0, True), (0.25, True)):
+        root = copy_writable(later.root, tmp_path / f"{factor:g}")
         change_file(
             root,
-            lambda document, wrong=wrong: document["pairs"]["uav1-uav1"].update(
-                profile_noise=document["pairs"]["uav1-uav1"]["profile_noise"] * wrong
+            lambda document, factor=factor: document["pairs"]["uav1-uav1"].update(
+                profile_noise=document["pairs"]["uav1-uav1"]["profile_noise"] * factor
             ),
         )
         campaign = Campaign.load(root)
         layers.layers(campaign, "f01", "uav1-uav1")
-        said = json.loads(campaign.result("f01", "uav1-uav1", "radiometry.json").read_text())
-        assert ("noise_disagrees" in said["flags"]) is flagged
+        report = json.loads(campaign.result("f01", "uav1-uav1", "radiometry.json").read_text())
+        assert ("noise_disagrees" in report["flags"]) is flagged

@@ -1,4 +1,4 @@
-"""The cube as people open it: by names, with its CRS, and with phases between pairs and between flights."""
+"""The cube: selection by name, CF metadata, CRS, and phases between pairs and between flights."""
 
 import warnings
 from dataclasses import replace
@@ -18,16 +18,16 @@ from apertura.methods.interferometry.coherence import chance, coherence
 from apertura.simulation import ImageGrid, preset, simulate
 from apertura.stages import cube
 
-LIFTED_M = 0.1
+HEIGHT_OFFSET_M = 0.1
 
 
-def two_days(root):
-    """Two flights, the second of one node, a little higher and a day later; tiles of 16 of 60 pixels."""
+def run_two_flights(root):
+    """Run two flights, the second of one node, higher by 0.1 m and a day later; tiles of 16 of 60 pixels."""
     plan = preset("demo", pulses=120)
     first, grid = plan.flights[0], ImageGrid("EPSG:32632", half_width_m=3.0, spacing_m=0.1)
     track = first.tracks["uav1"]
     east, north, up = track.start_m
-    lifted = {"uav1": replace(track, start_m=(east, north, up + LIFTED_M))}
+    lifted = {"uav1": replace(track, start_m=(east, north, up + HEIGHT_OFFSET_M))}
     second = replace(first, name="f02", tracks=lifted, start_utc="2025-05-15T09:30:00")
     simulate(root, replace(plan, scene=grid, flights=(first, second)), seed=7)
     edit_config(root, lambda document: document.setdefault("processing", {}).update(tile_px=16))
@@ -36,13 +36,13 @@ def two_days(root):
 
 @pytest.fixture(scope="session")
 def campaign(made_once):
-    """That, made once."""
-    return Campaign.load(made_once("cube", two_days))
+    """Return the campaign of two flights, run once per session."""
+    return Campaign.load(made_once("cube", run_two_flights))
 
 
 @pytest.fixture(scope="module")
 def opened(campaign):
-    """The cube as a stranger opens it; a warning is an error."""
+    """Open the cube with xarray; a warning is an error."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         return xr.open_zarr(str(campaign.stage("cube")))
@@ -61,15 +61,15 @@ def test_images_are_selected_by_name(campaign, opened):
     assert opened.sel(flight="f01", pair="uav1-uav2").verdict.values.item() in {"focused", "inconclusive", "defocused"}
 
 
-def test_the_cube_says_what_it_is_as_cf_has_it(campaign, opened):
-    """What compliance-checker of IOOS asks of CF-1.11; decibels it does not know are a unit of CF all the same."""
+def test_cube_has_the_metadata_of_cf(campaign, opened):
+    """Checks of the IOOS compliance-checker for CF-1.11, and dB, which CF allows but the checker does not know."""
     assert opened.attrs["Conventions"] == "CF-1.11"
     assert campaign.settings.campaign in opened.attrs["title"]
     assert opened.attrs["history"]
-    named = {
+    standard_names = {
         name: array.attrs["standard_name"] for name, array in opened.variables.items() if "standard_name" in array.attrs
     }
-    assert named == {
+    assert standard_names == {
         "incidence": "angle_of_incidence",
         "centre_frequency": "sensor_band_central_radiation_frequency",
         "time": "time",
@@ -83,7 +83,7 @@ def test_the_cube_says_what_it_is_as_cf_has_it(campaign, opened):
     assert not any("_FillValue" in array.attrs for array in opened.variables.values())
 
 
-def test_the_crs_is_one_line_away_and_every_raster_names_it(campaign, opened):
+def test_rioxarray_reads_the_crs_of_every_raster(campaign, opened):
     assert opened.rio.crs.to_epsg() == 32632
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", PendingDeprecationWarning)
@@ -96,7 +96,7 @@ def test_the_crs_is_one_line_away_and_every_raster_names_it(campaign, opened):
         assert (array.attrs.get("grid_mapping") == "spatial_ref") == (name in rasters)
 
 
-def test_names_and_units_are_those_of_cf(opened):
+def test_names_and_units_follow_cf(opened):
     assert opened.attrs["Conventions"].startswith("CF-")
     for name, array in opened.variables.items():
         assert name == "spatial_ref" or array.attrs.keys() & {"long_name", "standard_name"}, name
@@ -107,24 +107,24 @@ def test_names_and_units_are_those_of_cf(opened):
     assert opened.spatial_ref.attrs["grid_mapping_name"] == "transverse_mercator"
 
 
-def test_a_flight_has_the_time_of_its_middle(opened):
+def test_flight_has_the_time_of_its_middle(opened):
     middle = np.array(
         ["2025-05-14T09:30:02.975", "2025-05-15T09:30:02.975"], "datetime64[ns]"
     )  # of 120 pulses at 20 Hz
     assert (np.abs(opened.time.values - middle) < np.timedelta64(100, "ms")).all()
 
 
-def test_each_image_says_how_it_saw_the_scene(opened):
+def test_each_image_states_its_geometry(opened):
     f01, f02 = (opened.sel(flight=flight, pair="uav1-uav1") for flight in ("f01", "f02"))
-    assert float(f02.height - f01.height) == pytest.approx(LIFTED_M, abs=0.15)  # both wobble
-    assert float(f01.heading) == pytest.approx(40, abs=5)  # of the demo's tracks
+    assert float(f02.height - f01.height) == pytest.approx(HEIGHT_OFFSET_M, abs=0.15)  # both tracks have wobble
+    assert float(f01.heading) == pytest.approx(40, abs=5)  # heading of the demo's tracks
     assert (float(f01.look_direction) - float(f01.heading)) % 360 == pytest.approx(90, abs=30)
     assert np.degrees(np.arccos(float(f01.height / f01.range))) == pytest.approx(float(f01.incidence), abs=1)
     assert float(f01.bandwidth) == pytest.approx(409.6e6, rel=1e-3)
     assert float(f01.bistatic_angle) < 1 < float(opened.bistatic_angle.sel(flight="f01", pair="uav1-uav2"))
 
 
-def test_coherence_and_phase_are_those_of_whole_images_whatever_the_tiles(opened):
+def test_coherence_and_phase_do_not_depend_on_the_tiles(opened):
     window = opened.attrs["coherence_window"]
     images = opened.image.load()
     reference = opened.reference_pair.sel(flight="f01").values.item()
@@ -138,23 +138,23 @@ def test_coherence_and_phase_are_those_of_whole_images_whatever_the_tiles(opened
             images.sel(flight=against[0], pair=against[1]).values,
             window=window,
         )
-        held = opened.sel(flight=one[0], pair=one[1])
-        np.testing.assert_array_equal(held[f"{kind}_coherence"], whole[0])
-        np.testing.assert_array_equal(held[f"{kind}_phase"], whole[1])
-        assert float(held[f"{kind}_chance"]) == pytest.approx(chance(whole[2]), abs=0.03)  # looks are told tile by tile
+        stored = opened.sel(flight=one[0], pair=one[1])
+        np.testing.assert_array_equal(stored[f"{kind}_coherence"], whole[0])
+        np.testing.assert_array_equal(stored[f"{kind}_phase"], whole[1])
+        assert float(stored[f"{kind}_chance"]) == pytest.approx(chance(whole[2]), abs=0.03)  # looks estimated per tile
         assert np.isnan(opened.sel(flight=against[0], pair=against[1])[f"{kind}_coherence"]).all()
 
 
-def test_a_target_is_as_coherent_as_the_common_band_lets_it(opened):
+def test_coherence_of_a_target_is_limited_by_the_common_band(opened):
     brightest = np.abs(opened.image.sel(flight="f01", pair="uav1-uav2")).argmax(...)
     assert opened.reference_pair.sel(flight="f01") == "uav1-uav2"
     for name, flight in (("pair", "f01"), ("flight", "f02")):
-        here = opened.sel(flight=flight, pair="uav1-uav1").isel(brightest)
-        assert float(here[f"{name}_coherence"]) == pytest.approx(float(here[f"{name}_common_band"]), abs=0.12)
-        assert abs(float(here[f"{name}_phase"])) < 0.3
+        pixel = opened.sel(flight=flight, pair="uav1-uav1").isel(brightest)
+        assert float(pixel[f"{name}_coherence"]) == pytest.approx(float(pixel[f"{name}_common_band"]), abs=0.12)
+        assert abs(float(pixel[f"{name}_phase"])) < 0.3
 
 
-def test_the_sum_says_how_far_it_lowers_clutter(opened):
+def test_clutter_reduction_of_the_sum_is_stated(opened):
     floors = opened.noise_floor.sel(flight="f01")
     mean_db = 10 * np.log10((10 ** (floors / 10)).mean())
     assert np.isfinite(opened.phase_removed.sel(flight="f01")).all()  # both pairs are in the sum
@@ -163,7 +163,7 @@ def test_the_sum_says_how_far_it_lowers_clutter(opened):
     )
 
 
-def test_a_flight_of_one_pair_has_no_sum(opened):
+def test_flight_of_one_pair_has_no_sum(opened):
     alone = opened.sel(flight="f02")
     for name in ("coherent", "noncoherent", "magnitude", "clutter_reduction", "coherent_noise_floor", "phase_removed"):
         assert alone[name].isnull().all(), name
@@ -173,25 +173,25 @@ def test_a_flight_of_one_pair_has_no_sum(opened):
 
 def test_metadata_are_consolidated_and_hashed_with_the_rest(campaign):
     folder = campaign.stage("cube")
-    held = zarr.open_group(str(folder), mode="r", use_consolidated=True)
-    assert {"image", "flight", "time"} <= set(held.metadata.consolidated_metadata.metadata)
+    group = zarr.open_group(str(folder), mode="r", use_consolidated=True)
+    assert {"image", "flight", "time"} <= set(group.metadata.consolidated_metadata.metadata)
     assert damaged_files(manifest_of(folder)) == []
 
 
-def test_chunks_are_tiles_and_files(campaign, opened):
+def test_chunks_are_tiles_in_separate_files(campaign, opened):
     assert opened.image.encoding["chunks"] == (1, 1, 16, 16)
     assert opened.image.encoding["shards"] is None
-    assert len([*(campaign.stage("cube") / "pair_phase" / "c").rglob("*")]) == 1 + 1 + 4 + 16  # of one pair alone
+    assert len([*(campaign.stage("cube") / "pair_phase" / "c").rglob("*")]) == 1 + 1 + 4 + 16  # chunks of one pair only
     assert not (campaign.stage("cube") / "flight_phase" / "c" / "0").exists()
 
 
-def test_a_cube_made_again_by_any_number_of_threads_is_the_same_to_the_byte(campaign, tmp_path):
+def test_cube_does_not_depend_on_the_number_of_threads(campaign, tmp_path):
     again = Campaign.load(copy_writable(campaign.root, tmp_path / "campaign"))
     cube.cube(again, threads=3)
     assert manifest_of(again.stage("cube")).read_bytes() == manifest_of(campaign.stage("cube")).read_bytes()
 
 
-def test_images_of_an_older_version_end_in_one_message(campaign, tmp_path):
+def test_images_of_an_older_version_are_one_message(campaign, tmp_path):
     root = copy_writable(campaign.root, tmp_path / "campaign")
     folder = Campaign.load(root).stage("image", "f01", "uav1-uav1")
     image = open_stage(folder, "image").load()
@@ -199,13 +199,13 @@ def test_images_of_an_older_version_end_in_one_message(campaign, tmp_path):
     with writing(folder) as wip:
         create(wip, image, {"image": (16, 16)})
         finish(wip, folder)
-    said = complaint(lambda: cube.cube(Campaign.load(root)))
-    assert "'view' missing" in said
-    assert "Run the workflow again" in said
+    message = complaint(lambda: cube.cube(Campaign.load(root)))
+    assert "'view' missing" in message
+    assert "Run the workflow again" in message
 
 
 @pytest.mark.slow
-def test_every_block_of_the_how_to_runs_and_prints_what_it_shows(campaign, tmp_path, monkeypatch):
+def test_code_blocks_of_the_how_to_print_what_they_show(campaign, tmp_path, monkeypatch):
     copy_writable(campaign.root, tmp_path / "campaign")
     monkeypatch.chdir(tmp_path)
     walk(ROOT / "docs/howto/xarray.md")

@@ -1,4 +1,4 @@
-"""A flight of one pair: nothing is made of sums, and what people see names the pair."""
+"""Flights of one pair: no results of sums exist, and catalog, map, summary and report list the pair."""
 
 import json
 
@@ -21,36 +21,36 @@ from apertura.workflow.lineage import places_of
 PAIR = "uav1-uav1"
 
 
-def of_one_node(root):
-    """Leave the transmitter alone in a copy of the tiny campaign."""
+def keep_one_node(root):
+    """Reduce a copy of the tiny campaign to its transmitter."""
     (root / "config/flights.tsv").write_text("flight\tkind\ttransmitter\tnodes\nf01\timage\tuav1\tuav1\n")
     return root
 
 
 @pytest.fixture(scope="session")
 def alone(_tiny, made_once):
-    """The tiny campaign with all its results, of the transmitter alone; read only."""
-    return Campaign.load(made_once("alone", lambda root: run_steps(of_one_node(copy_writable(_tiny, root)))))
+    """Return the tiny campaign with the transmitter only and all its results; read only."""
+    return Campaign.load(made_once("alone", lambda root: run_steps(keep_one_node(copy_writable(_tiny, root)))))
 
 
-def test_no_result_no_source_and_no_file_is_of_sums(tiny):
-    campaign = Campaign.load(of_one_node(tiny))
+def test_single_pair_has_no_results_of_sums(tiny):
+    campaign = Campaign.load(keep_one_node(tiny))
     assert {result for result, _, _ in places_of(campaign)}.isdisjoint({"fused", "pictures_fused"})
-    assert not [one for _, _, result in places_of(campaign) for one in result.sources if "fused" in one]
+    assert not [source for _, _, result in places_of(campaign) for source in result.sources if "fused" in source]
     assert not [name for name in product_files(campaign.images, campaign.coefficients) if "fused" in name]
     for step in (export_fused, pictures_fused):
         assert "of f01" in complaint(lambda step=step: step(campaign, "f01"))
 
 
 @pytest.mark.slow
-def test_every_file_that_is_named_is_there_and_none_of_sums(alone):
-    named = set(product_files(alone.images, alone.coefficients))
-    assert not [name for name in named if not (alone.results / name).is_file()]
+def test_listed_products_exist_and_none_is_of_sums(alone):
+    products = set(product_files(alone.images, alone.coefficients))
+    assert not [name for name in products if not (alone.results / name).is_file()]
     assert not list(alone.results.rglob("*fused*"))
 
 
 @pytest.mark.slow
-def test_the_cube_the_catalog_and_the_map_hold_the_pair_alone(alone):
+def test_cube_catalog_and_map_contain_only_the_pair(alone):
     cube = open_stage(alone.stage("cube"), "cube")
     assert not SUMMED & {*cube.variables}
     assert cube.attrs["fusion"] == {}
@@ -58,17 +58,17 @@ def test_the_cube_the_catalog_and_the_map_hold_the_pair_alone(alone):
     items = pystac.Catalog.from_file(str(alone.results / "stac" / CATALOG)).get_items(recursive=True)
     assert [item.id for item in items] == [f"f01-{PAIR}"]
     images = json.loads((alone.results / "map" / "map.json").read_text())["images"]
-    assert [(one["flight"], one["image"]) for one in images] == [("f01", PAIR)]
+    assert [(image["flight"], image["image"]) for image in images] == [("f01", PAIR)]
 
 
 @pytest.mark.slow
-def test_score_summary_and_report_are_of_the_pair(alone, tmp_path, capsys):
-    assert {one.image for one in score(alone)} == {PAIR}
+def test_score_summary_and_report_list_the_pair(alone, tmp_path, capsys):
+    assert {finding.image for finding in score(alone)} == {PAIR}
     assert is_finished(alone)
     print_summary(alone)
-    said = capsys.readouterr().out
-    assert f"results/f01/{PAIR}/db.tif" in said
-    assert "missing or out of date" not in said
+    printed = capsys.readouterr().out
+    assert f"results/f01/{PAIR}/db.tif" in printed
+    assert "missing or out of date" not in printed
     campaign = Campaign.load(copy_writable(alone.root, tmp_path / "campaign"))
     pictures(campaign, "f01", PAIR)
     assert page(campaign, "f01") == [campaign.result("f01", "report.html")]

@@ -1,4 +1,4 @@
-"""How an image says that it saw its scene, against the layers that are computed pixel by pixel."""
+"""Viewing geometry of an image: angles, carrier, side and times, compared with layers, echo and tags."""
 
 import json
 
@@ -15,7 +15,7 @@ PAIRS = ("uav1-uav1", "uav1-uav2")
 
 
 @pytest.mark.parametrize("pair", PAIRS)
-def test_angles_of_the_view_are_those_of_the_layers_in_the_middle(finished_tiny, pair):
+def test_view_angles_agree_with_the_layers_at_the_centre(finished_tiny, pair):
     folder = finished_tiny.results / "f01" / pair
     view = json.loads((folder / "image.json").read_text())["view"]
     for name in ("incidence", "bistatic_angle"):
@@ -26,19 +26,19 @@ def test_angles_of_the_view_are_those_of_the_layers_in_the_middle(finished_tiny,
 
 
 @pytest.mark.parametrize("pair", PAIRS)
-def test_the_carrier_of_the_view_is_that_of_the_images_band(finished_tiny, pair):
-    """The mean turn from pixel to pixel over the image, weighed by power, up to whole turns."""
+def test_spatial_carrier_of_the_view_is_that_of_the_image(finished_tiny, pair):
+    """Power-weighted mean phase difference between adjacent pixels, modulo one cycle."""
     image = open_stage(finished_tiny.stage("image", "f01", pair), "image")
     east, north = image.attrs["quality"]["view"]["carrier_cycles_m"]
     values, spacing_m = image.image.values, 0.1
     for axis, cycles in ((1, east), (0, -north)):
         ahead = np.take(values, range(1, 60), axis) * np.take(values, range(59), axis).conj()
-        turn = np.angle(ahead.sum()) / (2 * np.pi)
-        assert abs((turn - cycles * spacing_m + 0.5) % 1 - 0.5) < 0.02
+        measured = np.angle(ahead.sum()) / (2 * np.pi)
+        assert abs((measured - cycles * spacing_m + 0.5) % 1 - 0.5) < 0.02
 
 
 def view_of(track_m):
-    """The view of a scene about (0, 20) from a track past it."""
+    """Return the view report of a scene centred at (0, 20) for a track."""
     frequency = 1.2e9 + 1e6 * np.arange(64)
     history = ap.PhaseHistory(
         np.ones((len(track_m), 64), np.complex64),
@@ -52,39 +52,39 @@ def view_of(track_m):
     return view_report(formation, np.datetime64("2025-05-14", "ns"), np.arange(len(track_m)) / 10)
 
 
-def flown(north_m=0.0):
+def straight_track(north_m=0.0):
     east = np.linspace(-5, 5, 101)
     return np.stack([east, np.broadcast_to(north_m, 101), np.full(101, 10.0)], -1)
 
 
-def test_the_side_is_that_of_the_scene_and_no_straight_track_observes_it():
-    for track, side in ((flown(), "left"), (flown()[::-1], "right")):
+def test_side_of_a_straight_track_is_stated_but_not_observable():
+    for track, side in ((straight_track(), "left"), (straight_track()[::-1], "right")):
         view = view_of(track)
         assert (view["side"], view["side_observable"]) == (side, False)
         assert view["side_mirror_rad"] < 1e-6
 
 
 @pytest.mark.slow
-def test_a_track_that_bends_sideways_observes_its_side_and_one_that_bobs_does_not():
-    """4π/λ·2w sin θ of a lateral rms w: a mirrored point is out of phase by it."""
+def test_side_is_observable_with_lateral_but_not_vertical_motion():
+    """Phase error of a mirrored point for a lateral rms deviation w: 4π/λ·2w sin θ."""
     bend = 0.05 * np.sin(np.linspace(-9, 9, 101))
-    view = view_of(flown(bend))
+    view = view_of(straight_track(bend))
     wavelength = SPEED_OF_LIGHT_M_S / (1.2e9 + 32e6)
     line = np.polyval(np.polyfit(np.linspace(-5, 5, 101), bend, 1), np.linspace(-5, 5, 101))
     expected = 8 * np.pi / wavelength * np.std(bend - line) * np.sin(np.arctan2(20, 10))
     assert view["side_mirror_rad"] == pytest.approx(expected, rel=0.02)
     assert view["side_observable"]
-    bobbing = flown() + np.outer(bend, [0, 0, 1])
-    assert not view_of(bobbing)["side_observable"]
+    vertical = straight_track() + np.outer(bend, [0, 0, 1])
+    assert not view_of(vertical)["side_observable"]
 
 
-def test_a_track_around_the_scene_has_no_side():
-    turn = np.linspace(0, 2 * np.pi, 201)[:-1]
-    wave = np.stack([10 * np.sin(turn), 20 + 10 * np.sin(2 * turn), np.full(200, 10.0)], -1)
-    assert view_of(wave)["side"] == "both"
+def test_track_around_the_scene_has_no_side():
+    angle = np.linspace(0, 2 * np.pi, 201)[:-1]
+    track = np.stack([10 * np.sin(angle), 20 + 10 * np.sin(2 * angle), np.full(200, 10.0)], -1)
+    assert view_of(track)["side"] == "both"
 
 
-def test_tags_state_time_frequency_side_and_incidence_as_the_report_does(finished_tiny):
+def test_tags_agree_with_the_view_of_the_report(finished_tiny):
     folder = finished_tiny.results / "f01" / "uav1-uav2"
     view = json.loads((folder / "image.json").read_text())["view"]
     with rasterio.open(str(folder / "db.tif")) as raster:
@@ -98,7 +98,7 @@ def test_tags_state_time_frequency_side_and_incidence_as_the_report_does(finishe
     assert tags["TIFFTAG_DATETIME"] == f"{date.replace('-', ':')} {time}"
 
 
-def test_a_flight_is_timed_by_its_pulses(finished_tiny):
+def test_times_of_the_view_are_those_of_the_pulses(finished_tiny):
     for pair in PAIRS:
         view = open_stage(finished_tiny.stage("image", "f01", pair), "image").attrs["quality"]["view"]
         echo = open_stage(finished_tiny.stage("echo", "f01", pair), "echo")

@@ -1,4 +1,4 @@
-"""Images of a flight hold each other: what is wrong with one is said of it, with what would mend it."""
+"""Assessment of a flight: agreement between pairs, flags, hypotheses of causes, error budget and sums."""
 
 import json
 import re
@@ -35,38 +35,38 @@ def flags_of(campaign):
     return {name: set(report["flags"]) for name, report in reports_of(campaign).items()}
 
 
-def sample(folder, spoil=lambda _: None):
+def run_sample(folder, change=lambda _: None):
     if not SHARED.is_dir():
         pytest.skip("../shared/data is absent")
-    root = copy_writable(SHARED / "campaign-sample", folder / "campaign")
-    spoil(root)
+    root = copy_writable(SHARED / "campaign-run_sample", folder / "campaign")
+    change(root)
     return run_steps(root)
 
 
-def test_a_right_campaign_is_focused_agrees_and_has_no_flag(finished_sample):
+def test_correct_campaign_is_focused_and_raises_no_flag(finished_sample):
     reports = reports_of(finished_sample)
     assert flags_of(finished_sample) == {name: set() for name in (*PAIRS, "fused")}
     for pair in PAIRS:
         assert reports[pair]["focus"]["verdict"] == "focused"
         assert reports[pair]["focus"]["loss_db"] > -0.1
         assert reports[pair]["hypotheses"] == []
-    found = reports["uav1-uav2"]["agreement"]
-    assert found["points"] == 4
-    assert abs(found["phase_rad"]) < 0.1
+    agreement = reports["uav1-uav2"]["agreement"]
+    assert agreement["points"] == 4
+    assert abs(agreement["phase_rad"]) < 0.1
     assert reports["fused"]["coherence"]["mean"] > 0.99
     assert reports["fused"]["coherence"]["chance"] == 0.5
     assert list(reports["fused"]["fusion"]["phases_rad"]) == list(PAIRS)
 
 
-def test_every_image_carries_its_budget(finished_sample):
+def test_every_image_states_its_budget(finished_sample):
     lines = {line["cause"]: line for line in reports_of(finished_sample)["uav1-uav2"]["budget"]}
     assert {"positions", "heights", "time tags", "calibration", "clock", "sidelink noise", "arithmetic"} <= set(lines)
-    assert lines["heights"]["stated"].startswith("not stated; assumed 3 m")  # a straight track does not show it
+    assert lines["heights"]["stated"].startswith("not stated; assumed 3 m")  # not observable with a straight track
     assert 0.6 < lines["heights"]["shift_m"] < 2.4
     assert lines["arithmetic"]["loss_db"] > -0.001
 
 
-def test_the_summary_says_each_flag_once_and_whole(finished_sample, capsys, tmp_path):
+def test_summary_prints_each_flag_once(finished_sample, capsys, tmp_path):
     root = copy_writable(finished_sample.root, tmp_path / "campaign")
     for name in (*PAIRS, "fused"):
         path = root / "results" / "f01" / name / "image.json"
@@ -74,13 +74,13 @@ def test_the_summary_says_each_flag_once_and_whole(finished_sample, capsys, tmp_
         path.write_text(json.dumps(report | {"flags": {"defocused": "a line [with brackets]"}}))
         record_files(path.with_name("export.manifest.json"), [path])
     print_summary(Campaign.load(root))
-    said = capsys.readouterr().out
-    assert said.count("a line [with brackets]") == 1
-    assert "not in the error budget, because no uncertainty is configured" in said
-    assert re.search(r"geolocation uncertainty \d\.\d+ m, dominated by heights, not stated; assumed 3 m", said)
+    printed = capsys.readouterr().out
+    assert printed.count("a line [with brackets]") == 1
+    assert "not in the error budget, because no uncertainty is configured" in printed
+    assert re.search(r"geolocation uncertainty \d\.\d+ m, dominated by heights, not stated; assumed 3 m", printed)
 
 
-def test_a_sentence_that_several_flags_have_in_common_stands_once_in_the_summary():
+def test_common_part_of_several_flags_is_printed_once():
     cause = "4.1 of 4.5 dB are explained if the times of the log of uav1 are 0.50 s late"
     lines = {"defocused": f"4.5 dB lost; {cause}", "pairs_displaced": f"5 points lie 12 cm apart; {cause}"}
     reports = {"f01 a-a": {"flags": lines}, "f01 a-b": {"flags": {"defocused": f"3.2 dB lost; {cause}"}}}
@@ -101,9 +101,9 @@ def flip_right_arm(document):
 
 
 @pytest.mark.slow
-def test_the_sign_of_a_lever_arm_is_seen_and_named(tmp_path):
-    """Both images are sharp, 33 and 26 cm from the truth: only each other they contradict, so neither is `focused`."""
-    campaign = sample(tmp_path, lambda root: edit_config(root, flip_right_arm))
+def test_sign_error_of_a_lever_arm_is_identified(tmp_path):
+    """Both images are sharp but displaced by 33 and 26 cm: only the comparison of pairs detects the error."""
+    campaign = run_sample(tmp_path, lambda root: edit_config(root, flip_right_arm))
     reports = reports_of(campaign)
     for pair in PAIRS:
         assert reports[pair]["focus"]["loss_db"] > -0.3
@@ -111,7 +111,7 @@ def test_the_sign_of_a_lever_arm_is_seen_and_named(tmp_path):
         assert "contradicted by pairs_displaced, pairs_out_of_phase" in reports[pair]["focus"]["reason"]
         assert {"pairs_displaced", "pairs_out_of_phase"} <= set(reports[pair]["flags"])
     best = reports["uav1-uav1"]["hypotheses"][0]
-    assert best["kind"] == "offset"  # along a straight track an arm's sign is one of several that do the same
+    assert best["kind"] == "offset"  # one of several equivalent causes along a straight track
     assert best["what"].endswith("right axis of the lever arms of uav1 has the opposite sign")
     assert best["what"] in reports["uav1-uav1"]["flags"]["pairs_displaced"]
     left_out = reports["fused"]["fusion"]["left_out"]
@@ -119,8 +119,8 @@ def test_the_sign_of_a_lever_arm_is_seen_and_named(tmp_path):
     assert next(iter(left_out)) in reports["fused"]["models"]["fusion"]
 
 
-def later(seconds):
-    """Shift the times of a CSV log."""
+def delayed(seconds):
+    """Return a function that shifts the times of a CSV log."""
 
     def change(lines):
         shifted = []
@@ -137,29 +137,29 @@ def later(seconds):
 
 
 @pytest.mark.slow
-def test_a_log_half_a_second_late_is_seen_and_named(tmp_path):
-    campaign = sample(tmp_path, lambda root: edit_track(root, "uav1", later(0.5)))
+def test_log_late_by_half_a_second_is_identified(tmp_path):
+    campaign = run_sample(tmp_path, lambda root: edit_track(root, "uav1", delayed(0.5)))
     report = reports_of(campaign)["uav1-uav2"]
     assert {"pairs_displaced", "defocused", "pairs_out_of_phase"} & set(report["flags"])
     assert "the times of the log of uav1 are 0.50 s late" in report["hypotheses"][0]["what"]
 
 
 @pytest.mark.slow
-def test_random_errors_of_a_log_have_no_cause_that_is_named(tmp_path):
-    """2 cm in both logs: several hypotheses gain 2 dB of the 7 that are lost, and so do tracks drawn at random."""
+def test_random_log_errors_have_no_single_cause(tmp_path):
+    """Errors of 2 cm: several hypotheses regain 2 dB of the loss of 7 dB, and so do random tracks."""
     generator = np.random.default_rng(5)
 
     def noisy(lines):
-        spoilt = []
+        noisy_lines = []
         for line in lines:
             stamp, latitude, longitude, *rest = line.split(",")
             if stamp[0].isdigit():
                 north, east = generator.normal(0, 0.02 / 111e3, 2)
                 latitude, longitude = f"{float(latitude) + north:.10f}", f"{float(longitude) + 1.5 * east:.10f}"
-            spoilt.append(",".join([stamp, latitude, longitude, *rest]))
-        return spoilt
+            noisy_lines.append(",".join([stamp, latitude, longitude, *rest]))
+        return noisy_lines
 
-    reports = reports_of(sample(tmp_path, lambda root: edit_track(root, "uav1", noisy)))
+    reports = reports_of(run_sample(tmp_path, lambda root: edit_track(root, "uav1", noisy)))
     flags = reports["uav1-uav1"]["flags"]
     assert reports["uav1-uav1"]["hypotheses"] == []
     assert "no single cause explains it" in flags["defocused"]
@@ -173,41 +173,41 @@ def trial(gain_db, kind, *, offset=False):
     ("trials", "drawn", "lost_db", "named"),
     [
         ([trial(6.0, "time"), trial(2.9, "height")], [2.0, 1.0], 7.0, "time"),
-        ([trial(6.0, "time"), trial(5.9, "time"), trial(2.9, "height")], [2.0], 7.0, "time"),  # half a second or 0.6
-        ([trial(6.0, "range"), trial(5.9, "prefix")], [2.0], 7.0, "range"),  # one cause by two names
-        ([trial(4.0, "time"), trial(1.0, "height")], [1.0], 7.0, None),  # less than most of what was lost
-        ([trial(6.0, "time"), trial(3.1, "height")], [1.0], 7.0, None),  # another cause does as well
-        ([trial(6.0, "time"), trial(1.0, "height")], [3.1], 7.0, None),  # so does chance
+        ([trial(6.0, "time"), trial(5.9, "time"), trial(2.9, "height")], [2.0], 7.0, "time"),  # two values of one cause
+        ([trial(6.0, "range"), trial(5.9, "prefix")], [2.0], 7.0, "range"),  # equivalent causes
+        ([trial(4.0, "time"), trial(1.0, "height")], [1.0], 7.0, None),  # explains less than most of the loss
+        ([trial(6.0, "time"), trial(3.1, "height")], [1.0], 7.0, None),  # another cause explains half as much
+        ([trial(6.0, "time"), trial(1.0, "height")], [3.1], 7.0, None),  # random tracks explain half as much
         ([trial(0.4, "time")], [], 0.5, None),
-        ([trial(60.0, "height"), trial(37.0, "carrier_is")], [3.0], 22.0, "height"),  # beyond doubt
+        ([trial(60.0, "height"), trial(37.0, "carrier_is")], [3.0], 22.0, "height"),  # far above all others
         ([trial(2.4, "range", offset=True), trial(2.3, "lever arm", offset=True)], [1.0], 2.6, "offset"),
         ([trial(2.4, "range", offset=True), trial(2.3, "time")], [1.0], 2.6, None),
         ([], [], 5.0, None),
     ],
 )
-def test_a_hypothesis_is_named_where_it_alone_explains_most_of_what_was_lost(trials, drawn, lost_db, named):
-    found = explanation(trials, [trial(gain_db, "chance") for gain_db in drawn], lost_db)
-    assert [one["kind"] for one in found] == ([named] if named else [])
+def test_hypothesis_is_reported_if_it_alone_explains_the_loss(trials, drawn, lost_db, named):
+    explanations = explanation(trials, [trial(gain_db, "chance") for gain_db in drawn], lost_db)
+    assert [one["kind"] for one in explanations] == ([named] if named else [])
 
 
 @pytest.mark.parametrize(
-    ("loss_db", "std_db", "gain_db", "told"),
+    ("loss_db", "std_db", "gain_db", "is_regained"),
     [
         (-1.35, 0.3, 1.6, True),
-        (-1.35, 0.3, 0.0, False),  # the cause is another pair's
+        (-1.35, 0.3, 0.0, False),  # the cause is in another pair
         (-1.35, 0.6, 1.6, False),  # chance
-        (-3.0, 0.3, 1.6, False),  # something else does most of it
+        (-3.0, 0.3, 1.6, False),  # most of the loss has another cause
         (-0.1, 0.01, 0.3, False),
     ],
 )
-def test_a_cause_named_for_one_pair_is_told_of_another_that_it_brings_back(loss_db, std_db, gain_db, told):
-    assert assess._regained({"loss_db": loss_db, "std_db": std_db}, gain_db) is told
+def test_cause_is_reported_for_other_pairs_that_it_restores(loss_db, std_db, gain_db, is_regained):
+    assert assess._regained({"loss_db": loss_db, "std_db": std_db}, gain_db) is is_regained
     assert assess._regained({}, gain_db) is False
 
 
 @pytest.mark.slow
-def test_a_phase_between_pairs_is_taken_off_where_that_is_asked_for(finished_sample, tmp_path):
-    def off_by_a_quarter(align):
+def test_phase_between_pairs_is_removed_if_configured(finished_sample, tmp_path):
+    def with_quarter_cycle(align):
         root = copy_writable(finished_sample.root, tmp_path / f"align-{align}")
 
         def change(document):
@@ -223,16 +223,16 @@ def test_a_phase_between_pairs_is_taken_off_where_that_is_asked_for(finished_sam
         cube.cube(campaign)
         return assessment_of(campaign, "f01")
 
-    left = off_by_a_quarter(align=False)
-    assert left["fusion"]["left_out"].keys() == {"uav1-uav2"}
-    assert "pairs_out_of_phase" in left["pairs"]["uav1-uav2"]["flags"]
-    aligned = off_by_a_quarter(align=True)
+    excluded = with_quarter_cycle(align=False)
+    assert excluded["fusion"]["left_out"].keys() == {"uav1-uav2"}
+    assert "pairs_out_of_phase" in excluded["pairs"]["uav1-uav2"]["flags"]
+    aligned = with_quarter_cycle(align=True)
     assert aligned["fusion"]["left_out"] == {}
     assert abs(aligned["fusion"]["phases_rad"]["uav1-uav2"]) == pytest.approx(2 * 3.1416 * 0.05 / 0.2142, abs=0.15)
 
 
 def with_longer_path(root, added_m):
-    """Image a campaign again with the path of the second receiver so much longer, and export its sums."""
+    """Recompute a campaign with a longer path of the second receiver and export its sums."""
     edit_config(root, lambda document: document["nodes"]["uav2"]["path_offset_m"].update(radar=0.911 + added_m))
     campaign = Campaign.load(root)
     for step in (echo.echo, profile.profile, image.image):
@@ -244,27 +244,27 @@ def with_longer_path(root, added_m):
 
 
 @pytest.mark.slow
-def test_a_sum_whose_phase_nothing_tells_says_so_and_that_its_peaks_are_lost(finished_tiny, tmp_path, monkeypatch):
+def test_sum_with_unobservable_phase_is_flagged(finished_tiny, tmp_path, monkeypatch):
     root = copy_writable(finished_tiny.root, tmp_path / "campaign")
     monkeypatch.setattr("apertura.stages.assess.agreement_of", lambda *_: None)
-    told = with_longer_path(root, 0.214 / 4)
-    assert [*told["fusion"]["phases_rad"]] == list(PAIRS)
-    assert "is added with phase 0: it shares nothing with" in told["flags"]["phase_unobservable"]
-    assert "peak loss for a phase error of a quarter cycle: 3 dB" in told["flags"]["phase_unobservable"]
-    assert told["coherence"]["mean"] == pytest.approx(0.5, abs=0.15)
-    assert "sum_incoherent" in told["flags"]
-    assert told["focus"]["verdict"] == "defocused"
-    assert "from phase differences between pairs" in told["focus"]["reason"]
+    report = with_longer_path(root, 0.214 / 4)
+    assert [*report["fusion"]["phases_rad"]] == list(PAIRS)
+    assert "is added with phase 0: it shares nothing with" in report["flags"]["phase_unobservable"]
+    assert "peak loss for a phase error of a quarter cycle: 3 dB" in report["flags"]["phase_unobservable"]
+    assert report["coherence"]["mean"] == pytest.approx(0.5, abs=0.15)
+    assert "sum_incoherent" in report["flags"]
+    assert report["focus"]["verdict"] == "defocused"
+    assert "from phase differences between pairs" in report["focus"]["reason"]
 
 
-def test_a_sum_states_what_it_gained(finished_tiny):
-    told = json.loads((finished_tiny.results / "f01" / "fused" / "image.json").read_text())
-    assert told["focus"]["verdict"] == "focused"
-    assert told["gain"]["allowed_db"] == pytest.approx(3.01)
+def test_sum_states_its_gain(finished_tiny):
+    report = json.loads((finished_tiny.results / "f01" / "fused" / "image.json").read_text())
+    assert report["focus"]["verdict"] == "focused"
+    assert report["gain"]["allowed_db"] == pytest.approx(3.01)
     pairs = [json.loads((finished_tiny.results / "f01" / pair / "image.json").read_text()) for pair in PAIRS]
     for cut in ("cross_range_width_m", "ground_range_width_m"):
-        assert told["brightest"][cut] < 1.05 * min(one["brightest"][cut] for one in pairs)
-    assert told["brightest"]["cross_range_width_m"] < 0.75 * pairs[0]["brightest"]["cross_range_width_m"]
+        assert report["brightest"][cut] < 1.05 * min(one["brightest"][cut] for one in pairs)
+    assert report["brightest"]["cross_range_width_m"] < 0.75 * pairs[0]["brightest"]["cross_range_width_m"]
 
 
 @pytest.fixture(scope="module")
@@ -275,65 +275,63 @@ def papers_flight(tmp_path_factory):
 
 
 @pytest.mark.parametrize(
-    ("spacing_m", "reason"), [(0.1, ""), (0.11, "pixels of 0.11 m do not sample resolution cells of 0.0997 m")]
+    ("spacing_m", "reason"), [(0.1, ""), (0.11, "pixels of 0.11 m do not run_sample resolution cells of 0.0997 m")]
 )
-def test_pixels_hardly_wider_than_a_cell_are_compared_and_wider_ones_are_named_as_the_reason(spacing_m, reason):
-    """A cell of 9.97 cm against pixels of 10 cm is no loss: the band is sampled twice a cycle up to 1.13 cells."""
-    shown = {pair: SimpleNamespace(cell_m=0.0997) for pair in PAIRS}
+def test_pixels_much_wider_than_a_resolution_cell_are_not_compared(spacing_m, reason):
+    """Resolution cell 9.97 cm, pixels 10 cm: the band is sampled at the Nyquist rate up to 1.13 cells."""
+    images = {pair: SimpleNamespace(cell_m=0.0997) for pair in PAIRS}
     grid = SceneGrid("local", 0.0, 10.0, spacing_m, (100, 100))
-    assert assess._too_coarse(shown, grid).partition(":")[0] == reason
+    assert assess._too_coarse(images, grid).partition(":")[0] == reason
 
 
 @pytest.mark.slow
-def test_the_papers_flight_is_added_in_phase_and_the_sum_states_its_widths(papers_flight):
-    """The paper prints 11 cm × 49 cm of segments that it does not give; those of the preset make 12 cm × 54 cm."""
-    told = json.loads((papers_flight.results / "f01" / "fused" / "image.json").read_text())
-    assert told["flags"] == {}
-    assert told["focus"]["verdict"] == "focused"
-    assert told["fusion"]["agreeing"] == list(PAIRS)
-    assert told["fusion"]["unmeasured"] == {}
-    assert told["coherence"]["mean"] > 0.95
-    brightest = told["brightest"]
+def test_flight_of_the_paper_is_added_in_phase(papers_flight):
+    """Resolution 12 cm × 54 cm; the paper states 11 cm × 49 cm for segments that it does not specify."""
+    report = json.loads((papers_flight.results / "f01" / "fused" / "image.json").read_text())
+    assert report["flags"] == {}
+    assert report["focus"]["verdict"] == "focused"
+    assert report["fusion"]["agreeing"] == list(PAIRS)
+    assert report["fusion"]["unmeasured"] == {}
+    assert report["coherence"]["mean"] > 0.95
+    brightest = report["brightest"]
     assert brightest["cross_range_width_m"] == pytest.approx(0.12, abs=0.005)
     assert brightest["ground_range_width_m"] == pytest.approx(0.54, abs=0.03)
-    assert brightest["cross_range_pslr_db"] == pytest.approx(-4.5, abs=0.6)  # of the gap between the segments
+    assert brightest["cross_range_pslr_db"] == pytest.approx(-4.5, abs=0.6)  # sidelobe of the gap between the segments
     (between,) = assessment_of(papers_flight, "f01")["between"]
     assert between["points"] == 3  # the fourth is 0.2 m from the edge
     assert abs(between["phase_rad"]) < 3 * between["phase_std_rad"] < 1
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("wavelengths", "flag"), [(0.25, "phase"), (0.5, "phase"), (1.0, "place")])
-def test_a_path_of_the_papers_flight_that_is_wrong_is_told_by_phase_or_place(
-    papers_flight, tmp_path, wavelengths, flag
-):
+@pytest.mark.parametrize(("wavelengths", "flag"), [(0.25, "phase"), (0.5, "phase"), (1.0, "position")])
+def test_path_error_of_the_papers_flight_is_flagged(papers_flight, tmp_path, wavelengths, flag):
     root = copy_writable(papers_flight.root, tmp_path / "campaign")
-    told = with_longer_path(root, wavelengths * 0.2134)
-    line = told["flags"][{"phase": "pairs_out_of_phase", "place": "pairs_displaced"}[flag]]
+    report = with_longer_path(root, wavelengths * 0.2134)
+    line = report["flags"][{"phase": "pairs_out_of_phase", "position": "pairs_displaced"}[flag]]
     assert "do not show which pairs are wrong" in line
-    assert len(told["fusion"]["left_out"]) == 1
-    assert told["fusion"]["ties"] == [[*told["fusion"]["left_out"]]]
-    assert "; tie: " in told["flags"]["pair_excluded"]
+    assert len(report["fusion"]["left_out"]) == 1
+    assert report["fusion"]["ties"] == [[*report["fusion"]["left_out"]]]
+    assert "; tie: " in report["flags"]["pair_excluded"]
 
 
 @pytest.mark.parametrize("height_m", [-3.0, 0.5, 3.0])
-def test_a_hypothesis_on_the_height_is_tried_where_its_point_then_lies(monkeypatch, height_m):
-    """A ground 3 m lower shifts points by several metres: as far as their mean path stays what it is."""
+def test_height_hypothesis_moves_its_point(monkeypatch, height_m):
+    """Terrain lower by 3 m displaces points by several metres, at a constant mean path."""
     track = np.stack([np.linspace(-5, 5, 64), np.full(64, -30.0), np.full(64, 25.0)], -1)
-    found = [SimpleNamespace(history=SimpleNamespace(aperture=Aperture(track, track + [0.0, 4.0, 2.0])))]
-    here_m = np.array([1.0, 2.0, 0.0])
-    monkeypatch.setattr(hypotheses, "_on_level", lambda *_: here_m)
+    pairs = [SimpleNamespace(history=SimpleNamespace(aperture=Aperture(track, track + [0.0, 4.0, 2.0])))]
+    point_m = np.array([1.0, 2.0, 0.0])
+    monkeypatch.setattr(hypotheses, "_on_level", lambda *_: point_m)
     scene = SimpleNamespace(axes=np.eye(3))
-    east_m, north_m = hypotheses._displacement_by_height(scene, (1.0, 2.0), found, height_m)
-    there_m = here_m + [east_m, north_m, height_m]
-    before, after = (found[0].history.aperture.path(one[None]).mean() for one in (here_m, there_m))
+    east_m, north_m = hypotheses._displacement_by_height(scene, (1.0, 2.0), pairs, height_m)
+    displaced_m = point_m + [east_m, north_m, height_m]
+    before, after = (pairs[0].history.aperture.path(point[None]).mean() for point in (point_m, displaced_m))
     moved_m = np.hypot(east_m, north_m)
     assert moved_m > 0.6 * abs(height_m)
-    assert abs(after - before) < (moved_m**2 + height_m**2) / 30  # of second order: a path of 80 m is curved
+    assert abs(after - before) < (moved_m**2 + height_m**2) / 30  # second order: iso-range curve of an 80 m path
 
 
-def test_a_carrier_that_a_recording_does_not_state_is_that_of_the_config():
-    """SigMF makes core:frequency optional: absent, it is no contradiction."""
+def test_missing_carrier_of_a_recording_is_accepted():
+    """The field core:frequency is optional in SigMF."""
     waveform = SimpleNamespace(carrier_hz=1.3e9, sample_rate_hz=5e7)
     check_rates(waveform, {"carrier_hz": 0.0, "sample_rate_hz": 5e7}, where="uav1.sigmf-meta")
     with pytest.raises(CampaignError, match="recorded with carrier_hz 1200000000"):

@@ -1,4 +1,4 @@
-"""Two flights over a ramp that the DEM lacks, simulated, and carried to a height map: files, tags, flags, refusals."""
+"""Interferogram of two flights over a ramp: height map, files, tags, flags and invalid configs."""
 
 import json
 
@@ -35,7 +35,7 @@ FILES = {export.file for export in exports_in("interferogram")} | {"interferogra
 
 
 def two_flights(*, half_width_m, density_per_m2, pulses=60, rise_m=1.0):
-    """One node that flies past a ramp twice, the second time higher; the config knows flat ground and two points."""
+    """Return a specification: two passes over a ramp, the second one higher, configured as flat with two points."""
     step_m, velocity = 12.0 / pulses, (120.0 / pulses, 0.0, 0.0)
     edge = half_width_m + 1.5
 
@@ -55,21 +55,21 @@ def two_flights(*, half_width_m, density_per_m2, pulses=60, rise_m=1.0):
     )
 
 
-def made(folder, **choices):
-    """A finished campaign that asks for one interferogram."""
+def run_ramp(folder, **choices):
+    """Run a campaign with one configured interferogram and return its folder."""
     root = simulate(folder / "ramp", two_flights(**choices))
     truth = json.loads((root / "truth.json").read_text())["targets"]
     points = [
-        {"name": f"mark {at}", "position_m": [one["x"], one["y"], one["height_m"]], "std_m": 0.02}
-        for at, one in enumerate(truth)
+        {"name": f"mark {number}", "position_m": [target["x"], target["y"], target["height_m"]], "std_m": 0.02}
+        for number, target in enumerate(truth)
     ]
 
-    def ask(config):
+    def configure(config):
         config["scene"]["reference_points"] = points
         config["processing"] = {"autofocus": "off"}
         config["interferometry"] = {"pairs": {NAME: ["f01/uav1-uav1", "f02/uav1-uav1"]}}
 
-    edit_config(root, ask)
+    edit_config(root, configure)
     run_steps(root)
     return root
 
@@ -80,9 +80,9 @@ def read(root, name):
 
 
 def ramp_at(root, transform, shape):
-    """Heights of the ramp at the pixels of the map, by the marks on it."""
+    """Return the heights of the ramp at the map pixels, from its two marks."""
     first, second = json.loads((root / "truth.json").read_text())["targets"]
-    scale = (second["x"] - first["x"]) / (MARKS[1][0] - MARKS[0][0])  # of the projection
+    scale = (second["x"] - first["x"]) / (MARKS[1][0] - MARKS[0][0])  # scale of the projection
     column, row = np.meshgrid(np.arange(shape[1]) + 0.5, np.arange(shape[0]) + 0.5)
     x, y = transform.c + transform.a * column, transform.f + transform.e * row
     return first["height_m"] + (SLOPE[0] * (x - first["x"]) + SLOPE[1] * (y - first["y"])) / scale
@@ -90,11 +90,11 @@ def ramp_at(root, transform, shape):
 
 @pytest.fixture(scope="module")
 def small(tmp_path_factory):
-    return made(tmp_path_factory.mktemp("small"), half_width_m=5.0, density_per_m2=8)
+    return run_ramp(tmp_path_factory.mktemp("small"), half_width_m=5.0, density_per_m2=8)
 
 
 @pytest.mark.slow
-def test_every_product_lies_there_with_its_tags(small):
+def test_every_product_is_written_with_its_tags(small):
     folder = small / "results/interferometry" / NAME
     assert {path.name for path in folder.iterdir()} == FILES | {"interferogram.manifest.json"}
     report = json.loads((folder / "interferogram.json").read_text())
@@ -107,8 +107,8 @@ def test_every_product_lies_there_with_its_tags(small):
         ("height", "m"),
         ("height_std", "m"),
     ):
-        _, transform, tags, told = read(small, name)
-        assert told == unit
+        _, transform, tags, raster_unit = read(small, name)
+        assert raster_unit == unit
         assert transform.a == 0.125
         assert tags["APERTURA_LEVEL"].startswith("heights relative to mark 0 and mark 1")
         assert json.loads(tags["APERTURA_FLAGS"]) == report["flags"]
@@ -119,7 +119,7 @@ def test_every_product_lies_there_with_its_tags(small):
 
 
 @pytest.mark.slow
-def test_its_lineage_names_both_images_and_all_that_their_geometry_is_from(small):
+def test_lineage_of_an_interferogram_includes_both_images(small):
     sources = result_of(Campaign.load(small), "interferogram", NAME).sources
     for flight in ("f01", "f02"):
         for stage in ("echo", "profile", "image", "layers"):
@@ -129,33 +129,33 @@ def test_its_lineage_names_both_images_and_all_that_their_geometry_is_from(small
 
 
 @pytest.mark.slow
-def test_verify_finds_every_link_as_it_was(small, capsys):
+def test_interferogram_is_verified(small, capsys):
     assert print_verified(small, quiet=True) == 0, capsys.readouterr().out
 
 
 @pytest.mark.slow
-def test_heights_of_sparse_ground_lie_about_the_ramp(small):
+def test_heights_of_sparse_clutter_agree_with_the_ramp(small):
     height, transform, *_ = read(small, "height")
-    wrong, std = height - ramp_at(small, transform, height.shape), read(small, "height_std")[0]
-    there = np.isfinite(wrong)
-    assert there.mean() > 0.5
-    assert abs(np.median(wrong[there])) < 0.03
-    assert np.mean(abs(wrong[there]) < 3 * std[there]) > 0.97
+    error_m, std = height - ramp_at(small, transform, height.shape), read(small, "height_std")[0]
+    valid = np.isfinite(error_m)
+    assert valid.mean() > 0.5
+    assert abs(np.median(error_m[valid])) < 0.03
+    assert np.mean(abs(error_m[valid]) < 3 * std[valid]) > 0.97
 
 
 @pytest.mark.slow
-def test_the_summary_tells_heights_and_the_flags_of_an_interferogram(small, tmp_path, capsys):
+def test_summary_lists_heights_and_flags_of_an_interferogram(small, tmp_path, capsys):
     root = copy_writable(small, tmp_path / "unlevelled")
     print_summary(Campaign.load(root))
-    told = capsys.readouterr().out
-    assert "interferogram two_tracks: coherence 0.9" in told
-    assert "height.tif" in told
+    message = capsys.readouterr().out
+    assert "interferogram two_tracks: coherence 0.9" in message
+    assert "height.tif" in message
     edit_config(root, lambda config: config["scene"].update(reference_points=[]))
     interferogram(Campaign.load(root), NAME)
     print_summary(Campaign.load(root))
-    told = capsys.readouterr().out
-    assert "height_relative" in told
-    assert "interferometry two_tracks: no point of known height is visible" in told
+    message = capsys.readouterr().out
+    assert "height_relative" in message
+    assert "interferometry two_tracks: no point of known height is visible" in message
 
 
 @pytest.mark.slow
@@ -167,12 +167,12 @@ def test_the_same_images_give_the_same_bytes(small, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_mask_edited_by_hand_is_refused(small, tmp_path):
+def test_edited_mask_is_refused(small, tmp_path):
     root = copy_writable(small, tmp_path / "edited")
     mask = root / "results/f02/uav1-uav1/mask.tif"
     mask.write_bytes(mask.read_bytes()[:-1] + b"x")
-    told = complaint(lambda: interferogram(Campaign.load(root), NAME))
-    assert "mask.tif: the file has changed since it was written" in told
+    message = complaint(lambda: interferogram(Campaign.load(root), NAME))
+    assert "mask.tif: the file has changed since it was written" in message
 
 
 @pytest.mark.slow
@@ -187,44 +187,44 @@ def test_a_mask_edited_by_hand_is_refused(small, tmp_path):
         ({"a;rm -rf x": ["f01/uav1-uav1", "f02/uav1-uav1"]}, "only letters, digits"),
     ],
 )
-def test_an_interferogram_that_is_none_is_refused_by_its_key(small, tmp_path, pairs, expected):
+def test_invalid_interferogram_is_refused_by_its_key(small, tmp_path, pairs, expected):
     (tmp_path / "config").mkdir()
     for name in ("config.yaml", "flights.tsv"):
         (tmp_path / "config" / name).write_bytes((small / "config" / name).read_bytes())
     edit_config(tmp_path, lambda config: config["interferometry"].update(pairs=pairs))
-    told = complaint(lambda: Campaign.load(tmp_path))
-    assert "interferometry" in told
-    assert expected in told
+    message = complaint(lambda: Campaign.load(tmp_path))
+    assert "interferometry" in message
+    assert expected in message
 
 
 @pytest.mark.slow
-def test_a_window_needs_a_middle_and_a_name_a_place(small):
+def test_even_window_and_unknown_interferogram_are_refused(small):
     with pytest.raises(ValueError, match="must be odd"):
         Interferometry(window_px=8)
-    told = complaint(lambda: interferogram(Campaign.load(small), "three_tracks"))
-    assert "no interferogram 'three_tracks'" in told
-    assert "two_tracks" in told
+    message = complaint(lambda: interferogram(Campaign.load(small), "three_tracks"))
+    assert "no interferogram 'three_tracks'" in message
+    assert "two_tracks" in message
 
 
 @pytest.mark.slow
-def test_two_flights_over_a_ramp_give_its_heights_within_their_deviation(tmp_path):
-    root = made(tmp_path, half_width_m=7.0, density_per_m2=25, pulses=100)
+def test_height_errors_of_a_ramp_agree_with_their_deviation(tmp_path):
+    root = run_ramp(tmp_path, half_width_m=7.0, density_per_m2=25, pulses=100)
     height, transform, *_ = read(root, "height")
-    wrong = (height - ramp_at(root, transform, height.shape))[12:-12, 12:-12]
+    error_m = (height - ramp_at(root, transform, height.shape))[12:-12, 12:-12]
     std = read(root, "height_std")[0][12:-12, 12:-12]
-    there = np.isfinite(wrong)
-    assert there.mean() > 0.85
-    alone = there.sum() / 15**2
-    assert abs(wrong[there].mean()) < 3 * np.median(std[there]) / np.sqrt(alone)
-    assert 0.5 < np.sqrt(np.mean((wrong[there] / std[there]) ** 2)) < 1.2
+    valid = np.isfinite(error_m)
+    assert valid.mean() > 0.85
+    independent = valid.sum() / 15**2
+    assert abs(error_m[valid].mean()) < 3 * np.median(std[valid]) / np.sqrt(independent)
+    assert 0.5 < np.sqrt(np.mean((error_m[valid] / std[valid]) ** 2)) < 1.2
     assert np.ptp(ramp_at(root, transform, height.shape)) > 1.0
     report = json.loads((root / "results/interferometry" / NAME / "interferogram.json").read_text())
     assert report["flags"] == {}
 
 
 @pytest.mark.slow
-def test_flights_beyond_the_critical_baseline_say_so(tmp_path):
-    root = made(tmp_path, half_width_m=5.0, density_per_m2=10, rise_m=30.0)
+def test_baseline_beyond_the_critical_one_is_flagged(tmp_path):
+    root = run_ramp(tmp_path, half_width_m=5.0, density_per_m2=10, rise_m=30.0)
     report = json.loads((root / "results/interferometry" / NAME / "interferogram.json").read_text())
     assert "the spectra of the two images do not overlap" in report["flags"]["interferogram_decorrelated"]
     assert np.isfinite(read(root, "height")[0]).mean() < 0.01

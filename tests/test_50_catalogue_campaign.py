@@ -1,4 +1,4 @@
-"""`.test/` runs as the Snakemake workflow catalogue runs it."""
+"""Campaign of the Snakemake workflow catalogue in `.test/`: it runs and gives a focused image."""
 
 import json
 import shutil
@@ -11,7 +11,7 @@ CAMPAIGN = Path(__file__).parents[1] / ".test"
 
 
 @pytest.mark.slow
-def test_the_campaign_of_the_catalogue_gives_a_focused_image_without_a_flag(tmp_path):
+def test_campaign_of_the_catalogue_gives_a_focused_image(tmp_path):
     ignored = shutil.ignore_patterns("results", ".snakemake")
     root = Path(shutil.copytree(CAMPAIGN, tmp_path / "campaign", ignore=ignored))
     code, output = finished(apertura("run", root))

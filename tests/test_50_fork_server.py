@@ -1,4 +1,4 @@
-"""What the process that steps are forks of is asked for: steps, by their whole command, and nothing else."""
+"""Fork server of steps: the executor sends it exactly the jobs that are plain step commands."""
 
 import csv
 import json
@@ -18,7 +18,7 @@ STEP = "apertura step image f01 uav1-uav2 --threads 2 > results/logs/f01/uav1-ua
 
 
 class Workflow(SimpleNamespace):
-    """Of Snakemake, as far as an executor sees of it; keeps what becomes of jobs."""
+    """Stub of Snakemake's workflow as an executor uses it; records the ends of jobs."""
 
     def __init__(self, requests):
         self.ends = queue.Queue()
@@ -37,9 +37,9 @@ class Workflow(SimpleNamespace):
         )
 
 
-def job(command, jobid=1, **said):
+def job(command, jobid=1, **attributes):
     return SimpleNamespace(
-        **{"is_shadow": False, "benchmark": "results/benchmarks/f01/uav1-uav2.image.tsv", **said},
+        **{"is_shadow": False, "benchmark": "results/benchmarks/f01/uav1-uav2.image.tsv", **attributes},
         jobid=jobid,
         shellcmd=command,
         threads=2,
@@ -51,16 +51,16 @@ def job(command, jobid=1, **said):
 
 
 @pytest.fixture
-def asked():
-    """An executor, and the other end of where it asks."""
-    theirs, ours = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    with ours:
-        ours.settimeout(10)
-        yield Executor(Workflow(theirs), None), ours
+def executor_and_server():
+    """Return an executor and the server end of its socket."""
+    client, server = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with server:
+        server.settimeout(10)
+        yield Executor(Workflow(client), None), server
 
 
-def test_steps_are_asked_for_with_all_that_their_commands_say_and_reported_as_they_end(asked):
-    executor, server = asked
+def test_steps_are_requested_with_their_arguments_and_results(executor_and_server):
+    executor, server = executor_and_server
     executor.run_job(job(STEP))
     executor.run_job(job(STEP, jobid=2))
     step, second = (json.loads(server.recv(1 << 16)) for _ in range(2))
@@ -79,7 +79,7 @@ def test_steps_are_asked_for_with_all_that_their_commands_say_and_reported_as_th
 
 
 @pytest.mark.parametrize(
-    ("command", "said"),
+    ("command", "attributes"),
     [
         (None, {}),
         ("apertura summary 2> /dev/null || true", {}),
@@ -92,22 +92,22 @@ def test_steps_are_asked_for_with_all_that_their_commands_say_and_reported_as_th
         (STEP, {"is_shadow": True}),
     ],
 )
-def test_any_other_job_goes_to_snakemakes_own_executor(asked, monkeypatch, command, said):
-    executor, server = asked
-    given = []
-    monkeypatch.setattr(executor._local, "run_job", given.append)
-    other = job(command, **said)
+def test_other_jobs_are_run_by_snakemakes_executor(executor_and_server, monkeypatch, command, attributes):
+    executor, server = executor_and_server
+    local_jobs = []
+    monkeypatch.setattr(executor._local, "run_job", local_jobs.append)
+    other = job(command, **attributes)
     executor.run_job(other)
-    assert given == [other]
+    assert local_jobs == [other]
     server.setblocking(False)
     with pytest.raises(BlockingIOError):
         server.recv(1)
 
 
-def test_what_a_step_took_is_told_in_the_columns_of_snakemake():
+def test_benchmark_has_the_columns_of_snakemake():
     header, row = csv.reader(_benchmark(90061.5).splitlines(), delimiter="\t")
     assert header == BenchmarkRecord.get_header()
-    told = dict(zip(header, row, strict=True))
-    assert (told["s"], told["h:m:s"], told["max_pss"]) == ("90061.50", "1 day, 1:01:01", "NA")
-    assert float(told["max_rss"]) > 10  # MiB, of this process
-    assert 0 < float(told["cpu_time"]) <= time.process_time() + 60
+    benchmark = dict(zip(header, row, strict=True))
+    assert (benchmark["s"], benchmark["h:m:s"], benchmark["max_pss"]) == ("90061.50", "1 day, 1:01:01", "NA")
+    assert float(benchmark["max_rss"]) > 10  # MiB, of this process
+    assert 0 < float(benchmark["cpu_time"]) <= time.process_time() + 60

@@ -1,4 +1,4 @@
-"""`apertura report` end to end, and its file in a browser without a net."""
+"""`apertura report` end to end, and its file in a browser without network access."""
 
 import os
 import subprocess
@@ -34,9 +34,9 @@ def written(_tiny, tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_one_command_writes_the_report_and_a_page_of_every_flight(written):
-    root, said = written
-    assert said.splitlines()[-2:] == [str(root / "results" / "report.html"), str(root / "results/f01/report.html")]
+def test_report_command_writes_the_report_and_a_page_per_flight(written):
+    root, printed = written
+    assert printed.splitlines()[-2:] == [str(root / "results" / "report.html"), str(root / "results/f01/report.html")]
     assert not list((root / "results").glob(".report*"))
     text = (root / "results" / "report.html").read_text()
     assert text.count("results/f01/uav1-uav2/pictures/phase.png") > 0
@@ -49,7 +49,7 @@ def test_one_command_writes_the_report_and_a_page_of_every_flight(written):
 
 
 @pytest.mark.slow
-def test_a_report_on_results_that_are_stale_is_written_and_listed(written, tmp_path):
+def test_report_on_outdated_results_is_written_and_verified(written, tmp_path):
     root = copy_writable(written[0], tmp_path / "campaign")
     edit_config(root, lambda document: document.setdefault("processing", {}).update(window="none"))
     done = apertura("report", root, "--cores", "2")
@@ -58,37 +58,37 @@ def test_a_report_on_results_that_are_stale_is_written_and_listed(written, tmp_p
 
 
 @pytest.mark.slow
-def test_the_report_opens_without_a_net_and_shows_names_as_text(written):
+def test_report_opens_offline_and_shows_names_as_text(written):
     if not CHROMIUM.is_file():
         pytest.skip("no /usr/bin/chromium")
     playwright = pytest.importorskip("playwright.sync_api", reason="no playwright")
     root, _ = written
-    asked, errors = [], []
+    requests, errors = [], []
     with playwright.sync_playwright() as browsers:
         browser = browsers.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        sheet = browser.new_page(viewport={"width": 1500, "height": 1000})
-        sheet.on("request", lambda request: asked.append(request.url))
-        sheet.on("pageerror", lambda error: errors.append(str(error)))
-        sheet.on("console", lambda said: errors.append(said.text) if said.type == "error" else None)
-        sheet.goto((root / "results" / "report.html").as_uri())
-        sheet.wait_for_selector("text=Image quality")
-        landing = sheet.inner_text("body")
-        top = sheet.locator("h1", has_text="7*7").bounding_box()
-        links = sheet.locator(".prose a").count()
-        sheet.get_by_text("f01", exact=True).first.click()
-        sheet.wait_for_selector("text=results section, to be printed")
-        menu = sheet.inner_text("body")
-        sheet.goto((root / "results" / "f01" / "report.html").as_uri())
-        page = sheet.inner_text("h1")
-        widths = sheet.eval_on_selector_all("img", "all => all.map(one => one.naturalWidth)")
+        browser_page = browser.new_page(viewport={"width": 1500, "height": 1000})
+        browser_page.on("request", lambda request: requests.append(request.url))
+        browser_page.on("pageerror", lambda error: errors.append(str(error)))
+        browser_page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
+        browser_page.goto((root / "results" / "report.html").as_uri())
+        browser_page.wait_for_selector("text=Image quality")
+        landing = browser_page.inner_text("body")
+        top = browser_page.locator("h1", has_text="7*7").bounding_box()
+        links = browser_page.locator(".prose a").count()
+        browser_page.get_by_text("f01", exact=True).first.click()
+        browser_page.wait_for_selector("text=results section, to be printed")
+        menu = browser_page.inner_text("body")
+        browser_page.goto((root / "results" / "f01" / "report.html").as_uri())
+        page = browser_page.inner_text("h1")
+        widths = browser_page.eval_on_selector_all("img", "all => all.map(one => one.naturalWidth)")
         browser.close()
     assert NAME in landing
     assert "uav1-uav2" in landing
-    assert top["y"] > 0  # nothing of it lies above the screen
+    assert top["y"] > 0  # the heading is not above the viewport
     assert links == 0
     assert menu.count("range profiles") == 2
     assert page == f"{NAME}, flight f01"
     assert len(widths) == 16
     assert min(widths) > 500
     assert errors == []
-    assert [url for url in asked if not url.startswith(("file:", "data:", "blob:"))] == []
+    assert [url for url in requests if not url.startswith(("file:", "data:", "blob:"))] == []

@@ -1,4 +1,4 @@
-"""The workflow as a user runs it: nothing to do twice, nothing lost to a kill, one message for what is wrong."""
+"""The workflow as users run it: repeated runs, killed runs, signals, changed inputs, messages and exit status."""
 
 import contextlib
 import os
@@ -17,7 +17,7 @@ from apertura.workflow.stale import stale_results
 
 
 def contents(root):
-    """Every product and every chunk, without logs, timings and Snakemake's own records."""
+    """Return every product and chunk, except logs, timings and Snakemake's records."""
     results = root / "results"
     files = {path.relative_to(results): path for path in sorted(results.rglob("*")) if path.is_file()}
     return {
@@ -28,11 +28,11 @@ def contents(root):
 
 
 TO_IMAGES = ("--until", "image")
-"""What is killed, and goes on: later products follow from the images."""
+"""Option for runs that are killed and resumed: later products follow from the images."""
 
 
-def larger(root):
-    """Enough tiles that imaging takes a few seconds."""
+def configure_many_tiles(root):
+    """Configure more tiles, so that imaging takes a few seconds."""
     path = root / "config" / "config.yaml"
     document = yaml.safe_load(path.read_text())
     document["scene"]["spacing_m"] = 0.01
@@ -41,7 +41,7 @@ def larger(root):
 
 
 @pytest.mark.slow
-def test_a_name_that_looks_like_a_wildcard_is_text(tiny):
+def test_campaign_name_with_wildcards_is_text(tiny):
     path = tiny / "config" / "config.yaml"
     path.write_text(yaml.safe_dump(yaml.safe_load(path.read_text()) | {"campaign": "{{7*7}} {config} {flight} %s"}))
     code, output = finished(snakemake(tiny, "-n", "all", "pages", "phase_history", "whole_chart"))
@@ -50,8 +50,8 @@ def test_a_name_that_looks_like_a_wildcard_is_text(tiny):
 
 
 @pytest.mark.slow
-def test_a_finished_campaign_has_nothing_to_do_and_a_new_setting_redoes_what_it_touches(run_by_snakemake, tmp_path):
-    root = Path(shutil.copytree(run_by_snakemake, tmp_path / "campaign"))  # with the times of its files
+def test_changed_setting_reruns_only_dependent_steps(run_by_snakemake, tmp_path):
+    root = Path(shutil.copytree(run_by_snakemake, tmp_path / "campaign"))  # keeps modification times
     code, output = finished(snakemake(root, "-n", "--set-scatter", "tiles=2"))
     assert code == 0
     assert "Nothing to be done" in output
@@ -90,32 +90,32 @@ def lines_of(folder, pattern):
 
 
 def wait_for_tiles(root, process, count=5, timeout=120):
-    until = time.monotonic() + timeout
+    deadline_s = time.monotonic() + timeout
     while len(tiles(root)) < count:
         assert process.poll() is None, process.communicate()[0]
-        assert time.monotonic() < until, "no tiles"
+        assert time.monotonic() < deadline_s, "no tiles"
         time.sleep(0.02)
     return len(tiles(root))
 
 
 @pytest.fixture(scope="session")
-def unbroken(_tiny, made_once):
-    """What a run makes to its images that nobody disturbed."""
+def uninterrupted(_tiny, made_once):
+    """Return the contents of results up to the images of an uninterrupted run."""
 
     def run(root):
-        larger(copy_writable(_tiny, root))
+        configure_many_tiles(copy_writable(_tiny, root))
         code, output = finished(apertura("run", root, *TO_IMAGES))
         assert code == 0, output
 
-    return contents(made_once("unbroken", run))
+    return contents(made_once("uninterrupted", run))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("whole_group", [True, False], ids=["process group", "snakemake alone"])
-def test_a_killed_run_goes_on_from_its_tiles_to_the_same_bytes(tiny, unbroken, whole_group):
-    larger(tiny)
+def test_killed_run_resumes_from_its_tiles_with_identical_results(tiny, uninterrupted, whole_group):
+    configure_many_tiles(tiny)
     process = snakemake(tiny, *TO_IMAGES, start_new_session=True)
-    made = wait_for_tiles(tiny, process)
+    finished_tiles = wait_for_tiles(tiny, process)
     if whole_group:
         os.killpg(process.pid, signal.SIGKILL)
     else:
@@ -126,20 +126,20 @@ def test_a_killed_run_goes_on_from_its_tiles_to_the_same_bytes(tiny, unbroken, w
     assert code == 0, output
     log = lines_of(tiny / "results" / "logs" / "f01", "*.image.log")
     formed_again = sum(int(line.split()[0]) for line in log if "tiles to form" in line)
-    assert formed_again <= 2 * 100 - made
-    assert contents(tiny) == unbroken
+    assert formed_again <= 2 * 100 - finished_tiles
+    assert contents(tiny) == uninterrupted
     assert not list((tiny / "results").rglob("*.wip"))
 
 
 @pytest.mark.slow
-def test_tiles_scattered_over_jobs_and_killed_give_the_same_bytes(tiny, unbroken):
-    larger(tiny)
+def test_killed_run_with_scattered_tiles_gives_identical_results(tiny, uninterrupted):
+    configure_many_tiles(tiny)
     process = snakemake(tiny, *TO_IMAGES, "--set-scatter", "tiles=3", start_new_session=True)
-    made = wait_for_tiles(tiny, process)
+    finished_tiles = wait_for_tiles(tiny, process)
     os.killpg(process.pid, signal.SIGKILL)
     process.wait()
     process.stdout.close()
-    receipt = tiny / "results/f01/uav1-uav1/tiles/1-of-3.json"  # as of a share that was done when the run was killed
+    receipt = tiny / "results/f01/uav1-uav1/tiles/1-of-3.json"  # receipt of a share finished before the kill
     receipt.parent.mkdir(exist_ok=True)
     receipt.write_text("{}")
     code, output = finished(apertura("run", tiny, *TO_IMAGES, "--set-scatter", "tiles=4"))
@@ -149,14 +149,14 @@ def test_tiles_scattered_over_jobs_and_killed_give_the_same_bytes(tiny, unbroken
         sum(int(line.split()[0]) for line in lines_of(logs, pattern) if "tiles to form" in line)
         for pattern in ("*.tiles.*-of-4.log", "*.image.log")
     )
-    assert 0 < by_shares <= 2 * 100 - made
+    assert 0 < by_shares <= 2 * 100 - finished_tiles
     assert by_image == 0
-    assert contents(tiny) == unbroken
+    assert contents(tiny) == uninterrupted
     assert not list((tiny / "results").rglob("*.wip"))
 
 
 @pytest.mark.slow
-def test_a_wrong_campaign_ends_with_its_message_and_no_traceback(tiny):
+def test_invalid_campaign_ends_with_a_message(tiny):
     (tiny / "raw" / "f01" / "uav2.sigmf-data").unlink()
     code, output = finished(snakemake(tiny))
     assert code != 0
@@ -166,7 +166,7 @@ def test_a_wrong_campaign_ends_with_its_message_and_no_traceback(tiny):
 
 
 @pytest.mark.slow
-def test_a_failing_step_shows_its_message_in_the_run(tiny):
+def test_message_of_a_failing_step_is_printed_by_the_run(tiny):
     path = tiny / "raw" / "f01" / "uav1.sigmf-data"
     data = bytearray(path.read_bytes())
     data[4000] ^= 1
@@ -178,7 +178,7 @@ def test_a_failing_step_shows_its_message_in_the_run(tiny):
 
 
 @pytest.mark.slow
-def test_what_headers_tell_ends_a_run_before_any_step(tiny):
+def test_errors_in_headers_end_a_run_before_any_step(tiny):
     path = tiny / "raw" / "f01" / "uav1.sigmf-data"
     path.write_bytes(path.read_bytes()[:-4000])
     for run in (snakemake(tiny), apertura("run", tiny)):
@@ -190,40 +190,40 @@ def test_what_headers_tell_ends_a_run_before_any_step(tiny):
     assert not (tiny / "results").exists()
 
 
-def replaced_keeping_times(path):
-    """What `rsync -a` and `cp -p` do: other bytes, the old times."""
+def append_keeping_times(path):
+    """Change the content of a file and keep its times, like `rsync -a` and `cp -p`."""
     before = path.stat()
     path.write_text(path.read_text() + "\n")
     os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("road", ["snakemake", "apertura"])
-def test_what_an_input_replaced_under_its_old_time_overtakes_is_made_again_and_no_more(finished_tiny, tmp_path, road):
-    """From results that came without Snakefile's own records: what they were made from is told by hashes alone.
+@pytest.mark.parametrize("program", ["snakemake", "apertura"])
+def test_changed_input_with_kept_time_reruns_dependent_steps(finished_tiny, tmp_path, program):
+    """From results that came without Snakefile's own records: what they were finished_tiles from is told by hashes alone.
 
-    Images of a flight hang together, as whether its tracks are refined rests on all its pairs; profiles do not.
+    Images of a flight depend on all its pairs, through track refinement; profiles do not.
     """
     root = copy_writable(finished_tiny.root, tmp_path / "campaign")
 
     def run(*options):
-        return finished(snakemake(root, *options) if road == "snakemake" else apertura("run", root, *options))
+        return finished(snakemake(root, *options) if program == "snakemake" else apertura("run", root, *options))
 
     code, output = run("-n")
     assert code == 0
     assert "Nothing to be done" in output
-    replaced_keeping_times(root / "raw/f01/uav2.track.pos")
-    untouched = (root / "results/f01/uav1-uav1/profile.zarr/zarr.json").stat().st_mtime_ns
+    append_keeping_times(root / "raw/f01/uav2.track.pos")
+    profile_time = (root / "results/f01/uav1-uav1/profile.zarr/zarr.json").stat().st_mtime_ns
     code, output = run()
     assert code == 0, output
     assert "results/f01/uav2/track.manifest.json: out of date, raw/f01/uav2.track.pos has changed" in output
-    assert (root / "results/f01/uav1-uav1/profile.zarr/zarr.json").stat().st_mtime_ns == untouched
+    assert (root / "results/f01/uav1-uav1/profile.zarr/zarr.json").stat().st_mtime_ns == profile_time
     assert stale_results(Campaign.load(root)) == {}
     assert "Nothing to be done" in run("-n")[1]
 
 
 @pytest.mark.slow
-def test_a_clock_set_back_a_day_makes_nothing_stale_and_nothing_again(finished_tiny, tmp_path):
+def test_clock_set_back_by_a_day_does_not_rerun_steps(finished_tiny, tmp_path):
     root = copy_writable(finished_tiny.root, tmp_path / "campaign")
     tomorrow = time.time() + 86400
     for path in (root / "results").rglob("*"):
@@ -238,14 +238,14 @@ def test_a_clock_set_back_a_day_makes_nothing_stale_and_nothing_again(finished_t
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
-def test_a_signal_ends_a_run_with_all_its_steps_within_five_seconds(tiny, number):
-    larger(tiny)
+def test_signal_ends_a_run_and_its_steps_within_five_seconds(tiny, number):
+    configure_many_tiles(tiny)
     run = apertura("run", tiny, "--cores", 2)
     wait_for_tiles(tiny, run, count=2)
-    asked = time.monotonic()
+    start_s = time.monotonic()
     run.send_signal(number)
     output = run.communicate(timeout=60)[0]
-    assert time.monotonic() - asked < 5
+    assert time.monotonic() - start_s < 5
     assert run.returncode == 130
     assert f"interrupted by {number.name}" in output
     running = [path.read_bytes() for path in Path("/proc").glob("[0-9]*/cmdline") if path.exists()]
@@ -258,21 +258,21 @@ def state_and_parent(pid):
     return state, int(parent)
 
 
-def below(pid):
-    """Return the process numbers of what a process has started, directly or not, with their command lines."""
+def descendants(pid):
+    """Return the process IDs of the descendants of a process with their command lines."""
     parents = {}
     for path in Path("/proc").glob("[0-9]*/stat"):
         with contextlib.suppress(OSError):
             state, parent = state_and_parent(path.parent.name)
             if state != "Z":
                 parents[int(path.parent.name)] = parent
-    found = {pid}
-    while more := {child for child, parent in parents.items() if parent in found} - found:
-        found |= more
-    return {one: Path(f"/proc/{one}/cmdline").read_bytes() for one in sorted(found - {pid})}
+    tree = {pid}
+    while more := {child for child, parent in parents.items() if parent in tree} - tree:
+        tree |= more
+    return {number: Path(f"/proc/{number}/cmdline").read_bytes() for number in sorted(tree - {pid})}
 
 
-def lives(pid):
+def is_alive(pid):
     try:
         return state_and_parent(pid)[0] != "Z"
     except OSError:
@@ -280,46 +280,46 @@ def lives(pid):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("killed", ["the run", "what steps are forks of", "snakemake"])
-def test_steps_are_forks_that_end_with_the_run_whatever_is_killed_outright(tiny, unbroken, killed):
-    larger(tiny)
-    run = apertura("run", tiny, "--cores", 2, *TO_IMAGES)  # others may be begun before the images, and would be more
+@pytest.mark.parametrize("killed", ["the run", "fork server", "snakemake"])
+def test_steps_end_with_the_run_whichever_process_is_killed(tiny, uninterrupted, killed):
+    configure_many_tiles(tiny)
+    run = apertura("run", tiny, "--cores", 2, *TO_IMAGES)  # without the target, other steps may start first
     wait_for_tiles(tiny, run, count=2)
-    processes = below(run.pid)
+    processes = descendants(run.pid)
     assert all(b"apertura.run.fork_server" in command for command in processes.values())
-    warm, snakemake_itself, *steps = processes
+    fork_server, snakemake_itself, *steps = processes
     assert steps
-    for one in (snakemake_itself, *steps):
-        with contextlib.suppress(OSError):  # a step may have ended by now
-            assert state_and_parent(one)[1] == warm  # no process of snakemake is in between
-    os.kill({"the run": run.pid, "snakemake": snakemake_itself}.get(killed, warm), signal.SIGKILL)
+    for number in (snakemake_itself, *steps):
+        with contextlib.suppress(OSError):  # a step may have finished
+            assert state_and_parent(number)[1] == fork_server  # no process of Snakemake in between
+    os.kill({"the run": run.pid, "snakemake": snakemake_itself}.get(killed, fork_server), signal.SIGKILL)
     code, output = finished(run, timeout=60)
     assert code == (-signal.SIGKILL if killed == "the run" else 1)
-    told = "error: the run was terminated by SIGKILL, possibly out of memory. Run again"
-    assert (told in output, output.count("error:")) == ((False, 0) if killed == "the run" else (True, 1))
-    until = time.monotonic() + 10
-    while any(map(lives, processes)):
-        assert time.monotonic() < until, "a step lives on"
+    message = "error: the run was terminated by SIGKILL, possibly out of memory. Run again"
+    assert (message in output, output.count("error:")) == ((False, 0) if killed == "the run" else (True, 1))
+    deadline_s = time.monotonic() + 10
+    while any(map(is_alive, processes)):
+        assert time.monotonic() < deadline_s, "a step is still running"
         time.sleep(0.05)
     hold(tiny).close()
     code, output = finished(apertura("run", tiny, *TO_IMAGES))
     assert code == 0, output
-    assert contents(tiny) == unbroken
+    assert contents(tiny) == uninterrupted
 
 
 @pytest.mark.slow
-def test_a_step_that_is_killed_ends_the_run_with_status_1(tiny):
-    larger(tiny)
+def test_killed_step_ends_the_run_with_status_1(tiny):
+    configure_many_tiles(tiny)
     run = apertura("run", tiny, "--cores", 2, *TO_IMAGES)
     wait_for_tiles(tiny, run, count=2)
-    os.kill(list(below(run.pid))[-1], signal.SIGSEGV)
+    os.kill(list(descendants(run.pid))[-1], signal.SIGSEGV)
     code, output = finished(run, timeout=60)
     assert (code, output.count("error:")) == (1, 1)
     assert "a step exited without a message" in output
 
 
 @pytest.mark.slow
-def test_a_run_from_any_folder_tells_each_step_and_ends_with_what_its_images_say(tiny, tmp_path):
+def test_run_prints_each_step_and_a_summary_of_the_images(tiny, tmp_path):
     code, output = finished(apertura("run", tiny, "-n"))
     assert code == 0
     assert output.startswith("23 steps to run: ")
@@ -329,9 +329,9 @@ def test_a_run_from_any_folder_tells_each_step_and_ends_with_what_its_images_say
     code, output = finished(apertura("run", tiny, **elsewhere))
     assert code == 0, output
     assert (tiny / "results" / "f01" / "fused" / "coherent_db.tif").is_file()
-    told = [line.split("  ") for line in output.splitlines()]
+    cells_of = [line.split("  ") for line in output.splitlines()]
     for word, count in (("started", 23), ("done", 23), ("failed", 0)):
-        assert sum(len(cells) > 2 and cells[1].strip() == word for cells in told) == count
+        assert sum(len(cells) > 2 and cells[1].strip() == word for cells in cells_of) == count
     assert "23 steps done in " in output
     timed = list((tiny / "results/benchmarks").rglob("*.tsv"))
     logs = {path.with_suffix("") for path in (tiny / "results/logs").rglob("*.log")}
@@ -357,7 +357,7 @@ def test_a_run_from_any_folder_tells_each_step_and_ends_with_what_its_images_say
 
 
 @pytest.mark.slow
-def test_what_is_no_option_of_snakemake_is_one_message(tiny):
+def test_unknown_option_of_snakemake_is_one_message(tiny):
     code, output = finished(apertura("run", tiny, "--no-such-option"))
     assert code == 2
     assert "error: snakemake: error: unrecognized arguments: --no-such-option\n" in output
@@ -365,8 +365,8 @@ def test_what_is_no_option_of_snakemake_is_one_message(tiny):
 
 
 @pytest.mark.slow
-def test_a_second_run_says_who_holds_the_campaign(tiny):
-    larger(tiny)
+def test_second_run_is_refused_with_the_lock_holder(tiny):
+    configure_many_tiles(tiny)
     run = apertura("run", tiny, "--cores", 2)
     wait_for_tiles(tiny, run, count=1)
     for second in (apertura("run", tiny), snakemake(tiny)):
@@ -380,7 +380,7 @@ def test_a_second_run_says_who_holds_the_campaign(tiny):
 
 
 @pytest.mark.slow
-def test_a_run_ends_with_2_where_the_campaign_is_wrong_also_if_a_step_finds_it(tiny):
+def test_campaign_error_found_by_a_step_ends_a_run_with_status_2(tiny):
     path = tiny / "raw" / "f01" / "uav1.sigmf-data"
     data = bytearray(path.read_bytes())
     data[4000] ^= 1

@@ -1,4 +1,4 @@
-"""How commands end: one message and one status, whatever the machine does to them."""
+"""Exit of commands: one message and a defined exit status for errors, signals and exhausted resources."""
 
 import os
 import signal
@@ -16,7 +16,7 @@ def run(*words, **options):
     return subprocess.run([APERTURA, *map(str, words)], text=True, capture_output=True, check=False, **options)
 
 
-def test_a_folder_that_is_no_campaign_ends_with_2_and_one_line(tmp_path):
+def test_folder_without_campaign_is_one_line_and_status_2(tmp_path):
     done = run("check", tmp_path / "nowhere")
     assert done.returncode == 2
     assert done.stdout.count("\n") == 1
@@ -27,7 +27,7 @@ def test_a_folder_that_is_no_campaign_ends_with_2_and_one_line(tmp_path):
 
 
 @pytest.mark.slow
-def test_every_problem_is_a_line_of_its_own(tiny):
+def test_every_problem_is_a_separate_line(tiny):
     (tiny / "raw/f01/uav1.sigmf-data").unlink()
     (tiny / "raw/codes.npy").write_bytes(b"x")
     done = run("check", tiny)
@@ -39,8 +39,8 @@ def test_every_problem_is_a_line_of_its_own(tiny):
 
 
 @pytest.mark.slow
-def test_a_reader_that_has_gone_ends_a_command_as_others_without_a_message(finished_tiny):
-    """`apertura summary | true`: 128 and the number of SIGPIPE"""
+def test_closed_output_pipe_ends_a_command_silently(finished_tiny):
+    """Exit status of `apertura summary | true`: 128 plus the number of SIGPIPE."""
     reading, writing = os.pipe()
     os.close(reading)
     with os.fdopen(writing, "w") as closed:
@@ -51,7 +51,7 @@ def test_a_reader_that_has_gone_ends_a_command_as_others_without_a_message(finis
 
 @pytest.mark.slow
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
-def test_a_full_disk_under_the_output_is_one_message(finished_tiny):
+def test_full_disk_for_the_output_is_one_message(finished_tiny):
     with Path("/dev/full").open("w") as full:
         command = [APERTURA, "summary", str(finished_tiny.root)]
         done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
@@ -62,7 +62,7 @@ def test_a_full_disk_under_the_output_is_one_message(finished_tiny):
 
 @pytest.mark.quick("15")
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
-def test_a_step_that_is_asked_to_end_says_so_and_ends_with_130(tiny, number):
+def test_signal_ends_a_step_with_a_message_and_status_130(tiny, number):
     code = "import time; from apertura import cli; cli.app = lambda: time.sleep(60); print('up', flush=True)"
     code += "; cli.main()"
     step = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
@@ -73,14 +73,14 @@ def test_a_step_that_is_asked_to_end_says_so_and_ends_with_130(tiny, number):
     assert step.returncode == 130
 
 
-def test_a_defect_shows_its_traceback_and_ends_with_1():
+def test_internal_error_shows_a_traceback_with_status_1():
     code = "from apertura import cli; cli.app = lambda: 1 / 0; cli.main()"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 1
     assert "ZeroDivisionError" in done.stderr
 
 
-def test_memory_that_runs_out_is_one_message():
+def test_out_of_memory_is_one_message():
     code = "import numpy; from apertura import cli; cli.app = lambda: numpy.empty(1 << 50); cli.main()"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 2
@@ -90,8 +90,8 @@ def test_memory_that_runs_out_is_one_message():
 
 @pytest.mark.quick("words0")
 @pytest.mark.parametrize("words", [(), ("paper-part", "effects"), ("sweep", "stability", "--folder", "x"), ("--help",)])
-def test_a_study_without_its_distribution_says_what_to_install(words):
-    """As where apertura alone is installed: no other distribution has commands."""
+def test_missing_study_distribution_is_one_message(words):
+    """Installation of apertura alone: no other distribution has commands."""
     code = (
         "import importlib.metadata as metadata, sys\n"
         "metadata.entry_points = lambda **_: ()\n"
@@ -107,14 +107,14 @@ def test_a_study_without_its_distribution_says_what_to_install(words):
 
 
 @pytest.mark.slow
-def test_a_study_is_a_group_of_commands_where_its_distribution_is_installed():
+def test_study_commands_exist_if_their_distribution_is_installed():
     done = run("study", "--help")
     assert done.returncode == 0
     assert "paper-part" in done.stdout
 
 
 @pytest.mark.slow
-def test_a_study_looks_for_its_results_in_the_folder_that_it_is_started_in(tmp_path):
+def test_study_reads_its_results_from_the_current_directory(tmp_path):
     done = run("study", "chart", "stability", "timing", cwd=tmp_path)
     assert done.returncode == 2
     assert done.stderr.startswith("error: results/study/stability/parts/timing.none.csv: ")

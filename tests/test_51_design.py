@@ -1,4 +1,4 @@
-"""From a ground station's mission to a decision: `apertura design`, `init --from` and `compare` as people type them."""
+"""Flight design from a mission file: `apertura design`, `init --from` and `compare`."""
 
 import copy
 import json
@@ -81,16 +81,16 @@ def folder(tmp_path):
     return tmp_path
 
 
-def typed(monkeypatch, capsys, *words):
+def run_command(monkeypatch, capsys, *words):
     monkeypatch.setattr(sys, "argv", ["apertura", *map(str, words)])
-    with pytest.raises(SystemExit) as ended:
+    with pytest.raises(SystemExit) as exit_info:
         cli.main()
-    said = capsys.readouterr()
-    return ended.value.code or 0, said.out, said.err
+    printed = capsys.readouterr()
+    return exit_info.value.code or 0, printed.out, printed.err
 
 
-def test_time_in_the_air_has_take_off_transit_and_landing(folder):
-    """30 m of climb and of descent at 2 m/s, and the 15.6 m back home at 1 m/s, beside the mission's own 15.6 s."""
+def test_flight_time_includes_take_off_transit_and_landing(folder):
+    """Climb and descent of 30 m at 2 m/s and 15.6 m back home at 1 m/s, in addition to the mission of 15.6 s."""
     design = designed(read_flight_plan(folder / "plan.yaml"), folder)
     back_m = np.radians(WAYPOINTS[1][1] - WAYPOINTS[0][1]) * 6.378e6 * np.cos(np.radians(WAYPOINTS[0][0]))
     assert design.recording.transfer_s["f01"] == pytest.approx(2 * 30 / 2 + back_m, rel=0.01)
@@ -98,12 +98,12 @@ def test_time_in_the_air_has_take_off_transit_and_landing(folder):
 
 
 @pytest.mark.slow
-def test_a_mission_becomes_a_report_layers_and_the_campaign_s_config(folder, monkeypatch, capsys):
-    status, out, err = typed(monkeypatch, capsys, "design", folder / "plan.yaml", folder / "out")
+def test_mission_yields_report_layers_and_config(folder, monkeypatch, capsys):
+    status, out, err = run_command(monkeypatch, capsys, "design", folder / "plan.yaml", folder / "out")
     assert (status, err) == (0, "")
     table = [line.split() for line in out.splitlines()]
     assert ["coverage", "0.95", "1", "yes"] in [words[:4] for words in table]
-    assert any("uav1" in line and "100.0" in line for line in out.splitlines())  # seen, %
+    assert any("uav1" in line and "100.0" in line for line in out.splitlines())  # share of the scene, %
     page = (folder / "out" / "design.html").read_text()
     assert page.count("data:image/png") == 2
     assert "GO: all requirements met (1 of 1)" in page
@@ -114,47 +114,47 @@ def test_a_mission_becomes_a_report_layers_and_the_campaign_s_config(folder, mon
         assert np.isfinite(raster.read(1)).all()
     assert len(json.loads((folder / "out/tracks.geojson").read_text())["features"]) == 2
     assert "LineString" in (folder / "out/tracks.kml").read_text()
-    status, _, err = typed(monkeypatch, capsys, "init", folder / "campaign", "--from", folder / "plan.yaml")
+    status, _, err = run_command(monkeypatch, capsys, "init", folder / "campaign", "--from", folder / "plan.yaml")
     assert (status, err) == (0, "")
     campaign = Campaign.load(folder / "campaign")
     assert campaign.flights[0].pairs == ("uav1-uav1",)
     assert campaign.settings.scene.spacing_m == 0.125
 
 
-def test_what_a_plan_lacks_is_one_message(folder, monkeypatch, capsys):
+def test_missing_mission_file_is_one_message(folder, monkeypatch, capsys):
     (folder / "dike.plan").unlink()
-    status, out, err = typed(monkeypatch, capsys, "design", folder / "plan.yaml")
+    status, out, err = run_command(monkeypatch, capsys, "design", folder / "plan.yaml")
     assert (status, out) == (2, "")
     assert err.count("\n") == 1
     assert "dike.plan: no such file" in err
 
 
-def test_an_unknown_word_of_optimise_is_one_message(folder, monkeypatch, capsys):
-    status, _, err = typed(monkeypatch, capsys, "design", folder / "plan.yaml", "--optimise", "speed")
+def test_unknown_argument_of_optimise_is_one_message(folder, monkeypatch, capsys):
+    status, _, err = run_command(monkeypatch, capsys, "design", folder / "plan.yaml", "--optimise", "speed")
     assert status == 2
     assert "expected one or more of height,offset,spacing,heading" in err
 
 
-def test_a_scene_beyond_the_dem_is_one_message(folder, monkeypatch, capsys):
-    place = {"transform": rasterio.Affine(1, 0, EAST, 0, -1, NORTH), "crs": "EPSG:32632", "height": 9, "width": 9}
-    with rasterio.open(folder / "dem.tif", "w", driver="GTiff", count=1, dtype="float32", **place) as raster:
+def test_scene_outside_the_dem_is_one_message(folder, monkeypatch, capsys):
+    profile = {"transform": rasterio.Affine(1, 0, EAST, 0, -1, NORTH), "crs": "EPSG:32632", "height": 9, "width": 9}
+    with rasterio.open(folder / "dem.tif", "w", driver="GTiff", count=1, dtype="float32", **profile) as raster:
         raster.write(np.full((9, 9), 500.0, np.float32), 1)
     scene = PLAN["scene"] | {"dem": "dem.tif", "dem_datum": "ellipsoid"}
     (folder / "plan.yaml").write_text(yaml.safe_dump(PLAN | {"scene": scene}))
-    status, out, err = typed(monkeypatch, capsys, "design", folder / "plan.yaml")
+    status, out, err = run_command(monkeypatch, capsys, "design", folder / "plan.yaml")
     assert (status, out) == (2, "")
     assert err.count("\n") == 1
     assert "dem.tif" in err
 
 
-def test_a_comparison_has_the_nesz_of_calibrated_images_alone(finished_tiny, tmp_path):
+def test_comparison_contains_the_nesz_of_calibrated_images_only(finished_tiny, tmp_path):
     campaign = Campaign.load(copy_writable(finished_tiny.root, tmp_path / "flown"))
     path = campaign.result("f01", "uav1-uav1", "nesz.tif")
     with rasterio.open(str(path)) as raster:
         values, tags, profile = raster.read(1), raster.tags(), raster.profile
     measured = _measured(campaign, "f01", "uav1-uav1")
     assert measured.pop("nesz, dB") == pytest.approx(np.nanmedian(values))
-    del tags["APERTURA_RADIOMETRY"]  # as of an image without a radio: dB of its own power
+    del tags["APERTURA_RADIOMETRY"]  # like an image without a configured radio: relative dB
     with rasterio.open(str(path), "w", **profile) as raster:
         raster.write(values, 1)
         raster.update_tags(**tags)
@@ -162,8 +162,8 @@ def test_a_comparison_has_the_nesz_of_calibrated_images_alone(finished_tiny, tmp
 
 
 @pytest.mark.slow
-def test_what_was_predicted_is_measured_after_the_same_plan_was_sampled_and_processed(tmp_path, monkeypatch, capsys):
-    """Widths within 5 %, NESZ and SNR within 1 dB: 256 pulses measure their noise to 0.4 dB."""
+def test_predicted_image_quality_is_measured_in_the_simulated_flight(tmp_path, monkeypatch, capsys):
+    """Widths within 5 %, NESZ and RCS within 1 dB: the noise of 256 pulses is measured to 0.4 dB."""
     document = copy.deepcopy(PLAN) | {"flights": {"f01": PLAN["flights"]["f01"] | {"tracks": {"uav1": LINE}}}}
     design = designed(FlightPlan.model_validate(document), tmp_path)
     campaign = run_steps(rehearse(design.opened, [PointTarget((0.0, 0.0, 0.0))], tmp_path / "flown"), exports=False)
@@ -174,15 +174,17 @@ def test_what_was_predicted_is_measured_after_the_same_plan_was_sampled_and_proc
         cut = cut_through(pixels, peak, direction=direction, spacing_m=grid.spacing_m, reach_m=3.8)
         assert cut.width_m == pytest.approx(planned[name][40, 40], rel=0.05)
     (tmp_path / "plan.yaml").write_text(yaml.safe_dump(document))
-    status, out, err = typed(monkeypatch, capsys, "compare", tmp_path / "plan.yaml", tmp_path / "flown")
+    status, out, err = run_command(monkeypatch, capsys, "compare", tmp_path / "plan.yaml", tmp_path / "flown")
     assert (status, err) == (0, "")
     assert "measured in the image" in out
     assert "different radar" not in out
     (width,) = (line.split() for line in out.splitlines() if "resolution_fine" in line)
-    assert float(width[-1]) == pytest.approx(float(width[-2]), rel=0.1)  # of the only target, against the logs
+    assert float(width[-1]) == pytest.approx(
+        float(width[-2]), rel=0.1
+    )  # the only target, compared with the prediction from the logs
     document["waveform"]["carrier_hz"] = 1.2e9
     (tmp_path / "plan.yaml").write_text(yaml.safe_dump(document))
-    _, out, _ = typed(monkeypatch, capsys, "compare", tmp_path / "plan.yaml", tmp_path / "flown")
+    _, out, _ = run_command(monkeypatch, capsys, "compare", tmp_path / "plan.yaml", tmp_path / "flown")
     assert "different radar: waveform.carrier_hz: 1.2e+09 planned, 1.3e+09 in the campaign" in out
     from apertura.stages.layers import layers
 

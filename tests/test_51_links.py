@@ -1,4 +1,4 @@
-"""Commands on campaigns that hold links, pipes and endless files, or that may not be written."""
+"""Commands on campaigns that contain links, pipes and endless files, or that are read-only."""
 
 import subprocess
 import sys
@@ -9,7 +9,7 @@ from folders import copy_writable
 
 pytestmark = pytest.mark.slow
 
-LOOKS = {
+READ_ONLY = {
     "list": ("list", "{root}"),
     "status": ("status", "{root}"),
     "summary": ("summary", "{root}"),
@@ -21,7 +21,7 @@ LOOKS = {
     "inspect": ("inspect", "{root}"),
     "score": ("score", "{root}"),
 }
-"""Commands that only look."""
+"""Read-only commands."""
 
 _CONFINED = """
 import sys
@@ -36,34 +36,34 @@ main()
 
 
 def state_of(root):
-    """Return everything below a folder but the kept hashes, and what a change would show in."""
-    kept = root / "results" / ".hashes"
-    paths = [path for path in root.rglob("*") if not path.is_relative_to(kept)]
+    """Return the status of all files below a folder except cached hashes, to detect changes."""
+    hashes = root / "results" / ".hashes"
+    paths = [path for path in root.rglob("*") if not path.is_relative_to(hashes)]
     return {str(path): (path.lstat()[:4], path.lstat().st_mtime_ns) for path in paths if path != root / "results"}
 
 
-@pytest.mark.parametrize("words", LOOKS.values(), ids=LOOKS)
-def test_a_command_that_only_looks_writes_nothing_but_hashes_and_needs_no_right_to_write(
-    finished_tiny, tmp_path, words
-):
+@pytest.mark.parametrize("words", READ_ONLY.values(), ids=READ_ONLY)
+def test_read_only_command_writes_only_hashes(finished_tiny, tmp_path, words):
     root = copy_writable(finished_tiny.root, tmp_path / "campaign")
     (tmp_path / "elsewhere").mkdir()
-    told = [word.format(root=root) for word in words]
+    arguments = [word.format(root=root) for word in words]
     code = [sys.executable, "-c", _CONFINED, tmp_path / "elsewhere"]
     before = state_of(root)
-    confined = subprocess.run([*code, *told], capture_output=True, text=True, check=False)
+    confined = subprocess.run([*code, *arguments], capture_output=True, text=True, check=False)
     if confined.returncode == 77:
         pytest.skip("this kernel has no Landlock, and root may write everywhere")
-    free = subprocess.run([sys.executable, "-m", "apertura", *told], capture_output=True, text=True, check=False)
-    assert confined.returncode == free.returncode, confined.stderr
-    assert confined.stdout.count("\n") == free.stdout.count("\n")
-    assert free.returncode in ({0, 1} if words[0] == "diff" else {0}), free.stderr
+    unconfined = subprocess.run(
+        [sys.executable, "-m", "apertura", *arguments], capture_output=True, text=True, check=False
+    )
+    assert confined.returncode == unconfined.returncode, confined.stderr
+    assert confined.stdout.count("\n") == unconfined.stdout.count("\n")
+    assert unconfined.returncode in ({0, 1} if words[0] == "diff" else {0}), unconfined.stderr
     assert state_of(root) == before
 
 
 @pytest.mark.parametrize("while_running", [False, True], ids=["before", "while it runs"])
-def test_links_pipes_and_endless_files_in_place_of_what_commands_write_change_nothing_outside(tmp_path, while_running):
-    """Some trials of those of `python -m tests.attack.links`; the review's come first."""
+def test_links_and_pipes_in_results_change_nothing_outside(tmp_path, while_running):
+    """A selection of the trials of `python -m tests.attack.links`."""
     names = ["list", "clean", "preview", "step scene"]
     outcomes = trials_of(tmp_path, names, kinds=list(KINDS), seed=1, most=2, while_running=while_running)
     assert len(outcomes) >= 2 * len(names)
