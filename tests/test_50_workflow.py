@@ -200,7 +200,7 @@ def append_keeping_times(path):
 @pytest.mark.slow
 @pytest.mark.parametrize("program", ["snakemake", "apertura"])
 def test_changed_input_with_kept_time_reruns_dependent_steps(finished_tiny, tmp_path, program):
-    """From results that came without Snakefile's own records: what they were finished_tiles from is told by hashes alone.
+    """Results without Snakemake's records: out-of-date results are found by hashes alone.
 
     Images of a flight depend on all its pairs, through track refinement; profiles do not.
     """

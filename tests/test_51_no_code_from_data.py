@@ -1,4 +1,4 @@
-"""A campaign folder brings data. Whatever else lies in it is neither run nor opened, by whatever road it is reached."""
+"""Campaign folders are data: planted code and foreign files are neither executed nor opened by any command."""
 
 import json
 import os
@@ -30,7 +30,7 @@ ROOT = Path(__file__).parents[1]
 BIN = Path(sys.executable).parent
 BATCH_SYSTEM = ROOT / "tests" / "attack" / "batch_system"
 PLAIN_PATH = f"{BIN}{os.pathsep}/usr/bin{os.pathsep}/bin{os.pathsep}."
-"""Of a person who has the working folder on the path, last."""
+"""Search path of a user with the current directory as its last entry."""
 
 TYPED = {
     "align": "align . f01 uav1 --point 500000 5300000 500",
@@ -81,12 +81,12 @@ TYPED = {
     "study summary": "study summary none",
     "study sweep": "study sweep stability none",
 }
-"""Command → what is typed in the campaign folder, where that is more than the command."""
+"""Command → command line in the campaign folder, if it has arguments."""
 
 MAY_REFUSE = {"align", "bench", "step bench", "reflectors", "step calibrate", "step interferogram", "step page"}
-"""Commands that ask for what such a campaign does not have."""
+"""Commands whose requirements such a campaign does not meet."""
 
-ROADS = {
+WORKFLOW_COMMANDS = {
     "apertura, in the campaign": ("{bin}/apertura run . --cores 2", "{campaign}"),
     "apertura, tiles by several jobs": (
         "{bin}/apertura run . --cores 2 --set-scatter tiles=2 --until image",
@@ -104,7 +104,7 @@ ROADS = {
         "{campaign}",
     ),
 }
-"""From raw files to products, two of them to the last; where from → command, and folder that it is typed in."""
+"""Workflow runs, two of them up to the last product: name → command and working folder."""
 
 PART = "--until profile"
 SOON = (
@@ -117,8 +117,8 @@ def slow(*cases):
     return [pytest.param(case, marks=pytest.mark.slow) for case in cases]
 
 
-def leaves():
-    """Every command there is, as it is typed."""
+def all_commands():
+    """Yield every command of the command line."""
     root = get_command(app)
     commands = {name: root.get_command(None, name) for name in root.list_commands(None)}
     for name, command in commands.items():
@@ -139,7 +139,7 @@ def start(words, folder, **environment):
 
 
 def run(words, folder, **environment):
-    """Run a command to its end; return its status and all that it printed."""
+    """Run a command; return its exit status and output."""
     process = start(words, folder, **environment)
     printed, said = process.communicate(timeout=500)
     return process.returncode, printed + said
@@ -168,7 +168,7 @@ def _finished(_on_a_plane, tmp_path_factory):
 
 
 def plan_of(root):
-    """Return a plan with the radar and the scene of a campaign, and a straight line beside it."""
+    """Return a flight plan with the radar and scene of a campaign and a straight line next to the scene."""
     config = yaml.safe_load((root / "config/config.yaml").read_text())
     west, south, east, _ = config["scene"]["bounds_m"]
     line = {"kind": "line", "start_m": [west, south - 30], "end_m": [east, south - 30], "height_m": 30, "speed_m_s": 1}
@@ -190,9 +190,9 @@ def finished(_finished, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_marker_that_is_run_or_opened_is_seen(unfinished, monkeypatch):
-    """What the other tests rest on: Python started in the folder, and a file outside that is read."""
-    monkeypatch.delenv(SAFE_PATH, raising=False)  # whatever ran in this process before
+def test_executed_or_opened_marker_is_detected(unfinished, monkeypatch):
+    """Check of the detection: Python started in the folder, and a file outside the folder that is read."""
+    monkeypatch.delenv(SAFE_PATH, raising=False)  # set by earlier tests in this process
     planted = plant(unfinished)
     with planted.fires() as fired:
         subprocess.run([sys.executable, "-c", "import yaml"], cwd=unfinished, check=False)
@@ -203,18 +203,18 @@ def test_a_marker_that_is_run_or_opened_is_seen(unfinished, monkeypatch):
     assert "ran numpy.py" not in fired
 
 
-def test_every_command_is_tried():
-    assert set(TYPED) | MAY_REFUSE <= set(leaves())
+def test_every_command_is_tested():
+    assert set(TYPED) | MAY_REFUSE <= set(all_commands())
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("command", list(leaves()))
-def test_nothing_fires_when_a_command_is_typed_in_a_finished_campaign(finished, command):
+@pytest.mark.parametrize("command", list(all_commands()))
+def test_command_in_a_finished_campaign_executes_no_planted_code(finished, command):
     planted = plant(finished)
     words = [str(BIN / "apertura"), *shlex.split(TYPED.get(command, command))]
     with planted.fires() as fired:
         if command == "map":
-            status, said = mapped(words, finished)
+            status, said = request_map(words, finished)
         else:
             status, said = run(words, finished)
     assert fired == []
@@ -223,8 +223,8 @@ def test_nothing_fires_when_a_command_is_typed_in_a_finished_campaign(finished, 
     assert status in allowed, said
 
 
-def mapped(words, folder):
-    """Ask the map's server for all that a browser would, and end it."""
+def request_map(words, folder):
+    """Start the map server, request everything that a browser requests, and stop the server."""
     process = start(words, folder)
     address = process.stdout.readline().strip()
     answers = []
@@ -243,11 +243,11 @@ def mapped(words, folder):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("road", ROADS)
-def test_nothing_fires_from_the_raw_files_to_the_products(unfinished, tmp_path, road):
+@pytest.mark.parametrize("start_from", WORKFLOW_COMMANDS)
+def test_workflow_executes_no_planted_code(unfinished, tmp_path, start_from):
     planted, jobs = plant(unfinished), tmp_path / "jobs"
     jobs.mkdir()
-    command, folder = ROADS[road]
+    command, folder = WORKFLOW_COMMANDS[start_from]
     names = {"bin": BIN, "root": ROOT, "campaign": unfinished, "soon": SOON, "part": PART}
     folder = tmp_path if folder is None else folder.format(**names)
     path = f"{BATCH_SYSTEM}{os.pathsep}{PLAIN_PATH}"
@@ -255,18 +255,23 @@ def test_nothing_fires_from_the_raw_files_to_the_products(unfinished, tmp_path, 
         status, said = run(shlex.split(command.format(**names)), folder, PATH=path, BATCH_JOBS=str(jobs))
     assert fired == []
     assert status == 0, said
-    made = {"{part}": "f01/uav1-uav2/profile.manifest.json", "image": "f01/uav1-uav2/image.manifest.json"}
-    last = next((file for end, file in made.items() if ROADS[road][0].endswith(end)), "f01/fused/coherent_db.tif")
+    last_files = {"{part}": "f01/uav1-uav2/profile.manifest.json", "image": "f01/uav1-uav2/image.manifest.json"}
+    last = next(
+        (file for end, file in last_files.items() if WORKFLOW_COMMANDS[start_from][0].endswith(end)),
+        "f01/fused/coherent_db.tif",
+    )
     assert (unfinished / "results" / last).is_file()
-    assert ("Slurm" in road) is any(jobs.iterdir())
+    assert ("Slurm" in start_from) is any(jobs.iterdir())
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("road", ["apertura, in the campaign", "snakemake, from the sources", "Slurm, in the campaign"])
-def test_modules_where_snakemake_installs_its_own_are_told_before_a_job_could_import_them(unfinished, tmp_path, road):
+@pytest.mark.parametrize(
+    "start_from", ["apertura, in the campaign", "snakemake, from the sources", "Slurm, in the campaign"]
+)
+def test_python_modules_in_snakemakes_folder_are_refused(unfinished, tmp_path, start_from):
     planted, jobs = plant(unfinished, in_snakemakes_own=True), tmp_path / "jobs"
     jobs.mkdir()
-    command, folder = ROADS[road]
+    command, folder = WORKFLOW_COMMANDS[start_from]
     names = {"bin": BIN, "root": ROOT, "campaign": unfinished, "soon": SOON, "part": PART}
     path = f"{BATCH_SYSTEM}{os.pathsep}{PLAIN_PATH}"
     with planted.fires() as fired:
@@ -279,7 +284,7 @@ def test_modules_where_snakemake_installs_its_own_are_told_before_a_job_could_im
     assert not any(jobs.iterdir())
 
 
-OWN = (
+OPTIONS_INTO_THE_FOLDER = (
     "--profile profiles/own",
     "--profile {linked}",
     "--profile=./profiles/slurm",
@@ -302,10 +307,10 @@ OWN = (
     "--profile leads_out/slurm",
     "--profile {campaign}/none/../leads_out/slurm",
 )
-"""Options of Snakemake that name something of the campaign's own, in the ways that it takes them."""
+"""Options of Snakemake, in all their spellings, with paths into the campaign folder."""
 
 
-def test_a_profile_of_the_campaigns_own_is_refused(unfinished, tmp_path, monkeypatch):
+def test_profile_in_the_campaign_folder_is_refused(unfinished, tmp_path, monkeypatch):
     plant(unfinished)
     linked = tmp_path / "linked"
     linked.symlink_to(unfinished / "profiles" / "slurm")
@@ -313,18 +318,18 @@ def test_a_profile_of_the_campaigns_own_is_refused(unfinished, tmp_path, monkeyp
     (unfinished / "leads_out").symlink_to(tmp_path / "profiles")
     monkeypatch.chdir(unfinished)
 
-    def told(words):
+    def is_refused(words):
         try:
             code_from_outside(unfinished, shlex.split(words.format(campaign=unfinished, linked=linked)))
         except CampaignError as problem:
             return "lies in the campaign folder" in str(problem)
         return False
 
-    assert [words for words in OWN if not told(words)] == []
+    assert [words for words in OPTIONS_INTO_THE_FOLDER if not is_refused(words)] == []
 
 
 @pytest.mark.slow
-def test_nothing_of_a_profile_that_is_refused_runs(unfinished):
+def test_refused_profile_is_not_executed(unfinished):
     planted = plant(unfinished)
     with planted.fires() as fired:
         said = one_message(*run([BIN / "apertura", "run", ".", "-n", "--profile", "profiles/own"], unfinished))
@@ -333,7 +338,7 @@ def test_nothing_of_a_profile_that_is_refused_runs(unfinished):
 
 
 @pytest.mark.slow
-def test_a_profile_of_the_environment_is_one_of_the_command_line(unfinished):
+def test_profile_from_the_environment_is_refused(unfinished):
     planted = plant(unfinished)
     with planted.fires() as fired:
         said = one_message(*run([BIN / "apertura", "run", ".", "-n"], unfinished, SNAKEMAKE_PROFILE="./profiles/slurm"))
@@ -343,7 +348,7 @@ def test_a_profile_of_the_environment_is_one_of_the_command_line(unfinished):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("option", ["--trust-io-cache", *slow("--tr")])
-def test_what_snakemake_pickled_of_the_folder_is_not_read(unfinished, option):
+def test_pickled_cache_of_snakemake_is_not_read(unfinished, option):
     planted, cache = plant(unfinished), unfinished / ".snakemake" / "iocache"
     cache.mkdir(parents=True, exist_ok=True)
     (cache / "latest.pkl").write_bytes(pickle.dumps(Code(planted.code("iocache"))))
@@ -354,13 +359,13 @@ def test_what_snakemake_pickled_of_the_folder_is_not_read(unfinished, option):
 
 
 @pytest.mark.slow
-def test_a_short_option_of_snakemake_reaches_it_letter_for_letter(unfinished):
+def test_short_option_of_snakemake_is_passed_unchanged(unfinished):
     _, said = run([BIN / "apertura", "run", ".", "-s/review/quiet"], unfinished)
     assert "/review/quiet" in said
 
 
 @pytest.mark.slow
-def test_a_target_that_is_there_stays_the_name_that_rules_know(finished):
+def test_existing_target_keeps_its_name(finished):
     target = "results/f01/uav1-uav1/export.manifest.json"
     for words in ([target, "-n"], ["-n", "--", target]):
         status, said = run([BIN / "apertura", "run", ".", *words], finished)
@@ -368,7 +373,7 @@ def test_a_target_that_is_there_stays_the_name_that_rules_know(finished):
 
 
 @pytest.mark.slow
-def test_shipped_profiles_come_before_those_of_the_folder_and_those_of_elsewhere_are_found(unfinished, tmp_path):
+def test_shipped_profiles_take_precedence(unfinished, tmp_path):
     planted, own = plant(unfinished), tmp_path / "elsewhere" / "mine"
     own.mkdir(parents=True)
     (own / "config.yaml").write_text("printshellcmds: true\n")
@@ -379,7 +384,7 @@ def test_shipped_profiles_come_before_those_of_the_folder_and_those_of_elsewhere
 
 
 @pytest.mark.slow
-def test_a_name_that_a_shell_would_run_is_refused_where_a_batch_system_takes_it(unfinished, tmp_path):
+def test_path_with_shell_syntax_is_refused_for_batch_systems(unfinished, tmp_path):
     jobs, root = tmp_path / "jobs", unfinished.rename(tmp_path / "$(touch ran)`touch ran`")
     jobs.mkdir()
     path = f"{BATCH_SYSTEM}{os.pathsep}{PLAIN_PATH}"
@@ -405,55 +410,55 @@ def test_a_name_that_a_shell_would_run_is_refused_where_a_batch_system_takes_it(
 
 
 def text_keys():
-    """Every key of the config that holds free text, as a way to it."""
+    """Return the paths of all config keys with free text."""
     schema = json.loads(config_schema())
-    found = {}
+    paths = {}
 
-    def walk(node, way):
+    def walk(node, path):
         if "$ref" in node:
             node = schema["$defs"][node["$ref"].rpartition("/")[2]]
         for kind in ("anyOf", "oneOf", "allOf"):
             for one in node.get(kind, []):
-                walk(one, way)
+                walk(one, path)
         if node.get("type") == "string" and not node.keys() & {"enum", "const"}:
-            found[way] = None
+            paths[path] = None
         for name, one in node.get("properties", {}).items():
-            walk(one, (*way, name))
+            walk(one, (*path, name))
         for name, one in (("*", node.get("additionalProperties")), (0, node.get("items"))):
             if isinstance(one, dict):
-                walk(one, (*way, name))
+                walk(one, (*path, name))
         for one in node.get("prefixItems", []):
-            walk(one, (*way, 0))
+            walk(one, (*path, 0))
 
     walk(schema, ())
-    return list(found)
+    return list(paths)
 
 
-def with_text(config, way, text):
-    """Return a config with a text at a key; names that are free are those of the campaign, or x."""
-    document = here = yaml.safe_load(yaml.safe_dump(config))
-    way = [
-        "uav1" if (at, name) == (1, "*") and way[0] == "nodes" else "x" if name == "*" else name
-        for at, name in enumerate(way)
+def with_text(config, path, text):
+    """Return a config with a text at a key path; free names are those of the campaign, or x."""
+    document = section = yaml.safe_load(yaml.safe_dump(config))
+    path = [
+        "uav1" if (at, name) == (1, "*") and path[0] == "nodes" else "x" if name == "*" else name
+        for at, name in enumerate(path)
     ]
-    for name, after in zip(way, [*way[1:], None], strict=True):
-        if after is None:
+    for name, following in zip(path, [*path[1:], None], strict=True):
+        if following is None:
             value = text
-        elif after == 0:
+        elif following == 0:
             value = []
         else:
             value = {}
-        if isinstance(here, list):
-            here.append(value)
-            here = here[-1]
-        elif after is None:
-            here[name] = text
+        if isinstance(section, list):
+            section.append(value)
+            section = section[-1]
+        elif following is None:
+            section[name] = text
         else:
-            here = here.setdefault(name, value)
+            section = section.setdefault(name, value)
     return document
 
 
-UNUSED = {
+ANY_TEXT = {
     ("campaign",),
     ("metadata", "author"),
     ("metadata", "licence"),
@@ -463,7 +468,7 @@ UNUSED = {
     ("nodes", "*", "log", "body"),
     ("processing", "scheduler"),
 }
-"""Keys that take any text: a title, what other formats of logs need, what counts only if the environment says it."""
+"""Keys that accept any text: titles, options of other log formats, and settings that need an environment variable."""
 
 IN_ONE_PROCESS = """
 import sys, traceback, yaml
@@ -483,7 +488,7 @@ for path in sorted(Path(sys.argv[2]).iterdir()):
 
 
 def checked(root, documents, scratch):
-    """Check a campaign with each of several configs; return what was told of each."""
+    """Check a campaign with each of several configs; return the outcome of each and the error output."""
     scratch.mkdir()
     for number, document in enumerate(documents):
         (scratch / f"{number:04d}").write_text(yaml.safe_dump(document))
@@ -499,26 +504,26 @@ def checked(root, documents, scratch):
 
 
 @pytest.mark.slow
-def test_no_text_of_the_config_leads_a_library_out_of_the_folder(unfinished, tmp_path):
+def test_config_texts_do_not_lead_libraries_outside_the_folder(unfinished, tmp_path):
     planted = plant(unfinished)
     (unfinished / "linked").symlink_to(planted.outside)
     config = yaml.safe_load((unfinished / "config/config.yaml").read_text())
-    cases = [(way, name) for way in text_keys() for name in hostile_texts(planted)]
+    cases = [(path, name) for path in text_keys() for name in hostile_texts(planted)]
     texts = hostile_texts(planted)
     with planted.fires() as fired:
-        told, said = checked(
-            unfinished, [with_text(config, way, texts[name]) for way, name in cases], tmp_path / "configs"
+        outcomes, errors = checked(
+            unfinished, [with_text(config, path, texts[name]) for path, name in cases], tmp_path / "configs"
         )
-    assert len(told) == len(cases) > 300
+    assert len(outcomes) == len(cases) > 300
     assert fired == []
-    assert [(case, line) for case, line in zip(cases, told, strict=True) if "TRACEBACK" in line] == []
-    assert "Warning" not in said
-    passed = {case for case, line in zip(cases, told, strict=True) if line == "PASSED"}
-    assert {way for way, _ in passed} <= UNUSED
+    assert [(case, line) for case, line in zip(cases, outcomes, strict=True) if "TRACEBACK" in line] == []
+    assert "Warning" not in errors
+    passed = {case for case, line in zip(cases, outcomes, strict=True) if line == "PASSED"}
+    assert {path for path, _ in passed} <= ANY_TEXT
 
 
 @pytest.mark.slow
-def test_text_that_is_only_a_title_is_only_a_title_in_every_product(unfinished):
+def test_hostile_title_is_harmless_in_every_product(unfinished):
     planted = plant(unfinished)
     texts = hostile_texts(planted)
     edit_config(unfinished, lambda config: config.update(campaign=texts["format"].replace("&", "")[:110]))
@@ -532,7 +537,7 @@ def test_text_that_is_only_a_title_is_only_a_title_in_every_product(unfinished):
 @pytest.mark.parametrize(
     "name", ["PROJ nadgrids", *slow("PROJ init", "PROJ geoidgrids", "PROJ text", "a code of PROJ")]
 )
-def test_a_crs_is_authority_and_code_and_any_other_text_is_one_message(unfinished, name):
+def test_crs_other_than_authority_and_code_is_one_message(unfinished, name):
     planted = plant(unfinished)
     edit_config(unfinished, lambda config: config["scene"].update(crs=hostile_texts(planted)[name]))
     with planted.fires() as fired:
@@ -542,19 +547,19 @@ def test_a_crs_is_authority_and_code_and_any_other_text_is_one_message(unfinishe
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("what", ["chunk", "config", "raw", "log", "results", "records"])
-def test_a_link_out_of_the_folder_is_refused_and_nothing_behind_it_is_opened(finished, tmp_path, what):
+@pytest.mark.parametrize("linked", ["chunk", "config", "raw", "log", "results", "records"])
+def test_link_out_of_the_folder_is_refused_and_its_target_not_opened(finished, tmp_path, linked):
     planted = plant(finished)
-    behind = {
+    path = {
         "config": finished / "config" / "config.yaml",
         "raw": finished / "raw" / "f01",
         "log": next((finished / "raw" / "f01").glob("uav1.track.*")),
         "results": finished / "results" / "f01",
         "records": finished / ".snakemake",
         "chunk": finished / "results/f01/uav1-uav1/image.zarr/image/c/0/0",
-    }[what]
-    shutil.move(behind, planted.outside / "moved")
-    behind.symlink_to(planted.outside / "moved")
+    }[linked]
+    shutil.move(path, planted.outside / "moved")
+    path.symlink_to(planted.outside / "moved")
     with planted.fires() as fired:
         for words in (["check", "."], ["run", ".", "-n"], ["step", "image", "f01", "uav1-uav1"]):
             status, said = run([BIN / "apertura", *words], finished)
@@ -564,7 +569,7 @@ def test_a_link_out_of_the_folder_is_refused_and_nothing_behind_it_is_opened(fin
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("road", ["apertura, in the campaign", "snakemake, from the sources"])
+@pytest.mark.parametrize("start_from", ["apertura, in the campaign", "snakemake, from the sources"])
 @pytest.mark.parametrize(
     "line",
     [
@@ -574,11 +579,11 @@ def test_a_link_out_of_the_folder_is_refused_and_nothing_behind_it_is_opened(fin
     ],
     ids=["yte", "python tag", "yte key"],
 )
-def test_code_in_the_config_is_refused_as_a_key_or_a_tag(unfinished, road, line):
+def test_code_in_the_config_is_refused(unfinished, start_from, line):
     planted = plant(unfinished)
     path = unfinished / "config" / "config.yaml"
     path.write_text(line.format(code=planted.code("config"), shell=planted.shell("config")) + path.read_text())
-    command, folder = ROADS[road]
+    command, folder = WORKFLOW_COMMANDS[start_from]
     names = {"bin": BIN, "root": ROOT, "campaign": unfinished}
     with planted.fires() as fired:
         status, said = run([*shlex.split(command.format(**names)), "-n"], folder.format(**names))
@@ -590,8 +595,8 @@ def test_code_in_the_config_is_refused_as_a_key_or_a_tag(unfinished, road, line)
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["version 2", "codec"])
-def test_a_stage_whose_chunks_are_code_is_not_opened(finished, kind):
-    """A forged result with manifests that agree: zarr's version 2 keeps objects as pickles, a codec may do anything."""
+def test_stage_with_pickled_chunks_is_not_opened(finished, kind):
+    """A forged stage with valid checksums: zarr version 2 stores objects as pickles, and codecs may execute code."""
     planted, folder = plant(finished), finished / "results/f01/uav1-uav1/image.zarr"
     chunk = pickle.dumps(Code(planted.code("pickle")))
     if kind == "codec":
@@ -606,17 +611,17 @@ def test_a_stage_whose_chunks_are_code_is_not_opened(finished, kind):
         layout |= {"compressor": None, "filters": [{"id": "pickle", "protocol": 5}]}
         for name, document in ((".zgroup", {"zarr_format": 2}), ("image/.zarray", layout)):
             (folder / name).parent.mkdir(exist_ok=True)
-            (folder / name).write_text(with_sum(json.dumps(document)))
+            (folder / name).write_text(with_checksum(json.dumps(document)))
         (folder / "image/0").write_bytes(chunk + google_crc32c.value(chunk).to_bytes(4, "little"))
     with planted.fires() as fired, pytest.raises((CampaignError, FileNotFoundError, KeyError)):
         array_of(folder, "image", "r")[...]
     assert fired == []
 
 
-def with_sum(text):
-    """Return a JSON document that ends in the sum of what stands before it: blanks, chosen so that the sum is blanks.
+def with_checksum(text):
+    """Return a JSON document that ends with its own CRC-32C: white space chosen so that the checksum is four blanks.
 
-    A sum is linear: each blank that becomes a tab changes it by a pattern of its own, whatever the others are.
+    CRC-32C is linear: a tab in place of a blank changes it by a fixed pattern; Gaussian elimination selects the tabs.
     """
     blanks, whole = 64, int.from_bytes(b"    ", "little")
     plain = text.encode() + b" " * blanks
@@ -658,7 +663,7 @@ HARMLESS = {
     "TZ": ["nosuch/zone"],
     "ZARR_ARRAY__ORDER": ["F", "Q"],
 }
-"""Settings of the environment → values that change nothing of a step, all of them at once."""
+"""Environment variables → values that do not affect a step, all set at once."""
 
 REFUSED = {
     "step pictures f01 uav1-uav2": {
@@ -669,13 +674,13 @@ REFUSED = {
     "run . -n": {"PATH": ["", "/nowhere"], "SNAKEMAKE_PROFILE": ["nosuch"]},
     "plan .": {"APERTURA_KERNEL": ["_backprojection.so"]},
 }
-"""Command → settings that it cannot do without → values that it refuses."""
+"""Command → environment variables that it needs → values that it refuses."""
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [0, 1])
 @pytest.mark.parametrize("words", ["step pictures f01 uav1-uav2", "run . -n", "plan ."])
-def test_settings_of_the_environment_that_no_result_needs_change_nothing(finished, words, number):
+def test_irrelevant_environment_variables_have_no_effect(finished, words, number):
     names = HARMLESS if words.startswith("step") else HARMLESS.keys() - {"PATH"}
     status, said = run([BIN / "apertura", *words.split()], finished, **{n: HARMLESS[n][-number] for n in names})
     assert status == 0, said
@@ -687,7 +692,7 @@ def test_settings_of_the_environment_that_no_result_needs_change_nothing(finishe
     ("words", "name", "value"),
     [(words, name, value) for words, of in REFUSED.items() for name, values in of.items() for value in values],
 )
-def test_a_setting_of_the_environment_that_is_wrong_is_one_message(finished, name, value, words):
+def test_invalid_environment_variable_is_one_message(finished, name, value, words):
     status, said = run([BIN / "apertura", *words.split()], finished, **{name: value})
     assert status == 2, said
     assert "Traceback" not in said
@@ -696,7 +701,7 @@ def test_a_setting_of_the_environment_that_is_wrong_is_one_message(finished, nam
 
 
 @pytest.mark.slow
-def test_a_setting_of_zarr_changes_no_byte_of_a_stage(unfinished, tmp_path):
+def test_zarr_environment_variable_does_not_change_stages(unfinished, tmp_path):
     other = copy_writable(unfinished, tmp_path / "other")
     for root, order in ((unfinished, "C"), (other, "F")):
         for words in ("step ingest f01 uav1", "step ingest f01 uav2", "step echo f01 uav1-uav2"):
@@ -707,7 +712,7 @@ def test_a_setting_of_zarr_changes_no_byte_of_a_stage(unfinished, tmp_path):
     assert [name for name in files if (other / name).read_bytes() != (unfinished / name).read_bytes()] == []
 
 
-def test_a_working_folder_that_is_gone_is_one_message(tmp_path):
+def test_deleted_working_folder_is_one_message(tmp_path):
     folder = tmp_path / "gone"
     folder.mkdir()
     process = subprocess.run(

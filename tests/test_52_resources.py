@@ -1,4 +1,4 @@
-"""What jobs ask of a cluster: enough for what they were measured to take, more where the work is more, not too much."""
+"""Resource requests of jobs: sufficient for measured use, growing with the work, and not excessive."""
 
 import csv
 import math
@@ -13,73 +13,73 @@ from apertura.campaign.folder import Campaign
 from apertura.workflow.resources import Resources
 from apertura.workflow.rules import RULES
 
-BESIDE_MB = 2 * 135
-"""Snakemake, which starts the job, and Snakemake again, which starts the step: measured."""
+SNAKEMAKE_MB = 2 * 135
+"""Measured memory of the two Snakemake processes that start the job and the step, in MB."""
 
 PAIR = SimpleNamespace(flight="f01", pair="uav1-uav2")
 
 
-def test_every_rule_has_a_row_and_quotes_it():
+def test_every_rule_uses_the_resources_of_its_row():
     rules = (path for path in (ROOT / "workflow" / "rules").glob("*.smk") if path.name != "study.smk")
     text = "\n".join(path.read_text() for path in rules)
     assert set(re.findall(r"^rule (\w+):", text, re.MULTILINE)) == set(RULES)
-    for what in ("threads: {}.threads", "**{}.resources", "**{}.params"):
-        assert all(what.format(f'job["{rule}"]') in text for rule in RULES)
+    for pattern in ("threads: {}.threads", "**{}.resources", "**{}.params"):
+        assert all(pattern.format(f'job["{rule}"]') in text for rule in RULES)
 
 
-def test_pulses_are_told_from_sizes_alone_and_no_fewer_than_there_are(finished_tiny):
+def test_pulse_number_is_estimated_from_file_sizes_as_upper_bound(finished_tiny):
     work = Resources(finished_tiny).work("f01", "uav1-uav2", None)
     assert 40 <= work.pulses <= 3 * 40
     assert (work.pixels, work.tiles, work.images) == (3600, 1, 1)
 
 
-def test_a_campaign_that_settles_its_grid_itself_is_taken_for_a_large_one_until_it_has(tiny, finished_tiny):
+def test_automatic_grid_requests_more_until_it_is_determined(tiny, finished_tiny):
     edit_config(tiny, lambda document: document["scene"].update(bounds_m="auto", spacing_m="auto"))
 
-    def asked():
+    def requests():
         image = Resources(Campaign.load(tiny))["image"]
         return image.mem_mb(PAIR, 1), image.threads(PAIR)
 
-    before = asked()
+    before = requests()
     copy_writable(finished_tiny.results, tiny / "results")
-    after = asked()
+    after = requests()
     assert before[0] > 1.4 * after[0]
     assert (before[1], after[1]) == (4, 1)
     (tiny / "results" / "scene.json").write_text('{"grid": 3}')
-    assert asked() == before
+    assert requests() == before
 
 
-def test_a_further_attempt_asks_for_twice_as_much_and_a_share_for_less_time(tiny):
+def test_retry_doubles_requests_and_a_share_needs_less_time(tiny):
     edit_config(tiny, lambda document: document["scene"].update(spacing_m=0.0005))
-    asked = Resources(Campaign.load(tiny))
-    image, share = asked["image"], SimpleNamespace(**vars(PAIR), scatteritem="2-of-8")
+    resources = Resources(Campaign.load(tiny))
+    image, share = resources["image"], SimpleNamespace(**vars(PAIR), scatteritem="2-of-8")
     assert [image.mem_mb(PAIR, attempt) // image.mem_mb(PAIR, 1) for attempt in (1, 2, 3)] == [1, 2, 4]
     assert image.runtime(PAIR, 2) == 2 * image.runtime(PAIR, 1)
-    assert asked["tiles"].runtime(share, 1) < image.runtime(PAIR, 1)
+    assert resources["tiles"].runtime(share, 1) < image.runtime(PAIR, 1)
 
 
-def test_a_long_recording_is_given_time_and_bounded_memory(tiny):
+def test_long_recording_requests_time_but_bounded_memory(tiny):
     for suffix, size in ((".sigmf-data", 5_000_000_000), (".sigmf-meta", 40_000_000)):
         os.truncate(tiny / "raw" / "f01" / f"uav1{suffix}", size)
-    asked = Resources(Campaign.load(tiny))
+    resources = Resources(Campaign.load(tiny))
     node = SimpleNamespace(flight="f01", node="uav1")
-    assert asked["ingest"].runtime(node, 1) > 20
-    assert asked["ingest"].mem_mb(node, 1) < 2048
-    assert asked["echo"].mem_mb(PAIR, 1) < 2048
+    assert resources["ingest"].runtime(node, 1) > 20
+    assert resources["ingest"].mem_mb(node, 1) < 2048
+    assert resources["echo"].mem_mb(PAIR, 1) < 2048
 
 
 @pytest.mark.slow
-def test_every_job_of_a_run_stays_within_what_it_asked_for_and_asked_for_no_more_than_four_times_that(run_by_snakemake):
-    asked, seen = Resources(Campaign.load(run_by_snakemake)), set()
+def test_memory_requests_cover_use_and_are_below_four_times_it(run_by_snakemake):
+    resources, measured_rules = Resources(Campaign.load(run_by_snakemake)), set()
     for path in (run_by_snakemake / "results" / "benchmarks").rglob("*.tsv"):
         rule, job = job_of(path)
         with path.open() as lines:
             used = float(next(csv.DictReader(lines, delimiter="\t"))["max_rss"])
-        predicted = asked[rule].mem_mb(job, 1)
-        assert math.isnan(used) or used * 1.048576 + BESIDE_MB <= predicted, (rule, used, predicted)
+        predicted = resources[rule].mem_mb(job, 1)
+        assert math.isnan(used) or used * 1.048576 + SNAKEMAKE_MB <= predicted, (rule, used, predicted)
         assert predicted <= 4 * max(used, 1000), (rule, used, predicted)
-        seen.add(rule)
-    assert seen == set(RULES) - {
+        measured_rules.add(rule)
+    assert measured_rules == set(RULES) - {
         "bench",
         "calibrate",
         "terrain",
@@ -92,7 +92,7 @@ def test_every_job_of_a_run_stays_within_what_it_asked_for_and_asked_for_no_more
 
 
 def job_of(path):
-    """The rule and the wildcards of a benchmark's file."""
+    """Return rule and wildcards of a benchmark file."""
     *folder, name = path.with_suffix("").parts[path.parts.index("benchmarks") + 1 :]
     where, _, rule = name.partition(".")
     if not rule:
@@ -100,7 +100,7 @@ def job_of(path):
     if where == "fused":
         return rule, SimpleNamespace(flight=folder[0])
     rule, _, share = rule.partition(".")
-    if where == rule:  # a flight's own folder
+    if where == rule:  # results of a whole flight
         return rule, SimpleNamespace(flight=folder[0])
     key = "pair" if "-" in where else "node"
     return rule, SimpleNamespace(flight=folder[0], **{key: where}, **({"scatteritem": share} if share else {}))

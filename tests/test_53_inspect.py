@@ -1,4 +1,4 @@
-"""`apertura inspect`: what files say of themselves, what they lack, and nothing that a stranger's file may do to it."""
+"""`apertura inspect`: reported facts of files, missing information, and previews."""
 
 import csv
 import doctest
@@ -46,12 +46,12 @@ def rows_of(path):
         return list(csv.DictReader(stream, skipinitialspace=True))
 
 
-def drawn(report, path):
+def preview_of(report, path):
     assert inspect_path(report.path, plot=path) == 0
     return image.imread(path)
 
 
-def test_a_csv_log_is_reported_as_its_own_columns_say(shared):
+def test_facts_of_a_csv_log_agree_with_its_columns(shared):
     rows = rows_of(F01 / "uav1.track.csv")
     report = look(F01 / "uav1.track.csv")
     assert (report.kind, report.format, report.problem) == ("flight log", "csv", None)
@@ -63,22 +63,22 @@ def test_a_csv_log_is_reported_as_its_own_columns_say(shared):
         assert report.facts["bounds"][name] == pytest.approx([min(values), max(values)], abs=1e-6)
 
 
-def test_a_log_in_radians_lacks_degrees_before_any_campaign_is_made(tmp_path):
-    """40 m to the east with a yaw of π/2, and of 90."""
-    for yaw, lacking in ((1.5708, True), (90.0, False)):
+def test_attitude_in_radians_is_reported_without_a_campaign(tmp_path):
+    """Track of 40 m to the east with a yaw of π/2, and of 90."""
+    for yaw, is_radians in ((1.5708, True), (90.0, False)):
         time = np.datetime64("2026-05-14T09:30:00.0", "ms") + 100 * np.arange(80)
         rows = [
             f"{at}Z,{0.5 * number},0,20,{0.02 * (number % 3)},-0.07,{yaw}" for number, at in enumerate(time.astype(str))
         ]
         path = tmp_path / "uav1.track.csv"
         path.write_text("\n".join(["time_utc,east_m,north_m,up_m,roll_deg,pitch_deg,yaw_deg", *rows, ""]))
-        said = [line for line in look(path).missing if line.startswith("an attitude in degrees")]
-        assert bool(said) is lacking
-        assert not lacking or "appear to be in radians: yaw then deviates from the course by 0°" in said[0]
+        lines = [line for line in look(path).missing if line.startswith("an attitude in degrees")]
+        assert bool(lines) is is_radians
+        assert not is_radians or "appear to be in radians: yaw then deviates from the course by 0°" in lines[0]
 
 
-def test_the_preview_of_a_log_names_the_axes_that_it_has(shared, tmp_path):
-    """East and north of a place on Earth; in a frame of its own x, y and z."""
+def test_preview_of_a_log_labels_the_axes_of_its_frame(shared, tmp_path):
+    """Axes: east and north for positions on Earth, x, y and z in a local frame."""
     path = tmp_path / "uav1.track.csv"
     rows = [f"2026-05-14T09:30:0{second}Z,{second},0,20" for second in range(9)]
     path.write_text("\n".join(["time_utc,east_m,north_m,up_m", *rows, ""]))
@@ -88,7 +88,7 @@ def test_the_preview_of_a_log_names_the_axes_that_it_has(shared, tmp_path):
     assert (plan.get_xlabel(), plan.get_ylabel()) == ("east of the median, m", "north of the median, m")
 
 
-def test_lines_taken_out_of_a_log_are_a_gap_of_their_length_at_their_time(shared, tmp_path):
+def test_removed_lines_of_a_log_are_a_gap(shared, tmp_path):
     lines = (F01 / "uav1.track.csv").read_text().splitlines(keepends=True)
     (tmp_path / "uav1.track.csv").write_text("".join(lines[:41] + lines[51:]))
     report = look(tmp_path / "uav1.track.csv")
@@ -98,7 +98,7 @@ def test_lines_taken_out_of_a_log_are_a_gap_of_their_length_at_their_time(shared
     assert any(sentence.startswith("epochs in 1 gap: pulses in gaps") for sentence in report.missing)
 
 
-def test_kinds_of_fix_are_counted_and_what_is_not_fixed_is_missing(shared, tmp_path):
+def test_solution_types_are_counted_and_unusable_ones_reported(shared, tmp_path):
     text = (F01 / "uav2.track.pos").read_text()
     lines = text.splitlines()
     solutions = [number for number, line in enumerate(lines) if line[0] != "%"]
@@ -115,7 +115,7 @@ def test_kinds_of_fix_are_counted_and_what_is_not_fixed_is_missing(shared, tmp_p
 
 
 @pytest.mark.parametrize("file", ["uav1.sigmf-meta", "uav1.sigmf-data"])
-def test_a_recording_is_reported_as_its_metadata_and_samples_say(shared, file):
+def test_facts_of_a_recording_agree_with_metadata_and_samples(shared, file):
     meta = json.loads((F01 / "uav1.sigmf-meta").read_text())
     report = look(F01 / file)
     length = meta["captures"][1]["core:sample_start"]
@@ -130,7 +130,7 @@ def test_a_recording_is_reported_as_its_metadata_and_samples_say(shared, file):
     assert report.missing == ()
 
 
-def test_a_recording_alone_lacks_its_log_and_its_waveform_and_says_what_to_put_into_the_config(shared, tmp_path):
+def test_single_recording_lacks_log_and_waveform(shared, tmp_path):
     for suffix in ("sigmf-meta", "sigmf-data"):
         (tmp_path / f"x.{suffix}").write_bytes((F01 / f"uav1.{suffix}").read_bytes())
     missing = " ".join(look(tmp_path / "x.sigmf-meta").missing)
@@ -138,22 +138,22 @@ def test_a_recording_alone_lacks_its_log_and_its_waveform_and_says_what_to_put_i
     assert "no flight log x.track.<" in missing
 
 
-def test_a_log_of_another_hour_says_that_the_clock_may_be_off(tiny):
+def test_log_of_another_hour_suggests_a_clock_error(tiny):
     log = tiny / "raw/f01/uav1.track.csv"
     times = re.findall(r"T(\d\d):", log.read_text())
     log.write_text(re.sub(r"T\d\d:", f"T{(int(times[0]) + 3) % 24:02}:", log.read_text()))
     report = look(tiny / "raw/f01/uav1.sigmf-meta")
     assert report.facts["captures_inside_log_share"] == 0.0
-    assert any("positions for 100.0% of the captures" in one and "apertura align" in one for one in report.missing)
+    assert any("positions for 100.0% of the captures" in line and "apertura align" in line for line in report.missing)
 
 
-def test_a_recording_of_one_capture_is_no_pulses(shared):
+def test_recording_of_a_single_capture_contains_no_pulses(shared):
     report = look(SHARED / "sigmf_nbiot/V16-beacon-NB-IoT-uplink.sigmf-data")
     assert report.facts["captures"] == 1
     assert any(sentence.startswith("pulses: the recording is a single capture") for sentence in report.missing)
 
 
-def test_phase_history_is_reported_as_its_fields_say(shared):
+def test_facts_of_a_phase_history_agree_with_its_fields(shared):
     path = SHARED / "gotcha_afrl/data_3dsar_pass1_az001_HH.mat"
     fields = scipy.io.loadmat(path, squeeze_me=True)["data"]
     frequency, x = (np.ravel(fields[name].item()) for name in ("freq", "x"))
@@ -165,7 +165,7 @@ def test_phase_history_is_reported_as_its_fields_say(shared):
     assert report.facts["clock"] == "none, pulses are counted"
 
 
-def test_the_scans_of_a_radar_with_a_clock_of_its_own_ask_for_a_log_and_for_align(shared):
+def test_scans_with_an_own_clock_require_a_log_and_alignment(shared):
     report = look(SHARED / "bwsi_rail_passA/July23_03.out")
     assert report.facts["clock"] == "its own"
     assert "first_utc" not in report.facts
@@ -174,7 +174,7 @@ def test_the_scans_of_a_radar_with_a_clock_of_its_own_ask_for_a_log_and_for_alig
 
 
 @pytest.mark.slow
-def test_a_log_above_sea_level_is_refused_with_the_key_and_read_once_that_is_set(shared):
+def test_log_with_heights_above_sea_level_needs_height_offset(shared):
     path = next((SHARED / "dji_rtk_ansfl").glob("*Airdata.csv"))
     refused = look(path)
     assert "height_offset_m" in refused.problem.expected
@@ -188,7 +188,7 @@ def test_a_log_above_sea_level_is_refused_with_the_key_and_read_once_that_is_set
     assert raised == pytest.approx(10.0, abs=1e-6)
 
 
-def test_a_ulog_is_reported_as_its_own_messages_say(shared):
+def test_facts_of_a_ulog_agree_with_its_messages(shared):
     path = SHARED / "px4_real_flight/esc_status_log.ulg"
     gps = pyulog.ULog(str(path)).get_dataset("vehicle_gps_position").data
     report = look(path)
@@ -196,24 +196,24 @@ def test_a_ulog_is_reported_as_its_own_messages_say(shared):
     assert report.facts["epochs"] + sum(report.facts["left_out"].values()) == len(gps["lat"])
     latitude = gps["lat"] * 1e-7
     assert report.facts["bounds"]["latitude_deg"] == pytest.approx([latitude.min(), latitude.max()], abs=1e-7)
-    assert report.facts["unusable_epochs"] == 0  # a log without RTK is used as it is
+    assert report.facts["unusable_epochs"] == 0  # single solutions are used in a log without RTK
     assert any("RTK" in sentence for sentence in report.missing)
 
 
-def test_a_dem_says_what_its_heights_lack(shared):
+def test_missing_datum_of_a_dem_is_reported(shared):
     report = look(SHARED / "dem_isce3/SanAnd_dem.tif")
     assert report.kind == "elevation model"
     assert report.facts["crs"] == "EPSG:4326"
     assert any("scene.dem_datum" in sentence for sentence in report.missing)
 
 
-def test_a_campaign_is_reported_node_by_node(shared):
+def test_facts_of_a_campaign_are_reported_per_node(shared):
     report = look(SHARED / "campaign-sample")
     assert (report.kind, report.missing) == ("campaign folder", ())
     reported = {part.path.name: part.facts for part in report.parts}
     for node in ("uav1", "uav2"):
         meta = json.loads((F01 / f"{node}.sigmf-meta").read_text())
-        times = np.array([one["core:datetime"][:-1] for one in meta["captures"]], "datetime64[ns]")
+        times = np.array([capture["core:datetime"][:-1] for capture in meta["captures"]], "datetime64[ns]")
         steps = np.diff(times) / np.timedelta64(50, "ms")
         assert reported[node]["captures"] == len(times)
         assert reported[node]["lost"] == round(steps.sum() - steps.size)
@@ -223,7 +223,7 @@ def test_a_campaign_is_reported_node_by_node(shared):
 
 
 @pytest.mark.slow
-def test_a_campaign_of_phase_history_is_reported_by_the_clock_that_was_aligned(shared, tmp_path):
+def test_phase_history_is_reported_with_its_aligned_clock(shared, tmp_path):
     root = copy_writable(EXAMPLES / "rail_pass", tmp_path / "rail")
     flight, node = (root / "config/flights.tsv").read_text().splitlines()[1].split("\t")[::3]
     raw = root / f"raw/{flight}"
@@ -243,7 +243,7 @@ def test_a_campaign_of_phase_history_is_reported_by_the_clock_that_was_aligned(s
 PRODUCT = {"transform": Affine(1, 0, 500000, 0, -1, 5400000), "crs": "EPSG:32632"}
 
 
-def test_a_product_of_apertura_is_no_elevation_model(tmp_path):
+def test_product_of_apertura_is_not_an_elevation_model(tmp_path):
     tags = {
         "APERTURA_VERSION": "1.0",
         "APERTURA_CODE_SHA256": "0123456789abcdef",
@@ -286,7 +286,7 @@ def test_heights_are_reported_in_the_unit_of_the_raster(tmp_path, unit, crs, sca
     assert {"height", "height_m"} & set(report.facts) == {fact}
 
 
-def test_an_axis_without_a_stated_deviation_is_not_known(tmp_path):
+def test_axis_without_a_stated_deviation_is_unknown(tmp_path):
     track = make_track(
         np.datetime64("2025-05-14T09:30", "ns") + np.arange(3) * np.timedelta64(1, "s"),
         np.array([[48.0, 11.0, 500.0]] * 3),
@@ -298,17 +298,17 @@ def test_an_axis_without_a_stated_deviation_is_not_known(tmp_path):
     assert log_facts(track.drop_vars("position_std")).stated_std_m is None
 
 
-def test_the_offset_of_a_recorders_clock_is_applied_once(tiny):
+def test_clock_offset_of_a_recorder_is_applied_once(tiny):
     recorded = {part.path.name: part.facts["recorded"]["first_utc"] for part in look(tiny).parts}
     (tiny / "config/clocks.tsv").write_text("flight\tnode\toffset_s\tdrift_ppm\tstd_s\nf01\tuav1\t2\t0\t0.001\n")
     for part in look(tiny).parts:
         first, before = (
-            np.datetime64(one[:-1], "ns") for one in (part.facts["recorded"]["first_utc"], recorded[part.path.name])
+            np.datetime64(time[:-1], "ns") for time in (part.facts["recorded"]["first_utc"], recorded[part.path.name])
         )
         assert first - before == np.timedelta64(2 if part.path.name == "uav1" else 0, "s")
 
 
-def test_a_spoilt_campaign_says_what_check_says(tiny):
+def test_problems_of_check_are_reported_for_a_campaign(tiny):
     (tiny / "raw/f01/uav1.sigmf-data").unlink()
     report = look(tiny)
     assert any(line.startswith("raw/f01/uav1.sigmf-data: no such file") for line in report.missing)
@@ -316,7 +316,7 @@ def test_a_spoilt_campaign_says_what_check_says(tiny):
     assert "config/config.yaml: not readable as YAML" in look(tiny).missing[0]
 
 
-def test_inside_a_campaign_the_config_says_how_a_log_is_read(tiny, tmp_path):
+def test_log_in_a_campaign_is_read_with_the_options_of_the_config(tiny, tmp_path):
     log, config = tiny / "raw/f01/uav1.track.csv", tiny / "config/config.yaml"
     log.write_text(log.read_text().replace("height_m", "up", 1))
     document = yaml.safe_load(config.read_text())
@@ -341,7 +341,7 @@ def test_inside_a_campaign_the_config_says_how_a_log_is_read(tiny, tmp_path):
         "dem_isce3/SanAnd_dem.tif",
     ],
 )
-def test_previews_are_pictures_and_the_same_each_time(shared, tmp_path, capsys, name):
+def test_previews_are_images_and_reproducible(shared, tmp_path, capsys, name):
     pictures = []
     for number in range(2):
         assert inspect_path(SHARED / name, plot=tmp_path / f"{number}.png") == 0
@@ -352,19 +352,19 @@ def test_previews_are_pictures_and_the_same_each_time(shared, tmp_path, capsys, 
 
 
 @pytest.mark.slow
-def test_the_examples_of_the_how_to_print_what_it_shows(shared, tmp_path):
+def test_examples_of_the_how_to_print_what_it_shows(shared, tmp_path):
     folder = copy_writable(SHARED / "campaign-sample", tmp_path / "sample")
     airdata = next((SHARED / "dji_rtk_ansfl").glob("*Airdata.csv"))
     (folder / "raw/f01/uav1.track.csv").write_text("".join(airdata.open(encoding="utf-8-sig").readlines()[:60]))
     examples = re.findall(r"```text\n\$ apertura inspect (\S+)\n(.*?)```", HOWTO.read_text(encoding="utf-8"), re.S)
     assert len(examples) == 2
-    for path, wanted in examples:
+    for path, expected in examples:
         printed = run(path, cwd=folder, env={**os.environ, "COLUMNS": "200"}).stdout.decode()
         flags = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
-        assert doctest.OutputChecker().check_output(wanted, printed, flags), printed
+        assert doctest.OutputChecker().check_output(expected, printed, flags), printed
 
 
-def test_beats_of_a_campaign_are_reported_with_the_times_beside(tmp_path):
+def test_beats_are_reported_with_their_file_of_times(tmp_path):
     flight = FmcwFlight(
         FrequencySweep(2.2e9, 400e6, 20e-6, 25e6), 100.0, 40, {"uav1": (0.0, -20.0, 10.0)}, ((0.0, 0.0, 0.0),)
     )
@@ -382,7 +382,7 @@ def test_beats_of_a_campaign_are_reported_with_the_times_beside(tmp_path):
 
 
 @pytest.mark.slow
-def test_times_of_a_campaign_are_whole_on_a_narrow_terminal_and_for_machines(shared):
+def test_times_are_printed_in_full_on_a_narrow_terminal(shared):
     meta = json.loads((F01 / "uav1.sigmf-meta").read_text())
     report = look(SHARED / "campaign-sample")
     node = next(part.facts for part in report.parts if part.path.name == "uav1")
@@ -397,21 +397,23 @@ def test_times_of_a_campaign_are_whole_on_a_narrow_terminal_and_for_machines(sha
                 assert time in printed
 
 
-def test_a_preview_of_phase_history_spreads_its_pulses_over_the_whole_of_it():
+def test_preview_of_a_phase_history_covers_all_pulses():
     count = 3000
-    ramp = np.exp(-2j * np.pi * np.arange(64) * np.linspace(-0.4, 0.4, count)[:, None])  # range moves from end to end
+    ramp = np.exp(
+        -2j * np.pi * np.arange(64) * np.linspace(-0.4, 0.4, count)[:, None]
+    )  # range sweeps the full interval
     echo = xr.Dataset(
         {"transfer": (("pulse", "subcarrier"), ramp), "frequency": ("subcarrier", 1e9 + 1e6 * np.arange(64.0))}
     )
     (profiles, *_) = draw_history(echo, "a").axes
-    (drawn,) = profiles.images
-    strongest = drawn.get_array().argmax(axis=1)
+    (shown,) = profiles.images
+    strongest = shown.get_array().argmax(axis=1)
     assert len(strongest) <= 256
     assert strongest.max() - strongest.min() > 45
-    assert tuple(drawn.get_extent()[2:]) == (count, 0)
+    assert tuple(shown.get_extent()[2:]) == (count, 0)
 
 
-def test_a_track_across_180_degrees_has_bounds_from_west_to_east_and_a_middle_on_it():
+def test_bounds_of_a_track_across_180_degrees_are_west_to_east():
     longitude = np.array([179.9999, -179.9998, 180.0, 179.9998])
     position = ecef_from_geodetic(np.full(4, 48.0), longitude, np.full(4, 30.0))
     assert bounds_of(position, "ecef")["longitude_deg"] == pytest.approx([179.9998, -179.9998], abs=1e-9)
@@ -421,7 +423,7 @@ def test_a_track_across_180_degrees_has_bounds_from_west_to_east_and_a_middle_on
 
 
 @pytest.mark.slow
-def test_a_named_pipe_in_place_of_the_log_is_not_waited_for(tiny):
+def test_named_pipe_instead_of_a_log_does_not_block(tiny):
     log = tiny / "raw/f01/uav1.track.csv"
     log.unlink()
     os.mkfifo(log)

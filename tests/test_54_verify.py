@@ -1,4 +1,4 @@
-"""`apertura verify`: whatever is touched between a product and the raw samples is named, and nothing else is."""
+"""`apertura verify`: every change between a product and the raw samples is reported, and nothing else."""
 
 import shutil
 import subprocess
@@ -16,11 +16,11 @@ from apertura.views.verify.chain import verify
 
 @pytest.fixture
 def root(finished_tiny, tmp_path):
-    """The tiny campaign with all its results, to be spoilt at will."""
+    """Return a writable copy of the tiny campaign with all its results."""
     return copy_writable(finished_tiny.root, tmp_path / "finished")
 
 
-def test_every_link_of_an_untouched_product_is_the_same(root):
+def test_links_of_an_unchanged_product_are_the_same(root):
     chain = verify(root / DB)
     names = {link.name for link in chain.links}
     assert {DB, EXPORT, IMAGE, RAW, "raw/codes.npy", f"tags of {DB}", f"code of {EXPORT}"} <= names
@@ -36,7 +36,7 @@ def test_every_link_of_an_untouched_product_is_the_same(root):
     "results/f01/uav1-uav2/db.tif",
 )
 @pytest.mark.parametrize(
-    "touched",
+    "changed",
     [
         RAW,
         "raw/codes.npy",
@@ -48,25 +48,25 @@ def test_every_link_of_an_untouched_product_is_the_same(root):
         DB,
     ],
 )
-def test_one_byte_is_reported_at_its_link(root, touched):
-    flip(root / touched)
-    found = wrong(root)
-    assert found[touched] == "changed"
-    spoilt = {touched, touched.replace(".manifest.json", ".zarr"), f"code of {touched}", f"settings of {touched}"}
-    assert found.keys() <= spoilt | {f"tags of {touched}"}
+def test_changed_byte_is_reported_at_its_link(root, changed):
+    flip(root / changed)
+    states = wrong(root)
+    assert states[changed] == "changed"
+    affected = {changed, changed.replace(".manifest.json", ".zarr"), f"code of {changed}", f"settings of {changed}"}
+    assert states.keys() <= affected | {f"tags of {changed}"}
 
 
 @pytest.mark.quick("image/c/0/0")
 @pytest.mark.parametrize("file", ["image/c/0/0", "image/zarr.json", "x/c/0"])
-def test_one_byte_of_a_stage_is_reported_at_the_stage(root, file):
+def test_changed_byte_of_a_stage_is_reported_at_the_stage(root, file):
     flip(root / IMAGE / file)
     assert wrong(root) == {IMAGE: "changed"}
     assert file in "".join(next(link for link in verify(root / DB).links if link.name == IMAGE).reason)
 
 
 @pytest.mark.slow
-def test_any_byte_of_the_last_manifest_is_noticed(root):
-    """Nothing has recorded its hash: what it says is compared with all that it speaks of, and how it is written."""
+def test_any_changed_byte_of_the_last_manifest_is_reported(root):
+    """No other file contains its hash: its content and its formatting are compared with what it lists."""
     whole = (root / EXPORT).read_bytes()
     for at in range(0, len(whole), 97):
         flip(root / EXPORT, at)
@@ -79,30 +79,30 @@ def test_any_byte_of_the_last_manifest_is_noticed(root):
 @pytest.mark.parametrize(
     ("name", "change"),
     [
-        ("SOURCES", lambda told: told | {"results/scene.manifest.json": "0" * 64}),
+        ("SOURCES", lambda tags: tags | {"results/scene.manifest.json": "0" * 64}),
         ("SOURCES", lambda _: {}),
-        ("INPUTS", lambda told: told | {RAW: "0" * 64}),
-        ("RUNSPEC", lambda told: told | {"window": "none"}),
+        ("INPUTS", lambda tags: tags | {RAW: "0" * 64}),
+        ("RUNSPEC", lambda tags: tags | {"window": "none"}),
     ],
 )
-def test_a_tag_edited_together_with_the_hash_of_its_file_is_reported(root, name, change):
+def test_edited_tag_with_updated_file_hash_is_reported(root, name, change):
     retag(root / DB, **{name: canonical_json(change(tag(root / DB, name)))})
     edited(root / EXPORT, lambda document: document["files"].update({"db.tif": sha256_file(root / DB)}))
     assert wrong(root) == {f"tags of {DB}": "changed"}
 
 
-def test_the_tags_of_a_picture_are_looked_at_too(root):
+def test_edited_tags_of_a_png_are_reported(root):
     path = root / DB.replace("db.tif", "quicklook.png")
     with Image.open(path) as picture:
         texts = PngImagePlugin.PngInfo()
         for name, text in picture.text.items():
             texts.add_text(name, text if name != "APERTURA_SOURCES" else "{}")
         picture.save(path, pnginfo=texts)
-    found = wrong(root, path.relative_to(root))
-    assert found == {f"{where}results/f01/uav1-uav2/quicklook.png": "changed" for where in ("", "tags of ")}
+    states = wrong(root, path.relative_to(root))
+    assert states == {f"{where}results/f01/uav1-uav2/quicklook.png": "changed" for where in ("", "tags of ")}
 
 
-def test_settings_that_changed_are_reported_where_they_matter(root):
+def test_changed_settings_are_reported_at_affected_results(root):
     edit_config(root, lambda document: document.setdefault("processing", {}).update({"window": "none"}))
     pairs = ("uav1-uav1", "uav1-uav2")
     assert wrong(root) == {f"settings of results/f01/{pair}/profile.manifest.json": "changed" for pair in pairs}
@@ -118,7 +118,7 @@ main()
 
 
 @pytest.mark.slow
-def test_code_that_changed_is_reported_where_it_ran(root, tmp_path):
+def test_changed_code_is_reported_at_affected_results(root, tmp_path):
     copied = shutil.copytree(PACKAGE, tmp_path / "src" / "apertura", ignore=shutil.ignore_patterns("__pycache__"))
     for name in ("Snakefile", "requirements"):
         (tmp_path / name).symlink_to(PACKAGE.parents[1] / name)
@@ -136,23 +136,23 @@ def test_code_that_changed_is_reported_where_it_ran(root, tmp_path):
 
 
 @pytest.mark.quick("raw*")
-@pytest.mark.parametrize("gone", [RAW, DB, EXPORT, "results/f01/uav1/raw.manifest.json", "results/scene.json"])
-def test_a_file_that_is_gone_is_missing(root, gone):
-    (root / gone).unlink()
-    assert wrong(root)[gone] == "missing" if gone != EXPORT else wrong(root)[DB] == "changed"
-    assert wrong(root, "")[gone] == "missing"
+@pytest.mark.parametrize("missing", [RAW, DB, EXPORT, "results/f01/uav1/raw.manifest.json", "results/scene.json"])
+def test_deleted_file_is_reported_as_missing(root, missing):
+    (root / missing).unlink()
+    assert wrong(root)[missing] == "missing" if missing != EXPORT else wrong(root)[DB] == "changed"
+    assert wrong(root, "")[missing] == "missing"
 
 
-def test_half_of_the_results_is_told_link_by_link(root):
-    before = wrong(root, "")  # what these steps do not make
+def test_incomplete_results_are_reported_per_link(root):
+    before = wrong(root, "")  # results of steps that were not run
     assert set(before.values()) <= {"missing"}
     shutil.rmtree(root / IMAGE)
     shutil.rmtree(root / "results/f01/fused")
-    gone = {IMAGE: "missing", "results/f01/fused/export.manifest.json": "missing"}
-    assert wrong(root, "") == before | gone
+    removed = {IMAGE: "missing", "results/f01/fused/export.manifest.json": "missing"}
+    assert wrong(root, "") == before | removed
 
 
-def test_what_is_new_in_a_stage_is_reported(root):
+def test_additional_file_in_a_stage_is_reported(root):
     (root / IMAGE / "image/c/9").mkdir()
     (root / IMAGE / "image/c/9/9").write_bytes(b"more")
     assert wrong(root) == {IMAGE: "changed"}

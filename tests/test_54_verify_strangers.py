@@ -1,4 +1,4 @@
-"""`apertura verify` on what strangers, older versions and editors leave: one line for each link, and no harm."""
+"""`apertura verify` with untrusted, outdated and edited files: one line per link, and no side effects."""
 
 import shutil
 import subprocess
@@ -15,13 +15,13 @@ from apertura.views.verify.chain import print_verified, verify
 
 @pytest.fixture
 def root(finished_tiny, tmp_path):
-    """The tiny campaign with all its results, to be spoilt at will."""
+    """Return a writable copy of the tiny campaign with all its results."""
     return copy_writable(finished_tiny.root, tmp_path / "finished")
 
 
 @pytest.mark.quick("[[]1]", '{"a": 3}')
 @pytest.mark.parametrize("text", ["{", "[1]", '{"a": 3}', "[" * 100_000, "\x1b[31m", "NaN"])
-def test_a_tag_that_is_no_document_is_reported(root, capsys, text):
+def test_malformed_tag_is_reported(root, capsys, text):
     retag(root / DB, SOURCES=text)
     assert print_verified(root / DB) == 1
     lines = capsys.readouterr().out.splitlines()
@@ -29,7 +29,7 @@ def test_a_tag_that_is_no_document_is_reported(root, capsys, text):
     assert all(line.isprintable() and len(line) < 400 for line in lines)
 
 
-def test_a_chunk_that_is_a_link_is_reported_and_not_followed(root, tmp_path):
+def test_linked_chunk_is_reported_and_not_followed(root, tmp_path):
     chunk = root / IMAGE / "image/c/0/0"
     shutil.copy(chunk, tmp_path / "elsewhere")
     chunk.unlink()
@@ -39,7 +39,7 @@ def test_a_chunk_that_is_a_link_is_reported_and_not_followed(root, tmp_path):
 
 @pytest.mark.quick("../../../etc/passwd", "x.zarr*")
 @pytest.mark.parametrize("name", ["../../../etc/passwd", "/etc/passwd", "a\x1b[31m", "x.zarr/../../../../etc/passwd"])
-def test_a_manifest_that_leads_out_of_the_campaign_is_refused(root, capsys, name):
+def test_manifest_with_paths_outside_the_campaign_is_refused(root, capsys, name):
     edited(root / EXPORT, lambda document: document["files"].update({name: "0" * 64}))
     assert print_verified(root / EXPORT, quiet=True) == 1
     (line,) = capsys.readouterr().out.splitlines()
@@ -48,19 +48,19 @@ def test_a_manifest_that_leads_out_of_the_campaign_is_refused(root, capsys, name
     assert "root:" not in line
 
 
-def test_sources_that_lead_in_a_circle_end(root):
+def test_circular_sources_terminate(root):
     edited(root / EXPORT, lambda document: document["sources"].update({EXPORT: "0" * 64}))
     assert wrong(root)[EXPORT] == "changed"
 
 
-def test_a_manifest_of_an_older_version_is_told(root):
+def test_manifest_of_an_older_version_is_reported(root):
     edited(root / EXPORT, lambda document: [document.pop(key) for key in ("sources", "settings", "code")])
     (link,) = [link for link in verify(root / DB).links if link.name == EXPORT]
     assert link.state == "changed"
     assert "versions before 0.1.0" in link.reason[0]
 
 
-def test_other_versions_are_noted_and_change_nothing(root, capsys):
+def test_other_software_versions_are_noted_without_failure(root, capsys):
     software = tag(root / DB, "SOFTWARE") | {"numpy": "1.0"}
     retag(root / DB, SOFTWARE=canonical_json(software), VERSION="0.0.9", LOCK_SHA256="0" * 64)
     edited(root / EXPORT, lambda document: document["files"].update({"db.tif": sha256_file(root / DB)}))
@@ -71,13 +71,13 @@ def test_other_versions_are_noted_and_change_nothing(root, capsys):
     assert lock == "made with a different requirements/all.txt"
 
 
-def test_a_config_that_is_wrong_hides_no_other_link(root):
+def test_invalid_config_does_not_hide_other_links(root):
     (root / "config/config.yaml").write_text("scene: [")
     flip(root / RAW)
     assert wrong(root) == {"campaign": "changed", RAW: "changed"}
 
 
-def test_a_copy_elsewhere_tells_its_tags_and_is_known_again_in_its_campaign(root, tmp_path, capsys):
+def test_copy_outside_the_campaign_is_recognised(root, tmp_path, capsys):
     copy = shutil.copy(root / DB, tmp_path / "copy.tif")
     assert "outside a campaign folder" in complaint(lambda: print_verified(tmp_path / "copy.tif"))
     assert f"APERTURA_INPUTS {RAW} {sha256_file(root / RAW)}" in capsys.readouterr().out.splitlines()
@@ -88,7 +88,7 @@ def test_a_copy_elsewhere_tells_its_tags_and_is_known_again_in_its_campaign(root
     assert capsys.readouterr().out.startswith("changed  copy.tif: not identical to any file of that campaign")
 
 
-def test_what_is_no_product_is_one_message(root, tmp_path):
+def test_file_that_is_no_product_is_one_message(root, tmp_path):
     (tmp_path / "note.txt").write_text("")
     (tmp_path / "plain.tif").write_bytes(b"II*\0")
     assert "no such file" in complaint(lambda: print_verified(tmp_path / "nowhere.tif"))
@@ -98,7 +98,7 @@ def test_what_is_no_product_is_one_message(root, tmp_path):
     assert "a folder that is not a result" in complaint(lambda: print_verified(root / "results/f01"))
 
 
-def test_a_file_beside_the_products_with_a_hostile_name_is_shown_harmlessly(root, capsys):
+def test_hostile_file_name_is_printed_escaped(root, capsys):
     shutil.copy(root / DB, root / "results/f01/uav1-uav2/a\x1b]0;owned\x07.tif")
     assert print_verified(root / "results/f01/uav1-uav2/a\x1b]0;owned\x07.tif", quiet=True) == 1
     assert all(line.isprintable() for line in capsys.readouterr().out.splitlines())
@@ -106,7 +106,7 @@ def test_a_file_beside_the_products_with_a_hostile_name_is_shown_harmlessly(root
 
 @pytest.mark.quick("words0")
 @pytest.mark.parametrize("words", [("verify", "nowhere.tif"), ("diff", "nowhere.tif", "there.tif"), ("reproduce", ".")])
-def test_a_question_that_cannot_be_answered_ends_with_2_and_one_line(tmp_path, words):
+def test_missing_product_is_one_line_and_status_2(tmp_path, words):
     apertura = Path(sys.executable).parent / "apertura"
     done = subprocess.run([apertura, *words], text=True, capture_output=True, check=False, cwd=tmp_path)
     assert (done.returncode, done.stdout) == (2, "")
