@@ -1,4 +1,4 @@
-"""The map in a browser: what it draws, tells and measures, and that nothing in it asks another host for anything."""
+"""The map in a browser: rendering, coordinates, permalinks, keyboard use, and isolation from other hosts."""
 
 import io
 import json
@@ -37,22 +37,24 @@ NO_GL = ("--no-sandbox", "--disable-gpu", "--disable-3d-apis")
 
 pytestmark = [
     pytest.mark.slow,
-    pytest.mark.skipif(not CHROMIUM.exists(), reason="no /usr/bin/chromium: the page is not tried in a browser"),
+    pytest.mark.skipif(not CHROMIUM.exists(), reason="/usr/bin/chromium is not installed"),
     pytest.mark.skipif(not is_built(), reason="the page is not bundled: `make webmap` needs npm"),
 ]
 
 
 @contextmanager
 def serving(root, *options):
-    """Run `apertura map` as a person would, and end it with Ctrl-C."""
+    """Run `apertura map`, yield its address, and stop it with Ctrl-C."""
     command = [APERTURA, "map", str(root), *options]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         try:
-            yield next(line.strip() for line in process.stdout if line.startswith("http"))  # after what is stale
+            yield next(
+                line.strip() for line in process.stdout if line.startswith("http")
+            )  # after notes on out-of-date results
         finally:
             process.send_signal(signal.SIGINT)
-            _, complaints = process.communicate(timeout=20)
-    assert (process.returncode, complaints) == (0, "")
+            _, errors = process.communicate(timeout=20)
+    assert (process.returncode, errors) == (0, "")
 
 
 @pytest.fixture(scope="module")
@@ -72,29 +74,33 @@ def browsing(tool, arguments):
 
 @contextmanager
 def shown(browser, address, *, size=(1000, 700), drawn=True):
-    """Yield the map, in its frame, and what it should not do: errors, and requests to other hosts."""
+    """Yield the frame of the map and a list of its console errors and requests to other hosts."""
     page = browser.new_page()
     page.set_viewport_size({"width": size[0], "height": size[1]})
-    wrong = []
-    page.on("console", lambda said: wrong.append(said.text) if said.type in {"error", "warning"} else None)
-    page.on("pageerror", lambda error: wrong.append(str(error)))
+    errors_and_requests = []
+    page.on(
+        "console", lambda entry: errors_and_requests.append(entry.text) if entry.type in {"error", "warning"} else None
+    )
+    page.on("pageerror", lambda error: errors_and_requests.append(str(error)))
     window = address.partition("#")[0]
-    ours = (window, window.replace("localhost", "127.0.0.1"), "data:", "blob:")
-    page.on("request", lambda asked: None if asked.url.startswith(ours) else wrong.append(asked.url))
+    allowed = (window, window.replace("localhost", "127.0.0.1"), "data:", "blob:")
+    page.on(
+        "request", lambda request: None if request.url.startswith(allowed) else errors_and_requests.append(request.url)
+    )
     page.goto(address)
     _, frame = page.frames
-    frame.wait_for_url(lambda url: url.startswith(f"{ours[1]}map/index.html"))
+    frame.wait_for_url(lambda url: url.startswith(f"{allowed[1]}map/index.html"))
     if drawn:
         frame.wait_for_selector("html[data-drawn]", timeout=20_000)
     try:
-        yield frame, wrong
+        yield frame, errors_and_requests
     finally:
         page.close()
 
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
-    """The demo of 300 pulses, whose targets do not blur into each other."""
+    """Run the demo of 300 pulses, which resolves all targets."""
     return run_steps(simulate(tmp_path_factory.mktemp("map") / "campaign", preset("demo"), seed=1))
 
 
@@ -110,86 +116,89 @@ def browser(tool):
         yield browser
 
 
-def until(frame, true):
-    """Wait for what is true soon: what one page tells the other takes its time."""
+def until(frame, condition):
+    """Wait up to 5 s for a condition: messages between window and frame take time."""
     end = time.monotonic() + 5
-    while not true() and time.monotonic() < end:
+    while not condition() and time.monotonic() < end:
         frame.wait_for_timeout(20)
-    assert true()
+    assert condition()
 
 
 def pixels(frame):
-    """Grey values of the map's picture, as the reader sees it, by a canvas of the test's own."""
+    """Return the rendered pixels of the map from a screenshot."""
     return np.asarray(imread(io.BytesIO(frame.locator("#view").screenshot()))[..., :3])
 
 
 @pytest.mark.parametrize("size", [(1000, 700), (800, 600), (390, 844)])
-def test_the_image_is_drawn_and_no_other_host_is_asked(browser, address, size):
-    with shown(browser, f"{address}#over=", size=size) as (frame, wrong):
+def test_image_is_drawn_without_requests_to_other_hosts(browser, address, size):
+    with shown(browser, f"{address}#over=", size=size) as (frame, errors_and_requests):
         frame.wait_for_timeout(300)
-        seen = pixels(frame)
-        assert wrong == []
+        rendered = pixels(frame)
+        assert errors_and_requests == []
         assert frame.locator("#notices").inner_text() == ""
         assert frame.evaluate("document.documentElement.scrollWidth <= innerWidth")
-    rows, columns = seen.shape[:2]
-    middle = seen[rows // 4 : 3 * rows // 4, columns // 4 : 3 * columns // 4]
+    rows, columns = rendered.shape[:2]
+    middle = rendered[rows // 4 : 3 * rows // 4, columns // 4 : 3 * columns // 4]
     assert middle.max() > 0.9  # the peak is white
     assert middle.std() > 0.05
 
 
 @pytest.mark.parametrize("image", ["f01/uav1-uav1&layer=db.tif", "f01/uav1-uav2&layer=db.tif", "f01/fused"])
-def test_a_targets_coordinates_read_from_the_page_are_within_a_pixel_of_the_truth(browser, address, finished, image):
+def test_displayed_target_coordinates_are_within_a_pixel(browser, address, finished, image):
     truth = json.loads((finished.root / "truth.json").read_text())["targets"]
     spacing_m = finished.settings.scene.spacing_m
-    with shown(browser, f"{address}#image={image}") as (frame, wrong):
+    with shown(browser, f"{address}#image={image}") as (frame, errors_and_requests):
         for number, target in enumerate(truth):
             row = frame.locator("#targets li", has_text=f"target {number}")
             row.locator("button").click()
             peak = row.locator(".peak[data-east]")
             peak.wait_for(timeout=10_000)
-            found = [float(peak.get_attribute(f"data-{axis}")) for axis in ("east", "north")]
-            assert found == pytest.approx((target["x"], target["y"]), abs=spacing_m / 4)
-        frame.wait_for_timeout(500)  # the map has come to the last target
+            position = [float(peak.get_attribute(f"data-{axis}")) for axis in ("east", "north")]
+            assert position == pytest.approx((target["x"], target["y"]), abs=spacing_m / 4)
+        frame.wait_for_timeout(500)  # the map has moved to the last target
         box = frame.locator("#map").bounding_box()
         frame.page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
         frame.locator("#value", has_text="dB").wait_for(timeout=10_000)
         east, north = (float(word) for word in frame.inner_text("#place").split() if word[0].isdigit())
-        latitude, longitude = (float(one.strip(" °NE")) for one in frame.inner_text("#geographic").split("°")[:2])
-        assert wrong == []
+        latitude, longitude = (float(angle.strip(" °NE")) for angle in frame.inner_text("#geographic").split("°")[:2])
+        assert errors_and_requests == []
     assert (east, north) == pytest.approx((truth[-1]["x"], truth[-1]["y"]), abs=spacing_m)
     to_wgs84 = Transformer.from_crs("EPSG:32632", "EPSG:4326")
     assert (latitude, longitude) == pytest.approx(to_wgs84.transform(east, north), abs=2e-8)
 
 
 @pytest.mark.parametrize("number", [0, 3])
-def test_a_target_is_drawn_where_it_is(browser, address, finished, number):
+def test_target_is_drawn_at_its_position(browser, address, finished, number):
     target = json.loads((finished.root / "truth.json").read_text())["targets"][number]
     metres, spacing_m = 0.005, finished.settings.scene.spacing_m
     view = f"{target['x']},{target['y']},{metres}"
-    with shown(browser, f"{address}#image=f01/uav1-uav1&layer=db.tif&over=&view={view}") as (frame, wrong):
+    with shown(browser, f"{address}#image=f01/uav1-uav1&layer=db.tif&over=&view={view}") as (
+        frame,
+        errors_and_requests,
+    ):
         peak_db = float(frame.inner_text("#high-value").split()[0].replace("−", "-"))
     level = peak_db + 20 * np.log10(target["amplitude"]) - 6
     link = f"{address}#image=f01/uav1-uav1&layer=db.tif&over=&view={view}&stretch={level},{level + 0.1}"
-    with shown(browser, link) as (frame, wrong):
+    with shown(browser, link) as (frame, errors_and_requests):
         frame.wait_for_timeout(300)
-        seen = pixels(frame).mean(axis=-1) > 0.99
-        assert wrong == []
-    rows, columns = np.nonzero(seen)
-    middle = [(size - 1) / 2 for size in seen.shape]
+        is_bright = pixels(frame).mean(axis=-1) > 0.99
+        assert errors_and_requests == []
+    rows, columns = np.nonzero(is_bright)
+    middle = [(size - 1) / 2 for size in is_bright.shape]
     near = np.hypot(rows - middle[0], columns - middle[1]) * metres < 0.5
     assert near.sum() > 1000
-    off = np.array([rows[near].mean() - middle[0], columns[near].mean() - middle[1]]) * metres
-    assert np.abs(off).max() < spacing_m / 2, off
+    error_m = np.array([rows[near].mean() - middle[0], columns[near].mean() - middle[1]]) * metres
+    assert np.abs(error_m).max() < spacing_m / 2, error_m
 
 
-def test_a_link_shows_what_it_was_taken_from_and_a_wrong_one_shows_the_map(browser, address, finished):
+def test_permalink_restores_the_view_and_an_invalid_one_is_ignored(browser, address, finished):
     west, south, east, north = finished.settings.scene.bounds_m
     middle = (west + east) / 2, (south + north) / 2
     line = f"{middle[0] - 1},{middle[1]},{middle[0] + 1},{middle[1]}"
-    asked = (
+    link = (
         f"image=f01/uav1-uav2&layer=incidence.tif&stretch=40,60&over=mask&view={middle[0]},{middle[1]},0.01&line={line}"
     )
-    with shown(browser, f"{address}#{asked}") as (frame, wrong):
+    with shown(browser, f"{address}#{link}") as (frame, errors_and_requests):
         frame.wait_for_selector("#plot path")
         assert frame.input_value("#image") == "f01/uav1-uav2"
         assert frame.input_value("#layer") == "incidence.tif"
@@ -199,43 +208,43 @@ def test_a_link_shows_what_it_was_taken_from_and_a_wrong_one_shows_the_map(brows
         again = frame.evaluate("location.hash")
         assert frame.page.url == address + again
         assert frame.page.title() == frame.title() == "tandem_demo · apertura map"
-        assert wrong == []
+        assert errors_and_requests == []
     with shown(browser, address + again) as (frame, _):
         frame.wait_for_selector("#plot path")
         assert frame.evaluate("location.hash") == again
     with shown(browser, f"{address}#image=x&layer=../y&stretch=a,b&view=1,2,-3&line=1,2&over=__proto__") as (
         frame,
-        wrong,
+        errors_and_requests,
     ):
         assert frame.input_value("#layer") == "coherent_db.tif"
-        assert wrong == []
+        assert errors_and_requests == []
 
 
-def test_the_windows_address_shows_something_else_when_it_is_edited_and_goes_back(browser, address):
-    with shown(browser, f"{address}#over=&colours=grey") as (frame, wrong):
+def test_edited_address_and_back_button_change_the_view(browser, address):
+    with shown(browser, f"{address}#over=&colours=grey") as (frame, errors_and_requests):
         window = frame.page
         before, length = window.url, window.evaluate("history.length")
         frame.select_option("#colours", "inferno")
         until(frame, lambda: "colours=inferno" in window.url)
         window.evaluate("location.hash = location.hash.replace('colours=inferno', 'colours=viridis')")
         until(frame, lambda: frame.input_value("#colours") == "viridis")
-        assert window.evaluate("history.length") == length + 1  # by the edit, and not by what the map tells
+        assert window.evaluate("history.length") == length + 1  # added by the edit, not by messages of the map
         window.go_back()
         until(frame, lambda: frame.input_value("#colours") == "inferno")
         assert window.url == before.replace("colours=grey", "colours=inferno")
-        assert wrong == []
+        assert errors_and_requests == []
 
 
-def test_tracks_outside_the_view_are_named_so_until_the_map_shows_them(browser, address):
-    with shown(browser, address) as (frame, wrong):
+def test_tracks_outside_the_view_are_labelled(browser, address):
+    with shown(browser, address) as (frame, errors_and_requests):
         words = frame.locator("#overlays span").nth(1)
         until(frame, lambda: words.inner_text().strip() == "tracks (outside the view)")
         frame.click("#fit-tracks")
         until(frame, lambda: words.inner_text().strip() == "tracks")
-        assert wrong == []
+        assert errors_and_requests == []
 
 
-def test_the_window_takes_a_permalink_from_its_frame_alone_and_no_more_than_that(browser, address):
+def test_window_accepts_permalinks_from_its_frame_only(browser, address):
     with shown(browser, address) as (frame, _):
         window = frame.page
         frame.evaluate("parent.postMessage({ hash: '//evil.example/x?y', title: '<b>told</b>' }, '*')")
@@ -246,8 +255,8 @@ def test_the_window_takes_a_permalink_from_its_frame_alone_and_no_more_than_that
         assert window.url == f"{address}#/evil.example/x?y"
 
 
-def test_the_cross_section_is_drawn_by_two_clicks_and_saved(browser, address):
-    with shown(browser, f"{address}#over=") as (frame, wrong):
+def test_cross_section_is_drawn_by_two_clicks_and_saved(browser, address):
+    with shown(browser, f"{address}#over=") as (frame, errors_and_requests):
         frame.click("#draw")
         box = frame.locator("#map").bounding_box()
         for share in (0.35, 0.65):
@@ -256,7 +265,7 @@ def test_the_cross_section_is_drawn_by_two_clicks_and_saved(browser, address):
         with frame.page.expect_download() as download:
             frame.click("#csv")
         header, *rows = Path(download.value.path()).read_text().splitlines()
-        assert wrong == []
+        assert errors_and_requests == []
     assert header == "distance_m,easting_m,northing_m,longitude_deg,latitude_deg,value_db"
     first, last = ([float(word) for word in row.split(",")] for row in (rows[0], rows[-1]))
     assert first[0] == 0
@@ -264,11 +273,11 @@ def test_the_cross_section_is_drawn_by_two_clicks_and_saved(browser, address):
     assert len(rows) > 10
 
 
-def test_the_map_is_moved_and_read_by_keys_alone(browser, address):
-    with shown(browser, address) as (frame, wrong):
+def test_map_is_operated_by_keyboard(browser, address):
+    with shown(browser, address) as (frame, errors_and_requests):
         frame.page.keyboard.press("Tab")
         until(frame, lambda: frame.evaluate("document.hasFocus() && document.activeElement.id") == "skip")
-        frame.page.keyboard.press("Enter")  # to the map
+        frame.page.keyboard.press("Enter")  # skip to the map
         until(frame, lambda: frame.evaluate("document.activeElement.id") == "map")
         before = frame.evaluate("location.hash")
         frame.page.keyboard.press("ArrowRight")
@@ -279,10 +288,10 @@ def test_the_map_is_moved_and_read_by_keys_alone(browser, address):
         frame.focus("#low")
         frame.page.keyboard.press("ArrowRight")
         assert frame.inner_text("#low-value") == frame.inner_text("#ramp-low")
-        assert wrong == []
+        assert errors_and_requests == []
 
 
-def test_text_of_strangers_stays_text(browser, finished, tmp_path):
+def test_hostile_text_is_displayed_as_text(browser, finished, tmp_path):
     root = copy_writable(finished.root, tmp_path / "campaign")
     path = root / "results" / "map" / "map.json"
     found = json.loads(path.read_text())
@@ -294,16 +303,16 @@ def test_text_of_strangers_stays_text(browser, finished, tmp_path):
     found["places"] = [{"name": HOSTILE, "source": HOSTILE, "image": None, "x_m": 0.0, "y_m": 0.0}]
     path.write_text(json.dumps(found))
     record_files(path.with_name("map.manifest.json"), [path])
-    with serving(root) as address, shown(browser, address) as (frame, wrong):
+    with serving(root) as address, shown(browser, address) as (frame, errors_and_requests):
         frame.wait_for_timeout(300)
         assert frame.inner_text("#campaign") == HOSTILE
         assert frame.inner_text("#flags dt") == HOSTILE
         assert frame.locator("img, body script").count() == 0
         assert frame.title() == frame.page.title() == f"{HOSTILE} · apertura map"
-        assert wrong == []
+        assert errors_and_requests == []
 
 
-def test_an_image_that_changed_after_the_map_was_made_is_told_and_not_shown(browser, finished, tmp_path):
+def test_image_changed_after_the_map_is_not_shown(browser, finished, tmp_path):
     root = copy_writable(finished.root, tmp_path / "campaign")
     path = root / "results" / "f01" / "fused" / "coherent_db.tif"
     path.with_name("noncoherent_db.tif").replace(path)
@@ -311,12 +320,12 @@ def test_an_image_that_changed_after_the_map_was_made_is_told_and_not_shown(brow
         frame.locator("#notices", has_text="changed since the map was made").wait_for(timeout=10_000)
 
 
-def test_without_webgl_the_page_says_so_and_still_tells_values(tool, address):
-    with browsing(tool, NO_GL) as browser, shown(browser, address) as (frame, wrong):
+def test_page_without_webgl_still_displays_values(tool, address):
+    with browsing(tool, NO_GL) as browser, shown(browser, address) as (frame, errors_and_requests):
         assert "no WebGL" in frame.inner_text("#notices")
         frame.locator("#targets button").first.click()
         frame.wait_for_selector("#targets .peak[data-east]", timeout=10_000)
-        assert wrong == []
+        assert errors_and_requests == []
 
 
 NAVIGATIONS = {
@@ -357,7 +366,7 @@ ADD = "const add = (name, with_) => document.body.appendChild(Object.assign(docu
 
 
 class Listener(ThreadingHTTPServer):
-    """A port of this machine, what connects to it or sends to it, and what is asked of it: an empty page."""
+    """Local server of an empty page that records its connections, datagrams and requests."""
 
     daemon_threads = True
 
@@ -368,17 +377,17 @@ class Listener(ThreadingHTTPServer):
         self.datagrams = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.datagrams.bind(("127.0.0.1", self.server_port))
 
-    def verify_request(self, _, asker):
-        self.connections.append(asker)
+    def verify_request(self, _, client):
+        self.connections.append(client)
         return True
 
-    def heard(self):
+    def received(self):
         with suppress(BlockingIOError):
             self.connections.append(self.datagrams.recv(9, socket.MSG_DONTWAIT))
         return self.connections
 
     def handle_error(self, *_):
-        """Say nothing of whoever connects and asks for nothing."""
+        """Ignore clients that connect without a request."""
 
 
 class Answer(BaseHTTPRequestHandler):
@@ -393,7 +402,7 @@ class Answer(BaseHTTPRequestHandler):
     do_POST = do_GET
 
     def log_message(self, *_):
-        """Say nothing."""
+        """Print nothing."""
 
 
 @contextmanager
@@ -410,7 +419,7 @@ def listening():
 
 
 def attack(frame, code, url):
-    """Run code in a page as the page's own; whether it throws, or ends the page, is all the same."""
+    """Run code in a page as its own script; ignore exceptions and a closed page."""
     from playwright.sync_api import Error
 
     with suppress(Error):
@@ -418,34 +427,38 @@ def attack(frame, code, url):
 
 
 @pytest.mark.parametrize("code", [pytest.param(code, id=name) for name, code in (NAVIGATIONS | REQUESTS).items()])
-def test_nothing_in_the_map_reaches_another_server(browser, address, code):
+def test_scripts_in_the_map_reach_no_other_server(browser, address, code):
     if int(browser.version.partition(".")[0]) < 152:
-        pytest.skip("this Chromium knows no connection allowlist")
+        pytest.skip("this Chromium does not support connection allowlists")
     with listening() as plain, listening() as other, browser.new_context() as context:
         page = context.new_page()
         page.goto(plain.url)
         attack(page.main_frame, code, other.url)
-        until(page, other.heard)  # where nothing hinders it
+        until(page, other.received)  # control: reached without the map's restrictions
     with listening() as other, browser.new_context() as context, shown(context, address) as (frame, _):
         window = frame.page
         until(frame, lambda: "#image=" in window.url)
         before = window.url
         attack(frame, code, other.url)
         window.wait_for_timeout(500)
-        assert (other.heard(), other.requests) == ([], [])
+        assert (other.received(), other.requests) == ([], [])
         assert (window.url, context.pages) == (before, [window])
 
 
 @pytest.fixture(scope="module")
-def older(tool):
-    """A browser that knows no connection allowlist."""
+def browser_without_allowlist(tool):
+    """Start a browser without support of connection allowlists."""
     with browsing(tool, (*SOFTWARE_GL, "--disable-features=ConnectionAllowlists")) as browser:
         yield browser
 
 
 @pytest.mark.parametrize("code", [pytest.param(code, id=name) for name, code in NAVIGATIONS.items()])
-def test_the_map_leads_nowhere_in_a_browser_that_knows_no_connection_allowlist(older, address, code):
-    with listening() as other, older.new_context() as context, shown(context, address) as (frame, _):
+def test_map_cannot_navigate_without_connection_allowlist(browser_without_allowlist, address, code):
+    with (
+        listening() as other,
+        browser_without_allowlist.new_context() as context,
+        shown(context, address) as (frame, _),
+    ):
         window = frame.page
         until(frame, lambda: "#image=" in window.url)
         before = window.url
@@ -455,28 +468,28 @@ def test_the_map_leads_nowhere_in_a_browser_that_knows_no_connection_allowlist(o
         assert (window.url, context.pages) == (before, [window])
 
 
-def test_a_frame_without_a_place_on_earth_has_x_and_y_and_no_north(browser, shared, tmp_path):
+def test_local_frame_is_labelled_with_x_and_y(browser, shared, tmp_path):
     root = Path(shutil.copytree(ROOT / "examples/gotcha", tmp_path / "gotcha"))
     (root / "raw/pass1").mkdir(parents=True)
     for path in (shared / "gotcha_afrl").glob("*.mat"):
         shutil.copyfile(path, root / f"raw/pass1/aircraft.{path.name}")
     run_steps(root)
-    with serving(root) as address, shown(browser, address) as (frame, wrong):
+    with serving(root) as address, shown(browser, address) as (frame, errors_and_requests):
         frame.locator("#targets button").first.click()
         until(frame, lambda: "cm along x" in frame.inner_text("#targets"))
         words = frame.inner_text("body").split()
-        assert wrong == []
+        assert errors_and_requests == []
     assert not {"E", "N", "east,", "north"} & set(words)
     assert words.count("from") >= 3  # colours from; from x, from y
 
 
-def test_the_map_does_not_see_the_window_around_it(browser, address):
+def test_map_cannot_read_the_window_that_contains_it(browser, address):
     with shown(browser, address) as (frame, _):
         seen = "try { parent.document.title } catch (error) { return error.name } return 'seen'"
         assert frame.evaluate(f"() => {{ {seen} }}") == "SecurityError"
 
 
-def test_a_page_that_came_with_the_results_is_not_shown_and_its_address_leads_to_the_map(browser, finished, tmp_path):
+def test_page_in_the_results_is_not_shown(browser, finished, tmp_path):
     root = copy_writable(finished.root, tmp_path / "campaign")
     for name in ("index.html", "shell.html", "app.js", "shell.js", "app.css"):
         (root / "results" / "map" / name).write_text("document.title='hacked'")
@@ -489,8 +502,8 @@ def test_a_page_that_came_with_the_results_is_not_shown_and_its_address_leads_to
         page.close()
 
 
-def test_a_page_of_a_look_shows_what_came_since_and_keeps_what_the_reader_chose(browser, tmp_path, monkeypatch):
-    """A campaign of which half the pulses are there, then all: the page changes without being loaded again."""
+def test_preview_page_updates_and_keeps_the_selection(browser, tmp_path, monkeypatch):
+    """First half of the pulses, then all: the page updates without being reloaded."""
     monkeypatch.setattr(preview_pair, "AT_ONCE", 60)
     root = simulate(tmp_path / "campaign", preset("demo", pulses=120), seed=1)
     preview = Preview(Campaign.load(root), follow=True, every_s=1.0, end_after_s=1e6)
@@ -498,7 +511,7 @@ def test_a_page_of_a_look_shows_what_came_since_and_keeps_what_the_reader_chose(
         node.read()
     assert all(pair.add_next(ended=True) for pair in preview.pairs)
     preview.show(ended=False, elapsed_s=1.0)
-    with serving(root, "--preview") as address, shown(browser, address) as (frame, wrong):
+    with serving(root, "--preview") as address, shown(browser, address) as (frame, errors_and_requests):
         frame.locator("#image").select_option("f01/uav1-uav2")
         frame.locator("#low").fill(str(float(frame.locator("#low").get_attribute("min"))))
         low = frame.locator("#low").input_value()
@@ -509,10 +522,10 @@ def test_a_page_of_a_look_shows_what_came_since_and_keeps_what_the_reader_chose(
         preview.show(ended=True, elapsed_s=1.0)
         changed = json.loads(document.read_text())
         assert changed["again_s"] is None
-        words = next(one["reason"] for one in changed["images"] if one["image"] == "uav1-uav2")
-        assert words not in before
-        until(frame, lambda: words in frame.locator("#verdict").text_content())
+        reason = next(image["reason"] for image in changed["images"] if image["image"] == "uav1-uav2")
+        assert reason not in before
+        until(frame, lambda: reason in frame.locator("#verdict").text_content())
         assert frame.locator("#image").input_value() == "f01/uav1-uav2"
         assert float(frame.locator("#low").input_value()) == pytest.approx(float(low), abs=0.5)
         assert frame.locator("#notices").text_content() == ""
-    assert wrong == []
+    assert errors_and_requests == []

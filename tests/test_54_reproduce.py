@@ -148,8 +148,8 @@ def test_nothing_is_overwritten(root, fake_run, tmp_path):
     (tmp_path / "full" / "note.txt").write_text("mine")
     product = root / PAIR / "db.tif"
     assert "not empty" in complaint(lambda: print_reproduced(product, cores=1, keep=tmp_path / "full"))
-    assert "outside the campaign" in complaint(lambda: print_reproduced(product, cores=1, keep=root / "fake_run"))
-    assert not (root / "fake_run").exists()
+    assert "outside the campaign" in complaint(lambda: print_reproduced(product, cores=1, keep=root / "recomputed"))
+    assert not (root / "recomputed").exists()
     assert fake_run == []
 
 

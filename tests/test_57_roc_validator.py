@@ -1,4 +1,4 @@
-"""The crate of a finished campaign, as the community's validator judges it."""
+"""Validation of the RO-Crate of a finished campaign by roc-validator."""
 
 import json
 import subprocess
@@ -12,24 +12,24 @@ from apertura.formats.catalog import CRATE
 
 @pytest.fixture
 def finished(finished_tiny, tmp_path):
-    """The tiny campaign with all its results, to be spoilt at will."""
+    """Return a writable copy of the tiny campaign with all its results."""
     return copy_writable(finished_tiny.root, tmp_path / "campaign")
 
 
-def edit(path):
+def change_byte(path):
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 1
     path.write_bytes(data)
 
 
 @pytest.mark.slow
-def test_roc_validator_passes_and_fails_with_one_file_changed(finished):
+def test_roc_validator_accepts_the_crate_and_reports_a_changed_file(finished):
     try:
         validator.make_environment()
     except (OSError, subprocess.CalledProcessError) as error:
         pytest.skip(f"roc-validator cannot be installed here: {str(getattr(error, 'stderr', error))[-300:]}")
     assert validator.issues(finished / "results") == []
-    edit(finished / "results/f01/uav1-uav1/db.tif")
+    change_byte(finished / "results/f01/uav1-uav1/db.tif")
     (problem,) = validator.issues(finished / "results")
     assert problem.endswith("f01/uav1-uav1/db.tif: is not the file that was made")
     path = finished / "results" / CRATE

@@ -1,4 +1,4 @@
-"""The campaigns of examples/, whose configs are in the repository and whose data are not."""
+"""Example campaigns of examples/: alignment, image formation and target positions with their measured data."""
 
 import runpy
 import shutil
@@ -37,7 +37,7 @@ def reflector(root):
 
 
 def response(root, point):
-    """Where the reflector is brightest (m off), how far above the image's median (dB), its widths at -3 dB (m)."""
+    """Return position error (m), level above the image median (dB) and -3 dB widths (m) of the reflector."""
     image = abs(open_stage(Campaign.load(root).stage("image", "passA", "radar-radar"), "image").image)
     near = image.where((abs(image.x - point[0]) < 0.3) & (abs(image.y - point[1]) < 0.3), 0.0).values
     row, column = np.unravel_index(near.argmax(), near.shape)
@@ -48,39 +48,42 @@ def response(root, point):
 
 
 def width(cut, peak):
-    """Samples between the -3 dB points on both sides of a peak."""
-    least = cut[peak] / np.sqrt(2)
-    left = peak - int((cut[peak::-1] < least).argmax())
-    right = peak + int((cut[peak:] < least).argmax())
-    inner = (least - cut[left]) / (cut[left + 1] - cut[left]), (least - cut[right]) / (cut[right - 1] - cut[right])
+    """Return the width between the -3 dB points of a peak in samples."""
+    threshold = cut[peak] / np.sqrt(2)
+    left = peak - int((cut[peak::-1] < threshold).argmax())
+    right = peak + int((cut[peak:] < threshold).argmax())
+    inner = (
+        (threshold - cut[left]) / (cut[left + 1] - cut[left]),
+        (threshold - cut[right]) / (cut[right - 1] - cut[right]),
+    )
     return right - left - sum(inner)
 
 
 @pytest.mark.slow
-def test_the_rail_pass_is_aligned_by_its_reflector_as_its_config_says(rail_pass):
+def test_rail_pass_alignment_agrees_with_its_config(rail_pass):
     campaign = Campaign.load(rail_pass)
-    found, stated = align(campaign, "passA", "radar", point=tuple(reflector(rail_pass)))
-    assert not found.flags
-    assert found.offset_s == pytest.approx(4.4535, abs=1e-3)
+    alignment, stated = align(campaign, "passA", "radar", point=tuple(reflector(rail_pass)))
+    assert not alignment.flags
+    assert alignment.offset_s == pytest.approx(4.4535, abs=1e-3)
     assert float(stated["offset_s"]) == pytest.approx(campaign.clock("passA", "radar").offset_ns * 1e-9, abs=1e-3)
     assert stated["path_offset_m"] == pytest.approx(campaign.settings.nodes["radar"].path_offset_m.radar, abs=2e-3)
 
 
 @pytest.mark.slow
-def test_a_path_that_was_frozen_leaves_only_the_clock_to_be_found(rail_pass):
-    """As another pass of the same radar needs it."""
+def test_alignment_with_fixed_path_offset_estimates_the_clock(rail_pass):
+    """Case of a further pass of the same radar."""
     (rail_pass / "config/clocks.tsv").unlink()
     campaign = Campaign.load(rail_pass)
-    found, stated = align(campaign, "passA", "radar", point=tuple(reflector(rail_pass)), search_m=0.0)
-    write_clock(campaign, "passA", "radar", offset_s=stated["offset_s"], std_s=found.offset_width_s)
-    kept, stated_before = Campaign.load(rail_pass).clock("passA", "radar"), 1563913933.0905
-    assert kept.offset_ns * 1e-9 == pytest.approx(stated_before, abs=2e-3)
-    assert kept.std_s == pytest.approx(found.offset_width_s, abs=1e-6)
+    alignment, stated = align(campaign, "passA", "radar", point=tuple(reflector(rail_pass)), search_m=0.0)
+    write_clock(campaign, "passA", "radar", offset_s=stated["offset_s"], std_s=alignment.offset_width_s)
+    written, expected_s = Campaign.load(rail_pass).clock("passA", "radar"), 1563913933.0905
+    assert written.offset_ns * 1e-9 == pytest.approx(expected_s, abs=2e-3)
+    assert written.std_s == pytest.approx(alignment.offset_width_s, abs=1e-6)
     assert stated["path_offset_m"] == 3.8194
 
 
 @pytest.mark.slow
-def test_the_reflector_of_the_rail_pass_is_where_it_was_tracked(rail_pass):
+def test_reflector_of_the_rail_pass_is_imaged_at_its_position(rail_pass):
     assert problems(rail_pass) == []
     run_steps(rail_pass, exports=False)
     off_m, above_db, (across_m, along_m) = response(rail_pass, reflector(rail_pass))
@@ -90,17 +93,17 @@ def test_the_reflector_of_the_rail_pass_is_where_it_was_tracked(rail_pass):
     assert along_m < 0.10
 
 
-def test_a_drift_without_a_reflector_is_refused(rail_pass):
+def test_drift_estimation_without_a_reflector_is_refused(rail_pass):
     message = complaint(lambda: align(Campaign.load(rail_pass), "passA", "radar", drift=True))
     assert "--point" in message
 
 
 @pytest.mark.slow
-def test_the_rail_pass_is_aligned_by_its_sharpness_alone_within_ten_centimetres(rail_pass):
+def test_rail_pass_is_aligned_by_image_sharpness_within_10_cm(rail_pass):
     (rail_pass / "config/clocks.tsv").unlink()
     campaign = Campaign.load(rail_pass)
-    found, stated = align(campaign, "passA", "radar", search_m=6.0)
-    write_clock(campaign, "passA", "radar", offset_s=stated["offset_s"], std_s=found.offset_width_s)
+    alignment, stated = align(campaign, "passA", "radar", search_m=6.0)
+    write_clock(campaign, "passA", "radar", offset_s=stated["offset_s"], std_s=alignment.offset_width_s)
     config = rail_pass / "config/config.yaml"
     config.write_text(config.read_text().replace("radar: 3.8194", f"radar: {stated['path_offset_m']:.4f}"))
     run_steps(rail_pass, exports=False)
@@ -108,19 +111,19 @@ def test_the_rail_pass_is_aligned_by_its_sharpness_alone_within_ten_centimetres(
 
 
 @pytest.mark.slow
-def test_targets_seen_from_a_real_px4_flight_are_within_a_centimetre(shared, tmp_path):
+def test_targets_of_a_real_px4_trajectory_are_within_a_centimetre(shared, tmp_path):
     runpy.run_path(str(EXAMPLES / "px4_flight" / "replay.py"))["replay"](
         shared / "px4_real_flight" / "esc_status_log.ulg", tmp_path / "replayed"
     )
     assert problems(tmp_path / "replayed") == []
     run_steps(tmp_path / "replayed")
-    found = [row for row in score(Campaign.load(tmp_path / "replayed")) if row.image == "uav1-uav1"]
-    assert len(found) == 3
-    assert max(row.error_m for row in found) < 0.01
+    findings = [row for row in score(Campaign.load(tmp_path / "replayed")) if row.image == "uav1-uav1"]
+    assert len(findings) == 3
+    assert max(row.error_m for row in findings) < 0.01
 
 
 @pytest.mark.slow
-def test_gotcha_is_without_problems(shared, tmp_path):
+def test_gotcha_example_has_no_problems(shared, tmp_path):
     root = tmp_path / "gotcha"
     shutil.copytree(EXAMPLES / "gotcha", root)
     folder = root / "raw" / "pass1"

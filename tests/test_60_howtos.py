@@ -1,4 +1,4 @@
-"""How-tos that bring their own data run as they stand, and print what they show."""
+"""How-tos with their own data: every code block runs and prints the output shown."""
 
 from pathlib import Path
 
@@ -10,7 +10,7 @@ HOWTOS = Path(__file__).parents[1] / "docs/howto"
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["bench", "calibration_flight", "dem", "gis", "notebook"])
-def test_every_block_of_a_how_to_runs_and_prints_what_it_shows(name, tmp_path, monkeypatch):
+def test_code_blocks_of_a_how_to_print_what_they_show(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert len(list(blocks(HOWTOS / f"{name}.md"))) > 1
     walk(HOWTOS / f"{name}.md")

@@ -1,4 +1,4 @@
-"""The tutorial runs as it stands: every block in order, and what it shows is what it prints."""
+"""Tutorial: every code block runs in order and prints the output shown."""
 
 import re
 import shutil
@@ -17,8 +17,8 @@ PROJECT = Path(__file__).parents[1] / "examples/qgis_project.py"
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not native.available(), reason="the plan that is shown takes the compiled engine")
-def test_every_block_of_the_tutorial_runs_and_prints_what_it_shows(tmp_path, monkeypatch):
+@pytest.mark.skipif(not native.available(), reason="the plan in the tutorial uses the compiled engine")
+def test_code_blocks_of_the_tutorial_print_what_they_show(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     names = walk(TUTORIAL)
     with rasterio.open(tmp_path / "both.tif") as raster:
@@ -27,16 +27,16 @@ def test_every_block_of_the_tutorial_runs_and_prints_what_it_shows(tmp_path, mon
 
 
 def with_qgis():
-    """Return the Python that QGIS came with, or None."""
+    """Return the Python interpreter of QGIS, or None if QGIS is not installed."""
     python = shutil.which("python3", path="/usr/bin")
-    asked = [python or "false", "-c", "import qgis.core"]
-    return python if subprocess.run(asked, capture_output=True, check=False).returncode == 0 else None
+    command = [python or "false", "-c", "import qgis.core"]
+    return python if subprocess.run(command, capture_output=True, check=False).returncode == 0 else None
 
 
-def test_the_tutorial_ends_with_a_qgis_project_of_every_image_in_its_place(finished_tiny, tmp_path):
+def test_qgis_project_of_the_tutorial_contains_every_image(finished_tiny, tmp_path):
     python = with_qgis()
     if python is None:
-        pytest.skip("no QGIS: its Python is not on this machine")
+        pytest.skip("QGIS with its Python is not installed")
     campaign = tmp_path / "a campaign"
     for path in finished_tiny.root.glob("results/*/*/*db.tif"):
         copied = campaign / path.relative_to(finished_tiny.root)

@@ -1,4 +1,4 @@
-"""docs/howto/your_own_recording.md runs as it stands, on plain files of a simulated flight, and finds the target."""
+"""docs/howto/your_own_recording.md: its code runs on plain files of a simulated flight and images the target."""
 
 import json
 import os
@@ -21,27 +21,27 @@ HOWTO = Path(__file__).parents[1] / "docs/howto/your_own_recording.md"
 
 
 def plain_files(folder):
-    """Write what the how-to begins with, and return where the brightest target stands."""
+    """Write the input files of the how-to and return the position of the brightest target."""
     plan = replace(preset("demo", pulses=60), scene=ImageGrid("EPSG:32632", half_width_m=3.0, spacing_m=0.1))
-    made = simulate(folder / "simulated", plan, seed=7)
+    simulated = simulate(folder / "simulated", plan, seed=7)
     for node in ("uav1", "uav2"):
-        stem = made / "raw/f01" / node
+        stem = simulated / "raw/f01" / node
         (stem.with_suffix(".sigmf-data")).rename(folder / f"{node}.iq")
         tags = [
             capture["core:datetime"][:-1]
             for capture in json.loads(stem.with_suffix(".sigmf-meta").read_text())["captures"]
         ]
         (folder / f"{node}_tags.txt").write_text("\n".join(tags) + "\n")
-    shutil.copy(made / "raw/f01/uav2.track.pos", folder / "uav2_solution.pos")
-    shutil.copy(made / "raw/codes.npy", folder / "codes.npy")
-    rows = [line.split(",") for line in (made / "raw/f01/uav1.track.csv").read_text().splitlines()[1:]]
+    shutil.copy(simulated / "raw/f01/uav2.track.pos", folder / "uav2_solution.pos")
+    shutil.copy(simulated / "raw/codes.npy", folder / "codes.npy")
+    rows = [line.split(",") for line in (simulated / "raw/f01/uav1.track.csv").read_text().splitlines()[1:]]
     seconds = (
         np.array([row[0][:-1] for row in rows], "datetime64[us]") - np.datetime64("2025-05-14T09:30")
     ) / np.timedelta64(1, "s")
     lines = [f"{second:.6f} {' '.join(row[1:])}" for second, row in zip(seconds, rows, strict=True)]
     (folder / "uav1_log.txt").write_text("\n".join(lines) + "\n")
-    target = json.loads((made / "truth.json").read_text())["targets"][0]
-    shutil.rmtree(made)
+    target = json.loads((simulated / "truth.json").read_text())["targets"][0]
+    shutil.rmtree(simulated)
     return target
 
 
@@ -54,7 +54,7 @@ def run_commands(block):
 
 
 @pytest.mark.slow
-def test_every_block_of_the_how_to_runs_and_the_target_is_where_it_stands(tmp_path, monkeypatch):
+def test_code_blocks_of_the_how_to_run_and_image_the_target(tmp_path, monkeypatch):
     target = plain_files(tmp_path)
     monkeypatch.chdir(tmp_path)
     names, text = {}, HOWTO.read_text(encoding="utf-8")
@@ -71,8 +71,8 @@ def test_every_block_of_the_how_to_runs_and_the_target_is_where_it_stands(tmp_pa
     assert np.hypot(float(names["peak"].x) - target["x"], float(names["peak"].y) - target["y"]) < 0.1
 
 
-def test_what_is_written_is_what_was_recorded(tmp_path, monkeypatch):
-    """Samples bit for bit, tags to the nanosecond, positions to 10 µm."""
+def test_written_campaign_equals_the_recorded_files(tmp_path, monkeypatch):
+    """Samples and time tags exactly, attitude to 1e-4°."""
     plain_files(tmp_path)
     monkeypatch.chdir(tmp_path)
     names, text = {}, HOWTO.read_text(encoding="utf-8")
