@@ -333,9 +333,9 @@ def test_preview_waits_for_missing_files(tiny):
     preview = Preview(Campaign.load(tiny), follow=True, every_s=1.0)
     threading.Timer(2.0, preview.finish.set).start()
     preview.run()
-    statuses = json.loads((tiny / "results/preview/status.json").read_text())["pairs"]["f01/uav1-uav1"]
-    assert "no such file" in statuses["waits"] or "track" in statuses["waits"]
-    assert statuses["image"] is None
+    status = json.loads((tiny / "results/preview/status.json").read_text())["pairs"]["f01/uav1-uav1"]
+    assert "no such file" in status["waits"] or "track" in statuses["waits"]
+    assert status["image"] is None
     assert not earlier.exists()
 
 
@@ -346,9 +346,9 @@ def test_image_of_a_short_aperture_is_inconclusive(tiny, monkeypatch):
     for node in preview.nodes.values():
         node.read()
     assert preview.pairs[0].add_next(ended=True)
-    statuses = preview.pairs[0].shown.judged()
-    assert statuses["verdict"] == "inconclusive"
-    assert statuses["reason"].startswith("aperture too short")
+    focus = preview.pairs[0].shown.judged()
+    assert focus["verdict"] == "inconclusive"
+    assert focus["reason"].startswith("aperture too short")
 
 
 def test_focus_is_judged_once_the_aperture_suffices(tmp_path, monkeypatch):
@@ -360,9 +360,9 @@ def test_focus_is_judged_once_the_aperture_suffices(tmp_path, monkeypatch):
     monkeypatch.setattr(preview_pair, "AT_ONCE", 2048)
     while preview.pairs[0].add_next(ended=True) or preview.pairs[0].refine_next():
         pass
-    statuses = preview.pairs[0].judged()
-    assert statuses["verdict"] == "focused", statuses
-    assert statuses["judged_by"].endswith("fine")
+    focus = preview.pairs[0].judged()
+    assert focus["verdict"] == "focused", focus
+    assert focus["judged_by"].endswith("fine")
 
 
 @pytest.mark.slow
@@ -397,9 +397,9 @@ def test_delayed_pair_uses_every_second_pulse(tiny):
     preview = Preview(Campaign.load(tiny), follow=False)
     preview.decimated = 2
     preview.run()
-    statuses = json.loads((tiny / "results/preview/status.json").read_text())
-    assert statuses["one_pulse_in"] == 2
-    counts = statuses["pairs"]["f01/uav1-uav1"]["pulses"]
+    status = json.loads((tiny / "results/preview/status.json").read_text())
+    assert status["one_pulse_in"] == 2
+    counts = status["pairs"]["f01/uav1-uav1"]["pulses"]
     assert counts["added"] + counts["left_out"] == counts["recorded"]
     assert counts["added"] == counts["recorded"] // 2
     assert "1 pulse in 2 used" in (tiny / "results/preview/index.html").read_text()
@@ -476,9 +476,9 @@ def test_preview_writes_only_to_its_own_folder(finished_tiny, tmp_path):
     shown = {path.relative_to(root / "results/preview").as_posix() for path in (root / "results/preview").rglob("*.*")}
     images = {f"f01/uav1-uav{node}{end}" for node in (1, 2) for end in (".png", "/db.0.tif")}
     assert shown == {"index.html", "status.json", "map/map.json"} | images
-    statuses = json.loads((root / "results/preview/status.json").read_text())["pairs"]["f01/uav1-uav1"]
-    assert statuses["verdict"] in {"focused", "inconclusive"}
-    assert statuses["share"] == 1
+    status = json.loads((root / "results/preview/status.json").read_text())["pairs"]["f01/uav1-uav1"]
+    assert status["verdict"] in {"focused", "inconclusive"}
+    assert status["share"] == 1
 
 
 @pytest.mark.slow

@@ -31,7 +31,7 @@ def test_roc_validator_accepts_the_crate_and_reports_a_changed_file(finished):
     assert validator.issues(finished / "results") == []
     change_byte(finished / "results/f01/uav1-uav1/db.tif")
     (problem,) = validator.issues(finished / "results")
-    assert problem.endswith("f01/uav1-uav1/db.tif: is not the file that was made")
+    assert problem.endswith("f01/uav1-uav1/db.tif: sha256 differs from that of the bytes")
     path = finished / "results" / CRATE
     document = json.loads(path.read_text())
     document["@graph"] = [one for one in document["@graph"] if one["@id"] != "workflow/Snakefile"]

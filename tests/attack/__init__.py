@@ -1,1 +1,1 @@
-"""What strangers and faults do to a campaign, as programs: each can be run for minutes in the tests and for hours."""
+"""Programs that test campaigns with untrusted files and system faults: minutes within the tests, hours on their own."""

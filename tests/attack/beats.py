@@ -1,4 +1,4 @@
-"""Beat signals as bytes in all their formats, and how a file of each is read."""
+"""Beat signals as bytes in all formats, and readers of a file of each format."""
 
 import io
 from dataclasses import asdict
@@ -39,7 +39,7 @@ def arrays() -> list[bytes]:
 
 
 def times() -> list[bytes]:
-    """Return times of sweeps as .npy, written in two ways."""
+    """Return times of sweeps as .npy in two representations."""
     seconds = 1.7e9 + 0.002 * np.arange(_COUNT)
     return [_saved(seconds), _saved((1e9 * seconds).astype("datetime64[ns]"))]
 
@@ -69,24 +69,24 @@ def sounds() -> list[bytes]:
 
 
 def read_array(path: Path) -> Any:
-    """Read beats that come at a regular rate."""
+    """Read beats at a regular rate."""
     return read_beat_npy([path], pair="a-a", described=DESCRIBED)
 
 
 def read_times(path: Path) -> Any:
-    """Read times beside beats that are as they should be."""
+    """Read times together with a valid file of beats."""
     beside = path.with_name(path.name.replace(".time.npy", ".npy"))
     beside.write_bytes(arrays()[0])
     return read_beat_npy([beside, path], pair="a-a", described=DESCRIBED)
 
 
 def read_matlab(path: Path) -> Any:
-    """As `read_beat_mat`, in this process: whoever calls it lets it die."""
+    """Read like `read_beat_mat`, but in this process, which may crash."""
     return joined_sweeps([sweeps_of(path, _fields(read_beat_fields, path))], pair="a-a", described=DESCRIBED)
 
 
 def read_sound(path: Path) -> Any:
-    """As `read_beat_wav`, in this process."""
+    """Read like `read_beat_wav`, but in this process."""
     sweeps = cut_sweeps(path, _fields(read_wav, path), DESCRIBED)
     return joined_sweeps([sweeps], pair="a-a", described=DESCRIBED)
 
@@ -94,5 +94,5 @@ def read_sound(path: Path) -> Any:
 def _fields(read: Any, path: Path) -> Any:
     try:
         return read(path)
-    except Exception as error:  # of whatever kind: there it is the last line of a process
+    except Exception as error:  # of any type: the isolated reader reports it as its last line
         raise CampaignError(str(error), path, "beat signals", "Copy it again.") from error

@@ -1,4 +1,4 @@
-"""What kind of difference there is between the value of a valid file and that of a changed one that was accepted."""
+"""Classify differences between the value of a valid file and that of a modified file that was accepted."""
 
 import dataclasses
 from collections.abc import Iterator, Mapping
@@ -10,45 +10,45 @@ import xarray as xr
 from pydantic import BaseModel
 
 
-def leaves(value: object, way: str = "") -> Iterator[tuple[str, object]]:
-    """Yield way → leaf of a parsed value: numbers, texts, and arrays as their shape and bytes."""
+def leaves(value: object, path: str = "") -> Iterator[tuple[str, object]]:
+    """Yield the leaves of a parsed value with their paths: numbers, texts, and arrays as shape and bytes."""
     if isinstance(value, np.memmap | np.ndarray):
         array = np.asarray(value)
-        yield f"{way} (shape)", array.shape
-        yield f"{way} (values)", array.tobytes() if array.size < 100_000 else array[:1000].tobytes()
+        yield f"{path} (shape)", array.shape
+        yield f"{path} (values)", array.tobytes() if array.size < 100_000 else array[:1000].tobytes()
     elif isinstance(value, xr.Dataset):
-        yield from leaves({name: value[name].values for name in value.variables} | dict(value.attrs), way)
+        yield from leaves({name: value[name].values for name in value.variables} | dict(value.attrs), path)
     elif isinstance(value, BaseModel):
-        yield from leaves({name: getattr(value, name) for name in type(value).model_fields}, way)
+        yield from leaves({name: getattr(value, name) for name in type(value).model_fields}, path)
     elif dataclasses.is_dataclass(value):
-        yield from leaves({field.name: getattr(value, field.name) for field in dataclasses.fields(value)}, way)
+        yield from leaves({field.name: getattr(value, field.name) for field in dataclasses.fields(value)}, path)
     elif isinstance(value, Mapping):
-        yield f"{way} (keys)", tuple(map(str, value))
+        yield f"{path} (keys)", tuple(map(str, value))
         for key, part in value.items():
-            yield from leaves(part, f"{way}.{key}")
+            yield from leaves(part, f"{path}.{key}")
     elif isinstance(value, list | tuple):
-        yield f"{way} (length)", len(value)
+        yield f"{path} (length)", len(value)
         for index, part in enumerate(value):
-            yield from leaves(part, f"{way}[{index}]")
+            yield from leaves(part, f"{path}[{index}]")
     elif not isinstance(value, Path):
-        yield way, value
+        yield path, value
 
 
 def same(one: object, other: object) -> bool:
-    """Return whether two leaves are equal; NaN equals NaN."""
+    """Return True if two leaves are equal, where NaN equals NaN."""
     return type(one) is type(other) and (one == other or (one != one and other != other))  # noqa: PLR0124
 
 
 def kinds(before: dict[str, object], after: dict[str, object]) -> set[str]:
-    """Return in words how a value differs: nothing, if it does not.
+    """Return the kinds of difference between two values, an empty set if they are equal.
 
     Examples
     --------
     >>> kinds({"a": 1.0, "b": "x"}, {"a": 2.0, "b": "x"}), kinds({"a": 1}, {"a": 1})
     ({'a number'}, set())
     """
-    changed = [way for way in before.keys() & after.keys() if not same(before[way], after[way])]
-    found = {_kind(way, before[way], after[way]) for way in changed}
+    changed = [path for path in before.keys() & after.keys() if not same(before[path], after[path])]
+    found = {_kind(path, before[path], after[path]) for path in changed}
     if not any("more or fewer" in kind for kind in found) and before.keys() != after.keys():
         found.add("more or fewer parts")
     return found
@@ -62,12 +62,12 @@ _ENDINGS = {
 }
 
 
-def _kind(way: str, before: Any, after: Any) -> str:
-    name, _, ending = way.rpartition(" ")
+def _kind(path: str, before: Any, after: Any) -> str:
+    name, _, ending = path.rpartition(" ")
     if ending in _ENDINGS:
         return _ENDINGS[ending] + (f" {name.rpartition('.')[2]}" if ending == "(values)" else "")
     if before is None or after is None or isinstance(before, bool) or isinstance(after, bool):
-        return "a choice, or a key left out"
+        return "a choice, or an omitted key"
     if isinstance(before, str) and isinstance(after, str):
         return "a text"
     numbers = isinstance(before, int | float) and isinstance(after, int | float)

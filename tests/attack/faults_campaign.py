@@ -1,4 +1,4 @@
-"""The smallest campaign that has every step: a calibration flight, an imaging flight, a DEM, tiles."""
+"""Smallest campaign with every step: a calibration flight, an imaging flight, a DEM and tiles."""
 
 import json
 from dataclasses import replace
@@ -44,7 +44,7 @@ STEPS = (
     "stac",
     "ro-crate",
 )
-"""Every command of a run in its order."""
+"""All commands of a run in order."""
 
 TARGETS = (
     "ingest f01 uav2",
@@ -68,15 +68,15 @@ TARGETS = (
     "stac",
     "ro-crate",
 )
-"""One command of every kind."""
+"""One command per kind of step."""
 
 
 def make_campaign(folder: Path, *, pulses: int = 40, half_width_m: float = 1.6) -> Path:
     """Write the campaign: 64 x 64 pixels in four tiles."""
     plan = replace(preset("demo", pulses=pulses), scene=ImageGrid("EPSG:32632", half_width_m, spacing_m=0.05))
-    over = replace(plan.flights[0], name="c01", kind="calibration", targets=(PointTarget((0.0, 0.0, 0.0), 5.0),))
-    later = replace(plan.flights[0], start_utc="2025-05-14T10:00:00")
-    root = simulate(folder / "campaign", replace(plan, flights=(over, later)), seed=21)
+    calibration = replace(plan.flights[0], name="c01", kind="calibration", targets=(PointTarget((0.0, 0.0, 0.0), 5.0),))
+    imaging = replace(plan.flights[0], start_utc="2025-05-14T10:00:00")
+    root = simulate(folder / "campaign", replace(plan, flights=(calibration, imaging)), seed=21)
     truth = json.loads((root / "truth.json").read_text())["targets"][0]
     path = root / "config" / "config.yaml"
     document = yaml.safe_load(path.read_text())
@@ -90,6 +90,6 @@ def make_campaign(folder: Path, *, pulses: int = 40, half_width_m: float = 1.6) 
 
 def _write_dem(path: Path, bounds_m: list[float], height_m: float) -> None:
     west, north = np.floor(bounds_m[0]) - 10, np.ceil(bounds_m[3]) + 10
-    form = {"driver": "GTiff", "width": 40, "height": 40, "count": 1, "dtype": "float64", "crs": "EPSG:32632"}
-    with rasterio.open(path, "w", transform=from_origin(west, north, 1, 1), **form) as raster:
+    profile = {"driver": "GTiff", "width": 40, "height": 40, "count": 1, "dtype": "float64", "crs": "EPSG:32632"}
+    with rasterio.open(path, "w", transform=from_origin(west, north, 1, 1), **profile) as raster:
         raster.write(np.full((40, 40), height_m) + np.arange(40) * 0.01, 1)

@@ -1,4 +1,4 @@
-"""What makes calls fail: the library `faults.c`, and the page that says what shall happen and counts."""
+"""Control of fault injection: the library `faults.c` and the shared page with its settings and counters."""
 
 import ctypes
 import errno
@@ -9,7 +9,7 @@ import subprocess
 from pathlib import Path
 
 COUNT, KILL, FAIL, FAIL_ON, SHORT = range(5)
-"""At a call: nothing; SIGKILL; an error once; from then on; half of a write, and then no error."""
+"""Actions at a call: count only; SIGKILL; one error; errors from then on; a partial write without error."""
 
 WRITE, RENAME, FSYNC, TRUNCATE, MKDIR, OPEN, UNLINK = (1 << bit for bit in range(7))
 """Kinds of calls."""
@@ -17,11 +17,11 @@ WRITE, RENAME, FSYNC, TRUNCATE, MKDIR, OPEN, UNLINK = (1 << bit for bit in range
 ALL = (1 << 7) - 1
 
 ENVIRONMENT = "APERTURA_FAULTS"
-"""Names the file of the page."""
+"""Environment variable with the file name of the page."""
 
 
 class Page(ctypes.Structure):
-    """As `struct page` in faults.c."""
+    """The structure `struct page` of faults.c."""
 
     _fields_ = (
         *((name, ctypes.c_long) for name in ("armed", "action", "error", "kinds", "at", "count", "struck")),
@@ -34,7 +34,7 @@ def compiler():
 
 
 def build(folder: Path) -> dict[str, str]:
-    """Compile the library, make the page; return the environment of a process that has both."""
+    """Compile the library and write the page; return the environment of a process that uses them."""
     library, page = folder / "faults.so", folder / "page"
     source = Path(__file__).with_name("faults.c")
     subprocess.run([compiler(), "-shared", "-fPIC", "-O2", "-o", library, source, "-ldl"], check=True)
@@ -49,7 +49,7 @@ def shared_page() -> Page:
 
 
 def arm(page: Page, folder: Path, action: int, *, at: int = 0, error: int = errno.EIO, kinds: int = ALL) -> None:
-    """Let something happen at the `at`-th call (from 1) of some kinds below a folder."""
+    """Arm an action for the `at`-th call (from 1) of the given kinds below a folder."""
     page.action, page.at, page.error, page.kinds = action, at, error, kinds
     page.count = page.struck = 0
     page.folder = os.fsencode(folder.resolve())

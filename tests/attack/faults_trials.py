@@ -1,4 +1,4 @@
-"""Trials: a step that is disturbed at one call, and the step again; what it left, what it said, what it made."""
+"""Trials of fault injection: run a step with a fault at one call, rerun it, and check files and messages."""
 
 import errno
 import faulthandler
@@ -18,19 +18,19 @@ ROOM = 1 << 30
 PAGE = 4096
 
 LIMIT_S = 30
-"""A step takes a second; one that takes longer hangs."""
+"""Time limit of a step in seconds: steps take about 1 s."""
 
 
 @dataclass(frozen=True)
 class Ended:
-    """How a command ended: its exit status, or minus the signal that killed it, and what it said."""
+    """End of a command: exit status, or the negative number of the signal that killed it, and output."""
 
     status: int
     said: str
 
     @property
     def faults(self) -> list[str]:
-        """What is wrong with how it told an error of the machine."""
+        """Deviations from a single message with exit status 2."""
         errors = re.findall(r"^error: .*", self.said, re.MULTILINE)
         wrong = [] if self.status == 2 else [f"exit status {self.status}"]
         wrong += [] if len(errors) == 1 else [f"{len(errors)} messages"]
@@ -39,16 +39,16 @@ class Ended:
 
 @dataclass
 class Bench:
-    """A campaign with its results before and after every step, undisturbed.
+    """A campaign with the results of undisturbed runs before and after every step.
 
     Attributes
     ----------
     root
-        The campaign; its results are those of the trial.
+        Campaign folder; its results are those of the current trial.
     page
-        What shall happen to calls.
+        Settings of fault injection.
     before, after, calls
-        Step → folder that holds the results before it; files after it; how many calls it made.
+        Per step: folder with the results before it, files after it, and its number of calls.
     """
 
     root: Path
@@ -62,27 +62,27 @@ class Bench:
         return self.root / "results"
 
     def prepare(self, targets: tuple[str, ...] = TARGETS) -> None:
-        """Run every step up to the last of some once, undisturbed; keep what the trials of those need."""
+        """Run all steps up to the last target once without faults; keep results for the trials of the targets."""
         self.results.mkdir()
         for step in STEPS[: 1 + max(map(STEPS.index, targets))]:
             if step in targets:
                 self.before[step] = self.root.parent / f"before {step}"
                 shutil.copytree(self.results, self.before[step])
             arm(self.page, self.results, COUNT)
-            ended = self.run(step, limit_s=10 * LIMIT_S)  # in a fresh clone it compiles first
+            ended = self.run(step, limit_s=10 * LIMIT_S)  # the first run in a fresh clone compiles
             if ended.status:
                 raise RuntimeError(f"{step} fails undisturbed:\n{ended.said}")
             self.calls[step], self.after[step] = self.page.count, files(self.results)
 
     def reset(self, step: str) -> None:
-        """Bring the results back to what they were before a step; the folder itself may be a file system of its own."""
+        """Restore the results before a step; the results folder itself is kept, because it may be a mount point."""
         self.results.mkdir(exist_ok=True)
         for path in self.results.iterdir():
             shutil.rmtree(path) if path.is_dir() else path.unlink()
         shutil.copytree(self.before[step], self.results, dirs_exist_ok=True)
 
     def run(self, step: str, *, limit_s: float = LIMIT_S) -> Ended:
-        """Run a step in a child of this process, which has imported everything, with what is on the page."""
+        """Run a step in a fork of this process, which has imported all modules, with the settings of the page."""
         with tempfile.TemporaryFile() as said:
             child = os.fork()
             if not child:
@@ -96,42 +96,44 @@ class Bench:
             return Ended(os.waitstatus_to_exitcode(status), said.read().decode(errors="replace"))
 
     def half_written(self, step: str) -> list[str]:
-        """Return files with a final name that are not what the undisturbed step leaves."""
+        """Return files with a final name that differ from those of the undisturbed step."""
         expected = self.after[step]
-        there = {name: content for name, content in files(self.results).items() if ".wip/" not in name}
-        return [f"{name} is half-written" for name, content in there.items() if expected.get(name) != content]
+        finals = {name: content for name, content in files(self.results).items() if ".wip/" not in name}
+        return [f"{name} is incomplete" for name, content in finals.items() if expected.get(name) != content]
 
     def again(self, step: str) -> list[str]:
-        """Run the step undisturbed; return what is wrong with what it makes."""
+        """Run the step without faults; return the differences of its results."""
         ended = self.run(step)
         if ended.status:
             return [f"the next run ends with {ended.status}: {ended.said[-2000:]}"]
-        made, expected = files(self.results), self.after[step]
-        return [f"{name} differs" for name in sorted(made.keys() | expected) if made.get(name) != expected.get(name)]
+        written, expected = files(self.results), self.after[step]
+        return [
+            f"{name} differs" for name in sorted(written.keys() | expected) if written.get(name) != expected.get(name)
+        ]
 
     def killed(self, step: str, at: int) -> tuple[bool, list[str]]:
-        """Kill a step at a call, run it again; return whether it was killed, and what is wrong."""
+        """Kill a step at a call and rerun it; return True if it was killed, and the failures."""
         self.reset(step)
         arm(self.page, self.results, KILL, at=at)
         ended = self.run(step)
         return ended.status == -9, self.half_written(step) + self.again(step)
 
     def failed(self, step: str, at: int, action: int, *, error: int, kinds: int) -> tuple[str, list[str]]:
-        """Let a call of a step fail, run it again; return how it ended, and what is wrong."""
+        """Let a call of a step fail and rerun it; return the outcome and the failures."""
         self.reset(step)
         arm(self.page, self.results, action, at=at, error=error, kinds=kinds)
         ended = self.run(step)
         if not self.page.struck:
-            return "not met", []
-        how = "went on" if ended.status == 0 else "said so"
+            return "not reached", []
+        outcome = "continued" if ended.status == 0 else "reported"
         wrong = ended.faults if ended.status else []
         wrong = [f"{', '.join(wrong)}:\n{ended.said[-3000:]}"] if wrong else []
-        return how, wrong + self.half_written(step) + self.again(step)
+        return outcome, wrong + self.half_written(step) + self.again(step)
 
     def full(self, step: str, share: float) -> tuple[int, list[str]]:
-        """Run a step on a disk with room for a share of what it writes, then again with room; as `failed`.
+        """Run a step on a disk with space for a share of its output, and rerun it with enough space.
 
-        Returns the bytes that were free, and what is wrong.
+        Returns the free space in bytes and the failures.
         """
         grows = sum(map(len, self.after[step].values())) - sum(map(len, files(self.before[step]).values()))
         _mount(self.results, ROOM)
@@ -149,7 +151,7 @@ class Bench:
                 self.reset(step)
             wrong = ended.faults
             if os.strerror(errno.ENOSPC) not in ended.said:
-                wrong.append("the full disk is not named")
+                wrong.append("the message does not name the full disk")
             wrong = [f"{', '.join(wrong)}:\n{ended.said[-3000:]}"] if wrong else []
             wrong += self.half_written(step)
             _mount(self.results, ROOM, again=True)
@@ -159,16 +161,16 @@ class Bench:
 
 
 def files(folder: Path) -> dict[str, bytes]:
-    """Return path → bytes of what a run makes: all files but hidden ones and those in hidden folders.
+    """Return the contents of all files by path, except hidden files and folders.
 
-    Left out are receipts of shares of tiles, which say how many tiles their run formed, fewer after a kill; and what a
-    killed writer left in work in progress, which finishing it removes.
+    Excluded are receipts of tile shares, which contain the number of tiles formed, smaller after a kill; and partial
+    files of a killed writer in unfinished stages, which are removed when the stage is finished.
     """
     found = {}
     for path in folder.rglob("*"):
         name = path.relative_to(folder)
-        left = path.parent.name == "tiles" or (path.suffix == ".partial" and ".wip/" in name.as_posix())
-        if path.is_file() and not left and not any(part.startswith(".") for part in name.parts):
+        is_excluded = path.parent.name == "tiles" or (path.suffix == ".partial" and ".wip/" in name.as_posix())
+        if path.is_file() and not is_excluded and not any(part.startswith(".") for part in name.parts):
             found[name.as_posix()] = path.read_bytes()
     return found
 
@@ -179,7 +181,7 @@ def _mount(folder: Path, size: int, *, again: bool = False) -> None:
 
 
 def _command(words: list[str]) -> int:
-    """Return the exit status of a command line, as its process would have it."""
+    """Run a command line in this process and return its exit status."""
     from apertura.cli import main
 
     sys.argv = words

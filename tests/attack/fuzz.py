@@ -1,8 +1,8 @@
-"""Thousands of wrong files for each parser: every one is refused in one message, or read without harm.
+"""Fuzzing of all parsers: every malformed file is refused with one message or read without harm.
 
-``python -m tests.attack.fuzz --inputs 5000``, or ``--seconds 600`` for each parser, prints a table; inputs that do harm
-are written beside it. Files are read in a child process with bounded memory and time, so that a crash, a hang or a
-hunger for memory is seen and named.
+``python -m tests.attack.fuzz --inputs 5000``, or ``--seconds 600`` per parser, prints a table and saves harmful inputs.
+Files are read in a child process with bounded memory and time, so that a crash, a hang or excessive use of memory is
+detected and reported.
 """
 
 import argparse
@@ -29,25 +29,25 @@ from .mutators import mutated
 from .parsers import PARSERS, Parser
 
 SECONDS = 5.0
-"""Time that a file may take."""
+"""Time limit per file, in seconds."""
 
 MEMORY_BYTES = 2 << 30
-"""Memory that reading a file may take, besides that of the libraries."""
+"""Memory limit for reading a file, in addition to that of the libraries, in bytes."""
 
 LONGEST_MESSAGE = 3000
 
-_AT_ONCE = 500  # inputs between two looks at the clock
+_AT_ONCE = 500  # inputs between two checks of the time
 
 REGRESSIONS = Path(__file__).parent / "regressions"
-"""Inputs that once did harm: <parser>/<name>."""
+"""Inputs that were harmful in the past: <parser>/<name>."""
 
 HARM = ("traceback", "hang", "crash", "memory", "message")
-"""What must not happen; `message`: one that is too long or holds control characters."""
+"""Kinds of harm; `message`: too long or with control characters."""
 
 
 @dataclass
 class Tally:
-    """What became of the inputs of one parser."""
+    """Outcomes of the inputs of one parser."""
 
     parser: str
     results: Counter[str] = field(default_factory=Counter)
@@ -59,13 +59,13 @@ class Tally:
 
     @property
     def harm(self) -> int:
-        """Inputs that did any harm."""
+        """Number of harmful inputs."""
         return sum(self.results[kind] for kind in HARM)
 
 
 def inputs_of(name: str, seed: int) -> "Inputs":
-    """Return the endless inputs of a parser, each made from the seed and its number."""
-    row = zlib.crc32(name.encode())  # of the name, not its place in the table: a new parser changes no other's inputs
+    """Return the unlimited inputs of a parser, each generated from the seed and its number."""
+    row = zlib.crc32(name.encode())  # from the name, so that a new parser does not change other inputs
     return Inputs(PARSERS[name], PARSERS[name].seeds(), seed, row)
 
 
@@ -84,37 +84,37 @@ class Inputs:
 
 
 def fuzz(name: str, count: int, *, seed: int = 1) -> Tally:
-    """Read `count` wrong files of a parser and tell what became of them."""
+    """Read `count` malformed files with a parser and return the outcomes."""
     source = inputs_of(name, seed)
     return read_all(name, count, source.__getitem__, seeds=source.seeds)
 
 
 def fuzz_for(name: str, seconds: float, *, seed: int = 1) -> Tally:
-    """Read wrong files of a parser for so long, and tell what became of them."""
-    source, whole = inputs_of(name, seed), Tally(name)
-    while whole.seconds < seconds:
-        first = sum(whole.results.values())
+    """Read malformed files with a parser for a time in seconds and return the outcomes."""
+    source, total = inputs_of(name, seed), Tally(name)
+    while total.seconds < seconds:
+        first = sum(total.results.values())
         part = read_all(name, _AT_ONCE, lambda number, first=first: source[first + number], seeds=source.seeds)
-        whole.results += part.results
-        whole.different += part.different
-        whole.examples |= {kind: first + number for kind, number in part.examples.items()} | whole.examples
-        whole.harmful += [(first + number, kind, text) for number, kind, text in part.harmful]
-        whole.peak_mb, whole.seconds = max(whole.peak_mb, part.peak_mb), whole.seconds + part.seconds
-    return whole
+        total.results += part.results
+        total.different += part.different
+        total.examples |= {kind: first + number for kind, number in part.examples.items()} | total.examples
+        total.harmful += [(first + number, kind, text) for number, kind, text in part.harmful]
+        total.peak_mb, total.seconds = max(total.peak_mb, part.peak_mb), total.seconds + part.seconds
+    return total
 
 
 def read_all(name: str, count: int, source, *, seeds: Sequence[bytes]) -> Tally:
-    """Read inputs number 0 to `count` in child processes; after one has died, the next goes on behind its input."""
-    tally, done, begun = Tally(name), 0, time.perf_counter()
+    """Read inputs 0 to `count` in child processes; after a crash, the next process continues with the next input."""
+    tally, done, start_s = Tally(name), 0, time.perf_counter()
     with TemporaryDirectory(prefix="fuzz-") as folder:
         while done < count:
             pending = done
             for line in _child(PARSERS[name], range(done, count), source, seeds, Path(folder)):
                 _count(tally, json.loads(line), PARSERS[name])
                 done += 1
-            if done == pending:  # not even the valid files could be read
-                raise RuntimeError(f"{name}: the child process ends before its first input")
-    tally.seconds = time.perf_counter() - begun
+            if done == pending:  # the valid files could not be read
+                raise RuntimeError(f"{name}: the child process ended before its first input")
+    tally.seconds = time.perf_counter() - start_s
     return tally
 
 
@@ -133,7 +133,7 @@ def _count(tally: Tally, result: dict, parser: Parser) -> None:
 
 
 def _child(parser: Parser, numbers: range, source, seeds: Sequence[bytes], folder: Path) -> Iterator[str]:
-    """Yield one line per input read in a child process, and one for the input that it died of."""
+    """Yield one line per input read in a child process, and one for the input that ended it."""
     receiver, sender = os.pipe()
     sys.stdout.flush()
     child = os.fork()
@@ -169,7 +169,7 @@ def _read_inputs(parser: Parser, numbers: range, source, seeds: Sequence[bytes],
     for data in seeds:
         path.write_bytes(data)
         valid.append(dict(leaves(parser.read(path))))
-    os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # what libraries say of each file
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # messages of libraries
     used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (used + MEMORY_BYTES, resource.RLIM_INFINITY))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
@@ -201,7 +201,7 @@ def _outcome(parser: Parser, path: Path, valid: list[dict[str, object]]) -> dict
 
 
 def table(tallies: Sequence[Tally]) -> str:
-    """Return results as a Markdown table, and kinds of difference below it."""
+    """Return the outcomes as a Markdown table, followed by the kinds of difference."""
     heads = ("parser", "inputs", "refused", "same", "different", *HARM, "peak MB", "s")
     rows = [heads, tuple("---" for _ in heads)]
     for tally in tallies:
@@ -215,33 +215,37 @@ def table(tallies: Sequence[Tally]) -> str:
     return "\n".join(lines)
 
 
-def _arguments(given: Sequence[str] | None) -> argparse.Namespace:
-    asked = argparse.ArgumentParser(description=__doc__.split("\n")[0] if __doc__ else None)
-    asked.add_argument("--inputs", type=int, default=5000, help="inputs per parser")
-    asked.add_argument("--seconds", type=float, help="for so long for each parser, instead of a number of inputs")
-    asked.add_argument("--parser", action="append", choices=sorted(PARSERS), help="one parser, or several")
-    asked.add_argument("--seed", type=int, default=1)
-    asked.add_argument("--save", type=Path, default=Path("build/fuzz"), help="folder of inputs that do harm")
-    return asked.parse_args(given)
+def _arguments(words: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0] if __doc__ else None)
+    parser.add_argument("--inputs", type=int, default=5000, help="inputs per parser")
+    parser.add_argument("--seconds", type=float, help="time per parser instead of a number of inputs")
+    parser.add_argument("--parser", action="append", choices=sorted(PARSERS), help="one parser, or several")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--save", type=Path, default=Path("build/fuzz"), help="folder of harmful inputs")
+    return parser.parse_args(words)
 
 
 def main(given: Sequence[str] | None = None) -> int:
-    """Fuzz parsers and print a table; return 1 if an input did harm."""
-    asked = _arguments(given)
+    """Fuzz parsers and print a table; return 1 if an input was harmful."""
+    arguments = _arguments(given)
     tallies = []
-    for name in asked.parser or PARSERS:
-        timed = asked.seconds is not None
-        tally = fuzz_for(name, asked.seconds, seed=asked.seed) if timed else fuzz(name, asked.inputs, seed=asked.seed)
+    for name in arguments.parser or PARSERS:
+        timed = arguments.seconds is not None
+        tally = (
+            fuzz_for(name, arguments.seconds, seed=arguments.seed)
+            if timed
+            else fuzz(name, arguments.inputs, seed=arguments.seed)
+        )
         tallies.append(tally)
-        seen: set[str] = set()
+        printed: set[str] = set()
         for number, kind, text in tally.harmful:
             last = text.strip().splitlines()[-1] if text.strip() else ""
-            path = asked.save / name / f"{asked.seed}-{number}"
+            path = arguments.save / name / f"{arguments.seed}-{number}"
             path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(inputs_of(name, asked.seed)[number])
-            if last[:60] not in seen:
+            path.write_bytes(inputs_of(name, arguments.seed)[number])
+            if last[:60] not in printed:
                 print(f"{name} input {number}: {kind}\n{text}", file=sys.stderr)
-            seen.add(last[:60])
+            printed.add(last[:60])
         print(f"{name}: {dict(tally.results)} in {tally.seconds:.0f} s", file=sys.stderr, flush=True)
     print(table(tallies))
     return int(any(tally.harm for tally in tallies))

@@ -1,4 +1,4 @@
-"""Flight logs of many makers, written as bytes from one list of epochs, for seeds and for tests of what comes back."""
+"""Flight logs in formats of several vendors, written from one list of epochs, as seeds and for tests of readers."""
 
 import functools
 import itertools
@@ -11,7 +11,7 @@ START = np.datetime64("2025-05-14T23:59:57", "ns")
 
 
 def circle(count: int = 40, rate_hz: int = 10) -> tuple[np.ndarray, np.ndarray]:
-    """Return times over midnight, and latitude, longitude (deg), height (m) of a node on a circle."""
+    """Return times across midnight, and latitude, longitude (deg) and height (m) of a node on a circle."""
     along = np.arange(count) / rate_hz
     turn = 0.3 * along
     geodetic = np.stack([48.4 + 1e-4 * np.sin(turn), 9.95 + 1.5e-4 * np.cos(turn), 600 + along], -1)
@@ -19,12 +19,12 @@ def circle(count: int = 40, rate_hz: int = 10) -> tuple[np.ndarray, np.ndarray]:
 
 
 def sealed(body: str) -> str:
-    """Return an NMEA sentence with its checksum, the exclusive or of its bytes."""
+    """Return an NMEA sentence with its checksum, the exclusive OR of its bytes."""
     return f"${body}*{functools.reduce(operator.xor, body.encode('latin-1'), 0):02X}"
 
 
 def degrees_minutes(angle: float, width: int, signs: str) -> str:
-    """Return an angle as NMEA writes it: ddmm.mmmmmmmm,N."""
+    """Return an angle in the format of NMEA: ddmm.mmmmmmmm,N."""
     degrees, minutes = divmod(round(abs(angle) * 60e8), 60 * 10**8)
     return f"{degrees:0{width}d}{minutes // 10**8:02d}.{minutes % 10**8:08d},{signs[int(angle < 0)]}"
 
@@ -38,7 +38,7 @@ def of_day(time: np.datetime64, digits: int = 2) -> str:
 def gga(
     time: np.datetime64, geodetic: Sequence[float], *, talker="GN", quality=4, separation="48.000", digits=2
 ) -> str:
-    """Return GGA of an ellipsoidal height that is `separation` above the sea's."""
+    """Return a GGA sentence of an ellipsoidal height with a geoid separation."""
     latitude, longitude, height = geodetic
     place = f"{degrees_minutes(latitude, 2, 'NS')},{degrees_minutes(longitude, 3, 'EW')}"
     heights = f"{height - float(separation or 0):.6f},M,{separation},{'M' if separation else ''}"
@@ -46,24 +46,24 @@ def gga(
 
 
 def rmc(time: np.datetime64, *, status: str = "A") -> str:
-    """Return RMC with little but its date."""
+    """Return an RMC sentence with status, time and date."""
     year, month, day = str(time)[2:10].split("-")
     return sealed(f"GNRMC,{of_day(time)},{status},,,,,,,{day}{month}{year},,,A")
 
 
 def zda(time: np.datetime64) -> str:
-    """Return ZDA."""
+    """Return a ZDA sentence."""
     year, month, day = str(time)[:10].split("-")
     return sealed(f"GPZDA,{of_day(time)},{day},{month},{year},00,00")
 
 
 def gst(time: np.datetime64, north: float, east: float, up: float) -> str:
-    """Return GST."""
+    """Return a GST sentence."""
     return sealed(f"GPGST,{of_day(time)},1.0,,,,{north},{east},{up}")
 
 
 def nmea(times: np.ndarray, geodetic: np.ndarray, *, every: int = 5, prefix: str = "", **written) -> str:
-    """Return a log with RMC before every `every`-th GGA and GST behind each."""
+    """Return a log with RMC before every `every`-th GGA and GST after each GGA."""
     lines = []
     for number, (time, place) in enumerate(zip(times, geodetic, strict=True)):
         lines += [rmc(time)] * (every > 0 and number % every == 0)
@@ -78,7 +78,7 @@ AIRDATA = (
 
 
 def airdata(times: np.ndarray, geodetic: np.ndarray, *, clock_ms: np.ndarray | None = None, satellites=17) -> str:
-    """Return a flight whose clock counts from its first epoch, with a message that holds a comma."""
+    """Return an Airdata export with times from the first epoch and a message that contains a comma."""
     clock = (times - times[0]).astype("timedelta64[ms]").astype(int) + 100 if clock_ms is None else clock_ms
     lines = [AIRDATA]
     for number, (time, (latitude, longitude, height)) in enumerate(zip(times, geodetic, strict=True)):
@@ -92,7 +92,7 @@ def airdata(times: np.ndarray, geodetic: np.ndarray, *, clock_ms: np.ndarray | N
 def capture(
     seconds: np.ndarray, bodies: dict[str, np.ndarray], *, unit: str = "Meters", lost: Sequence[int] = ()
 ) -> str:
-    """Return a take of Motive: per body (frame, 7) quaternion x, y, z, w and position x, y, z; a marker besides."""
+    """Return a Motive take: per body (frame, 7) quaternion x, y, z, w and position x, y, z; and a marker."""
     names = [name for name in bodies for _ in range(7)]
     rows = [
         f"Format Version,1.23,Take Name,a,Capture Start Time,2019-07-23 04.54.06.021 PM,Rotation Type,Quaternion,"
@@ -111,7 +111,7 @@ def capture(
 
 
 def poses(count: int = 12) -> dict[str, np.ndarray]:
-    """Return a body on a rail and one that stands still."""
+    """Return the poses of a body on a rail and of a stationary one."""
     along = np.linspace(0, 1, count)
     turned = np.stack([0 * along, np.sin(along / 2), 0 * along, np.cos(along / 2)], -1)
     rail = np.stack([along - 5, 0 * along + 1.8, -3 * along], -1)
@@ -120,7 +120,7 @@ def poses(count: int = 12) -> dict[str, np.ndarray]:
 
 
 def solution(times: np.ndarray, columns: np.ndarray, names: str, *, system="UTC", separator=" ", head=()) -> str:
-    """Return RTKLIB's solution with Q = 1 behind columns written with nine decimals."""
+    """Return an RTKLIB solution with Q = 1 after columns with nine decimals."""
     lines = ["% (lat/lon/height=WGS84/ellipsoidal,Q=1:fix,2:float)", *head]
     lines.append("%  " + separator.join([system, *names.split(), "Q"]))
     for time, row in zip(times, columns, strict=True):

@@ -1,4 +1,4 @@
-"""One valid file becomes many wrong ones: bytes in the manner of AFL, and parts where the format is known."""
+"""Mutators of valid files: changes of bytes in the manner of AFL, and changes of parts of known formats."""
 
 import csv
 import functools
@@ -44,8 +44,8 @@ LEAVES += [
 LEAVES += [[], {}, [[]], [1, 2, 3], {"a": 1}, [None] * 300, {"": {"": {}}}, "0001-01-01T00:00:00Z", "nowZ", "NaT", "١٢"]
 
 
-def _place(data: bytes, generator: np.random.Generator) -> int:
-    """Half of the places lie among the first bytes, where binary formats keep what counts."""
+def _offset(data: bytes, generator: np.random.Generator) -> int:
+    """Return a random offset; half of them are among the first bytes, which are the header of binary formats."""
     size = len(data)
     return int(generator.integers(0, min(size, 256) if generator.random() < 0.5 else size)) if size else 0
 
@@ -54,12 +54,12 @@ def flip(data: bytes, generator: np.random.Generator, tokens: Sequence[bytes]) -
     """Flip a few bits."""
     changed = bytearray(data)
     for _ in range(int(generator.integers(1, 5)) if data else 0):
-        changed[_place(data, generator)] ^= 1 << int(generator.integers(8))
+        changed[_offset(data, generator)] ^= 1 << int(generator.integers(8))
     return bytes(changed)
 
 
 def edge(data: bytes, generator: np.random.Generator, tokens: Sequence[bytes]) -> bytes:
-    """Overwrite bytes by a number at the edge of its type, in either order of bytes."""
+    """Overwrite bytes with an extreme value of a number type, in either byte order."""
     order = "<>"[int(generator.integers(2))]
     kind = "bhiqfd"[int(generator.integers(6))]
     if kind in "fd":
@@ -68,17 +68,17 @@ def edge(data: bytes, generator: np.random.Generator, tokens: Sequence[bytes]) -
     else:
         number = struct.pack(">q", EDGES[int(generator.integers(len(EDGES)))])[-struct.calcsize("=" + kind) :]
         number = number if order == ">" else number[::-1]
-    place = _place(data, generator)
+    place = _offset(data, generator)
     return data[:place] + number + data[place + len(number) :]
 
 
 def cut(data: bytes, generator: np.random.Generator, tokens: Sequence[bytes]) -> bytes:
-    """Keep only the beginning."""
+    """Truncate the data."""
     return data[: int(generator.integers(0, len(data) + 1))]
 
 
 def block(data: bytes, generator: np.random.Generator, tokens: Sequence[bytes]) -> bytes:
-    """Delete, double or move a block."""
+    """Delete, duplicate or move a block."""
     first, last = sorted(int(place) for place in generator.integers(0, len(data) + 1, 2))
     last = min(last, first + int(generator.integers(1, 200)))
     at = int(generator.integers(0, len(data) + 1))
@@ -90,22 +90,22 @@ def block(data: bytes, generator: np.random.Generator, tokens: Sequence[bytes]) 
 
 
 def token(data: bytes, generator: np.random.Generator, tokens: Sequence[bytes]) -> bytes:
-    """Insert a word, or write it over what is there."""
+    """Insert a token, or overwrite bytes with it."""
     known = [*tokens, *WORDS]
     word, place = known[int(generator.integers(len(known)))], int(generator.integers(0, len(data) + 1))
     return data[:place] + word + data[place + (len(word) if generator.random() < 0.5 else 0) :]
 
 
 def noise(data: bytes, generator: np.random.Generator, tokens: Sequence[bytes]) -> bytes:
-    """Write random bytes over some."""
+    """Overwrite some bytes with random ones."""
     size = int(generator.integers(1, 40))
-    place = _place(data, generator)
+    place = _offset(data, generator)
     return data[:place] + generator.bytes(size) + data[place + size :]
 
 
 def digit(data: bytes, generator: np.random.Generator, tokens: Sequence[bytes]) -> bytes:
-    """Write another digit, or another letter where there is none."""
-    places = [place for place, byte in enumerate(data[:100_000]) if 48 <= byte <= 57] or [_place(data, generator)]
+    """Replace a digit, or a letter if there is no digit."""
+    places = [place for place, byte in enumerate(data[:100_000]) if 48 <= byte <= 57] or [_offset(data, generator)]
     place = places[int(generator.integers(len(places)))]
     return data[:place] + b"%d" % generator.integers(10) + data[place + 1 :]
 
@@ -114,7 +114,7 @@ BYTES: tuple[Mutator, ...] = (flip, edge, cut, block, token, noise, digit)
 
 
 def _tree(document: object, generator: np.random.Generator) -> object:
-    """Replace, drop, double or rename a random part of a document."""
+    """Replace, delete, duplicate or rename a random part of a document."""
     ways = list(_ways(document, ()))
     way = ways[int(generator.integers(len(ways)))]
     leaf = LEAVES[int(generator.integers(len(LEAVES)))]
@@ -154,7 +154,7 @@ def _ways(document: object, way: tuple[object, ...]):
 
 
 def json_tree(data: bytes, generator: np.random.Generator, tokens: Sequence[bytes]) -> bytes:
-    """Change a part of a JSON document; bytes where it is none any more."""
+    """Change a part of a JSON document, or bytes if the data are not valid JSON."""
     try:
         text = json.dumps(_tree(json.loads(data), generator))
     except (ValueError, RecursionError, TypeError, OverflowError):
@@ -163,9 +163,9 @@ def json_tree(data: bytes, generator: np.random.Generator, tokens: Sequence[byte
 
 
 def yaml_tree(data: bytes, generator: np.random.Generator, tokens: Sequence[bytes]) -> bytes:
-    """Change a part of a YAML document, or name a part and repeat it; bytes where it is none any more."""
+    """Change a part of a YAML document, or repeat it with an alias; bytes if the data are not valid YAML."""
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-    if b"&b" in data or data.count(b"[") > 200 or len(data) > 100_000:  # would be expanded here
+    if b"&b" in data or data.count(b"[") > 200 or len(data) > 100_000:  # parsing would expand it
         return token(data, generator, tokens)
     try:
         document = yaml.load(data, Loader=loader)
@@ -182,7 +182,7 @@ def bomb(data: bytes, generator: np.random.Generator, tokens: Sequence[bytes]) -
 
 
 def cells(delimiter: str) -> Mutator:
-    """Return a mutator of tables with that delimiter; a space stands for columns of any width."""
+    """Return a mutator of tables with a delimiter; a space means columns separated by white space."""
 
     def mutate(data: bytes, generator: np.random.Generator, tokens: Sequence[bytes]) -> bytes:
         lines = data.decode("utf-8", "surrogateescape").split("\n")
@@ -224,7 +224,7 @@ def cells(delimiter: str) -> Mutator:
 
 
 def resealed(data: bytes, generator: np.random.Generator, tokens: Sequence[bytes]) -> bytes:
-    """Change cells of sentences and write their checksums anew: what else is wrong with them must be seen."""
+    """Change cells of sentences and update their checksums, so that the reader parses the changed cells."""
     lines = cells(",")(data, generator, tokens).split(b"\n")
     for number, line in enumerate(lines):
         stamp, dollar, rest = line.partition(b"$")
@@ -235,7 +235,7 @@ def resealed(data: bytes, generator: np.random.Generator, tokens: Sequence[bytes
 
 
 def quoted_cells(data: bytes, generator: np.random.Generator, tokens: Sequence[bytes]) -> bytes:
-    """Write a table again with each cell in quotation marks."""
+    """Rewrite a table with each cell in quotation marks."""
     text = data.decode("utf-8", "replace").replace("\x00", "")
     target = io.StringIO()
     try:
@@ -248,7 +248,7 @@ def quoted_cells(data: bytes, generator: np.random.Generator, tokens: Sequence[b
 def mutated(
     seeds: Sequence[bytes], generator: np.random.Generator, *, tokens: Sequence[bytes], structure: Sequence[Mutator]
 ) -> bytes:
-    """Return one of the seeds after one to four changes, mostly one; half of them know the format, if any does."""
+    """Return one of the seeds after one to four changes, mostly one; half of them are format-specific if available."""
     data = seeds[int(generator.integers(len(seeds)))]
     for _ in range(min(4, int(generator.geometric(0.7)))):
         known = structure and generator.random() < 0.5

@@ -1,4 +1,4 @@
-"""One row per parser: how its seeds are made, what its formats are made of, and how a file is read."""
+"""Table of parsers: seeds, tokens and structure of the format, and reader of a file."""
 
 import functools
 from collections.abc import Callable, Sequence
@@ -140,15 +140,15 @@ def _zarr(path: Path) -> Any:
 
 
 def _alone(read: Callable[[Path], Any], path: Path) -> Any:
-    """As `read_isolated`, in this process: whoever calls it lets it die."""
+    """Read like `read_isolated`, but in this process, which may crash."""
     try:
         return read(path)
-    except Exception as error:  # of whatever kind: there it is the last line of a process
+    except Exception as error:  # of any type: the isolated reader reports it as its last line
         raise CampaignError(shown(str(error), 300), path, "a file of its format", "Copy it again.") from error
 
 
 def _autopilot(fields_of: Any, track_of: Any) -> Callable[[Path], Any]:
-    """As a reader of an autopilot's log, in this process: whoever calls it lets it die."""
+    """Return a reader of autopilot logs that runs in this process, which may crash."""
 
     def read(path: Path) -> Any:
         return track_of(_alone(fields_of, path), node="uav1", options=DEFAULT_OPTIONS, where=path)
@@ -171,13 +171,13 @@ def _campaign(root: Path) -> Campaign:
 
 
 def _recorded(path: Path) -> Path:
-    """Write the manifest that belongs to a document, so that what it holds is looked at."""
+    """Write the manifest of a document, so that its content is parsed."""
     record_files(manifest_of(path), [path])
     return path
 
 
 def _listed(path: Path) -> Path:
-    """Write the manifest of the products that a report is one of."""
+    """Write the manifest of the products that includes a report."""
     record_files(path.with_name("export.manifest.json"), [path])
     return path
 
@@ -378,7 +378,7 @@ PARSERS: dict[str, Parser] = {
         _JSON_TREE,
         _JSON,
     ),
-    "tag.json": Parser("tag.json", products.told, products.read_told, _JSON_TREE, _JSON),
+    "tag.json": Parser("tag.json", products.tag_texts, products.read_tag_text, _JSON_TREE, _JSON),
     "product.tif": Parser(
         "slc.tif", products.rasters, products.read_product, (), f"{_TIFF} <GDALMetadata> <Item name="
     ),

@@ -1,7 +1,7 @@
-"""Markers of every kind in a campaign folder: each would leave a trace if it were run, and be seen if it were opened.
+"""Markers of every kind in a campaign folder: executing or opening one of them is detected.
 
-Two things tell that a marker fired. What is run makes a file whose name says which marker it was. What is only read (a
-matplotlibrc, a sidecar of GDAL, a file outside the folder) is watched by the kernel (inotify, IN_OPEN).
+A marker that is executed creates a file with its name. Opening a marker that is only read (a matplotlibrc, a sidecar
+file of GDAL, a file outside the folder) is reported by the kernel (inotify, IN_OPEN).
 """
 
 import ctypes
@@ -22,11 +22,11 @@ _EVENT = struct.Struct("iIII")
 _LIBC = ctypes.CDLL(None, use_errno=True)
 
 SNAKEMAKES_OWN = ".snakemake/pip-deployments"
-"""Where Snakemake looks for modules that it finds nowhere else, relative to the working folder."""
+"""Folder in the working folder that Snakemake adds to the module search path."""
 
 PROFILES = ("default", "slurm", "own", "none")
 SETTINGS = {
-    ".numba_config.yaml": "[",  # an error at least, if it were read
+    ".numba_config.yaml": "[",  # reading it raises an error
     "matplotlibrc": "backend: nosuch\n\x00",
     "setup.cfg": "[tool:pytest]\naddopts = --nosuch\n",
     "tox.ini": "[pytest]\naddopts = --nosuch\n",
@@ -64,13 +64,13 @@ class Planted:
     Attributes
     ----------
     root
-        The folder.
+        Campaign folder.
     outside
-        A folder beside it, in which nothing may be opened.
+        Folder next to it, in which no file may be opened.
     ran
-        A folder in which what is run leaves a file.
+        Folder in which executed markers create files.
     watched
-        Files in the campaign that nobody may open.
+        Files in the campaign that may not be opened.
     """
 
     root: Path
@@ -79,16 +79,16 @@ class Planted:
     watched: tuple[Path, ...]
 
     def code(self, name: str) -> str:
-        """Return Python that tells that it ran."""
+        """Return Python code that records its execution."""
         return f"import os; os.close(os.open({str(self.ran / name.replace('/', '.'))!r}, os.O_CREAT))"
 
     def shell(self, name: str) -> str:
-        """Return a command that tells that it ran."""
+        """Return a shell command that records its execution."""
         return f"touch {self.ran / name.replace('/', '.')}"
 
     @contextmanager
     def fires(self) -> Iterator[list[str]]:
-        """Yield what fired: filled in when the block ends."""
+        """Yield a list of fired markers, which is filled when the block ends."""
         fired: list[str] = []
         before = set(self.ran.iterdir())
         with opened([*self.watched, self.outside, *self.outside.rglob("*")]) as seen:
@@ -98,7 +98,7 @@ class Planted:
 
 
 class Code:
-    """What runs Python when it is unpickled."""
+    """Object that executes Python code when it is unpickled."""
 
     def __init__(self, code: str) -> None:
         self.code = code
@@ -108,14 +108,14 @@ class Code:
 
 
 def plant(root: Path, *, in_snakemakes_own: bool = False) -> Planted:
-    """Lay markers into a campaign folder, wherever a tool that trusts the folder would look for something.
+    """Place markers in a campaign folder, at all paths that a tool which trusts the folder reads.
 
     Parameters
     ----------
     root
-        The folder, unfinished or finished.
+        Campaign folder, unfinished or finished.
     in_snakemakes_own
-        Also where `apertura check` tells that they lie.
+        Place markers also in the folder of Snakemake, which `apertura check` reports.
     """
     outside, ran = root.parent / "outside", root.parent / "ran"
     for folder in (outside, ran):
@@ -136,7 +136,7 @@ def plant(root: Path, *, in_snakemakes_own: bool = False) -> Planted:
 
 
 def _outside_files(planted: Planted) -> None:
-    """Write what hostile texts name: grids, lists of CRS, rasters, archives, all empty of meaning."""
+    """Write the files that hostile texts name: grids, lists of CRS, rasters and archives without valid content."""
     for name in ("init", "shift.gsb", "geoid.gtx", "raster.tif", "array.zarr", "archive.zip", "config.yaml", "log.csv"):
         (planted.outside / name).write_bytes(b"<9> +proj=utm +zone=32 +datum=WGS84 <>\n")
 
@@ -172,7 +172,7 @@ def _modules(planted: Planted, *, in_snakemakes_own: bool) -> Mapping[str, str]:
 
 
 def _workflows(planted: Planted) -> Mapping[str, str]:
-    """Return profiles that hold code (YTE), at every name, and workflows."""
+    """Return profiles with code (YTE) at every name, and workflows."""
 
     def profile(name: str) -> str:
         return f"__use_yte__: true\n__definitions__:\n  - {planted.code(name)!r}\ncores: 1\n"
@@ -191,7 +191,7 @@ def _workflows(planted: Planted) -> Mapping[str, str]:
 
 
 def _sidecars(planted: Planted) -> Mapping[str, str]:
-    """Return files that GDAL reads beside a raster, each naming one outside."""
+    """Return sidecar files that GDAL reads with a raster, each naming a file outside."""
     rasters = [path.relative_to(planted.root).as_posix() for path in planted.root.rglob("*.tif")]
     text = (
         f"<PAMDataset><SRS>LOCAL_CS[x]</SRS><VRTRasterBand><SourceFilename>{planted.outside / 'raster.tif'}"
@@ -204,13 +204,13 @@ def _sidecars(planted: Planted) -> Mapping[str, str]:
 
 
 def _pickles(planted: Planted) -> Mapping[str, bytes]:
-    """Return records of Snakemake that would run code if they were unpickled."""
+    """Return records of Snakemake that execute code when they are unpickled."""
     names = ("iocache/latest.pkl", "metadata/cmVzdWx0cw==", "auxiliary/code.pkl", "scripts/x.py", "incomplete/x")
     return {f".snakemake/{name}": pickle.dumps(Code(planted.code(f"pickle {name}"))) for name in names}
 
 
 def hostile_texts(planted: Planted) -> Mapping[str, str]:
-    """Return texts that a library may take for more than a name, by what takes them so."""
+    """Return texts that a library may interpret, by the library and its interpretation."""
     outside = planted.outside
     shifted = f"+proj=utm +zone=32 +ellps=bessel +nadgrids={outside}/shift.gsb +units=m"
     return {
@@ -245,7 +245,7 @@ def hostile_texts(planted: Planted) -> Mapping[str, str]:
 
 @contextmanager
 def opened(paths: list[Path]) -> Iterator[set[Path]]:
-    """Yield which of these files and folders are opened by any process while the block runs, filled in at its end."""
+    """Yield the set of files and folders that any process opens during the block; it is filled at the end."""
     watching = _LIBC.inotify_init1(_IN_NONBLOCK)
     if watching < 0:
         raise OSError(ctypes.get_errno(), "inotify_init1")

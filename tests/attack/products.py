@@ -1,4 +1,4 @@
-"""Finished products as strangers may hand them out: tags and pictures that `apertura verify` and `diff` read."""
+"""Products from untrusted sources: tags, rasters and images that `apertura verify` and `diff` read."""
 
 import json
 from pathlib import Path
@@ -12,16 +12,16 @@ from rasterio import Affine
 from apertura.formats.export.cog import write_slc
 from apertura.views.verify.products import document, hashes, read_tags, sections_of
 
-_TOLD = {"raw/f01/uav1.sigmf-data": "0f" * 32, "results/scene.manifest.json": "1e" * 32}
+_HASHES = {"raw/f01/uav1.sigmf-data": "0f" * 32, "results/scene.manifest.json": "1e" * 32}
 _TAGS = {
-    "APERTURA_SOURCES": json.dumps(_TOLD),
+    "APERTURA_SOURCES": json.dumps(_HASHES),
     "APERTURA_RUNSPEC": '{"window":"hann","nodes":{"uav1":{"lever":[0,1]}}}',
     "APERTURA_VERSION": "0.1.0",
 }
 
 
-def told() -> list[bytes]:
-    """Return the text of a tag."""
+def tag_texts() -> list[bytes]:
+    """Return texts of a tag."""
     return [_TAGS["APERTURA_SOURCES"].encode(), b"{}"]
 
 
@@ -35,7 +35,7 @@ def rasters() -> list[bytes]:
 
 
 def pictures() -> list[bytes]:
-    """Return a small picture with tags before its pixels, plain and compressed."""
+    """Return a small PNG with tags before its pixels, plain and compressed."""
     found = []
     for packed in (False, True):
         texts = PngImagePlugin.PngInfo()
@@ -48,12 +48,12 @@ def pictures() -> list[bytes]:
     return found
 
 
-def read_told(path: Path) -> Any:
-    """Return what a tag with the text of a file says."""
+def read_tag_text(path: Path) -> Any:
+    """Return the content of a tag whose text is that of a file."""
     tags = {"APERTURA_SOURCES": path.read_bytes().decode("utf-8", "replace")}
     return document(tags, "SOURCES", path), hashes(tags, "SOURCES", path)
 
 
 def read_product(path: Path) -> Any:
-    """Return what a product says of itself."""
+    """Return tags and sections of a product."""
     return read_tags(path), sections_of(path)

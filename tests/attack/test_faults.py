@@ -1,4 +1,4 @@
-"""Some of the trials of `faults.py`: kills, errors and full disks; the rest by its command line."""
+"""A selection of the trials of `faults.py`: kills, errors and full disks."""
 
 import re
 import subprocess
@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[2]
 
 
 def disturbed(*options: str) -> list[int]:
-    """Run the trials; return how many kills, errors and full disks there were."""
+    """Run the trials; return the numbers of kills, errors and full disks."""
     command = [sys.executable, "-m", "tests.attack.faults", *options]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
@@ -22,7 +22,7 @@ def disturbed(*options: str) -> list[int]:
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(compiler() is None, reason="no C compiler to build what makes calls fail")
-def test_a_step_killed_or_failing_or_on_a_full_disk_leaves_nothing_half_and_resumes_to_the_same_bytes():
+@pytest.mark.skipif(compiler() is None, reason="no C compiler for the fault injection library")
+def test_steps_resume_after_kills_errors_and_full_disks():
     kills, errors, full = disturbed("--kills", "26", "--errors", "26", "--full", "13")
     assert (kills, errors, full >= 10) == (26, 26, may_mount())

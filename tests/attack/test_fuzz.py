@@ -1,4 +1,4 @@
-"""No file that a campaign brings ends in a traceback, a hang, a crash or a message that a terminal obeys."""
+"""Fuzzing: no input file causes a traceback, a hang, a crash or a message with control characters."""
 
 import os
 import signal
@@ -17,7 +17,7 @@ INPUTS = 150
 
 @pytest.mark.quick("track.csv", "sigmf-meta", "codes.npy")
 @pytest.mark.parametrize("name", PARSERS)
-def test_wrong_files_are_refused_in_one_message_or_read_without_harm(name):
+def test_malformed_files_are_refused_or_read_without_harm(name):
     tally = fuzz.fuzz(name, INPUTS, seed=2)
     assert tally.harmful == []
     assert sum(tally.results.values()) == INPUTS
@@ -27,20 +27,20 @@ def test_wrong_files_are_refused_in_one_message_or_read_without_harm(name):
 
 
 @pytest.mark.parametrize("name", sorted(path.name for path in fuzz.REGRESSIONS.iterdir()))
-def test_what_once_did_harm_does_none_any_more(name):
+def test_regressions_are_harmless(name):
     files = [path.read_bytes() for path in sorted((fuzz.REGRESSIONS / name).iterdir())]
     tally = fuzz.read_all(name, len(files), files.__getitem__, seeds=PARSERS[name].seeds())
     assert tally.harmful == []
 
 
-def test_the_same_seed_makes_the_same_files():
+def test_equal_seeds_give_equal_files():
     first, again, other = (fuzz.inputs_of("track.csv", seed) for seed in (1, 1, 2))
     assert [first[number] for number in range(50)] == [again[number] for number in range(50)]
     assert [first[number] for number in range(50)] != [other[number] for number in range(50)]
 
 
 def harmful(path):
-    """A parser with every kind of harm, by the first byte of its file."""
+    """Cause the kind of harm that the content of a file selects."""
     kind = path.read_bytes()
     if kind == b"r":
         raise CampaignError("found", path, "expected", "remedy")
@@ -55,8 +55,8 @@ def harmful(path):
     return {"n": 1 if kind == b"s" else 2}
 
 
-def test_the_fuzzer_sees_every_kind_of_harm(monkeypatch):
-    """A crash and a hang are charged to their own input, and the inputs behind them are read."""
+def test_fuzzer_detects_every_kind_of_harm(monkeypatch):
+    """Crashes and hangs are attributed to their input, and the following inputs are read."""
     monkeypatch.setitem(PARSERS, "toy", Parser("toy.bin", lambda: [b"s"], harmful))
     monkeypatch.setattr(fuzz, "SECONDS", 0.5)
     files = [b"s", b"c", b"d", b"h", b"t", b"m", b"r", b"c"]
@@ -73,7 +73,7 @@ def test_the_fuzzer_sees_every_kind_of_harm(monkeypatch):
     assert "| toy | 8 | 1 | 1 | 1 | 1 | 1 | 2 | 1 | 0 |" in fuzz.table([tally])
 
 
-def test_a_message_that_a_terminal_would_obey_is_harm(monkeypatch):
+def test_message_with_control_codes_is_harmful(monkeypatch):
     class RawError(CampaignError):
         def __str__(self):
             return "\x1b[2J"

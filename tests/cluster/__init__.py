@@ -1,1 +1,1 @@
-"""A campaign on a real batch system, disturbed: a program, not part of the test suite."""
+"""A campaign on a real batch system with disturbances: a program, not part of the test suite."""

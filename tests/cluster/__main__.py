@@ -2,10 +2,10 @@
 
     python -m tests.cluster [FOLDER]
 
-Simulates the campaign, runs a copy of it here and one on the cluster by ``profiles/slurm``, disturbs that, and compares
-every product byte for byte. The one on the cluster holds a marker of every kind (`tests.attack.planted`), and the run
-is typed in it: none may fire. Says what is missing, and does nothing, where Slurm is not installed. Ends with an error
-where the run fails, a marker fires or the bytes differ.
+Simulates the campaign, runs one copy locally and one on the cluster with ``profiles/slurm`` and disturbances, and
+compares every product byte for byte. The copy on the cluster contains markers of every kind (`tests.attack.planted`),
+and the run starts in it: no marker may fire. Without Slurm it prints what is missing and does nothing. Exits with an
+error if the run fails, a marker fires or bytes differ.
 """
 
 import importlib.util
@@ -28,7 +28,7 @@ from tests.cluster import slurm
 ROOT = Path(__file__).parents[2]
 APERTURA = Path(sys.executable).parent / "apertura"
 RULES = ("tiles", "image")
-"""Long enough to be met while they run."""
+"""Rules whose jobs last long enough to be disturbed while they run."""
 
 
 def main() -> None:
@@ -38,31 +38,33 @@ def main() -> None:
         print(f"no cluster test: {reason}")
         return
     for number in (signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, lambda one, _: sys.exit(128 + one))  # the scratch folder is removed on the way out
+        signal.signal(number, lambda received, _: sys.exit(128 + received))  # so that the scratch folder is removed
     began = time.perf_counter()
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(sys.argv[1] if sys.argv[1:] else scratch)
         campaign = simulated(folder)
-        expected = products(here(Path(shutil.copytree(campaign, folder / "here"))))
-        planted = plant(Path(shutil.copytree(campaign, folder / "there")))
+        expected = products(run_locally(Path(shutil.copytree(campaign, folder / "local"))))
+        planted = plant(Path(shutil.copytree(campaign, folder / "cluster")))
         with slurm.running(folder / "slurm"), planted.fires() as fired:
-            made = products(disturbed(planted.root, folder))
+            from_cluster = products(disturbed(planted.root, folder))
         report(folder / "slurm" / "jobs.log")
     took_s = time.perf_counter() - began
     busy = 100 * sum(os.times()[:4]) / took_s / (os.cpu_count() or 1)
     load = os.getloadavg()[2]
-    print(f"{took_s:.0f} s in all; {busy:.0f} % of the machine taken beside Slurm's jobs, load {load:.1f}")
+    print(f"total {took_s:.0f} s; CPU use without Slurm's jobs {busy:.0f} %, load {load:.1f}")
     if fired:
-        sys.exit(f"{len(fired)} markers in the campaign folder fired: {', '.join(fired[:5])}")
+        sys.exit(f"{len(fired)} markers of the campaign folder fired: {', '.join(fired[:5])}")
     print(f"{len(planted.watched)} markers in the campaign folder, none fired", flush=True)
-    differ = sorted(str(name) for name in made.keys() | expected.keys() if made.get(name) != expected.get(name))
+    differ = sorted(
+        str(name) for name in from_cluster.keys() | expected.keys() if from_cluster.get(name) != expected.get(name)
+    )
     if differ:
         sys.exit(f"{len(differ)} of {len(expected)} files differ: {', '.join(differ[:5])}")
-    print(f"{len(made)} files, the same bytes as here")
+    print(f"{len(from_cluster)} files, identical to those of the local run")
 
 
 def simulated(folder: Path) -> Path:
-    """A flight whose images take a while: by the double sum, in many tiles."""
+    """Simulate a flight whose images take several seconds: double sum in many tiles."""
     from apertura.simulation import ImageGrid, preset, simulate
 
     plan = replace(preset("demo", pulses=60), scene=ImageGrid("EPSG:32632", half_width_m=6.0, spacing_m=0.03))
@@ -73,7 +75,7 @@ def simulated(folder: Path) -> Path:
     return root
 
 
-def here(root: Path) -> Path:
+def run_locally(root: Path) -> Path:
     began = time.perf_counter()
     subprocess.run([APERTURA, "run", root, "--cores", "2"], check=True, capture_output=True)
     print(f"on this machine: {time.perf_counter() - began:.0f} s", flush=True)
@@ -81,12 +83,12 @@ def here(root: Path) -> Path:
 
 
 def disturbed(root: Path, folder: Path) -> Path:
-    """Run a campaign on the cluster, and see to it that not all goes well."""
+    """Run a campaign on the cluster with a cancelled job, a drained node and a killed node."""
     began, log = time.perf_counter(), folder / "run.log"
     command = [APERTURA, "run", root, "--cores", "2", "--profile", ROOT / "profiles" / "slurm"]
     command += ["--set-scatter", "tiles=2", "--latency-wait", "5"]
-    with log.open("w") as said:
-        run = subprocess.Popen(command, cwd=root, stdout=said, stderr=subprocess.STDOUT)
+    with log.open("w") as output:
+        run = subprocess.Popen(command, cwd=root, stdout=output, stderr=subprocess.STDOUT)
     try:
         for disturb in (cancel_a_job, drain_a_node, kill_a_node):
             done = disturb(folder / "slurm", run.poll)
@@ -104,45 +106,45 @@ def disturbed(root: Path, folder: Path) -> Path:
 
 
 def cancel_a_job(_: Path, ended: Callable[[], int | None]) -> str:
-    job, node = met(ended)
-    slurm.said("scancel", job)
+    job, node = wait_for_job(ended)
+    slurm.output_of("scancel", job)
     return f"job {job} on {node} cancelled"
 
 
 def drain_a_node(_: Path, ended: Callable[[], int | None]) -> str:
-    job, node = met(ended)
+    job, node = wait_for_job(ended)
     slurm.drain(node)
     slurm.wait_for("drained", lambda: slurm.state(node) == "drained", 120)
     slurm.resume(node)
-    return f"{node} drained under job {job}, which ended, and resumed"
+    return f"{node} drained during job {job}, which finished, and resumed"
 
 
 def kill_a_node(root: Path, ended: Callable[[], int | None]) -> str:
-    job, node = met(ended)
+    job, node = wait_for_job(ended)
     slurm.kill(root, node)
     slurm.wait_for("down", lambda: slurm.state(node) == "down", 120)
     slurm.start(node)
     slurm.wait_for("up", lambda: slurm.state(node) in {"idle", "mixed", "allocated"})
-    return f"{node} killed with job {job}, missed by the controller, and started again"
+    return f"{node} killed with job {job}, reported as down by the controller, and restarted"
 
 
-def met(ended: Callable[[], int | None]) -> tuple[str, str]:
-    """Wait for a long job that runs; return it and its node."""
+def wait_for_job(ended: Callable[[], int | None]) -> tuple[str, str]:
+    """Wait until a job of a long rule runs; return the job and its node."""
     found: dict[str, str] = {}
 
-    def meet() -> bool:
+    def is_running() -> bool:
         if ended() is not None:
-            raise RuntimeError("the run ended before it was disturbed")
+            raise RuntimeError("the run finished before it was disturbed")
         for rule in RULES:
             found.update(slurm.jobs(rule))
         return bool(found)
 
-    slurm.wait_for("a job", meet, 300)
+    slurm.wait_for("a job", is_running, 300)
     return next(iter(found.items()))
 
 
 def products(root: Path) -> dict[Path, bytes]:
-    """Return path → bytes of all results but logs, timings, and hidden files and folders."""
+    """Return the contents of all results except logs, timings and hidden files and folders."""
     results = root / "results"
     files = [(path.relative_to(results), path) for path in results.rglob("*") if path.is_file()]
     kept = [(name, path) for name, path in files if name.parts[0] not in {"logs", "benchmarks"}]
@@ -150,7 +152,7 @@ def products(root: Path) -> dict[Path, bytes]:
 
 
 def report(jobs: Path) -> None:
-    """Print how many jobs came to which end."""
+    """Print the number of jobs per final state."""
     ends: dict[str, int] = {}
     for line in jobs.read_text().splitlines():
         state = line.split("JobState=")[1].split()[0]

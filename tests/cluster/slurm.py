@@ -1,4 +1,4 @@
-"""A Slurm of two nodes on this machine, from Debian's packages: started, asked, disturbed and ended."""
+"""A Slurm of two nodes on this machine, from Debian's packages: start, query, disturb and stop it."""
 
 import os
 import shutil
@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-CONF = Path("/etc/slurm/slurm.conf")  # a job's own srun is told of no other
+CONF = Path("/etc/slurm/slurm.conf")  # the only path that srun within a job reads
 OURS = "# Written by tests/cluster"
 NODES = ("node1", "node2")
 _PROGRAMS = ("slurmctld", "slurmd", "srun", "sbatch", "squeue", "munged")
@@ -17,38 +17,38 @@ _PACKAGES = "slurmctld slurmd slurm-client munge"
 
 
 def missing() -> str | None:
-    """Return why there can be no Slurm here, and what to do; None where there can."""
+    """Return why Slurm cannot run on this machine and the remedy; None if it can."""
     if any(shutil.which(program) is None for program in _PROGRAMS):
         return f"Slurm is not installed: apt-get install --no-install-recommends {_PACKAGES}"
     if os.geteuid():
-        return f"{CONF} has to be written: run this as root, in a container"
+        return f"{CONF} must be writable: run this program as root in a container"
     if CONF.is_file() and not CONF.read_text(encoding="utf-8").startswith(OURS):
-        return f"{CONF} is that of another Slurm: move it away if this machine is not part of one"
+        return f"{CONF} belongs to another Slurm: remove it if this machine is not part of a cluster"
     return None
 
 
-def said(*command: str) -> str:
-    """Return what a command prints."""
+def output_of(*command: str) -> str:
+    """Return the output of a command."""
     return subprocess.run(command, text=True, capture_output=True, check=True).stdout.strip()
 
 
 def wait_for(what: str, happened: Callable[[], object], timeout_s: float = 60.0) -> None:
-    """Wait until something has happened."""
-    until = time.monotonic() + timeout_s
+    """Wait until a condition holds; raise `TimeoutError` after a time limit."""
+    deadline_s = time.monotonic() + timeout_s
     while not happened():
-        if time.monotonic() > until:
+        if time.monotonic() > deadline_s:
             raise TimeoutError(f"{what}: not within {timeout_s:.0f} s")
         time.sleep(0.2)
 
 
 @contextmanager
 def running(root: Path) -> Iterator[None]:
-    """Run a Slurm whose files lie in a folder."""
+    """Run a Slurm with its files in a folder."""
     for folder in ("ctld", "log", *(f"spool/{node}" for node in NODES)):
         (root / folder).mkdir(parents=True, exist_ok=True)
     munged = _munge()
     template = Path(__file__).with_name("slurm.conf.in").read_text(encoding="utf-8")
-    host = said("hostname", "-s")
+    host = output_of("hostname", "-s")
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2**20 // 2 - 256
     settings = {"ROOT": str(root), "HOST": host, "CPUS": str(os.cpu_count()), "MEM": str(memory)}
     for name, value in settings.items():
@@ -58,7 +58,7 @@ def running(root: Path) -> Iterator[None]:
 
     def end() -> None:
         for node in NODES:
-            with suppress(subprocess.CalledProcessError):  # its controller may have ended
+            with suppress(subprocess.CalledProcessError):  # the controller may have stopped
                 kill(root, node)
         _end(root / "slurmctld.pid", signal.SIGTERM)
         if munged:
@@ -66,7 +66,7 @@ def running(root: Path) -> Iterator[None]:
         CONF.unlink(missing_ok=True)
 
     with _at_the_end(end):
-        said("slurmctld", "-i")
+        output_of("slurmctld", "-i")
         for node in NODES:
             start(node)
         wait_for("both nodes idle", lambda: all(state(node) == "idle" for node in NODES))
@@ -75,29 +75,29 @@ def running(root: Path) -> Iterator[None]:
 
 @contextmanager
 def _at_the_end(end: Callable[[], None]) -> Iterator[None]:
-    """Have a process of its own `end` what was started, when the body or this process is gone, however that is."""
-    held, ours = os.pipe()  # which only this process writes to: programs that it starts inherit no pipe
-    keeper = os.fork()
-    if not keeper:
+    """Call `end` in a separate process when the body or this process has ended, even if it was killed."""
+    read_end, write_end = os.pipe()  # closes with this process, because programs that it starts inherit no pipe
+    watcher = os.fork()
+    if not watcher:
         try:
-            os.setsid()  # out of reach of Ctrl-C and of `make`
+            os.setsid()  # not reached by Ctrl-C and by `make`
             for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
                 signal.signal(number, signal.SIG_IGN)
-            os.close(ours)
-            os.read(held, 1)
+            os.close(write_end)
+            os.read(read_end, 1)
             end()
         finally:
             os._exit(0)
-    os.close(held)
+    os.close(read_end)
     try:
         yield
     finally:
-        os.close(ours)
-        os.waitpid(keeper, 0)
+        os.close(write_end)
+        os.waitpid(watcher, 0)
 
 
 def _munge() -> bool:
-    """See to it that munge works; return whether it was started here."""
+    """Start munge if it does not run; return True if it was started."""
 
     def works() -> bool:
         return subprocess.run("munge -n | unmunge", shell=True, capture_output=True, check=False).returncode == 0
@@ -105,7 +105,7 @@ def _munge() -> bool:
     if not works():
         Path("/run/munge").mkdir(exist_ok=True)
         shutil.chown("/run/munge", "munge", "munge")
-        said("su", "-s", "/bin/sh", "munge", "-c", "/usr/sbin/munged")
+        output_of("su", "-s", "/bin/sh", "munge", "-c", "/usr/sbin/munged")
         wait_for("munge", works)
         return True
     return False
@@ -113,13 +113,13 @@ def _munge() -> bool:
 
 def start(node: str) -> None:
     """Start the daemon of a node."""
-    said("slurmd", "-N", node)
+    output_of("slurmd", "-N", node)
 
 
 def kill(root: Path, node: str) -> None:
-    """Kill a node: its daemons and all that runs in its jobs, outright."""
+    """Kill a node with SIGKILL: its daemons and all processes of its jobs."""
     _end(root / f"slurmd.{node}.pid", signal.SIGKILL)
-    jobs = said("squeue", "-h", "-t", "running", "-w", node, "-o", "%A").split()
+    jobs = output_of("squeue", "-h", "-t", "running", "-w", node, "-o", "%A").split()
     for job in [f"slurmstepd: [{job}." for job in jobs] + [f"SLURM_JOB_ID={job}\0" for job in jobs]:
         for path in Path("/proc").glob("[0-9]*"):
             with suppress(OSError):
@@ -129,22 +129,22 @@ def kill(root: Path, node: str) -> None:
 
 def state(node: str) -> str:
     """Return the state of a node, such as idle, mixed, drained, down."""
-    return said("sinfo", "-h", "-n", node, "-o", "%T").rstrip("*")
+    return output_of("sinfo", "-h", "-n", node, "-o", "%T").rstrip("*")
 
 
 def drain(node: str) -> None:
-    """Let a node take no further job."""
-    said("scontrol", "update", f"nodename={node}", "state=drain", "reason=test")
+    """Drain a node, so that it accepts no further jobs."""
+    output_of("scontrol", "update", f"nodename={node}", "state=drain", "reason=test")
 
 
 def resume(node: str) -> None:
-    """Let a node take jobs again."""
-    said("scontrol", "update", f"nodename={node}", "state=resume")
+    """Resume a drained node."""
+    output_of("scontrol", "update", f"nodename={node}", "state=resume")
 
 
 def jobs(rule: str) -> dict[str, str]:
-    """Return job → node of those that run a rule or a group of rules."""
-    lines = said("squeue", "-h", "-t", "running", "-o", "%A %N %k").splitlines()
+    """Return the nodes of running jobs of a rule or a group of rules, by job."""
+    lines = output_of("squeue", "-h", "-t", "running", "-o", "%A %N %k").splitlines()
     found = (line.split(" ", 2) for line in lines)
     return {job: node for job, node, comment in found if comment.startswith((f"rule_{rule}", f"group_{rule}"))}
 

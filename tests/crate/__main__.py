@@ -2,8 +2,8 @@
 
     python -m tests.crate CAMPAIGN
 
-The validator has an environment of its own, ``build/roc``, installed by hash from ``requirements/roc.txt`` when it is
-not there. Prints what is wrong, and ends with 1 if anything is.
+The validator has its own environment, ``build/roc``, installed by hash from ``requirements/roc.txt`` if it does not
+exist. Prints the issues found and exits with status 1 if there are any.
 """
 
 import sys
@@ -13,14 +13,14 @@ from tests.crate.validator import issues, make_environment
 
 
 def main() -> None:
-    (campaign,) = sys.argv[1:] or sys.exit("which campaign? python -m tests.crate CAMPAIGN")
+    (campaign,) = sys.argv[1:] or sys.exit("no campaign folder given; usage: python -m tests.crate CAMPAIGN")
     make_environment()
-    wrong = issues(Path(campaign) / "results")
-    for line in wrong:
+    found = issues(Path(campaign) / "results")
+    for line in found:
         print(line)
-    if wrong:
+    if found:
         sys.exit(1)
-    print("a valid Provenance Run Crate, every file as it was made")
+    print("valid Provenance Run Crate, all files agree with their hashes")
 
 
 if __name__ == "__main__":

@@ -1,9 +1,9 @@
-"""Contexts of JSON-LD where roc-validator looks for what it would fetch: its cache of HTTP answers, filled by hand.
+"""Fill the HTTP cache of roc-validator with JSON-LD contexts, so that it runs offline.
 
     python contexts.py CACHE RO_CRATE_CONTEXT
 
-Runs in the validator's environment. The context of RO-Crate comes with the package `rocrate`; the terms of workflow
-runs are names below one address, so they are put together here.
+Runs in the environment of the validator. The context of RO-Crate is part of the package `rocrate`; the terms of
+workflow runs are names below one address and are assembled in this module.
 """
 
 import io
@@ -35,8 +35,8 @@ ACCEPTED = (
 )
 
 
-class Written(requests.adapters.BaseAdapter):
-    """Answers by documents that are here; no network."""
+class DocumentAdapter(requests.adapters.BaseAdapter):
+    """HTTP adapter that answers with given documents, without network access."""
 
     def __init__(self, documents):
         super().__init__()
@@ -58,15 +58,18 @@ class Written(requests.adapters.BaseAdapter):
 
 
 def main(cache, context):
-    told = json.loads(Path(context).read_text(encoding="utf-8"))
+    crate_context = json.loads(Path(context).read_text(encoding="utf-8"))
     documents = {
-        "https://w3id.org/ro/crate/1.1/context": {**told, "@context": {**told["@context"], **WORKFLOW_TERMS}},
+        "https://w3id.org/ro/crate/1.1/context": {
+            **crate_context,
+            "@context": {**crate_context["@context"], **WORKFLOW_TERMS},
+        },
         f"{RUN}/context": {"@context": {term: f"{RUN}#{term}" for term in RUN_TERMS}},
     }
     session = requests_cache.CachedSession(
         cache, backend="sqlite", expire_after=-1, allowable_codes=[200], allowable_methods=["GET", "HEAD"]
     )
-    session.mount("https://", Written(documents))
+    session.mount("https://", DocumentAdapter(documents))
     for address in documents:
         session.head(address)
         for accepted in ACCEPTED:

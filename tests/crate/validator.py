@@ -1,4 +1,4 @@
-"""roc-validator in an environment of its own: its requirements are not those of apertura."""
+"""roc-validator in a separate environment, because its requirements differ from those of apertura."""
 
 import json
 import subprocess
@@ -13,11 +13,11 @@ ENVIRONMENT = ROOT / "build" / "roc"
 PYTHON = ENVIRONMENT / "bin" / "python"
 LOCK = ROOT / "requirements" / "roc.txt"
 PROFILE = "apertura-run-crate-1.0"
-"""Of the folder `profile`: Provenance Run Crate 0.5, and the hashes of all files."""
+"""Name of the profile in folder `profile`: Provenance Run Crate 0.5 and hashes of all files."""
 
 
 def make_environment() -> None:
-    """Install the validator, once for each lock; raise `subprocess.CalledProcessError` where that cannot be."""
+    """Install the validator if its lock file has changed; raise `subprocess.CalledProcessError` on failure."""
     mark = ENVIRONMENT / ".lock"
     if mark.is_file() and mark.read_bytes() == LOCK.read_bytes():
         return
@@ -31,17 +31,17 @@ def make_environment() -> None:
 
 
 def issues(results: Path, *, profile: str = PROFILE) -> list[str]:
-    """Return what the validator finds wrong with the crate in a folder of results, a line each."""
+    """Return the issues that the validator reports for the crate in a results folder, one line each."""
     with tempfile.TemporaryDirectory() as scratch:
         cache, report = Path(scratch) / "cache", Path(scratch) / "report.json"
         context = files("rocrate") / "data" / "ro-crate.jsonld"
         subprocess.run([PYTHON, HERE / "contexts.py", cache, str(context)], check=True, capture_output=True)
         options = ["--offline", "--cache-path", cache, "--extra-profiles-path", HERE, "-p", profile, "-l", "required"]
-        told = ["--verbose", "--no-paging", "-f", "json", "-o", report]
-        command = [PYTHON.with_name("rocrate-validator"), "-y", "validate", *options, *told, results.absolute()]
+        output = ["--verbose", "--no-paging", "-f", "json", "-o", report]
+        command = [PYTHON.with_name("rocrate-validator"), "-y", "validate", *options, *output, results.absolute()]
         done = subprocess.run(command, check=False, capture_output=True, text=True, cwd=scratch)
         if not report.is_file():
-            raise RuntimeError(f"roc-validator told nothing: {done.stderr[-2000:] or done.stdout[-2000:]}")
+            raise RuntimeError(f"roc-validator wrote no report: {done.stderr[-2000:] or done.stdout[-2000:]}")
         document = json.loads(report.read_text(encoding="utf-8"))
     found = [f"{issue['check']['identifier']}: {issue['message']}" for issue in document["issues"]]
-    return found if document["passed"] or found else ["it does not pass"]
+    return found if document["passed"] or found else ["the crate does not pass, without an issue reported"]

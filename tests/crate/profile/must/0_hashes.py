@@ -1,4 +1,4 @@
-"""A requirement for roc-validator: every file of the crate has a sha256, and is what it says."""
+"""Requirement for roc-validator: every file of the crate has a sha256 that agrees with its bytes."""
 
 import hashlib
 from pathlib import Path
@@ -10,7 +10,7 @@ from rocrate_validator.requirements.python import PyFunctionCheck, check, requir
 
 @requirement(name="Hashes of files")
 class Hashes(PyFunctionCheck):
-    """Every file of the crate MUST have a sha256, which is that of its bytes."""
+    """Every file of the crate MUST have a sha256 that agrees with its bytes."""
 
     @check(name="Hashes of files")
     def check_hashes(self, context: ValidationContext) -> bool:
@@ -20,11 +20,11 @@ class Hashes(PyFunctionCheck):
             stated = entity.get_property("sha256")
             path = root / unquote(entity.id)
             if stated is None:
-                context.result.add_issue(f"{entity.id}: states no sha256", self)
+                context.result.add_issue(f"{entity.id}: no sha256 is stated", self)
             elif not path.is_file():
-                context.result.add_issue(f"{entity.id}: is not there", self)
+                context.result.add_issue(f"{entity.id}: no such file", self)
             elif hashlib.sha256(path.read_bytes()).hexdigest() != stated:
-                context.result.add_issue(f"{entity.id}: is not the file that was made", self)
+                context.result.add_issue(f"{entity.id}: sha256 differs from that of the bytes", self)
             else:
                 continue
             good = False
