@@ -202,7 +202,7 @@ def bounds_of(root):
     return found
 
 
-def test_a_scene_in_the_neighbouring_zone_is_444_km_away(tiny):
+def test_scene_in_the_neighbouring_zone_is_reported_with_distance(tiny):
     state(tiny, "scene", crs="EPSG:32633")
     line = only(tiny)
     assert "the scene is 444 km from the track" in line

@@ -275,7 +275,7 @@ def test_narrow_scene_has_the_mean_height_of_its_dem(tiny):
 
 
 def test_undeclared_void_is_an_impossible_height(tiny):
-    """A value of -9999 without a nodata tag is refused wherever the DEM is first read."""
+    """Values of -9999 without a nodata tag are refused wherever the DEM is first read."""
     write_plane(tiny, void=-9999.0)
     campaign = edit_scene(tiny, dem="dem.tif", dem_datum="ellipsoid")
     for read in (lambda: expected_plan(campaign, *PAIR), lambda: settle_ground(campaign)):

@@ -108,7 +108,7 @@ def test_places_are_the_simulated_targets_and_image_peaks(finished_tiny):
     }
 
 
-def test_the_same_results_give_the_same_bytes(finished):
+def test_map_is_reproduced_byte_for_byte(finished):
     before = {path.name: path.read_bytes() for path in (finished.results / "map").iterdir()}
     webmap(finished)
     assert {path.name: path.read_bytes() for path in (finished.results / "map").iterdir()} == before

@@ -71,7 +71,7 @@ def _models(path):
 
 
 @pytest.mark.slow
-def test_the_same_results_give_the_same_bytes(reported):
+def test_report_page_is_reproduced_byte_for_byte(reported):
     path = reported.result("f01", "report.html")
     before = path.read_bytes()
     page(reported, "f01")

@@ -159,7 +159,7 @@ def test_summary_lists_heights_and_flags_of_an_interferogram(small, tmp_path, ca
 
 
 @pytest.mark.slow
-def test_the_same_images_give_the_same_bytes(small, tmp_path):
+def test_interferogram_is_reproduced_byte_for_byte(small, tmp_path):
     again = copy_writable(small, tmp_path / "elsewhere")
     before = contents(again / "results/interferometry")
     interferogram(Campaign.load(again), NAME)

@@ -141,15 +141,15 @@ def start(words, folder, **environment):
 def run(words, folder, **environment):
     """Run a command; return its exit status and output."""
     process = start(words, folder, **environment)
-    printed, said = process.communicate(timeout=500)
-    return process.returncode, printed + said
+    printed, output = process.communicate(timeout=500)
+    return process.returncode, printed + output
 
 
-def one_message(status, said):
-    assert status == 2, said
-    assert "Traceback" not in said
-    assert len(said.strip().splitlines()) < 12, said
-    return said
+def one_message(status, output):
+    assert status == 2, output
+    assert "Traceback" not in output
+    assert len(output.strip().splitlines()) < 12, output
+    return output
 
 
 @pytest.fixture(scope="session")
@@ -214,13 +214,13 @@ def test_command_in_a_finished_campaign_executes_no_planted_code(finished, comma
     words = [str(BIN / "apertura"), *shlex.split(TYPED.get(command, command))]
     with planted.fires() as fired:
         if command == "map":
-            status, said = request_map(words, finished)
+            status, output = request_map(words, finished)
         else:
-            status, said = run(words, finished)
+            status, output = run(words, finished)
     assert fired == []
-    assert "Traceback" not in said
+    assert "Traceback" not in output
     allowed = {0, 2} if command in MAY_REFUSE or command.startswith("study") else {1} if command == "diff" else {0}
-    assert status in allowed, said
+    assert status in allowed, output
 
 
 def request_map(words, folder):
@@ -237,9 +237,9 @@ def request_map(words, folder):
             except urllib.error.HTTPError as error:
                 answers.append(error.read())
     process.send_signal(signal.SIGINT)
-    said = "".join(process.communicate(timeout=20))
+    output = "".join(process.communicate(timeout=20))
     assert not any(b"evil.example" in answer or b"os.O_CREAT" in answer for answer in answers)
-    return process.returncode, said
+    return process.returncode, output
 
 
 @pytest.mark.slow
@@ -252,9 +252,9 @@ def test_workflow_executes_no_planted_code(unfinished, tmp_path, start_from):
     folder = tmp_path if folder is None else folder.format(**names)
     path = f"{BATCH_SYSTEM}{os.pathsep}{PLAIN_PATH}"
     with planted.fires() as fired:
-        status, said = run(shlex.split(command.format(**names)), folder, PATH=path, BATCH_JOBS=str(jobs))
+        status, output = run(shlex.split(command.format(**names)), folder, PATH=path, BATCH_JOBS=str(jobs))
     assert fired == []
-    assert status == 0, said
+    assert status == 0, output
     last_files = {"{part}": "f01/uav1-uav2/profile.manifest.json", "image": "f01/uav1-uav2/image.manifest.json"}
     last = next(
         (file for end, file in last_files.items() if WORKFLOW_COMMANDS[start_from][0].endswith(end)),
@@ -275,12 +275,12 @@ def test_python_modules_in_snakemakes_folder_are_refused(unfinished, tmp_path, s
     names = {"bin": BIN, "root": ROOT, "campaign": unfinished, "soon": SOON, "part": PART}
     path = f"{BATCH_SYSTEM}{os.pathsep}{PLAIN_PATH}"
     with planted.fires() as fired:
-        status, said = run(
+        status, output = run(
             shlex.split(command.format(**names)), folder.format(**names), PATH=path, BATCH_JOBS=str(jobs)
         )
     assert fired == []
     assert status != 0
-    assert f"{SNAKEMAKES_OWN}: Python modules in a folder of Snakemake" in said.replace("\n", " ")
+    assert f"{SNAKEMAKES_OWN}: Python modules in a folder of Snakemake" in output.replace("\n", " ")
     assert not any(jobs.iterdir())
 
 
@@ -332,18 +332,20 @@ def test_profile_in_the_campaign_folder_is_refused(unfinished, tmp_path, monkeyp
 def test_refused_profile_is_not_executed(unfinished):
     planted = plant(unfinished)
     with planted.fires() as fired:
-        said = one_message(*run([BIN / "apertura", "run", ".", "-n", "--profile", "profiles/own"], unfinished))
+        output = one_message(*run([BIN / "apertura", "run", ".", "-n", "--profile", "profiles/own"], unfinished))
     assert fired == []
-    assert "lies in the campaign folder" in said
+    assert "lies in the campaign folder" in output
 
 
 @pytest.mark.slow
 def test_profile_from_the_environment_is_refused(unfinished):
     planted = plant(unfinished)
     with planted.fires() as fired:
-        said = one_message(*run([BIN / "apertura", "run", ".", "-n"], unfinished, SNAKEMAKE_PROFILE="./profiles/slurm"))
+        output = one_message(
+            *run([BIN / "apertura", "run", ".", "-n"], unfinished, SNAKEMAKE_PROFILE="./profiles/slurm")
+        )
     assert fired == []
-    assert "SNAKEMAKE_PROFILE ./profiles/slurm lies in the campaign folder" in said
+    assert "SNAKEMAKE_PROFILE ./profiles/slurm lies in the campaign folder" in output
 
 
 @pytest.mark.slow
@@ -353,23 +355,23 @@ def test_pickled_cache_of_snakemake_is_not_read(unfinished, option):
     cache.mkdir(parents=True, exist_ok=True)
     (cache / "latest.pkl").write_bytes(pickle.dumps(Code(planted.code("iocache"))))
     with planted.fires() as fired:
-        said = one_message(*run([BIN / "apertura", "run", ".", "-n", option], unfinished))
+        output = one_message(*run([BIN / "apertura", "run", ".", "-n", option], unfinished))
     assert fired == []
-    assert "would read a pickle in the campaign folder" in said
+    assert "would read a pickle in the campaign folder" in output
 
 
 @pytest.mark.slow
 def test_short_option_of_snakemake_is_passed_unchanged(unfinished):
-    _, said = run([BIN / "apertura", "run", ".", "-s/review/quiet"], unfinished)
-    assert "/review/quiet" in said
+    _, output = run([BIN / "apertura", "run", ".", "-s/review/quiet"], unfinished)
+    assert "/review/quiet" in output
 
 
 @pytest.mark.slow
 def test_existing_target_keeps_its_name(finished):
     target = "results/f01/uav1-uav1/export.manifest.json"
     for words in ([target, "-n"], ["-n", "--", target]):
-        status, said = run([BIN / "apertura", "run", ".", *words], finished)
-        assert status == 0, said
+        status, output = run([BIN / "apertura", "run", ".", *words], finished)
+        assert status == 0, output
 
 
 @pytest.mark.slow
@@ -379,8 +381,8 @@ def test_shipped_profiles_take_precedence(unfinished, tmp_path):
     (own / "config.yaml").write_text("printshellcmds: true\n")
     for folder, profile in ((unfinished, "profiles/default"), (own.parent, "mine"), (tmp_path, "elsewhere/mine")):
         with planted.fires() as fired:
-            status, said = run([BIN / "apertura", "run", unfinished, "-n", "--profile", profile], folder)
-        assert (status, fired) == (0, []), said
+            status, output = run([BIN / "apertura", "run", unfinished, "-n", "--profile", profile], folder)
+        assert (status, fired) == (0, []), output
 
 
 @pytest.mark.slow
@@ -401,9 +403,9 @@ def test_path_with_shell_syntax_is_refused_for_batch_systems(unfinished, tmp_pat
         ],
     ):
         folder = root if "run" in words else tmp_path
-        status, said = run([*words, "--cores", "1"], folder, PATH=path, BATCH_JOBS=str(jobs))
+        status, output = run([*words, "--cores", "1"], folder, PATH=path, BATCH_JOBS=str(jobs))
         assert status != 0
-        assert "a path with '$'" in said
+        assert "a path with '$'" in output
     assert not any(jobs.iterdir())
     assert not [*tmp_path.rglob("ran")]
     assert run([BIN / "apertura", "run", ".", "-n"], root)[0] == 0
@@ -481,7 +483,7 @@ for path in sorted(Path(sys.argv[2]).iterdir()):
     (root / "config/config.yaml").write_bytes(path.read_bytes())
     try:
         lines = [as_line(problem) for problem in problems(root)]
-        print(path.name, "PASSED" if not lines else f"{len(lines)} told", flush=True)
+        print(path.name, "PASSED" if not lines else f"{len(lines)} problems", flush=True)
     except Exception:
         print(path.name, "TRACEBACK", traceback.format_exc().splitlines()[-1], flush=True)
 """
@@ -528,9 +530,9 @@ def test_hostile_title_is_harmless_in_every_product(unfinished):
     texts = hostile_texts(planted)
     edit_config(unfinished, lambda config: config.update(campaign=texts["format"].replace("&", "")[:110]))
     with planted.fires() as fired:
-        status, said = run([BIN / "apertura", "run", ".", "--cores", "2"], unfinished)
+        status, output = run([BIN / "apertura", "run", ".", "--cores", "2"], unfinished)
     assert fired == []
-    assert status in {0, 2}, said
+    assert status in {0, 2}, output
 
 
 @pytest.mark.slow
@@ -541,9 +543,9 @@ def test_crs_other_than_authority_and_code_is_one_message(unfinished, name):
     planted = plant(unfinished)
     edit_config(unfinished, lambda config: config["scene"].update(crs=hostile_texts(planted)[name]))
     with planted.fires() as fired:
-        said = one_message(*run([BIN / "apertura", "check", "."], unfinished))
+        output = one_message(*run([BIN / "apertura", "check", "."], unfinished))
     assert fired == []
-    assert "scene" in said
+    assert "scene" in output
 
 
 @pytest.mark.slow
@@ -562,9 +564,9 @@ def test_link_out_of_the_folder_is_refused_and_its_target_not_opened(finished, t
     path.symlink_to(planted.outside / "moved")
     with planted.fires() as fired:
         for words in (["check", "."], ["run", ".", "-n"], ["step", "image", "f01", "uav1-uav1"]):
-            status, said = run([BIN / "apertura", *words], finished)
-            assert "Traceback" not in said
-            assert status == 2 or "step" in words, said
+            status, output = run([BIN / "apertura", *words], finished)
+            assert "Traceback" not in output
+            assert status == 2 or "step" in words, output
     assert fired == []
 
 
@@ -586,11 +588,11 @@ def test_code_in_the_config_is_refused(unfinished, start_from, line):
     command, folder = WORKFLOW_COMMANDS[start_from]
     names = {"bin": BIN, "root": ROOT, "campaign": unfinished}
     with planted.fires() as fired:
-        status, said = run([*shlex.split(command.format(**names)), "-n"], folder.format(**names))
+        status, output = run([*shlex.split(command.format(**names)), "-n"], folder.format(**names))
     assert fired == []
     assert status != 0
-    assert "config/config.yaml" in said
-    assert "Traceback" not in said
+    assert "config/config.yaml" in output
+    assert "Traceback" not in output
 
 
 @pytest.mark.slow
@@ -682,9 +684,9 @@ REFUSED = {
 @pytest.mark.parametrize("words", ["step pictures f01 uav1-uav2", "run . -n", "plan ."])
 def test_irrelevant_environment_variables_have_no_effect(finished, words, number):
     names = HARMLESS if words.startswith("step") else HARMLESS.keys() - {"PATH"}
-    status, said = run([BIN / "apertura", *words.split()], finished, **{n: HARMLESS[n][-number] for n in names})
-    assert status == 0, said
-    assert "Traceback" not in said
+    status, output = run([BIN / "apertura", *words.split()], finished, **{n: HARMLESS[n][-number] for n in names})
+    assert status == 0, output
+    assert "Traceback" not in output
 
 
 @pytest.mark.slow
@@ -693,11 +695,11 @@ def test_irrelevant_environment_variables_have_no_effect(finished, words, number
     [(words, name, value) for words, of in REFUSED.items() for name, values in of.items() for value in values],
 )
 def test_invalid_environment_variable_is_one_message(finished, name, value, words):
-    status, said = run([BIN / "apertura", *words.split()], finished, **{name: value})
-    assert status == 2, said
-    assert "Traceback" not in said
-    assert len(said.strip().splitlines()) < 6, said
-    assert name != "APERTURA_KERNEL" or name in said
+    status, output = run([BIN / "apertura", *words.split()], finished, **{name: value})
+    assert status == 2, output
+    assert "Traceback" not in output
+    assert len(output.strip().splitlines()) < 6, output
+    assert name != "APERTURA_KERNEL" or name in output
 
 
 @pytest.mark.slow
@@ -705,8 +707,8 @@ def test_zarr_environment_variable_does_not_change_stages(unfinished, tmp_path):
     other = copy_writable(unfinished, tmp_path / "other")
     for root, order in ((unfinished, "C"), (other, "F")):
         for words in ("step ingest f01 uav1", "step ingest f01 uav2", "step echo f01 uav1-uav2"):
-            status, said = run([BIN / "apertura", *words.split()], root, ZARR_ARRAY__ORDER=order)
-            assert status == 0, said
+            status, output = run([BIN / "apertura", *words.split()], root, ZARR_ARRAY__ORDER=order)
+            assert status == 0, output
     files = sorted(path.relative_to(other) for path in (other / "results").rglob("*.zarr/**/*") if path.is_file())
     assert len(files) > 20
     assert [name for name in files if (other / name).read_bytes() != (unfinished / name).read_bytes()] == []

@@ -485,8 +485,8 @@ def test_local_frame_is_labelled_with_x_and_y(browser, shared, tmp_path):
 
 def test_map_cannot_read_the_window_that_contains_it(browser, address):
     with shown(browser, address) as (frame, _):
-        seen = "try { parent.document.title } catch (error) { return error.name } return 'seen'"
-        assert frame.evaluate(f"() => {{ {seen} }}") == "SecurityError"
+        script = "try { parent.document.title } catch (error) { return error.name } return 'seen'"
+        assert frame.evaluate(f"() => {{ {script} }}") == "SecurityError"
 
 
 def test_page_in_the_results_is_not_shown(browser, finished, tmp_path):

@@ -334,7 +334,7 @@ def test_preview_waits_for_missing_files(tiny):
     threading.Timer(2.0, preview.finish.set).start()
     preview.run()
     status = json.loads((tiny / "results/preview/status.json").read_text())["pairs"]["f01/uav1-uav1"]
-    assert "no such file" in status["waits"] or "track" in statuses["waits"]
+    assert "no such file" in status["waits"] or "track" in status["waits"]
     assert status["image"] is None
     assert not earlier.exists()
 

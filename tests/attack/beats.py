@@ -75,9 +75,9 @@ def read_array(path: Path) -> Any:
 
 def read_times(path: Path) -> Any:
     """Read times together with a valid file of beats."""
-    beside = path.with_name(path.name.replace(".time.npy", ".npy"))
-    beside.write_bytes(arrays()[0])
-    return read_beat_npy([beside, path], pair="a-a", described=DESCRIBED)
+    beats = path.with_name(path.name.replace(".time.npy", ".npy"))
+    beats.write_bytes(arrays()[0])
+    return read_beat_npy([beats, path], pair="a-a", described=DESCRIBED)
 
 
 def read_matlab(path: Path) -> Any:

@@ -1,6 +1,6 @@
-/* A library that is loaded before libc: at the n-th call that changes something below one folder it kills the process,
-   lets the call fail, or writes half. What to do stands on a page that all processes of a run share (APERTURA_FAULTS
-   names its file), and so does the count: "the n-th write of a run" is one write, whichever process makes it. */
+/* Library preloaded before libc: at the n-th call that changes a file below a folder it kills the process, returns an
+   error, or writes half of the data. The settings are on a page shared by all processes of a run (APERTURA_FAULTS is its
+   file name), as is the count: the n-th write of a run is counted over all its processes. */
 #define _GNU_SOURCE
 #undef _FORTIFY_SOURCE
 #include <dlfcn.h>
@@ -20,7 +20,7 @@
 enum { COUNT, KILL, FAIL, FAIL_ON, SHORT };                                          /* actions */
 enum { WRITE = 1, RENAME = 2, FSYNC = 4, TRUNCATE = 8, MKDIR = 16, OPEN = 32, UNLINK = 64 }; /* kinds of calls */
 
-struct page { /* as `Page` in faults_control.py */
+struct page { /* same layout as `Page` in faults_control.py */
     long armed, action, error, kinds, at, count, struck;
     char folder[PATH_MAX];
 };
@@ -67,7 +67,7 @@ static int is_open_below(int file) {
 
 static int watched(int kind) { return page && page->armed && (page->kinds & kind); }
 
-/* Count a call; return what shall happen to it: 0 nothing, FAIL, or SHORT. */
+/* Count a call; return its action: 0 (none), FAIL or SHORT. */
 static int struck(void) {
     long now = __atomic_add_fetch(&page->count, 1, __ATOMIC_SEQ_CST);
     if (page->action == COUNT || now < page->at || (now > page->at && page->action != FAIL_ON)) return 0;

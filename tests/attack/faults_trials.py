@@ -26,15 +26,15 @@ class Ended:
     """End of a command: exit status, or the negative number of the signal that killed it, and output."""
 
     status: int
-    said: str
+    output: str
 
     @property
     def faults(self) -> list[str]:
         """Deviations from a single message with exit status 2."""
-        errors = re.findall(r"^error: .*", self.said, re.MULTILINE)
+        errors = re.findall(r"^error: .*", self.output, re.MULTILINE)
         wrong = [] if self.status == 2 else [f"exit status {self.status}"]
         wrong += [] if len(errors) == 1 else [f"{len(errors)} messages"]
-        return wrong + (["a traceback"] if "Traceback" in self.said else [])
+        return wrong + (["a traceback"] if "Traceback" in self.output else [])
 
 
 @dataclass
@@ -71,7 +71,7 @@ class Bench:
             arm(self.page, self.results, COUNT)
             ended = self.run(step, limit_s=10 * LIMIT_S)  # the first run in a fresh clone compiles
             if ended.status:
-                raise RuntimeError(f"{step} fails undisturbed:\n{ended.said}")
+                raise RuntimeError(f"{step} fails undisturbed:\n{ended.output}")
             self.calls[step], self.after[step] = self.page.count, files(self.results)
 
     def reset(self, step: str) -> None:
@@ -83,17 +83,17 @@ class Bench:
 
     def run(self, step: str, *, limit_s: float = LIMIT_S) -> Ended:
         """Run a step in a fork of this process, which has imported all modules, with the settings of the page."""
-        with tempfile.TemporaryFile() as said:
+        with tempfile.TemporaryFile() as output:
             child = os.fork()
             if not child:
-                os.dup2(said.fileno(), 1)
-                os.dup2(said.fileno(), 2)
+                os.dup2(output.fileno(), 1)
+                os.dup2(output.fileno(), 2)
                 faulthandler.dump_traceback_later(limit_s, exit=True, file=2)
                 os._exit(_command(["apertura", "step", *step.split(), "--campaign", str(self.root)]))
             _, status = os.waitpid(child, 0)
             disarm(self.page)
-            said.seek(0)
-            return Ended(os.waitstatus_to_exitcode(status), said.read().decode(errors="replace"))
+            output.seek(0)
+            return Ended(os.waitstatus_to_exitcode(status), output.read().decode(errors="replace"))
 
     def half_written(self, step: str) -> list[str]:
         """Return files with a final name that differ from those of the undisturbed step."""
@@ -105,7 +105,7 @@ class Bench:
         """Run the step without faults; return the differences of its results."""
         ended = self.run(step)
         if ended.status:
-            return [f"the next run ends with {ended.status}: {ended.said[-2000:]}"]
+            return [f"the next run ends with {ended.status}: {ended.output[-2000:]}"]
         written, expected = files(self.results), self.after[step]
         return [
             f"{name} differs" for name in sorted(written.keys() | expected) if written.get(name) != expected.get(name)
@@ -127,7 +127,7 @@ class Bench:
             return "not reached", []
         outcome = "continued" if ended.status == 0 else "reported"
         wrong = ended.faults if ended.status else []
-        wrong = [f"{', '.join(wrong)}:\n{ended.said[-3000:]}"] if wrong else []
+        wrong = [f"{', '.join(wrong)}:\n{ended.output[-3000:]}"] if wrong else []
         return outcome, wrong + self.half_written(step) + self.again(step)
 
     def full(self, step: str, share: float) -> tuple[int, list[str]]:
@@ -150,9 +150,9 @@ class Bench:
                 _mount(self.results, ROOM, again=True)
                 self.reset(step)
             wrong = ended.faults
-            if os.strerror(errno.ENOSPC) not in ended.said:
+            if os.strerror(errno.ENOSPC) not in ended.output:
                 wrong.append("the message does not name the full disk")
-            wrong = [f"{', '.join(wrong)}:\n{ended.said[-3000:]}"] if wrong else []
+            wrong = [f"{', '.join(wrong)}:\n{ended.output[-3000:]}"] if wrong else []
             wrong += self.half_written(step)
             _mount(self.results, ROOM, again=True)
             return free, wrong + self.again(step)

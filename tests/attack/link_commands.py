@@ -1,4 +1,4 @@
-"""Commands that the harness of links runs, the campaigns that it runs them in, and a folder of the user outside."""
+"""Commands of the link harness, their campaigns, and a folder of the user outside the campaigns."""
 
 import hashlib
 import importlib
@@ -15,23 +15,23 @@ from typing import Any
 # ---- Commands -------------------------------------------------------------------------------------------------------
 
 SAMPLE, PAIR, BENCH = "sample", "pair", "bench"
-"""Campaigns: one with every step; one with two flights, an interferogram and a reflector; one on the bench."""
+"""Campaigns: with every step; with two flights, an interferogram and a reflector; with a bench measurement."""
 
 
 @dataclass(frozen=True)
 class Command:
-    """A command line, and the campaign that it is typed in.
+    """A command line and its campaign.
 
     Attributes
     ----------
     words
-        What is typed after `apertura`, in the campaign folder.
+        Arguments of `apertura`, in the campaign folder.
     campaign
         Name of the campaign.
     finished
-        Whether the campaign has results.
+        True if the campaign has results.
     is_cold
-        Whether a new interpreter runs it, not a fork of one that has imported the package.
+        True if a new interpreter runs the command instead of a fork that has imported the package.
     writes
         Paths among the inputs that the command may create or change.
     """
@@ -86,50 +86,50 @@ COMMANDS: dict[str, Command] = {
     "step bench": Command("step bench b01", BENCH),
     "step whole-chart": Command("step whole-chart --repeats 1"),
 }
-"""Name → command. `whole-chart` takes a minute, and is tried only if it is named."""
+"""Commands by name. `whole-chart` takes a minute and runs only if it is given by name."""
 
 SETTLED_S = 2.2
-"""Age from which the package keeps the hash of a file."""
+"""Minimum age of a file, in seconds, for its hash to be cached."""
 
 INPUTS = ("config", "raw", "dem.tif", "truth.json", "plan.yaml")
 
-# ---- Campaigns, and the folder of the user --------------------------------------------------------------------------
+# ---- Campaigns and the folder of the user ---------------------------------------------------------------------------
 
 
 def program() -> str:
-    """Return the program of the checkout whose interpreter this is."""
+    """Return the program `apertura` next to this interpreter."""
     return str(Path(sys.executable).parent / "apertura")
 
 
 def environment(folder: Path) -> dict[str, str]:
-    """Return the environment of commands: temporary files in a folder, and lines of messages that are not broken."""
+    """Return the environment of commands: folder for temporary files, and message lines without line breaks."""
     own = {"TMPDIR": str(folder / "tmp"), "COLUMNS": "1000", "TERM": "dumb", "OPENBLAS_NUM_THREADS": "1"}
     return {**os.environ, "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}", **own}
 
 
 def make_campaign(folder: Path, name: str) -> None:
-    """Simulate a campaign, ``<name>``, the inputs alone, and run it: ``<name>-finished`` has results."""
+    """Write a campaign ``<name>`` with its inputs only, and a copy ``<name>-finished`` with results."""
     from apertura.simulation import ImageGrid, Straight, preset, simulate
 
     root = folder / name
     if name == SAMPLE:
-        made = importlib.import_module(f"{__package__}.faults_campaign").make_campaign(folder / "make")
-        (made / "plan.yaml").write_text(json.dumps(_plan(made)))
-        made.rename(root)
+        simulated = importlib.import_module(f"{__package__}.faults_campaign").make_campaign(folder / "make")
+        (simulated / "plan.yaml").write_text(json.dumps(_plan(simulated)))
+        simulated.rename(root)
     elif name == PAIR:
         demo = replace(preset("demo", pulses=40), scene=ImageGrid("EPSG:32632", 1.6, spacing_m=0.05))
-        flown = demo.flights[0]
-        lines = {node: track for node, track in flown.tracks.items() if isinstance(track, Straight)}
+        first = demo.flights[0]
+        lines = {node: track for node, track in first.tracks.items() if isinstance(track, Straight)}
         raised = {node: replace(at, start_m=(*at.start_m[:2], at.start_m[2] + 0.3)) for node, at in lines.items()}
-        second = replace(flown, name="f02", tracks=raised, start_utc="2025-05-14T11:00:00")
-        simulate(root, replace(demo, flights=(flown, second)))
+        second = replace(first, name="f02", tracks=raised, start_utc="2025-05-14T11:00:00")
+        simulate(root, replace(demo, flights=(first, second)))
         ball = {"name": "ball", "kind": "sphere", "size_m": [0.5], "position_m": first_target(root), "std_m": 0.02}
         _edit(root, "scene", reflectors=[ball])
         _edit(root, "interferometry", pairs={"two": ["f01/uav1-uav1", "f02/uav1-uav1"]})
     else:
         lab = preset("paper-lab", pulses=60)
         simulate(root, replace(lab, flights=(replace(lab.flights[0], name="b01", kind="bench"),)))
-        _edit(root, "bench", sidelink_m=1.0)  # so that the measured path differs, and `--write` writes
+        _edit(root, "bench", sidelink_m=1.0)  # so that the measured path differs and `--write` changes the config
     finished = copy(root, folder / f"{name}-finished")
     words = [program(), "run", str(finished), "--cores", "2", "--quiet"]
     subprocess.run(words, check=name != BENCH, capture_output=True, env=environment(folder))
@@ -164,7 +164,7 @@ def first_target(root: Path) -> list[float]:
 
 
 def copy(source: Path, target: Path) -> Path:
-    """Copy a folder with its times, without hard links, and return the copy."""
+    """Copy a folder with its times and without hard links; return the copy."""
     subprocess.run(["cp", "-a", "--reflink=auto", "--", source, target], check=True)
     return target
 
@@ -174,7 +174,7 @@ FOLDERS = ("", "f01", "f01/uav1-uav1", "f01/uav1", "raw", "raw/f01", "steps", "m
 
 
 def make_user_folder(folder: Path) -> Path:
-    """Write D: files and subfolders with the names that a campaign's results have."""
+    """Write D: files and subfolders with the names of campaign results."""
     shutil.rmtree(folder, ignore_errors=True)
     for name in FOLDERS:
         (folder / name).mkdir(parents=True, exist_ok=True)
@@ -185,27 +185,27 @@ def make_user_folder(folder: Path) -> Path:
 
 def fingerprint(*paths: Path) -> dict[str, tuple[object, ...]]:
     """Return type, mode, inode, size, time and content of all files and folders."""
-    found: dict[str, tuple[object, ...]] = {}
+    entries: dict[str, tuple[object, ...]] = {}
     for top in paths:
         below = [Path(folder, name) for folder, *names in os.walk(top) for name in (*names[0], *names[1])]
         for path in (top, *below) if os.path.lexists(top) else ():
             status = path.lstat()
             is_file = stat.S_ISREG(status.st_mode)
             content = hashlib.sha256(path.read_bytes()).hexdigest() if is_file else ""
-            found[str(path)] = (status.st_mode, status.st_ino, status.st_size, status.st_mtime_ns, content)
-    return found
+            entries[str(path)] = (status.st_mode, status.st_ino, status.st_size, status.st_mtime_ns, content)
+    return entries
 
 
 def differences(before: dict[str, tuple[object, ...]], after: dict[str, tuple[object, ...]], top: Path) -> str:
-    """Return what differs between two fingerprints as one line, empty if nothing does."""
+    """Return the differences between two fingerprints as one line, empty if there are none."""
     sets = {
-        "gone": before.keys() - after.keys(),
+        "missing": before.keys() - after.keys(),
         "new": after.keys() - before.keys(),
         "changed": {name for name in before.keys() & after.keys() if before[name] != after[name]},
     }
     parts = [
-        f"{len(names)} {what} ({', '.join(os.path.relpath(name, top) for name in sorted(names)[:3])})"
-        for what, names in sets.items()
+        f"{len(names)} {state} ({', '.join(os.path.relpath(name, top) for name in sorted(names)[:3])})"
+        for state, names in sets.items()
         if names
     ]
     return "; ".join(parts)

@@ -1,4 +1,4 @@
-"""Commands run in a campaign folder, in forks of one interpreter, while the kernel reports what they write and open."""
+"""Run commands in a campaign folder, in forks of one interpreter, and record which paths they write and open."""
 
 import ctypes
 import importlib
@@ -26,15 +26,15 @@ from .link_commands import INPUTS, Command, environment, first_target, program
 
 
 def _limit() -> None:
-    """Bound memory and the size of files, so that a sparse file that is copied does not fill the machine."""
+    """Limit memory and file size, so that a copied sparse file does not exhaust the machine."""
     resource.setrlimit(resource.RLIMIT_AS, (12 << 30, 12 << 30))
     resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 30, 1 << 30))
 
 
 def serve() -> None:
-    """Fork a process for each line of standard input, a JSON object; answer with its number and its exit status.
+    """Fork a process for each line of standard input, a JSON object; print its process ID and its exit status.
 
-    Runs in an interpreter of its own, which has imported the package and has no thread.
+    Runs in a separate interpreter, which has imported the package and has no threads.
     """
     from apertura.workflow.rules import RULES
 
@@ -44,14 +44,14 @@ def serve() -> None:
         order = json.loads(line)
         number = os.fork()
         if number == 0:
-            _be(order)
+            _execute(order)
         print(number, flush=True)
         _, status = os.waitpid(number, 0)
         print(os.waitstatus_to_exitcode(status), flush=True)
 
 
-def _be(order: dict[str, Any]) -> None:
-    """Be the command of an order; ends with `SystemExit`, as the program does."""
+def _execute(order: dict[str, Any]) -> None:
+    """Execute the command of an order in this process; exits with `SystemExit`, like the program."""
     os.setsid()
     _limit()
     os.chdir(order["folder"])
@@ -61,7 +61,7 @@ def _be(order: dict[str, Any]) -> None:
         opened = os.open(name, flags | (os.O_CREAT | os.O_TRUNC if stream else 0), 0o666)
         os.dup2(opened, stream)
         os.close(opened)
-    sys.stdin = open(0, closefd=False)  # noqa: SIM115 - of the process, to its end
+    sys.stdin = open(0, closefd=False)  # noqa: SIM115 - stays open until the process exits
     sys.argv = ["apertura", *order["words"]]
     pkgutil.resolve_name("apertura.__main__:main")()
     sys.exit(0)
@@ -69,7 +69,7 @@ def _be(order: dict[str, Any]) -> None:
 
 @dataclass
 class Ended:
-    """How a command ended.
+    """End of a command.
 
     Attributes
     ----------
@@ -88,7 +88,7 @@ class Ended:
 
 
 class Runner:
-    """Runs commands one after the other, each as a fork or as a new process.
+    """Runner of commands in sequence, each as a fork or as a new process.
 
     Parameters
     ----------
@@ -110,7 +110,7 @@ class Runner:
         )
 
     def close(self) -> None:
-        """End the server."""
+        """Stop the server."""
         if self._server.stdin and self._server.stdout:
             self._server.stdin.close()
             self._server.stdout.close()
@@ -130,7 +130,7 @@ class Runner:
                 stderr=files[1],
                 env=self._environment,
                 start_new_session=True,
-                preexec_fn=_limit,  # noqa: PLW1509 - the harness has no thread here
+                preexec_fn=_limit,  # noqa: PLW1509 - the harness has no threads
             )
             ending = os.pidfd_open(process.pid)
             try:
@@ -158,18 +158,18 @@ class Runner:
                 os.close(ending)
 
     def run(self, command: Command, root: Path, limit_s: float, meanwhile: Callable[[], object] | None = None) -> Ended:
-        """Run a command in a campaign folder to its end, or for so long."""
-        began = time.monotonic()
+        """Run a command in a campaign folder until it ends or a time limit is reached."""
+        start_s = time.monotonic()
         is_ended = was_interrupted = False
         with self.started(command, root) as (group, ending):
-            while not is_ended and time.monotonic() - began < limit_s:
+            while not is_ended and time.monotonic() - start_s < limit_s:
                 if meanwhile:
                     meanwhile()
                 is_ended = bool(select.select([ending], [], [], 0.002 if meanwhile else 0.02)[0])
                 if not was_interrupted and command.words.startswith("map ") and self._is_serving():
                     os.killpg(group, signal.SIGINT)
                     was_interrupted = True
-        seconds = time.monotonic() - began
+        seconds = time.monotonic() - start_s
         printed, message = (path.read_text(errors="replace") for path in self._output)
         return Ended(self._status if is_ended else None, seconds, printed, message)
 
@@ -178,7 +178,7 @@ class Runner:
 
 
 def _kill(group: int) -> None:
-    """End whatever is left of a process group."""
+    """Kill the remaining processes of a process group."""
     with suppress(ProcessLookupError):
         os.killpg(group, signal.SIGKILL)
 
@@ -196,12 +196,12 @@ _CHUNK = re.compile(r"(.*\.zarr/.*?)/c(/.*)?$|(.*\.snakemake/metadata)/[^/]*$|(.
 
 
 class Watch:
-    """The events below a folder, of new subfolders too.
+    """Watch of the events below a folder, including new subfolders.
 
     Parameters
     ----------
     root
-        The folder.
+        Folder to be watched.
     """
 
     def __init__(self, root: Path) -> None:
@@ -213,7 +213,7 @@ class Watch:
         self._add("")
 
     def _add(self, name: str) -> list[tuple[str, int]]:
-        """Watch a folder and those below; return what is in them already as events."""
+        """Watch a folder and its subfolders; return their existing entries as events."""
         mask = _WRITTEN | _OPEN | _ONLY_FOLDERS | _NO_LINKS
         number = _LIBC.inotify_add_watch(self._descriptor, os.fsencode(self._root / name), mask)
         events: list[tuple[str, int]] = []
@@ -244,24 +244,24 @@ class Watch:
         return events
 
     def close(self) -> None:
-        """End watching."""
+        """Stop watching."""
         os.close(self._descriptor)
 
 
 @dataclass
 class Recording:
-    """The paths that a command touches, relative to the campaign folder.
+    """Paths that a command uses, relative to the campaign folder.
 
     Attributes
     ----------
     written
-        Created, written, renamed or deleted, for however short a time; with the folders above.
+        Paths created, written, renamed or deleted, even temporarily, with their parent folders.
     opened
-        Files that are only read, inputs excepted.
+        Files that are only read, except inputs.
     folders
-        Those of both that are folders.
+        Folders among both.
     random
-        How many names have a random part, and cannot be planted before.
+        Number of names with a random part, which cannot be planted in advance.
     seconds, status
         Duration and exit status of the command.
     """
@@ -275,7 +275,7 @@ class Recording:
 
 
 def record(runner: Runner, command: Command, root: Path) -> Recording:
-    """Run a command in a copy of a campaign, and return what it touches there."""
+    """Run a command in a copy of a campaign and return the paths that it uses."""
     watch = Watch(root)
     events: list[tuple[str, int]] = []
     try:
@@ -292,32 +292,32 @@ def record(runner: Runner, command: Command, root: Path) -> Recording:
 
 
 def _sorted(masks: dict[str, int], ended: Ended) -> Recording:
-    """Return a recording from the events of each path."""
-    found = Recording(seconds=ended.seconds, status=ended.status)
+    """Return a recording from the event masks per path."""
+    recording = Recording(seconds=ended.seconds, status=ended.status)
     kept: Counter[str] = Counter()
     folders_above: set[str] = set()
     for path, mask in sorted(masks.items()):
         is_written = bool(mask & _WRITTEN)
         is_input = path.split("/")[0] in INPUTS
         if mask & _IS_FOLDER:
-            found.folders.add(path)
+            recording.folders.add(path)
         if not is_written and (is_input or mask & _IS_FOLDER):
             continue
         if _RANDOM.search(path):
-            found.random += 1
+            recording.random += 1
             continue
         chunk = _CHUNK.match(path)
         if chunk:
             kept[key := "".join(filter(None, chunk.group(1, 3, 4)))] += 1
             if kept[key] > 3:
                 continue
-        (found.written if is_written else found.opened).append(path)
+        (recording.written if is_written else recording.opened).append(path)
         if is_written:
             folders_above |= {str(above) for above in Path(path).parents} - {"."}
     above = {path for path in folders_above if path.split("/")[0] not in INPUTS and not _RANDOM.search(path)}
-    found.folders |= above
-    found.written = sorted({*found.written, *above})
-    return found
+    recording.folders |= above
+    recording.written = sorted({*recording.written, *above})
+    return recording
 
 
 if __name__ == "__main__":

@@ -1,9 +1,9 @@
-"""Links, FIFOs, sockets, sparse files and folders in place of what commands write in a campaign folder.
+"""Links, FIFOs, sockets, sparse files and folders in place of the files that commands write in a campaign folder.
 
 The paths are recorded: every command runs once on a copy of a small campaign while the kernel (inotify) reports which
-files and folders it creates, writes, renames, deletes and opens. Then one of these paths, or a few, is replaced before
-the command starts, or while it runs. A folder of the user outside the campaign, D, and the inputs of the campaign must
-stay as they are, and the command must end in time, with one message or with its work done::
+files and folders it creates, writes, renames, deletes and opens. Then one or several of these paths are replaced before
+the command starts, or while it runs. A folder D of the user outside the campaign and the inputs of the campaign must
+remain unchanged, and the command must end in time, with one message or successfully::
 
     python -m tests.attack.links --commands list,status --most 20 --seed 3
     python -m tests.attack.links --while-running
@@ -55,14 +55,14 @@ KINDS = {
     "sparse": 2,
     "file": 1,
 }
-"""Kind of what is planted → how often, relative to the others."""
+"""Kinds of planted objects → relative frequency."""
 
 
 def plant(root: Path, path: str, kind: str, outside: Path) -> None:
     """Replace a path of a campaign by a link, a FIFO, a socket, a sparse file of 1 TB, a folder or a file."""
     target = root / path
     for above in list(target.relative_to(root).parents)[-2::-1]:
-        if (root / above).is_symlink():  # planted before, and left as it is
+        if (root / above).is_symlink():  # planted earlier
             return
         if not (root / above).is_dir():
             _remove(root / above)
@@ -93,7 +93,7 @@ _LINKS: dict[str, Callable[[Path, Path, Path], Path]] = {
     "link to config": lambda root, _, __: root / "config",
     "link to input": lambda root, _, __: min((root / "raw").rglob("*.sigmf-meta")),
 }
-"""Kind of link → its target, from campaign, path and D."""
+"""Kind of link → function of campaign, path and D that returns its target."""
 
 
 def _folder_with_links(target: Path, outside: Path) -> None:
@@ -109,7 +109,7 @@ def _sparse(target: Path, _: Path) -> None:
 
 
 def _socket(target: Path, _: Path) -> None:
-    """Make a socket file from its folder: an address is shorter than many a path."""
+    """Create a socket file by its name in its folder, because addresses are limited to about 100 bytes."""
     before = Path.cwd()
     os.chdir(target.parent)
     try:
@@ -126,7 +126,7 @@ _OTHERS: dict[str, Callable[[Path, Path], object]] = {
     "sparse": _sparse,
     "file": lambda target, _: target.write_text("not what is expected\n"),
 }
-"""Kind of what is no link → what makes it, from path and D."""
+"""Kind of other object → function of path and D that creates it."""
 
 
 def _remove(path: Path) -> None:
@@ -138,7 +138,7 @@ def _remove(path: Path) -> None:
 
 @dataclass(frozen=True)
 class Trial:
-    """What is planted for one run of a command: a kind, and paths."""
+    """Kind and paths of the objects planted for one run of a command."""
 
     command: str
     kind: str
@@ -146,14 +146,14 @@ class Trial:
 
 
 class Replacing:
-    """Replaces paths of a campaign by links to D while a command runs, upon events and at random moments.
+    """Replacement of campaign paths by links to D while a command runs, upon events and at random times.
 
     Parameters
     ----------
     root, outside, aside
-        Campaign, D, and a folder that what is replaced is moved to.
+        Campaign, D, and a folder to which replaced objects are moved.
     paths
-        The recorded paths.
+        Recorded paths.
     start_s
         Time of the first replacement, after the first call.
     rng
@@ -164,14 +164,14 @@ class Replacing:
         self, root: Path, outside: Path, aside: Path, paths: Sequence[str], start_s: float, rng: random.Random
     ) -> None:
         self._root, self._outside, self._aside, self._paths, self._rng = root, outside, aside, paths, rng
-        self._watch, self._start_s, self._began_s = Watch(root), start_s, 0.0
+        self._watch, self._start_s, self._first_call_s = Watch(root), start_s, 0.0
         self.replaced: list[str] = []
 
     def work(self) -> None:
-        """Replace what has just appeared, or any path whose folder exists."""
+        """Replace a path that has just appeared, or any path whose folder exists."""
         events = [path for path, mask in self._watch.read() if mask & (CREATE | MOVED_TO)]
-        self._began_s = self._began_s or time.monotonic()
-        if time.monotonic() - self._began_s < self._start_s or len(self.replaced) >= 40:
+        self._first_call_s = self._first_call_s or time.monotonic()
+        if time.monotonic() - self._first_call_s < self._start_s or len(self.replaced) >= 40:
             return
         events = [path for path in events if path.split("/")[0] not in INPUTS]
         chosen = [self._rng.choice(events)] if events and self._rng.random() < 0.5 else []
@@ -182,7 +182,7 @@ class Replacing:
 
     def _swap(self, path: str) -> None:
         target = self._root / path
-        if target.is_symlink() or self._leaves(target.parent):
+        if target.is_symlink() or self._is_linked(target.parent):
             return
         with suppress(OSError):
             link = self._aside / f"link{len(self.replaced)}"
@@ -193,15 +193,15 @@ class Replacing:
             link.rename(target)
             self.replaced.append(path)
 
-    def _leaves(self, folder: Path) -> bool:
+    def _is_linked(self, folder: Path) -> bool:
         return not folder.is_dir() or folder.resolve() != folder
 
     def close(self) -> None:
-        """End watching."""
+        """Stop watching."""
         self._watch.close()
 
 
-# ---- The trials of the review ---------------------------------------------------------------------------------------
+# ---- Trials of the review -------------------------------------------------------------------------------------------
 
 ALL_WORK, ALL_LOCKS, ALL_HASHES = "every work folder", "every lock", "every work folder of hashes"
 _LINKED_COMMANDS = (
@@ -221,7 +221,7 @@ REVIEW: tuple[Trial, ...] = (
     Trial("step bench", "link to file", ("results/b01/bench.json",)),
     *(Trial("clean", "link to folder", (f"results/{name}",)) for name in (".run", "logs", "benchmarks", "preview")),
     Trial("clean", "link to file", ("results/.run.lock",)),
-    # Findings that follow the count of 56, or that are not about links.
+    # Findings in addition to the 56 links, or not about links.
     Trial("preview", "link to folder", ("results/preview/.status.json.wip",)),
     Trial("preview", "link to folder", ("results/preview/.index.html.wip",)),
     Trial("preview", "link to folder", ("results/preview/f01/uav1-uav1/.db.0.tif.wip",)),
@@ -240,11 +240,11 @@ REVIEW: tuple[Trial, ...] = (
     Trial("check", "sparse", ("results/scene.json",)),
     Trial("list", "sparse", (_HASH,)),
 )
-"""The 56 links of the review of 2026, and its findings 6, 7 and 10."""
+"""The 56 links of the review of 2026 and its findings 6, 7 and 10."""
 
 
 def _expanded(paths: Sequence[str], recordings: Sequence[Recording]) -> tuple[str, ...]:
-    """Return the paths of a trial, those that a word stands for listed."""
+    """Return the paths of a trial, with placeholders such as `ALL_WORK` expanded."""
     if not {ALL_WORK, ALL_LOCKS, ALL_HASHES} & set(paths):
         return tuple(paths)
     written = {path for found in recordings for path in found.written}
@@ -276,13 +276,13 @@ FAULTS = (D_CHANGED, HUNG, TRACEBACK, KILLED)
 
 
 def _weight(path: str) -> float:
-    """Return how often a path is chosen: what lies in an array or in Snakemake's folder is one of many alike."""
+    """Return the relative frequency of a path: arrays and Snakemake's folder contain a number of similar paths."""
     return 0.05 if ".zarr/" in path else 0.2 if path.startswith(".snakemake/") else 1.0
 
 
 @dataclass
 class Outcome:
-    """Result of a trial: which columns of the table it counts in, and what was seen."""
+    """Result of a trial: columns of the table that count it, and description."""
 
     trial: Trial
     columns: tuple[str, ...]
@@ -290,7 +290,7 @@ class Outcome:
 
     @property
     def is_fault(self) -> bool:
-        """Whether any column is a fault."""
+        """Return True if any column is a fault."""
         return bool(set(self.columns) & set(FAULTS))
 
 
@@ -300,7 +300,7 @@ class Harness:
     Parameters
     ----------
     folder
-        An empty folder.
+        Empty folder.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -313,7 +313,7 @@ class Harness:
         self._copies = 0
 
     def record(self, names: Sequence[str]) -> None:
-        """Record what commands touch."""
+        """Record the paths that commands use."""
         for name in names:
             root = self._fresh(COMMANDS[name])
             self.recordings[name] = found = record(self.runner, COMMANDS[name], root)
@@ -321,7 +321,7 @@ class Harness:
             print(f"recorded {name:22}{counts} {found.seconds:6.1f} s, status {found.status}", file=sys.stderr)
 
     def _fresh(self, command: Command) -> Path:
-        """Return a copy of a campaign, old enough that hashes of its files are kept; remove the one before."""
+        """Return a copy of a campaign, old enough for its hashes to be cached; remove the previous copy."""
         if self._used:
             shutil.rmtree(self._used, ignore_errors=True)
         if not (self.folder / command.campaign).exists():
@@ -331,18 +331,18 @@ class Harness:
         while len(waiting) < 4:
             self._copies += 1
             waiting.append((copy(self.folder / name, self.folder / f"copy{self._copies}"), time.time()))
-        self._used, made_s = waiting.popleft()
-        time.sleep(max(0.0, made_s + SETTLED_S - time.time()))
+        self._used, created_s = waiting.popleft()
+        time.sleep(max(0.0, created_s + SETTLED_S - time.time()))
         return self._used
 
     def trials(self, name: str, most: int, kinds: Sequence[str], rng: random.Random) -> list[Trial]:
-        """Return the trials of the review for a command, and others by chance: its own paths first."""
+        """Return the trials of the review for a command and random ones, preferably of its own paths."""
         own = self.recordings[name]
         campaign = COMMANDS[name].campaign
         same = [self.recordings[other] for other in self.recordings if COMMANDS[other].campaign == campaign]
         others = sorted({path for found in same for path in found.written})
-        typed = set(COMMANDS[name].words.split())  # whoever types the name of a link means its target
-        tiers = [[path for path in tier if path not in typed] for tier in (own.written, own.opened, others)]
+        arguments = set(COMMANDS[name].words.split())  # links given as arguments may be followed
+        tiers = [[path for path in tier if path not in arguments] for tier in (own.written, own.opened, others)]
         tiers = [tier for tier in tiers if tier]
         weights = [{0: 0.55, 1: 0.25, 2: 0.2}[place] for place in range(len(tiers))]
         fixed = [
@@ -362,7 +362,7 @@ class Harness:
         return [*fixed, *(trial for trial in chosen if trial not in fixed)]
 
     def attempt(self, trial: Trial) -> Outcome:
-        """Plant, run the command, and compare D and the inputs with what they were."""
+        """Plant objects, run the command, and compare D and the inputs with their earlier state."""
         command = COMMANDS[trial.command]
         root, outside = self._fresh(command), make_user_folder(self.folder / "user")
         for path in trial.paths:
@@ -371,7 +371,7 @@ class Harness:
         return self._judged(trial, ended, changes)
 
     def attempt_while_running(self, name: str, rng: random.Random) -> Outcome:
-        """Start a command, and replace paths by links to D while it runs."""
+        """Start a command and replace paths by links to D while it runs."""
         command, own = COMMANDS[name], self.recordings[name]
         root, outside = self._fresh(command), make_user_folder(self.folder / "user")
         aside = self.folder / "aside"
@@ -388,7 +388,7 @@ class Harness:
     def _compared(
         self, name: str, root: Path, outside: Path, planted: Sequence[str], meanwhile: Callable[[], object] | None
     ) -> tuple[Ended, str]:
-        """Run a command; return how it ended, and what changed in D and in the inputs."""
+        """Run a command; return its end and the changes of D and of the inputs."""
         command = COMMANDS[name]
         watched = [outside, *(root / top for top in INPUTS)]
         before = fingerprint(*watched)
@@ -404,7 +404,7 @@ class Harness:
         return ended, differences(before, after, self.folder)
 
     def _judged(self, trial: Trial, ended: Ended, changes: str) -> Outcome:
-        """Return the columns that a trial counts in."""
+        """Return the outcome of a trial."""
         messages = [line for line in ended.message.splitlines() if line.startswith("error:")]
         last = (ended.message.strip() or ended.printed.strip()).splitlines()[-1:]
         columns, text = [], []
@@ -413,7 +413,7 @@ class Harness:
             text.append(changes)
         if ended.status is None:
             columns.append(HUNG)
-            text.append(f"ended by the harness after {ended.seconds:.0f} s")
+            text.append(f"killed by the harness after {ended.seconds:.0f} s")
         elif ended.status < 0:
             columns.append(KILLED)
             text.append(f"signal {-ended.status}")
@@ -429,7 +429,7 @@ class Harness:
 
 
 def table(outcomes: Sequence[Outcome]) -> str:
-    """Return the counts of each command, and a line for each fault."""
+    """Return a table of the counts per command, and a line per fault."""
     columns = (*FAULTS, REFUSED, WORKED)
     rows: list[tuple[str, ...]] = [("command", "planted", *columns)]
     for name in dict.fromkeys(outcome.trial.command for outcome in outcomes):
@@ -450,7 +450,7 @@ def table(outcomes: Sequence[Outcome]) -> str:
 def trials_of(
     folder: Path, names: Sequence[str], *, kinds: Sequence[str], seed: int, most: int, while_running: bool
 ) -> list[Outcome]:
-    """Make the campaigns in an empty folder, record the commands, and return the outcome of every trial."""
+    """Write the campaigns to an empty folder, record the commands, and return the outcome of every trial."""
     harness = Harness(folder)
     outcomes: list[Outcome] = []
     try:
@@ -463,26 +463,30 @@ def trials_of(
             else:
                 outcomes += [harness.attempt(trial) for trial in harness.trials(name, most, kinds, rng)]
             done = [outcome for outcome in outcomes if outcome.trial.command == name]
-            print(f"{name}: {sum(one.is_fault for one in done)} of {len(done)} trials fired", file=sys.stderr)
+            print(
+                f"{name}: faults in {sum(outcome.is_fault for outcome in done)} of {len(done)} trials", file=sys.stderr
+            )
     finally:
         harness.runner.close()
     return outcomes
 
 
 def main() -> int:
-    """Run the harness as the command line asks; return 1 if anything fired."""
+    """Run the harness with the options of the command line; return 1 if there is any fault."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--commands", help="names, separated by commas (default: all): " + ", ".join(COMMANDS))
     parser.add_argument("--kinds", help="kinds, separated by commas (default: all): " + ", ".join(KINDS))
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--most", type=int, default=12, help="random trials per command, beside those of the review")
+    parser.add_argument(
+        "--most", type=int, default=12, help="random trials per command, in addition to those of the review"
+    )
     parser.add_argument("--while-running", action="store_true", help="replace paths while the commands run")
     options = parser.parse_args()
     names = options.commands.split(",") if options.commands else [name for name in COMMANDS if "whole" not in name]
     kinds = options.kinds.split(",") if options.kinds else list(KINDS)
     with tempfile.TemporaryDirectory(prefix="links-") as folder:
-        asked = {"kinds": kinds, "seed": options.seed, "most": options.most, "while_running": options.while_running}
-        outcomes = trials_of(Path(folder).resolve(), names, **asked)
+        choices = {"kinds": kinds, "seed": options.seed, "most": options.most, "while_running": options.while_running}
+        outcomes = trials_of(Path(folder).resolve(), names, **choices)
     print(table(outcomes))
     return int(any(outcome.is_fault for outcome in outcomes))
 

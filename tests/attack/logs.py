@@ -83,9 +83,9 @@ def airdata(times: np.ndarray, geodetic: np.ndarray, *, clock_ms: np.ndarray | N
     lines = [AIRDATA]
     for number, (time, (latitude, longitude, height)) in enumerate(zip(times, geodetic, strict=True)):
         utc = str(time)[:19].replace("T", " ")
-        said = '"Mode, changed"' if number == 3 else ""
+        message = '"Mode, changed"' if number == 3 else ""
         place = f"{latitude:.9f},{longitude:.9f},{height - 48:.6f}"
-        lines.append(f"{clock[number]},{utc},{place},{satellites},0, 90.5, -2.5, 1.5,{said}")
+        lines.append(f"{clock[number]},{utc},{place},{satellites},0, 90.5, -2.5, 1.5,{message}")
     return "\n".join(lines) + "\n"
 
 

@@ -53,17 +53,17 @@ class Parser:
     Attributes
     ----------
     file
-        Name of the file, by whose suffix formats are told apart.
+        File name; its suffix determines the format.
     seeds
-        Makes valid files.
+        Function that returns valid files.
     read
-        Path → value, or CampaignError.
+        Function that returns the value of a file or raises `CampaignError`.
     structure
-        Mutators that know the format.
+        Format-specific mutators.
     tokens
-        What the format is made of, separated by spaces.
+        Tokens of the format, separated by spaces.
     may_die
-        The file is read in a process of its own in the product: its death is a refusal.
+        True if the product reads the file in a separate process, where a crash is a refusal.
     """
 
     file: str
@@ -113,7 +113,7 @@ def _collection(path: Path) -> Any:
 
 
 def _preamble(path: Path) -> Any:
-    return read_framing(path, seeds.DESCRIBED, sample_rate_hz=1e6, where=path)
+    return read_framing(path, seeds.FRAMING, sample_rate_hz=1e6, where=path)
 
 
 def _history(path: Path) -> Any:

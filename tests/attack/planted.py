@@ -91,10 +91,10 @@ class Planted:
         """Yield a list of fired markers, which is filled when the block ends."""
         fired: list[str] = []
         before = set(self.ran.iterdir())
-        with opened([*self.watched, self.outside, *self.outside.rglob("*")]) as seen:
+        with opened([*self.watched, self.outside, *self.outside.rglob("*")]) as opened_paths:
             yield fired
         fired += sorted(f"ran {path.name}" for path in set(self.ran.iterdir()) - before)
-        fired += sorted(f"opened {path.relative_to(self.root.parent)}" for path in seen)
+        fired += sorted(f"opened {path.relative_to(self.root.parent)}" for path in opened_paths)
 
 
 class Code:
@@ -256,8 +256,8 @@ def opened(paths: list[Path]) -> Iterator[set[Path]]:
             if number < 0:
                 raise OSError(ctypes.get_errno(), "inotify_add_watch", str(path))
             names[number] = path
-        seen: set[Path] = set()
-        yield seen
+        opened_paths: set[Path] = set()
+        yield opened_paths
         while select.select([watching], [], [], 0)[0]:
             events = os.read(watching, 1 << 16)
             at = 0
@@ -265,7 +265,7 @@ def opened(paths: list[Path]) -> Iterator[set[Path]]:
                 number, mask, _, length = _EVENT.unpack_from(events, at)
                 name = events[at + _EVENT.size : at + _EVENT.size + length].rstrip(b"\0").decode()
                 if mask & _IN_OPEN:
-                    seen.add(names[number] / name if name else names[number])
+                    opened_paths.add(names[number] / name if name else names[number])
                 at += _EVENT.size + length
     finally:
         os.close(watching)

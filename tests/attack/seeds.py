@@ -1,4 +1,4 @@
-"""Small valid files of every format that a campaign brings, as bytes; real ones are added where they are at hand."""
+"""Small valid files of every input format, as bytes, and real files if they are available."""
 
 import hashlib
 import io
@@ -37,18 +37,18 @@ SHARED = Path(__file__).parents[3] / "shared" / "data"
 SYMBOLS, NODES, SAMPLES, CHANNELS = 64, ("uav1", "uav2"), 24, 2
 
 CALIBRATED = "calibration: {flight: c01, reflector_m: [570660.0, 5363700.0, 620.0], search_m: 2.0}\n"
-DESCRIBED = {
+FRAMING = {
     "chip_samples": 2,
     "centre_hz": 0.0,
     "counter_bits": 8,
     "bit_chips": 3,
     "guard_samples": 4,
 }
-"""What an apertura:framing says besides the preamble."""
+"""Fields of apertura:framing except the preamble."""
 
 
 def real(name: str, *, lines: int = 0, most: int = 40_000) -> list[bytes]:
-    """Return a real file, or its first lines, if it is here and small."""
+    """Return a real file or its first lines, if it is available and small."""
     path = SHARED / name
     if not path.is_file():
         return []
@@ -58,7 +58,7 @@ def real(name: str, *, lines: int = 0, most: int = 40_000) -> list[bytes]:
 
 
 def configs() -> list[bytes]:
-    """Return configs: all keys commented, one with a calibration and a DEM, a real one."""
+    """Return configs: with all keys commented, with a calibration and a DEM, and a real one."""
     rest = "\n".join(line for line in config_template().splitlines() if not line.startswith("calibration"))
     rest = rest.replace("crs: auto", "crs: EPSG:32632").replace("dem: null", "dem: config/dem.tif")
     rest = rest.replace("dem_datum: null", "dem_datum: ellipsoid")
@@ -89,7 +89,7 @@ def clocks() -> list[bytes]:
 
 
 def scans() -> list[bytes]:
-    """Return scans of a PulsON radar, the last of them cut off, and as it began to write them."""
+    """Return recordings of a PulsON radar, complete and with a truncated last scan."""
     messages = np.zeros((2, 2), MESSAGE)
     messages["type"], messages["source"], messages["step_bins"], messages["kind"] = 0xF201, 1, 32, 1
     messages["start_ps"], messages["stop_ps"], messages["total"], messages["messages"] = 10_000, 40_518, 500, 2
@@ -101,14 +101,14 @@ def scans() -> list[bytes]:
 
 
 def sigmf_meta() -> list[bytes]:
-    """Return metadata of triggered captures, of recorders that ran through, with headers between, of another maker."""
+    """Return metadata of triggered and continuous recordings, with header bytes, and of another vendor."""
     header = {"core:datatype": "ci16_le", "core:version": "1.2.5", "core:sample_rate": 1e6, "core:num_channels": 2}
     captures = [
         {"core:sample_start": 6 * n, "core:frequency": 1.2e9, "core:datetime": f"2025-05-14T09:30:0{n}.25Z"}
         for n in range(4)
     ]
     counted = [{**capture, "apertura:frame": n} for n, capture in enumerate(captures)]
-    framing = {"apertura:framing": {"preamble": "raw/preamble.npy", **DESCRIBED}}
+    framing = {"apertura:framing": {"preamble": "raw/preamble.npy", **FRAMING}}
     names = {"apertura:channels": ["radar", "sidelink"]}
     headed = [{**capture, "core:sample_start": 5 * n, "core:header_bytes": 8} for n, capture in enumerate(captures)]
     real_valued = {"core:datatype": "rf32_le", "apertura:if_hz": 2.5e5}
@@ -129,12 +129,12 @@ def sigmf_data() -> list[bytes]:
 
 
 def sigmf_floats() -> list[bytes]:
-    """Return as many samples of all channels as float32."""
+    """Return the samples of all channels as float32."""
     return [np.arange(1, SAMPLES * CHANNELS * 2 + 1, dtype="<f4").tobytes()]
 
 
 def sigmf_collections() -> list[bytes]:
-    """Return collections that list the first recording of `sigmf_meta`, as a node's and as it is."""
+    """Return collections that list the first recording of `sigmf_meta`, under the name of a node and its own."""
     streams = [{"name": "rx_0", "hash": hashlib.sha512(sigmf_meta()[0]).hexdigest()}]
     body = {"core:version": "1.2.0", "core:streams": streams}
     return [json.dumps({"collection": body | more}).encode() for more in ({"apertura:nodes": {"uav1": "rx_0"}}, {})]
@@ -180,21 +180,21 @@ def other_solutions() -> list[bytes]:
 
 
 def mapped_tracks() -> list[bytes]:
-    """Return a CSV log that counts seconds, under names of its own."""
+    """Return a CSV log with times in seconds and other column names."""
     _, places = logs.circle(8)
     rows = [f"{number / 10:.1f},{a},{b},{h}" for number, (a, b, h) in enumerate(places)]
     return ["\n".join(["t,lat,lon,alt", *rows, ""]).encode()]
 
 
 def nmea() -> list[bytes]:
-    """Return NMEA logs with and without dates and a host's stamps."""
+    """Return NMEA logs with and without dates and host time stamps."""
     times, places = logs.circle(8)
     texts = [logs.nmea(times, places), logs.nmea(times, places, every=1, prefix="2025-05-14 23:59:57.1 ", talker="GP")]
     return [text.encode() for text in texts]
 
 
 def airdata() -> list[bytes]:
-    """Return exports of DJI flights, one whose clock stood still; and the head of a real one."""
+    """Return Airdata exports of DJI flights, one with a constant clock, and the head of a real one."""
     times, places = logs.circle(24)
     late = times + np.where(np.arange(24) < 12, 0, 74_000).astype("timedelta64[ms]")
     texts = [logs.airdata(times, places), logs.airdata(late, places, clock_ms=100 + 100 * np.arange(24))]
@@ -203,13 +203,13 @@ def airdata() -> list[bytes]:
 
 
 def captures() -> list[bytes]:
-    """Return takes of two bodies and the head of a real one."""
+    """Return Motive takes of two bodies and the head of a real one."""
     text = logs.capture(np.arange(12) / 360, logs.poses(), lost=[5])
     return [text.encode(), *real("bwsi_rail_passA/Rail SAR 2.csv", lines=30)]
 
 
 def ulogs() -> list[bytes]:
-    """Return logs of PX4 of both generations, with attitude and fused positions."""
+    """Return PX4 logs of both message generations, with attitude and fused positions."""
     attitude = ("vehicle_attitude", 0, ulog_attitude(12, 10.0))
     old = ulog(("vehicle_gps_position", 0, ulog_receiver(epochs=12)), attitude)
     new = ulog(
@@ -219,17 +219,17 @@ def ulogs() -> list[bytes]:
 
 
 def dataflash_logs() -> list[bytes]:
-    """Return binary logs of ArduPilot with one receiver and with two."""
+    """Return binary ArduPilot logs with one receiver and with two."""
     return [dataflash(dataflash_rows(epochs=12)), dataflash(dataflash_rows(epochs=8, receivers=(0, 1)))]
 
 
 def dataflash_texts() -> list[bytes]:
-    """Return the same as text."""
+    """Return the ArduPilot logs as text."""
     return [dataflash_text(dataflash_rows(epochs=12)), dataflash_text(dataflash_rows(epochs=8, receivers=(0, 1)))]
 
 
 def patterns() -> list[bytes]:
-    """Return a sampled beam, without and with phase."""
+    """Return sampled beam patterns without and with phase."""
     rows = [f"{cut},{angle},{-(angle**2) / 100}" for cut in ("azimuth", "elevation") for angle in range(-60, 61, 20)]
     with_phase = ["cut,angle_deg,gain_db,phase_deg", *(f"{row},-3.5" for row in rows), ""]
     return ["\n".join(["cut,angle_deg,gain_db", *rows, ""]).encode(), "\n".join(with_phase).encode()]
@@ -255,13 +255,13 @@ def pulses() -> list[bytes]:
 
 
 def preambles() -> list[bytes]:
-    """Return chips as integers and as numbers."""
+    """Return chips as integers and as floats."""
     chips = np.where(np.arange(31) % 3, 1, -1)
     return [_npy(chips.astype(np.int8)), _npy(chips.astype(np.float64))]
 
 
 def matlab() -> list[bytes]:
-    """Return a Gotcha structure, as it is and compressed."""
+    """Return a Gotcha structure, uncompressed and compressed."""
     pulses, lines = 6, 5
     angle = np.linspace(0, 0.1, pulses)
     data = {
@@ -290,13 +290,13 @@ RECORDED = {
     "rx_position": np.array([4177000.0, 855000.0, 4728009.0]) + np.arange(6)[:, None],
     "reference_delay": np.linspace(6.6e-6, 6.7e-6, 6),
 }
-"""A phase history, as stage echo has it."""
+"""Phase history with the variables of the echo stage."""
 
 TIME_UNITS = {"units": "nanoseconds since 1970-01-01"}
 
 
 def cphd() -> list[bytes]:
-    """Return a bistatic pair as CPHD, with and without a parameter of our own."""
+    """Return a bistatic pair as CPHD, with and without a custom parameter."""
     place = RECORDED["tx_position"][0] - [500.0, 200.0, 300.0]
     parts = RECORDED["time"].astype("datetime64[ns]"), RECORDED["tx_position"], RECORDED["rx_position"]
     files = []
@@ -323,7 +323,7 @@ def cphd() -> list[bytes]:
 
 
 def hdf5() -> list[bytes]:
-    """Return a phase history in HDF5, as it is and compressed."""
+    """Return a phase history in HDF5, uncompressed and compressed."""
     files = []
     for packed in (None, "gzip"):
         target = io.BytesIO()
@@ -344,7 +344,7 @@ def zarr_folder(folder: Path) -> None:
 
 
 def zarr_arrays() -> list[bytes]:
-    """Return the metadata of the samples of such a folder."""
+    """Return the metadata of the sample array of a zarr folder."""
     with TemporaryDirectory() as folder:
         zarr_folder(Path(folder) / "b.zarr")
         return [(Path(folder) / "b.zarr/transfer/zarr.json").read_bytes()]
@@ -360,7 +360,7 @@ def _tiff(heights: np.ndarray, place: rasterio.Affine, crs: str, **more: object)
 
 
 def dems() -> list[bytes]:
-    """Return rasters under the scene of `parsers`: plain, packed, tiled, with voids, in degrees."""
+    """Return DEMs of the scene of `parsers`: plain, packed, tiled, with voids, in degrees."""
     rows, columns = np.mgrid[:24, :24]
     heights, corner = (600 + 0.5 * rows - 0.25 * columns).astype(np.float32), from_origin(500000, 5400100, 5, 5)
     return [
@@ -372,7 +372,7 @@ def dems() -> list[bytes]:
 
 
 GEOID_AT = (np.array([9.0, 9.2]), np.array([48.5, 48.7]))
-"""Longitudes and latitudes at which undulations are asked for."""
+"""Longitudes and latitudes, in degrees, at which undulations are interpolated."""
 
 
 def _undulations() -> np.ndarray:
@@ -380,12 +380,12 @@ def _undulations() -> np.ndarray:
 
 
 def gtx_grids() -> list[bytes]:
-    """Return a grid of 9 × 9 posts."""
+    """Return a geoid grid of 9 × 9 posts in GTX format."""
     return [struct.pack(">4d2i", 47.0, 7.0, 0.5, 0.5, 9, 9) + _undulations().tobytes()]
 
 
 def tif_grids() -> list[bytes]:
-    """Return the same as GeoTIFF of PROJ's kind."""
+    """Return the geoid grid as GeoTIFF in the format of PROJ."""
     return [_tiff(_undulations()[::-1].astype(np.float32), from_origin(6.75, 51.25, 0.5, 0.5), "EPSG:4326")]
 
 
@@ -411,14 +411,14 @@ def missions() -> list[bytes]:
 
 
 def waypoints() -> list[bytes]:
-    """Return missions of ArduPilot's ground stations."""
+    """Return waypoint missions of ArduPilot ground stations."""
     rows = ["0\t1\t0\t16\t0\t0\t0\t0\t48\t9\t480\t1"]
     rows += [f"{number}\t0\t3\t16\t0\t0\t0\t0\t48.00{number}\t9\t40\t1" for number in (1, 2)]
     return ["\n".join(["QGC WPL 110", *rows]).encode()]
 
 
 def kmls() -> list[bytes]:
-    """Return lines of KML."""
+    """Return KML documents with lines."""
     line = "<altitudeMode>absolute</altitudeMode><coordinates>9,48,500 9.01,48,500</coordinates>"
     return [f"<kml><Placemark><LineString>{line}</LineString></Placemark></kml>".encode()]
 
@@ -491,5 +491,5 @@ REPORTED = {
 
 
 def documents(document: object) -> list[bytes]:
-    """Return a result as the workflow writes it."""
+    """Return a document in the format of the workflow."""
     return [json.dumps(document, indent=1).encode()]
