@@ -197,9 +197,9 @@ def test_logs_far_from_the_scene_are_reported_with_the_likely_cause(tiny, change
 
 
 def bounds_of(root):
-    found = []
-    edit_config(root, lambda document: found.extend(document["scene"]["bounds_m"]))
-    return found
+    bounds_m = []
+    edit_config(root, lambda document: bounds_m.extend(document["scene"]["bounds_m"]))
+    return bounds_m
 
 
 def test_scene_in_the_neighbouring_zone_is_reported_with_distance(tiny):

@@ -83,14 +83,14 @@ def test_changed_log_with_kept_time_outdates_all_dependent_results(finished):
     campaign, path = Campaign.load(finished), finished / LOG
     data = path.read_bytes()
     replace_keeping_times(path, data.replace(b"8", b"9", 1))
-    found = stale_results(campaign)
-    assert found["results/f01/uav2/track.manifest.json"] == f"{LOG} has changed"
-    assert "results/f01/uav1-uav2/echo.manifest.json" in found
-    assert "results/f01/uav1-uav1/echo.manifest.json" not in found
-    assert "results/f01/uav1-uav1/export.manifest.json" in found  # through the assessment
-    assert list(stale_lines(found)) == [
+    outdated = stale_results(campaign)
+    assert outdated["results/f01/uav2/track.manifest.json"] == f"{LOG} has changed"
+    assert "results/f01/uav1-uav2/echo.manifest.json" in outdated
+    assert "results/f01/uav1-uav1/echo.manifest.json" not in outdated
+    assert "results/f01/uav1-uav1/export.manifest.json" in outdated  # through the assessment
+    assert list(stale_lines(outdated)) == [
         f"results/f01/uav2/track.manifest.json: out of date, {LOG} has changed",
-        f"{len(found) - 1} dependent results out of date as well",
+        f"{len(outdated) - 1} dependent results out of date as well",
     ]
     replace_keeping_times(path, data)
     assert stale_results(campaign) == {}
@@ -157,9 +157,9 @@ def test_copied_results_with_other_times_are_up_to_date(finished, tmp_path):
     ids=["name", "window", "node"],
 )
 def test_setting_outdates_only_the_results_that_depend_on_it(finished, change, expected, spared):
-    found = names(stale_results(edit(finished, change)))
-    assert expected <= found
-    assert not spared & found
+    outdated = names(stale_results(edit(finished, change)))
+    assert expected <= outdated
+    assert not spared & outdated
 
 
 def test_changed_code_outdates_its_results(finished, monkeypatch):
@@ -167,18 +167,18 @@ def test_changed_code_outdates_its_results(finished, monkeypatch):
         return ("apertura.common.constants",) if result == "profile" else modules_of(campaign, result, *where)
 
     monkeypatch.setattr("apertura.workflow.lineage.modules_of", other)
-    found = stale_results(Campaign.load(finished))
-    assert found["results/f01/uav1-uav1/profile.manifest.json"] == "its code has changed"
-    assert not {"raw", "track", "echo", "scene"} & names(found)
+    outdated = stale_results(Campaign.load(finished))
+    assert outdated["results/f01/uav1-uav1/profile.manifest.json"] == "its code has changed"
+    assert not {"raw", "track", "echo", "scene"} & names(outdated)
 
 
 def test_missing_source_or_damaged_manifest_outdates_a_result(finished):
     campaign = Campaign.load(finished)
     (finished / "results/f01/uav1/track.manifest.json").unlink()
     (finished / "results/cube.manifest.json").write_text("{")
-    found = stale_results(campaign)
-    assert "results/f01/uav1/track.manifest.json is missing" in found["results/f01/uav1-uav1/echo.manifest.json"]
-    assert found["results/cube.manifest.json"].startswith("its manifest is damaged")
+    outdated = stale_results(campaign)
+    assert "results/f01/uav1/track.manifest.json is missing" in outdated["results/f01/uav1-uav1/echo.manifest.json"]
+    assert outdated["results/cube.manifest.json"].startswith("its manifest is damaged")
 
 
 @pytest.mark.quick("f01/uav1-uav1/db.tif*", "cube*")
@@ -215,9 +215,9 @@ def test_edited_or_missing_product_is_out_of_date(finished, file, how):
         path.unlink()
     else:
         path.write_bytes(path.read_bytes()[:-1] + b"x")
-    found = stale_results(Campaign.load(finished))
+    outdated = stale_results(Campaign.load(finished))
     reason = "is missing" if how == "gone" else "has changed since it was written"
-    assert [reason for reason in found.values() if reason] == [f"{path.name} {reason}"]
+    assert [reason for reason in outdated.values() if reason] == [f"{path.name} {reason}"]
 
 
 @pytest.mark.quick("0")
@@ -238,8 +238,8 @@ def test_edited_product_is_kept_under_another_name(finished, before, capsys):
 
 def test_stage_with_a_missing_array_is_out_of_date(finished):
     shutil.rmtree(finished / "results/f01/uav1-uav1/echo.zarr/path_removed")
-    found = stale_results(Campaign.load(finished))
-    assert found["results/f01/uav1-uav1/echo.manifest.json"].endswith(" is missing")
+    outdated = stale_results(Campaign.load(finished))
+    assert outdated["results/f01/uav1-uav1/echo.manifest.json"].endswith(" is missing")
 
 
 def test_products_without_manifest_are_out_of_date_and_not_summarised(finished):

@@ -40,18 +40,18 @@ def image_of(root, pair="uav1-uav1"):
 def peaks(root, flight, targets=None, pair="uav1-uav1"):
     """Return east, north (m, from the origin) and magnitude of the peak next to each target."""
     grid, pixels = open_scene(Campaign.load(root)).grid, image_of(root, pair).image.values
-    found = []
+    positions = []
     for east, north, _ in targets or flight.targets:
         row, column = grid.pixel_of(flight.origin[0] + east, flight.origin[1] + north)
         peak = find_peak(pixels, round(float(row)), round(float(column)))
-        found.append(
+        positions.append(
             (
                 east + (peak.column - float(column)) * flight.spacing_m,
                 north - (peak.row - float(row)) * flight.spacing_m,
                 abs(peak.value),
             )
         )
-    return np.array(found)
+    return np.array(positions)
 
 
 def error_and_magnitudes(root, flight, pair="uav1-uav1"):

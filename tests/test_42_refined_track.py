@@ -38,7 +38,7 @@ from apertura.views.score import score
 from apertura.workflow.stale import stale_results
 
 PAIRS = ("uav1-uav1", "uav1-uav2")
-DECISIONS = (Decision("autofocus", "on", "asked for"), Decision("autofocus_method", "tracks", "asked for"))
+DECISIONS = (Decision("autofocus", "on", "requested"), Decision("autofocus_method", "tracks", "requested"))
 
 
 def run_steps_before_image(campaign):
@@ -113,7 +113,7 @@ def write_track(campaign, start, correction, *, accepted=True, flags=None):
         records.append(PairRecord(name, profiles, clock_s(pair, start), pair.sidelink_m))
     std_m = {node: np.full_like(moved, 1e-3) for node, moved in correction.moved_m.items()}
     report = {"gain_held_out_db": 3.0, "left_db": -0.05, "left_rad": 0.1, "gauge_shift_m": 0.01}
-    refinement = Refinement(correction, std_m, accepted, "as told", report, flags or {})
+    refinement = Refinement(correction, std_m, accepted, "as stated", report, flags or {})
     inputs = RefinementInputs(tuple(records), {}, (), start)
     stage = refine.refined_stage(refinement, DECISIONS, inputs, opened)
     save_stage(stamped(stage, "refined_track", modules=[refine.__name__]), campaign.stage("refined_track", "f01"))
@@ -124,7 +124,7 @@ def test_corrected_track_gives_the_images_of_the_true_track(erroneous, finished_
     campaign, correction = erroneous
     correlation = {}
     for accepted in (False, True):
-        write_track(campaign, *correction, accepted=accepted, flags={"position_error_understated": "told so"})
+        write_track(campaign, *correction, accepted=accepted, flags={"position_error_understated": "as stated"})
         for pair in PAIRS:
             image.image(campaign, "f01", pair)
             true, corrected = (image_of(which, pair) for which in (finished_tiny, campaign))
@@ -137,8 +137,8 @@ def test_corrected_track_gives_the_images_of_the_true_track(erroneous, finished_
         quality = quality_of(campaign, pair)
         assert quality["autofocus"]["rms_cm"]["uav1"] == pytest.approx(3 * np.sqrt(3 / 2), rel=0.15)
         assert quality["autofocus"]["gain_held_out_db"] == 3.0
-        assert quality["models"]["autofocus"] == "on: asked for; as told"
-        assert quality["flags"]["position_error_understated"] == "told so"
+        assert quality["models"]["autofocus"] == "on: requested; as stated"
+        assert quality["flags"]["position_error_understated"] == "as stated"
         assert [line for line in quality["budget"] if line["cause"] == "positions"] == [
             {
                 "cause": "positions",
@@ -260,7 +260,7 @@ def test_correct_logs_with_a_stated_error_of_2_cm_are_unchanged(tmp_path, pulses
     assert stage.attrs["flags"].keys() <= {"position_error_overstated"}
     assert quality["flags"].items() >= stage.attrs["flags"].items()
     assert quality["autofocus"]["accepted"] is False
-    assert quality["models"]["autofocus"].startswith("on: asked for; ")
+    assert quality["models"]["autofocus"].startswith("on: requested; ")
     assert json.loads(stage.attrs["runspec"]) == {
         "autofocus": "on",
         "autofocus_method": "auto",
@@ -299,18 +299,18 @@ def test_log_errors_of_2_cm_are_refined_automatically(tmp_path):
     simulate(right, preset("demo", pulses=600), seed=7)
     copy_writable(right, erroneous)
     add_noise(erroneous, 0.02, 0.02)
-    found = {}
+    loss_of = {}
     for name, root in (("off", copy_writable(erroneous, tmp_path / "off")), ("auto", erroneous)):
         state(root, "processing", autofocus=name)
         campaign = run_steps(root)
-        found[name] = {pair: quality_of(campaign, pair)["focus"]["loss_db"] for pair in PAIRS}
+        loss_of[name] = {pair: quality_of(campaign, pair)["focus"]["loss_db"] for pair in PAIRS}
         worst_m = max(one.error_m for one in score(campaign))
     for pair in PAIRS:
         quality = quality_of(campaign, pair)
         assert quality["autofocus"]["accepted"]
         assert quality["focus"]["verdict"] == "focused"
-        assert found["off"][pair] < -1.0
-        assert found["auto"][pair] > -0.3
+        assert loss_of["off"][pair] < -1.0
+        assert loss_of["auto"][pair] > -0.3
         assert quality["focus"]["expected_db"] == pytest.approx(quality["focus"]["loss_db"], abs=0.2)
     assert worst_m < 0.03
     report = json.loads((campaign.results / "f01" / "uav1-uav1" / "image.json").read_text())

@@ -53,10 +53,10 @@ def log():
 
 
 def test_pos_file_contains_the_refined_positions(log, tmp_path):
-    write_pos(tmp_path / "uav1.pos", log, outcome="refined: as told", version="0")
+    write_pos(tmp_path / "uav1.pos", log, outcome="refined: as stated", version="0")
     text = (tmp_path / "uav1.pos").read_text()
     read = read_rtklib_pos(tmp_path / "uav1.pos", node="uav1")
-    assert "% refined: as told" in text.splitlines()
+    assert "% refined: as stated" in text.splitlines()
     assert "5 of 30 epochs lie outside the pulses" in text
     assert "ns, age, ratio and covariances 0: unknown" in text  # reported because programs filter by them
     np.testing.assert_array_equal(read.time.values, log.track.time.values)
@@ -122,8 +122,8 @@ def stage_of(*, accepted, pairs=()):
             "nodes": ["uav1"],
             "pairs": list(pairs),
             "accepted": accepted,
-            "reason": "as told",
-            "decisions": {"autofocus": {"value": "on", "reason": "asked for"}},
+            "reason": "as stated",
+            "decisions": {"autofocus": {"value": "on", "reason": "requested"}},
         },
     )
 
@@ -131,8 +131,8 @@ def stage_of(*, accepted, pairs=()):
 @pytest.mark.parametrize(
     ("refinement", "outcome", "moved_m", "refined"),
     [
-        ({"accepted": True}, "refined: autofocus on: asked for; as told", [0.0, 0.5, 1.0, 1.0], [1, 1, 1, 0]),
-        ({"accepted": False}, "as logged: autofocus on: asked for; as told", [0.0] * 4, [0] * 4),
+        ({"accepted": True}, "refined: autofocus on: requested; as stated", [0.0, 0.5, 1.0, 1.0], [1, 1, 1, 0]),
+        ({"accepted": False}, "as logged: autofocus on: requested; as stated", [0.0] * 4, [0] * 4),
     ],
 )
 def test_accepted_correction_is_applied_and_held_beyond_the_pulses(refinement, outcome, moved_m, refined, settings):
@@ -191,7 +191,7 @@ def test_unrefined_tracks_are_exported_as_logged(finished_tiny):
 @pytest.mark.slow
 def test_plot_has_a_column_per_node(log, tmp_path):
     for count in (1, 4):
-        write_picture(tmp_path / f"{count}.png", [log] * count, title="a flight", outcome="refined: as told", tags={})
+        write_picture(tmp_path / f"{count}.png", [log] * count, title="a flight", outcome="refined: as stated", tags={})
     one, four = (imread(tmp_path / f"{count}.png") for count in (1, 4))
     assert four.shape[1] > 1.5 * one.shape[1]
 

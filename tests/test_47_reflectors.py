@@ -332,7 +332,7 @@ def test_phase_history_is_calibrated_from_its_images(measured, tmp_path):
     layers.layers(campaign, "f01", "uav1-uav1")
     constant = read_constants(write_constants(campaign)).pairs["uav1-uav1"]
     assert constant.radar.sent_power is None
-    assert -3 < constant.constant_db - true_constant_db(measured, "uav1-uav1") < 0  # beam gain below boresight
+    assert -3 < constant.constant_db - true_constant_db(measured, "uav1-uav1") < 0  # beam gain relative to boresight
     campaign = state(tmp_path, "processing", radiometric_calibration="calibration.json")
     layers.layers(campaign, "f01", "uav1-uav1")
     points = json.loads(campaign.result("f01", "uav1-uav1", "radiometry.json").read_text())["points"]

@@ -80,10 +80,10 @@ def test_overlap_of_two_grids_is_compared(tmp_path, scene):
     write_slc(tmp_path / "a.tif", scene, tags={}, **GEOREFERENCE)
     part = Affine(0.5, 0, 500002.5, 0, -0.5, 5399998)
     write_slc(tmp_path / "b.tif", scene[4:, 5:25], tags={}, transform=part, crs="EPSG:32632")
-    found = differing(tmp_path / "a.tif", tmp_path / "b.tif")
-    assert found["pixels"] == ["compared in the overlap: 20 × 36 pixels"]
-    assert [line.split(":")[0] for line in found["geometry"]] == ["size", "transform"]
-    assert differing(tmp_path / "b.tif", tmp_path / "a.tif")["pixels"] == found["pixels"]
+    sections = differing(tmp_path / "a.tif", tmp_path / "b.tif")
+    assert sections["pixels"] == ["compared in the overlap: 20 × 36 pixels"]
+    assert [line.split(":")[0] for line in sections["geometry"]] == ["size", "transform"]
+    assert differing(tmp_path / "b.tif", tmp_path / "a.tif")["pixels"] == sections["pixels"]
 
 
 @pytest.mark.parametrize(
@@ -116,14 +116,14 @@ def test_different_setting_is_reported_with_its_effects(finished_tiny, root):
     campaign = Campaign.load(root)
     profile.profile(campaign, "f01", "uav1-uav2")
     stage = f"{PAIR}/profile.zarr"
-    found = differing(finished_tiny.root / stage, root / stage)
-    assert found["settings"] == ["window: hann → none"]
-    (line,) = (line for line in found["values"] if line.startswith("profile: "))
+    sections = differing(finished_tiny.root / stage, root / stage)
+    assert sections["settings"] == ["window: hann → none"]
+    (line,) = (line for line in sections["values"] if line.startswith("profile: "))
     hann = np.hanning(1000)
     np.testing.assert_allclose(float(line.split()[-1]), hann.mean() / np.sqrt(np.mean(hann**2)), atol=0.03)
-    measured, setting = (line for line in found["report"] if not line.startswith("background."))
+    measured, setting = (line for line in sections["report"] if not line.startswith("background."))
     assert (measured.split(":")[0], setting) == ("compression_error_db", "window: hann → none")
-    assert found.keys() == {"settings", "report", "values"}
+    assert sections.keys() == {"settings", "report", "values"}
 
 
 def test_different_source_is_reported(finished_tiny, root):

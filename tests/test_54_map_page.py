@@ -294,14 +294,14 @@ def test_map_is_operated_by_keyboard(browser, address):
 def test_hostile_text_is_displayed_as_text(browser, finished, tmp_path):
     root = copy_writable(finished.root, tmp_path / "campaign")
     path = root / "results" / "map" / "map.json"
-    found = json.loads(path.read_text())
-    found["campaign"] = found["crs"]["name"] = HOSTILE
-    found["notes"] = [HOSTILE]
-    image = found["images"][0]
+    map_document = json.loads(path.read_text())
+    map_document["campaign"] = map_document["crs"]["name"] = HOSTILE
+    map_document["notes"] = [HOSTILE]
+    image = map_document["images"][0]
     image |= {"flight": HOSTILE, "image": HOSTILE, "verdict": HOSTILE, "reason": HOSTILE, "flags": {HOSTILE: HOSTILE}}
     image["layers"][0] |= {"title": HOSTILE, "unit": HOSTILE}
-    found["places"] = [{"name": HOSTILE, "source": HOSTILE, "image": None, "x_m": 0.0, "y_m": 0.0}]
-    path.write_text(json.dumps(found))
+    map_document["places"] = [{"name": HOSTILE, "source": HOSTILE, "image": None, "x_m": 0.0, "y_m": 0.0}]
+    path.write_text(json.dumps(map_document))
     record_files(path.with_name("map.manifest.json"), [path])
     with serving(root) as address, shown(browser, address) as (frame, errors_and_requests):
         frame.wait_for_timeout(300)

@@ -48,10 +48,10 @@ def kinds(before: dict[str, object], after: dict[str, object]) -> set[str]:
     ({'a number'}, set())
     """
     changed = [path for path in before.keys() & after.keys() if not same(before[path], after[path])]
-    found = {_kind(path, before[path], after[path]) for path in changed}
-    if not any("more or fewer" in kind for kind in found) and before.keys() != after.keys():
-        found.add("more or fewer parts")
-    return found
+    differences = {_kind(path, before[path], after[path]) for path in changed}
+    if not any("more or fewer" in kind for kind in differences) and before.keys() != after.keys():
+        differences.add("more or fewer parts")
+    return differences
 
 
 _ENDINGS = {

@@ -166,13 +166,13 @@ def files(folder: Path) -> dict[str, bytes]:
     Excluded are receipts of tile shares, which contain the number of tiles formed, smaller after a kill; and partial
     files of a killed writer in unfinished stages, which are removed when the stage is finished.
     """
-    found = {}
+    contents = {}
     for path in folder.rglob("*"):
         name = path.relative_to(folder)
         is_excluded = path.parent.name == "tiles" or (path.suffix == ".partial" and ".wip/" in name.as_posix())
         if path.is_file() and not is_excluded and not any(part.startswith(".") for part in name.parts):
-            found[name.as_posix()] = path.read_bytes()
-    return found
+            contents[name.as_posix()] = path.read_bytes()
+    return contents
 
 
 def _mount(folder: Path, size: int, *, again: bool = False) -> None:

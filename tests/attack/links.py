@@ -247,7 +247,7 @@ def _expanded(paths: Sequence[str], recordings: Sequence[Recording]) -> tuple[st
     """Return the paths of a trial, with placeholders such as `ALL_WORK` expanded."""
     if not {ALL_WORK, ALL_LOCKS, ALL_HASHES} & set(paths):
         return tuple(paths)
-    written = {path for found in recordings for path in found.written}
+    written = {path for recording in recordings for path in recording.written}
     if ALL_LOCKS in paths:
         return tuple(sorted(path for path in written if path.endswith(".lock") and not path.endswith(".wip/.lock")))
     plain = {
@@ -316,9 +316,9 @@ class Harness:
         """Record the paths that commands use."""
         for name in names:
             root = self._fresh(COMMANDS[name])
-            self.recordings[name] = found = record(self.runner, COMMANDS[name], root)
-            counts = f"{len(found.written):5} written {len(found.opened):5} opened {found.random:5} random"
-            print(f"recorded {name:22}{counts} {found.seconds:6.1f} s, status {found.status}", file=sys.stderr)
+            self.recordings[name] = recording = record(self.runner, COMMANDS[name], root)
+            counts = f"{len(recording.written):5} written {len(recording.opened):5} opened {recording.random:5} random"
+            print(f"recorded {name:22}{counts} {recording.seconds:6.1f} s, status {recording.status}", file=sys.stderr)
 
     def _fresh(self, command: Command) -> Path:
         """Return a copy of a campaign, old enough for its hashes to be cached; remove the previous copy."""
@@ -340,7 +340,7 @@ class Harness:
         own = self.recordings[name]
         campaign = COMMANDS[name].campaign
         same = [self.recordings[other] for other in self.recordings if COMMANDS[other].campaign == campaign]
-        others = sorted({path for found in same for path in found.written})
+        others = sorted({path for recording in same for path in recording.written})
         arguments = set(COMMANDS[name].words.split())  # links given as arguments may be followed
         tiers = [[path for path in tier if path not in arguments] for tier in (own.written, own.opened, others)]
         tiers = [tier for tier in tiers if tier]
@@ -398,9 +398,9 @@ class Harness:
         own = [*command.writes, *planted]
         allowed = {str(root / path) for path in own} | {str((root / path).parent) for path in own}
         allowed -= {str(outside)}
-        for found in (before, after):
+        for entries in (before, after):
             for path in allowed:
-                found.pop(path, None)
+                entries.pop(path, None)
         return ended, differences(before, after, self.folder)
 
     def _judged(self, trial: Trial, ended: Ended, changes: str) -> Outcome:

@@ -154,9 +154,9 @@ def _modules(planted: Planted, *, in_snakemakes_own: bool) -> Mapping[str, str]:
         "cupy",
         "snaphu",
     }
-    found = {f"{name}.py": planted.code(f"{name}.py") + "\n" for name in names}
-    found |= {"apertura/__init__.py": planted.code("apertura") + "\n", "conftest.py": planted.code("conftest.py")}
-    found |= {
+    markers = {f"{name}.py": planted.code(f"{name}.py") + "\n" for name in names}
+    markers |= {"apertura/__init__.py": planted.code("apertura") + "\n", "conftest.py": planted.code("conftest.py")}
+    markers |= {
         "python.pth": planted.code("python.pth") + "\n",
         "distutils-precedence.pth": planted.code("precedence.pth"),
     }
@@ -167,8 +167,8 @@ def _modules(planted: Planted, *, in_snakemakes_own: bool) -> Mapping[str, str]:
         "usercustomize",
     )
     if in_snakemakes_own:
-        found |= {f"{SNAKEMAKES_OWN}/{name}.py": planted.code(f"own.{name}") for name in (*plugins, "sitecustomize")}
-    return found
+        markers |= {f"{SNAKEMAKES_OWN}/{name}.py": planted.code(f"own.{name}") for name in (*plugins, "sitecustomize")}
+    return markers
 
 
 def _workflows(planted: Planted) -> Mapping[str, str]:
@@ -179,7 +179,7 @@ def _workflows(planted: Planted) -> Mapping[str, str]:
 
     folders = [*(f"profiles/{name}" for name in PROFILES), *PROFILES, "."]
     files = ("config.yaml", "config.v8+.yaml", "config.v9+.yaml", "profile.yaml", "profile.v9+.yaml")
-    found = {f"{folder}/{file}": profile(f"{folder}/{file}") for folder in folders for file in files}
+    markers = {f"{folder}/{file}": profile(f"{folder}/{file}") for folder in folders for file in files}
     snakefiles = (
         "Snakefile",
         "workflow/Snakefile",
@@ -187,7 +187,7 @@ def _workflows(planted: Planted) -> Mapping[str, str]:
         "workflow/snakefile",
         "workflow/profiles/default/Snakefile",
     )
-    return found | {name: planted.code(name) + "\n" for name in snakefiles}
+    return markers | {name: planted.code(name) + "\n" for name in snakefiles}
 
 
 def _sidecars(planted: Planted) -> Mapping[str, str]:
@@ -197,8 +197,8 @@ def _sidecars(planted: Planted) -> Mapping[str, str]:
         f"<PAMDataset><SRS>LOCAL_CS[x]</SRS><VRTRasterBand><SourceFilename>{planted.outside / 'raster.tif'}"
         "</SourceFilename></VRTRasterBand></PAMDataset>"
     )
-    found = {f"{name}{suffix}": text for name in rasters for suffix in SIDECARS}
-    return found | {
+    markers = {f"{name}{suffix}": text for name in rasters for suffix in SIDECARS}
+    return markers | {
         f"{name.removesuffix('.tif')}{suffix}": text for name in rasters for suffix in (".tfw", ".wld", ".tab")
     }
 

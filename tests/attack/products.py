@@ -36,7 +36,7 @@ def rasters() -> list[bytes]:
 
 def pictures() -> list[bytes]:
     """Return a small PNG with tags before its pixels, plain and compressed."""
-    found = []
+    images = []
     for packed in (False, True):
         texts = PngImagePlugin.PngInfo()
         for name, text in _TAGS.items():
@@ -44,8 +44,8 @@ def pictures() -> list[bytes]:
         texts.add_itxt("Title", "flight f01", zip=packed)
         with TemporaryDirectory() as folder:
             Image.fromarray(np.arange(48, dtype="u1").reshape(4, 4, 3)).save(Path(folder) / "a.png", pnginfo=texts)
-            found.append((Path(folder) / "a.png").read_bytes())
-    return found
+            images.append((Path(folder) / "a.png").read_bytes())
+    return images
 
 
 def read_tag_text(path: Path) -> Any:

@@ -145,8 +145,8 @@ def resume(node: str) -> None:
 def jobs(rule: str) -> dict[str, str]:
     """Return the nodes of running jobs of a rule or a group of rules, by job."""
     lines = output_of("squeue", "-h", "-t", "running", "-o", "%A %N %k").splitlines()
-    found = (line.split(" ", 2) for line in lines)
-    return {job: node for job, node, comment in found if comment.startswith((f"rule_{rule}", f"group_{rule}"))}
+    rows = (line.split(" ", 2) for line in lines)
+    return {job: node for job, node, comment in rows if comment.startswith((f"rule_{rule}", f"group_{rule}"))}
 
 
 def _end(pid_file: Path, number: signal.Signals) -> None:
