@@ -208,7 +208,7 @@ def test_noise_locks_no_more_often_than_promised():
     assert 0 < locks <= 6000 * LOCK_FALSE_ALARM * 2
 
 
-def test_sidelink_without_lock_is_refused():
+def test_a_sidelink_that_never_locks_is_refused():
     noise = complex_noise(np.random.default_rng(14), (30, 512)).astype(np.complex64)
     with pytest.raises(CampaignError, match="locks in none of 30 pulses"):
         measure(noise)
