@@ -114,9 +114,9 @@ def test_sign_error_of_a_lever_arm_is_identified(tmp_path):
     assert best["kind"] == "offset"  # one of several equivalent causes along a straight track
     assert best["what"].endswith("right axis of the lever arms of uav1 has the opposite sign")
     assert best["what"] in reports["uav1-uav1"]["flags"]["pairs_displaced"]
-    left_out = reports["fused"]["fusion"]["left_out"]
-    assert len(left_out) == 1
-    assert next(iter(left_out)) in reports["fused"]["models"]["fusion"]
+    excluded_pairs = reports["fused"]["fusion"]["excluded"]
+    assert len(excluded_pairs) == 1
+    assert next(iter(excluded_pairs)) in reports["fused"]["models"]["fusion"]
 
 
 def delayed(seconds):
@@ -224,10 +224,10 @@ def test_phase_between_pairs_is_removed_if_configured(finished_sample, tmp_path)
         return assessment_of(campaign, "f01")
 
     excluded = with_quarter_cycle(align=False)
-    assert excluded["fusion"]["left_out"].keys() == {"uav1-uav2"}
+    assert excluded["fusion"]["excluded"].keys() == {"uav1-uav2"}
     assert "pairs_out_of_phase" in excluded["pairs"]["uav1-uav2"]["flags"]
     aligned = with_quarter_cycle(align=True)
-    assert aligned["fusion"]["left_out"] == {}
+    assert aligned["fusion"]["excluded"] == {}
     assert abs(aligned["fusion"]["phases_rad"]["uav1-uav2"]) == pytest.approx(2 * 3.1416 * 0.05 / 0.2142, abs=0.15)
 
 
@@ -309,8 +309,8 @@ def test_path_error_of_the_papers_flight_is_flagged(papers_flight, tmp_path, wav
     report = with_longer_path(root, wavelengths * 0.2134)
     line = report["flags"][{"phase": "pairs_out_of_phase", "position": "pairs_displaced"}[flag]]
     assert "do not show which pairs are wrong" in line
-    assert len(report["fusion"]["left_out"]) == 1
-    assert report["fusion"]["ties"] == [[*report["fusion"]["left_out"]]]
+    assert len(report["fusion"]["excluded"]) == 1
+    assert report["fusion"]["ties"] == [[*report["fusion"]["excluded"]]]
     assert "; tie: " in report["flags"]["pair_excluded"]
 
 
