@@ -1,4 +1,4 @@
-"""Ways to use the Python door wrongly: each is refused with one message, or its image carries a flag or a verdict."""
+"""Misuse of the Python functions: refused with one message, or the image has a flag or a verdict."""
 
 import json
 from dataclasses import replace
@@ -36,8 +36,8 @@ def echo_of(path_m, **fields):
     return of(transfer=echo.astype(np.complex64), **fields)
 
 
-def wide(pulses):
-    """A beam of one gain everywhere, over some pulses."""
+def uniform_beam(pulses):
+    """Return a beam of uniform gain for a number of pulses."""
     angle = np.linspace(-3, 3, 9)
     return Beams(transmit=Beam(np.tile(np.eye(3), (pulses, 1, 1)), angle, np.ones(9), angle, np.ones(9)))
 
@@ -123,7 +123,7 @@ REFUSED = {
     "beams a number": (lambda: HISTORY, {"beams": 30.0}, "Beams"),
     "beams of other pulses": (
         lambda: HISTORY,
-        {"beams": lambda: wide(50)},
+        {"beams": lambda: uniform_beam(50)},
         "50 pulses",
     ),
     "atmosphere dry": (lambda: HISTORY, {"atmosphere": "dry"}, "atmosphere"),
@@ -162,15 +162,15 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_what_is_no_recording_is_refused_in_one_line(name):
-    given, options, complaint = REFUSED[name]
+def test_invalid_arguments_are_refused_in_one_line(name):
+    make_input, options, complaint = REFUSED[name]
 
-    def formed():
-        made = {key: value() if callable(value) else value for key, value in options.items()}
-        return ap.backproject(given(), made.pop("grid", TARGET_GRID), **made)
+    def form():
+        arguments = {key: value() if callable(value) else value for key, value in options.items()}
+        return ap.backproject(make_input(), arguments.pop("grid", TARGET_GRID), **arguments)
 
     with pytest.raises(CampaignError, match=complaint) as told:
-        formed()
+        form()
     assert "\n" not in str(told.value)
     assert "self." not in str(told.value)
 
@@ -203,16 +203,16 @@ FLAGGED = {
 
 @pytest.mark.quick("conjugated", "track 5 cm wrong at random", "starts in km", "conjugated profiles", "pulses shuffled")
 @pytest.mark.parametrize("name", FLAGGED)
-def test_what_forms_an_image_of_nothing_is_flagged(name):
-    given, flag = FLAGGED[name]
-    image = ap.backproject(given(), TARGET_GRID)
+def test_plausible_but_wrong_input_is_flagged(name):
+    make_input, flag = FLAGGED[name]
+    image = ap.backproject(make_input(), TARGET_GRID)
     flags = json.loads(image.attrs["flags"])
     assert flags, image.attrs["verdict"]
     assert flag is None or flag in flags
 
 
 @pytest.mark.slow
-def test_samples_of_the_other_sign_are_told_as_such():
+def test_conjugated_samples_are_identified():
     for name in ("conjugated", "I and Q swapped", "conjugated profiles"):
         (line,) = json.loads(ap.backproject(FLAGGED[name][0](), TARGET_GRID).attrs["flags"]).values()
         assert "I and Q are swapped" in line
@@ -221,36 +221,36 @@ def test_samples_of_the_other_sign_are_told_as_such():
         assert "I and Q" not in ap.backproject(FLAGGED[name][0](), TARGET_GRID).attrs["flags"]
 
 
-def test_what_the_pulses_cannot_tell_is_not_called_focused():
-    """Half-spectra swapped: two peaks in range, and nothing that tells them from two targets."""
+def test_ambiguous_spectrum_gives_no_verdict():
+    """Swapped halves of the spectrum give two peaks in range, not distinguishable from two targets."""
     swapped = replace(HISTORY, transfer=np.fft.fftshift(ECHO, axes=1))
     assert ap.backproject(swapped, TARGET_GRID).attrs["verdict"] == "cannot tell"
 
 
-def test_a_right_image_is_called_focused_without_a_flag():
+def test_correct_image_is_focused_without_a_flag():
     for inputs in (HISTORY, PROFILES):
         attributes = ap.backproject(inputs, TARGET_GRID).attrs
         assert (attributes["verdict"], attributes["flags"]) == ("focused", "{}")
 
 
-def test_an_echo_outside_is_no_fault_where_the_scene_has_points_of_its_own():
-    """A house 30 dB brighter than the scene's target, 40 m farther: its sidelobes are weaker still."""
+def test_outside_echo_is_not_flagged_if_the_scene_has_points():
+    """A house 30 dB brighter than the target, 40 m farther, whose sidelobes are weaker than the target."""
     window = np.hanning(202)[1:-1]
     house = 30 * np.exp(-2j * np.pi * FREQUENCY * (PATH_M + 40)[:, None] / SPEED_OF_LIGHT_M_S)
-    beside = replace(HISTORY, transfer=(ECHO + house).astype(np.complex64), weight=window / window.sum())
-    assert "echo_outside_scene" not in json.loads(ap.backproject(beside, TARGET_GRID).attrs["flags"])
+    with_target = replace(HISTORY, transfer=(ECHO + house).astype(np.complex64), weight=window / window.sum())
+    assert "echo_outside_scene" not in json.loads(ap.backproject(with_target, TARGET_GRID).attrs["flags"])
     alone = replace(HISTORY, transfer=house.astype(np.complex64))
     assert "echo_outside_scene" in json.loads(ap.backproject(alone, TARGET_GRID).attrs["flags"])
 
 
-def test_a_lazy_image_is_judged_when_asked_and_by_all_of_it():
+def test_lazy_image_is_judged_on_request_and_as_a_whole():
     lazy = ap.backproject(HISTORY, TARGET_GRID, judge=False, tile_px=64)
     assert lazy.attrs["verdict"] == "not judged"
     assert "apertura.judge" in lazy.attrs["verdict_why"]
-    told = ap.judge(abs(lazy)[:9, :9])
-    assert (told.verdict, dict(told.flags)) == ("focused", {})
-    assert told.focus["points"][0]["x_m"] == pytest.approx(TARGET[0, 0], abs=0.03)
-    assert [line["cause"] for line in told.budget] == [
+    result = ap.judge(abs(lazy)[:9, :9])
+    assert (result.verdict, dict(result.flags)) == ("focused", {})
+    assert result.focus["points"][0]["x_m"] == pytest.approx(TARGET[0, 0], abs=0.03)
+    assert [line["cause"] for line in result.budget] == [
         "positions",
         "heights",
         "calibration",
@@ -263,13 +263,13 @@ def test_a_lazy_image_is_judged_when_asked_and_by_all_of_it():
         ap.judge(lazy + ap.backproject(HISTORY, TARGET_GRID, judge=False))
 
 
-def test_errors_of_positions_that_are_stated_are_expected():
-    sent, received = 0.01 * np.random.default_rng(3).standard_normal((2, len(HISTORY), 3))
-    image = ap.backproject(flown(APERTURE.tx_m + sent, APERTURE.rx_m + received)(), TARGET_GRID)
+def test_stated_position_errors_are_expected():
+    transmit_error, receive_error = 0.01 * np.random.default_rng(3).standard_normal((2, len(HISTORY), 3))
+    image = ap.backproject(flown(APERTURE.tx_m + transmit_error, APERTURE.rx_m + receive_error)(), TARGET_GRID)
     assert "loss_unexpected" in json.loads(image.attrs["flags"])
-    told = ap.judge(image, position_std_m=0.01, time_s=10.0 * np.arange(len(HISTORY)))
-    assert told.focus["loss_db"] == pytest.approx(told.focus["expected_db"], abs=0.3)
-    assert not told.flags
+    result = ap.judge(image, position_std_m=0.01, time_s=10.0 * np.arange(len(HISTORY)))
+    assert result.focus["loss_db"] == pytest.approx(result.focus["expected_db"], abs=0.3)
+    assert not result.flags
     with pytest.raises(CampaignError, match="with time_s"):
         ap.judge(image, position_std_m=0.01)
     with pytest.raises(CampaignError, match="seconds of each of 96 pulses"):
@@ -285,7 +285,7 @@ def judged(**stated):
 
 
 @pytest.mark.parametrize(
-    ("call", "told"),
+    ("call", "message"),
     [
         (lambda: ap.range_compress("x", TARGET_GRID, 0.0), "type str; expected a PhaseHistory"),
         (lambda: ap.range_compress(PROFILES, TARGET_GRID, 0.0), "range profiles; expected a PhaseHistory"),
@@ -326,18 +326,18 @@ def judged(**stated):
         (lambda: judged(position_std_m=0.01, time_s=SECONDS[::-1]), "seconds of any origin"),
     ],
 )
-def test_other_doors_refuse_what_is_of_another_kind(call, told):
+def test_other_functions_refuse_invalid_arguments(call, message):
     with pytest.raises(CampaignError) as refused:
         call()
-    assert told in str(refused.value)
+    assert message in str(refused.value)
 
 
-def test_one_height_is_flat_ground_for_every_door():
+def test_single_height_is_accepted_as_flat_terrain():
     assert np.array_equal(ap.range_compress(HISTORY, TARGET_GRID, 0.0).samples, PROFILES.samples)
 
 
 @pytest.mark.parametrize(
-    "as_given",
+    "convert",
     [
         pytest.param(np.matrix, id="matrix", marks=pytest.mark.filterwarnings("ignore:the matrix subclass")),
         pytest.param(np.ma.masked_array, id="masked nowhere"),
@@ -347,39 +347,39 @@ def test_one_height_is_flat_ground_for_every_door():
         ),
     ],
 )
-def test_arrays_of_every_kind_give_the_image_of_plain_ones(as_given):
-    given = replace(HISTORY, transfer=as_given(ECHO), aperture=ap.Aperture(*map(as_given, APERTURE.legs)))
-    images = [ap.backproject(one, TARGET_GRID, judge=False).values for one in (given, HISTORY)]
+def test_other_numpy_arrays_give_the_same_image(convert):
+    converted = replace(HISTORY, transfer=convert(ECHO), aperture=ap.Aperture(*map(convert, APERTURE.legs)))
+    images = [ap.backproject(echo, TARGET_GRID, judge=False).values for echo in (converted, HISTORY)]
     np.testing.assert_allclose(images[0], images[1], atol=1e-5)
 
 
-def test_numbers_of_few_bits_are_sizes_of_a_grid():
-    few = replace(TARGET_GRID, shape=tuple(map(np.uint8, TARGET_GRID.shape)))
-    images = [ap.backproject(HISTORY, grid, judge=False).values for grid in (few, TARGET_GRID)]
+def test_small_integer_types_are_accepted_as_grid_shape():
+    small_integers = replace(TARGET_GRID, shape=tuple(map(np.uint8, TARGET_GRID.shape)))
+    images = [ap.backproject(HISTORY, grid, judge=False).values for grid in (small_integers, TARGET_GRID)]
     np.testing.assert_array_equal(*images)
 
 
-def test_an_image_of_one_pixel_is_judged():
-    one = ap.SceneGrid("local", -0.05, 0.05, 0.1, (1, 1))
-    assert ap.backproject(HISTORY, one, judge=True).attrs["verdict"] == "cannot tell"
+def test_single_pixel_image_is_judged():
+    grid = ap.SceneGrid("local", -0.05, 0.05, 0.1, (1, 1))
+    assert ap.backproject(HISTORY, grid, judge=True).attrs["verdict"] == "cannot tell"
 
 
 @pytest.mark.slow
-def test_arrays_of_xarray_and_dask_are_arrays():
-    given = replace(HISTORY, transfer=xr.DataArray(ECHO), aperture=ap.Aperture(*map(xr.DataArray, APERTURE.legs)))
+def test_xarray_and_dask_arrays_are_accepted():
+    labelled = replace(HISTORY, transfer=xr.DataArray(ECHO), aperture=ap.Aperture(*map(xr.DataArray, APERTURE.legs)))
     lazy = replace(HISTORY, transfer=xr.DataArray(ECHO).chunk().data)
     expected = ap.backproject(HISTORY, TARGET_GRID).values
-    assert all(np.array_equal(ap.backproject(one, TARGET_GRID).values, expected) for one in (given, lazy))
+    assert all(np.array_equal(ap.backproject(echo, TARGET_GRID).values, expected) for echo in (labelled, lazy))
 
 
-def test_what_the_arithmetic_could_not_form_is_not_called_focused():
-    """Profiles that begin a thousandth of the way out: no pixel lies in them."""
+def test_image_without_samples_is_not_called_focused():
+    """Profile starts in km: no pixel lies within the samples."""
     image = ap.backproject(replace(PROFILES, start_m=PROFILES.start_m / 1e3), TARGET_GRID, judge=True)
     assert image.attrs["verdict"] == "cannot tell"
 
 
-def test_an_image_is_of_the_track_that_was_given_whatever_becomes_of_its_array():
-    """It is lazy: what is computed later must not follow an array that the caller goes on using."""
+def test_lazy_image_does_not_follow_later_changes_of_the_track_array():
+    """A lazy image is computed later, when the caller may have changed the array."""
     track = APERTURE.tx_m.copy()
     first, second = (
         ap.backproject(replace(HISTORY, aperture=ap.Aperture(track, track)), TARGET_GRID, judge=False) for _ in range(2)
@@ -389,10 +389,10 @@ def test_an_image_is_of_the_track_that_was_given_whatever_becomes_of_its_array()
     np.testing.assert_array_equal(second.values, expected)
 
 
-def test_the_budget_of_arrays_states_what_air_would_do_where_vacuum_is_assumed():
-    """N = 300 makes every path longer by 300 parts in a million: of a range R the image lies 300e-6 R farther."""
+def test_error_budget_contains_the_atmosphere_if_vacuum_is_assumed():
+    """N = 300 lengthens every path by 300 ppm, which displaces a point at range R by 300e-6 R."""
     budget = json.loads(ap.backproject(HISTORY, TARGET_GRID, judge=False).attrs["budget"])
-    line = next(one for one in budget if one["cause"] == "atmosphere")
+    line = next(entry for entry in budget if entry["cause"] == "atmosphere")
     slant_m = np.linalg.norm(APERTURE.tx_m.mean(axis=0) - TARGET)
     ground_m = np.linalg.norm((APERTURE.tx_m.mean(axis=0) - TARGET)[0, :2])
     assert "N = 300" in line["stated"]
@@ -402,11 +402,11 @@ def test_the_budget_of_arrays_states_what_air_would_do_where_vacuum_is_assumed()
 
 
 @pytest.mark.parametrize(("accuracy_db", "replaced"), [(-60.0, False), (-100.0, True)])
-def test_a_requested_engine_that_is_too_coarse_is_replaced_and_that_is_flagged(accuracy_db, replaced):
+def test_requested_engine_that_misses_the_accuracy_is_replaced_and_flagged(accuracy_db, replaced):
     image = ap.backproject(HISTORY, TARGET_GRID, engine="native", accuracy_db=accuracy_db, judge=False)
     flags = json.loads(image.attrs["flags"])
     assert ("engine_replaced" in flags) == replaced
     if replaced:
         assert flags["engine_replaced"] == "the image by reference: native, as requested, misses -100 dB"
-    left_to_the_planner = ap.backproject(HISTORY, TARGET_GRID, accuracy_db=accuracy_db, judge=False)
-    assert "engine_replaced" not in json.loads(left_to_the_planner.attrs["flags"])
+    automatic = ap.backproject(HISTORY, TARGET_GRID, accuracy_db=accuracy_db, judge=False)
+    assert "engine_replaced" not in json.loads(automatic.attrs["flags"])
