@@ -45,7 +45,7 @@ def oversampled(noise: float = 1.0):
 
 @pytest.mark.slow
 @compiled
-def test_presummed_image_equals_that_of_all_pulses_but_a_decimated_one_does_not():
+def test_presummed_image_equals_that_of_all_pulses_unlike_a_decimated_one():
     drawn, widest = oversampled()
     presum = design(400, 4, widest_cycles=widest)
     points = drawn.job.points_m

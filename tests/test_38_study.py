@@ -199,8 +199,8 @@ def test_swarm_receivers_sum_in_phase_with_gain_10_lg_n():
 
 
 def test_trigger_finds_every_pulse_at_its_position():
-    found, error = trigger_claims(pulses=4)
-    assert (found.computed, found.verdict, error.verdict) == ("1", AGREES, AGREES)
+    detected, error = trigger_claims(pulses=4)
+    assert (detected.computed, detected.verdict, error.verdict) == ("1", AGREES, AGREES)
 
 
 @pytest.mark.parametrize(

@@ -406,7 +406,7 @@ def test_mission_file_instead_of_a_plan_is_refused_with_a_remedy(tmp_path, name)
 
 
 def test_unknown_key_named_like_a_kind_of_track_is_reported(tmp_path):
-    """`mission` is both unknown as a key and a kind of track."""
+    """`mission` is not a key of a plan, but a kind of track."""
     (tmp_path / "plan.yaml").write_text("mission: dike.plan\n")
     with pytest.raises(CampaignError, match="mission: unknown key"):
         read_flight_plan(tmp_path / "plan.yaml")

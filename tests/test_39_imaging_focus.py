@@ -112,10 +112,10 @@ def test_joint_peak_power_is_largest_on_the_true_track():
     assert displaced_power < 0.7 * true_power
 
 
-# ---- Focus of points along coarse range cells
+# Focus of points with coarse range cells
 
 COARSE_HZ = 1.2e9 + 100e6 / 256 * np.arange(256)
-"""Cells of 3 m along the line of sight, and of 0.16 m across it from 50 m of track 67 m away."""
+"""Resolution 3 m along the line of sight, 0.16 m across it from 50 m of track at a range of 67 m."""
 
 
 ALONG = np.linspace(-1, 1, 512)

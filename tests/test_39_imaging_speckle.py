@@ -52,7 +52,7 @@ def test_looks_by_correlation_equal_those_of_the_mean_power(side):
 
 
 def test_looks_are_measured_for_squares_smaller_than_cells():
-    """Eq. 4: a window of 49 squares has eleven looks, so its variance is a tenth less than that of squares."""
+    """Eq. 4: a window of 49 squares has only eleven independent looks, which lowers its variance by a tenth."""
     measured = Multilook.of((image := speckle(0.1)).__getitem__, image.shape, SIDE)
     assert measured.within == pytest.approx(11.1, rel=0.1)
     assert measured.found == pytest.approx(measured.looks, rel=0.15)
