@@ -116,9 +116,9 @@ def test_invalid_beams_are_refused(plain):
     good = swaying_beam(scene.tx, (12, 0, 0))
     with pytest.raises(ValueError, match="must be one for each of 36 pulses"):
         native.form(native.prepare(profiles), ecef(pixels), beams=Beams(replace(good, axes=good.axes[:5])))
-    with pytest.raises(ValueError, match="right angles"):
+    with pytest.raises(ValueError, match="orthogonal unit vectors"):
         replace(good, axes=1.1 * good.axes)
-    with pytest.raises(ValueError, match="azimuth: angles must grow in equal steps"):
+    with pytest.raises(ValueError, match="azimuth: angles must ascend in equal steps"):
         replace(good, azimuth_rad=good.azimuth_rad**3)
     with pytest.raises(ValueError, match=r"elevation: .* must be equal"):
         replace(good, elevation_gain=good.azimuth_gain)

@@ -71,7 +71,7 @@ def test_library_without_layout_table_is_refused(tmp_path, monkeypatch):
     source.write_text('extern "C" const char* apertura_form(const char* name) { return name; }\n')
     subprocess.run([compiler, "-shared", "-fPIC", source, "-o", library], check=True)
     monkeypatch.setenv("APERTURA_KERNEL", str(library))
-    with pytest.raises(CampaignError, match=r"BeamJob\.axes at no place; expected .* byte 0, 8 bytes"):
+    with pytest.raises(CampaignError, match=r"BeamJob\.axes: no such field; expected .* byte 0, 8 bytes"):
         native.instruction_set()
 
 

@@ -464,7 +464,7 @@ def test_tile_band_is_the_largest_phase_slope_plus_an_airy_tail():
                 "start_m": np.zeros(0),
                 "aperture": Aperture(*np.zeros((2, 0, 3))),
             },
-            "holds no pulse",
+            "contains no pulse",
         ),
         ({"start_m": np.full(300, np.nan)}, "must be finite"),
     ],
@@ -478,5 +478,5 @@ def test_pixels_and_beams_of_wrong_shape_are_refused(plain):
     trees = tree.prepare(plain.profiles)
     with pytest.raises(ValueError, match=r"must be \(y, x, 3\)"):
         tree.form(trees, np.zeros((4, 3)))
-    with pytest.raises(ValueError, match="beams must be of 300 pulses"):
+    with pytest.raises(ValueError, match="beams must have 300 pulses"):
         tree.form(trees, ecef(plain.pixels), beams=Beams(swaying_beam(plain.scene.tx[:9], (12, 0, 0))))

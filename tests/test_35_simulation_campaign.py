@@ -103,7 +103,7 @@ def test_same_seed_writes_identical_bytes(tmp_path):
 def test_non_empty_folder_is_left_unchanged(tmp_path):
     (tmp_path / "occupied").mkdir()
     (tmp_path / "occupied" / "mine.txt").write_text("mine")
-    with pytest.raises(CampaignError, match="something is there already"):
+    with pytest.raises(CampaignError, match="already exists and is not an empty folder"):
         simulate(tmp_path / "occupied", small_simulation(), seed=0)
     assert contents(tmp_path) == {"occupied/mine.txt": b"mine"}
 

@@ -166,7 +166,7 @@ def test_python_arguments_replace_parts_of_the_specification(tmp_path):
     settings = Campaign.load(root).settings
     assert set(settings.nodes) == {"a", "c"}
     assert (settings.waveform.subcarriers, settings.waveform.prf_hz) == (32, 400.0)
-    with pytest.raises(CampaignError, match="nodes are a, b, z, but tracks are of a, b"):
+    with pytest.raises(CampaignError, match="nodes are a, b, z, but the nodes with a track are a, b"):
         simulate(tmp_path / "other", small_simulation(), impairments={"z": Impairments()})
 
 

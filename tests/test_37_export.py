@@ -432,7 +432,7 @@ def test_quicklook_lists_the_flags_of_its_image(tmp_path, monkeypatch):
 
 def test_long_footer_ends_inside_the_figure():
     footer = (
-        "apertura 0.1.0 · focus: focused (0.0 dB lost) · geolocation uncertainty 1.5 m"
+        "apertura 0.1.0 · focus: focused (peak loss 0.0 dB) · geolocation uncertainty 1.5 m"
         " · numerical error below −77.31 dB · looks left, assumed · code 833b8269428b"
     )
     for bounds in ((0.0, 0.0, 7.0, 7.0), (0.0, 0.0, 2.0, 7.0)):

@@ -55,9 +55,9 @@ def written(tmp_path):
 def test_read_back_check_detects_missing_pixels_and_tags(written):
     checksum = added(0, power(image()))
     check_written(written, checksum, UTM["tags"])
-    with pytest.raises(OSError, match="does not read back"):
+    with pytest.raises(OSError, match="differs from the data written"):
         check_written(written, checksum + 1, UTM["tags"])
-    with pytest.raises(OSError, match="does not read back"):
+    with pytest.raises(OSError, match="differs from the data written"):
         check_written(written, checksum, {"APERTURA_FLAGS": "{}"})
 
 

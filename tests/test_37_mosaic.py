@@ -83,6 +83,6 @@ def test_complex_rasters_and_other_grids_are_refused_in_a_mosaic(tmp_path):
     write_power(tmp_path / "b.tif", image, **other_grid, tags={})
     write_slc(tmp_path / "c.tif", image, **UTM, tags={})
     for names in (("a", "b"), ("a", "c"), ("c", "c")):
-        with pytest.raises(ContractError, match=r"no real raster on the grid of .*\.tif"):
+        with pytest.raises(ContractError, match=r"not a real raster on the grid of .*\.tif"):
             write_mosaic(tmp_path / "x.vrt", [tmp_path / f"{name}.tif" for name in names])
     assert not (tmp_path / "x.vrt").exists()

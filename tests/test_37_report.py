@@ -91,7 +91,7 @@ def budget(path):
         {"cause": "positions", "stated": "1 cm", "loss_db": -0.2, "shift_m": 0.01, "phase_rad": 0.1},
         {
             "cause": "between epochs",
-            "stated": "not stated; 1 m would do this",
+            "stated": "not stated; effect computed for 1 m",
             "loss_db": -3.0,
             "shift_m": 5.0,
             "phase_rad": None,
@@ -140,7 +140,7 @@ def test_budget_legend_shows_each_kind_of_bar(monkeypatch, tmp_path):
 @pytest.mark.parametrize(
     ("counted", "labels"),
     [
-        (True, ["of 2 pulses", "pulses from the first pulse sent; no times"]),
+        (True, ["pulses per 2 transmitted", "pulses from the first pulse sent (no times recorded)"]),
         (False, ["pulses in 2 s", "time from the first pulse sent, s"]),
     ],
 )
@@ -161,8 +161,8 @@ def test_panels_of_a_local_frame_have_x_and_y_and_no_north_arrow(monkeypatch, tm
         axes = figure.axes[0]
         return [axes.get_xlabel(), axes.get_ylabel(), *(text.get_text() for text in axes.texts)]
 
-    assert texts(True) == ["x of the corner, m", "y of the corner, m", "2 m"]
-    assert texts(False) == ["east of the corner, m", "north of the corner, m", "2 m", "", "N"]
+    assert texts(True) == ["x from the lower left corner, m", "y from the lower left corner, m", "2 m"]
+    assert texts(False) == ["east from the lower left corner, m", "north from the lower left corner, m", "2 m", "", "N"]
 
 
 def test_sidelink_correction_removes_clock_and_trigger_phase():

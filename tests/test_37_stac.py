@@ -128,7 +128,7 @@ def test_invalid_item_is_refused(slc, name):
 def test_extension_without_a_shipped_schema_is_refused(slc):
     document = item(slc)
     document["stac_extensions"].append("https://example.com/schema.json")
-    assert document_problem(document) == "no schema of https://example.com/schema.json here"
+    assert document_problem(document) == "the schema of https://example.com/schema.json is not available"
 
 
 def written(folder, images, campaign="tandem"):

@@ -115,7 +115,7 @@ def test_toy_engine_is_used_if_accurate_enough(toy):
     assert rough.attrs["numerical_error_db"] < -20
     assert not ap.backproject(point_history(), TARGET_GRID, accuracy_db=-60.0).attrs["setting"].startswith("toy")
     requested = ap.backproject(point_history(), TARGET_GRID, accuracy_db=-10.0, engine_options={"toy": {"refine": 2}})
-    assert json.loads(requested.attrs["models"])["refine"] == "2: asked for; nearest sample of a refined profile"
+    assert json.loads(requested.attrs["models"])["refine"] == "2: requested; nearest sample of a refined profile"
 
 
 def test_setting_that_misses_the_accuracy_is_replaced_by_the_next(toy):
@@ -125,7 +125,7 @@ def test_setting_that_misses_the_accuracy_is_replaced_by_the_next(toy):
     assert not image.attrs["setting"].startswith("toy")
     assert image.attrs["numerical_error_db"] < -60
     models = json.loads(image.attrs["models"])
-    assert "missed the accuracy asked" in models["engine"]
+    assert "missed the requested accuracy" in models["engine"]
     assert "refine" not in models
     assert "accuracy_not_met" not in json.loads(image.attrs["flags"])
 
@@ -134,7 +134,7 @@ def test_accuracy_met_by_no_setting_is_flagged():
     """Profiles do not permit the double sum as a fallback."""
     profiles = ap.range_compress(point_history(), TARGET_GRID, ap.FlatGround(0.0))
     flags = json.loads(ap.backproject(profiles, TARGET_GRID, accuracy_db=-120.0).attrs["flags"])
-    assert "-120 dB asked" in flags["accuracy_not_met"]
+    assert "-120 dB requested" in flags["accuracy_not_met"]
 
 
 def test_image_can_be_written_with_plan_and_certificate(image, tmp_path):
@@ -146,9 +146,9 @@ def test_image_can_be_written_with_plan_and_certificate(image, tmp_path):
 @pytest.mark.parametrize(
     ("offset_m", "grid", "options", "complaint"),
     [
-        (1e6, TARGET_GRID, {}, "no echo of the scene is in the samples"),
+        (1e6, TARGET_GRID, {}, "the samples contain no echo of the scene"),
         (0.0, SceneGrid("EPSG:32632", 5e5, 5e6, 0.5, (9, 9)), {"terrain": 0.0}, "no echo of the scene"),
-        (0.0, SceneGrid("EPSG:32632", 5e5, 5e6, 0.5, (9, 9)), {}, "no terrain for a grid on Earth"),
+        (0.0, SceneGrid("EPSG:32632", 5e5, 5e6, 0.5, (9, 9)), {}, "no terrain for a georeferenced grid"),
     ],
 )
 def test_scene_outside_the_samples_is_refused(offset_m, grid, options, complaint):
@@ -171,7 +171,7 @@ def test_profiles_that_end_within_the_scene_are_flagged():
     profiles = ap.range_compress(point_history(), TARGET_GRID, ap.FlatGround(0.0))
     short = replace(profiles, samples=profiles.samples[:, :60])
     assert "beyond the samples" in json.loads(ap.backproject(short, TARGET_GRID).attrs["flags"])["scene_beyond_samples"]
-    with pytest.raises(CampaignError, match=r"samples \(50, .*as many pulses"):
+    with pytest.raises(CampaignError, match=r"samples \(50, .*the same number of pulses"):
         replace(profiles, samples=profiles.samples[:50])
 
 

@@ -74,7 +74,7 @@ def test_missing_scene_before_the_first_run_is_reported_with_a_remedy(tiny):
     opened = open_campaign(tiny)
     for work in (lambda: opened.scene, lambda: score(opened.campaign)):
         message = complaint(work)
-        assert message.startswith(f"{tiny}/results/scene.json: not there, or not finished")
+        assert message.startswith(f"{tiny}/results/scene.json: the result is missing or unfinished")
         assert "`apertura run`" in message
     message = complaint(lambda: opened.stage("echo", *PAIR))
     assert "Run the workflow" in message
@@ -94,9 +94,9 @@ def test_unknown_name_is_refused_with_the_list_of_names(opened):
 
 def test_missing_identifiers_of_a_stage_are_reported(opened):
     message = complaint(lambda: opened.stage("echo", "f01"))
-    assert "campaign.stage('echo'): given f01; expected a flight and a pair" in message
-    assert "given nothing more; expected a flight and a node" in complaint(lambda: opened.stage("raw"))
-    assert "given f01; expected the stage alone" in complaint(lambda: opened.stage("cube", "f01"))
+    assert "campaign.stage('echo'): arguments: f01; expected a flight and a pair" in message
+    assert "arguments: none; expected a flight and a node" in complaint(lambda: opened.stage("raw"))
+    assert "arguments: f01; expected no further arguments" in complaint(lambda: opened.stage("cube", "f01"))
 
 
 def test_planned_grid_equals_the_grid_of_the_workflow(tiny):

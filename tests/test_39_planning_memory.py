@@ -13,9 +13,9 @@ from apertura.stages.planning import check_fits
 def test_job_that_exceeds_memory_or_disk_is_refused():
     planned = plan(shape=(20000, 20000))
     check_fits(planned, free_disk=planned.disk_bytes, where="f01/a-b", memory=planned.memory_bytes)
-    with pytest.raises(CampaignError, match=r"f01/a-b: imaging needs .* of memory; expected at most the 1.0 MB"):
+    with pytest.raises(CampaignError, match=r"f01/a-b: image formation requires .* of memory; expected at most 1.0 MB"):
         check_fits(planned, free_disk=None, where="f01/a-b", memory=1_000_000)
-    with pytest.raises(CampaignError, match=r"the results need 30.4 GB on disk; expected at most the 5.0 GB"):
+    with pytest.raises(CampaignError, match=r"the results require 30.4 GB on disk; expected at most 5.0 GB"):
         check_fits(planned, free_disk=5_000_000_000, where="f01/a-b", memory=planned.memory_bytes)
 
 
@@ -64,7 +64,7 @@ def test_long_flight_is_summed_in_blocks_for_any_memory():
 @pytest.mark.slow
 def test_pulse_blocks_can_be_requested_and_have_64_pulses_or_more():
     assert plan(overrides={"pulse_blocks": 3}).setting.pulse_blocks == 3
-    assert "asked for" in plan(overrides={"pulse_blocks": 3}).reasons["pulse_blocks"]
+    assert "requested" in plan(overrides={"pulse_blocks": 3}).reasons["pulse_blocks"]
     assert plan(overrides={"pulse_blocks": 100}).setting.pulse_blocks == 300 // 64
 
 

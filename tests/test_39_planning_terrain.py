@@ -61,9 +61,9 @@ def test_flat_and_rough_terrain_use_plane_and_dem():
     assert plan(terrain=smooth).terrain == FlatGround(0.0)
     assert plan(terrain=rough).terrain is rough.full
     assert plan(terrain=smooth, overrides={"terrain": "dem"}).terrain is smooth.full
-    with pytest.raises(CampaignError, match="terrain is dem; expected plane or auto: the scene has no DEM"):
+    with pytest.raises(CampaignError, match="terrain model dem, but the scene has no DEM; expected plane or auto"):
         plan(overrides={"terrain": "dem"})
 
 
 def test_plan_without_a_dem_states_the_tolerated_height_error():
-    assert "no DEM; height may be wrong by" in plan().reasons["terrain"]
+    assert "no DEM; tolerated height error" in plan().reasons["terrain"]

@@ -152,10 +152,10 @@ def test_a_product_made_by_other_code_or_settings_says_so(finished):
     described = {one["@id"]: one["description"] for one in graph if one["@id"].startswith("#job/")}
     said = described["#job/layers/f01/uav1-uav2"]
     installed = result_of(Campaign.load(finished), "layers", "f01", "uav1-uav2").code_sha256
-    assert f"made by other code than is installed now, which is {installed}" in said
-    assert f"made under other settings than these, of sha256 {'1' * 64}" in said
+    assert f"written by code other than the installed one, whose sha256 is {installed}" in said
+    assert f"written with other settings, of sha256 {'1' * 64}" in said
     assert "results/f01/uav1-uav2/layers.manifest.json" in described["#job/coverage"]
-    assert described["#job/echo/f01/uav1-uav2"] == "As the code and settings of today would make it."
+    assert described["#job/echo/f01/uav1-uav2"] == "Up to date with the current code and settings."
 
 
 @pytest.mark.quick("results/f01/uav1-uav1/db.tif", "raw/f01/uav2.sigmf-data")

@@ -233,7 +233,7 @@ def test_a_recorder_that_is_started_again_under_the_same_name_is_shown_anew(tiny
     assert before["added"] > 0
     change(tiny)
     look._read()
-    assert "is dropped, and begun anew" in capsys.readouterr().out
+    assert "are restarted from the new files" in capsys.readouterr().out
     assert [pair.counts["added"] for pair in look.pairs] == [0, 0]  # both are sent by uav1
     assert look._map._entries == {}
     assert not list((tiny / "results/look").rglob("*.png"))
@@ -242,7 +242,7 @@ def test_a_recorder_that_is_started_again_under_the_same_name_is_shown_anew(tiny
         while pair.add_next(ended=True):
             pass
         assert pair.counts["added"] <= pair.counts["recorded"]
-    assert "anew" not in capsys.readouterr().out
+    assert "restarted" not in capsys.readouterr().out
     assert (look.pairs[0].counts["recorded"] < before["recorded"]) == (change in (other_flight, shorter))
 
 
@@ -285,7 +285,7 @@ def test_a_log_that_becomes_a_named_pipe_is_reported_once(tiny, capsys):
     look._read()
     look._read()
     (line,) = capsys.readouterr().out.splitlines()
-    assert "uav1 is not read at present: " in line
+    assert "uav1 is not readable at present: " in line
     assert "uav1.track.csv: a named pipe" in line
 
 
@@ -298,7 +298,7 @@ def test_metadata_that_are_half_written_anew_are_no_new_flight(tiny):
     for share in (0.5, 1.0):
         meta.write_text(text[: int(share * len(text))])
         node.read()
-        assert (node.begun_anew, len(node.time)) == ("", count)
+        assert (node.restart, len(node.time)) == ("", count)
 
 
 def test_a_recording_that_rests_is_ended_and_what_it_lacks_is_said(tiny, capsys):
@@ -308,8 +308,8 @@ def test_a_recording_that_rests_is_ended_and_what_it_lacks_is_said(tiny, capsys)
     log.write_bytes(log.read_bytes()[: log.stat().st_size // 2])
     Look(Campaign.load(tiny), follow=True, every_s=1.0, end_after_s=1.0).run()
     told = next(line for line in capsys.readouterr().out.splitlines() if "--end-after" in line)
-    assert "nothing has come for 1 s" in told
-    assert "the metadata of uav1 do not state" in told
+    assert "no new data for 1 s" in told
+    assert "the metadata of uav1 do not contain" in told
     assert "the log of uav2 ends before its last capture" in told
 
 
@@ -345,7 +345,7 @@ def test_an_image_of_hardly_any_aperture_is_shown_but_not_judged(tiny, monkeypat
     assert look.pairs[0].add_next(ended=True)
     told = look.pairs[0].shown.judged()
     assert told["verdict"] == "cannot tell"
-    assert told["why"].startswith("no aperture yet")
+    assert told["why"].startswith("aperture too short")
 
 
 def test_what_the_first_pulses_could_not_tell_later_ones_do(tmp_path, monkeypatch):
@@ -399,7 +399,7 @@ def test_a_pair_that_falls_behind_takes_every_other_pulse_and_says_so(tiny):
     counts = told["pairs"]["f01/uav1-uav1"]["pulses"]
     assert counts["added"] + counts["left_out"] == counts["recorded"]
     assert counts["added"] == counts["recorded"] // 2
-    assert "1 pulse in 2 taken" in (tiny / "results/look/index.html").read_text()
+    assert "1 pulse in 2 used" in (tiny / "results/look/index.html").read_text()
 
 
 def test_pulses_stand_for_those_left_out_beside_them(finished_tiny, tmp_path, monkeypatch):
@@ -441,7 +441,7 @@ def test_a_map_of_a_look_serves_the_last_pictures_and_nothing_else(tiny, capsys)
     serving = threading.Thread(target=serve)
     serving.start()
     assert not waiting.wait(0.5)
-    assert "waiting for the first picture" in capsys.readouterr().out
+    assert "waiting for the first image" in capsys.readouterr().out
     for node in look.nodes.values():
         node.read()
     assert all(pair.add_next(ended=True) for pair in look.pairs)

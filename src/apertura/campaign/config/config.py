@@ -1,4 +1,4 @@
-"""The config as one value: config/config.yaml validated as `Settings`; all errors are one message."""
+"""Validation of config/config.yaml as `Settings`; one message lists all errors."""
 
 from pathlib import Path
 from typing import Self
@@ -23,7 +23,7 @@ CONFIG = Path("config/config.yaml")
 
 
 class Metadata(Section):
-    """Statements about the campaign that no file of it holds."""
+    """Metadata of the campaign that its files do not contain."""
 
     author: Title | None = Field(None, description="who recorded the campaign; null: not stated")
     licence: Licence | None = Field(
@@ -34,7 +34,7 @@ class Metadata(Section):
 
 
 class Settings(Section):
-    """config/config.yaml."""
+    """Content of config/config.yaml."""
 
     campaign: Title = Field(description="name of the campaign", examples=["my_campaign"])
     waveform: Waveform = Field(description="what was transmitted")
@@ -59,17 +59,18 @@ class Settings(Section):
     )
 
     @model_validator(mode="after")
-    def _calibration_needs_a_place(self) -> Self:
+    def _calibration_needs_a_crs(self) -> Self:
         if self.calibration is not None and self.scene.crs == "auto":
-            raise ValueError("calibration.reflector_m is in scene.crs, which is auto: give the CRS")
+            raise ValueError("calibration.reflector_m refers to scene.crs, which is auto: state the CRS")
         return self
 
     @model_validator(mode="after")
-    def _orders_are_of_samples(self) -> Self:
-        named = [name for name, node in self.nodes.items() if node.iq is not None]
-        if named and not isinstance(self.waveform, SampledWaveform):
+    def _node_iq_needs_samples(self) -> Self:
+        nodes = [name for name, node in self.nodes.items() if node.iq is not None]
+        if nodes and not isinstance(self.waveform, SampledWaveform):
             raise ValueError(
-                f"nodes.{named[0]}.iq is of recorded samples (kinds ofdm and pulse): set it to null, and waveform.iq"
+                f"nodes.{nodes[0]}.iq applies to recorded samples only (kinds ofdm and samples): set it to null and "
+                "use waveform.iq"
             )
         return self
 
@@ -78,29 +79,29 @@ class Settings(Section):
         return self.nodes[node].iq or self.waveform.iq
 
     @model_validator(mode="after")
-    def _beams_need_a_log(self) -> Self:
-        named = [name for name, node in self.nodes.items() if node.antennas.any()]
-        if named and isinstance(self.waveform, PhaseHistoryWaveform):
+    def _beams_need_attitude(self) -> Self:
+        nodes = [name for name, node in self.nodes.items() if node.antennas.any()]
+        if nodes and isinstance(self.waveform, PhaseHistoryWaveform):
             raise ValueError(
-                f"nodes.{named[0]}.antennas has a beam, but phase history carries no attitude: set it to null"
+                f"nodes.{nodes[0]}.antennas has a beam, but phase histories contain no attitude: set it to null"
             )
         return self
 
 
 def read_settings(path: Path) -> Settings:
-    """Return the settings in a config file.
+    """Read the settings of a config file.
 
     Raises
     ------
     CampaignError
-        If it is not there, is not YAML, or `validated` refuses it.
+        If the file is missing, is not YAML, or is not valid.
     """
-    remedy = "`apertura init` writes a commented one."
+    remedy = "`apertura init` writes a commented config."
     return validated(read_yaml(path, expected="a campaign folder", remedy=remedy), where=path)
 
 
 def located(message: str) -> str:
-    """Return a message with the config's path before it, where it begins with a key of it.
+    """Return a message with the path of the config as a prefix if it begins with a config key.
 
     Examples
     --------
@@ -114,12 +115,12 @@ def located(message: str) -> str:
 
 
 def validated(document: object, *, where: object) -> Settings:
-    """Return `document` as Settings; one message names every wrong key and the nearest valid one.
+    """Return `document` as Settings; one message names every invalid key and the nearest valid one.
 
     Raises
     ------
     CampaignError
-        With file, key, what was found and what was expected.
+        If the document is not valid.
 
     Examples
     --------
@@ -128,5 +129,5 @@ def validated(document: object, *, where: object) -> Settings:
     ...
     apertura.common.errors.CampaignError: config.yaml: campaing: unknown key (did you mean 'campaign'?); ...
     """
-    expected = f"the keys and values of {CONFIG} as `apertura init` writes it"
+    expected = f"keys and values as in the {CONFIG} of `apertura init`"
     return documents.validated(Settings, document, where=where, expected=expected)

@@ -1,4 +1,4 @@
-"""Section `nodes`: equipment of each UAV, lever arms, antennas, and values that its log lacks."""
+"""Section `nodes`: equipment of each UAV, lever arms, antennas, accuracies, and settings for reading its log."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -20,7 +20,7 @@ Cell = Annotated[str, Field(min_length=1, max_length=200)]
 
 
 class Log(Section):
-    """Settings for reading a flight log that the log itself leaves open."""
+    """Settings for reading a flight log that the log does not contain."""
 
     format: str | None = Field(None, description=f"one of {', '.join(TRACKS)}; null: by the file's suffix and heading")
     time_system: Literal["utc", "gpst"] | None = Field(
@@ -60,19 +60,18 @@ class Log(Section):
     @classmethod
     def _format_is_known(cls, name: str | None) -> str | None:
         if name is not None and name not in TRACKS:
-            raise ValueError(f"no such format; choose {', '.join(TRACKS)}")
+            raise ValueError(f"unknown format; choose {', '.join(TRACKS)}")
         return name
 
     @property
     def options(self) -> LogOptions:
-        """As readers take them."""
-        read = self.model_dump(exclude={"longest_gap_s", "smoothing_m"})
-        return LogOptions(**read)
+        """Options of the log readers."""
+        return LogOptions(**self.model_dump(exclude={"longest_gap_s", "smoothing_m"}))
 
 
 # ---- Section `nodes`: equipment, lever arms, antennas ---------------------------------------------------------------
 
-_OHMS = 50.0  # that voltages are stated in
+_OHMS = 50.0  # reference impedance of configured voltages
 StandardDeviation = Annotated[float, Field(gt=0)]
 Beamwidth = Annotated[float, Field(gt=0, le=180)]
 
@@ -98,7 +97,7 @@ class Antenna(Section):
     @model_validator(mode="after")
     def _one_pattern(self) -> Self:
         if (self.beamwidth_deg is None) == (self.pattern is None):
-            raise ValueError("give either beamwidth_deg, [azimuth, elevation], or pattern, a CSV file")
+            raise ValueError("state either beamwidth_deg, [azimuth, elevation], or pattern, a CSV file")
         return self
 
 
@@ -110,7 +109,7 @@ _BEAM = "null (isotropic), or boresight_deg with beamwidth_deg or pattern, and c
 
 
 class Antennas(Section):
-    """The beams of a node."""
+    """Beams, gains and polarisations of a node's antennas."""
 
     radar_tx: Antenna | None = Field(None, description=f"transmitting radar antenna: {_BEAM}")
     radar_rx: Antenna | None = Field(None, description=f"receiving radar antenna: {_BEAM}")
@@ -128,7 +127,7 @@ class Antennas(Section):
     )
 
     def any(self) -> bool:
-        """Test whether one of them has a beam."""
+        """Return True if an antenna has a beam."""
         return self.radar_tx is not None or self.radar_rx is not None
 
 
@@ -140,12 +139,12 @@ class LeverArms(Section):
     sidelink: Metres3 = Field((0.0, 0.0, 0.0), description="sidelink antenna, m")
 
     def any(self) -> bool:
-        """Test whether one of them is not zero."""
+        """Return True if a lever arm is not zero."""
         return any(any(arm) for arm in (self.radar_tx, self.radar_rx, self.sidelink))
 
 
 class PathOffsets(Section):
-    """Electrical path beyond geometry, metres of total path, of the receiving node."""
+    """Path offsets of the receiving node: electrical path in addition to the geometric one, metres of total path."""
 
     radar: float = Field(0.0, description="radar channel, m")
     sidelink: float = Field(0.0, description="sidelink channel, m")
@@ -169,7 +168,7 @@ class Receiver(Section):
     @model_validator(mode="after")
     def _one_full_scale(self) -> Self:
         if (self.full_scale_dbm is None) == (self.full_scale_v is None):
-            raise ValueError("give either full_scale_dbm or full_scale_v, what the converter takes as full scale")
+            raise ValueError("state either full_scale_dbm or full_scale_v, the full scale of the converter")
         return self
 
     @property
@@ -187,7 +186,7 @@ class Receiver(Section):
 
 
 class Node(Section):
-    """One UAV."""
+    """UAV with its equipment."""
 
     lever_arms_m: LeverArms = Field(default_factory=LeverArms, description="logged point → phase centres, body axes")
     antennas: Antennas = Field(default_factory=Antennas, description="beams: where the antennas look, in body axes")
@@ -255,7 +254,7 @@ class Node(Section):
 
     @property
     def attitude_error_deg(self) -> tuple[float, float] | None:
-        """Value of `attitude_std_deg` for the vertical and for heading."""
+        """Values of `attitude_std_deg` for roll and pitch, and for heading."""
         stated = self.attitude_std_deg
         return stated if stated is None or isinstance(stated, tuple) else (stated, stated)
 
@@ -268,22 +267,22 @@ class Node(Section):
     def _lever_arm_needs_attitude(self) -> Self:
         if self.attitude == "none" and self.lever_arms_m.any():
             raise ValueError(
-                "lever_arms_m is not zero but attitude is none: body axes cannot be turned to north-east-down; "
+                "lever_arms_m is not zero but attitude is none: body axes cannot be rotated to north-east-down; "
                 "set attitude to log or course, or the lever arms to zero"
             )
         if self.attitude == "none" and self.antennas.any():
             raise ValueError(
-                "antennas has a beam but attitude is none: body axes cannot be turned to north-east-down; "
+                "antennas has a beam but attitude is none: body axes cannot be rotated to north-east-down; "
                 "set attitude to log or course, or the beam to null"
             )
         return self
 
 
-# ---- The radio of a pair, where images are calibrated --------------------------------------------------------------
+# ---- Radio of a pair, for calibrated images --------------------------------------------------------------------------
 
 
 def radio_of(nodes: Mapping[str, Node], pair: str) -> dict[str, object]:
-    """Return key of the config → what it states of a pair's radio; None where it states nothing.
+    """Return config key → value of a pair's radio; None for values that are not configured.
 
     Examples
     --------
@@ -300,7 +299,7 @@ def radio_of(nodes: Mapping[str, Node], pair: str) -> dict[str, object]:
 
 
 def polarisation_of(nodes: Mapping[str, Node], pair: str) -> str | None:
-    """Return the polarisations of a pair, as sent and as received; None unless both are stated.
+    """Return the transmitted and received polarisation of a pair, such as HV; None unless both are configured.
 
     Examples
     --------
@@ -314,31 +313,31 @@ def polarisation_of(nodes: Mapping[str, Node], pair: str) -> str | None:
 
 
 def check_radio(nodes: Mapping[str, Node], pairs: Iterable[str], *, sampled: bool, where: Path) -> None:
-    """Raise CampaignError unless the radio of all pairs is stated, or of none.
+    """Check that the radio is configured completely for all pairs, or for none.
 
     Parameters
     ----------
     nodes, pairs
-        Of the campaign.
+        Nodes and pairs of the campaign.
     sampled
-        Whether samples were recorded: the scale of recorded phase histories is not known.
+        True if samples were recorded; the scale of recorded phase histories is not known.
     where
-        The config.
+        Path of the config.
 
     Raises
     ------
     CampaignError
-        If the radio of some pair is stated in parts.
+        If the radio of a pair is configured incompletely, or with recorded phase histories.
     """
     stated = {key: value for pair in pairs for key, value in radio_of(nodes, pair).items()}
     missing = [key for key, value in stated.items() if value is None]
     if len(missing) < len(stated) and (missing or not sampled):
         raise CampaignError(
-            f"{', '.join(missing)} {'is' if len(missing) == 1 else 'are'} not stated, "
+            f"{', '.join(missing)} {'is' if len(missing) == 1 else 'are'} not configured, but "
             f"{next(key for key, value in stated.items() if value is not None)} is"
             if missing
-            else "a radio is stated, but numbers of a recorded phase history have no stated scale",
+            else "a radio is configured, but the scale of a recorded phase history is unknown",
             where=where,
-            expected="power, both antenna gains and receiver of every pair, or of none of them",
-            remedy="State what is missing, or set the rest to null: images are then relative.",
+            expected="power, both antenna gains and receiver of every pair, or none of these",
+            remedy="State the missing values, or set the others to null for relative images.",
         )

@@ -1,4 +1,4 @@
-"""Sections `scene`, `processing`, `calibration`, `interferometry`: grid, ground, how to compute, what to compare."""
+"""Sections `scene`, `processing`, `calibration`, `bench` and `interferometry` of the config."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -24,7 +24,7 @@ class Fusion(Section):
 
 
 class Multilooking(Section):
-    """Mean power on a coarser grid."""
+    """Settings of multilooking: mean power on a coarser grid."""
 
     spacing_m: float = Field(gt=0, description="side of the squares that power is averaged over, to whole pixels, m")
     subtract_noise: bool = Field(
@@ -33,11 +33,26 @@ class Multilooking(Section):
     speckle_filter: Literal["none", "lee"] = Field("none", description="what is done against the speckle that is left")
 
 
+class RunningBackground(Section):
+    """Background that changes during a flight."""
+
+    running_s: float = Field(gt=0, description="length of the running median, s")
+
+
 class Processing(ImagingChoices):
     """Processing settings; every key has a default."""
 
     sidelink: Literal["auto", "divide", "wiener", "gated", "two_parameter"] = Field(
         "auto", description="correction of a secondary node by its sidelink; auto takes the cheapest adequate"
+    )
+    background: Literal["auto", "none", "median", "mean"] | RunningBackground = Field(
+        "auto",
+        description="echoes at constant delay (antenna coupling, airframe) removed before range compression: median or "
+        "mean of all pulses, or a running median, {running_s: 2.0}; auto: the best of these, if targets gain by it",
+    )
+    interference: Literal["auto", "none"] = Field(
+        "auto",
+        description="auto: subcarriers with narrow-band interference are excluded if that raises the SNR",
     )
     fusion: Fusion = Field(default_factory=Fusion, description="how the images of a flight's pairs are added up")
     autofocus: Literal["auto", "on", "off"] = Field(
@@ -78,6 +93,11 @@ class Processing(ImagingChoices):
         1e-3, gt=0, description="how often noise alone may trigger in a continuous recording, per second"
     )
 
+    @property
+    def background_method(self) -> str | float:
+        """Name of the method, or the length of the running median, s."""
+        return self.background if isinstance(self.background, str) else self.background.running_s
+
     @field_validator("autofocus", mode="before")
     @classmethod
     def _yaml_reads_on_and_off_as_truth(cls, word: object) -> object:
@@ -87,12 +107,12 @@ class Processing(ImagingChoices):
     @classmethod
     def _scheduler_is_an_address(cls, text: str) -> str:
         if text != "threads" and not re.fullmatch(r"tcp://[A-Za-z0-9_.-]+:[0-9]{1,5}", text):
-            raise ValueError("neither threads nor an address tcp://host:port")
+            raise ValueError("must be threads or an address tcp://host:port")
         return text
 
 
 class CalibrationSettings(Section):
-    """Calibration flight that the path offsets come from."""
+    """Calibration flight for path offsets."""
 
     flight: Name = Field(description="flight of kind calibration whose offsets the imaging flights use")
     reflector_m: Metres3 = Field(description="reflector: easting, northing in scene.crs, ellipsoidal height, m")
@@ -116,13 +136,13 @@ class BenchSettings(Section):
 # ---- Section `interferometry`: pairs of images for interferograms ---------------------------------------------------
 
 LEAST_WINDOW_PX = 3
-"""Any two pixels are coherent: a window must hold several."""
+"""Smallest side of the coherence window, pixels: the coherence of a single pixel is always 1."""
 
 _IMAGE = r"([A-Za-z0-9_.]+)/([A-Za-z0-9_.]+-[A-Za-z0-9_.]+)"
 
 
 class Interferometry(Section):
-    """Phase between two images of one scene."""
+    """Interferograms: pairs of images of one scene."""
 
     pairs: Mapping[Name, tuple[str, str]] = Field(
         default_factory=dict,
@@ -141,14 +161,14 @@ class Interferometry(Section):
                 if not re.fullmatch(_IMAGE, image):
                     raise ValueError(f"{name}: {quoted(image)} is not flight/transmitter-receiver")
             if images[0] == images[1]:
-                raise ValueError(f"{name}: {images[0]} is named twice: an image has no phase against itself")
+                raise ValueError(f"{name}: {images[0]} is named twice; an interferogram requires two different images")
         return pairs
 
     @field_validator("window_px")
     @classmethod
     def _has_a_middle(cls, side: int) -> int:
         if side % 2 == 0:
-            raise ValueError("must be odd, so that a pixel is in its middle")
+            raise ValueError("must be odd, so that the window is centred on a pixel")
         return side
 
     def images(self, name: str) -> tuple[tuple[str, str], tuple[str, str]]:
@@ -159,21 +179,21 @@ class Interferometry(Section):
         >>> Interferometry(pairs={"two": ("f01/a-a", "f02/a-b")}).images("two")
         (('f01', 'a-a'), ('f02', 'a-b'))
         """
-        first, second = ((flight, pair) for flight, _, pair in (one.partition("/") for one in self.pairs[name]))
+        first, second = ((flight, pair) for flight, _, pair in (image.partition("/") for image in self.pairs[name]))
         return first, second
 
 
 def check_interferometry(requested: Interferometry, known: Sequence[str], *, where: Path) -> None:
-    """Raise CampaignError unless every image named is one of the campaign's.
+    """Check that the images of all interferograms are images of the campaign; raise CampaignError if not.
 
     Parameters
     ----------
     requested
-        The section.
+        Section `interferometry`.
     known
         Images of the campaign, flight/pair.
     where
-        The config.
+        Path of the config.
     """
     for name, images in requested.pairs.items():
         for image in images:
@@ -181,28 +201,28 @@ def check_interferometry(requested: Interferometry, known: Sequence[str], *, whe
                 raise CampaignError(
                     f"no image {quoted(image)}",
                     where=f"{where}: interferometry.pairs.{name}",
-                    expected=f"two of {', '.join(known) or 'no image at all'}",
+                    expected=f"two of {', '.join(known)}" if known else "two images; the campaign has none",
                     remedy="Correct the flight or the pair, or add them to flights.tsv.",
                 )
 
 
-# ---- Section `scene`: the grid of every raster, and the ground under it --------------------------------------------
+# ---- Section `scene`: grid of all rasters, and terrain ---------------------------------------------------------------
 
 
 class KnownPoint(Section):
-    """A point of known place that is visible in the images: it fixes the position of refined tracks."""
+    """Bright point of known position, which fixes the position of refined tracks."""
 
     name: Title = Field(description="what it is called")
     position_m: Metres3 = Field(description="easting, northing in scene.crs, ellipsoidal height (z in local), m")
     std_m: float = Field(gt=0, description="standard deviation of each coordinate, m")
 
 
-_CORNERS = ("trihedral", "dihedral")  # that look somewhere
+_CORNERS = ("trihedral", "dihedral")  # reflectors with a boresight
 _SIZES = {"trihedral": "[leg]", "dihedral": "[across the seam, along it]", "sphere": "[radius]"}
 
 
 class KnownReflector(KnownPoint):
-    """A reflector whose radar cross-section follows from its shape."""
+    """Reflector whose radar cross-section follows from its shape."""
 
     kind: Literal["trihedral", "dihedral", "sphere"] = Field(description="of three triangles, two rectangles, a sphere")
     size_m: tuple[Annotated[float, Field(gt=0, le=100)], ...] = Field(
@@ -226,19 +246,19 @@ class KnownReflector(KnownPoint):
     @model_validator(mode="after")
     def _is_complete(self) -> Self:
         if len(self.size_m) != (2 if self.kind == "dihedral" else 1):
-            raise ValueError(f"size_m={list(self.size_m)}: a {self.kind} has {_SIZES[self.kind]}")
+            raise ValueError(f"size_m={list(self.size_m)}: a {self.kind} requires {_SIZES[self.kind]}")
         aimed = [value for value in (self.azimuth_deg, self.elevation_deg) if value is not None]
         if len(aimed) != (2 if self.kind in _CORNERS else 0):
             raise ValueError(
-                f"a {self.kind} looks somewhere: state both azimuth_deg and elevation_deg"
+                f"a {self.kind} requires azimuth_deg and elevation_deg of its boresight"
                 if self.kind in _CORNERS
-                else "a sphere looks nowhere: azimuth_deg and elevation_deg are of corners"
+                else "a sphere has no boresight: azimuth_deg and elevation_deg apply to corner reflectors"
             )
         return self
 
 
 class Air(Section):
-    """Air at the ground of the scene, in place of the standard atmosphere: as measured, or its refractivity."""
+    """Atmosphere at the terrain, instead of the standard atmosphere: measured weather, or refractivity."""
 
     temperature_c: float | None = Field(None, ge=-60, le=60, description="at the ground, °C")
     pressure_hpa: float | None = Field(None, ge=300, le=1100, description="at the ground, not reduced to the sea, hPa")
@@ -248,30 +268,30 @@ class Air(Section):
     )
 
     @model_validator(mode="after")
-    def _one_way(self) -> Self:
+    def _weather_or_refractivity(self) -> Self:
         weather = self.temperature_c, self.pressure_hpa, self.relative_humidity
-        given = sum(value is not None for value in weather)
-        if given != (3 if self.refractivity_n is None else 0):
+        count = sum(value is not None for value in weather)
+        if count != (3 if self.refractivity_n is None else 0):
             raise ValueError(
-                f"{given} of temperature_c, pressure_hpa, relative_humidity"
-                f"{' beside refractivity_n' if self.refractivity_n is not None else ''}: give all three, or "
+                f"{count} of temperature_c, pressure_hpa and relative_humidity are stated"
+                f"{' in addition to refractivity_n' if self.refractivity_n is not None else ''}: state all three, or "
                 "refractivity_n alone"
             )
         return self
 
     @property
     def weather(self) -> tuple[float, float, float]:
-        """Temperature, °C, pressure, hPa, and humidity, %; ValueError where refractivity is stated instead."""
+        """Temperature, °C, pressure, hPa, and humidity, %; raises ValueError if refractivity is configured instead."""
         if self.temperature_c is None or self.pressure_hpa is None or self.relative_humidity is None:
-            raise ValueError("the refractivity is stated, and no weather")
+            raise ValueError("refractivity is configured instead of weather")
         return self.temperature_c, self.pressure_hpa, self.relative_humidity
 
 
-HEIGHT_DEFAULT = "no ground height is configured: scene.height_m is 0 m, the ellipsoid itself"
+HEIGHT_DEFAULT = "no terrain height is configured: scene.height_m is 0 m, the ellipsoid"
 
 
 class Scene(Section):
-    """The campaign's output grid."""
+    """Output grid of the campaign, terrain and atmosphere."""
 
     crs: CrsName = Field(
         "auto",
@@ -316,7 +336,7 @@ class Scene(Section):
 
     @property
     def height_is_default(self) -> bool:
-        """True if flat ground lies at 0 m, as in the template: an unlikely height."""
+        """True if the height of flat terrain is 0 m, as in the template, which is unlikely."""
         return self.dem is None and self.height_m == 0
 
     @model_validator(mode="after")
@@ -324,32 +344,33 @@ class Scene(Section):
         for key in ("reference_points", "reflectors"):
             names = [point.name for point in getattr(self, key)]
             if names and self.crs == "auto":
-                raise ValueError(f"{key} are in crs, which is auto: give the CRS")
-            twice = sorted({name for name in names if names.count(name) > 1})
-            if twice:
-                raise ValueError(f"{key}: two are called {twice[0]!r}")
+                raise ValueError(f"positions of {key} refer to crs, which is auto: state the CRS")
+            duplicates = sorted({name for name in names if names.count(name) > 1})
+            if duplicates:
+                raise ValueError(f"{key}: name {duplicates[0]!r} is used twice")
         return self
 
     @model_validator(mode="after")
     def _datum_is_stated(self) -> Self:
         if self.dem is not None and self.dem_datum is None:
             raise ValueError(
-                "dem is given without dem_datum: state what its heights count from "
-                "(ellipsoid, egm96, egm2008, or carried where its CRS says it); it is never guessed"
+                "dem is stated without dem_datum, the vertical datum of its heights, which has no default: state "
+                "ellipsoid, egm96, egm2008, or carried if the CRS of the DEM defines the datum"
             )
         if self.dem is None and self.dem_datum is not None:
-            raise ValueError(f"dem_datum={self.dem_datum} is given without dem")
+            raise ValueError(f"dem_datum={self.dem_datum} is stated without dem")
         stated = {self.dem_datum, self.height_datum}
         if self.crs == "local" and stated & {"egm96", "egm2008"}:
             raise ValueError(
-                "heights in the local frame count from no geoid: take carried for dem_datum, and ellipsoid"
+                "heights in the local frame do not refer to a geoid: use carried for dem_datum, and ellipsoid for "
+                "height_datum"
             )
         return self
 
     @model_validator(mode="before")
     @classmethod
     def _heights_of_crs_are_those_stated(cls, values: Any) -> Any:
-        """Take the horizontal part of a compound CRS, whose heights must be those that the datum states."""
+        """Replace a compound CRS by its horizontal part; its vertical part must be the configured datum."""
         crs = values.get("crs") if isinstance(values, dict) else None
         if not isinstance(crs, str) or "+" not in plain_crs(crs):
             return values
@@ -359,8 +380,8 @@ class Scene(Section):
         stated, carried = values.get(key, "ellipsoid"), VERTICAL_DATUMS.get(vertical, vertical)
         if stated != carried:
             raise ValueError(
-                f"crs={crs} says heights of {carried}, {key} says {quoted(stated)}: "
-                f"heights count from what {key} says; give crs={horizontal}, and {key} as it is"
+                f"crs={crs} has the vertical datum {carried}, but {key} is {quoted(stated)}, which applies to heights: "
+                f"state crs={horizontal} and the correct {key}"
             )
         return {**values, "crs": horizontal}
 
@@ -374,7 +395,7 @@ class Scene(Section):
         if xmin >= xmax or ymin >= ymax:
             sorted_m = [min(xmin, xmax), min(ymin, ymax), max(xmin, xmax), max(ymin, ymax)]
             raise ValueError(
-                f"bounds_m={list(self.bounds_m)}: must be [xmin, ymin, xmax, ymax] with min < max, in order {sorted_m}"
+                f"bounds_m={list(self.bounds_m)}: must be [xmin, ymin, xmax, ymax] with min < max; sorted: {sorted_m}"
             )
         if self.spacing_m != "auto":
             self._divisible(xmin, ymin, xmax, ymax, self.spacing_m)
@@ -385,7 +406,7 @@ class Scene(Section):
         if any(abs(count - round(count)) > 1e-6 * max(count, 1.0) for count in counts):
             columns, rows = (max(1, round(count)) for count in counts)
             degrees = self.crs != "local" and max(map(abs, (xmin, ymin, xmax, ymax))) <= 180 and xmax - xmin < 1
-            hint = ": these look like degrees, bounds_m is in metres of crs" if degrees else ""
+            hint = "; the values look like degrees, but bounds_m is in metres of crs" if degrees else ""
             nearest = [xmin, round(ymax - rows * spacing, 9), round(xmin + columns * spacing, 9), ymax]
             raise ValueError(
                 f"bounds_m={list(self.bounds_m)} is {counts[0]:.6g} × {counts[1]:.6g} pixels of {spacing} m; "

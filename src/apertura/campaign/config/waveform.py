@@ -1,4 +1,4 @@
-"""Section `waveform`: what was transmitted, as samples or as transfer functions."""
+"""Section `waveform`: the transmitted signal and the kind of recording, samples or transfer functions."""
 
 from abc import abstractmethod
 from typing import Annotated, ClassVar, Literal, Self
@@ -12,10 +12,10 @@ from apertura.formats.names import PHASE_HISTORIES
 
 
 class SampledWaveform(Section):
-    """One pulse per trigger, recorded as samples: the common interface from captures to transfer functions.
+    """Waveform with one pulse per trigger, recorded as samples: interface from captures to transfer functions.
 
-    Each kind states in `file_key` the key that names the file of the transmitted signal, in `delay_key` and
-    `limit_name` the key and the name of the interval in which an echo must arrive.
+    `file_key` is the key with the file of the transmitted signal; `delay_key` and `limit_name` are key and name of the
+    interval in which echoes must arrive.
     """
 
     file_key: ClassVar[str]
@@ -35,41 +35,41 @@ class SampledWaveform(Section):
     @property
     @abstractmethod
     def longest_delay_s(self) -> float:
-        """Delay up to which a whole echo is recorded, seconds."""
+        """Longest delay of an echo that is recorded completely, seconds."""
 
     @property
     @abstractmethod
     def middle_s(self) -> float:
-        """Time of the middle of the measured part of the pulse, seconds after its beginning."""
+        """Mid-time of the measured part of the pulse, seconds after its start."""
 
     @property
     @abstractmethod
     def capture_s(self) -> float:
-        """Duration of a capture, seconds; nothing beyond is used."""
+        """Duration of a capture, seconds; later samples are not used."""
 
     @property
     @abstractmethod
     def needed_samples(self) -> int:
-        """Samples that a capture must hold."""
+        """Smallest number of samples of a capture."""
 
     @property
     @abstractmethod
     def most_subcarriers(self) -> int:
-        """Frequencies that an echo is measured at, at most."""
+        """Largest number of frequencies at which an echo is measured."""
 
     @property
     @abstractmethod
     def widest_band_hz(self) -> float:
-        """Bandwidth, at most."""
+        """Largest bandwidth, Hz."""
 
     @property
     def capture_samples(self) -> int:
-        """Samples of a whole capture."""
+        """Number of samples of a capture."""
         return round(self.capture_s * self.sample_rate_hz)
 
 
 class OfdmWaveform(SampledWaveform):
-    """One OFDM symbol per pulse."""
+    """Waveform with one OFDM symbol per pulse."""
 
     file_key, delay_key, limit_name = "codes", "cyclic_prefix_s", "the cyclic prefix"
 
@@ -85,17 +85,17 @@ class OfdmWaveform(SampledWaveform):
 
     @property
     def longest_delay_s(self) -> float:
-        """The cyclic prefix."""
+        """Duration of the cyclic prefix."""
         return self.cyclic_prefix_s
 
     @property
     def middle_s(self) -> float:
-        """The middle of the symbol."""
+        """Mid-time of the symbol."""
         return self.cyclic_prefix_s + self.symbol_s / 2
 
     @property
     def capture_s(self) -> float:
-        """Prefix and symbol."""
+        """Duration of prefix and symbol."""
         return self.cyclic_prefix_s + self.symbol_s
 
     @property
@@ -110,7 +110,7 @@ class OfdmWaveform(SampledWaveform):
 
     @property
     def needed_samples(self) -> int:
-        """Prefix and one period 1/Δf."""
+        """Samples of the prefix and one period 1/Δf."""
         return self.prefix_samples + self.dft_samples
 
     @property
@@ -127,9 +127,7 @@ class OfdmWaveform(SampledWaveform):
     def _dft_fits(self) -> Self:
         length = self.sample_rate_hz / self.subcarrier_spacing_hz
         if abs(length - round(length)) > 1e-6 * length:
-            raise ValueError(
-                f"sample_rate_hz/subcarrier_spacing_hz = {length:.6f} must be an integer: it is the DFT length"
-            )
+            raise ValueError(f"sample_rate_hz/subcarrier_spacing_hz = {length:.6f} must be an integer, the DFT length")
         if self.subcarriers > round(length):
             raise ValueError(f"subcarriers={self.subcarriers} exceed the DFT length {round(length)}")
         if self.symbol_s < (1 - 1e-9) / self.subcarrier_spacing_hz:
@@ -141,7 +139,7 @@ class OfdmWaveform(SampledWaveform):
 
 
 class PulseWaveform(SampledWaveform):
-    """A pulse given by its samples and sent once per trigger: a chirp, a code, whatever a loop-back captured."""
+    """Waveform given by its samples and transmitted once per trigger: a chirp, a code, or a loop-back recording."""
 
     file_key, delay_key, limit_name = "pulse", "listen_s", "the listening time"
 
@@ -163,32 +161,32 @@ class PulseWaveform(SampledWaveform):
 
     @property
     def longest_delay_s(self) -> float:
-        """As stated."""
+        """Configured listening time."""
         return self.listen_s
 
     @property
     def middle_s(self) -> float:
-        """The middle of the pulse."""
+        """Mid-time of the pulse."""
         return self.pulse_s / 2
 
     @property
     def capture_s(self) -> float:
-        """Lead time, pulse, and longest delay."""
+        """Sum of lead time, pulse duration and listening time."""
         return self.lead_s + self.pulse_s + self.listen_s
 
     @property
     def needed_samples(self) -> int:
-        """Number of samples of a whole capture: its end holds the end of the last echo."""
+        """Samples of a whole capture, which ends with the end of the last echo."""
         return self.capture_samples
 
     @property
     def most_subcarriers(self) -> int:
-        """Number of subcarriers of the band."""
+        """Largest number of DFT frequencies within the band."""
         return min(self.capture_samples, int(self.widest_band_hz / self.sample_rate_hz * self.capture_samples) + 1)
 
     @property
     def widest_band_hz(self) -> float:
-        """Stated bandwidth, or all that the samples carry."""
+        """Configured bandwidth, else the sample rate."""
         return self.sample_rate_hz if self.band_hz is None else self.band_hz[1] - self.band_hz[0]
 
     @model_validator(mode="after")
@@ -198,7 +196,8 @@ class PulseWaveform(SampledWaveform):
             half = self.sample_rate_hz / 2
             if not -half <= low < high <= half:
                 raise ValueError(
-                    f"band_hz={[low, high]} must rise within ±sample_rate_hz/2 = ±{half:g} Hz: beyond, it aliases"
+                    f"band_hz={[low, high]} must be ascending and within ±sample_rate_hz/2 = ±{half:g} Hz; higher "
+                    "frequencies are aliased"
                 )
         if self.capture_s * self.prf_hz > 1:
             raise ValueError(
@@ -221,7 +220,7 @@ def _formats(kind: str) -> list[str]:
 
 def _known(name: str, kind: str) -> str:
     if name not in _formats(kind):
-        raise ValueError(f"no such format; choose {', '.join(_formats(kind))}")
+        raise ValueError(f"unknown format; choose {', '.join(_formats(kind))}")
     return name
 
 
@@ -257,14 +256,14 @@ class PhaseHistoryWaveform(Section):
     @model_validator(mode="after")
     def _keys_are_of_their_format(self) -> Self:
         if self.channel is not None and self.format != "cphd":
-            raise ValueError(f"channel={self.channel!r} is of format cphd, and not of {self.format}")
+            raise ValueError(f"channel={self.channel!r} applies to format cphd, not to {self.format}")
         if self.corrections != "none" and self.format != "afrl_mat":
-            raise ValueError(f"corrections={self.corrections!r} is of format afrl_mat, and not of {self.format}")
+            raise ValueError(f"corrections={self.corrections!r} applies to format afrl_mat, not to {self.format}")
         return self
 
 
 class Trigger(Section):
-    """Beginnings of the sweeps in a .wav file."""
+    """Detection of sweep starts in a .wav file."""
 
     sync_channel: int = Field(1, ge=1, le=64, description="channel of the sync pulses, counted from 1")
     beat_channel: int = Field(2, ge=1, le=64, description="channel of the beat signal, counted from 1")
@@ -275,7 +274,7 @@ class Trigger(Section):
 
 
 class FmcwWaveform(Section):
-    """Linear sweeps, mixed with their echoes when received: the beat signal was recorded."""
+    """FMCW waveform: linear sweeps, whose beat signals with their echoes were recorded."""
 
     kind: Literal["fmcw"] = Field(description=WAVEFORM_KINDS)
     format: str = Field(
@@ -315,12 +314,12 @@ class FmcwWaveform(Section):
     def _sweeps_hold_samples(self) -> Self:
         if not self.bandwidth_hz or self.start_hz + self.bandwidth_hz <= 0:
             raise ValueError(
-                f"bandwidth_hz={self.bandwidth_hz:g} from start_hz={self.start_hz:g} is no band above 0 Hz"
+                f"bandwidth_hz={self.bandwidth_hz:g} with start_hz={self.start_hz:g} is not a band above 0 Hz"
             )
         if not 8 <= (self.sweep_s - self.settle_s) * self.sample_rate_hz <= _MOST_SAMPLES:
             raise ValueError(
                 f"(sweep_s - settle_s)*sample_rate_hz = {(self.sweep_s - self.settle_s) * self.sample_rate_hz:g} "
-                f"samples per sweep: must be 8 to {_MOST_SAMPLES}"
+                f"samples per sweep; must be 8 to {_MOST_SAMPLES}"
             )
         if self.reference_path_m > _LONGEST_REFERENCE_M:
             raise ValueError(f"reference_path_m={self.reference_path_m:g}: at most {_LONGEST_REFERENCE_M:g}")
@@ -329,6 +328,6 @@ class FmcwWaveform(Section):
         return self
 
 
-# ---- Section `waveform`: what was transmitted ----------------------------------------------------------------------
+# ---- Section `waveform` ----------------------------------------------------------------------------------------------
 
 Waveform = Annotated[OfdmWaveform | PulseWaveform | PhaseHistoryWaveform | FmcwWaveform, Field(discriminator="kind")]

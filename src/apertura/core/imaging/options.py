@@ -1,4 +1,4 @@
-"""Choices of how an image is formed, from Python or in section `processing` of a campaign."""
+"""Options of image formation, from Python or in section `processing` of a campaign's configuration."""
 
 from typing import Annotated, Any, Literal, Self
 
@@ -16,7 +16,7 @@ class IntegrationAngle(BaseModel):
 
 
 class IntegrationResolution(BaseModel):
-    """Integration by the resolution along the flight."""
+    """Integration given by the resolution along the flight."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -24,7 +24,7 @@ class IntegrationResolution(BaseModel):
 
 
 PLANNED = ("engine", "engine_options", "presum", "pulse_blocks", "terrain")
-"""Choices that the planner makes where they are 'auto'."""
+"""Options decided by the planner where they are 'auto'."""
 
 
 def _options_of_each_engine(schema: dict[str, Any]) -> None:
@@ -33,7 +33,7 @@ def _options_of_each_engine(schema: dict[str, Any]) -> None:
 
 
 class ImagingChoices(BaseModel):
-    """How to form an image; every choice has a default.
+    """Options of image formation; each has a default.
 
     Examples
     --------
@@ -77,7 +77,7 @@ class ImagingChoices(BaseModel):
 
     @property
     def planned(self) -> dict[str, Any]:
-        """Overrides of the planner: choice → value."""
+        """Overrides of the planner: option → value."""
         return {name: getattr(self, name) for name in PLANNED}
 
     @property
@@ -89,14 +89,14 @@ class ImagingChoices(BaseModel):
     @classmethod
     def _engine_is_known(cls, name: str) -> str:
         if name not in {"auto", *ENGINES}:
-            raise ValueError(f"no such engine; choose auto, {', '.join(ENGINES)}")
+            raise ValueError(f"unknown engine; choose auto, {', '.join(ENGINES)}")
         return name
 
     @model_validator(mode="after")
     def _options_are_those_of_engines(self) -> Self:
         for name, options in self.engine_options.items():
             if name not in ENGINES:
-                raise ValueError(f"engine_options.{name}: no such engine; choose {', '.join(ENGINES)}")
+                raise ValueError(f"engine_options.{name}: unknown engine; choose {', '.join(ENGINES)}")
             try:
                 load_engine(name).Options.model_validate(options)
             except ValidationError as error:

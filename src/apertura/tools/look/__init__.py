@@ -1,1 +1,1 @@
-"""A look at a campaign while it flies: images of the pulses so far, beside the results; no stage is written."""
+"""Live view of a campaign during the flight: images of the pulses recorded so far, next to the results."""
