@@ -143,7 +143,7 @@ def test_weights_add_to_predicted_time_and_error():
     steep = beam_of((0.5, 60.0))  # pattern falls within half a degree
     errors = [setting.error_db for setting in (plain, two_beams, predicted(beams=Beams(steep)))]
     assert errors[0] < errors[1] < errors[2] - 1
-    assert "weights by" in predicted(beams=Beams(steep)).reasons["oversampling"]
+    assert ", weights -" in predicted(beams=Beams(steep)).reasons["oversampling"]
     assert "weights" not in plain.reasons["oversampling"]
 
 
@@ -188,10 +188,10 @@ def test_simulator_slower_than_the_double_sum_is_no_fallback(monkeypatch):
 @pytest.mark.skipif(cuda.available(), reason="there is a device")
 def test_engine_is_refused_without_a_device(plain):
     pixels, profiles = plain
-    with pytest.raises(CampaignError, match="engine cuda is not available on this machine") as told:
+    with pytest.raises(CampaignError, match="engine cuda is not available on this machine") as raised:
         plan(overrides={"engine": "cuda"})
-    assert "NVIDIA" in told.value.remedy
-    assert "cuda" not in told.value.expected
+    assert "NVIDIA" in raised.value.remedy
+    assert "cuda" not in raised.value.expected
     with pytest.raises(CampaignError, match="no device can be used"):
         cuda.form(cuda.prepare(profiles), ecef(pixels))
     assert cuda.instruction_set() == "cuda: no device"

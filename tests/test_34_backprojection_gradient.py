@@ -205,7 +205,7 @@ def test_profile_stage_is_accepted_and_other_stages_are_refused():
     from_arrays, from_stage = (ap.gradient(profile_input, patch, slope) for profile_input in (profiles, stage))
     assert np.array_equal(from_arrays.rx_m, from_stage.rx_m)
     for profile_input in (point_history(), stage.drop_vars("profile")):
-        with pytest.raises(CampaignError, match="expected Profiles, or a stage profile"):
+        with pytest.raises(CampaignError, match="expected Profiles, or the dataset of stage profile"):
             ap.gradient(profile_input, patch, slope)
 
 

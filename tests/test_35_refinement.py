@@ -281,7 +281,7 @@ def test_exact_tracks_are_left_unchanged():
     result = refine(simulated.records, GRID, FlatGround(0.0), simulated.errors)
     assert not result.accepted
     assert not result.flags.keys() - {"position_error_overstated"}  # correct for tracks without error and 2 cm stated
-    assert "the logs are as good" in result.why
+    assert "no improvement over the logs" in result.why
 
 
 def test_track_slip_is_found_by_delays_and_corrected():

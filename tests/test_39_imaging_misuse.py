@@ -169,10 +169,10 @@ def test_invalid_arguments_are_refused_in_one_line(name):
         arguments = {key: value() if callable(value) else value for key, value in options.items()}
         return ap.backproject(make_input(), arguments.pop("grid", TARGET_GRID), **arguments)
 
-    with pytest.raises(CampaignError, match=complaint) as told:
+    with pytest.raises(CampaignError, match=complaint) as raised:
         form()
-    assert "\n" not in str(told.value)
-    assert "self." not in str(told.value)
+    assert "\n" not in str(raised.value)
+    assert "self." not in str(raised.value)
 
 
 FLAGGED = {
