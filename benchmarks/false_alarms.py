@@ -65,7 +65,7 @@ def _rows(number: int, drawn: Drawn, outcome: Outcome, root: Path) -> Iterator[R
     said |= {"verdict": "", "texts": "{}", "seconds": round(outcome.seconds, 1)}
     if outcome.error:
         yield known | said
-    untold = any(verdict_of(report) == "cannot tell" for report in outcome.reports.values())
+    untold = any(verdict_of(report) == "inconclusive" for report in outcome.reports.values())
     true_flags = {
         *drawn.true_flags,
         *(["phase_unobservable"] if untold else []),

@@ -289,7 +289,7 @@ finally:
         ("step", "image", "f01", "uav1-uav2", "--campaign"),
         ("step", "export", "f01", "uav1-uav2", "--campaign"),
         ("step", "stac", "--campaign"),
-        ("look",),
+        ("preview",),
         ("clean", "--yes"),
     ],
     ids=lambda words: " ".join(words[:2]),

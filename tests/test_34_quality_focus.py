@@ -105,7 +105,7 @@ def test_single_point_does_not_decide_the_verdict():
 
 @pytest.mark.parametrize(
     ("losses_db", "verdict"),
-    [((-0.3, -0.5), "focused"), ((-0.6, -6.0), "cannot tell"), ((-4.0, -4.2), "defocused"), ((-1.0,), "cannot tell")],
+    [((-0.3, -0.5), "focused"), ((-0.6, -6.0), "inconclusive"), ((-4.0, -4.2), "defocused"), ((-1.0,), "inconclusive")],
 )
 def test_loss_interval_that_includes_1_db_gives_no_verdict(losses_db, verdict):
     assert judge([(1.0, PointFocus(loss_db, 0.01, 1, 30.0)) for loss_db in losses_db]).verdict == verdict
@@ -113,17 +113,17 @@ def test_loss_interval_that_includes_1_db_gives_no_verdict(losses_db, verdict):
 
 @pytest.mark.parametrize("flag", sorted(GEOMETRY_CONTRADICTED))
 def test_flag_that_contradicts_the_geometry_prevents_verdict_focused(flag):
-    focus = {"verdict": "focused", "why": "3 bright points lost 0.02 dB", "loss_db": -0.02}
+    focus = {"verdict": "focused", "reason": "3 bright points lost 0.02 dB", "loss_db": -0.02}
     assert flag in FLAGS
-    assert focus_with_flags(focus, ["hover", flag])["verdict"] == "cannot tell"
-    assert focus_with_flags(focus, ["hover", flag])["why"].endswith(f"contradicted by {flag}")
+    assert focus_with_flags(focus, ["hover", flag])["verdict"] == "inconclusive"
+    assert focus_with_flags(focus, ["hover", flag])["reason"].endswith(f"contradicted by {flag}")
     assert focus_with_flags(focus | {"verdict": "defocused"}, [flag])["verdict"] == "defocused"
     assert focus_with_flags(focus, ["hover", "track_gap"]) == focus
 
 
-@pytest.mark.parametrize(("error_db", "verdict"), [(-10.0, "cannot tell"), (-40.0, "focused"), (None, "focused")])
+@pytest.mark.parametrize(("error_db", "verdict"), [(-10.0, "inconclusive"), (-40.0, "focused"), (None, "focused")])
 def test_large_numerical_error_prevents_verdict_focused(error_db, verdict):
-    focus = {"verdict": "focused", "why": "3 bright points lost 0.02 dB"}
+    focus = {"verdict": "focused", "reason": "3 bright points lost 0.02 dB"}
     assert focus_with_flags(focus, ["accuracy_not_met"], error_db=error_db)["verdict"] == verdict
 
 
@@ -252,7 +252,7 @@ def test_predicted_scatter_of_the_loss_equals_monte_carlo_scatter():
     ],
 )
 def test_loss_beyond_expectation_is_flagged_also_below_1_db(loss_db, std_db, expected, raised):
-    report = {"verdict": "focused", "why": "points lost", "loss_db": loss_db, "std_db": std_db}
+    report = {"verdict": "focused", "reason": "points lost", "loss_db": loss_db, "std_db": std_db}
     assert ("loss_unexpected" in focus_flags(report, expected)) == raised
     bad = focus_flags(report | {"verdict": "defocused"}, expected)
     assert "defocused" in bad
@@ -421,7 +421,7 @@ def test_drift_between_subapertures_is_detected():
     still, moving = patches(0.0), patches(2.0)
     assert still.drift_m < 0.02
     assert moving.drift_m == pytest.approx(0.2 * np.sqrt((8**2 - 1) / 12), rel=0.15)
-    assert judge_parts(still, cell_m=0.3).verdict == "cannot tell"
+    assert judge_parts(still, cell_m=0.3).verdict == "inconclusive"
     assert judge_parts(moving, cell_m=0.3).verdict == "defocused"
     assert still.snr_db > 10
 

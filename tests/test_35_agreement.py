@@ -136,7 +136,7 @@ def test_single_pair_has_no_agreement():
 def test_speckle_refinement_is_accepted_by_coherence_of_tiles_not_fitted():
     records, _ = records_of(1)
     refined = refined_by_speckle(speckle_tiles(records), PRIOR, KNOTS_S)
-    assert refined.accepted, refined.why
+    assert refined.accepted, refined.reason
     unrelated = [records[0], replace(records[1], profiles=records_of(2)[0][1].profiles)]
     rejected = refined_by_speckle(speckle_tiles(unrelated), PRIOR, KNOTS_S)
     assert not rejected.accepted

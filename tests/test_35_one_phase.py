@@ -171,7 +171,7 @@ def test_one_phase_focuses_a_far_scene_without_displacing_it(method, pair):
     refined = refine_one_phase([record], patches_at(FAR_POINTS_M, 5.0, 0.8), FAR_ERRORS, method=method)
     before_db, _ = losses(record.profiles, true, PROBES_M, 1.0)
     after_db, displacements_m = losses(record.moved(refined.correction), true, PROBES_M, 1.0)
-    assert refined.accepted, refined.why
+    assert refined.accepted, refined.reason
     assert before_db.mean() < -2
     assert after_db.min() > -0.2
     np.testing.assert_allclose(displacements_m[:, :2], expected_shifts(record, true, PROBES_M), atol=0.01)
@@ -206,7 +206,7 @@ def test_phases_fitted_to_noise_are_rejected(method):
     for seed in (0, 2):
         record, _ = record_of(FAR, points, seed=seed, snr_db=-10)
         refined = refine_one_phase([record], patches_at(points, 5.0, 0.8), FAR_ERRORS, method=method)
-        assert refined.flags["refinement_rejected"] == refined.why
+        assert refined.flags["refinement_rejected"] == refined.reason
         gains_db.append(refined.report["gain_held_out_db"])
     assert max(gains_db) < 0
 

@@ -270,7 +270,7 @@ def test_short_flight_past_few_points_is_corrected(points, pairs, sigma_m):
     simulated = case(f"points-{points}", "short", pairs, sigma_m, 10.0, 0)
     result = refine(simulated.records, GRID, FlatGround(0.0), simulated.errors)
     before, after = judge(simulated), judge(simulated, result.correction)
-    assert result.accepted, result.why
+    assert result.accepted, result.reason
     assert before.target_loss_db < -2
     assert after.target_loss_db > -0.5
     assert after.target_shift_cm < before.target_shift_cm + 1  # unobservable modes keep the logged values
@@ -281,14 +281,14 @@ def test_exact_tracks_are_left_unchanged():
     result = refine(simulated.records, GRID, FlatGround(0.0), simulated.errors)
     assert not result.accepted
     assert not result.flags.keys() - {"position_error_overstated"}  # correct for tracks without error and 2 cm stated
-    assert "no improvement over the logs" in result.why
+    assert "no improvement over the logs" in result.reason
 
 
 def test_track_slip_is_found_by_delays_and_corrected():
     """4 cm in 7.5 s: the sharpest tracks have one-wavelength slips in parts of the flight until delays are compared."""
     simulated = case("points-4", "short", "mono", 0.04, 10.0, 13)
     result = refine(simulated.records, GRID, FlatGround(0.0), simulated.errors)
-    assert result.accepted, result.why
+    assert result.accepted, result.reason
     assert judge(simulated, result.correction).target_shift_cm < 8
     assert judge(simulated).target_shift_cm > 20
 

@@ -87,7 +87,7 @@ def test_one_or_two_wrong_pairs_of_six_are_excluded_from_the_sum(error, wrong):
     }
     fusion = fusion_of(CORRECT | erroneous)
     assert set(fusion.agreeing) == set(PAIRS) - set(wrong)
-    assert set(fusion.left_out) == set(wrong)
+    assert set(fusion.excluded) == set(wrong)
     assert set(fusion.phases_rad) == set(fusion.agreeing)
     assert fusion.ties == ()
     assert fusion.unmeasured == {}
@@ -183,7 +183,7 @@ def test_unmeasured_pair_is_summed_unless_it_lacks_points_of_others():
     uncertain = choose_fusion(rank, between | {("a", "c"): measured_agreement(2.0, std_rad=0.7)}, align=False)
     assert "not certain enough" in uncertain.unmeasured["c"]
     hidden = choose_fusion(rank, between, hidden={("a", "c")}, align=False)
-    assert "contains no bright points of a" in hidden.left_out["c"]
+    assert "contains no bright points of a" in hidden.excluded["c"]
     assert hidden.unmeasured == {}
 
 
@@ -217,7 +217,7 @@ def test_wrong_pair_is_excluded_from_many_pairs_without_exhaustive_search():
     rank = {f"p{number:02}": (0.0,) for number in range(14)}
     between = {pairs: measured_agreement(2.5 if "p03" in pairs else 0.0) for pairs in combinations(rank, 2)}
     fusion = choose_fusion(rank, between, align=False)
-    assert "p03" in fusion.left_out
+    assert "p03" in fusion.excluded
     assert len(fusion.agreeing) == 12
 
 

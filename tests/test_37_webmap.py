@@ -238,7 +238,7 @@ def test_port_in_use_is_reported(server, results):
 def test_untrusted_names_are_encoded_in_urls():
     name = 'a"<b>#?&%2f é'
     layer = Layer(f"{name}.tif", "0f", "image", name, "dB", -50.0, 0.0)
-    report = {"focus": {"verdict": name, "why": ""}, "numerical_error_db": -60, "flags": {}}
+    report = {"focus": {"verdict": name, "reason": ""}, "numerical_error_db": -60, "flags": {}}
     entry = image_entry(name, "a-b", report, [layer])
     assert re.fullmatch(r"\.\./[\w%./-]+\.tif\?sha256=0f", entry["layers"][0]["url"], re.ASCII)
     grid = {"bounds_m": [0, 0, 1, 1], "spacing_m": 1.0, "shape": [1, 1]}

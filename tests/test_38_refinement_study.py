@@ -39,7 +39,7 @@ QUARTER_OF_A_CELL_CM = 100 * np.sqrt(CELL_M2) / 4
 
 
 def row(sigma_cm, verdict, *, scene="five", seed=1, product_db=0.2):
-    return AutofocusRow(scene, sigma_cm, seed, 2.0 * sigma_cm, product_db, 0.2, verdict, "", "why")
+    return AutofocusRow(scene, sigma_cm, seed, 2.0 * sigma_cm, product_db, 0.2, verdict, "", "reason")
 
 
 def refinement(accepted, *flags, correction=UNCORRECTED):

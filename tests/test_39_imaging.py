@@ -82,7 +82,7 @@ def test_campaign_stage_gives_the_image_of_the_workflow(finished_tiny):
     np.testing.assert_array_equal(image.values, campaign.image(flight, pairs[0]).values)
     assert campaign.report(flight, pairs[0])["flags"] == campaign.flags(flight, pairs[0])
     result, workflow_focus = ap.judge(image), campaign.report(flight, pairs[0])["focus"]
-    for name in ("verdict", "why", "points", "parts"):
+    for name in ("verdict", "reason", "points", "parts"):
         assert result.focus[name] == workflow_focus[name]
 
 

@@ -224,7 +224,7 @@ def test_conjugated_samples_are_identified():
 def test_ambiguous_spectrum_gives_no_verdict():
     """Swapped halves of the spectrum give two peaks in range, not distinguishable from two targets."""
     swapped = replace(HISTORY, transfer=np.fft.fftshift(ECHO, axes=1))
-    assert ap.backproject(swapped, TARGET_GRID).attrs["verdict"] == "cannot tell"
+    assert ap.backproject(swapped, TARGET_GRID).attrs["verdict"] == "inconclusive"
 
 
 def test_correct_image_is_focused_without_a_flag():
@@ -246,7 +246,7 @@ def test_outside_echo_is_not_flagged_if_the_scene_has_points():
 def test_lazy_image_is_judged_on_request_and_as_a_whole():
     lazy = ap.backproject(HISTORY, TARGET_GRID, judge=False, tile_px=64)
     assert lazy.attrs["verdict"] == "not judged"
-    assert "apertura.judge" in lazy.attrs["verdict_why"]
+    assert "apertura.judge" in lazy.attrs["verdict_reason"]
     result = ap.judge(abs(lazy)[:9, :9])
     assert (result.verdict, dict(result.flags)) == ("focused", {})
     assert result.focus["points"][0]["x_m"] == pytest.approx(TARGET[0, 0], abs=0.03)
@@ -364,7 +364,7 @@ def test_small_integer_types_are_accepted_as_grid_shape():
 
 def test_single_pixel_image_is_judged():
     grid = ap.SceneGrid("local", -0.05, 0.05, 0.1, (1, 1))
-    assert ap.backproject(HISTORY, grid, judge=True).attrs["verdict"] == "cannot tell"
+    assert ap.backproject(HISTORY, grid, judge=True).attrs["verdict"] == "inconclusive"
 
 
 @pytest.mark.slow
@@ -378,7 +378,7 @@ def test_xarray_and_dask_arrays_are_accepted():
 def test_image_without_samples_is_not_called_focused():
     """Profile starts in km: no pixel lies within the samples."""
     image = ap.backproject(replace(PROFILES, start_m=PROFILES.start_m / 1e3), TARGET_GRID, judge=True)
-    assert image.attrs["verdict"] == "cannot tell"
+    assert image.attrs["verdict"] == "inconclusive"
 
 
 def test_lazy_image_does_not_follow_later_changes_of_the_track_array():

@@ -217,7 +217,7 @@ def test_a_product_or_document_that_is_edited_or_gone_is_made_again(finished, fi
         path.write_bytes(path.read_bytes()[:-1] + b"x")
     found = stale_results(Campaign.load(finished))
     reason = "is missing" if how == "gone" else "has changed since it was written"
-    assert [why for why in found.values() if why] == [f"{path.name} {reason}"]
+    assert [reason for reason in found.values() if reason] == [f"{path.name} {reason}"]
 
 
 @pytest.mark.quick("0")

@@ -90,7 +90,7 @@ def test_a_gpst_log_taken_for_utc_misses_the_pulses_by_18_seconds(tiny):
     campaign = Campaign.load(tiny)
     ingest_all(campaign)
     message = complaint(lambda: echo.echo(campaign, "f01", "uav1-uav2"))
-    assert "begins 1" in message
+    assert "starts 1" in message
     assert "GPST is 18 s ahead" in message
 
 

@@ -196,7 +196,7 @@ def test_an_image_without_an_aperture_cannot_tell_its_focus():
     echo = np.exp(-2j * np.pi * frequency * flown.path(np.zeros((1, 3))) / 299792458.0).astype(np.complex64)
     image = ap.backproject(ap.PhaseHistory(echo, frequency, np.full(128, 1 / 128), np.zeros(64), flown), grid)
     told = ap.judge(image)
-    assert told.verdict == "cannot tell"
-    assert told.why.startswith("no aperture: antennas moved 0 m: no resolution")
+    assert told.verdict == "inconclusive"
+    assert told.reason.startswith("no aperture: antennas moved 0 m: no resolution")
     assert "no_aperture" in image.attrs["flags"]
     assert not told.flags.keys() & {"defocused", "echo_outside_scene"}

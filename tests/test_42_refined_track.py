@@ -78,7 +78,7 @@ def test_tracks_left_alone_have_no_knots_and_their_images_say_why(finished_tiny)
         "decision": "off: auto: position accuracy of uav1 is not configured; set nodes.<node>.position_std_m to "
         "have the tracks refined",
         "accepted": False,
-        "why": "images are formed from the unchanged logs",
+        "reason": "images are formed from the unchanged logs",
     }
     assert quality["models"]["autofocus"].startswith("off: auto: position accuracy")
 
@@ -256,7 +256,7 @@ def test_right_logs_that_are_said_to_err_by_2_cm_are_left_as_they_are(tmp_path, 
     refine.refine(campaign, "f01")
     image.image(campaign, "f01", "uav1-uav1")
     quality, stage = quality_of(campaign, "uav1-uav1"), open_refined(campaign, "f01").stage
-    assert "no improvement over the logs" in stage.attrs["why"]
+    assert "no improvement over the logs" in stage.attrs["reason"]
     assert stage.attrs["flags"].keys() <= {"position_error_overstated"}
     assert quality["flags"].items() >= stage.attrs["flags"].items()
     assert quality["autofocus"]["accepted"] is False

@@ -211,7 +211,7 @@ def test_a_specification_of_a_pulse_is_read_back_as_it_was(tmp_path):
 
 @pytest.mark.parametrize(
     ("changed", "told"),
-    [({"bandwidth_hz": 2e9}, "beyond sample_rate_hz"), ({"pulse": "pn", "bandwidth_hz": 300e6}, "whole samples")],
+    [({"bandwidth_hz": 2e9}, "exceeds sample_rate_hz"), ({"pulse": "pn", "bandwidth_hz": 300e6}, "whole samples")],
 )
 def test_a_pulse_that_cannot_be_sampled_is_refused(changed, told):
     with pytest.raises(ValueError, match=told):

@@ -122,7 +122,7 @@ def stage_of(*, accepted, further=()):
             "nodes": ["uav1"],
             "pairs": list(further),
             "accepted": accepted,
-            "why": "as told",
+            "reason": "as told",
             "decisions": {"autofocus": {"value": "on", "reason": "asked for"}},
         },
     )

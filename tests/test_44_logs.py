@@ -84,7 +84,7 @@ def test_a_good_log_leaves_nothing_out_and_states_its_error(tmp_path):
 @pytest.mark.quick("0.02-expected1")
 @pytest.mark.parametrize(
     ("asked", "expected"),
-    [(None, (None, "nobody")), (0.02, ([0.02] * 3, "config")), ([0.01, 0.02, 0.03], ([0.01, 0.02, 0.03], "config"))],
+    [(None, (None, "none")), (0.02, ([0.02] * 3, "config")), ([0.01, 0.02, 0.03], ([0.01, 0.02, 0.03], "config"))],
 )
 def test_the_config_states_the_error_where_the_log_does_not(tmp_path, asked, expected):
     campaign = small_campaign(tmp_path)

@@ -276,8 +276,8 @@ def test_a_verdict_is_the_same_word_in_every_product(finished, monkeypatch):
     cube.cube(campaign)
     for name, raster, item, verdict in (
         ("uav1-uav1", "db.tif", "f01-uav1-uav1", "focused"),
-        ("uav1-uav2", "db.tif", "f01-uav1-uav2", "cannot tell"),
-        ("fused", "coherent_db.tif", "f01-coherent", "cannot tell"),
+        ("uav1-uav2", "db.tif", "f01-uav1-uav2", "inconclusive"),
+        ("fused", "coherent_db.tif", "f01-coherent", "inconclusive"),
     ):
         export.export(campaign, "f01", name)
         stac(campaign)

@@ -107,8 +107,8 @@ def test_the_sign_of_a_lever_arm_is_seen_and_named(tmp_path):
     reports = reports_of(campaign)
     for pair in PAIRS:
         assert reports[pair]["focus"]["loss_db"] > -0.3
-        assert reports[pair]["focus"]["verdict"] == "cannot tell"
-        assert "contradicted by pairs_displaced, pairs_out_of_phase" in reports[pair]["focus"]["why"]
+        assert reports[pair]["focus"]["verdict"] == "inconclusive"
+        assert "contradicted by pairs_displaced, pairs_out_of_phase" in reports[pair]["focus"]["reason"]
         assert {"pairs_displaced", "pairs_out_of_phase"} <= set(reports[pair]["flags"])
     best = reports["uav1-uav1"]["hypotheses"][0]
     assert best["kind"] == "offset"  # along a straight track an arm's sign is one of several that do the same
@@ -254,7 +254,7 @@ def test_a_sum_whose_phase_nothing_tells_says_so_and_that_its_peaks_are_lost(fin
     assert told["coherence"]["mean"] == pytest.approx(0.5, abs=0.15)
     assert "sum_incoherent" in told["flags"]
     assert told["focus"]["verdict"] == "defocused"
-    assert "from phase differences between pairs" in told["focus"]["why"]
+    assert "from phase differences between pairs" in told["focus"]["reason"]
 
 
 def test_a_sum_states_what_it_gained(finished_tiny):

@@ -317,10 +317,10 @@ def test_without_a_terminal_each_step_has_a_line_when_it_begins_and_one_when_it_
         screen.update(reader.news())
     lines = [line.split("  ", 1)[1] for line in stream.getvalue().splitlines()]
     assert [line.split(":")[0] for line in lines] == [
-        "started ingest f01 uav1",
-        "done    ingest f01 uav1",
-        "started image f01 uav1-uav1",
-        "failed  image f01 uav1-uav1",
+        "started  ingest f01 uav1",
+        "done     ingest f01 uav1",
+        "started  image f01 uav1-uav1",
+        "failed   image f01 uav1-uav1",
     ]
     assert "1 of 5 steps, time left unknown" in lines[1]
     assert "\x1b" not in stream.getvalue()
@@ -337,11 +337,11 @@ def test_what_happened_between_two_looks_is_told_in_its_order_and_counted_one_by
         screen.update(run)
     told = [re.sub(r"^\S+  |: .* s;|, (time|about) .*", "", line) for line in stream.getvalue().splitlines()]
     assert told == [
-        "started ingest f01 uav1",
-        "started scene",
-        "done    scene 1 of 3 steps",
-        "started ingest f01 uav2",
-        "done    ingest f01 uav1 2 of 3 steps",
+        "started  ingest f01 uav1",
+        "started  scene",
+        "done     scene 1 of 3 steps",
+        "started  ingest f01 uav2",
+        "done     ingest f01 uav1 2 of 3 steps",
     ]
 
 

@@ -43,7 +43,7 @@ TYPED = {
     "init": "init new",
     "inspect": "inspect .",
     "list": "list",
-    "look": "look .",
+    "preview": "preview .",
     "map": "map .",
     "plan": "plan .",
     "reflectors": "reflectors .",

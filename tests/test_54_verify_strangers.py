@@ -57,7 +57,7 @@ def test_a_manifest_of_an_older_version_is_told(root):
     edited(root / EXPORT, lambda document: [document.pop(key) for key in ("sources", "settings", "code")])
     (link,) = [link for link in verify(root / DB).links if link.name == EXPORT]
     assert link.state == "changed"
-    assert "versions before 0.1.0" in link.why[0]
+    assert "versions before 0.1.0" in link.reason[0]
 
 
 def test_other_versions_are_noted_and_change_nothing(root, capsys):

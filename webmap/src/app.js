@@ -140,9 +140,9 @@ class Page {
 
   /** Show verdict, numerical error and flags of the image. */
   showQuality() {
-    const { verdict, why, error_db: error, flags } = this.image;
+    const { verdict, reason, error_db: error, flags } = this.image;
     const bound = error === null ? '' : `; numerical error below ${number(error, 1)} dB`;
-    byId('verdict').textContent = `${verdict}: ${why}${bound}`;
+    byId('verdict').textContent = `${verdict}: ${reason}${bound}`;
     const raised = Object.entries(flags).flatMap(([name, explanation]) => [
       element('dt', { textContent: name }),
       element('dd', { textContent: explanation }),

@@ -172,7 +172,8 @@ def print_findings(root: str | Path, *, products: bool = False, paranoid: bool =
     if products:
         damaged = damaged_results(campaign).items()
         lines += [
-            f"{manifest}: damaged, {why}. Delete this file and run the workflow again." for manifest, why in damaged
+            f"{manifest}: damaged, {reason}. Delete this file and run the workflow again."
+            for manifest, reason in damaged
         ]
     for line in lines:
         print(line)

@@ -103,7 +103,7 @@ def log_facts(track: "xr.Dataset") -> LogFacts:
     places = geodetic_from_ecef(position) if frame == "ecef" else position
     return LogFacts(
         times=time_facts(times, longer=LONG_GAP),
-        dropped={why: int(count) for why, count in track.attrs["dropped"].items()},
+        dropped={reason: int(count) for reason, count in track.attrs["dropped"].items()},
         fixes=_fixes(track),
         attitude_share=float(logged.all(axis=1).mean()),
         has_attitude=bool(logged.any()),
@@ -303,7 +303,7 @@ def history_facts(echo: "xr.Dataset") -> HistoryFacts:
         frame=frame,
         bistatic=bool(np.abs(tx - rx).max() > 0),
         bounds={leg: bounds_of(at, str(frame)) for leg, at in (("tx", tx), ("rx", rx))} if has_positions else {},
-        dropped={why: int(count) for why, count in echo.attrs.get("dropped", {}).items()},
+        dropped={reason: int(count) for reason, count in echo.attrs.get("dropped", {}).items()},
         flags=dict(echo.attrs.get("flags", {})),
         remarks=tuple(echo.attrs.get("remarks", ())),
     )

@@ -101,9 +101,9 @@ def check_intervals(examined: Examination) -> Iterator[CampaignError]:
         if whole and key not in transmitters:
             continue
         ordinal = {2: "second", 3: "third"}.get(whole, f"{whole}th")
-        why = f": only every {ordinal} pulse was recorded, or waveform.prf_hz is {whole} times the true one"
+        reason = f": only every {ordinal} pulse was recorded, or waveform.prf_hz is {whole} times the true one"
         yield CampaignError(
-            f"time tag interval {interval_s:.6g} s ({1 / interval_s:.6g} Hz){why if whole else ''}",
+            f"time tag interval {interval_s:.6g} s ({1 / interval_s:.6g} Hz){reason if whole else ''}",
             where=recording.files[0],
             expected=f"{1 / waveform.prf_hz:.6g} s, 1/waveform.prf_hz ({waveform.prf_hz:g} Hz)",
             remedy=f"Correct waveform.prf_hz in {CONFIG}, or the trigger of the recorder.",

@@ -74,7 +74,7 @@ QUOTED: dict[str, Row] = {
     "pulses_dropped": (_IMAGES, "float64", "1", "pulses excluded from the image"),
     "peak": (_IMAGES, "float64", "1", "largest magnitude; divisor of the image in sums"),
     "phase_removed": (_IMAGES, "float64", "rad", "phase removed before the coherent sum; NaN: not in the sum"),
-    "verdict": (_IMAGES, "T", "", "focus: focused, defocused or cannot tell; empty: no flight"),
+    "verdict": (_IMAGES, "T", "", "focus: focused, defocused or inconclusive; empty: no flight"),
     "flags": (_IMAGES, "T", "", "comma-separated names of the image's flags"),
 }
 """Quality of each image; NaN where not measured."""

@@ -131,7 +131,7 @@ class CoherentSum:
         The best focused member, the reference of the phases.
     phases_rad
         Pair → phase removed before it is added; 0 if none was requested or needed.
-    left_out
+    excluded
         Excluded pair → reason, one line; it is part of the non-coherent sums only.
     why
         Included pair → reason, one line.
@@ -149,8 +149,8 @@ class CoherentSum:
 
     reference: str
     phases_rad: Mapping[str, float]
-    left_out: Mapping[str, str]
-    why: Mapping[str, str]
+    excluded: Mapping[str, str]
+    reason: Mapping[str, str]
     agreeing: tuple[str, ...]
     apart: Mapping[str, Agreement]
     unmeasured: Mapping[str, str]
@@ -163,8 +163,8 @@ class CoherentSum:
         """The choice as JSON values."""
         return {
             "phases_rad": {pair: round(phase, 4) for pair, phase in self.phases_rad.items()},
-            "left_out": dict(self.left_out),
-            "why": dict(self.why),
+            "excluded": dict(self.excluded),
+            "reason": dict(self.reason),
             "agreeing": list(self.agreeing),
             "aligning_phase_rad": {
                 pair: round(-difference.phase_rad, 4) for pair, difference in self.apart.items() if difference.alignable
@@ -221,8 +221,8 @@ def choose_fusion(
     reference = min(best.pairs, key=lambda pair: (*rank[pair], pairs.index(pair)))
     agreeing = tuple(pair for pair in pairs if pair in best.pairs)
     others = " and ".join(pair for pair in agreeing if pair != reference)
-    phases, left_out, apart, unmeasured = {reference: 0.0}, {}, {}, {}
-    why = {reference: f"it agrees with {others}" if others else "it is the reference of the phases"}
+    phases, excluded, apart, unmeasured = {reference: 0.0}, {}, {}, {}
+    reason = {reference: f"it agrees with {others}" if others else "it is the reference of the phases"}
     for pair in pairs:
         if pair == reference:
             continue
@@ -230,12 +230,12 @@ def choose_fusion(
         if pair in best.pairs and difference is not None:
             removed = difference.phase_rad if align else 0.0
             phases[pair] = removed
-            why[pair] = f"{_phase_line(difference, reference)}{', removed' if align else ''}"
+            reason[pair] = f"{_phase_line(difference, reference)}{', removed' if align else ''}"
         elif difference is not None:
             apart[pair] = difference
-            left_out[pair] = _reason(difference, _named(agreeing), reference, align=align)
+            excluded[pair] = _reason(difference, _named(agreeing), reference, align=align)
         elif unseen := [member for member in best.pairs if (member, pair) in hidden]:
-            left_out[pair] = f"its image contains no bright points of {_named(unseen)} beyond random matches"
+            excluded[pair] = f"its image contains no bright points of {_named(unseen)} beyond random matches"
         else:
             phases[pair], uncertain = 0.0, best.against(pair, compared, reference)
             unmeasured[pair] = (
@@ -243,11 +243,13 @@ def choose_fusion(
                 if uncertain is None
                 else f"{_phase_line(uncertain, reference)} is not certain enough"
             )
-            why[pair] = f"phase not measured: {unmeasured[pair]}"
+            reason[pair] = f"phase not measured: {unmeasured[pair]}"
     opposite = [rival.pairs for rival in rivals if rival.contradicts(best, measured)]
     ties = tuple(sorted(tuple(sorted(members, key=pairs.index)) for members in opposite))
     ordered = {pair: phases[pair] for pair in pairs if pair in phases}
-    return CoherentSum(reference, ordered, left_out, why, agreeing, apart, unmeasured, ties, best.misfit, best.freedom)
+    return CoherentSum(
+        reference, ordered, excluded, reason, agreeing, apart, unmeasured, ties, best.misfit, best.freedom
+    )
 
 
 def _named(pairs: Collection[str]) -> str:

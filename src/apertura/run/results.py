@@ -27,9 +27,9 @@ _OWN: Mapping[str, str | tuple[str, ...]] = {
     "benchmarks": ".tsv",
     ".hashes": ".json",
     RUN: "",
-    "look": (".png", ".json", ".html", ".tif"),
+    "preview": (".png", ".json", ".html", ".tif"),
 }
-"""Folder of the results → suffixes of files written there by a run or by `apertura look`."""
+"""Folder of the results → suffixes of files written there by a run or by `apertura preview`."""
 
 
 def print_list(campaign: Campaign) -> None:

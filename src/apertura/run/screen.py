@@ -105,9 +105,9 @@ def table(rows: list[Bar]) -> "Table":
     grid.add_column(no_wrap=True, justify="right", min_width=len(UNKNOWN))
     *steps, whole = rows
     for row in steps[:_MOST_BARS]:
-        grid.add_row(Text(f"{'':8}{row.name}"), ProgressBar(1.0, row.fraction), Text(row.counts), Text(row.left))
+        grid.add_row(Text(f"{'':9}{row.name}"), ProgressBar(1.0, row.fraction), Text(row.counts), Text(row.left))
     if len(steps) > _MOST_BARS:
-        grid.add_row(Text(f"{'':8}and {len(steps) - _MOST_BARS} more", style="dim"))
+        grid.add_row(Text(f"{'':9}and {len(steps) - _MOST_BARS} more", style="dim"))
     grid.add_row(Text(whole.name, style="bold"), ProgressBar(1.0, whole.fraction), "", Text(whole.left, style="bold"))
     return grid
 
@@ -166,7 +166,7 @@ class Screen:
                 done += not job.failed
                 self._ended(job, whole, f"{done} of {run.total} steps")
             elif not self._live:
-                self._line(f"{_clock(job.begun_s)}  started {job.name}")
+                self._line(f"{_clock(job.begun_s)}  started  {job.name}")
         if self._live:
             from rich.constrain import Constrain
 
@@ -184,7 +184,7 @@ class Screen:
             self._live.console.print(_line(word, job))
         elif whole:
             left = f", {whole.left}" if not job.failed and whole.fraction < 1 else ""
-            self._line(f"{_clock(job.ended_s or 0)}  {word:6}  {job.name}: {span(job.seconds())}; {done}{left}")
+            self._line(f"{_clock(job.ended_s or 0)}  {word:7}  {job.name}: {span(job.seconds())}; {done}{left}")
 
     def _line(self, line: str) -> None:
         if not self._quiet:
@@ -199,7 +199,7 @@ def _line(word: str, job: JobRecord) -> "Table":
     line = Table.grid(expand=True)
     line.add_column(no_wrap=True, overflow="ellipsis", ratio=1)
     line.add_column(no_wrap=True, justify="right")
-    line.add_row(Text.assemble((f"{word:8}", "red" if job.failed else "green"), job.name), span(job.seconds()))
+    line.add_row(Text.assemble((f"{word:9}", "red" if job.failed else "green"), job.name), span(job.seconds()))
     return line
 
 

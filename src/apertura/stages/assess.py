@@ -181,7 +181,7 @@ def _hypotheses(
             flags[pair][name] = line + cause
         focus = images[pair].attrs["quality"]["focus"]
         if causes and not names and _regained(focus, causes[0]["pair_gain_db"][pair]):
-            flags[pair]["loss_unexpected"] = f"{focus['why']}{cause}"
+            flags[pair]["loss_unexpected"] = f"{focus['reason']}{cause}"
     return causes
 
 
@@ -194,9 +194,9 @@ def _regained(focus: Mapping[str, Any], gain_db: float) -> bool:
 
 def _rank(focus: Mapping[str, Any]) -> tuple[int, float]:
     """Return the sort key of a pair's focus; the best focus has the lowest key."""
-    uncertain = "cannot tell" if "loss_db" in focus else "not measured"
-    verdict = uncertain if focus["verdict"] == "cannot tell" else focus["verdict"]
-    return ["focused", "cannot tell", "defocused", "not measured"].index(verdict), -focus.get("loss_db", 0.0)
+    uncertain = "inconclusive" if "loss_db" in focus else "not measured"
+    verdict = uncertain if focus["verdict"] == "inconclusive" else focus["verdict"]
+    return ["focused", "inconclusive", "defocused", "not measured"].index(verdict), -focus.get("loss_db", 0.0)
 
 
 def _disagreement(chosen: CoherentSum, pair: str, blind: Sequence[str]) -> dict[str, str]:

@@ -143,7 +143,7 @@ def hypotheses(
     logged = {node: open_acquisition(campaign, flight, node, sent) for node in campaign.flight(flight).nodes}
     window, track = campaign.settings.processing.window, open_refined(campaign, flight)
     geometries = [
-        subset_geometry(logged, pair, PairEcho.opened(campaign, flight, pair).stage, window)
+        subset_geometry(logged, pair, PairEcho.cleaned(campaign, flight, pair).stage, window)
         for pair in campaign.flight(flight).pairs
     ]
     nodes = {name: track.node(node) for name, node in logged.items()}

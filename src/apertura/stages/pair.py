@@ -356,7 +356,7 @@ def _positions(stated: Mapping[str, Any]) -> NodePositions:
     return NodePositions(
         axes,
         float(stated.get("correlation_s", 1.0)),
-        str(stated.get("stated_by", "nobody")),
+        str(stated.get("stated_by", "none")),
         float(stated.get("drift_m", 0.0)),
         stated.get("receiver"),
     )

@@ -209,12 +209,12 @@ def air_decision(pair: OpenPair) -> Decision:
     if not air["refractivity_n"]:
         displaced_m, reference = 1e-6 * USUAL_N * float(air["range_m"]), f"N = {USUAL_N:.0f}"
     observable = "" if displaced_m > _OBSERVABLE_CELLS * cell_m else ", not observable"
-    why = (
+    reason = (
         f"{air['source']}; mean along the paths from {air['antennas_m']:.0f} m height; displacement of the image "
         f"relative to {reference} {100 * displaced_m:.2g} cm in slant range, {displaced_m / cell_m:.2g} cells"
         f"{observable}; residual of one value for all pulses {100 * residual_m:.1g} cm of path"
     )
-    return Decision("atmosphere", f"N = {air['refractivity_n']:.1f}", why)
+    return Decision("atmosphere", f"N = {air['refractivity_n']:.1f}", reason)
 
 
 def background_decision(pair: OpenPair) -> Decision:

@@ -61,6 +61,10 @@ class PairEcho:
         Function that forms transfer functions from captures, or reads those that a recorder stored.
     saturation
         Saturation of the samples read so far.
+    removed
+        Background that `stage` is without.
+    gain
+        (subcarrier,) float32, factors of `stage`: 0 where interference is excluded.
     """
 
     dataset: xr.Dataset
@@ -139,8 +143,8 @@ class PairEcho:
 
     @property
     def stage(self) -> xr.Dataset:
-        """Stage `echo`, whose `transfer` is read or formed on access."""
-        if "transfer" in self.dataset:
+        """Stage `echo`, whose `transfer` is read or formed on access, without removed background and interference."""
+        if "transfer" in self.dataset and self.removed is None and self.gain is None:
             return self.dataset
         return self.dataset.assign(transfer=xr.Variable(_HISTORY, indexing.LazilyIndexedArray(_Transfer(self))))
 
@@ -222,7 +226,7 @@ class _Transfer(BackendArray):
     def _formed(self, key: tuple[Any, Any]) -> Complexes:
         pulses = np.arange(self.shape[0])[key[0]]
         unique, inverse = np.unique(pulses, return_inverse=True)
-        blocks = [self._echo.form(block) for block in blocks_of(unique)]
+        blocks = [self._echo.read(block) for block in blocks_of(unique)]
         transfer = np.concatenate(blocks) if blocks else np.empty((0, self.shape[1]), np.complex64)
         if len(unique) != pulses.size or (np.diff(np.atleast_1d(pulses)) < 0).any():
             transfer = transfer[inverse]

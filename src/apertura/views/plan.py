@@ -39,8 +39,8 @@ def print_plan(campaign: Campaign, *, threads: int = 1) -> None:
     scene = expected_scene(campaign, lambda: first_flight(campaign))
     rows, columns = scene.grid.shape
     console.print(f"scene: {columns} × {rows} pixels of {scene.grid.spacing_m:g} m, {scene.grid.crs}", highlight=False)
-    for key, why in scene.chosen.items():
-        console.print(f"  scene.{key}: {why}", highlight=False)
+    for key, reason in scene.chosen.items():
+        console.print(f"  scene.{key}: {reason}", highlight=False)
     for flight in campaign.image_flights:
         logged = [open_pair(campaign, flight.name, pair) for pair in flight.pairs]
         pairs, autofocus = expected_track(campaign, logged, scene)

@@ -44,14 +44,14 @@ class ImageValues:
         Upper bound of the numerical error, dB.
     used, recorded
         Numbers of pulses used in the image, and recorded.
-    coherence, left_out
+    coherence, excluded
         Coherence of the pairs of a sum, and number of pairs excluded from it.
     flags
         Flag → measurement.
     """
 
     verdict: str
-    why: str
+    reason: str
     loss_db: float | None
     expected_db: float | None
     worst_cause: str
@@ -62,7 +62,7 @@ class ImageValues:
     used: int | None
     recorded: int
     coherence: float | None
-    left_out: int
+    excluded: int
     flags: Mapping[str, str]
 
     @classmethod
@@ -76,7 +76,7 @@ class ImageValues:
         used = pulses.get("used")
         return cls(
             str(focus.get("verdict", "")),
-            str(focus.get("why", "")),
+            str(focus.get("reason", "")),
             focus.get("loss_db"),
             focus.get("expected_db"),
             most_lossy["cause"] if most_lossy else "",
@@ -87,7 +87,7 @@ class ImageValues:
             used,
             (used or 0) + (pulses.get("dropped") or 0),
             coherence.get("mean"),
-            len(fusion.get("left_out", ())),
+            len(fusion.get("excluded", ())),
             report["flags"],
         )
 

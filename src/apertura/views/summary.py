@@ -63,7 +63,7 @@ def print_summary(campaign: Campaign) -> None:
     undecided = dict[str, list[str]]()  # reason → images whose verdict is not `focused` although no flag explains it
     for name, image_values in values.items():
         if image_values.verdict not in ("", "focused") and not image_values.flags:
-            undecided.setdefault(f"{image_values.verdict}: {image_values.why}", []).append(name)
+            undecided.setdefault(f"{image_values.verdict}: {image_values.reason}", []).append(name)
     for reason, images in undecided.items():
         console.print(f"{_abbreviated(images)}: {reason}", soft_wrap=True)
     uncertain = max(values.values(), key=lambda image_values: image_values.place_m, default=None)
@@ -182,8 +182,8 @@ def _table(images: Mapping[str, ImageValues]) -> "Table":
             expected += f", {values.worst_cause}"
         if values.coherence is not None:
             coherence.append(f"{values.coherence:.3f}")
-        if values.left_out:
-            coherence.append(f"{values.left_out} excluded")
+        if values.excluded:
+            coherence.append(f"{values.excluded} excluded")
         table.add_row(
             name,
             values.verdict,

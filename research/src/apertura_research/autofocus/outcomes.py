@@ -156,7 +156,7 @@ class AutofocusRow:
     estimate_loss_db: float
     verdict: str
     flags: str
-    why: str
+    reason: str
 
 
 def cases_of(scene: str) -> list[tuple[float, int]]:  # noqa: ARG001
@@ -200,7 +200,7 @@ def outcome_of(one: AutofocusCase, result: Refinement) -> AutofocusRow:
         estimate_loss_db=round(after, 4),
         verdict=verdict_of(result),
         flags=" ".join(result.flags),
-        why=result.why,
+        reason=result.reason,
     )
 
 

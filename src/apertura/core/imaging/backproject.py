@@ -213,7 +213,7 @@ def backproject(  # noqa: PLR0913 - each choice is a keyword, for completion in 
     error_db = attributes.get("numerical_error_db")
     judged = _judged(formation, judge, error_db=error_db)
     flags = Flags.merged(flags, plan.flags, judged.flags)
-    focus = focus_with_flags({"verdict": judged.verdict, "why": judged.why}, flags, error_db=error_db)
+    focus = focus_with_flags({"verdict": judged.verdict, "reason": judged.reason}, flags, error_db=error_db)
     attributes |= {
         "units": "1",
         "wave_speed_m_s": inputs.wave_speed_m_s,
@@ -224,7 +224,7 @@ def backproject(  # noqa: PLR0913 - each choice is a keyword, for completion in 
         "models": json.dumps(formation.plan.reasons, ensure_ascii=False),
         "flags": json.dumps(flags, ensure_ascii=False),
         "verdict": focus["verdict"],
-        "verdict_why": focus["why"],
+        "verdict_reason": focus["reason"],
         "budget": json.dumps(judged.budget, ensure_ascii=False),
     }
     lazy = formation.image
@@ -280,8 +280,8 @@ def _judged(formation: Formation, judge: bool | str, *, error_db: float | None) 
     if judge is True or (judge == "auto" and seconds <= _AT_ONCE_S):
         return judgement(formation, np.asarray(formation.image), lines)
     reason = "not requested" if judge is False else f"predicted run time of the image {seconds:.2g} s"
-    why = f"{reason}; apertura.judge forms and judges the image"
-    return Judgement("not judged", why, Flags(), [line.report for line in lines], {})
+    reason = f"{reason}; apertura.judge forms and judges the image"
+    return Judgement("not judged", reason, Flags(), [line.report for line in lines], {})
 
 
 def _wave_speed(

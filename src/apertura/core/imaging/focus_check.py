@@ -449,7 +449,7 @@ def focus_report(formation: Formation, target: Any) -> dict[str, Any]:
     return {
         "verdict": verdict.verdict,
         **({"loss_db": round(verdict.loss_db, 3), "std_db": round(verdict.std_db, 3)} if verdict.points else {}),
-        "why": verdict.why,
+        "reason": verdict.reason,
         **({"elsewhere": elsewhere} if elsewhere else {}),
         **({"conjugated": line} if conjugated and (line := _conjugated(formation, peak)) else {}),
         "cell_m": round(cell_m, 4),
@@ -517,13 +517,13 @@ def focus_flags(report: dict[str, Any], expected: Effect) -> Flags:
     budget = f"{abs(expected.loss_db):.1f} ± {expected.loss_std_db:.1f} dB expected from the error budget"
     if report["verdict"] == "defocused":
         flags["defocused"] = (
-            f"{report['why']}; {budget}: positions, lever arms, heights or times are less accurate than configured, "
+            f"{report['reason']}; {budget}: positions, lever arms, heights or times are less accurate than configured, "
             "or their accuracy is not configured"
         )
     elif "loss_db" in report:
         beyond_db = expected.loss_db - report["loss_db"]
         if beyond_db > max(UNEXPECTED_DB, _UNEXPECTED_SIGMAS * float(np.hypot(report["std_db"], expected.loss_std_db))):
-            flags["loss_unexpected"] = f"{report['why']}; {budget}: an error source exceeds its entry in the budget"
+            flags["loss_unexpected"] = f"{report['reason']}; {budget}: an error source exceeds its entry in the budget"
     if "conjugated" in report:
         return Flags({name: f"{line}; {report['conjugated']}" for name, line in flags.items()})
     return flags

@@ -43,7 +43,7 @@ class Judgement:
     Attributes
     ----------
     verdict
-        'focused', 'defocused' or 'cannot tell' (not observable).
+        'focused', 'defocused' or 'inconclusive' (not observable).
     why
         Reason for the verdict, one line.
     flags
@@ -56,7 +56,7 @@ class Judgement:
     """
 
     verdict: str
-    why: str
+    reason: str
     flags: Flags
     budget: list[dict[str, Any]]
     focus: dict[str, Any]
@@ -80,10 +80,10 @@ def judgement(formation: Formation, target: Any, lines: Sequence[BudgetLine]) ->
     still = formation.plan.flags.get("no_aperture")
     if still:  # range resolution only: the focus measures of points are meaningless
         focus = {key: value for key, value in focus.items() if key not in {"loss_db", "std_db", "elsewhere", "points"}}
-        focus |= {"verdict": "cannot tell", "why": f"no aperture: {still}", "points": []}
+        focus |= {"verdict": "inconclusive", "reason": f"no aperture: {still}", "points": []}
     flags = Flags.merged(antenna_flags(lines), {} if still else focus_flags(focus, effect))
     focus = focus_with_flags(focus, flags)
-    return Judgement(focus["verdict"], focus["why"], flags, [line.report for line in lines], focus)
+    return Judgement(focus["verdict"], focus["reason"], flags, [line.report for line in lines], focus)
 
 
 def judge(

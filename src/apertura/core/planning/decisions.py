@@ -213,9 +213,9 @@ def integrate(
     sampled = whole[aperture.sample(_PULSES)]
     position, squint = sampled.place(pulses, points), _squint(whole, antennas)
     per_path = _gradient_per_path(pulses, sampled, points)
-    half, why = sector_half(requested, wavelength_m, spacing_m, per_path=per_path, squint=squint), "requested"
+    half, reason = sector_half(requested, wavelength_m, spacing_m, per_path=per_path, squint=squint), "requested"
     if requested == "auto":
-        why = f"finest resolution that pixels of {spacing_m:g} m can represent"
+        reason = f"finest resolution that pixels of {spacing_m:g} m can represent"
         span = float(np.ptp(position, axis=0).max())
         if span <= 2 * half * (1 + TAPER):
             cell_m = wavelength_m / (per_path * span) if span else np.inf
@@ -223,7 +223,7 @@ def integrate(
             reason = f"all pulses contribute: pixels of {spacing_m:g} m suffice for {resolution}"
             return Integration(None, len(aperture), "all", reason)
     sector = Sector(whole.tx_axis, whole.rx_axis, squint, half).following(aperture, points)
-    return _integration_of(sector, aperture, points_m, wavelength_m / (2 * per_path * half), why, where)
+    return _integration_of(sector, aperture, points_m, wavelength_m / (2 * per_path * half), reason, where)
 
 
 def sector_half(
@@ -277,7 +277,7 @@ def _gradient_per_path(aperture: Aperture, sector: Sector, points: NDArray[np.fl
 
 
 def _integration_of(
-    sector: Sector, aperture: Aperture, points_m: NDArray[np.float64], resolution_m: float, why: str, where: str
+    sector: Sector, aperture: Aperture, points_m: NDArray[np.float64], resolution_m: float, reason: str, where: str
 ) -> Integration:
     """Return the integration over a sector, with its pulses per pixel, resolution and flags."""
     points = points_m.reshape(-1, 3)
@@ -317,7 +317,7 @@ def _integration_of(
         )
     value, count = f"{degrees:.3g}°, {resolution_m:.3g} m", max(1, round(float(total.max())))
     share = float(counts.mean()) / len(aperture)
-    return Integration(sector, count, value, f"{why}; {counted}", share, report, flags)
+    return Integration(sector, count, value, f"{reason}; {counted}", share, report, flags)
 
 
 def _pulses_per_place(

@@ -305,7 +305,7 @@ class Plan:
         replaced = {"engine", "presum", "pulse_blocks", *self.setting.reasons}
         decisions = (
             Decision("engine", setting.engine, reason, setting.error_db),
-            *(Decision(name, setting.all_options[name], why) for name, why in setting.reasons.items()),
+            *(Decision(name, setting.all_options[name], reason) for name, reason in setting.reasons.items()),
             Decision("presum", 1, "no presumming in a fallback"),
             Decision("pulse_blocks", setting.pulse_blocks, "number of the fallback setting"),
             *(decision for decision in self.decisions if decision.name not in replaced),
@@ -365,13 +365,13 @@ def block_decision(chosen: Setting, job: Job, presum: Presum | None, *, requeste
     """Return the decision on pulse blocks; the reason for a single block does not depend on the machine."""
     size = f"{decimal(int(_resident_bytes(chosen, job, presum)))} of samples and tables"
     if requested:
-        why = f"requested, with at least {_LEAST_PULSES} pulses per block; {size} in total"
+        reason = f"requested, with at least {_LEAST_PULSES} pulses per block; {size} in total"
     elif chosen.pulse_blocks > 1:
         limit = decimal(int(min(job.memory_bytes, BLOCK_BYTES)))
-        why = f"{size} exceed the memory limit of a block, {limit}"
+        reason = f"{size} exceed the memory limit of a block, {limit}"
     else:
-        why = f"{size} fit into memory"
-    return Decision("pulse_blocks", chosen.pulse_blocks, why)
+        reason = f"{size} fit into memory"
+    return Decision("pulse_blocks", chosen.pulse_blocks, reason)
 
 
 def bytes_needed(job: Job, chosen: Setting, presum: Presum | None) -> tuple[int, int]:

@@ -127,14 +127,14 @@ class SettingSearch:
         """Yield the decisions of a setting with their reasons, the first with its error relative to the accuracy."""
         requested = self._requested(chosen.engine)
         candidates = "all engines and settings" if self.engine is None and not requested else "the requested settings"
-        why = f"cheapest of {candidates} (within 5 %) that meets {accuracy_db:.0f} dB"
+        reason = f"cheapest of {candidates} (within 5 %) that meets {accuracy_db:.0f} dB"
         if expected_db > accuracy_db:
-            why = f"most exact of {candidates}, predicted {expected_db:.1f} dB, requested {accuracy_db:.0f} dB: "
-            why += "tiles that miss the accuracy are recomputed"
-        yield Decision("engine", chosen.engine, why, chosen.error_db)
+            reason = f"most exact of {candidates}, predicted {expected_db:.1f} dB, requested {accuracy_db:.0f} dB: "
+            reason += "tiles that miss the accuracy are recomputed"
+        yield Decision("engine", chosen.engine, reason, chosen.error_db)
         for name, reason in chosen.reasons.items():
-            why = "requested; " if name in requested else ""
-            yield Decision(name, chosen.all_options[name], why + reason)
+            prefix = "requested; " if name in requested else ""
+            yield Decision(name, chosen.all_options[name], prefix + reason)
 
     def _engines(self) -> list[str]:
         """Return the available engines that match the request.
@@ -259,8 +259,8 @@ def _decide_presum(
     _, widest = job.aperture.phase_rates(job.points_m, wavelength_m=SPEED_OF_LIGHT_M_S / job.band_hz[1])
     oversampled = f"phase rates of the scene differ from its middle by up to {widest:.3f} cycles per pulse"
 
-    def keep(why: str) -> tuple[Decision, None, Setting]:
-        return Decision("presum", 1, f"{oversampled}; {why}"), None, every_pulse
+    def keep(reason: str) -> tuple[Decision, None, Setting]:
+        return Decision("presum", 1, f"{oversampled}; {reason}"), None, every_pulse
 
     if requested == 1:
         return keep("requested")

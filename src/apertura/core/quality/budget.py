@@ -141,7 +141,7 @@ class NodePositions:
 
     std_m: tuple[float, float, float] | None
     correlation_s: float = 1.0
-    stated_by: str = "nobody"
+    stated_by: str = "none"
     drift_m: float = 0.0
     receiver: str | None = None
 
@@ -399,11 +399,14 @@ def height_line(paths: PointPaths, std_m: float | None, *, expected_db: float = 
     loss_db_m2 = -paths.of_offset(_SMALL_M * slope, common=True).loss_db / _SMALL_M**2
     undetectable_db = UNDETECTABLE_LOSS_DB - expected_db
     observable_m = math.sqrt(undetectable_db / max(loss_db_m2, 1e-9))
-    assumed_m, why = GROUND_STD_M, "not observable with this track"
+    assumed_m, reason = GROUND_STD_M, "not observable with this track"
     if observable_m < assumed_m:
-        assumed_m, why = observable_m, f"a larger error would cost more than {undetectable_db:.2g} dB and be observable"
+        assumed_m, reason = (
+            observable_m,
+            f"a larger error would cost more than {undetectable_db:.2g} dB and be observable",
+        )
     effect = replace(paths.of_offset(assumed_m * slope, common=True), loss_db=0.0, loss_std_db=0.0)
-    return BudgetLine("heights", None, effect, assumed=f"{assumed_m:.2g} m: {why}")
+    return BudgetLine("heights", None, effect, assumed=f"{assumed_m:.2g} m: {reason}")
 
 
 def summed(effects: Iterable[Effect]) -> Effect:

@@ -134,7 +134,7 @@ another echo."""
 DEFOCUSED_DB = -1.0
 """Peak loss beyond which an image is defocused, dB."""
 
-Verdict = Literal["focused", "defocused", "cannot tell"]
+Verdict = Literal["focused", "defocused", "inconclusive"]
 
 MOST_ERROR_DB = -20.0
 """Numerical error relative to the peak, dB, above which bright points may be artefacts if the accuracy is missed."""
@@ -270,7 +270,7 @@ class Focus:
     Attributes
     ----------
     verdict
-        'focused', 'defocused' or 'cannot tell' (not observable).
+        'focused', 'defocused' or 'inconclusive' (not observable).
     loss_db, std_db
         Median peak loss over the points, weighted by amplitude, and its standard deviation; NaN without points.
     points
@@ -283,7 +283,7 @@ class Focus:
     loss_db: float
     std_db: float
     points: int
-    why: str
+    reason: str
 
 
 def judge(points: Sequence[tuple[float, PointFocus | None]]) -> Focus:
@@ -299,11 +299,11 @@ def judge(points: Sequence[tuple[float, PointFocus | None]]) -> Focus:
     >>> judge([(1.0, PointFocus(-3.0, 0.01, 1, 30.0)), (0.9, PointFocus(-3.2, 0.02, 1, 29.0))]).verdict
     'defocused'
     >>> judge([(1.0, None)]).verdict
-    'cannot tell'
+    'inconclusive'
     """
     measured = [(amplitude, focus) for amplitude, focus in points if focus is not None]
     if not measured:
-        return Focus("cannot tell", float("nan"), float("nan"), 0, "no bright point")
+        return Focus("inconclusive", float("nan"), float("nan"), 0, "no bright point")
     losses = np.array([focus.loss_db for _, focus in measured])
     # Standard deviation of each loss from noise and neighbours.
     stds = np.array(
@@ -316,7 +316,7 @@ def judge(points: Sequence[tuple[float, PointFocus | None]]) -> Focus:
     verdict = verdict_of_loss(loss, std)
     count = number_of(len(measured), "bright point")
     line = f"peak loss {abs(loss):.2f} ± {std:.2f} dB from phase errors, {count}"
-    if verdict == "cannot tell":
+    if verdict == "inconclusive":
         line += f": not significantly above or below {-DEFOCUSED_DB:g} dB (two standard deviations)"
     return Focus(verdict, loss, std, len(measured), line)
 
@@ -327,11 +327,11 @@ def verdict_of_loss(loss_db: float, std_db: float) -> Verdict:
     Examples
     --------
     >>> verdict_of_loss(-0.2, 0.1), verdict_of_loss(-2.0, 0.1), verdict_of_loss(-4.48, 2.85)
-    ('focused', 'defocused', 'cannot tell')
+    ('focused', 'defocused', 'inconclusive')
     """
     if loss_db < DEFOCUSED_DB - 2 * std_db:
         return "defocused"
-    return "focused" if loss_db > DEFOCUSED_DB + 2 * std_db else "cannot tell"
+    return "focused" if loss_db > DEFOCUSED_DB + 2 * std_db else "inconclusive"
 
 
 def focus_with_flags(
@@ -355,14 +355,14 @@ def focus_with_flags(
     Examples
     --------
     >>> focus_with_flags({"verdict": "focused", "why": "peak loss 0.02 dB"}, ["wrong_code"])["verdict"]
-    'cannot tell'
+    'inconclusive'
     """
     against = sorted(GEOMETRY_CONTRADICTED.intersection(flags))
     if "accuracy_not_met" in flags and error_db is not None and error_db > MOST_ERROR_DB:
         against.append("accuracy_not_met")
     if focus["verdict"] != "focused" or not against:
         return dict(focus)
-    return {**focus, "verdict": "cannot tell", "why": f"{focus['why']}; contradicted by {', '.join(against)}"}
+    return {**focus, "verdict": "inconclusive", "reason": f"{focus['reason']}; contradicted by {', '.join(against)}"}
 
 
 def judge_parts(parts: SubApertures, *, cell_m: float) -> Focus:
@@ -380,7 +380,7 @@ def judge_parts(parts: SubApertures, *, cell_m: float) -> Focus:
     >>> judge_parts(SubApertures(20.0, 0.9, 0.05, 7.0, 7.1), cell_m=0.3).verdict
     'defocused'
     >>> judge_parts(SubApertures(20.0, 0.9, 0.5, 7.0, 7.1), cell_m=0.3).verdict
-    'cannot tell'
+    'inconclusive'
     """
     nothing = float("nan"), float("nan"), 0
     line = "no bright point dominates its range cell"
@@ -389,4 +389,4 @@ def judge_parts(parts: SubApertures, *, cell_m: float) -> Focus:
         return Focus("defocused", *nothing, f"{line}, and subaperture images are displaced by {drift}")
     if np.isfinite(parts.entropy):
         line += f"; entropy {parts.entropy:.2f}, {parts.entropy_random_phase:.2f} with random phases"
-    return Focus("cannot tell", *nothing, line)
+    return Focus("inconclusive", *nothing, line)

@@ -192,8 +192,8 @@ COVERAGE = ("coverage.png", "coverage.geojson")
 MOSAICS = "mosaic"
 """Folder of the mosaics of all flights."""
 
-LOOK = "look"
-"""Folder of the images of `apertura look`, laid out like the results."""
+PREVIEW = "preview"
+"""Folder of the images of `apertura preview`, laid out like the results."""
 
 MAP = "map/map.json"
 """Description of the web map of `apertura map`."""

@@ -137,7 +137,7 @@ def history(path: Path, fields: dict[str, NDArray[Any]], *, pair: str) -> Histor
         used=normal & ~is_zero,
         flags=_flags(fields, path_m / SPEED_OF_LIGHT_M_S, normal),
         frame=str(fields["frame"]),
-        dropped={why: count for why, count in dropped.items() if count},
+        dropped={reason: count for reason, count in dropped.items() if count},
         reference="point",
     )
 

@@ -161,7 +161,7 @@ def joined_sweeps(read: Sequence[Sweeps], *, pair: str, described: Mapping[str, 
             raise _error(f"{len(starts)} times for {len(file.beat)} sweeps", file.path)
         has_signal = file.beat[:, sweep.first : sweep.sweep_samples].any(axis=1)
         excluded = {**(file.dropped or {}), "all samples zero": int((~has_signal).sum())}
-        dropped = {why: dropped.get(why, 0) + excluded.get(why, 0) for why in {**dropped, **excluded}}
+        dropped = {reason: dropped.get(reason, 0) + excluded.get(reason, 0) for reason in {**dropped, **excluded}}
         late_s = None if file.late_s is None else file.late_s[has_signal]
         times.append(starts[has_signal])
         transfers.append(transfer_of(file.beat[has_signal], sweep, late_s=late_s))
@@ -188,7 +188,7 @@ def joined_sweeps(read: Sequence[Sweeps], *, pair: str, described: Mapping[str, 
             "pair": pair,
             "flags": {},
             "wave_speed_m_s": SPEED_OF_LIGHT_M_S,
-            "dropped": {why: count for why, count in dropped.items() if count},
+            "dropped": {reason: count for reason, count in dropped.items() if count},
             "sweep_used_s": sweep.samples / sweep.sample_rate_hz,
         },
     )

@@ -374,8 +374,10 @@ class SampleFile:
         try:
             return self.layout.numbers(data)
         except ValueError as error:
-            why, index = error.args
-            raise self._invalid_sample(why, spans, index * self.layout.stored.itemsize // self.sample_bytes) from error
+            reason, index = error.args
+            raise self._invalid_sample(
+                reason, spans, index * self.layout.stored.itemsize // self.sample_bytes
+            ) from error
 
     def _pieces(self, first: int, last: int) -> Iterator[tuple[int, int]]:
         """Yield file offset and size in bytes of a span of samples, split at bytes that are not samples."""
@@ -389,7 +391,7 @@ class SampleFile:
             before = int(skipped[segment]) if segment >= 0 else 0
             yield start * self.sample_bytes + before, (stop - start) * self.sample_bytes
 
-    def _invalid_sample(self, why: str, spans: Spans, index: int) -> CampaignError:
+    def _invalid_sample(self, reason: str, spans: Spans, index: int) -> CampaignError:
         sample = index
         for first, last in spans:
             if index < last - first:
@@ -397,7 +399,7 @@ class SampleFile:
                 break
             index -= last - first
         return CampaignError(
-            f"sample {sample} is {why}",
+            f"sample {sample} is {reason}",
             self.path,
             f"finite numbers of datatype {self.layout.datatype}",
             "Record or copy again, or correct core:datatype.",

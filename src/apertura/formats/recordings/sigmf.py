@@ -156,8 +156,8 @@ def _opened(path: Path) -> Iterator[BinaryIO]:
         with naming(path), path.open("rb") as stream:
             yield stream
     except (ijson.JSONError, UnicodeDecodeError) as error:
-        why = shown(str(error).strip().splitlines()[0])
-        raise CampaignError(f"not valid SigMF: invalid JSON: {why}", path, _EXPECTED, _REMEDY) from error
+        reason = shown(str(error).strip().splitlines()[0])
+        raise CampaignError(f"not valid SigMF: invalid JSON: {reason}", path, _EXPECTED, _REMEDY) from error
 
 
 def _read_global(stream: BinaryIO, path: Path) -> Global:

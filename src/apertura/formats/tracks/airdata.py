@@ -89,7 +89,7 @@ def read_airdata(path: Path, *, node: str, options: LogOptions = DEFAULT_OPTIONS
         utc[resolved],
         position[resolved],
         attitude_deg=attitude,
-        dropped={why: count for why, count in dropped.items() if count},
+        dropped={reason: count for reason, count in dropped.items() if count},
         node=node,
         where=path,
     )
@@ -107,7 +107,7 @@ def _measured(table: pd.DataFrame) -> tuple[pd.DataFrame, dict[str, int]]:
     if _SATELLITES in table:
         blind = numbers(table[[_SATELLITES]])[:, 0] < _FEWEST
     counts = {"duplicate": doubled, f"fewer than {_FEWEST} satellites": blind & ~doubled}
-    return table[~(doubled | blind)], {why: int(rows.sum()) for why, rows in counts.items()}
+    return table[~(doubled | blind)], {reason: int(rows.sum()) for reason, rows in counts.items()}
 
 
 class _DateError(ValueError):

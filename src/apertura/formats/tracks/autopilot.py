@@ -258,9 +258,9 @@ def autopilot_track(
     """
     dropped: dict[str, int] = {}
 
-    def without(wrong: NDArray[np.bool_], why: str) -> Epochs:
+    def without(wrong: NDArray[np.bool_], reason: str) -> Epochs:
         if wrong.any():
-            dropped[why] = int(wrong.sum())
+            dropped[reason] = int(wrong.sum())
         return epochs.only(~wrong)
 
     epochs = without(~epochs.fixed, "no fix")

@@ -262,8 +262,8 @@ def read_csv_track(path: Path, *, node: str, options: LogOptions = DEFAULT_OPTIO
         table = _table(log)
         if cut_off(path):
             table, dropped["truncated line"] = table.iloc[:-1], 1
-        for why, wrong in _exclusions(table, log).items():
-            dropped[why] += int(wrong.sum())
+        for reason, wrong in _exclusions(table, log).items():
+            dropped[reason] += int(wrong.sum())
             table = table[~wrong.reindex(table.index)]
         frame = _frame(table, log)
         position = _scaled(table, _POSITIONS[frame], log)
@@ -289,7 +289,7 @@ def read_csv_track(path: Path, *, node: str, options: LogOptions = DEFAULT_OPTIO
         attitude_deg=attitude,
         position_std_m=std,
         fix=fix,
-        dropped={why: count for why, count in dropped.items() if count},
+        dropped={reason: count for reason, count in dropped.items() if count},
         node=node,
         where=path,
     )
@@ -300,9 +300,9 @@ def _exclusions(table: pd.DataFrame, log: _Log) -> dict[str, "pd.Series[bool]"]:
     reasons = {}
     if _QUALITY in table and log.options.quality == "gga":
         quality = _words(table[_QUALITY])
-        for number, why in GGA_NOT_MEASURED.items():
+        for number, reason in GGA_NOT_MEASURED.items():
             if number:
-                reasons[f"{why} (quality {number})"] = quality == number
+                reasons[f"{reason} (quality {number})"] = quality == number
     for name in ("time_utc", "time"):
         if name in table:
             texts = table[name].fillna("").astype(str)

@@ -76,8 +76,8 @@ def read_mission(path: Path) -> Mission:
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, ArithmeticError) as error:
         if isinstance(error, CampaignError):
             raise
-        why = f"no key {error}" if isinstance(error, KeyError) else str(error)
-        raise CampaignError(f"unreadable mission: {quoted(why, 200)}", path, expected, _REMEDY) from error
+        reason = f"no key {error}" if isinstance(error, KeyError) else str(error)
+        raise CampaignError(f"unreadable mission: {quoted(reason, 200)}", path, expected, _REMEDY) from error
     latitude, longitude, height = mission.place.T
     good = (np.abs(latitude) <= 90) & (np.abs(longitude) <= 360) & (np.abs(height) < 1e5)
     if not 2 <= len(mission.place) <= _MOST_WAYPOINTS or not good.all():

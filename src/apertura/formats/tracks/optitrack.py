@@ -72,7 +72,7 @@ def read_optitrack(path: Path, *, node: str, options: LogOptions = DEFAULT_OPTIO
         position @ _ENU_FROM_MOTIVE.T,
         frame="local",
         attitude_deg=_attitude_deg(quaternion),
-        dropped={why: count for why, count in counts.items() if count},
+        dropped={reason: count for reason, count in counts.items() if count},
         node=node,
         where=path,
     )

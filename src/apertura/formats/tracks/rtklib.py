@@ -101,7 +101,7 @@ def read_rtklib_pos(path: Path, *, node: str, options: LogOptions = DEFAULT_OPTI
         frame="ecef" if ecef else "geodetic",
         fix=_joined([part.fix for part in parts], np.zeros, parts),
         position_std_m=_joined([part.std for part in parts], lambda count: np.full((count, 3), np.nan), parts),
-        dropped={why: count for why, count in dropped.items() if count},
+        dropped={reason: count for reason, count in dropped.items() if count},
         node=node,
         where=path,
     )

@@ -96,7 +96,9 @@ def make_track(
     )
     fix = None if fix is None else fix[has_fix]
     if len(time_utc) < 2:
-        without = f" ({', '.join(f'{count} excluded: {why}' for why, count in excluded.items())})" if excluded else ""
+        without = (
+            f" ({', '.join(f'{count} excluded: {reason}' for reason, count in excluded.items())})" if excluded else ""
+        )
         raise CampaignError(f"{len(time_utc)} epochs{without}", where, "at least two", "Export the whole log.")
     remarks = []
     if len(time_utc) > 2 and (np.diff(time_utc) < np.timedelta64(0, "ns")).all():

@@ -147,7 +147,7 @@ class CauseFit:
         }
         rejected = {"refinement_rejected", "refinement_no_bright_point"}  # the cause alone is then corrected
         flags = {name: text for name, text in rest.flags.items() if name not in rejected} | {"cause_corrected": line}
-        return Refinement(total, rest.std_m, True, f"{line}; {rest.why}", {**rest.report, "cause": report}, flags)
+        return Refinement(total, rest.std_m, True, f"{line}; {rest.reason}", {**rest.report, "cause": report}, flags)
 
 
 def explained(

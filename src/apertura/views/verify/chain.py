@@ -60,13 +60,13 @@ class ChainLink:
 
     name: str
     state: State = "same"
-    why: list[str] = field(default_factory=list)
+    reason: list[str] = field(default_factory=list)
 
-    def add(self, state: State, why: str) -> None:
+    def add(self, state: State, reason: str) -> None:
         """Add a difference to the link; state "missing" takes precedence over "changed"."""
         self.state = "missing" if "missing" in (state, self.state) else state
-        if why not in self.why:
-            self.why.append(why)
+        if reason not in self.reason:
+            self.reason.append(reason)
 
 
 class Links:
@@ -466,8 +466,8 @@ def print_verified(path: Path, campaign: Path | None = None, *, quiet: bool = Fa
     links = sorted(chain.links, key=lambda link: _ORDER.index(link.state))
     for link in links:
         if link.state != "same" or not quiet:
-            why = f": {'; '.join(link.why)}" if link.why else ""
-            print(f"{link.state:<8} {shown(link.name + why, _LONGEST)}")
+            reason = f": {'; '.join(link.reason)}" if link.reason else ""
+            print(f"{link.state:<8} {shown(link.name + reason, _LONGEST)}")
     for note in chain.notes:
         print(shown(note, _LONGEST))
     counts = [(state, sum(link.state == state for link in links)) for state in reversed(_ORDER)]

@@ -99,7 +99,7 @@ def image_entry(flight: str, image: str, report: Mapping[str, Any], layers: Iter
         "flight": flight,
         "image": image,
         "verdict": values.verdict,
-        "why": values.why,
+        "reason": values.reason,
         "error_db": values.error_db,
         "flags": explained_flags(values.flags),
         "layers": [
@@ -113,7 +113,7 @@ def found_places(flight: str, image: str, report: Mapping[str, Any]) -> list[Pla
 
     Examples
     --------
-    >>> found_places("f01", "a-a", {"brightest": {"x_m": 3.0, "y_m": 4.0}, "focus": {"verdict": "cannot tell"}})
+    >>> found_places("f01", "a-a", {"brightest": {"x_m": 3.0, "y_m": 4.0}, "focus": {"verdict": "inconclusive"}})
     [Place(name='brightest', source='found', x_m=3.0, y_m=4.0, image='f01/a-a')]
     """
     where = f"{flight}/{image}"

@@ -28,7 +28,7 @@ from apertura.common.documents import read_json, undamaged
 from apertura.common.errors import CampaignError
 from apertura.common.processes import Interrupted
 from apertura.common.provenance import sha256_file
-from apertura.formats.export import LOOK, MAP, product_files
+from apertura.formats.export import MAP, PREVIEW, product_files
 from apertura.views.webmap.document import named_files, requested_file
 
 LOOPBACK = "127.0.0.1"
@@ -386,16 +386,16 @@ class _Handler(BaseHTTPRequestHandler):
 
 
 def served_look(campaign: Campaign, *, port: int = 0) -> MapServer:
-    """Return a server for the images of `apertura look`, after waiting for the first; otherwise as `served`."""
-    folder = campaign.result(LOOK)
+    """Return a server for the images of `apertura preview`, after waiting for the first; otherwise as `served`."""
+    folder = campaign.result(PREVIEW)
     path = folder / MAP
     if not path.is_file():
-        print("waiting for the first image of `apertura look` in another terminal; press Ctrl-C to stop", flush=True)
+        print("waiting for the first image of `apertura preview` in another terminal; press Ctrl-C to stop", flush=True)
     while not path.is_file():
         time.sleep(_WAIT_S)
 
     def files() -> Mapping[str, str]:
-        expected, remedy = "a document of `apertura look`", "Run `apertura look CAMPAIGN` again."
+        expected, remedy = "a document of `apertura preview`", "Run `apertura preview CAMPAIGN` again."
         document = read_json(path, expected=expected, remedy=remedy)
         with undamaged(path, expected=expected, remedy=remedy):
             return {**named_files(document), MAP: sha256_file(path)}

@@ -41,7 +41,7 @@ from apertura.stages.positions import inside_segments, place, scene_air
 from apertura.stages.scene import ConfiguredGround
 from apertura.stages.transfer import PairEcho
 from apertura.stages.transmitted import Transmitted
-from apertura.tools.look.node import NodeSoFar
+from apertura.tools.preview.node import NodeSoFar
 
 Axes = dict[str, NDArray[np.float64]]
 """Body axes of the antennas with beams, as required by `apertura.stages.pair.beams_of`."""
@@ -266,7 +266,7 @@ class ImageSoFar:
         """Return focus verdict, reason, peak loss if measured, and flags, from the kept pulses."""
         pulses = sum(len(kept.profiles) for kept in self._kept)
         if self._plan is None or pulses < LEAST_PULSES or not self.sums.any():
-            return {"verdict": "cannot tell", "why": f"{pulses} pulses so far", "flags": {}}
+            return {"verdict": "inconclusive", "reason": f"{pulses} pulses so far", "flags": {}}
         joined = Compressed.joined(self._kept)
         profiles, times = joined.profiles, joined.time
         beams = self._beams(profiles.aperture, joined.axes, profiles.centre_frequency_hz)
@@ -276,7 +276,7 @@ class ImageSoFar:
         cell_m = resolution_cell_m(formation)
         if not cell_m * _CELLS < min(self.grid.shape) * self.grid.spacing_m:
             reason = f"aperture too short: resolution cells of {cell_m:.2g} m"
-            return {"verdict": "cannot tell", "why": reason, "flags": {}}
+            return {"verdict": "inconclusive", "reason": reason, "flags": {}}
         stated = [self._campaign.settings.nodes[node].position_std_m for node in self._pair.split("-")]
         std_m = None if None in stated else max(float(np.max(cast("Any", axes))) for axes in stated)
         seconds = seconds_since(times, times[0])
@@ -284,7 +284,7 @@ class ImageSoFar:
         lines = budget_by_hand(formation, error_db=error_db, position_std_m=std_m, time_s=seconds)
         judged = judgement(formation, self.image, lines)
         loss = {"loss_db": judged.focus["loss_db"]} if "loss_db" in judged.focus else {}
-        return {"verdict": judged.verdict, "why": judged.why, **loss, "flags": dict(judged.flags)}
+        return {"verdict": judged.verdict, "reason": judged.reason, **loss, "flags": dict(judged.flags)}
 
 
 AT_ONCE = 2048
@@ -339,7 +339,7 @@ class PairSoFar:
     taken: int = 0
     dropped: int = 0
     until: np.datetime64 | None = None
-    why_dropped: str = ""
+    drop_reason: str = ""
     _shift_ns: int = 0
     _blocks: int = 0
     _raised: dict[str, tuple[int, str]] = field(default_factory=dict)  # blocks that raised a flag, and its last line
@@ -398,7 +398,7 @@ class PairSoFar:
             tx_index, rx_index = self.ready(ended=ended)
         except CampaignError as error:  # the time tags cannot be associated yet
             if ended:
-                self.why_dropped = str(error)
+                self.drop_reason = str(error)
             return False
         if len(tx_index) < (1 if ended else _LEAST * every):
             return False
@@ -417,7 +417,7 @@ class PairSoFar:
         try:
             block = self._block(tx_index, rx_index)
         except (CampaignError, OSError) as error:  # for example a file that was removed meanwhile
-            self.why_dropped = str(error)
+            self.drop_reason = str(error)
             return 0
         if block is None:
             return 0
@@ -445,7 +445,7 @@ class PairSoFar:
         rx = tx if self.rx is self.tx else self.rx.acquisition(rx_index[inside])
         hovers = bool(campaign.segments_of(self.flight, self.name))
         if not place(tx, rx, tx.raw.time.values, hovers=hovers).good.any():
-            self.why_dropped = "hover: platform stationary"
+            self.drop_reason = "hover: platform stationary"
             return None
         air = scene_air(campaign, tx.track.position.values)
         offset = calibrated(campaign, self.flight, self.name)
@@ -495,7 +495,7 @@ class PairSoFar:
         image = fine if 2 * fine.pulses >= coarse.pulses else coarse
         judged = image.judged() | {"judged_by": f"{image.pulses} pulses, {'fine' if image is fine else 'coarse'}"}
         if image is coarse and judged["flags"]:
-            judged |= {"verdict": "cannot tell", "why": f"coarse image only: {judged['why']}", "flags": {}}
+            judged |= {"verdict": "inconclusive", "reason": f"coarse image only: {judged['reason']}", "flags": {}}
         return judged
 
     @property
@@ -526,7 +526,7 @@ class PairSoFar:
     def waits(self) -> str:
         """Reason for missing pulses; empty: none."""
         nodes = [node.waits for node in (self.tx, self.rx) if node is not None]
-        return next((reason for reason in (*nodes, self.why_dropped) if reason), "")
+        return next((reason for reason in (*nodes, self.drop_reason) if reason), "")
 
     @property
     def shown(self) -> ImageSoFar | None:

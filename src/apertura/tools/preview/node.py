@@ -106,7 +106,7 @@ class NodeSoFar:
                 "apertura:framing: a continuous recording, whose pulses are found only in the complete samples",
                 files[0],
                 "one capture segment per trigger for --follow",
-                "Use apertura look without --follow, or after the end of the recording.",
+                "Use apertura preview without --follow, or after the end of the recording.",
             )
         else:
             recording = growing if growing or self._follow else open_recording(files)
@@ -148,7 +148,7 @@ class NodeSoFar:
                     f"a log of format {kind}, which cannot be read while it is being written",
                     path,
                     f"a line-oriented text format ({by_lines}) for --follow",
-                    "Use apertura look without --follow after the end of the log, or record the log as text.",
+                    "Use apertura preview without --follow after the end of the log, or record the log as text.",
                 )
             self.track = read_track(path, node=self.name, options=options)
         else:

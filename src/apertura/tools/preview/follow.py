@@ -1,4 +1,4 @@
-"""`apertura look`: quicklooks, verdicts, a page and a map in results/look, updated until the recordings end."""
+"""`apertura preview`: quicklooks, verdicts, a page and a map in results/preview, updated until the recordings end."""
 
 import json
 import signal
@@ -29,7 +29,7 @@ from apertura.common.provenance import sha256_file
 from apertura.core.geometry.geodesy import LOCAL
 from apertura.core.planning.plan import Plan
 from apertura.core.scene.grid import SceneGrid
-from apertura.formats.export import LOOK, MAP
+from apertura.formats.export import MAP, PREVIEW
 from apertura.formats.export.cog import power, write_cog
 from apertura.formats.export.db import DB, decibels
 from apertura.formats.export.quicklook import write_quicklook
@@ -37,8 +37,8 @@ from apertura.stages.pair import open_pair
 from apertura.stages.scene import ConfiguredGround, Flown, settled
 from apertura.stages.transfer import PairEcho, recorded_echo
 from apertura.stages.transmitted import transmitted
-from apertura.tools.look.node import NodeSoFar
-from apertura.tools.look.pair import PairSoFar, PulseBlock
+from apertura.tools.preview.node import NodeSoFar
+from apertura.tools.preview.pair import PairSoFar, PulseBlock
 from apertura.views.quality import explained_flags
 from apertura.views.webmap.document import Layer, Place, crs_of, map_document, stated_places, true_places, url_of
 
@@ -48,7 +48,7 @@ _AT_EASE = 0.3  # busy share of the time below which the decimation is halved
 _MOST_DECIMATED = 64
 
 
-class Look:
+class Preview:
     """Live view of a campaign.
 
     Parameters
@@ -79,7 +79,7 @@ class Look:
         self.finish = threading.Event()
         """Event that is set when the recordings have ended."""
         self.decimated, self.busy_s = 1, 0.0
-        self._map = LiveMap(campaign, LOOK, every_s=every_s)
+        self._map = LiveMap(campaign, PREVIEW, every_s=every_s)
         self._delay_s = np.inf  # at the previous update
         self._reported = set[str]()  # file errors that were printed already
         waveform = campaign.settings.waveform
@@ -92,7 +92,7 @@ class Look:
                     f"waveform.kind {waveform.kind}, whose files cannot be read before they are complete",
                     campaign.root / CONFIG,
                     "ofdm or samples, recorded as SigMF, for --follow",
-                    "Use apertura look without --follow when the files are complete.",
+                    "Use apertura preview without --follow when the files are complete.",
                 )
             for flight in campaign.image_flights:
                 for pair in flight.pairs:
@@ -200,7 +200,7 @@ class Look:
             "one_pulse_in": self.decimated,
             "pairs": pairs,
         }
-        folder = self.campaign.result(LOOK)
+        folder = self.campaign.result(PREVIEW)
         write_json(folder / "status.json", status)
         self._map.write(ended=ended)
         write_text(folder / "index.html", _page(status, refresh_s=0 if ended else max(1, round(self.every_s))))
@@ -239,7 +239,7 @@ class Look:
         return report
 
     def _picture(self, pair: PairSoFar) -> Path:
-        return self.campaign.result(LOOK, pair.flight, f"{pair.name}.png")
+        return self.campaign.result(PREVIEW, pair.flight, f"{pair.name}.png")
 
     def _draw(self, path: Path, pair: PairSoFar, report: Mapping[str, Any]) -> None:
         shown = pair.shown
@@ -277,13 +277,13 @@ def check_bounds(campaign: Campaign, *, follow: bool) -> None:
 
 
 @contextmanager
-def finished_by_interrupt(look: Look) -> Iterator[None]:
+def finished_by_interrupt(preview: Preview) -> Iterator[None]:
     """Handle the first Ctrl-C as the end of the recordings; a second one stops the command."""
 
     def finish(_: int, __: FrameType | None) -> None:
         signal.signal(signal.SIGINT, before)
         print("finishing with the data read so far; press Ctrl-C again to stop", flush=True)
-        look.finish.set()
+        preview.finish.set()
 
     before = signal.signal(signal.SIGINT, finish)
     try:
@@ -292,15 +292,15 @@ def finished_by_interrupt(look: Look) -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
-def look_at(campaign: Campaign, *, follow: bool, every_s: float, end_after_s: float, threads: int) -> None:
+def run_preview(campaign: Campaign, *, follow: bool, every_s: float, end_after_s: float, threads: int) -> None:
     """Show images of a campaign's pulses so far, with `follow` until its recordings end."""
-    look = Look(campaign, follow=follow, every_s=every_s, end_after_s=end_after_s, threads=threads)
-    print(f"shown in {as_typed(campaign.result(LOOK, 'index.html'))}", flush=True)
+    preview = Preview(campaign, follow=follow, every_s=every_s, end_after_s=end_after_s, threads=threads)
+    print(f"shown in {as_typed(campaign.result(PREVIEW, 'index.html'))}", flush=True)
     if not follow:
-        look.run()
+        preview.run()
         return
-    with finished_by_interrupt(look):
-        look.run()
+    with finished_by_interrupt(preview):
+        preview.run()
 
 
 # ---- Text -----------------------------------------------------------------------------------------------------------
@@ -435,7 +435,7 @@ class LiveMap:
             "flight": pair.flight,
             "image": pair.name,
             "verdict": report["verdict"],
-            "why": report["why"],
+            "reason": report["reason"],
             "error_db": report["error_db"],
             "flags": explained_flags(report["flags"]),
             "layers": [{**asdict(layer), "url": url_of(f"{name}/{path.name}", layer.sha256)}],
