@@ -163,7 +163,7 @@ def test_lists_are_accepted_as_arrays():
     from_lists = replace(history, weight=list(history.weight), reference_delay_s=[0.0] * len(history))
     np.testing.assert_array_equal(from_lists.weight, history.weight)
     assert len(ap.Aperture([[0.0, 0, 9], [1, 0, 9]], [[0.0, 0, 9], [1, 0, 9]])) == 2
-    with pytest.raises(CampaignError, match=r"tx_m \(3,\).*x, y and z of each pulse"):
+    with pytest.raises(CampaignError, match=r"tx_m \(3,\).*one row of x, y and z per pulse"):
         ap.Aperture([0.0, 0, 9], [0.0, 0, 9])
 
 
