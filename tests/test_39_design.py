@@ -267,7 +267,7 @@ def test_ambiguous_echoes_are_reported_as_cause_and_more_pulses_help(tmp_path):
     plan["scene"] |= {"bounds_m": [-30.0, 20.0, 30.0, 80.0], "spacing_m": 1.0}
     (verdict,) = judge(designed(FlightPlan.model_validate(plan), tmp_path))
     assert not verdict.met
-    assert "Doppler spreads" in verdict.cause
+    assert "Doppler spread of" in verdict.cause
     assert "double the pulse rate (waveform.prf_hz)" in {
         change.words for change in changes_of(plan, tmp_path) if change.meets
     }

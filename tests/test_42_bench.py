@@ -121,7 +121,7 @@ def test_no_path_of_a_link_that_carries_a_flag_goes_into_the_config(tmp_path, ca
     edit_config(root, lambda config: config["nodes"]["uav2"]["path_offset_m"].update(radar=0.5))
     before = (root / "config/config.yaml").read_text()
     print_bench(Campaign.load(root), write=True)
-    assert "nodes.uav2.path_offset_m: not of a link with link_incoherent" in capsys.readouterr().out
+    assert "nodes.uav2.path_offset_m: not determined, because the link has link_incoherent" in capsys.readouterr().out
     assert (root / "config/config.yaml").read_text() == before
 
 

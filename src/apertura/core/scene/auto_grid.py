@@ -13,7 +13,7 @@ from apertura.core.scene.grid import SceneGrid
 GRAZING_LIMIT_DEG = 10.0
 """Degrees, smallest grazing angle within automatic bounds; below it backscatter and terrain accuracy decrease."""
 
-CELLS_PER_PIXEL = 3.0
+PIXELS_PER_CELL = 3.0
 """Pixels per finest resolution cell; the Nyquist limit of a band-limited magnitude is 2."""
 
 
@@ -120,7 +120,7 @@ def auto_spacing(
     slopes = np.einsum("pyxk,yxak->pyxa", gradient, axes)
     cycles = np.stack([slopes * f / SPEED_OF_LIGHT_M_S for f in (frequency_hz[0], frequency_hz[-1])])
     widest = float(np.ptp(cycles.reshape(-1, 8, 8, 2), axis=0).max())
-    return _one_two_five(1.0 / (CELLS_PER_PIXEL * widest))
+    return _one_two_five(1.0 / (PIXELS_PER_CELL * widest))
 
 
 MOST_PIXELS = 25_000_000
@@ -132,14 +132,14 @@ _FEWEST_PIXELS = 250_000  # permitted for any recording
 def most_pixels(pulses: int, subcarriers: int) -> int:
     """Return the largest number of pixels of an automatic grid: one resolution cell per recorded sample.
 
-    A cell has `CELLS_PER_PIXEL` pixels along each axis.
+    A cell has `PIXELS_PER_CELL` pixels along each axis.
 
     Examples
     --------
     >>> most_pixels(300, 1024), most_pixels(10, 512), most_pixels(10**6, 1024)
     (2764800, 250000, 25000000)
     """
-    return min(MOST_PIXELS, max(_FEWEST_PIXELS, round(CELLS_PER_PIXEL**2) * pulses * subcarriers))
+    return min(MOST_PIXELS, max(_FEWEST_PIXELS, round(PIXELS_PER_CELL**2) * pulses * subcarriers))
 
 
 def coarsened(spacing_m: float, bounds_m: tuple[float, float, float, float], most: int) -> float:

@@ -203,7 +203,7 @@ def write_offsets(campaign: Campaign, flight: str, offsets: Mapping[str, Any]) -
         validated(yaml.safe_load(text), where=path)
         write_text(path, text)
     else:
-        print(f"{CONFIG}: unchanged, because it agrees with the measurement")
+        print(f"{CONFIG}: unchanged: no measured path to write")
 
 
 def with_value(text: str, keys: tuple[str, ...], value: float) -> str:
