@@ -125,7 +125,7 @@ def test_a_chart_tells_apart_what_was_said(monkeypatch, tmp_path):
     monkeypatch.setattr(sweep, "save_png", lambda figure, _: figures.append(figure))
     charts.draw_losses("losses", rows, tmp_path / "losses.png")
     five, dense = figures[0].axes
-    places = [marks(five, said).tolist() for said in (*VERDICTS, "what was refused")]
+    places = [marks(five, said).tolist() for said in (*VERDICTS, "refused estimate")]
     assert places == [[[1.0, 0.2]], [[2.0, 0.2]], [[3.0, 6.0]], [[5.0, 10.0]], [[3.0, 0.2]]]
     assert marks(dense, TOO_FEW)[:, 0].tolist() == [1.0, 2.0, 3.0, 5.0]
     assert "2 of 4 accepted, 0 of them worse" in five.get_title()
@@ -203,6 +203,6 @@ def test_a_picture_of_what_was_refused_says_so_and_shows_the_logs(monkeypatch, t
     monkeypatch.setattr(charts, "save_png", lambda figure, _: figures.append(figure))
     charts.draw_case("five", tmp_path / "five.png")
     logs, after, _ = [axes for axes in figures[0].axes if axes.images][:3]
-    assert after.get_title().startswith("refused: the logs stay")
+    assert after.get_title().startswith("refused: logged tracks are used")
     assert (logs.images[0].get_array() == after.images[0].get_array()).all()
     assert "flags: refinement_rejected" in figures[0].get_suptitle()

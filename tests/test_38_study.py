@@ -229,7 +229,7 @@ def test_localization_costs_what_the_independent_model_says(monkeypatch):
     (claim,) = loss_claims("localization", draws=6)
     assert (claim.paper, claim.independent_model) == ("", "-1.24")
     assert claim.verdict == AGREES
-    assert "±1 dB allowed here; mean of 6 draws, spread" in claim.note
+    assert "tolerance ±1 dB; mean of 6 draws, spread" in claim.note
 
 
 @pytest.mark.parametrize("name", ERRORS)
@@ -337,9 +337,9 @@ def test_a_loss_table_row_says_destroyed_only_where_both_are(monkeypatch):
 
 def test_a_row_says_whose_value_it_is_compared_with_and_hides_no_difference():
     ours = require("x", 0.02, "dB", limit="below 0.01 dB", met=False, note="n")
-    assert ours == Claim("x", "", "", "0.02", "dB", OWN, DISAGREES, "required here: below 0.01 dB; n")
+    assert ours == Claim("x", "", "", "0.02", "dB", OWN, DISAGREES, "required: below 0.01 dB; n")
     said = require("x", 0.02, "dB", limit="below 0.01 dB", met=False, words="none", note="n")
-    assert (said.about, said.note) == (PAPER, "the paper: none; read here as: below 0.01 dB; n")
+    assert (said.about, said.note) == (PAPER, "the paper: none; interpreted as: below 0.01 dB; n")
     both = compare("x", 1.0, "1", paper="2.0", independent_model=1.0, within=0.1)
     assert (both.paper, both.independent_model, both.about, both.verdict) == ("2.0", "1", PAPER, DISAGREES)
     assert both.note == "differs by -50.0 %"
@@ -347,7 +347,7 @@ def test_a_row_says_whose_value_it_is_compared_with_and_hides_no_difference():
     assert (known.verdict, known.note) == (EXPLAINED, "differs by -50.0 %; swapped; n")
     assert (
         compare("x", 2.0, "1", paper="2.0", within=0.1, reason="swapped").note
-        == "differs by +0.0 %, ±10 % allowed here"
+        == "differs by +0.0 %, tolerance ±10 %"
     )
     # what rounds to the printed digits agrees, and nothing else does
     assert [compare("x", value, "1", paper="2.0").verdict for value in (2.049, 2.06)] == [AGREES, DISAGREES]
