@@ -25,7 +25,7 @@ TILE_PX = 32
 
 
 @dataclass(frozen=True)
-class Judged:
+class ImageErrors:
     """Errors of one image, dB: true error over all pixels, prediction, bounds and estimate of its certificates."""
 
     name: str
@@ -36,7 +36,7 @@ class Judged:
     drawn_alone_db: float
 
 
-def judged(seeds: range, *, pixels: int, pulses: int, engine: str | None = None) -> Iterator[Judged]:
+def evaluated(seeds: range, *, pixels: int, pulses: int, engine: str | None = None) -> Iterator[ImageErrors]:
     """Evaluate two images of every campaign: the planned one, and one with a random setting of one or any engine."""
     for seed in seeds:
         generator = np.random.default_rng(seed)
@@ -46,17 +46,17 @@ def judged(seeds: range, *, pixels: int, pulses: int, engine: str | None = None)
         others = [one for one in SettingSearch(drawn.job, engine).settings(pulses) if one.engine != "reference"]
         other = others[generator.integers(len(others))]
         for one in (plan, replace(plan, setting=other, presum=None)):
-            yield _judge(drawn, one, exact, seed)
+            yield _image_errors(drawn, one, exact, seed)
 
 
-def _judge(drawn: Drawn, plan: Plan, exact: NDArray[np.complex128], seed: int) -> Judged:
+def _image_errors(drawn: Drawn, plan: Plan, exact: NDArray[np.complex128], seed: int) -> ImageErrors:
     formation = Formation(drawn.history, drawn.profiles, drawn.grid, plan, TILE_PX)
     image = _image(drawn, plan.setting, plan)
     certificate = certified(formation, image, accuracy_db=np.inf, threads=1)
     sampled = np.random.default_rng(seed).integers(0, image.shape, (64, 2))
     values, power = formation.values(sampled)
     bound = error_bound(values, exact[tuple(sampled.T)], np.ones(64), power=power)
-    return Judged(
+    return ImageErrors(
         f"{drawn.name}, {plan.setting.line}",
         true_error_db(image, exact),
         plan.setting.error_db,
@@ -91,7 +91,7 @@ def main() -> None:
     options = parser.parse_args()
     seeds = range(options.first, options.first + options.campaigns)
     images = []
-    for one in judged(seeds, pixels=options.size, pulses=options.pulses, engine=options.engine):
+    for one in evaluated(seeds, pixels=options.size, pulses=options.pulses, engine=options.engine):
         images.append(one)
         missed = "" if one.bound_db >= one.error_db else "  below the error"
         print(f"{one.name:<100}{one.error_db:>8.1f} dB, bound {one.bound_db:>7.1f} dB{missed}", flush=True)

@@ -37,13 +37,13 @@ class Cause:
         Description with the unit of the sizes.
     sizes
         Sizes of the error, increasing.
-    spoil
+    apply
         Function that adds the error of a given size to a campaign folder.
     """
 
     words: str
     sizes: Sequence[float]
-    spoil: Callable[[Folder, float], None]
+    apply: Callable[[Folder, float], None]
 
 
 @dataclass(frozen=True)
@@ -135,9 +135,9 @@ def main() -> None:
     peaks = {image: find_targets(values, outcome.grid, places) for image, values in outcome.images.items()}
     for cause in [name for name in options.only.split(",") if name] or CAUSES:
         for size in CAUSES[cause].sizes:
-            spoilt = copy_writable(right, options.folder / "spoilt")
-            CAUSES[cause].spoil(Folder(spoilt), size)
-            changed = run_campaign(spoilt)
+            modified = copy_writable(right, options.folder / "modified")
+            CAUSES[cause].apply(Folder(modified), size)
+            changed = run_campaign(modified)
             error = changed.error
             if error:
                 rows.append(

@@ -66,14 +66,18 @@ def native_contestants(jobs: dict[str, Job]) -> list[Contestant]:
     """Return the compiled engine in each instruction set and geometry."""
     flat = jobs["bistatic"]
     contestants = [
-        Contestant(f"native {isa}", "bistatic", former(flat), flat, isa=isa, every=1 + (isa == "portable"))
+        Contestant(f"native {isa}", "bistatic", formation_call(flat), flat, isa=isa, every=1 + (isa == "portable"))
         for isa in filter(native_binding.supports, native.INSTRUCTION_SETS)
     ]
     fast, linear = contestants[0].isa, {"oversampling": 10, "degree": 1}
     contestants += [
-        Contestant(f"native {fast}", name, former(job), job, isa=fast) for name, job in jobs.items() if job is not flat
+        Contestant(f"native {fast}", name, formation_call(job), job, isa=fast)
+        for name, job in jobs.items()
+        if job is not flat
     ]
-    contestants.append(Contestant(f"native {fast}, lines 10x", "bistatic", former(flat, **linear), flat, isa=fast))
+    contestants.append(
+        Contestant(f"native {fast}, lines 10x", "bistatic", formation_call(flat, **linear), flat, isa=fast)
+    )
     contestants.append(compression_contestant(flat))
     contestants.append(Contestant("tables", "bistatic", lambda: native.prepare(flat.profiles), isa=fast))
     pair = TwoThreads(flat)
@@ -95,7 +99,7 @@ def compression_contestant(job: Job) -> Contestant:
     )
 
 
-def former(job: Job, **options: int) -> Callable[[], Any]:
+def formation_call(job: Job, **options: int) -> Callable[[], Any]:
     """Return a call that forms the whole image from precomputed tables."""
     tables = native.prepare(job.profiles, **options)
     return lambda: native.form(tables, job.pixels)

@@ -25,7 +25,7 @@ from statistics import median
 from typing import NamedTuple
 
 from growing.chart import draw
-from growing.contestants import Contestant, House, SkippedError
+from growing.contestants import Contestant, EngineInput, SkippedError
 from growing.rivals import Fastsar
 from growing.scene import Geometry, Scene, Surface, build
 from growing.table import exponents, markdown
@@ -118,19 +118,19 @@ def measured(case: Case, effort: Effort, only: list[str]) -> list[Row]:
     """Measure one scene; contestants run alternately until each reaches its number of rounds or its time limit."""
     begin = time.perf_counter()
     scene = build(case.size, case.pulses, case.geometry, case.surface)
-    house = House(scene)
+    engine_input = EngineInput(scene)
     print(f"{scene.name}: {len(scene.history.frequency_hz)} subcarriers", flush=True)
-    contestants = [one for one in _contestants(house, effort) if not only or one.name in only]
+    contestants = [one for one in _contestants(engine_input, effort) if not only or one.name in only]
     loads = [os.getloadavg()[0]]
     for number in range(effort.rounds):
-        house.compress()
+        engine_input.compress()
         for one in contestants:
             once = effort.quick and one.share < SLOW  # contestants that work pixel by pixel
             if number == 0 or (not once and one.spent * (number + 1) / number < 3 * effort.limit_s):
                 one.go()
         loads.append(os.getloadavg()[0])
     print(f"  {time.perf_counter() - begin:.0f} s, load {min(loads):.1f} to {max(loads):.1f}", flush=True)
-    compression_s = median(house.compressions)
+    compression_s = median(engine_input.compressions)
     measures = {"machine": machine(), "load": round(max(loads), 1), "compression_s": float(f"{compression_s:.3g}")}
     return [one.row(compression_s) | measures for one in contestants]
 
@@ -142,18 +142,20 @@ def machine() -> str:
     return f"{model}, {instruction_set('native')}"
 
 
-def _contestants(house: House, effort: Effort) -> Iterator[Contestant]:
+def _contestants(engine_input: EngineInput, effort: Effort) -> Iterator[Contestant]:
     """Yield the available contestants; print the reasons of the skipped ones."""
     limit_s = effort.limit_s
     entries: list[tuple[str, Callable[[], Contestant]]] = [
-        (f"{engine} {aim_db:.0f} dB", partial(house.planned, engine, aim_db, limit_s))
+        (f"{engine} {aim_db:.0f} dB", partial(engine_input.planned, engine, aim_db, limit_s))
         for engine in ("native", "tree")
         for aim_db in (AIMS_DB if engine == "tree" or not effort.quick else (-60.0,))
     ]
-    entries.append(("numba", partial(house.planned, "numba", -60.0, limit_s / 2, fields=True)))
+    entries.append(("numba", partial(engine_input.planned, "numba", -60.0, limit_s / 2, fields=True)))
     if importlib.util.find_spec("fastsar"):
-        rival = Fastsar(house.scene)
-        entries += [(name, partial(rival.factorized, name, **options)) for name, options in _factorized(house.scene)]
+        rival = Fastsar(engine_input.scene)
+        entries += [
+            (name, partial(rival.factorized, name, **options)) for name, options in _factorized(engine_input.scene)
+        ]
         entries += [
             ("fastsar exact", partial(rival.exact, limit_s)),
             ("fastsar points", partial(rival.points, limit_s / 2)),

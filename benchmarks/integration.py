@@ -21,7 +21,7 @@ FREQUENCY = 1.2e9 + 1e6 * np.arange(96)
 SIDE, TARGETS, PULSES = 40, 4, 150
 
 
-def drawn(generator: np.random.Generator) -> tuple[Aperture, SceneGrid, np.ndarray]:
+def draw_pass(generator: np.random.Generator) -> tuple[Aperture, SceneGrid, np.ndarray]:
     """Draw a pass, a grid and targets on the terrain."""
     spacing_m = float(np.exp(generator.uniform(np.log(0.05), np.log(1.5))))
     size_m = SIDE * spacing_m
@@ -55,7 +55,7 @@ def main(count: int) -> None:
     """Print the losses."""
     losses, is_covered, empty = list[np.ndarray](), list[np.ndarray](), 0
     for seed in range(count):
-        aperture, grid, targets = drawn(np.random.default_rng(seed))
+        aperture, grid, targets = draw_pass(np.random.default_rng(seed))
         echo = transfer(Scatterers(targets, np.ones(TARGETS)), aperture, FREQUENCY, spreading=False)
         history = PhaseHistory(echo, FREQUENCY, np.full(96, 1 / 96), np.zeros(PULSES), aperture)
         auto, whole = (
@@ -79,7 +79,7 @@ def main(count: int) -> None:
     covered = np.concatenate(is_covered)
     print(f"{covered.sum()} targets with a span within the sector of their pixels: worst {loss[covered].min():+.2f} dB")
     for seed in np.argsort([one.min() for one in losses])[:8]:
-        aperture, grid, targets = drawn(np.random.default_rng(seed))
+        aperture, grid, targets = draw_pass(np.random.default_rng(seed))
         print(
             seed,
             np.round(losses[seed], 1),

@@ -34,7 +34,19 @@ straight track, or an error of attitude or lever arm at constant attitude."""
 
 @dataclass(frozen=True)
 class Row:
-    """Effect of a mistake on one image, and its report; losses in dB and displacements in metres, worst and median."""
+    """Effect of a mistake on one image, and its report; losses in dB and displacements in metres, worst and median.
+
+    Attributes
+    ----------
+    wrong, silent
+        True if the image is wrong; and if it has no flag in addition to those of the error-free campaign.
+    control
+        True for a change without effect on the image.
+    alike
+        True if the mistake displaces the whole scene.
+    within
+        True if the displacement is within the geolocation uncertainty.
+    """
 
     base: str
     mistake: str
@@ -87,7 +99,7 @@ def main() -> None:
 
 
 def _rows(folder: Path, base: str, names: list[str]) -> Iterator[Row]:
-    right, spoilt = folder / f"{base}-right", folder / f"{base}-spoilt"
+    right, modified = folder / f"{base}-right", folder / f"{base}-modified"
     if not right.exists():
         BASES[base](right)
     outcome, places = run_campaign(right), true_places(right)
@@ -99,9 +111,9 @@ def _rows(folder: Path, base: str, names: list[str]) -> Iterator[Row]:
     )
     yield from _judged(base, _RIGHT, outcome, before, right)
     for name in names:
-        copy_writable(right, spoilt)
-        MISTAKES[name].spoil(Folder(spoilt))
-        yield from _judged(base, name, run_campaign(spoilt), before, spoilt)
+        copy_writable(right, modified)
+        MISTAKES[name].apply(Folder(modified))
+        yield from _judged(base, name, run_campaign(modified), before, modified)
 
 
 def _judged(base: str, name: str, outcome: Outcome, right: Right, root: Path) -> Iterator[Row]:

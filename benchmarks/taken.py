@@ -67,7 +67,7 @@ def main() -> None:
 
 def measured(case: Case) -> Iterator[float]:
     """Print the rows of a case; yield the ratio of the times of tree and native where the tree is chosen."""
-    job = _shaken(build(case.size, case.pulses, bistatic=case.bistatic), case)
+    job = _with_track_noise(build(case.size, case.pulses, bistatic=case.bistatic), case)
     planned = _planned(job)
     exact = native.form(native.prepare(job.profiles, oversampling=16), job.pixels, tolerance_rad=5e-5)
     for aim_db in AIMS_DB:
@@ -90,7 +90,7 @@ def measured(case: Case) -> Iterator[float]:
             yield seconds[0] / seconds[1]
 
 
-def _shaken(job: Job, case: Case) -> Job:
+def _with_track_noise(job: Job, case: Case) -> Job:
     """Return the job with noise on its tracks and unchanged echoes; only times and numerical errors are measured."""
     generator = np.random.default_rng(3)
     legs = (leg + case.jitter_m * generator.standard_normal(leg.shape) for leg in job.profiles.aperture.legs)

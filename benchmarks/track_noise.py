@@ -68,18 +68,18 @@ def _row(draws: list[Draw]) -> list[str]:
 
 
 def _drawn(folder: Path, right: Path, size_cm: float, seed: int, peaks: dict[str, Peaks]) -> list[Draw]:
-    spoilt = copy_writable(right, folder / "spoilt")
+    modified = copy_writable(right, folder / "modified")
     if size_cm:
-        logs(noisy(size_cm / 100, seed=seed), TX, RX)(Folder(spoilt))
-    logs(declare_std(max(size_cm, 1e-2) / 100), RX)(Folder(spoilt))
-    Folder(spoilt).edit_config(
+        logs(noisy(size_cm / 100, seed=seed), TX, RX)(Folder(modified))
+    logs(declare_std(max(size_cm, 1e-2) / 100), RX)(Folder(modified))
+    Folder(modified).edit_config(
         lambda document: [
             document.setdefault("processing", {}).update(autofocus="off"),
             *(node.update(position_std_m=max(size_cm, 1e-3) / 100) for node in document["nodes"].values()),
         ]
     )
     draws = []
-    for pair, quality, predicted_db, pair_peaks in _imaged(spoilt):
+    for pair, quality, predicted_db, pair_peaks in _imaged(modified):
         loss_db = float(np.nanmean(pair_peaks.level_db - peaks[pair].level_db))
         focus = quality["focus"]
         draws.append(Draw(pair, predicted_db, loss_db, focus.get("loss_db", np.nan), focus["verdict"]))

@@ -81,7 +81,7 @@ def test_what_follows_from_parameters_is_what_the_paper_says():
     assert (sfo.paper, sfo.computed) == ("200", "199.96")
     assert rows["timing of the samples 2δR/c, δR = 2 cm"].computed == "133.4"
     differ = {"OFDM symbol T against 1/Δf", "effective chirp bandwidth B(T − Δt_max)/T, Δt_max = T_cp"}
-    differ |= {"CFO of a clock off by 10 ppb", "SFO of a clock off by 10 ppb"}
+    differ |= {"CFO of a clock error of 10 ppb", "SFO of a clock error of 10 ppb"}
     differ.add("clock error of each node at the SFO limit, ±")
     assert {name for name, row in rows.items() if row.verdict != AGREES} == differ
     assert rows["effective chirp bandwidth B(T − Δt_max)/T, Δt_max = T_cp"].verdict == UNTESTABLE
@@ -99,8 +99,8 @@ def test_what_the_paper_prints_stands_digit_by_digit_even_where_it_is_wrong():
         "97.64",
         EXPLAINED,
     )  # two clocks in opposite directions, and rounded
-    assert printed["CFO of a clock off by 10 ppb"] == ("41", "12", EXPLAINED)
-    assert printed["SFO of a clock off by 10 ppb"] == ("12", "40.96", EXPLAINED)
+    assert printed["CFO of a clock error of 10 ppb"] == ("41", "12", EXPLAINED)
+    assert printed["SFO of a clock error of 10 ppb"] == ("12", "40.96", EXPLAINED)
     assert not any("8.3" in row.paper for row in rows.values())
 
 
@@ -111,7 +111,7 @@ def test_the_converter_samples_the_band_without_aliases():
 
 def test_contradictions_of_the_paper_are_noted_where_they_stand():
     rows = by_claim([*parameter_claims(), *uav_table(pulses=60)])
-    for name in ("CFO of a clock off by 10 ppb", "UAV flight: cross-range width as printed"):
+    for name in ("CFO of a clock error of 10 ppb", "UAV flight: cross-range width as printed"):
         assert "contradicts itself" in rows[name].note
         assert rows[name].verdict == EXPLAINED
 

@@ -107,7 +107,7 @@ def _digits(value: float) -> float:
     return float(f"{value:.3g}")
 
 
-class House:
+class EngineInput:
     """Input of apertura's engines for a scene: profiles, and the planner's job."""
 
     def __init__(self, scene: Scene):

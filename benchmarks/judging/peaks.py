@@ -82,9 +82,9 @@ def find_targets(image: NDArray[np.complex64], grid: SceneGrid, places_m: NDArra
     return Peaks(found, levels)
 
 
-def harm(spoilt: Peaks, right: Peaks) -> Harm:
+def harm(degraded: Peaks, right: Peaks) -> Harm:
     """Compare the targets of a degraded image with those of the error-free image; infinite for missing targets."""
     known = np.isfinite(right.level_db)
-    loss, shift = right.level_db - spoilt.level_db, np.linalg.norm(spoilt.place_m - right.place_m, axis=1)
+    loss, shift = right.level_db - degraded.level_db, np.linalg.norm(degraded.place_m - right.place_m, axis=1)
     loss, shift = (np.nan_to_num(values[known], nan=np.inf, posinf=np.inf) for values in (loss, shift))
     return Harm(float(loss.max()), float(shift.max()), float(np.median(loss)), float(np.median(shift)))

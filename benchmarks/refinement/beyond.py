@@ -37,7 +37,7 @@ OTHERS = {
 """Additional error → lever arm of the first node, metres to the right of its course; height, metres; stated drift."""
 
 
-def spoilt(flight_name: str, arm_m: float, height_m: float, drift_m: float, seed: int) -> AutofocusCase:
+def erroneous_case(flight_name: str, arm_m: float, height_m: float, drift_m: float, seed: int) -> AutofocusCase:
     """Return a case with a lever arm error of the first node to its right, and terrain above its assumed height."""
     of_tracks, of_scene, of_noise = np.random.default_rng(seed).spawn(3)
     flight, scatterers = FLIGHTS[flight_name](), SCENES["forty"](of_scene)
@@ -68,7 +68,7 @@ def main() -> None:
         for name, (arm_m, height_m, drift_m) in OTHERS.items():
             rows = []
             for seed in range(300, 302 if flight_name == "circle" else 305):
-                one = spoilt(flight_name, arm_m, height_m, drift_m, seed)
+                one = erroneous_case(flight_name, arm_m, height_m, drift_m, seed)
                 result = refine(one.records, GRID, FlatGround(0.0), one.errors)
                 before, after = judge(one), judge(one, result.correction)
                 rows.append(

@@ -73,7 +73,7 @@ class Folder:
         return self.root / "raw" / "f01" / name
 
 
-Spoil = Callable[[Folder], None]
+FolderChange = Callable[[Folder], None]
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ class Mistake:
     ----------
     words
         Short description.
-    spoil
+    apply
         Function that introduces the mistake.
     cause
         Cause of the expected hypothesis: one of `CAUSES`, or empty if no tested hypothesis applies.
@@ -95,7 +95,7 @@ class Mistake:
     """
 
     words: str
-    spoil: Spoil
+    apply: FolderChange
     cause: str = ""
     control: bool = False
     alike: tuple[str, ...] = ()

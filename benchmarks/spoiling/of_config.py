@@ -6,17 +6,17 @@ from collections.abc import Callable
 import numpy as np
 from judging.bases import SHARED
 
-from spoiling.folder import RX, TX, Document, Folder, Mistake, Spoil
+from spoiling.folder import RX, TX, Document, Folder, FolderChange, Mistake
 
 _ARMS = ("radar_tx", "radar_rx", "sidelink")
 
 
-def config(change: Callable[[Document], object]) -> Spoil:
+def config(change: Callable[[Document], object]) -> FolderChange:
     """Return a mistake that changes the config."""
     return lambda folder: folder.edit_config(change)
 
 
-def section(name: str, **changes: Callable[[float], object] | object) -> Spoil:
+def section(name: str, **changes: Callable[[float], object] | object) -> FolderChange:
     """Return a mistake that replaces keys of a section by values, or by functions of their old values."""
 
     def change(document: Document) -> None:
@@ -26,7 +26,9 @@ def section(name: str, **changes: Callable[[float], object] | object) -> Spoil:
     return config(change)
 
 
-def arms(*factors: float, plus: tuple[float, float, float] = (0, 0, 0), points: tuple[str, ...] = _ARMS) -> Spoil:
+def arms(
+    *factors: float, plus: tuple[float, float, float] = (0, 0, 0), points: tuple[str, ...] = _ARMS
+) -> FolderChange:
     """Return a mistake that multiplies lever arms of the transmitting node axis by axis, and adds metres."""
 
     def change(document: Document) -> None:
@@ -37,7 +39,7 @@ def arms(*factors: float, plus: tuple[float, float, float] = (0, 0, 0), points: 
     return config(change)
 
 
-def offset(node: str, channel: str, *, plus: float = 0.0, times: float = 1.0) -> Spoil:
+def offset(node: str, channel: str, *, plus: float = 0.0, times: float = 1.0) -> FolderChange:
     """Return a mistake that changes a node's path offset."""
 
     def change(document: Document) -> None:
@@ -47,12 +49,12 @@ def offset(node: str, channel: str, *, plus: float = 0.0, times: float = 1.0) ->
     return config(change)
 
 
-def codes(change: Callable[[np.ndarray], np.ndarray]) -> Spoil:
+def codes(change: Callable[[np.ndarray], np.ndarray]) -> FolderChange:
     """Return a mistake that changes the code symbols."""
     return lambda folder: folder.edit_codes(change)
 
 
-def prefix(samples: int) -> Spoil:
+def prefix(samples: int) -> FolderChange:
     """Return a mistake that configures too long a cyclic prefix, without changing the length of the DFT window."""
 
     def change(document: Document) -> None:
@@ -63,7 +65,7 @@ def prefix(samples: int) -> Spoil:
     return config(change)
 
 
-def spacing(extra_bins: int) -> Spoil:
+def spacing(extra_bins: int) -> FolderChange:
     """Return a mistake that configures a subcarrier spacing with a longer DFT."""
     return section("waveform", subcarrier_spacing_hz=lambda hz: 1.024e9 / (round(1.024e9 / hz) + extra_bins))
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from spoiling.folder import RX, TX, Folder, Mistake, Spoil
+from spoiling.folder import RX, TX, Folder, FolderChange, Mistake
 from spoiling.logs import Floats, Log
 
 Change = Callable[[Log], Log]
@@ -14,14 +14,14 @@ BOTH = (TX, RX)
 _FEET_M = 0.3048
 
 
-def logs(change: Change, *nodes: str) -> Spoil:
+def logs(change: Change, *nodes: str) -> FolderChange:
     """Return a mistake that changes the logs of the given nodes."""
 
-    def spoil(folder: Folder) -> None:
+    def apply(folder: Folder) -> None:
         for node in nodes:
             folder.edit_log(node, change)
 
-    return spoil
+    return apply
 
 
 def late(seconds: float) -> Change:
@@ -136,10 +136,10 @@ def retimed(change: Callable[[Floats], Floats]) -> Change:
     return lambda log: replace(log, time_s=change(log.time_s))
 
 
-def relabelled(declared: str, *, actual: str = "GPST") -> Spoil:
+def relabelled(declared: str, *, actual: str = "GPST") -> FolderChange:
     """Return a mistake that extends both logs by 20 s and declares a wrong time system in the RTKLIB header."""
 
-    def spoil(folder: Folder) -> None:
+    def apply(folder: Folder) -> None:
         folder.edit_log(TX, lambda log: longer(log, 20.0))
         folder.edit_log(RX, lambda log: longer(log, 20.0))
         folder.edit_log(RX, lambda log: replace(log, header=_named(log.header, actual)))
@@ -148,7 +148,7 @@ def relabelled(declared: str, *, actual: str = "GPST") -> Spoil:
         count = sum(line.startswith("%") for line in lines)
         path.write_text("\n".join([*_named(lines[:count], declared), *lines[count:]]) + "\n", encoding="utf-8")
 
-    return spoil
+    return apply
 
 
 def _named(header: Sequence[str], system: str) -> tuple[str, ...]:

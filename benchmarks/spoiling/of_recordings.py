@@ -5,13 +5,13 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from spoiling.folder import RX, TX, Captures, Document, Folder, Mistake, Spoil
+from spoiling.folder import RX, TX, Captures, Document, Folder, FolderChange, Mistake
 
 _RADAR = np.s_[:, :, 0]
 Complex = NDArray[np.complex128]
 
 
-def samples(change: Callable[[Complex], Complex], *nodes: str, channels: slice = slice(None)) -> Spoil:
+def samples(change: Callable[[Complex], Complex], *nodes: str, channels: slice = slice(None)) -> FolderChange:
     """Return a mistake that changes samples, (capture, sample, channel) complex; the first channel is the radar."""
 
     def changed(captures: Captures) -> NDArray[np.float64]:
@@ -20,17 +20,17 @@ def samples(change: Callable[[Complex], Complex], *nodes: str, channels: slice =
         values[:, :, channels] = np.ascontiguousarray(new)[..., None].view(np.float64)
         return values
 
-    def spoil(folder: Folder) -> None:
+    def apply(folder: Folder) -> None:
         for node in nodes:
             folder.edit_captures(node, changed)
 
-    return spoil
+    return apply
 
 
 RADAR = slice(0, 1)
 
 
-def tags(change: Callable[[NDArray[np.int64]], NDArray[np.int64]], *nodes: str) -> Spoil:
+def tags(change: Callable[[NDArray[np.int64]], NDArray[np.int64]], *nodes: str) -> FolderChange:
     """Return a mistake that adds to the time tags of captures: capture numbers → nanoseconds."""
 
     def changed(meta: Document) -> None:
@@ -39,14 +39,14 @@ def tags(change: Callable[[NDArray[np.int64]], NDArray[np.int64]], *nodes: str) 
             time = np.datetime64(capture["core:datetime"].rstrip("Z"), "ns") + np.timedelta64(int(shift), "ns")
             capture["core:datetime"] = f"{np.datetime_as_string(time, 'us')}Z"
 
-    def spoil(folder: Folder) -> None:
+    def apply(folder: Folder) -> None:
         for node in nodes:
             folder.edit_meta(node, changed)
 
-    return spoil
+    return apply
 
 
-def kept(choose: Callable[[int], NDArray[np.int_]], *nodes: str, tagged: bool = True) -> Spoil:
+def kept(choose: Callable[[int], NDArray[np.int_]], *nodes: str, tagged: bool = True) -> FolderChange:
     """Return a mistake that keeps selected captures (count → numbers); not `tagged`: with the first time tags."""
 
     def changed(folder: Folder, node: str) -> None:
@@ -65,14 +65,14 @@ def kept(choose: Callable[[int], NDArray[np.int_]], *nodes: str, tagged: bool = 
         folder.edit_captures(node, cut)
         folder.edit_meta(node, renumbered)
 
-    def spoil(folder: Folder) -> None:
+    def apply(folder: Folder) -> None:
         for node in nodes:
             changed(folder, node)
 
-    return spoil
+    return apply
 
 
-def starts(by: int, node: str) -> Spoil:
+def starts(by: int, node: str) -> FolderChange:
     """Return a mistake that delays the starts of captures by a number of samples; the last capture is lost."""
 
     def changed(meta: Document) -> None:

@@ -3,9 +3,9 @@
 from dataclasses import dataclass, replace
 from math import isinf
 
-AGREES, DISAGREES, EXPLAINED, UNTESTABLE = "agrees", "disagrees", "explained", "not testable here"
+AGREES, DISAGREES, EXPLAINED, UNTESTABLE = "agrees", "disagrees", "explained", "not testable"
 VERDICTS = (AGREES, DISAGREES, EXPLAINED, UNTESTABLE)
-"""`explained`: the value differs for a reason stated in the note, or agrees by construction; `not testable here`: the
+"""`explained`: the value differs for a reason stated in the note, or agrees by construction; `not testable`: the
 note states the missing information."""
 
 PAPER, MODEL, OWN = "paper", "model", "own limit"

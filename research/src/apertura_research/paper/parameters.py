@@ -159,8 +159,8 @@ def _clocks() -> list[Claim]:
         compare("clock error of each node at the SFO limit, ±", sfo_ppm / 2, "ppm", paper="100",
                 reason=f"the paper assumes two clocks with opposite errors, and rounds: {opposite}"),
         compare("CFO limit Δf/10", cfo_hz / 1e3, "kHz", paper="10", note=first),
-        compare("CFO of a clock off by 10 ppb", at_carrier_hz, "Hz", paper="41", reason=swapped),
-        compare("SFO of a clock off by 10 ppb", at_converter_hz, "Hz", paper="12", reason=swapped),
+        compare("CFO of a clock error of 10 ppb", at_carrier_hz, "Hz", paper="41", reason=swapped),
+        compare("SFO of a clock error of 10 ppb", at_converter_hz, "Hz", paper="12", reason=swapped),
     ]  # fmt: skip
 
 
