@@ -97,7 +97,7 @@ void write(const ApertureJob& job, const Patch& patch, const Real* total) {
 template <class Real>
 void form_region(const ApertureJob& job, const Isa& isa, int64_t top, int64_t left, std::vector<Patch>& patches,
                  std::vector<Real>& totals) {
-  // A quarter of the tolerance for the sum of both one-way paths.
+  // Deviation of a pixel that changes the total path by at most a quarter of the tolerance.
   const double deviation_cells = 0.125 * job.tolerance_rad / job.radians_per_cell;
   int64_t count = 0;
   for (int64_t row = top; row < top + kRegion && row < job.rows; row += kPatchSide)

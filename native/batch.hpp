@@ -64,7 +64,7 @@ inline Variant expand_paths(const ApertureJob& job, const Patch& patch, const Or
   Lanes path[kParts], low[kParts], lowest[kParts], high[kParts];
   for (int64_t part = 0; part < kParts; part++) {
     const int64_t b = part * kLanes;
-    // (3) to (5): path and derivatives at the block centres, both legs added.
+    // (3) to (5): path and derivatives at the block centres, sum over both antennas.
     BlockPaths s;
     add_block_leg<kTerrain, kCurvature>(patch, origin.leg[0], q, b, s);
     add_block_leg<kTerrain, kCurvature>(patch, origin.leg[1], q, b, s);

@@ -16,7 +16,7 @@ constexpr int64_t kTermTaps = 24;   // samples that interpolate an echo in float
 // A path may be half a cell from the cell it is rounded to; the remainder covers errors of float32.
 constexpr float kWindowMargin = 0.51f;
 
-// Largest error of one leg's series of |w + d| (engine.md, "Paths"), whose order n is at most
+// Largest error of the series of a one-way path |w + d| (engine.md, "Paths"), whose order n is at most
 // max |P_{n-2} - P_n| / (2n - 1) times d^n / R^(n-1): 1/(3 sqrt 3) for n = 3, 1/8 for 4, 0.083 for 5. D is the largest
 // distance of a block's centre from the patch's origin, delta that of a pixel from its block's centre.
 constexpr float kFifthOrder = 0.14f;            // D^5/R^4, with room for higher orders; the gradient adds delta D^4/R^4

@@ -33,7 +33,7 @@ struct alignas(64) Patch {
   double origin[3], step_x[3], step_y[3], up[3];
   float xx, xy, yy, xh, yh;         // products of step_x, step_y and up
   float block_reach, pixel_reach;   // D and delta: largest |d|, largest distance of a pixel from its block's centre
-  float fifth, third, shared, own;  // errors of a leg's series (engine.md, "Neglected per leg"), without powers of 1/R
+  float fifth, third, shared, own;  // errors of a one-way path's series (engine.md, "Paths"), without powers of 1/R
   float rise_max, height_max;       // largest |rise|, and largest height above or below the plane
   int64_t row, column;              // of the first pixel
   int64_t rows, columns;            // number of pixels
