@@ -65,7 +65,7 @@ def cross_range_resolution_m(frequency_hz: float, slant_range_m: float, aperture
 
 
 def coherence_of_snr(snr: float, pulses: int) -> float:
-    """Return the coherence factor Γ = (SNR + 1/M)/(SNR + 1) of M equal echoes with a power SNR per compressed pulse.
+    """Return the coherence factor Γ = (SNR + 1/M)/(SNR + 1) of M equal echoes at a power SNR per compressed pulse.
 
     Examples
     --------
@@ -76,7 +76,7 @@ def coherence_of_snr(snr: float, pulses: int) -> float:
 
 
 def snr_of_coherence_factor(coherence: float, pulses: int) -> float:
-    """Return the power SNR per compressed pulse at which M equal echoes in white noise have a coherence factor.
+    """Return the power SNR per compressed pulse at which M equal echoes have a given coherence factor.
 
     Notes
     -----
