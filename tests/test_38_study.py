@@ -163,7 +163,7 @@ def test_errors_along_the_sidelink_cancel_only_where_both_nodes_share_them():
     both = position_claims(draws=1)[-1]
     assert (both.about, both.verdict) == (PAPER, AGREES)
     alone_cm = 1 - 2.35 / np.hypot(2.35, np.hypot(15, 10))  # the sidelink grows by 1 cm, the echo's path by less
-    assert f"of one node alone, of which the paper says nothing, leaves {alone_cm:.2f} cm" in both.note
+    assert f"of a single node, which the paper does not discuss, leaves {alone_cm:.2f} cm" in both.note
 
 
 def test_a_bistatic_path_errs_at_worst_by_the_root_of_two_more_than_a_monostatic_one():
@@ -352,7 +352,7 @@ def test_a_row_says_whose_value_it_is_compared_with_and_hides_no_difference():
     # what rounds to the printed digits agrees, and nothing else does
     assert [compare("x", value, "1", paper="2.0").verdict for value in (2.049, 2.06)] == [AGREES, DISAGREES]
     assert compare("x", 1.0, "1", independent_model=1.0).about == MODEL
-    with pytest.raises(ValueError, match="neither"):
+    with pytest.raises(ValueError, match="no value of the paper or of a model"):
         compare("x", 1.0, "1", within=0.1)
 
 
