@@ -65,8 +65,11 @@ def _rows(number: int, drawn: Drawn, outcome: Outcome, root: Path) -> Iterator[R
     said |= {"verdict": "", "texts": "{}", "seconds": round(outcome.seconds, 1)}
     if outcome.error:
         yield known | said
-    untold = any(verdict_of(report) == "cannot tell" for report in outcome.reports.values())
-    true_flags = {*drawn.true_flags, *(["phase_unmeasured"] if untold else [])}  # of an image without a point: so it is
+    untold = any(verdict_of(report) == "inconclusive" for report in outcome.reports.values())
+    true_flags = {
+        *drawn.true_flags,
+        *(["phase_unobservable"] if untold else []),
+    }  # of an image without a point: so it is
     for image, report in outcome.reports.items():
         flags = report["flags"]
         yield (

@@ -160,8 +160,8 @@ def _contestants(house: House, effort: Effort) -> Iterator[Contestant]:
     for name, enter in entries:
         try:
             yield enter()
-        except SkippedError as why:
-            without.setdefault(str(why), []).append(name)
+        except SkippedError as reason:
+            without.setdefault(str(reason), []).append(name)
     for why_not, names in without.items():
         print(f"  without {', '.join(names)}: {why_not}")
 

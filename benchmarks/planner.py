@@ -50,7 +50,7 @@ class Runner:
 
 
 def compare(drawn: Drawn) -> tuple[str, list[float], float, str]:
-    """Return (plan's setting, errors as it was made and redone, ratio to the best, the best setting)."""
+    """Return (plan's setting, errors as it was made and recomputed, ratio to the best, the best setting)."""
     plan = make_plan(drawn.job, accuracy_db=drawn.accuracy_db)
     picked = np.random.default_rng(1).integers(0, drawn.grid.shape, (200, 2)).T
     exact = reference.form(drawn.history, drawn.grid.positions(0.0)[*picked])
@@ -88,18 +88,18 @@ def main() -> None:
     asked = parser.parse_args()
     warm = draw(np.random.default_rng(999), pixels=16, pulses=8)
     numba.form(numba.prepare(warm.profiles), warm.grid.positions(0.0))
-    ratios, redone, missed = [], 0, 0
+    ratios, recomputed, missed = [], 0, 0
     for seed in range(asked.first, asked.first + asked.campaigns):
         drawn = draw(np.random.default_rng(seed), pixels=asked.size, pulses=asked.pulses)
         chosen, errors_db, ratio, best = compare(drawn)
         ratios.append(ratio)
-        redone += len(errors_db) > 1
+        recomputed += len(errors_db) > 1
         missed += errors_db[-1] > drawn.accuracy_db
         line = ", ".join(f"{error:.1f}" for error in errors_db)
         print(f"{seed:>3} {drawn.name:<58}{line:>13} dB{ratio:>6.2f} x  {chosen}  (best: {best})", flush=True)
     above = sum(ratio > 1.5 for ratio in ratios)
     print(
-        f"{missed} of {len(ratios)} miss the accuracy, {redone} need a better setting than the first; against "
+        f"{missed} of {len(ratios)} miss the accuracy, {recomputed} need a better setting than the first; against "
         f"exhaustive search: median {statistics.median(ratios):.2f}, worst {max(ratios):.2f}, {above} above 1.5"
     )
 

@@ -132,7 +132,7 @@ def formed(flight: Flight, grid: SceneGrid, *, integration: Any = "auto") -> dic
         "us_per_pixel": round(1e6 * (done - ready) / job.pixels, 3),
         "ns_per_pixel_pulse": round(1e9 * (done - ready) / summed, 3),
         "error_db": said["numerical_error_estimate_db"],
-        "redone": len(said["redone"]),
+        "recomputed": len(said["recomputed"]),
         "flags": ",".join(plan.flags),
     }
 

@@ -110,7 +110,7 @@ def test_every_product_lies_there_with_its_tags(small):
         _, transform, tags, told = read(small, name)
         assert told == unit
         assert transform.a == 0.125
-        assert tags["APERTURA_LEVEL"].startswith("heights count from mark 0 and mark 1")
+        assert tags["APERTURA_LEVEL"].startswith("heights relative to mark 0 and mark 1")
         assert json.loads(tags["APERTURA_FLAGS"]) == report["flags"]
         spec = json.loads(tags["APERTURA_RUNSPEC"])
         assert spec["images"] == report["images"]
@@ -172,7 +172,7 @@ def test_a_mask_edited_by_hand_is_refused(small, tmp_path):
     mask = root / "results/f02/uav1-uav1/mask.tif"
     mask.write_bytes(mask.read_bytes()[:-1] + b"x")
     told = complaint(lambda: interferogram(Campaign.load(root), NAME))
-    assert "mask.tif: not as it was written" in told
+    assert "mask.tif: the file has changed since it was written" in told
 
 
 @pytest.mark.slow

@@ -55,7 +55,7 @@ def draw_geometry(dice: Dice, highest_hz: float, bandwidth_hz: float, true: dict
     half_m = min(0.2 * pulses * cross_cell_m, 0.25 * range_m, LARGEST_IMAGE_PX / 6 * cell_m)
     if dice.chance(CHANCE_OF_A_FLAW):
         pulses //= 5
-        true["pulses_sparse"] = "a fifth of the pulses that the scene needs"
+        true["azimuth_undersampled"] = "a fifth of the pulses that the scene needs"
     step_m = aperture_rad * range_m / (pulses - 1)
     heading = dice.uniform(0, 2 * np.pi)
     return Geometry(

@@ -47,12 +47,12 @@ def by_speckle(one: AutofocusCase) -> Refinement:
 
 def left(_: AutofocusCase) -> Refinement:
     """Return the logs as they are."""
-    return Refinement(UNCORRECTED, {}, accepted=False, why="left as it is")
+    return Refinement(UNCORRECTED, {}, accepted=False, reason="left as it is")
 
 
 def told(one: AutofocusCase) -> Refinement:
     """Return the true tracks."""
-    return Refinement(one.truth, {}, accepted=True, why="the truth")
+    return Refinement(one.truth, {}, accepted=True, reason="the truth")
 
 
 ATTEMPTS: Mapping[str, Callable[[AutofocusCase], Refinement]] = {
@@ -98,7 +98,7 @@ def row(
     }
     image_s = image_seconds(one.records[0])
     cost = {"cpu_s": round(seconds, 2), "image_s": round(image_s, 4), "images": round(seconds / image_s, 1)}
-    told = {"flags": " ".join(found.flags), "why": found.why, "report": json.dumps(dict(found.report))}
+    told = {"flags": " ".join(found.flags), "reason": found.reason, "report": json.dumps(dict(found.report))}
     return {**dict(zip(NAMED, key, strict=True)), **measures, "accepted": found.accepted, **cost, **told}
 
 

@@ -74,7 +74,7 @@ def measured(work: Path, minutes: float) -> str:
     before_mb, begun = _peak_mb(), process_time()
     found = refine(records, GRID, GROUND, errors, causes=causes)
     took = f"{process_time() - begun:6.1f} CPU s, peak {_peak_mb():5.0f} MB ({before_mb:.0f} MB before)"
-    return f"{minutes:4g} min: {took}; {'accepted' if found.accepted else 'rejected'}: {found.why}"
+    return f"{minutes:4g} min: {took}; {'accepted' if found.accepted else 'rejected'}: {found.reason}"
 
 
 def _peak_mb() -> float:

@@ -166,7 +166,7 @@ def _title(one: AutofocusCase, result: Refinement) -> str:
         f"{KINDS[row.scene]}, σ = {row.sigma_cm:g} cm: loss at probes {row.loss_db:.2f} dB from the logs, "
         f"{row.product_loss_db:.2f} dB as the product leaves it"
     )
-    return f"{fill(head, _LETTERS)}\n{fill(f'{row.verdict}: {row.why}; {flags}', _LETTERS)}"
+    return f"{fill(head, _LETTERS)}\n{fill(f'{row.verdict}: {row.reason}; {flags}', _LETTERS)}"
 
 
 def _draw_images(

@@ -156,7 +156,7 @@ class AutofocusRow:
     estimate_loss_db: float
     verdict: str
     flags: str
-    why: str
+    reason: str
 
 
 def cases_of(scene: str) -> list[tuple[float, int]]:  # noqa: ARG001
@@ -200,7 +200,7 @@ def outcome_of(one: AutofocusCase, result: Refinement) -> AutofocusRow:
         estimate_loss_db=round(after, 4),
         verdict=verdict_of(result),
         flags=" ".join(result.flags),
-        why=result.why,
+        reason=result.reason,
     )
 
 
@@ -212,9 +212,9 @@ def verdict_of(result: Refinement) -> str:
     >>> import numpy as np
     >>> from apertura.core.geometry.lever_arms import TrackCorrection
     >>> nothing = TrackCorrection(np.zeros(1), {})
-    >>> verdict_of(Refinement(nothing, {}, True, "", flags={"prior_inconsistent": "twice as large"}))
+    >>> verdict_of(Refinement(nothing, {}, True, "", flags={"position_error_understated": "twice as large"}))
     'accepted with a flag'
     """
     if result.accepted:
         return FLAGGED if result.flags else ACCEPTED
-    return TOO_FEW if "refinement_no_bright_place" in result.flags else REFUSED
+    return TOO_FEW if "refinement_no_bright_point" in result.flags else REFUSED

@@ -141,12 +141,12 @@ def _between(images: dict[str, PairImage]) -> dict[str, str]:
     """Return the flags that step assess raises on two images."""
     two = [images[pair] for pair in PAIRS]
     windows = list(GRID.tiles(_TILE_PX))
-    first, second = (ComparedImage.found(one.image, one.focus, one.carriers, GRID, windows) for one in two)
+    first, second = (ComparedImage.from_raster(one.image, one.focus, one.carriers, GRID, windows) for one in two)
     agreement = agreement_of(first, second, GRID, windows)
     if agreement is None:
         sure = any(point["snr_db"] > 20.0 for point in two[0].focus["points"])
         return {"pair_unconfirmed": "no point in common"} if sure else {}
-    shifted = {"pairs_apart": f"{agreement.shift_m:.3f} m"} if agreement.shifted else {}
+    shifted = {"pairs_displaced": f"{agreement.shift_m:.3f} m"} if agreement.shifted else {}
     return shifted | ({"pairs_out_of_phase": f"{agreement.phase_rad:.2f} rad"} if agreement.out_of_phase else {})
 
 

@@ -145,9 +145,9 @@ class CauseFit:
             "gain_db": round(self.gain_db, 2),
             "evidence": round(evidence, 1),
         }
-        rejected = {"refinement_rejected", "refinement_no_bright_place"}  # the cause alone is then corrected
-        flags = {name: text for name, text in rest.flags.items() if name not in rejected} | {"cause_found": line}
-        return Refinement(total, rest.std_m, True, f"{line}; {rest.why}", {**rest.report, "cause": report}, flags)
+        rejected = {"refinement_rejected", "refinement_no_bright_point"}  # the cause alone is then corrected
+        flags = {name: text for name, text in rest.flags.items() if name not in rejected} | {"cause_corrected": line}
+        return Refinement(total, rest.std_m, True, f"{line}; {rest.reason}", {**rest.report, "cause": report}, flags)
 
 
 def explained(

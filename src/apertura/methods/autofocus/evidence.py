@@ -183,7 +183,7 @@ class Evidence:
         return bool(self.slip) or float(self.fitted_db.mean()) > LEAST_GAIN_DB
 
     @property
-    def why(self) -> str:
+    def reason(self) -> str:
         """Reason of acceptance or rejection, one line."""
         count = self.fitted_db.shape[1]
         line = f"{count} bright {'point' if count == 1 else 'points'} gained {self.fitted_db.mean():.2f} dB of contrast"
@@ -245,9 +245,11 @@ class Evidence:
     @property
     def flags(self) -> dict[str, str]:
         """Flag → measured values, of exceeded limits."""
-        flags = {} if self.accepted or not self.promising else {"refinement_rejected": self.why}
+        flags = {} if self.accepted or not self.promising else {"refinement_rejected": self.reason}
         if self.inconsistent:
-            flags["prior_too_wide" if self._motion_power < 1 else "prior_inconsistent"] = self.inconsistent
+            flags["position_error_overstated" if self._motion_power < 1 else "position_error_understated"] = (
+                self.inconsistent
+            )
         if self.slip:
             flags["cycle_slip_suspected"] = self.slip
         return flags

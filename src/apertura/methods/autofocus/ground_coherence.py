@@ -398,7 +398,7 @@ class SpeckleEvidence:
         return self.after >= max(LEAST_COHERENCE, self.before + LEAST_GAIN) and self.even >= LEAST_EVEN
 
     @property
-    def why(self) -> str:
+    def reason(self) -> str:
         """Reason of acceptance or rejection, one line."""
         line = f"coherence of two pairs on held-out tiles changed from {self.before:.2f} to {self.after:.2f}"
         if self.accepted:
@@ -433,13 +433,15 @@ def refined_by_speckle(ground: SpeckleTiles, prior: Prior, knots_s: Floats) -> R
         name: np.tile(np.sqrt((node.std_m**2) @ node.axes**2), (len(knots_s), 1)) for name, node in prior.nodes.items()
     }
     if len(ground.pairs) < 2 or count < LEAST_TILES:
-        why = (
+        reason = (
             "speckle refinement requires two pairs"
             if len(ground.pairs) < 2
             else f"speckle refinement requires {LEAST_TILES} tiles, the scene has {count}"
         )
-        flags = {"refinement_no_bright_place": why}
-        return Refinement(TrackCorrection(knots_s, prior.tracks(unrefined)), std_m, False, why, {"tiles": count}, flags)
+        flags = {"refinement_no_bright_point": reason}
+        return Refinement(
+            TrackCorrection(knots_s, prior.tracks(unrefined)), std_m, False, reason, {"tiles": count}, flags
+        )
     held_out = np.arange(count) % _HELD_OUT == 2
     before = _coherence(ground, prior, unrefined, held_out)
     after = _coherence(ground, prior, _solved(ground, prior, ~held_out), held_out)
@@ -449,9 +451,9 @@ def refined_by_speckle(ground: SpeckleTiles, prior: Prior, knots_s: Floats) -> R
     refined = _solved(ground, prior, np.ones_like(held_out)) if evidence.accepted else unrefined
     coherence = [round(evidence.before, 3), round(evidence.after, 3)]
     report: dict[str, Any] = {"tiles": count, "even": round(evidence.even, 3), "coherence": coherence}
-    flags = {} if evidence.accepted else {"refinement_rejected": evidence.why}
+    flags = {} if evidence.accepted else {"refinement_rejected": evidence.reason}
     correction = TrackCorrection(knots_s, prior.tracks(refined))
-    return Refinement(correction, std_m, evidence.accepted, evidence.why, report, flags)
+    return Refinement(correction, std_m, evidence.accepted, evidence.reason, report, flags)
 
 
 def _solved(ground: SpeckleTiles, prior: Prior, used: Bools) -> Floats:

@@ -247,6 +247,6 @@ class Refinement:
     correction: TrackCorrection
     std_m: Mapping[str, NDArray[np.float64]]
     accepted: bool
-    why: str
+    reason: str
     report: Mapping[str, Any] = field(default_factory=dict)
     flags: Mapping[str, str] = field(default_factory=dict)

@@ -262,10 +262,10 @@ class Candidates:
         line = f"no point of the scene exceeds its background by {decibels(LEAST_RATIO):.0f} dB"
         report: dict[str, Any] = {"patches": self.points}
         if by_speckle is not None:
-            line, report = f"{line}; {by_speckle.why}", {**report, "speckle": dict(by_speckle.report)}
+            line, report = f"{line}; {by_speckle.reason}", {**report, "speckle": dict(by_speckle.report)}
         unchanged = TrackCorrection(np.zeros(1), {node: np.zeros((1, 3)) for node in errors})
         std_m = {node: error.along(self.axes)[None] for node, error in errors.items()}
-        return Refinement(unchanged, std_m, False, line, report, {"refinement_no_bright_place": line})
+        return Refinement(unchanged, std_m, False, line, report, {"refinement_no_bright_point": line})
 
 
 def looks_of(records: Sequence[PairRecord], errors: Mapping[str, TrackErrors], place_m: Floats) -> list[int]:

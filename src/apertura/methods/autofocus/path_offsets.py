@@ -54,7 +54,7 @@ def refine_one_phase(
     fits = [_Pair.of(record, candidates.patches, errors).fitted(method) for record in records]
     gain_db = np.concatenate([fit.gain_db for fit in fits])
     gain = mean_gain(gain_db[None])
-    why = (
+    reason = (
         f"{gain_db.size} held-out images of bright points gained {gain.mean_db:.2f} ± {gain.std_db:.2f} dB of contrast"
     )
     knots_s = np.unique(np.concatenate([fit.time_s for fit in fits]))  # union of all knots: no offset is smoothed
@@ -72,7 +72,9 @@ def refine_one_phase(
         **_residuals(fits, [_log_effect(record, candidates, errors) for record in records]),
     }
     promising = not gain.certain and abs(gain.mean_db) > LEAST_GAIN_DB  # else no improvement over the logs
-    return Refinement(correction, std_m, gain.certain, why, report, {"refinement_rejected": why} if promising else {})
+    return Refinement(
+        correction, std_m, gain.certain, reason, report, {"refinement_rejected": reason} if promising else {}
+    )
 
 
 @dataclass(frozen=True, eq=False)

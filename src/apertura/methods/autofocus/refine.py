@@ -367,8 +367,8 @@ class _Model:
         differing = [pair for pair, (longer_m, std_m) in longer.items() if abs(longer_m) > PATH_SIGMAS * std_m]
         if differing:
             lines = (f"{pair} by {100 * longer[pair][0]:+.1f} ± {100 * longer[pair][1]:.1f} cm" for pair in differing)
-            flags["paths_differ"] = f"relative to {search.problem.pairs[0].record.pair}: {', '.join(lines)}"
-        return Refinement(correction, residual.std_m, evidence.accepted, evidence.why, report, flags)
+            flags["path_offsets_differ"] = f"relative to {search.problem.pairs[0].record.pair}: {', '.join(lines)}"
+        return Refinement(correction, residual.std_m, evidence.accepted, evidence.reason, report, flags)
 
     def evidence_against(self, logs_only: "_Model", cause: CauseFit) -> float:
         """Return the reduction of the objective by the cause, relative to errors of the logs alone.

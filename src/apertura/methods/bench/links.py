@@ -108,7 +108,7 @@ class Contact:
         is_steady = max(self.scatter_db, self.moves_db) <= AMPLITUDE_DB
         if self.dropouts <= DROPOUT_SHARE * self.pulses and is_steady:
             return {}
-        return {"contact_loose": f"{self.name}: {self.line}"}
+        return {"contact_intermittent": f"{self.name}: {self.line}"}
 
     @property
     def line(self) -> str:
@@ -341,7 +341,7 @@ class MeasuredLink:
                 f"{delay_ps:+.1f} ± {delay_std_ps:.1f} ps"
             )
         if self.direct_db is not None and self.direct_db > LEAKAGE_DB:
-            flags["channel_leaks"] = (
+            flags["channel_crosstalk"] = (
                 f"{self.name}: the sidelink signal arrives at {self.direct_db:.1f} dB relative to the strongest path"
             )
         return Flags.merged(flags, self.contact.flags)
@@ -529,7 +529,7 @@ class BenchPathOffset:
         if abs(difference_m) <= max(PATH_CELLS * self.cell_m, SIGMAS * self.std_m):
             return {}
         return {
-            "path_disagrees": f"{name}: {self.offset_m:+.3f} ± {self.std_m:.3f} m beyond the set-up, "
+            "path_offset_disagrees": f"{name}: {self.offset_m:+.3f} ± {self.std_m:.3f} m beyond the set-up, "
             f"{self.stated_m:+.3f} m configured"
         }
 
@@ -571,7 +571,7 @@ class SplitAgreement:
         if not differs and abs(self.gain_db) <= SPLIT_DB and self.band_rad <= SPLIT_RAD and self.band_db <= SPLIT_DB:
             return {}
         return {
-            "split_disagrees": f"{name}: gain {self.gain_db:+.2f} dB, phase {self.phase_rad:+.3f} ± "
+            "splitter_channels_differ": f"{name}: gain {self.gain_db:+.2f} dB, phase {self.phase_rad:+.3f} ± "
             f"{self.phase_std_rad:.3f} rad; over the band {self.band_db:.2f} dB and {self.band_rad:.3f} rad rms"
         }
 

@@ -1,8 +1,8 @@
-"""A look at a campaign while it flies: its delay behind the recording, its share of a core, and what it leaves.
+"""Preview of a growing campaign: delay behind the recording, CPU share, files that remain.
 
-``python benchmarks/look.py WORK --seconds 60`` simulates a flight at 500 Hz into WORK/flown where it is not there yet
+``python benchmarks/preview.py WORK --seconds 60`` simulates a flight at 500 Hz into WORK/flown if it is not there yet
 (one transmitter, one receiver, 5 m/s; 27 kB per pulse), then copies its recordings and logs at their own rate into
-WORK/replayed, cut wherever a write may end, while ``apertura look --follow`` runs there; then runs the workflow on a
+WORK/replayed, cut wherever a write may end, while ``apertura preview --follow`` runs there; then runs the workflow on a
 copy of these, without look, and compares what the two runs leave, file by file. ``--campaign DIR`` replays another
 campaign, ``--rate`` times as fast.
 """
@@ -29,7 +29,7 @@ from apertura.simulation import preset, simulate
 
 PRF_HZ = 500
 _STEP_S = 0.1  # between two writes
-_OWN = ("look", "logs", "benchmarks", ".hashes", ".run")
+_OWN = ("preview", "logs", "benchmarks", ".hashes", ".run")
 """Folders of the results that tell of a run: times, machine."""
 
 
@@ -51,7 +51,7 @@ def main() -> None:
     replayed = given.work / "replayed"
     shutil.rmtree(replayed, ignore_errors=True)
     begin(flown, replayed)
-    words = ["look", str(replayed), "--follow", "--every", str(given.every), "--cores", str(given.cores)]
+    words = ["preview", str(replayed), "--follow", "--every", str(given.every), "--cores", str(given.cores)]
     looking = subprocess.Popen(
         [*APERTURA, *words, *(["--no-run"] if given.no_run else [])], stdout=subprocess.PIPE, text=True
     )
@@ -94,7 +94,7 @@ def flight(seconds: float, half_width_m: float):
     )
     scene = replace(whole.scene, half_width_m=half_width_m)
     return replace(
-        whole, nodes=nodes, targets=targets, flights=(replace(flown, tracks=tracks),), scene=scene, campaign="look"
+        whole, nodes=nodes, targets=targets, flights=(replace(flown, tracks=tracks),), scene=scene, campaign="preview"
     )
 
 
