@@ -114,7 +114,7 @@ def test_the_order_of_i_and_q_of_a_node_overrides_that_of_the_waveform_of_sample
     settings = validated(document, where="config.yaml")
     assert [settings.iq_of(node) for node in ("uav1", "uav2")] == ["swapped", "conjugate"]
     document = yaml.safe_load(config_template("fmcw")) | {"nodes": {"uav1": {"iq": "conjugate"}}}
-    with pytest.raises(CampaignError, match=r"nodes\.uav1\.iq is of recorded samples"):
+    with pytest.raises(CampaignError, match=r"nodes\.uav1\.iq applies to recorded samples only"):
         validated(document, where="config.yaml")
 
 
@@ -159,14 +159,20 @@ def test_of_a_compound_crs_pixels_lie_in_the_horizontal_part(asked, taken):
 @pytest.mark.parametrize(
     ("asked", "told"),
     [
-        ({"crs": "EPSG:32632+5773"}, "says heights of egm96, height_datum says 'ellipsoid'"),
-        ({"crs": "EPSG:32632+7837", "height_datum": "egm96"}, "says heights of EPSG:7837, height_datum says 'egm96'"),
-        ({"crs": "EPSG:32632+3855", "dem": "d.tif", "dem_datum": "egm96"}, "says heights of egm2008, dem_datum says"),
-        ({"crs": "+proj=utm +zone=32"}, "only authority and code such as EPSG:32632"),
-        ({"crs": "+init=/elsewhere/file:9"}, "only authority and code such as EPSG:32632"),
-        ({"crs": "urn:ogc:def:crs:EPSG::32632"}, "only authority and code such as EPSG:32632"),
-        ({"crs": "EPSG:32632+geoidgrids=x"}, "only authority and code such as EPSG:32632"),
-        ({"crs": "EPSG:32632\n"}, "only authority and code such as EPSG:32632"),
+        ({"crs": "EPSG:32632+5773"}, "has the vertical datum egm96, but height_datum is 'ellipsoid'"),
+        (
+            {"crs": "EPSG:32632+7837", "height_datum": "egm96"},
+            "has the vertical datum EPSG:7837, but height_datum is 'egm96'",
+        ),
+        (
+            {"crs": "EPSG:32632+3855", "dem": "d.tif", "dem_datum": "egm96"},
+            "has the vertical datum egm2008, but dem_datum is",
+        ),
+        ({"crs": "+proj=utm +zone=32"}, "must be authority and code such as EPSG:32632"),
+        ({"crs": "+init=/elsewhere/file:9"}, "must be authority and code such as EPSG:32632"),
+        ({"crs": "urn:ogc:def:crs:EPSG::32632"}, "must be authority and code such as EPSG:32632"),
+        ({"crs": "EPSG:32632+geoidgrids=x"}, "must be authority and code such as EPSG:32632"),
+        ({"crs": "EPSG:32632\n"}, "must be authority and code such as EPSG:32632"),
     ],
 )
 def test_heights_of_a_crs_that_are_not_those_stated_and_texts_of_proj_are_refused(asked, told):
@@ -182,4 +188,4 @@ def test_bounds_that_are_no_multiple_of_the_spacing_name_the_nearest_and_no_keys
     assert "10.1, 10.0] is 40.4 × 40 pixels of 0.25 m; the nearest whole grid is [0.0, 0.0, 10.0, 10.0]" in str(
         refused.value
     )
-    assert refused.value.expected == "values that go together"
+    assert refused.value.expected == "consistent values"

@@ -142,7 +142,9 @@ def test_the_air_of_a_scene_is_a_keyword_from_python_for_transfer_functions_and_
         image = ap.backproject(recorded, GRID, atmosphere=stated, **quick)
         assert np.abs(image.values - by_speed.values).max() < 2e-3 * np.abs(by_speed.values).max()
     assert np.abs(ap.backproject(given, GRID, **quick).values - by_speed.values).max() > 0.1
-    with pytest.raises(CampaignError, match="expected auto, vacuum, an Atmosphere, or N units"):
+    with pytest.raises(
+        CampaignError, match="expected auto, vacuum, an Atmosphere, or the refractivity at the terrain in N units"
+    ):
         ap.backproject(given, GRID, atmosphere="dry")
 
 

@@ -143,7 +143,9 @@ def test_an_automatic_grid_has_no_more_pixels_than_the_pass_recorded_samples_for
     campaign = replace(campaign, settings=campaign.settings.model_copy(update={"scene": scene}))
     grid, _, chosen = settled(campaign, lambda: flown)
     assert np.prod(grid.shape) <= 9 * 100 * 512
-    assert "than the 0.461 Mpx that this pass fills: state scene.bounds_m" in chosen["spacing_m"]
+    assert (
+        "than the limit of 0.461 Mpx for this flight; for a finer spacing, state scene.bounds_m" in chosen["spacing_m"]
+    )
     small = campaign.settings.model_copy(update={"scene": Scene(crs="local", bounds_m=(-200, -200, 200, 200))})
     grid, _, chosen = settled(replace(campaign, settings=small), lambda: flown)  # bounds that somebody wants stay fine
     assert chosen["spacing_m"].startswith("a third of the finest resolution cell")

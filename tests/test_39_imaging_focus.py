@@ -43,13 +43,13 @@ def echo_of(places, *, noise=1e-3, seed=1):
 def test_an_echo_that_the_scene_has_no_range_for_is_elsewhere():
     line = echo_outside_scene(echo_of(np.array([[0.0, 40.0, 0.0]])), GRID, GROUND)
     assert "has a total path of 12" in line  # 2·√(60² + 10²) = 121.7 m
-    assert "the scene's are" in line
+    assert "those of the scene are" in line
 
 
 def test_a_strong_echo_that_no_place_gathers_is_said_to_be():
     """Asked only where no bright point was found: a point in the scene's own ranges is then at no place."""
     line = echo_outside_scene(echo_of(np.zeros((1, 3))), GRID, GROUND)
-    assert "no place of the image gathers it" in line
+    assert "no pixel of the image focuses it" in line
 
 
 def test_points_that_share_a_range_cell_are_no_echo_from_elsewhere():
@@ -57,11 +57,11 @@ def test_points_that_share_a_range_cell_are_no_echo_from_elsewhere():
     east = np.array([-2.6, 0.0, 2.6])
     places = np.column_stack([east, np.sqrt(400 - east**2) - 20, 0 * east])
     history = echo_of(places)
-    assert "no place of the image gathers it" in echo_outside_scene(history, GRID, GROUND)
+    assert "no pixel of the image focuses it" in echo_outside_scene(history, GRID, GROUND)
     terms = list(reference.terms(history, places).T)
     assert echo_outside_scene(history, GRID, GROUND, points=terms) is None
     elsewhere = list(reference.terms(history, places + [1.5, 0.0, 0.0]).T)
-    assert "no place of the image gathers it" in echo_outside_scene(history, GRID, GROUND, points=elsewhere)
+    assert "no pixel of the image focuses it" in echo_outside_scene(history, GRID, GROUND, points=elsewhere)
 
 
 @pytest.mark.slow

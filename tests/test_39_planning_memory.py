@@ -13,9 +13,9 @@ from apertura.stages.planning import check_fits
 def test_a_job_that_does_not_fit_is_refused_with_the_numbers():
     planned = plan(shape=(20000, 20000))
     check_fits(planned, free_disk=planned.disk_bytes, where="f01/a-b", memory=planned.memory_bytes)
-    with pytest.raises(CampaignError, match=r"f01/a-b: imaging needs .* of memory; expected at most the 1.0 MB"):
+    with pytest.raises(CampaignError, match=r"f01/a-b: image formation requires .* of memory; expected at most 1.0 MB"):
         check_fits(planned, free_disk=None, where="f01/a-b", memory=1_000_000)
-    with pytest.raises(CampaignError, match=r"the results need 30.4 GB on disk; expected at most the 5.0 GB"):
+    with pytest.raises(CampaignError, match=r"the results require 30.4 GB on disk; expected at most 5.0 GB"):
         check_fits(planned, free_disk=5_000_000_000, where="f01/a-b", memory=planned.memory_bytes)
 
 
@@ -63,7 +63,7 @@ def test_a_long_flight_is_summed_in_blocks_whatever_memory_there_is():
 @pytest.mark.slow
 def test_pulse_blocks_can_be_asked_for_and_hold_64_pulses_or_more():
     assert plan(overrides={"pulse_blocks": 3}).setting.pulse_blocks == 3
-    assert "asked for" in plan(overrides={"pulse_blocks": 3}).reasons["pulse_blocks"]
+    assert "requested" in plan(overrides={"pulse_blocks": 3}).reasons["pulse_blocks"]
     assert plan(overrides={"pulse_blocks": 100}).setting.pulse_blocks == 300 // 64
 
 

@@ -74,27 +74,27 @@ def dem_beside_the_track(root):
 SPOILT = {
     "wide scene": (wider, "echoes of the scene arrive after the cyclic prefix"),
     "in the ground": (a_few_in_the_ground, "is in or below the ground of the scene, worst at pulse"),
-    "beam to the other side": (antenna([-90.0, 0.0]), "zero pulses in the beam"),
-    "beam to the sky": (antenna([90.0, 80.0]), "zero pulses in the beam"),
+    "beam to the other side": (antenna([-90.0, 0.0]), "no pulse illuminates the scene"),
+    "beam to the sky": (antenna([90.0, 80.0]), "no pulse illuminates the scene"),
     "sums of pulses under a beam": (antenna([90.0, 0.0], 120.0, presum=4), "presum is 4, and the antennas have beams"),
     "sums of many pulses": (processing(presum=64), "presum is 64"),
     "a DEM that is none": (processing(terrain="dem"), "terrain is dem"),
     "an engine that is not here": (processing(engine="cuda"), "engine cuda cannot run here"),
     "an angle of one pulse": (
         processing(integration={"degrees": 0.001}),
-        "no more than 2 pulses see the scene inside",
+        "at most 2 pulses illuminate a pixel inside",
     ),
     "another's scheduler": (processing(scheduler="tcp://127.0.0.1:9999"), "DASK_SCHEDULER_ADDRESS is not set"),
     "a log with a hole": (
         lambda root: edit_track(root, "uav1", lambda lines: [*lines[:4], *lines[-3:]]),
-        "no pulse has a position",
+        "no pulse has a valid position",
     ),
     "codes too few": (codes, "complex64 of shape (1023,)"),
     "no sidelink": (metadata("uav2", apertura_channels=["radar", "spare"]), "a channel named 'sidelink'"),
     "another rate": (metadata("uav2", core_sample_rate=1e9), "recorded with sample_rate_hz"),
-    "no pulse in a segment": (segment, "no pulse of flight f01, pair uav1-uav1 inside"),
+    "no pulse in a segment": (segment, "no pulse of flight f01, pair uav1-uav1 within"),
     "a tag twice": (lambda root: edit_meta(root, "uav2", tag_twice), "not after the one before"),
-    "a DEM beside the track": (dem_beside_the_track, "under the track, where scene.bounds_m: auto starts from"),
+    "a DEM beside the track": (dem_beside_the_track, "below the track, which scene.bounds_m: auto requires"),
 }
 
 

@@ -89,8 +89,8 @@ def test_a_log_replaced_under_its_old_time_is_noticed_with_all_that_stands_on_it
     assert "results/f01/uav1-uav1/echo.manifest.json" not in found
     assert "results/f01/uav1-uav1/export.manifest.json" in found  # through the assessment
     assert list(stale_lines(found)) == [
-        f"results/f01/uav2/track.manifest.json: stale, {LOG} has changed",
-        f"{len(found) - 1} results stand on that: stale, too",
+        f"results/f01/uav2/track.manifest.json: out of date, {LOG} has changed",
+        f"{len(found) - 1} dependent results out of date as well",
     ]
     replace_keeping_times(path, data)
     assert stale_results(campaign) == {}
@@ -133,7 +133,7 @@ def test_what_changes_while_it_is_read_is_no_source(tmp_path):
     sources = Sources.of(tmp_path, ["raw.bin"])
     assert set(sources.unchanged()) == {"raw.bin"}
     path.write_bytes(bytes(11))
-    with pytest.raises(CampaignError, match=r"raw\.bin: changed while it was read"):
+    with pytest.raises(CampaignError, match=r"raw\.bin: the file changed while it was read"):
         sources.unchanged()
 
 
@@ -177,7 +177,7 @@ def test_a_result_without_its_source_or_with_a_damaged_manifest_is_stale(finishe
     (finished / "results/f01/uav1/track.manifest.json").unlink()
     (finished / "results/cube.manifest.json").write_text("{")
     found = stale_results(campaign)
-    assert "results/f01/uav1/track.manifest.json is gone" in found["results/f01/uav1-uav1/echo.manifest.json"]
+    assert "results/f01/uav1/track.manifest.json is missing" in found["results/f01/uav1-uav1/echo.manifest.json"]
     assert found["results/cube.manifest.json"].startswith("its manifest is damaged")
 
 
@@ -216,8 +216,8 @@ def test_a_product_or_document_that_is_edited_or_gone_is_made_again(finished, fi
     else:
         path.write_bytes(path.read_bytes()[:-1] + b"x")
     found = stale_results(Campaign.load(finished))
-    reason = "is gone" if how == "gone" else "is not as it was written"
-    assert [why for why in found.values() if why] == [f"{path.name} {reason}"]
+    reason = "is missing" if how == "gone" else "has changed since it was written"
+    assert [reason for reason in found.values() if reason] == [f"{path.name} {reason}"]
 
 
 @pytest.mark.quick("0")
@@ -239,7 +239,7 @@ def test_what_was_edited_by_hand_is_kept_beside_what_is_made_again(finished, bef
 def test_a_stage_of_which_a_chunk_is_gone_is_made_again(finished):
     shutil.rmtree(finished / "results/f01/uav1-uav1/echo.zarr/path_removed")
     found = stale_results(Campaign.load(finished))
-    assert found["results/f01/uav1-uav1/echo.manifest.json"].endswith(" is gone")
+    assert found["results/f01/uav1-uav1/echo.manifest.json"].endswith(" is missing")
 
 
 def test_products_without_their_manifest_are_stale_and_their_report_is_not_believed(finished):
@@ -254,7 +254,10 @@ def test_products_without_their_manifest_are_stale_and_their_report_is_not_belie
 def test_a_report_that_was_edited_is_not_believed(finished):
     path = finished / "results/f01/fused/image.json"
     path.write_text(path.read_text().replace("focused", "perfect"))
-    with pytest.raises(CampaignError, match=r"image\.json: not as it was written; expected what export\.manifest"):
+    with pytest.raises(
+        CampaignError,
+        match=r"image\.json: the file has changed since it was written; expected the file listed in export\.manifest",
+    ):
         print_summary(Campaign.load(finished))
 
 
@@ -266,12 +269,12 @@ def test_a_damaged_document_is_not_read(finished, file):
     from apertura.stages.scene import settled_scene
 
     campaign = Campaign.load(finished)
-    with pytest.raises(CampaignError, match=r"not as they were written, first .*Delete .*manifest\.json"):
+    with pytest.raises(CampaignError, match=r"1 file differs from the manifest, first .*Delete .*manifest\.json"):
         (settled_scene(campaign), assessment_of(campaign, "f01"))
 
 
 def test_a_campaign_is_held_by_one_run_and_free_when_it_ends(tmp_path):
-    with hold(tmp_path), pytest.raises(CampaignError, match=f"another run holds this campaign: process {os.getpid()}"):
+    with hold(tmp_path), pytest.raises(CampaignError, match=f"locked by another run: process {os.getpid()}"):
         hold(tmp_path)
     hold(tmp_path).close()
 
@@ -297,7 +300,7 @@ def test_recordings_that_lie_elsewhere_overtake_nothing_and_nothing_is_wrong(fin
     campaign = archive(finished)
     assert stale_results(campaign) == {}
     assert (absent_files(campaign), wanted_files(campaign, {})) == (SAMPLES, {})
-    assert list(absent_lines(campaign)) == [f"not there, so results are not compared with it: {SAMPLES[0]} and 1 more"]
+    assert list(absent_lines(campaign)) == [f"missing recordings, not compared with results: {SAMPLES[0]} and 1 more"]
     assert problems(finished, without=["memory"]) == []
     assert Resources(campaign).work("f01", None, "uav1").pulses == 40
 

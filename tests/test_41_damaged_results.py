@@ -34,7 +34,7 @@ def test_a_damaged_result_is_named_and_to_be_deleted(tiny, content):
         "f01/uav1-uav1/image.json": lambda: print_summary(campaign),
     }
     for name, read in readers.items():
-        assert "no such file" in complaint(read) or "not there, or not finished" in complaint(read)
+        assert "no such file" in complaint(read) or "missing or unfinished" in complaint(read)
         (results / name).parent.mkdir(parents=True, exist_ok=True)
         (results / name).write_bytes(content)
         manifest = manifest_of(results / name)

@@ -92,8 +92,8 @@ def test_the_configs_of_the_how_to_are_valid(example):
 @pytest.mark.parametrize(
     ("changes", "told"),
     [
-        ({"bandwidth_hz": 0}, "no band above 0 Hz"),
-        ({"bandwidth_hz": -3e9}, "no band above 0 Hz"),
+        ({"bandwidth_hz": 0}, "not a band above 0 Hz"),
+        ({"bandwidth_hz": -3e9}, "not a band above 0 Hz"),
         ({"settle_s": 21e-6}, "samples per sweep"),
         ({"prf_hz": 60e3}, "longer than 1/prf_hz"),
         ({"format": "afrl_mat"}, "choose beat_npy, beat_mat, beat_wav"),
@@ -165,5 +165,5 @@ def test_missing_sweeps_are_counted_and_flagged(tmp_path):
     beat[60:100] = 0
     np.save(root / "raw/f01/uav1.npy", beat)
     attrs = recorded_echo(Campaign.load(root), "f01", "uav1-uav1").attrs
-    assert attrs["pulses"] == {"used": 160, "dropped": 40, "reasons": {"silent": 40}}
+    assert attrs["pulses"] == {"used": 160, "dropped": 40, "reasons": {"all samples zero": 40}}
     assert set(attrs["flags"]) == {"pulses_missing"}

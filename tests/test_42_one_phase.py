@@ -118,7 +118,7 @@ def test_a_method_that_is_asked_for_is_taken(campaigns, tmp_path):
     campaign = state(root, "processing", autofocus_method="phase_gradient")
     refine.refine(campaign, "f01")
     told = open_refined(campaign, "f01").stage.attrs
-    assert told["decisions"]["autofocus_method"] == {"value": "phase_gradient", "reason": "asked for"}
+    assert told["decisions"]["autofocus_method"] == {"value": "phase_gradient", "reason": "configured"}
     assert told["report"]["method"] == "phase_gradient"
     assert told["accepted"]
 

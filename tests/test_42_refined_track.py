@@ -25,7 +25,7 @@ from apertura.methods.autofocus.inputs import PairRecord, Refinement
 from apertura.simulation import ImageGrid, preset, simulate
 from apertura.stages import echo, image, profile, refine, scene, tracks
 from apertura.stages.acquisition import open_acquisition
-from apertura.stages.hypotheses import evidence_of, flown
+from apertura.stages.hypotheses import subset_geometry, with_logs
 from apertura.stages.pair import open_pair
 from apertura.stages.refine import RefinedTrack, RefinementInputs, clock_s, open_refined, reference_points
 from apertura.stages.scene import open_scene
@@ -75,10 +75,10 @@ def test_tracks_left_alone_have_no_knots_and_their_images_say_why(finished_tiny)
     assert stage.attrs["nodes"] == ["uav1", "uav2"]
     quality = quality_of(finished_tiny, "uav1-uav2")
     assert quality["autofocus"] == {
-        "decision": "off: auto: position accuracy of uav1 is not configured; state nodes.<node>.position_std_m to "
-        "have them refined",
+        "decision": "off: auto: position accuracy of uav1 is not configured; set nodes.<node>.position_std_m to "
+        "have the tracks refined",
         "accepted": False,
-        "why": "images are formed from the logs as they are",
+        "reason": "images are formed from the unchanged logs",
     }
     assert quality["models"]["autofocus"].startswith("off: auto: position accuracy")
 
@@ -142,7 +142,7 @@ def test_images_of_a_corrected_track_are_those_of_the_true_one(spoilt, finished_
         assert [line for line in quality["budget"] if line["cause"] == "positions"] == [
             {
                 "cause": "positions",
-                "stated": "error remaining after refinement",
+                "stated": "residual error after track refinement",
                 "loss_db": -0.05,
                 "shift_m": 0.01,
                 "phase_rad": 0.1,
@@ -189,8 +189,8 @@ def test_hypotheses_begin_where_the_images_do(spoilt):
     nodes = {name: track.node(node) for name, node in logged.items()}
     for name in PAIRS:
         pair = open_pair(campaign, "f01", name)
-        told = evidence_of(logged, name, PairEcho.opened(campaign, "f01", name).stage, "hann")
-        (moved,) = flown(nodes, [told])
+        told = subset_geometry(logged, name, PairEcho.opened(campaign, "f01", name).stage, "hann")
+        (moved,) = with_logs(nodes, [told])
         imaged = track.pair(pair).history
         assert np.abs(imaged.aperture.tx_m - pair.aperture.tx_m).max() > 0.02
         np.testing.assert_allclose(moved.history.aperture.tx_m, imaged.aperture.tx_m, atol=1e-3)
@@ -211,7 +211,7 @@ def test_what_refinement_costs_or_knows_makes_again_only_what_stands_on_it(finis
 
 @pytest.mark.parametrize(
     ("by_m", "told"),
-    [((4.0, 0.0, 0.0), "outside the scene"), ((0.0, 0.0, 2000.0), "whose ground lies at about 620.0 m")],
+    [((4.0, 0.0, 0.0), "outside the scene"), ((0.0, 0.0, 2000.0), "close to the terrain of the scene, about 620.0 m")],
 )
 def test_a_reference_point_outside_the_scene_is_told(finished_tiny, tmp_path, by_m, told):
     root = copy_writable(finished_tiny.root, tmp_path / "campaign")
@@ -221,7 +221,7 @@ def test_a_reference_point_outside_the_scene_is_told(finished_tiny, tmp_path, by
     (line,) = map(as_line, problems(root))
     assert line.startswith("config/config.yaml: scene.reference_points[0]: corner")
     assert told in line
-    with pytest.raises(CampaignError, match="reference_points are in crs, which is auto"):
+    with pytest.raises(CampaignError, match="positions of reference_points refer to crs, which is auto"):
         state(root, "scene", crs="auto")
 
 
@@ -256,7 +256,7 @@ def test_right_logs_that_are_said_to_err_by_2_cm_are_left_as_they_are(tmp_path, 
     refine.refine(campaign, "f01")
     image.image(campaign, "f01", "uav1-uav1")
     quality, stage = quality_of(campaign, "uav1-uav1"), open_refined(campaign, "f01").stage
-    assert "the logs are as good" in stage.attrs["why"]
+    assert "no improvement over the logs" in stage.attrs["reason"]
     assert stage.attrs["flags"].keys() <= {"position_error_overstated"}
     assert quality["flags"].items() >= stage.attrs["flags"].items()
     assert quality["autofocus"]["accepted"] is False

@@ -157,12 +157,12 @@ def test_a_campaign_of_a_pulse_passes_the_checks_and_asks_for_little(tiny):
 @pytest.mark.parametrize(
     ("changed", "told"),
     [
-        ({"listen_s": 0.6e-6}, "or lead_s, pulse_s and listen_s"),
+        ({"listen_s": 0.6e-6}, "or the sum of lead_s, pulse_s and listen_s"),
         ({"pulse_s": 0.9e-6}, "complex64 of shape (1024,)"),
         ({"pulse": "raw/other.npy"}, "no such file"),
-        ({"band_hz": [400e6, 500e6]}, "of its energy"),
+        ({"band_hz": [400e6, 500e6]}, "of the pulse's energy"),
         ({"carrier_hz": 1.2e9}, "waveform.carrier_hz"),
-        ({"listen_s": 0.02e-6}, "what waveform.listen_s holds"),
+        ({"listen_s": 0.02e-6}, "the limit by waveform.listen_s"),
     ],
 )
 def test_what_does_not_fit_the_recording_is_told_before_anything_runs(tiny, changed, told):
@@ -198,7 +198,7 @@ def test_a_recording_that_never_stopped_begins_with_the_pulse(tmp_path):
     waveform = {"kind": "samples", "carrier_hz": 1.2e9, "sample_rate_hz": 64e6, "prf_hz": 1000.0}
     waveform |= {"pulse_s": 4e-6, "listen_s": 2e-6, "lead_s": 1e-6}
     edit_config(root, lambda document: document.update(waveform=waveform))
-    with pytest.raises(CampaignError, match=r"waveform.lead_s is 1e-06, and uav1.sigmf-meta never stopped"):
+    with pytest.raises(CampaignError, match=r"waveform.lead_s is 1e-06, and uav1.sigmf-meta is a continuous recording"):
         ingest.ingest(Campaign.load(root), "f01", "uav1")
 
 
@@ -211,7 +211,7 @@ def test_a_specification_of_a_pulse_is_read_back_as_it_was(tmp_path):
 
 @pytest.mark.parametrize(
     ("changed", "told"),
-    [({"bandwidth_hz": 2e9}, "beyond sample_rate_hz"), ({"pulse": "pn", "bandwidth_hz": 300e6}, "whole samples")],
+    [({"bandwidth_hz": 2e9}, "exceeds sample_rate_hz"), ({"pulse": "pn", "bandwidth_hz": 300e6}, "whole samples")],
 )
 def test_a_pulse_that_cannot_be_sampled_is_refused(changed, told):
     with pytest.raises(ValueError, match=told):

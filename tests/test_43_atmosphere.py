@@ -31,12 +31,12 @@ C = SPEED_OF_LIGHT_M_S
         ({"refractivity_n": 1000.0}, "less than or equal to 500"),
         (
             {"refractivity_n": 290.0, "temperature_c": 10.0},
-            "1 of temperature_c, pressure_hpa, relative_humidity beside",
+            "1 of temperature_c, pressure_hpa and relative_humidity are stated in addition to",
         ),
-        ({"temperature_c": 10.0, "pressure_hpa": 950.0}, "give all three"),
+        ({"temperature_c": 10.0, "pressure_hpa": 950.0}, "state all three"),
         ({"temperature_c": 10.0, "pressure_hpa": 95000.0, "relative_humidity": 50.0}, "pressure_hpa"),
         ({"temperature_k": 283.0}, "did you mean 'temperature_c'"),
-        ({}, "give all three"),
+        ({}, "state all three"),
         (290, "atmosphere"),
     ],
 )
@@ -89,7 +89,7 @@ def test_a_sidelink_is_as_long_as_its_air_at_the_height_of_the_antennas_makes_it
 def test_the_product_says_which_air_it_took_and_what_vacuum_would_have_done(finished_tiny):
     said = json.loads((finished_tiny.results / "f01/uav1-uav2/image.json").read_text())
     air = said["atmosphere"]
-    assert air["source"] == "standard atmosphere at the ground's 620 m, humidity 50 %"
+    assert air["source"] == "standard atmosphere, terrain height 620 m, humidity 50 %"
     assert air["vacuum_shift_m"] == pytest.approx(air["refractivity_n"] * 1e-6 * 12.2, rel=0.15)
     assert said["models"]["atmosphere"].startswith(f"N = {air['refractivity_n']:.1f}: standard atmosphere")
     (line,) = (line for line in said["budget"] if line["cause"] == "atmosphere")

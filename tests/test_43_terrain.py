@@ -197,8 +197,8 @@ def test_a_dem_without_its_datum_is_refused(tiny):
     write_plane(tiny)
     message = complaint(lambda: edit_scene(tiny, dem="dem.tif"))
     assert "dem_datum" in message
-    assert "never guessed" in message
-    assert "given without dem" in complaint(lambda: edit_scene(tiny, dem=None, dem_datum="egm96"))
+    assert "has no default" in message
+    assert "stated without dem" in complaint(lambda: edit_scene(tiny, dem=None, dem_datum="egm96"))
 
 
 def test_a_dem_that_is_not_there_is_named_before_anything_runs(tiny):
@@ -243,7 +243,7 @@ def test_a_dem_under_the_scene_alone_is_enough_where_bounds_are_stated(tiny):
         assert not np.isfinite(expected.terrain.dem.heights(under(expected.grid, seen)))
     campaign = edit_scene(tiny, bounds_m="auto")
     message = complaint(lambda: expected_plan(campaign, *PAIR))
-    assert "under the track, where scene.bounds_m: auto starts from" in message
+    assert "below the track, which scene.bounds_m: auto requires" in message
     assert "% of the scene" not in message
 
 
@@ -281,7 +281,7 @@ def test_a_void_undeclared_is_no_height_on_earth(tiny):
     for work in (lambda: expected_plan(campaign, *PAIR), lambda: settle_ground(campaign)):
         message = complaint(work)
         assert "dem.tif: 1 of the " in message
-        assert "no height on Earth, most often -9999 m" in message
+        assert "impossible heights, most frequently -9999 m" in message
         assert "nodata" in message
 
 
@@ -293,7 +293,7 @@ def test_a_dem_above_the_antennas_is_flagged_and_flat_ground_refused(tiny):
     message = complaint(lambda: expected_plan(campaign, *PAIR))  # no echo comes from so far
     assert "unit and datum of scene.dem" in message
     write_plane(tiny, height_m=680.0)
-    assert "below the lowest ground of the scene" in expected_plan(campaign, *PAIR).flags["platform_below_scene"]
+    assert "below the lowest terrain of the scene" in expected_plan(campaign, *PAIR).flags["platform_below_scene"]
     campaign = edit_scene(tiny, dem=None, dem_datum=None, height_m=2034.0)
     message = complaint(lambda: expected_plan(campaign, *PAIR))
     assert message.startswith("scene.height_m: ")
@@ -321,12 +321,12 @@ def test_a_platform_below_the_terrain_is_refused_with_its_pulse(hillside, tmp_pa
     campaign = edit_scene(root, bounds_m=bounds)
     planned = complaint(lambda: expected_plan(campaign, "f01", "uav1-uav1"))  # before anything ran
     assert "flight f01, pair uav1-uav1: at " in planned
-    assert "transmitter is in or below the ground" in planned
+    assert "transmitter is at or below the terrain" in planned
     shutil.copytree(str(hillside.results / "f01"), str(root / "results" / "f01"))
     settle_ground(campaign)
     message = complaint(lambda: profile.profile(campaign, "f01", "uav1-uav1"))
     assert message.split(", worst")[0].split(": at ")[0] == planned.split(": at ")[0]
-    assert "transmitter is in or below the ground" in message
+    assert "transmitter is at or below the terrain" in message
     assert "worst at pulse" in message
 
 

@@ -84,7 +84,7 @@ def test_a_good_log_leaves_nothing_out_and_states_its_error(tmp_path):
 @pytest.mark.quick("0.02-expected1")
 @pytest.mark.parametrize(
     ("asked", "expected"),
-    [(None, (None, "nobody")), (0.02, ([0.02] * 3, "config")), ([0.01, 0.02, 0.03], ([0.01, 0.02, 0.03], "config"))],
+    [(None, (None, "none")), (0.02, ([0.02] * 3, "config")), ([0.01, 0.02, 0.03], ([0.01, 0.02, 0.03], "config"))],
 )
 def test_the_config_states_the_error_where_the_log_does_not(tmp_path, asked, expected):
     campaign = small_campaign(tmp_path)
@@ -110,7 +110,7 @@ def test_pulses_of_a_float_solution_are_left_out_unless_allowed(tmp_path):
     assert 10 <= left_out <= 12  # 0.6 s of 20 Hz
     assert dataset.sizes["pulse"] == dataset.attrs["pulses"]["used"] == 40 - left_out
     assert dataset.attrs["flags"]["fix_quality_low"].startswith(
-        f"b: {left_out} of 40 pulses left out: the log's solution is"
+        f"b: {left_out} of 40 pulses excluded: position solution poorer than"
     )
     assert flags_of(echo_of(campaign, "a-a")) == {}
     edit_config(campaign.root, lambda document: document["nodes"]["b"].update(worst_fix="float"))
@@ -128,7 +128,7 @@ def test_a_log_of_a_poor_fix_throughout_is_refused_and_one_without_rtk_is_not(tm
         )
         if refused:
             message = complaint(lambda: echo_of(campaign))
-            assert "no pulse has a position: a: 40 of 40 pulses left out" in message
+            assert "no pulse has a valid position: a: 40 of 40 pulses excluded" in message
             assert "worst_fix" in message
         else:
             assert flags_of(echo_of(campaign)) == {}
@@ -174,7 +174,7 @@ def test_a_log_that_repeats_positions_is_read_through_those_that_are_new(tmp_pat
 
     edit_track(campaign.root, "b", epochs(repeated))
     dataset = echo_of(campaign)
-    assert dataset.attrs["flags"]["track_frozen"].startswith("b: 0 of 40 pulses left out: epochs that repeat")
+    assert dataset.attrs["flags"]["track_frozen"].startswith("b: 0 of 40 pulses excluded: epochs that repeat")
     np.testing.assert_allclose(dataset.rx_position.values, clean, atol=1e-3)
 
 
@@ -194,7 +194,7 @@ def test_a_log_with_rounded_times_is_flagged_with_how_far_that_moves_its_positio
     edit_track(campaign.root, "a", epochs(lambda table: rounded(table[::3])))
     flags = flags_of(echo_of(campaign))
     assert ("track_times" in flags) is flagged
-    assert not flagged or "positions err by 0.29 m along the flight" in flags["track_times"]
+    assert not flagged or "position errors of 0.29 m along the track" in flags["track_times"]
 
 
 def logged_flags(position, *, damage=""):
@@ -211,13 +211,13 @@ def test_a_log_on_a_coarse_grid_is_flagged_with_how_far_its_positions_err():
     flown = np.stack([5 * time_s, 3 * np.sin(time_s), 5 + np.sin(0.7 * time_s)], -1)
     assert logged_flags(flown) == {}
     flags = logged_flags(np.round(flown / [0.2, 0.1, 0.01]) * [0.2, 0.1, 0.01])
-    assert "a: positions of the log are written so coarsely that they err by 0.065 m" in flags["track_positions"]
+    assert "a: rounded coordinates of the log cause position errors of 0.065 m" in flags["track_positions"]
 
 
 def test_a_damaged_log_is_flagged():
     time_s = np.arange(400) * 0.1
     flown = np.stack([5 * time_s, 3 * np.sin(time_s), 5 + np.sin(0.7 * time_s)], -1)
-    found = "259 of 6873 bytes are no messages, from byte 2602 on; epochs there are lost"
+    found = "259 of 6873 bytes are not valid messages, from byte 2602 on; their epochs are lost"
     assert logged_flags(flown, damage=found) == {"track_log_damaged": f"a: {found}"}
 
 
@@ -264,7 +264,7 @@ def test_captures_that_repeat_earlier_ones_are_left_out(tmp_path, node):
     edit_data(Path(str(campaign.root)), node, repeat)
     attrs = echo_of(campaign, f"a-{node}").attrs
     assert attrs["pulses"] == {"used": 32, "dropped": 8, "reasons": {"captures_repeated": 8}}
-    assert attrs["flags"]["captures_repeated"] == f"8 of 40 captures of {node}, the first is number 20"
+    assert attrs["flags"]["captures_repeated"] == f"8 of 40 captures of {node}, first at capture 20"
 
 
 @pytest.mark.slow
@@ -295,7 +295,8 @@ def test_an_attitude_that_looks_like_radians_is_a_flag_where_it_moves_an_antenna
     flags = place(log, log, time[5:-5]).flags
     assert ("attitude_suspect" in flags) is flagged
     if flagged:
-        assert "a: angles of attitude look in radians: yaw is 0° off the course so, 88°" in flags["attitude_suspect"]
+        measured = "yaw then deviates from the course by 0°, but by 88° as degrees clockwise from north"
+        assert f"a: attitude angles appear to be in radians: {measured}" in flags["attitude_suspect"]
 
 
 @pytest.mark.parametrize("pair", ["uav1-uav1", "uav1-uav2"])

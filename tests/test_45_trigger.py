@@ -61,7 +61,7 @@ def test_a_recording_of_noise_alone_says_so(flown, tmp_path):
     noise = np.random.default_rng(9)
     edit_data(root, "b", lambda samples: samples.__setitem__(slice(None), noise.normal(0, 300, samples.size)))
     message = complaint(lambda: ingest.ingest(Campaign.load(root), "f01", "b"))
-    assert "no preamble in" in message
+    assert "no preamble detected in" in message
     assert "b.sigmf-data" in message
 
 

@@ -97,4 +97,4 @@ def test_a_reflector_needs_a_crs(calibrated, tmp_path):
     document["scene"]["crs"] = "auto"
     (tmp_path / "config").mkdir()
     (tmp_path / "config" / "config.yaml").write_text(yaml.safe_dump(document))
-    assert "give the CRS" in complaint(lambda: Campaign.load(tmp_path))
+    assert "state the CRS" in complaint(lambda: Campaign.load(tmp_path))

@@ -216,7 +216,9 @@ def test_a_mosaic_of_a_product_that_was_edited_or_is_gone_is_refused(finished_ti
     root = copy_writable(finished_tiny.root, tmp_path / "campaign")
     path = root / "results" / "f01" / "fused" / "coherent_db.tif"
     path.write_bytes(path.read_bytes()[:-1] + b"x")
-    with pytest.raises(CampaignError, match=r"coherent_db\.tif: not as it was written.*Delete .*export\.manifest"):
+    with pytest.raises(
+        CampaignError, match=r"coherent_db\.tif: the file has changed since it was written.*Delete .*export\.manifest"
+    ):
         mosaic.mosaic(Campaign.load(root))
     path.unlink()
     with pytest.raises(CampaignError, match=r"coherent_db\.tif: no such file"):

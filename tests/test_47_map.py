@@ -122,7 +122,7 @@ def test_a_damaged_truth_is_a_note_on_the_map_and_no_failure(finished, truth):
     (finished.root / "truth.json").write_text(truth)
     webmap(finished)
     found = document(finished)
-    assert [note[:31] for note in found["notes"]] == ["No targets are listed: truth.js"]
+    assert [note[:41] for note in found["notes"]] == ["No simulated targets are listed: truth.js"]
     assert {one["source"] for one in found["places"]} == {"found"}
 
 
@@ -130,7 +130,8 @@ def test_an_image_that_is_not_as_it_was_written_is_not_shown(finished):
     path = finished.results / "f01" / "uav1-uav1" / "incidence.tif"
     path.write_bytes(path.read_bytes()[:-1] + b"x")
     with pytest.raises(
-        CampaignError, match=r"incidence\.tif: not as it was written; expected what layers\.manifest\.json"
+        CampaignError,
+        match=r"incidence\.tif: the file has changed since it was written; .* listed in layers\.manifest\.json",
     ):
         webmap(finished)
 
@@ -193,7 +194,10 @@ def test_a_page_that_came_with_the_results_is_not_served(finished):
 
 def test_a_map_that_is_not_as_it_was_written_is_one_message_at_the_start(finished):
     tampered(finished)
-    with pytest.raises(CampaignError, match=r"map/map\.json: not as it was written; expected what map\.manifest\.json"):
+    with pytest.raises(
+        CampaignError,
+        match=r"map/map\.json: the file has changed since it was written; .* listed in map\.manifest\.json",
+    ):
         served(finished)
     (finished.results / "map" / "map.manifest.json").write_text("{")
     with pytest.raises(CampaignError, match=r"map\.manifest\.json: damaged"):

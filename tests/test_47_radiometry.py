@@ -155,8 +155,8 @@ def test_coefficients_are_products_where_they_are_written():
 
 def test_a_radio_stated_in_parts_is_one_message(tiny):
     message = complaint(lambda: with_radio(tiny, left_out=["receiver"]).load(tiny))
-    assert "nodes.uav1.receiver, nodes.uav2.receiver are not stated" in message
-    assert "of every pair, or of none" in message
+    assert "nodes.uav1.receiver, nodes.uav2.receiver are not configured" in message
+    assert "of every pair, or none of these" in message
 
 
 def test_a_receiver_states_its_full_scale_once(tiny):
@@ -223,7 +223,7 @@ def test_mean_power_lies_on_a_coarser_grid_and_says_what_it_is(flown, tmp_path):
         with rasterio.open(str(folder / "multilook_sigma0_power.tif")) as raster:
             assert (raster.res, raster.shape) == ((pytest.approx(0.3), pytest.approx(0.3)), (20, 20))
             mean, said = raster.read(1), json.loads(raster.tags()["APERTURA_RADIOMETRY"])
-            assert raster.descriptions[0].startswith("mean sigma0, radar cross-section per area of ground of 6 x 6 pix")
+            assert raster.descriptions[0].startswith("mean sigma0, radar cross-section per ground area of 6 x 6 pix")
         with rasterio.open(str(folder / "multilook_sigma0_db.tif")) as raster:
             decibels = raster.read(1)
             assert raster.units == ("dB",)

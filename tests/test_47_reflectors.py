@@ -262,14 +262,14 @@ def test_a_constant_that_is_not_the_earlier_one_has_drifted(measured, tmp_path):
     assert flags["uav1-uav1"] == {}
     assert "since reflectors of campaign over_reflectors" in flags["uav1-uav2"]["constant_drifts"]
     message = complaint(lambda: write_constants(campaign, root / "earlier.json"))
-    assert "what processing.radiometric_calibration takes up" in message
+    assert "the file used by processing.radiometric_calibration" in message
 
 
 @pytest.mark.slow
 def test_nothing_is_measured_in_images_of_other_settings(measured, tmp_path):
     root = copy_writable(measured.root, tmp_path / "campaign")
     campaign = state(root, "processing", window="none")
-    assert "4 of 4 images are overtaken" in complaint(lambda: write_constants(campaign, root / "new.json"))
+    assert "4 of 4 images out of date" in complaint(lambda: write_constants(campaign, root / "new.json"))
     assert not (root / "new.json").exists()
 
 
@@ -356,7 +356,7 @@ def test_a_pair_without_a_constant_is_flagged_and_the_other_one_calibrated(later
         pair: json.loads(campaign.result("f01", pair, "image.json").read_text()) for pair in campaign.images["f01"][:2]
     }
     assert "pair_uncalibrated" not in told["uav1-uav1"]["flags"]
-    assert told["uav1-uav2"]["flags"]["pair_uncalibrated"].startswith("calibration.json has no constant of uav1-uav2")
+    assert told["uav1-uav2"]["flags"]["pair_uncalibrated"].startswith("calibration.json has no constant for uav1-uav2")
     for pair, some in (("uav1-uav1", True), ("uav1-uav2", False)):
         with rasterio.open(str(campaign.result("f01", pair, "sigma0_db.tif"))) as raster:
             assert np.isfinite(raster.read(1, masked=True).filled(np.nan)).any() == some
@@ -434,7 +434,7 @@ def test_a_file_of_constants_is_checked_before_anything_runs(tiny):
     assert "calibration.json: no such file" in line
     (tiny / "calibration.json").write_text(some_constants("uav3-uav3").model_dump_json())
     (line,) = map(as_line, problems(tiny))
-    assert "no constant of uav1-uav1, uav1-uav2, but of uav3-uav3" in line
+    assert "constants of uav3-uav3 only, none of uav1-uav1, uav1-uav2" in line
     (tiny / "calibration.json").write_text(some_constants("uav1-uav1").model_dump_json())
     assert problems(tiny) == []
     change_file(tiny, lambda document: document.update(schema_version=2))
@@ -445,8 +445,11 @@ def test_a_file_of_constants_is_checked_before_anything_runs(tiny):
 @pytest.mark.parametrize(
     ("keys", "told"),
     [
-        ({"kind": "sphere", "size_m": [0.2], "azimuth_deg": 3.0}, "a sphere looks nowhere"),
-        ({"kind": "trihedral", "size_m": [0.2], "azimuth_deg": 3.0}, "a trihedral looks somewhere"),
+        ({"kind": "sphere", "size_m": [0.2], "azimuth_deg": 3.0}, "a sphere has no boresight"),
+        (
+            {"kind": "trihedral", "size_m": [0.2], "azimuth_deg": 3.0},
+            "a trihedral requires azimuth_deg and elevation_deg",
+        ),
         (
             {"kind": "dihedral", "size_m": [0.2], "azimuth_deg": 3.0, "elevation_deg": 0.0},
             "[across the seam, along it]",
@@ -475,7 +478,7 @@ def test_a_reflector_measures_no_polarisation_that_it_does_not_return(measured, 
         edit_config(root, change)
         return Campaign.load(root)
 
-    assert "HV: such a reflector sends nothing back" in complaint(lambda: measured_constants(received("V")))
+    assert "returns no echo in polarisation HV" in complaint(lambda: measured_constants(received("V")))
     constants, _ = measured_constants(received("H"))
     own = constants.pairs["uav1-uav1"].radar
     assert own.polarisation == "HH"

@@ -97,7 +97,7 @@ def test_the_brightest_target_adds_up_once_the_sidelink_took_the_clocks_out(repo
     before, after = (steadiness(phasors) for phasors in found.values())
     assert before[1] < 0.4
     assert after[1] > 0.9
-    assert list(Shown(reported, "f01", "uav1-uav1").phasors()) == ["as recorded, on the tracks of the logs"]
+    assert list(Shown(reported, "f01", "uav1-uav1").phasors()) == ["as recorded, tracks from the logs"]
 
 
 @pytest.mark.slow
@@ -136,5 +136,5 @@ def test_a_picture_changed_by_hand_does_not_reach_the_page(reported):
     path = reported.result("f01", "uav1-uav1", "pictures", "cuts.png")
     whole = path.read_bytes()
     path.write_bytes(whole[:-1] + b"x")
-    assert "not as it was written" in complaint(lambda: page(reported, "f01"))
+    assert "the file has changed since it was written" in complaint(lambda: page(reported, "f01"))
     path.write_bytes(whole)

@@ -110,7 +110,7 @@ def test_every_product_lies_there_with_its_tags(small):
         _, transform, tags, told = read(small, name)
         assert told == unit
         assert transform.a == 0.125
-        assert tags["APERTURA_LEVEL"].startswith("heights count from mark 0 and mark 1")
+        assert tags["APERTURA_LEVEL"].startswith("heights relative to mark 0 and mark 1")
         assert json.loads(tags["APERTURA_FLAGS"]) == report["flags"]
         spec = json.loads(tags["APERTURA_RUNSPEC"])
         assert spec["images"] == report["images"]
@@ -155,7 +155,7 @@ def test_the_summary_tells_heights_and_the_flags_of_an_interferogram(small, tmp_
     print_summary(Campaign.load(root))
     told = capsys.readouterr().out
     assert "height_relative" in told
-    assert "interferometry two_tracks: no point of known height shows" in told
+    assert "interferometry two_tracks: no point of known height is visible" in told
 
 
 @pytest.mark.slow
@@ -172,7 +172,7 @@ def test_a_mask_edited_by_hand_is_refused(small, tmp_path):
     mask = root / "results/f02/uav1-uav1/mask.tif"
     mask.write_bytes(mask.read_bytes()[:-1] + b"x")
     told = complaint(lambda: interferogram(Campaign.load(root), NAME))
-    assert "mask.tif: not as it was written" in told
+    assert "mask.tif: the file has changed since it was written" in told
 
 
 @pytest.mark.slow
@@ -226,5 +226,5 @@ def test_two_flights_over_a_ramp_give_its_heights_within_their_deviation(tmp_pat
 def test_flights_beyond_the_critical_baseline_say_so(tmp_path):
     root = made(tmp_path, half_width_m=5.0, density_per_m2=10, rise_m=30.0)
     report = json.loads((root / "results/interferometry" / NAME / "interferogram.json").read_text())
-    assert "further apart than any coherence reaches" in report["flags"]["interferogram_decorrelated"]
+    assert "the spectra of the two images do not overlap" in report["flags"]["interferogram_decorrelated"]
     assert np.isfinite(read(root, "height")[0]).mean() < 0.01

@@ -71,7 +71,7 @@ def test_the_report_opens_without_a_net_and_shows_names_as_text(written):
         sheet.on("pageerror", lambda error: errors.append(str(error)))
         sheet.on("console", lambda said: errors.append(said.text) if said.type == "error" else None)
         sheet.goto((root / "results" / "report.html").as_uri())
-        sheet.wait_for_selector("text=Verdicts")
+        sheet.wait_for_selector("text=Image quality")
         landing = sheet.inner_text("body")
         top = sheet.locator("h1", has_text="7*7").bounding_box()
         links = sheet.locator(".prose a").count()

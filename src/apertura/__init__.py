@@ -1,6 +1,6 @@
-"""apertura: campaign folders of UAV-borne digital radar recordings in, georeferenced SAR images out.
+"""apertura: georeferenced SAR images from campaign folders of UAV-borne digital radar recordings.
 
-The public names are imported from their modules when they are first used: importing apertura loads no library.
+Public names are imported from their modules on first use: `import apertura` alone loads no library.
 
 Examples
 --------

@@ -1,6 +1,6 @@
-"""The command line: one subcommand per step, and campaigns from end to end.
+"""Command line: the workflow of a campaign, one subcommand per step, and the tools around them.
 
-Commands import what they run when they run: help and mistakes in the command line cost nothing.
+Commands import their modules when they run: help texts and usage errors load no library.
 """
 
 import os
@@ -36,22 +36,22 @@ if TYPE_CHECKING:
     from apertura.run.driver import Show
 
 PASS_ON = {"allow_extra_args": True, "ignore_unknown_options": True}
-"""Options that are not known go to snakemake."""
+"""Click settings of a command that passes unknown options to snakemake."""
 
 
 class Commands(TyperGroup):
-    """Commands of apertura, and of other distributions: these are looked up only where no own command has the name."""
+    """Commands of apertura and of installed plugins; plugins are searched only for names that apertura lacks."""
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """Return a command by its name, None where there is none."""
+        """Return a command by its name, None if there is none."""
         if cmd_name not in self.commands:
             self._add_installed()
         if cmd_name == "study" and "study" not in self.commands:
             raise CampaignError(
                 "the studies are not installed",
                 where="apertura study",
-                expected="the distribution apertura-research beside apertura",
-                remedy="Install it from the source of apertura: `pip install ./research`.",
+                expected="the distribution apertura-research",
+                remedy="Install it from the source tree of apertura: `pip install ./research`.",
             )
         return super().get_command(ctx, cmd_name)
 
@@ -61,7 +61,7 @@ class Commands(TyperGroup):
         return super().list_commands(ctx)
 
     def _add_installed(self) -> None:
-        from importlib.metadata import entry_points  # 20 ms, which every job of a run would pay
+        from importlib.metadata import entry_points  # costs 20 ms, which jobs of a run save
 
         for point in entry_points(group="apertura.commands"):
             if point.name not in self.commands:
@@ -69,12 +69,12 @@ class Commands(TyperGroup):
                 group.name, group.hidden = point.name, True
 
 
-# ---- apertura step: one command per rule, as rows of the rules say ---------------------------------------------------
+# ---- apertura step: one command per row of RULES ---------------------------------------------------------------------
 
-step = typer.Typer(no_args_is_help=True, help="One step of the pipeline, as the workflow runs it.")
+step = typer.Typer(no_args_is_help=True, help="Run one step of the pipeline as the workflow runs it.")
 
 Directory = Annotated[Path, typer.Option("--campaign", help="campaign folder")]
-Threads = Annotated[int, typer.Option(min=1, help="tiles formed at once")]
+Threads = Annotated[int, typer.Option(min=1, help="number of tiles processed in parallel")]
 
 _OPTIONS: dict[str, tuple[Any, Any]] = {
     "threads": (Threads, 1),
@@ -85,56 +85,59 @@ _OPTIONS: dict[str, tuple[Any, Any]] = {
 
 
 def _command_of(rule: Rule) -> Callable[..., None]:
-    """Return the command of a rule: its arguments, the campaign folder and its options."""
+    """Return the command of a rule; its parameters are the rule's arguments, the campaign folder and the options."""
 
-    def command(campaign: Path, **stated: Any) -> None:
+    def command(campaign: Path, **values: Any) -> None:
         from apertura.campaign.folder import Campaign
 
-        opened, words = Campaign.load(given(campaign)), [stated.pop(name) for name in rule.arguments]
-        with reporting_to(opened.result(*progress_path([rule.command, *words]))):
-            written = rule.step(opened, *words, **stated)
+        opened, arguments = Campaign.load(given(campaign)), [values.pop(name) for name in rule.arguments]
+        with reporting_to(opened.result(*progress_path([rule.command, *arguments]))):
+            written = rule.step(opened, *arguments, **values)
         for path in [written] if isinstance(written, Path) else written:
             print(as_typed(path))
 
-    kinds: dict[str, tuple[Any, Any]] = dict.fromkeys(rule.arguments, (str, Parameter.empty))
-    kinds |= {"campaign": (Directory, Path()), **{name: _OPTIONS[name] for name in rule.options}}
+    parameters: dict[str, tuple[Any, Any]] = dict.fromkeys(rule.arguments, (str, Parameter.empty))
+    parameters |= {"campaign": (Directory, Path()), **{name: _OPTIONS[name] for name in rule.options}}
     command.__doc__ = rule.help
-    command.__annotations__ = {name: kind for name, (kind, _) in kinds.items()}
+    command.__annotations__ = {name: annotation for name, (annotation, _) in parameters.items()}
     command.__signature__ = Signature(  # type: ignore[attr-defined]
         [
-            Parameter(name, Parameter.POSITIONAL_OR_KEYWORD, default=default, annotation=kind)
-            for name, (kind, default) in kinds.items()
+            Parameter(name, Parameter.POSITIONAL_OR_KEYWORD, default=default, annotation=annotation)
+            for name, (annotation, default) in parameters.items()
         ]
     )
     return command
 
 
-_named: dict[str, Rule] = {}
+_first_rows: dict[str, Rule] = {}
 for _row in RULES.values():
-    if _named.setdefault(_row.command, _row) is _row:  # `export` serves two rules
+    if _first_rows.setdefault(_row.command, _row) is _row:  # two rules run `export`
         step.command(_row.command)(_command_of(_row))
 
 
-# ---- The commands ---------------------------------------------------------------------------------------------------
+# ---- Commands --------------------------------------------------------------------------------------------------------
 
 app = typer.Typer(cls=Commands, no_args_is_help=True, help="SAR images from campaign folders.")
-app.add_typer(step, name="step", hidden=True)  # for rules, and to paste what one runs
+app.add_typer(step, name="step", hidden=True)  # for the rules, and to repeat a single step
 
 
-CampaignFolder = Annotated[Path, typer.Argument(help="campaign folder, default: current folder", show_default=False)]
-Cores = Annotated[int, typer.Option(min=1, help="cores to use")]
-Paranoid = Annotated[bool, typer.Option("--paranoid", help="read every input again, whatever its times say")]
+CampaignFolder = Annotated[Path, typer.Argument(help="campaign folder, default: current directory", show_default=False)]
+Cores = Annotated[int, typer.Option(min=1, help="number of CPU cores")]
+Paranoid = Annotated[
+    bool, typer.Option("--paranoid", help="compute the checksum of every input, even if its modification time is old")
+]
 HERE = Path()
 ALL_CORES = os.cpu_count() or 1
 
 
 class _PassesOn(TyperCommand):
-    """A command whose unknown options go to snakemake."""
+    """Command that passes unknown options to snakemake."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Take options and values apart: of `-sFILE`, click would take each letter that is an option of ours.
+        """Parse arguments after separating short options from their values and repeating `--until` for each step.
 
-        Names of steps that follow `--until` are all its values, as snakemake reads them; click takes one value.
+        In `-sFILE`, click reads each letter that is an option of apertura as that option. snakemake accepts several
+        step names after one `--until`; click accepts one value.
         """
         from apertura.run.driver import UNTIL, apart
         from apertura.workflow.rules import RULES
@@ -154,25 +157,25 @@ def _opened(campaign: Path) -> "Campaign":
 
 
 _UNREAD = SIGNALLED + signal.SIGPIPE
-"""Exit status where the reader of the output has gone, as `head` does: that of other commands, without a message."""
+"""Exit status, without a message, if the reader of the output has closed the pipe, as `head` does."""
 
 
 def main() -> None:
-    """Run the command line; exits with 0, 2 (one message: something to see to), 130 (a signal) or 1 (a defect)."""
+    """Run the command line; exit with 0, 2 (user error, one message), 130 (signal) or 1 (internal error)."""
     with ended_by_signals():
         try:
             app()
         except CampaignError as error:
             from apertura.campaign.config import located
 
-            _say(located(as_typed(error)))
+            _print_error(located(as_typed(error)))
             leave_status(2)
             raise SystemExit(2) from None
-        except Interrupted as signalled:
-            _say(str(signalled.code))
+        except Interrupted as interrupt:
+            _print_error(str(interrupt.code))
             raise SystemExit(INTERRUPTED) from None
-        except SystemExit as ended:
-            if isinstance(ended.__context__, BrokenPipeError):  # typer takes it for a failure of ours
+        except SystemExit as leaving:
+            if isinstance(leaving.__context__, BrokenPipeError):  # typer turns a closed pipe into exit status 1
                 raise SystemExit(_UNREAD) from None
             raise
         except BrokenPipeError:
@@ -182,28 +185,28 @@ def main() -> None:
             leave_status(2 if message else 1)
             if message is None:
                 raise
-            _say(message)
+            _print_error(message)
             raise SystemExit(2) from None
         finally:
             _flush()
 
 
 def _flush() -> None:
-    """Write what is printed; where its reader has gone or its disk is full, nothing is left to fail at the exit."""
+    """Flush the output; if its reader has gone or its disk is full, discard it so that the exit does not fail."""
     try:
         sys.stdout.flush()
     except OSError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def _say(message: str) -> None:
-    """Print an error where the reader of the output may have gone."""
+def _print_error(message: str) -> None:
+    """Print an error message; ignore a closed or full error stream."""
     with suppress(OSError):
         print(f"error: {message}", file=sys.stderr, flush=True)
 
 
-def _print_version(asked: bool) -> None:
-    if asked:
+def _print_version(requested: bool) -> None:
+    if requested:
         print(__version__)
         raise typer.Exit
 
@@ -219,16 +222,18 @@ def _options(
 
 @app.command()
 def inspect(
-    path: Annotated[Path, typer.Argument(help="a recording, a flight log, phase history, a DEM, a folder, a campaign")],
+    path: Annotated[
+        Path, typer.Argument(help="recording, flight log, phase history, DEM, other folder or campaign folder")
+    ],
     *,
     settings: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="what a log cannot say of itself, as nodes.<n>.log does"),
+        typer.Option("--set", metavar="KEY=VALUE", help="setting that a log does not contain; keys of nodes.<n>.log"),
     ] = None,
     plot: Annotated[Path | None, typer.Option(metavar="FILE.png", help="draw a preview")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="for machines")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
 ) -> None:
-    """Tell what a file or folder is, its times, rates, gaps, fix and bounds, and what is missing for an image."""
+    """Describe a file or folder: type, times, rates, gaps, position fix, bounds, and what an image still requires."""
     picture = None if plot is None else given(plot)
     from apertura.views.inspect.path import inspect_path
 
@@ -241,7 +246,7 @@ def align(
         list[str],
         typer.Argument(
             metavar="[CAMPAIGN] FLIGHT NODE",
-            help="campaign folder, default: current folder; flight; node that sends and receives",
+            help="campaign folder, default: current directory; flight; node that transmits and receives",
         ),
     ],
     *,
@@ -249,21 +254,23 @@ def align(
         tuple[float, float, float] | None,
         typer.Option(help="reflector: easting, northing in scene.crs, ellipsoidal height (z in a local frame), m"),
     ] = None,
-    search_s: Annotated[float | None, typer.Option(min=0, help="how far the clock may be off, s")] = None,
-    search_m: Annotated[float, typer.Option(min=0, help="how long the path may be, m of total path")] = 10.0,
-    drift: Annotated[bool, typer.Option("--drift", help="find by how much the clock runs slow, too")] = False,
-    keep_path: Annotated[bool, typer.Option("--keep-path", help="the path is as the config says")] = False,
+    search_s: Annotated[float | None, typer.Option(min=0, help="half width of the search for the clock, s")] = None,
+    search_m: Annotated[
+        float, typer.Option(min=0, help="half width of the search for the path offset, m of total path")
+    ] = 10.0,
+    drift: Annotated[bool, typer.Option("--drift", help="estimate the clock drift as well")] = False,
+    keep_path: Annotated[bool, typer.Option("--keep-path", help="keep the configured path offset")] = False,
     write: Annotated[bool, typer.Option("--write", help="write config/clocks.tsv")] = False,
 ) -> None:
-    """Find the clock and the range of a recorder against its flight log: where echoes add up best."""
+    """Estimate clock and path offset of a recorder relative to its flight log, at which echoes focus best."""
     if len(words) not in {2, 3}:
         raise CampaignError(" ".join(words), "align", "[CAMPAIGN] FLIGHT NODE", "Name flight and node.")
     *folder, flight, node = words
     opened = _opened(Path(*folder))
     from apertura.tools.align import print_alignment
 
-    asked = {"point": point, "search_s": search_s, "search_m": 0.0 if keep_path else search_m, "drift": drift}
-    print_alignment(opened, flight, node, write=write, **asked)
+    search = {"point": point, "search_s": search_s, "search_m": 0.0 if keep_path else search_m, "drift": drift}
+    print_alignment(opened, flight, node, write=write, **search)
 
 
 @app.command(cls=_PassesOn, context_settings=PASS_ON)
@@ -273,32 +280,35 @@ def run(
     cores: Cores = ALL_CORES,
     *,
     paranoid: Paranoid = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="only errors, and what to open")] = False,
-    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="all that snakemake says")] = False,
-    dry_run: Annotated[bool, typer.Option("--dry-run", "-n", help="tell which steps would run; run none")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="print errors and the paths of products only")] = False,
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="print the whole output of snakemake")] = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", "-n", help="dry run: list the steps without running them")
+    ] = False,
     until: Annotated[
         list[str] | None, typer.Option("--until", "-U", metavar="STEP …", help="last steps: image, export, cube, …")
     ] = None,
     profile: Annotated[
-        str | None, typer.Option(metavar="PROFILE", help="where steps run: profiles/slurm, or a folder of yours")
+        str | None, typer.Option(metavar="PROFILE", help="snakemake profile: profiles/slurm, or your own folder")
     ] = None,
     set_scatter: Annotated[
-        list[str] | None, typer.Option("--set-scatter", metavar="tiles=N", help="form each image by N jobs")
+        list[str] | None, typer.Option("--set-scatter", metavar="tiles=N", help="divide each image among N jobs")
     ] = None,
 ) -> None:
-    """Run the workflow on a campaign folder; further options and targets go to snakemake."""
+    """Run the workflow on a campaign folder; other options and targets are passed to snakemake."""
     show: Show = "snakemake" if verbose else "errors" if quiet else "steps"
-    asked = [*context.args, *(["-n"] if dry_run else []), *(["--until", *until] if until else [])]
-    asked += [*(["--profile", profile] if profile else []), *(["--set-scatter", *set_scatter] if set_scatter else [])]
-    _run(campaign, cores, *asked, paranoid=paranoid, show=show)
+    arguments = [*context.args, *(["-n"] if dry_run else []), *(["--until", *until] if until else [])]
+    arguments += ["--profile", profile] if profile else []
+    arguments += ["--set-scatter", *set_scatter] if set_scatter else []
+    _run(campaign, cores, *arguments, paranoid=paranoid, show=show)
 
 
-def _run(campaign: Path, cores: int, *asked: str, paranoid: bool = False, show: "Show" = "steps") -> None:
+def _run(campaign: Path, cores: int, *arguments: str, paranoid: bool = False, show: "Show" = "steps") -> None:
     from apertura.run.driver import run_workflow
     from apertura.workflow.stale import forms_results
 
-    status = run_workflow(given(campaign), cores, *asked, paranoid=paranoid, show=show)
-    if status == 0 and forms_results(["", *asked]):
+    status = run_workflow(given(campaign), cores, *arguments, paranoid=paranoid, show=show)
+    if status == 0 and forms_results(["", *arguments]):
         opened = _opened(campaign)
         from apertura.views.summary import is_finished, print_benches, print_products, print_summary, print_unfinished
 
@@ -311,29 +321,33 @@ def _run(campaign: Path, cores: int, *asked: str, paranoid: bool = False, show: 
 
 
 @app.command()
-def look(
+def preview(
     campaign: CampaignFolder = HERE,
     cores: Cores = ALL_CORES,
     *,
     follow: Annotated[
-        bool, typer.Option("--follow", help="its recordings still grow: show it as they do, then run the workflow")
+        bool, typer.Option("--follow", help="update the images while recordings grow, then run the workflow")
     ] = False,
-    every: Annotated[float, typer.Option(min=1, help="s between pictures")] = 5.0,
-    end_after: Annotated[float, typer.Option(min=1, help="s without growth that end the recordings")] = 10.0,
-    run_after: Annotated[bool, typer.Option("--run/--no-run", help="run the workflow when they have ended")] = True,
+    every: Annotated[float, typer.Option(min=1, help="interval between updates, s")] = 5.0,
+    end_after: Annotated[
+        float, typer.Option(min=1, help="time without growth after which recordings count as finished, s")
+    ] = 10.0,
+    run_after: Annotated[
+        bool, typer.Option("--run/--no-run", help="run the workflow when the recordings are finished")
+    ] = True,
 ) -> None:
-    """Show images of the pulses so far, beside the results; Ctrl-C ends a campaign that is followed, and runs it."""
+    """Show preview images of the pulses so far; with --follow, Ctrl-C ends following and starts the workflow."""
     opened = _opened(campaign)
-    from apertura.tools.look.follow import look_at
+    from apertura.tools.preview.follow import run_preview
 
-    look_at(opened, follow=follow, every_s=every, end_after_s=end_after, threads=cores)
+    run_preview(opened, follow=follow, every_s=every, end_after_s=end_after, threads=cores)
     if follow and run_after:
         _run(campaign, cores)
 
 
 @app.command()
 def status(campaign: CampaignFolder = HERE) -> None:
-    """Tell what a run does, from another terminal: steps done, under way and left, time left, the last error."""
+    """Print the progress of a run from another terminal: steps done, running and left, time left, the last error."""
     opened = _opened(campaign)
     from apertura.run.screen import print_status
 
@@ -342,7 +356,7 @@ def status(campaign: CampaignFolder = HERE) -> None:
 
 @app.command("list")
 def list_results(campaign: CampaignFolder = HERE) -> None:
-    """List flights and pairs, and which of their results are finished, stale or missing, with their sizes."""
+    """List flights and pairs, which of their results are finished, out of date or missing, and their sizes."""
     opened = _opened(campaign)
     from apertura.run.results import print_list
 
@@ -352,10 +366,10 @@ def list_results(campaign: CampaignFolder = HERE) -> None:
 @app.command()
 def clean(
     campaign: CampaignFolder = HERE,
-    wip: Annotated[bool, typer.Option("--wip", help="only work in progress that a killed run has left")] = False,
-    yes: Annotated[bool, typer.Option("--yes", "-y", help="do not ask")] = False,
+    wip: Annotated[bool, typer.Option("--wip", help="remove only unfinished files of a run that was killed")] = False,
+    yes: Annotated[bool, typer.Option("--yes", "-y", help="do not ask for confirmation")] = False,
 ) -> None:
-    """Remove what the workflow has made, and nothing else; not while a run holds the campaign."""
+    """Remove the files that the workflow has written, and no others; refused while the campaign is being run."""
     opened = _opened(campaign)
     from apertura.run.results import clean as remove_results
 
@@ -368,7 +382,7 @@ def check(
     products: Annotated[bool, typer.Option("--products", help="read every byte of the results")] = False,
     paranoid: Paranoid = False,
 ) -> None:
-    """Print all that is wrong with a campaign folder, a line each, and which results are overtaken; run nothing."""
+    """Print every error in a campaign folder, one per line, and the results that are out of date; run nothing."""
     from apertura.check import print_findings
 
     raise SystemExit(2 if print_findings(given(campaign), products=products, paranoid=paranoid) else 0)
@@ -376,7 +390,7 @@ def check(
 
 @app.command()
 def plan(campaign: CampaignFolder = HERE, threads: Threads = 1) -> None:
-    """Print how each pair would be imaged, why, how exactly and at what cost; nothing is run."""
+    """Print engine, settings, reasons, predicted accuracy and cost of each pair's image; run nothing."""
     opened = _opened(campaign)
     from apertura.views.plan import print_plan
 
@@ -385,18 +399,23 @@ def plan(campaign: CampaignFolder = HERE, threads: Threads = 1) -> None:
 
 @app.command()
 def design(
-    plan: Annotated[Path, typer.Argument(metavar="PLAN.yaml", help="radar, nodes with planned tracks, scene")],
+    plan: Annotated[
+        Path, typer.Argument(metavar="PLAN.yaml", help="flight plan: radar, nodes with planned tracks, scene")
+    ],
     out: Annotated[
         Path | None, typer.Argument(help="folder for layers, tracks, map and report", show_default=False)
     ] = None,
     *,
     optimise: Annotated[
         str | None,
-        typer.Option(metavar="WORDS", help="move tracks within the plan's bounds first: height,offset,spacing,heading"),
+        typer.Option(
+            metavar="QUANTITIES",
+            help="first optimise the tracks within the plan's bounds; any of height,offset,spacing,heading",
+        ),
     ] = None,
     threads: Threads = 1,
 ) -> None:
-    """Tell before a flight what it will give: resolution, noise, coverage, volume; whether it is what is required."""
+    """Predict resolution, noise, coverage and data volume of a planned flight, and compare with the requirements."""
     path, folder = given(plan), None if out is None else given(out)
     from apertura.tools.design.view import print_design
 
@@ -405,11 +424,11 @@ def design(
 
 @app.command()
 def compare(
-    plan: Annotated[Path, typer.Argument(metavar="PLAN.yaml", help="as of `apertura design`")],
+    plan: Annotated[Path, typer.Argument(metavar="PLAN.yaml", help="flight plan of `apertura design`")],
     campaign: CampaignFolder = HERE,
     threads: Threads = 1,
 ) -> None:
-    """Print planned and flown side by side, by the campaign's logs and, where there are any, its images."""
+    """Compare the flight plan with the campaign's logs and, once they are formed, its images."""
     path, folder = given(plan), given(campaign)
     from apertura.tools.design.view import print_comparison
 
@@ -418,7 +437,7 @@ def compare(
 
 @app.command(context_settings=PASS_ON)
 def chart(context: typer.Context, campaign: CampaignFolder = HERE, cores: Cores = ALL_CORES) -> None:
-    """Time and measure every engine and setting on the campaign: results/study/speed_accuracy.{png,html,csv}."""
+    """Measure run time and accuracy of every engine and setting: results/study/speed_accuracy.{png,html,csv}."""
     from apertura.run.driver import run_workflow
 
     status = run_workflow(given(campaign), cores, *context.args, "speed_accuracy")
@@ -429,7 +448,7 @@ def chart(context: typer.Context, campaign: CampaignFolder = HERE, cores: Cores 
 
 @app.command()
 def summary(campaign: CampaignFolder = HERE) -> None:
-    """Print what every finished image says of itself: focus, agreement, numerical error, flags."""
+    """Print the quality of every finished image: focus, agreement, numerical error, flags."""
     opened = _opened(campaign)
     from apertura.views.summary import print_stale, print_summary
 
@@ -440,9 +459,9 @@ def summary(campaign: CampaignFolder = HERE) -> None:
 @app.command()
 def score(
     campaign: Annotated[
-        Path, typer.Argument(help="campaign folder with truth.json, default: current folder", show_default=False)
+        Path, typer.Argument(help="campaign folder with truth.json, default: current directory", show_default=False)
     ] = HERE,
-    paths: Annotated[bool, typer.Option("--paths", help="list the files of all products, too")] = False,
+    paths: Annotated[bool, typer.Option("--paths", help="list the files of all products as well")] = False,
 ) -> None:
     """Compare the measured positions of point targets with the true ones."""
     opened = _opened(campaign)
@@ -458,9 +477,9 @@ def bench(
     campaign: CampaignFolder = HERE,
     write: Annotated[bool, typer.Option("--write", help="write the measured paths into config/config.yaml")] = False,
 ) -> None:
-    """Measure a radar that stands still or is cabled: channels, clocks, coherence, paths; a verdict per line.
+    """Measure channels, clocks, coherence and path lengths of a stationary or cabled radar, each with a verdict.
 
-    Exits with 2 where a line is beyond its limit.
+    The exit code is 2 if a measurement exceeds its limit.
     """
     opened = _opened(campaign)
     from apertura.tools.bench.report import print_bench
@@ -471,9 +490,11 @@ def bench(
 @app.command()
 def reflectors(
     campaign: CampaignFolder = HERE,
-    to: Annotated[Path | None, typer.Option(metavar="FILE", help="by default calibration.json in that folder")] = None,
+    to: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="output file, default: calibration.json in the campaign folder")
+    ] = None,
 ) -> None:
-    """Measure the constant of each pair at reflectors of known cross-section, and write it for later campaigns."""
+    """Measure each pair's calibration constant at reflectors of known cross-section, for use in later campaigns."""
     opened, path = _opened(campaign), None if to is None else given(to)
     from apertura.tools.reflectors import write_constants
 
@@ -485,28 +506,28 @@ def verify(
     product: Annotated[
         Path,
         typer.Argument(
-            help="a file, a stage or a manifest of a campaign, or a campaign folder, default: current folder",
+            help="file, stage or manifest of a campaign, or a campaign folder, default: current directory",
             show_default=False,
         ),
     ] = HERE,
     *,
     campaign: Annotated[
-        Path | None, typer.Option(metavar="FOLDER", help="the campaign of a file that lies elsewhere")
+        Path | None, typer.Option(metavar="FOLDER", help="campaign folder of a file that was copied elsewhere")
     ] = None,
     crate: Annotated[
-        bool, typer.Option("--crate", help="results that were passed on: every file by their RO-Crate, and the catalog")
+        bool, typer.Option("--crate", help="verify a copy of results/ by its RO-Crate and catalogue")
     ] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="only what is not the same")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="print differences only")] = False,
 ) -> None:
-    """Walk from a product to the raw samples; say of each link whether it is the same, changed or missing."""
+    """Verify a product back to the raw samples: report for each file if it is unchanged, changed or missing."""
     if crate:
         from apertura.views.verify.chain import print_checked
 
         raise typer.Exit(print_checked(given(product), quiet=quiet))
-    there = None if campaign is None else given(campaign)
+    folder = None if campaign is None else given(campaign)
     from apertura.views.verify.chain import print_verified
 
-    raise typer.Exit(print_verified(given(product), there, quiet=quiet))
+    raise typer.Exit(print_verified(given(product), folder, quiet=quiet))
 
 
 @app.command()
@@ -514,17 +535,20 @@ def reproduce(
     product: Annotated[
         Path,
         typer.Argument(
-            help="a file, a stage or a manifest of a campaign, or a campaign folder, default: current folder",
+            help="file, stage or manifest of a campaign, or a campaign folder, default: current directory",
             show_default=False,
         ),
     ] = HERE,
     *,
     cores: Cores = ALL_CORES,
     keep: Annotated[
-        Path | None, typer.Option(metavar="FOLDER", help="a new folder to make it in, which stays; else in TMPDIR")
+        Path | None,
+        typer.Option(
+            metavar="FOLDER", help="new folder for the reproduced files, which is kept; default: temporary, in TMPDIR"
+        ),
     ] = None,
 ) -> None:
-    """Make a product again from the raw samples, in another folder, and compare it byte for byte with what is there."""
+    """Recompute a product from the raw samples in another folder, and compare it byte for byte with the original."""
     kept = None if keep is None else given(keep)
     from apertura.views.verify.diff import print_reproduced
 
@@ -533,12 +557,12 @@ def reproduce(
 
 @app.command()
 def diff(
-    first: Annotated[Path, typer.Argument(help="a raster, picture, stage or report")],
-    second: Annotated[Path, typer.Argument(help="what to hold it against, of this campaign or another")],
+    first: Annotated[Path, typer.Argument(help="raster, picture, stage or report")],
+    second: Annotated[Path, typer.Argument(help="product to compare it with, of the same or another campaign")],
     *,
-    whole: Annotated[bool, typer.Option("--all", help="every line of a section, however many")] = False,
+    whole: Annotated[bool, typer.Option("--all", help="print every line of long sections")] = False,
 ) -> None:
-    """Tell two products apart: geometry, settings, inputs, stages, code, software, flags and pixels."""
+    """Compare two products: geometry, settings, inputs, stages, code, software, flags and pixels."""
     from apertura.views.verify.diff import print_differences
 
     raise typer.Exit(print_differences(given(first), given(second), whole=whole))
@@ -549,7 +573,7 @@ def report(
     campaign: CampaignFolder = HERE,
     cores: Cores = ALL_CORES,
 ) -> None:
-    """Write results/report.html: what was asked and decided, how images turned out, pictures; it needs no net."""
+    """Write results/report.html: configuration, decisions, image quality, pictures; readable without a network."""
     from apertura.campaign.folder import Campaign
     from apertura.run.driver import run_workflow
     from apertura.views.report import PAGE
@@ -562,8 +586,8 @@ def report(
     if status:
         raise SystemExit(status)
     with open_report(opened) as (temporary, style):
-        asked = ["--report", str(temporary), "--report-stylesheet", str(style)]
-        status = run_workflow(campaign, 1, "all", "pages", *asked, show="errors")
+        arguments = ["--report", str(temporary), "--report-stylesheet", str(style)]
+        status = run_workflow(campaign, 1, "all", "pages", *arguments, show="errors")
         if status:
             raise SystemExit(status)
     for path in (opened.result(PAGE), *(opened.result(flight.name, PAGE) for flight in opened.image_flights)):
@@ -573,30 +597,30 @@ def report(
 @app.command("map")
 def map_page(
     campaign: CampaignFolder = HERE,
-    port: Annotated[int, typer.Option(min=0, max=65535, help="to serve on; 0: a free one")] = 0,
-    look_: Annotated[bool, typer.Option("--look", help="what `apertura look` shows, as it flies")] = False,
-    open_: Annotated[bool, typer.Option("--open", help="show it in the browser")] = False,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="port of the server; 0: any free port")] = 0,
+    preview_: Annotated[bool, typer.Option("--preview", help="show the live images of `apertura preview`")] = False,
+    open_: Annotated[bool, typer.Option("--open", help="open the map in the browser")] = False,
 ) -> None:
-    """Show a campaign as a map in a browser: served to this machine alone, until Ctrl-C."""
+    """Show a campaign as a map in a browser; the server accepts this machine only and runs until Ctrl-C."""
     opened = _opened(campaign)
     opened.check_images()
     from apertura.views.summary import print_stale
     from apertura.views.webmap.server import served, served_look
 
-    if not look_:
+    if not preview_:
         print_stale(opened)
-    (served_look if look_ else served)(opened, port=port).show(in_browser=open_)
+    (served_look if preview_ else served)(opened, port=port).show(in_browser=open_)
 
 
 @app.command()
 def init(
-    directory: Annotated[Path, typer.Argument(help="folder to make")],
-    kind: Annotated[str, typer.Option(help="of waveform: ofdm, samples, fmcw, phase_history")] = "ofdm",
+    directory: Annotated[Path, typer.Argument(help="folder to create")],
+    kind: Annotated[str, typer.Option(help="kind of waveform: ofdm, samples, fmcw, phase_history")] = "ofdm",
     from_: Annotated[
-        Path | None, typer.Option("--from", metavar="PLAN.yaml", help="the config of a flight that was planned")
+        Path | None, typer.Option("--from", metavar="PLAN.yaml", help="derive the config from this flight plan")
     ] = None,
 ) -> None:
-    """Write the commented config of a new campaign folder, or that of a flight plan, ready for its recordings."""
+    """Create a campaign folder with a commented config, from a template or from a flight plan."""
     if from_ is not None:
         path, folder = given(from_), given(directory)
         from apertura.tools.design.flight_plan import read_flight_plan
@@ -612,7 +636,7 @@ def init(
     folder = made_folder(given(directory)) / "config"
     for path, text in ((folder / name, text) for name, text in texts.items()):
         if path.exists():
-            raise CampaignError("exists already", path, "a new folder", "Choose another folder; nothing was changed.")
+            raise CampaignError("exists already", path, "a new folder", "Choose another folder; no file was changed.")
         write_text(path, text)
         print(as_typed(path))
     print(_next_after_init(directory))
@@ -621,14 +645,16 @@ def init(
 def _next_after_init(directory: Path) -> str:
     folder = shlex.quote(str(directory))
     return (
-        "Next: state radar, nodes and scene in config.yaml and the flights in flights.tsv, copy recordings and logs to "
-        f"{folder}/raw/<flight>/, then: apertura check {folder}"
+        "Next: describe radar, nodes and scene in config.yaml and the flights in flights.tsv, copy recordings and logs "
+        f"to {folder}/raw/<flight>/, then run: apertura check {folder}"
     )
 
 
 @app.command()
 def simulate(
-    paths: Annotated[list[Path] | None, typer.Argument(metavar="[SPEC.yaml] DIR", help="what, and where to")] = None,
+    paths: Annotated[
+        list[Path] | None, typer.Argument(metavar="[SPEC.yaml] DIR", help="specification, and folder to create")
+    ] = None,
     preset: Annotated[
         str | None,
         typer.Option(
@@ -636,8 +662,10 @@ def simulate(
             "paper-lab, paper-static, paper-uav"
         ),
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="of the random generator")] = 1,
-    print_spec: Annotated[str | None, typer.Option(metavar="PRESET", help="print a preset to start from")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="seed of the random generator")] = 1,
+    print_spec: Annotated[
+        str | None, typer.Option(metavar="PRESET", help="print the specification of a preset")
+    ] = None,
 ) -> None:
     """Write a simulated campaign folder of raw IQ, with truth.json, from a YAML specification or a preset."""
     from apertura import simulation
@@ -648,6 +676,6 @@ def simulate(
     paths = paths or []
     if len(paths) + (preset is not None) not in {1, 2} or not paths:
         typed = " ".join(map(str, paths)) + (f" --preset {preset}" if preset else "") or "no folder"
-        raise CampaignError(typed, "simulate", "[SPEC.yaml] DIR, or DIR --preset PRESET", "Name a folder to make.")
+        raise CampaignError(typed, "simulate", "[SPEC.yaml] DIR, or DIR --preset PRESET", "Name a folder to create.")
     chosen = given(paths[0]) if len(paths) > 1 else simulation.preset(preset or "demo")
     print(as_typed(simulation.simulate(given(paths[-1]), chosen, seed=seed)))

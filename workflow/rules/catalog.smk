@@ -20,12 +20,12 @@ rule stac:
     params:
         **job["stac"].params,
     message:
-        "describing every image in a catalog"
+        "writing the STAC catalogue of all images"
     shell:
         "apertura step stac > {log} 2>&1"
 
 
-# Last of all: it describes every other result.
+# The last rule, because it describes all other results.
 rule ro_crate:
     input:
         config=files(inputs.config_files),
@@ -45,6 +45,6 @@ rule ro_crate:
     params:
         **job["ro_crate"].params,
     message:
-        "describing the whole run as an RO-Crate"
+        "writing the RO-Crate of the run"
     shell:
         "apertura step ro-crate > {log} 2>&1"

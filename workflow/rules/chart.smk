@@ -24,12 +24,12 @@ rule speed_accuracy:
         **job["speed_accuracy"].params,
         charted=lambda _: " ".join(inputs.charted(campaign)),
     message:
-        "timing and measuring every engine and setting"
+        "measuring run time and accuracy of every engine and setting"
     shell:
         "apertura step chart {params.charted} > {log} 2>&1"
 
 
-# Everything from raw samples on, under several settings: works in results/study/whole, which it removes.
+# The whole workflow with several settings, in the temporary folder results/study/whole.
 rule whole_chart:
     input:
         recordings=files(inputs.everything_recorded),
@@ -50,6 +50,6 @@ rule whole_chart:
     params:
         **job["whole_chart"].params,
     message:
-        "timing the way from raw samples to GeoTIFFs under several settings"
+        "measuring the workflow from raw samples to GeoTIFFs with several settings"
     shell:
         "apertura step whole-chart > {log} 2>&1"

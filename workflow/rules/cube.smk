@@ -17,6 +17,6 @@ rule cube:
     params:
         **job["cube"].params,
     message:
-        "stacking and adding up every image"
+        "stacking and summing all images"
     shell:
         "apertura step cube --threads {threads} > {log} 2>&1"

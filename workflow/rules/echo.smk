@@ -18,7 +18,7 @@ rule echo:
     params:
         **job["echo"].params,
     message:
-        "{wildcards.flight}: calibrating {wildcards.pair}"
+        "{wildcards.flight}: forming the echo of {wildcards.pair}"
     shell:
         "apertura step echo {wildcards.flight} {wildcards.pair} > {log} 2>&1"
 
@@ -41,7 +41,7 @@ rule transfer:
     params:
         **job["transfer"].params,
     message:
-        "{wildcards.flight}: keeping the transfer functions of {wildcards.pair}"
+        "{wildcards.flight}: storing the transfer functions of {wildcards.pair}"
     shell:
         "apertura step transfer {wildcards.flight} {wildcards.pair} > {log} 2>&1"
 

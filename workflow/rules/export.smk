@@ -1,4 +1,4 @@
-# The files are those of the rows of `apertura.formats.export.EXPORTS`, which a test compares with this list.
+# A test compares these files with the rows of `apertura.formats.export.EXPORTS`.
 rule export:
     input:
         image="results/{flight}/{pair}/image.manifest.json",
@@ -32,12 +32,12 @@ rule export:
     params:
         **job["export"].params,
     message:
-        "{wildcards.flight}: writing the files of {wildcards.pair}"
+        "{wildcards.flight}: writing the products of {wildcards.pair}"
     shell:
         "apertura step export {wildcards.flight} {wildcards.pair} --threads {threads} > {log} 2>&1"
 
 
-# As large as the echo: made where somebody asks for it, by its name or by rule phase_history.
+# Made on demand, because the file is as large as the echo: request the file, or rule phase_history for all pairs.
 rule cphd:
     input:
         echo="results/{flight}/{pair}/echo.manifest.json",
@@ -103,7 +103,7 @@ rule export_fused:
     params:
         **job["export_fused"].params,
     message:
-        "{wildcards.flight}: writing what the pairs add up to"
+        "{wildcards.flight}: writing the sums of the pairs"
     shell:
         "apertura step export {wildcards.flight} fused --threads {threads} > {log} 2>&1"
 
@@ -129,7 +129,7 @@ rule coverage:
     params:
         **job["coverage"].params,
     message:
-        "drawing what the flights cover"
+        "drawing the coverage of the flights"
     shell:
         "apertura step coverage > {log} 2>&1"
 
@@ -182,6 +182,6 @@ rule map:
     params:
         **job["map"].params,
     message:
-        "making the map"
+        "writing the data of the map"
     shell:
         "apertura step map > {log} 2>&1"

@@ -1,4 +1,4 @@
-# Tiles of one image are formed by so many jobs: --set-scatter tiles=8, or `set-scatter: tiles=8` in a profile.
+# Number of jobs that form the tiles of an image: --set-scatter tiles=8, or `set-scatter: tiles=8` in a profile.
 scattergather:
     tiles=1,
 
@@ -75,7 +75,7 @@ rule layers:
         "results/logs/{flight}/{pair}.layers.log",
     benchmark:
         "results/benchmarks/{flight}/{pair}.layers.tsv"
-    priority: 1  # before images, which take all cores: what rasters take on this machine is then known early
+    priority: 1  # before images, which use all cores, so that the speed of raster steps is measured early
     conda:
         "../../environment.yml"
     threads: job["layers"].threads
@@ -84,7 +84,7 @@ rule layers:
     params:
         **job["layers"].params,
     message:
-        "{wildcards.flight}: angles, mask, looks and noise of {wildcards.pair}"
+        "{wildcards.flight}: computing angles, mask, looks and noise of {wildcards.pair}"
     shell:
         "apertura step layers {wildcards.flight} {wildcards.pair} --threads {threads} > {log} 2>&1"
 
@@ -108,7 +108,7 @@ rule refine:
     params:
         **job["refine"].params,
     message:
-        "{wildcards.flight}: refining the tracks of its nodes where that pays"
+        "{wildcards.flight}: refining the tracks of its nodes if autofocus is on"
     shell:
         "apertura step refine {wildcards.flight} > {log} 2>&1"
 
@@ -138,7 +138,7 @@ rule tracks:
     params:
         **job["tracks"].params,
     message:
-        "{wildcards.flight}: writing the tracks as refined"
+        "{wildcards.flight}: writing the refined tracks"
     shell:
         "apertura step tracks {wildcards.flight} > {log} 2>&1"
 
@@ -165,12 +165,12 @@ rule tiles:
     params:
         **job["tiles"].params,
     message:
-        "{wildcards.flight}: share {wildcards.scatteritem} of the tiles of {wildcards.pair}"
+        "{wildcards.flight}: forming share {wildcards.scatteritem} of the tiles of {wildcards.pair}"
     shell:
         "apertura step tiles {wildcards.flight} {wildcards.pair} {wildcards.scatteritem} --threads {threads} > {log} 2>&1"
 
 
-# One job alone forms the tiles and finishes the image; the shares of many are gathered.
+# A single job forms the tiles and completes the image; the shares of several jobs are gathered.
 rule image:
     input:
         echo="results/{flight}/{pair}/echo.manifest.json",
@@ -198,7 +198,7 @@ rule image:
     params:
         **job["image"].params,
     message:
-        "{wildcards.flight}: focusing {wildcards.pair} with {threads} threads"
+        "{wildcards.flight}: forming the image of {wildcards.pair} with {threads} threads"
     shell:
         "apertura step image {wildcards.flight} {wildcards.pair} --threads {threads} > {log} 2>&1"
 
@@ -225,6 +225,6 @@ rule assess:
     params:
         **job["assess"].params,
     message:
-        "{wildcards.flight}: comparing the images with each other"
+        "{wildcards.flight}: comparing the images"
     shell:
         "apertura step assess {wildcards.flight} > {log} 2>&1"

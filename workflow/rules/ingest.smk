@@ -47,6 +47,6 @@ rule bench:
     params:
         **job["bench"].params,
     message:
-        "{wildcards.flight}: measuring channels, clocks and links on the bench"
+        "{wildcards.flight}: measuring channels, clocks and links of the bench set-up"
     shell:
         "apertura step bench {wildcards.flight} > {log} 2>&1"

@@ -39,6 +39,6 @@ rule interferogram:
     params:
         **job["interferogram"].params,
     message:
-        "{wildcards.two}: comparing two images in phase"
+        "{wildcards.two}: forming the interferogram"
     shell:
         "apertura step interferogram {wildcards.two} > {log} 2>&1"

@@ -1,4 +1,4 @@
-# What the report shows and says, made where somebody asks for it: `apertura report`, or rule pages.
+# Figures and pages of the report, made on demand by `apertura report` or rule pages.
 rule pictures:
     input:
         echo="results/{flight}/{pair}/echo.manifest.json",
@@ -59,7 +59,7 @@ rule pictures:
     params:
         **job["pictures"].params,
     message:
-        "{wildcards.flight}: drawing {wildcards.pair} for the report"
+        "{wildcards.flight}: drawing figures of {wildcards.pair} for the report"
     shell:
         "apertura step pictures {wildcards.flight} {wildcards.pair} > {log} 2>&1"
 
@@ -97,7 +97,7 @@ rule pictures_fused:
     params:
         **job["pictures_fused"].params,
     message:
-        "{wildcards.flight}: drawing what the pairs add up to for the report"
+        "{wildcards.flight}: drawing figures of the sums for the report"
     shell:
         "apertura step pictures-fused {wildcards.flight} > {log} 2>&1"
 
@@ -129,6 +129,6 @@ rule page:
     params:
         **job["page"].params,
     message:
-        "{wildcards.flight}: writing the page of the report"
+        "{wildcards.flight}: writing the report page"
     shell:
         "apertura step page {wildcards.flight} > {log} 2>&1"

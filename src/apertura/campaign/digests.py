@@ -1,7 +1,8 @@
 """Hashes of the source files of results, computed once per state of a file.
 
-A file's state is its size, inode, and times of content and of inode: `cp -p` and `rsync -a` set the former time back,
-none sets the latter. A hash is kept under that state in ``results/.hashes``, so that nothing large is read twice.
+The state of a file consists of its size, inode, modification time and change time: `cp -p` and `rsync -a` restore the
+modification time, but not the change time. Hashes are cached with the state in ``results/.hashes``, so that large files
+are read once.
 """
 
 import json
@@ -19,31 +20,31 @@ from apertura.common.errors import CampaignError
 from apertura.common.provenance import canonical_json, check_size, code_sha256, hashes_of_file, sha256_text
 
 _KEPT = Path("results/.hashes")
-_SMALL = 1 << 16  # bytes; hashed faster than its state is looked up
+_SMALL = 1 << 16  # bytes; smaller files are hashed faster than their cached state is read
 _SETTLED_S = 2.0
-"""A file changed within this time of being read may change again in the same tick of the clock: not kept."""
+"""Smallest age of a file whose hash is cached, seconds: a newer one may change again within the same clock tick."""
 
 
 def digest_of(
     root: Path, name: str, *, algorithm: Literal["sha256", "sha512"] = "sha256", paranoid: bool = False
 ) -> str:
-    """Return the hash of a campaign's file, hex; from `results/.hashes` where its state is known.
+    """Return the hash of a campaign's file, hex, from `results/.hashes` if its state is unchanged.
 
     Parameters
     ----------
     root
-        The campaign folder.
+        Campaign folder.
     name
-        The file relative to it.
+        File relative to the folder.
     algorithm
-        sha256, or sha512, with which the other is taken, too: a recording is read once for both.
+        sha256 or sha512; with sha512, both are computed in one pass, because recordings need both.
     paranoid
         Read the file in any case.
 
     Raises
     ------
     CampaignError
-        If the file is not there, is reached through a link, or changes while it is read.
+        If the file is missing, is reached through a link, or changes while it is read.
     """
     root = ConfinedPath.at(root)
     path = root.named(name, where=root)
@@ -63,7 +64,7 @@ def digest_of(
     if _state(path) != state:
         raise _changed(path)
     if max(state["mtime_ns"], state["ctime_ns"]) < time.time_ns() - _SETTLED_S * 1e9:
-        with suppress(OSError, CampaignError):  # a folder that cannot be written: the next one hashes again
+        with suppress(OSError, CampaignError):  # in a read-only folder, hashes are not cached
             write_json(kept, {"state": state, **digests})
     return digests[algorithm]
 
@@ -75,9 +76,9 @@ class Sources:
     Attributes
     ----------
     root
-        The campaign folder.
+        Campaign folder.
     digests
-        File relative to it → sha256.
+        File relative to the folder → SHA-256.
     """
 
     root: Path
@@ -86,13 +87,13 @@ class Sources:
 
     @classmethod
     def of(cls, root: Path, names: Iterable[str]) -> "Sources":
-        """Hash some files; raise CampaignError if one is not there."""
+        """Hash files; raise CampaignError if one is missing."""
         root = ConfinedPath.at(root)
         states = {name: _state(root.named(name, where=root)) for name in sorted(set(names))}
         return cls(root, {name: digest_of(root, name) for name in states}, states)
 
     def unchanged(self) -> dict[str, str]:
-        """Return file → sha256; raise CampaignError if one has changed since it was hashed: what was read is unknown.
+        """Return file → SHA-256; raise CampaignError if a file has changed since it was hashed.
 
         Examples
         --------
@@ -105,7 +106,7 @@ class Sources:
         ...     sources.unchanged()
         Traceback (most recent call last):
         ...
-        apertura.common.errors.CampaignError: ...log.csv: changed while it was read; expected ...
+        apertura.common.errors.CampaignError: ...log.csv: the file changed while it was read; expected ...
         """
         for name, state in self._states.items():
             if _state(self.root / name) != state:
@@ -117,8 +118,8 @@ def _state(path: Path) -> dict[str, int]:
     try:
         state = path.stat()
     except OSError as error:
-        found = "no such file" if isinstance(error, FileNotFoundError) else f"not readable ({error.strerror})"
-        raise CampaignError(found, path, "a file that was there", "Copy it there.") from error
+        problem = "no such file" if isinstance(error, FileNotFoundError) else f"not readable ({error.strerror})"
+        raise CampaignError(problem, path, "a source file of a result", "Copy it there.") from error
     return {
         "size": state.st_size,
         "inode": state.st_ino,
@@ -130,32 +131,32 @@ def _state(path: Path) -> dict[str, int]:
 
 def _changed(path: Path) -> CampaignError:
     return CampaignError(
-        "changed while it was read",
+        "the file changed while it was read",
         where=path,
-        expected="a file that nobody writes to",
-        remedy="Wait until it is copied, then run the workflow again.",
+        expected="a file that is not being modified",
+        remedy="Wait until it is completely written, then run the workflow again.",
     )
 
 
 @cache
 def _code_sha256(modules: tuple[str, ...]) -> str:
-    return code_sha256(*modules)  # the same for every flight and pair
+    return code_sha256(*modules)  # identical for all flights and pairs
 
 
 @dataclass(frozen=True)
 class Result:
-    """Result of one rule.
+    """Result of a rule with its lineage.
 
     Attributes
     ----------
     manifest
-        Its manifest, relative to the campaign folder.
+        Manifest, relative to the campaign folder.
     sources
-        Its sources: files, and manifests of other results, relative to the campaign folder.
+        Source files, and manifests of other results, relative to the campaign folder.
     settings
-        Settings of the config that affect it.
+        Settings that affect the result.
     modules
-        Modules whose import closure is the code that makes it, as `apertura.workflow.lineage.result_of` returns them.
+        Modules whose import closure is the code of the result, as `apertura.workflow.lineage.result_of` returns them.
     """
 
     manifest: str
@@ -165,29 +166,29 @@ class Result:
 
     @property
     def settings_sha256(self) -> str:
-        """Hash of the settings, as the manifest records it."""
+        """Hash of the settings, as stored in the manifest."""
         return sha256_text(canonical_json(self.settings))
 
     @property
     def code_sha256(self) -> str:
-        """Hash of the code that makes it, as the manifest records it."""
+        """Hash of the code, as stored in the manifest."""
         return _code_sha256(self.modules)
 
     def begin(self, root: Path, *, others: Sequence[str] = ()) -> "Lineage":
-        """Hash its sources, and `others` that these name."""
+        """Hash the sources, and `others` to which the sources refer."""
         return Lineage(self, Sources.of(root, (*self.sources, *others)))
 
 
 @dataclass(frozen=True)
 class Lineage:
-    """A result in the making, and its sources with their hashes at the start."""
+    """Result that is being computed, with the hashes of its sources at the start."""
 
     result: Result
     sources: Sources
 
     @property
     def modules(self) -> tuple[str, ...]:
-        """Modules whose import closure makes the result."""
+        """Modules whose import closure is the code of the result."""
         return self.result.modules
 
     def record(self) -> dict[str, Any]:
@@ -198,5 +199,5 @@ class Lineage:
         CampaignError
             If a source has changed since it was hashed.
         """
-        made_by = {"settings": self.result.settings_sha256, "code": self.result.code_sha256}
-        return {"sources": self.sources.unchanged(), **made_by}
+        hashes = {"settings": self.result.settings_sha256, "code": self.result.code_sha256}
+        return {"sources": self.sources.unchanged(), **hashes}

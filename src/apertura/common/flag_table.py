@@ -223,6 +223,18 @@ _OF_RECORDINGS = {
         "waveform.codes, waveform.carrier_is, waveform.iq, nodes.<n>.iq; the recording",
         "core/echo/sidelink_state.py",
     ),
+    "background": Flag(
+        "image noise with arcs of the background, dB above that without; why it is not removed",
+        "echoes at constant delay, such as antenna coupling, cause arcs at constant range",
+        "processing.background; isolation of the antennas",
+        "core/imaging/background.py",
+    ),
+    "background_loss": Flag(
+        "largest peak loss of a target, dB",
+        "the removed background contains part of targets whose range hardly changes",
+        "processing.background: none; a longer track",
+        "core/imaging/background.py",
+    ),
     "sidelink_lost": Flag(
         "pulses dropped",
         "pulses without a sidelink were dropped",
@@ -660,10 +672,10 @@ _OF_BENCHES = {
         "methods/bench/links.py",
     ),
     "interference": Flag(
-        "power fluctuation of a subcarrier relative to the others, dB; its frequency",
-        "a narrow-band signal in the band adds noise at every range",
-        "other transmitters; spurious signals of the node's clocks",
-        "methods/bench/links.py",
+        "noise of a subcarrier relative to its neighbours, dB; its frequency and usual service",
+        "a narrow-band signal in the band adds noise at every range; excluded subcarriers cause sidelobes",
+        "other transmitters; spurious signals of the node's clocks; processing.interference",
+        "methods/bench/links.py, core/echo/interference.py",
     ),
     "contact_intermittent": Flag(
         "change of amplitude in excess of noise; pulses lost or 6 dB low",

@@ -1,4 +1,4 @@
-"""Recording of one node in a flight: samples by channel, antennas by pulse, by the clocks of recorder and log."""
+"""Recording of one node in a flight: samples per channel and antenna positions per pulse, on a common time scale."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -21,53 +21,53 @@ from apertura.formats.recordings.sample_file import SampleFile, SampleLayout
 from apertura.stages.node_log import NodeLog, shortest_wave
 from apertura.stages.transmitted import Transmitted, check_mixing
 
-# ---- What a recording must be ---------------------------------------------------------------------------------------
+# ---- Checks of a recording against the waveform ----------------------------------------------------------------------
 
-_SAME = 1e-9
-"""Carriers and rates that differ by less, relative to what the config states, are the same."""
+_RATE_TOLERANCE = 1e-9
+"""Largest relative difference between recorded and configured carriers or sample rates."""
 
 
 def check_rates(waveform: SampledWaveform, recorded: Mapping[str, float], *, where: Path | str) -> None:
-    """Raise CampaignError unless what was `recorded`, sample_rate_hz and carrier_hz, is that of the waveform.
+    """Check the recorded sample_rate_hz and carrier_hz against the waveform; raise CampaignError if they differ.
 
-    A carrier of 0 is not stated by the recording: that of the config is taken.
+    A value of 0 means that the recording does not state it; the configured value is used.
     """
     for key, value in recorded.items():
         stated = float(getattr(waveform, key))
-        if value and not abs(value - stated) <= _SAME * stated:
+        if value and not abs(value - stated) <= _RATE_TOLERANCE * stated:
             raise CampaignError(
                 f"recorded with {key} {value:.6f}",
                 where=where,
-                expected=f"{stated:.6f}, as {CONFIG}: waveform.{key}",
-                remedy="Correct whichever is wrong; every node of a flight shares one waveform.",
+                expected=f"{stated:.6f}, as configured in {CONFIG}: waveform.{key}",
+                remedy="Correct the wrong value; all nodes of a flight share one waveform.",
             )
 
 
 def check_channels(recorded: Sequence[str], needed: Sequence[str], *, where: Path | str) -> None:
-    """Raise CampaignError unless channels were recorded under the names `needed`."""
+    """Check that the channels named in `needed` were recorded; raise CampaignError for a missing one."""
     for channel in needed:
         if channel not in recorded:
             raise CampaignError(
                 f"apertura:channels {[*recorded]}",
                 where=where,
                 expected=f"a channel named {channel!r}",
-                remedy="A secondary node needs its sidelink; name the channel or take the node out of the flight.",
+                remedy="A secondary node needs its sidelink: name the channel, or remove the node from the flight.",
             )
 
 
 def check_length(samples: int, needed: int, *, where: Path | str) -> None:
-    """Raise CampaignError unless captures hold as many samples as an echo takes."""
+    """Check that captures contain as many samples as an echo requires; raise CampaignError if they are shorter."""
     if samples < needed:
         raise CampaignError(
             f"captures of {samples} samples",
             where=where,
-            expected=f"at least {needed}: cyclic prefix and one period of 1/subcarrier_spacing_hz, or lead_s, "
-            "pulse_s and listen_s",
+            expected=f"at least {needed}: cyclic prefix and one period of 1/subcarrier_spacing_hz, or the sum of "
+            "lead_s, pulse_s and listen_s",
             remedy=f"Correct the waveform in {CONFIG}, or record longer captures.",
         )
 
 
-# ---- Recording of one node: samples by channel, antennas by pulse ---------------------------------------------------
+# ---- Recording of one node: samples per channel, antenna positions per pulse -----------------------------------------
 
 
 @dataclass(frozen=True)
@@ -77,17 +77,17 @@ class Captured:
     Attributes
     ----------
     raw
-        Its stage, or what it would hold.
+        Stage `raw` of the node, or a dataset of the same content.
     samples
-        The recorder's file.
+        Sample file of the recorder.
     files
-        raw/<flight>/<node>, with which its files' names begin.
+        raw/<flight>/<node>, the prefix of the node's file names.
     recording
-        Its files of samples, for messages.
+        Names of the sample files, for messages.
     numerology
-        Of the symbol.
+        Numerology of the symbol.
     order
-        Of I and Q: complex, swapped or conjugate.
+        Order of I and Q: complex, swapped or conjugate.
     """
 
     raw: xr.Dataset
@@ -98,14 +98,14 @@ class Captured:
     order: str
 
     def reader(self, channels: Sequence[str], pulses: NDArray[np.int64]) -> Read:
-        """Return a function that reads channels of some captures from the recorder's file, block by block.
+        """Return a function that reads channels of selected captures from the recorder's file, block by block.
 
         Parameters
         ----------
         channels
-            Names.
+            Channel names.
         pulses
-            (capture,) int64, captures of the recording; the function takes indices into this.
+            (capture,) int64, capture indices in the recording; the function takes indices into this array.
 
         Raises
         ------
@@ -115,24 +115,24 @@ class Captured:
         recorded, length = list(self.raw.attrs["channels"]), int(self.raw.attrs["capture_samples"])
         check_channels(recorded, channels, where=self.recording)
         check_length(length, self.numerology.prefix_samples + self.numerology.dft_samples, where=self.recording)
-        start, places = self.raw.start.values[pulses], {name: recorded.index(name) for name in channels}
+        start, columns = self.raw.start.values[pulses], {name: recorded.index(name) for name in channels}
 
         def read(captures: NDArray[np.int64]) -> dict[str, Samples]:
             if not self.samples.path.is_file():
                 raise CampaignError(
                     "no such file",
                     where=self.samples.path,
-                    expected="the recording that transfer functions are formed from: stage `transfer` keeps none",
-                    remedy=f"Copy it there. `processing: {{keep: [echo]}}` in {CONFIG} keeps them from then on.",
+                    expected="the recording, from which transfer functions are formed: stage `transfer` keeps none",
+                    remedy=f"Copy it there. With `processing: {{keep: [echo]}}` in {CONFIG}, later runs keep them.",
                 )
             iq = self.samples.captures(start[captures], length)
             iq = np.ascontiguousarray(ordered(iq, self.order))
-            # I and Q move together: one by one they cost more than their transform
+            # Copy each I and Q pair as one element: separate copies cost more than the Fourier transform.
             both = np.dtype(f"i{2 * iq.itemsize}")
             pairs = iq.view(both)[..., 0]
             return {
-                name: np.ascontiguousarray(pairs[:, :, place])[..., None].view(iq.dtype)
-                for name, place in places.items()
+                name: np.ascontiguousarray(pairs[:, :, column])[..., None].view(iq.dtype)
+                for name, column in columns.items()
             }
 
         return read
@@ -141,18 +141,18 @@ class Captured:
     def of(
         cls, raw: xr.Dataset, samples: Path, files: Path, recording: str, sent: Transmitted, *, order: str
     ) -> "Captured":
-        """Return captures of a file of samples; raise CampaignError unless carrier and rate are those of what was sent.
+        """Return the captures of a sample file; raise CampaignError if carrier or rate differ from the waveform's.
 
         Parameters
         ----------
         raw
-            Stage `raw`, or what it would hold.
+            Stage `raw`, or a dataset of the same content.
         samples
-            The recorder's file.
+            Sample file of the recorder.
         files, recording, order
             As the attributes.
         sent
-            What was transmitted.
+            Transmitted waveform.
         """
         recorded = {"sample_rate_hz": raw.attrs["sample_rate_hz"], "carrier_hz": raw.attrs["frequency_hz"]}
         check_rates(sent.waveform, recorded, where=recording)
@@ -167,12 +167,12 @@ class Acquisition(Captured, NodeLog):
 
 
 def open_acquisition(campaign: Campaign, flight: str, node: str, sent: Transmitted) -> Acquisition:
-    """Return the finished raw and track stages of a node.
+    """Open the finished raw and track stages of a node.
 
     Raises
     ------
     CampaignError
-        If it was recorded at another carrier or sample rate than what was sent.
+        If the recorded carrier or sample rate differs from the transmitted waveform's.
     """
     raw, track = (open_stage(campaign.stage(stage, flight, node), stage) for stage in ("raw", "track"))
     raw = raw.assign(time=("pulse", campaign.clock(flight, node).utc(raw.time.values)))
@@ -183,7 +183,7 @@ def open_acquisition(campaign: Campaign, flight: str, node: str, sent: Transmitt
     name = raw.attrs["samples"]
     if (campaign.root / name).is_file() and digest_of(campaign.root, name) != raw.attrs["inputs"][name]:
         raise CampaignError(
-            "changed since it was ingested",
+            "the file has changed since it was ingested",
             where=campaign.root / name,
             expected="the file that the raw stage describes",
             remedy="Run the workflow again: it ingests the recording first.",
@@ -194,13 +194,13 @@ def open_acquisition(campaign: Campaign, flight: str, node: str, sent: Transmitt
 
 
 def _own_sources(stage: xr.Dataset, files: Path) -> str:
-    """Return the node's own source files of a stage, without the preamble."""
+    """Return the names of a stage's source files that belong to the node, without the preamble, for messages."""
     own = [name for name in stage.attrs["inputs"] if name.startswith(f"{files.as_posix()}.")]
-    return " and ".join(own or stage.attrs["inputs"])  # a collection may give other names
+    return " and ".join(own or stage.attrs["inputs"])  # files of a SigMF collection may have other names
 
 
 def common_pulses(tx: Acquisition, rx: Acquisition, *, prf_hz: float) -> Association:
-    """Return the pulses that a transmitter and a receiver have in common."""
+    """Associate the pulses of a transmitter with the captures of a receiver."""
     tx_time, rx_time = (nanoseconds(node.raw.time.values) for node in (tx, rx))
     return associate(
         tx_time,

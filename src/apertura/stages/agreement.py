@@ -1,4 +1,4 @@
-"""Finished images of a campaign opened again: a layer at few places, and how two images agree."""
+"""Comparison of two finished images of a campaign, and access to their layers and reports."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -28,11 +28,11 @@ from apertura.core.quality.measures import BlockRaster
 from apertura.core.quality.point_targets import BandLimitedPatch, carrier_at
 from apertura.core.scene.grid import SceneGrid
 
-_SPECKLE_SHOWS = 2e-3
-"""Probability that speckle has a pixel 10 dB above its mean within a resolution cell of a place."""
+_SPECKLE_PROBABILITY = 2e-3
+"""Probability that speckle has a pixel 10 dB above its mean within a resolution cell of a given pixel."""
 
-_BY_CHANCE = 0.01
-"""Probability below which bright pixels at the points of another image are these points."""
+_SIGNIFICANCE = 0.01
+"""Significance level of the test for the bright points of another image."""
 
 
 @contextmanager
@@ -47,7 +47,7 @@ def opened_layer(campaign: Campaign, flight: str, pair: str, file: str) -> Itera
     Raises
     ------
     CampaignError
-        If it is not there as the step wrote it.
+        If the file is missing, or has changed since the step wrote it.
     """
     from apertura.common.raster import opened_raster
 
@@ -55,20 +55,25 @@ def opened_layer(campaign: Campaign, flight: str, pair: str, file: str) -> Itera
     manifest = campaign.root / campaign.manifest("layers", flight, pair)
     remedy = remake_from(manifest)
     if not path.is_file() or read_manifest(manifest)["files"].get(path.name) != sha256_file(path):
-        raise CampaignError("not as it was written", path, f"what {manifest.name} describes", remedy)
-    with opened_raster(path, expected="what step layers writes", remedy=remedy) as raster:
+        raise CampaignError(
+            "the file has changed since it was written" if path.is_file() else "no such file",
+            path,
+            f"the file listed in {manifest.name}",
+            remedy,
+        )
+    with opened_raster(path, expected="a raster of step layers", remedy=remedy) as raster:
         yield raster
 
 
 def averaged(raster: Any, dots: int) -> NDArray[np.float32]:
-    """Return a raster averaged to few places, from its overviews.
+    """Return a raster averaged to a coarse grid, from its overviews.
 
     Parameters
     ----------
     raster
-        Open for reading.
+        Raster open for reading.
     dots
-        Places along the longer side, at most.
+        Largest number of averaged pixels along the longer side.
 
     Returns
     -------
@@ -77,29 +82,30 @@ def averaged(raster: Any, dots: int) -> NDArray[np.float32]:
     """
     from rasterio.enums import Resampling
 
-    fewer = max(1.0, max(raster.shape) / dots)
-    shape = tuple(max(1, round(size / fewer)) for size in raster.shape)
+    factor = max(1.0, max(raster.shape) / dots)
+    shape = tuple(max(1, round(size / factor)) for size in raster.shape)
     values: NDArray[np.float32] = raster.read(1, out_shape=shape, resampling=Resampling.average)
     return values
 
 
 @dataclass(frozen=True, eq=False)
 class ComparedImage:
-    """An image as it is compared with others of its scene.
+    """Image with the properties that a comparison with other images of the scene needs.
 
     Attributes
     ----------
     raster
         (y, x) complex64.
     points
-        Its isolated bright points whose main lobe lies in the image. Each stands above what lies around it there,
-        whether or not it dominates its range cell in every pulse, as evidence of focus has to.
+        Isolated bright points whose main lobe lies in the image. They exceed their surroundings in the image; unlike
+        points that measure the focus, they need not dominate their range cell in every pulse.
     cell_m, spectrum
         Finest resolution cell, and (2, 2) covariance of a point's spatial spectrum, cycles² per m².
     focus
-        Its section of image.json.
+        Section `focus` of image.json.
     carriers, grid
-        Of points over the image, as `apertura.core.imaging.view.carriers_of`; and where its pixels lie.
+        Spatial carriers of points over the image, as `apertura.core.imaging.view.carriers_of` returns them; and the
+        image grid.
     """
 
     raster: BlockRaster
@@ -112,12 +118,13 @@ class ComparedImage:
 
     @classmethod
     def of(cls, image: "xr.Dataset", grid: SceneGrid, windows: Iterable[Window]) -> "ComparedImage":
-        """Return a stage `image` with its bright points, from windows that cover it once."""
+        """Return the comparison data of a stage `image`; `windows` cover the grid once."""
         quality = image.attrs["quality"]
-        return cls.found(image.image, quality["focus"], np.array(quality["view"]["carriers_cycles_m"]), grid, windows)
+        carriers = np.array(quality["view"]["carriers_cycles_m"])
+        return cls.from_raster(image.image, quality["focus"], carriers, grid, windows)
 
     @classmethod
-    def found(
+    def from_raster(
         cls,
         raster: BlockRaster,
         focus: Mapping[str, Any],
@@ -125,30 +132,30 @@ class ComparedImage:
         grid: SceneGrid,
         windows: Iterable[Window],
     ) -> "ComparedImage":
-        """Return an image with its bright points."""
+        """Return the comparison data of a raster, with its bright points."""
         spectrum = np.array(focus["spectrum_cycles2_m2"])
-        points = bright_places(raster, grid, windows, spectrum, cell_m=focus["cell_m"])
+        points = bright_points_within(raster, grid, windows, spectrum, cell_m=focus["cell_m"])
         image = cls(raster, points, focus["cell_m"], spectrum, focus, carriers, grid)
-        placed = [replace(point, carrier=image.carrier(point.row, point.column)) for point in points]
-        return replace(image, points=placed)
+        with_carriers = [replace(point, carrier=image.carrier(point.row, point.column)) for point in points]
+        return replace(image, points=with_carriers)
 
     def carrier(self, row: float, column: float) -> tuple[float, float]:
-        """Return the carrier of a point there, cycles per pixel down and right."""
+        """Return the spatial carrier of a point at a pixel, cycles per pixel down and right."""
         east, north = carrier_at(self.carriers, self.grid.shape, row, column)
         return -north * self.grid.spacing_m, east * self.grid.spacing_m
 
     def shows(self, point: BrightPoint) -> bool:
-        """Test whether one of its bright points lies within a resolution cell of another image's."""
+        """Return True if this image has a bright point within a resolution cell of another image's bright point."""
         reach_px = self.cell_m / self.grid.spacing_m
-        return any(np.hypot(point.row - one.row, point.column - one.column) <= reach_px for one in self.points)
+        return any(np.hypot(point.row - own.row, point.column - own.column) <= reach_px for own in self.points)
 
     def at(self, row: float, column: float) -> complex:
-        """Return the image at a fractional pixel, interpolated about the carrier of a point there."""
+        """Return the image at a fractional pixel, interpolated about the spatial carrier at that pixel."""
         patch = BandLimitedPatch(self.raster, round(row), round(column), self.carrier(row, column))
         return complex(patch.at(row, column))
 
 
-def bright_places(
+def bright_points_within(
     raster: BlockRaster,
     grid: SceneGrid,
     windows: Iterable[Window],
@@ -157,26 +164,26 @@ def bright_places(
     cell_m: float,
     isolated: bool = True,
 ) -> list[BrightPoint]:
-    """Return the bright points of an image whose main lobe lies in it.
+    """Return the bright points of an image whose main lobe lies within the image.
 
     Parameters
     ----------
     raster
         (y, x) complex64.
     grid, windows
-        Of it, and windows that cover it once.
+        Grid of the image, and windows that cover it once.
     spectrum
         (2, 2) float64, covariance of a point's spatial spectrum east and north, cycles² per m².
     cell_m
         Finest resolution cell.
     isolated
-        Those alone that stand far enough above their surroundings not to be speckle.
+        Return only points that exceed their surroundings by more than speckle does.
     """
     cell_px = cell_m / grid.spacing_m
-    found = bright_points(raster, windows, cell_px=max(8, round(cell_px)), shown=near(spectrum, grid.spacing_m, cell_m))
+    shown = near(spectrum, grid.spacing_m, cell_m)
     return [
         point
-        for point in found
+        for point in bright_points(raster, windows, cell_px=max(8, round(cell_px)), shown=shown)
         if (point.background <= SPECKLE or not isolated)
         and all(
             cell_px <= at <= size - 1 - cell_px for at, size in zip((point.row, point.column), grid.shape, strict=True)
@@ -187,9 +194,9 @@ def bright_places(
 def agreement_of(
     first: ComparedImage, second: ComparedImage, grid: SceneGrid, windows: Sequence[Window]
 ) -> Agreement | None:
-    """Compare a second image with a first: by bright points, else by ground; None where neither is possible.
+    """Compare a second image with a first by bright points, or by distributed clutter where common points are missing.
 
-    None as well where pixels are wider than a resolution cell: they do not resolve the place of a point.
+    None if neither is possible, or if pixels are wider than a resolution cell and do not resolve a point's position.
     """
     if not comparable(first, second, grid):
         return None
@@ -205,12 +212,12 @@ def agreement_of(
 
 
 def comparable(first: ComparedImage, second: ComparedImage, grid: SceneGrid) -> bool:
-    """Test whether the pixels of two images are fine enough to compare the places of points."""
+    """Return True if the pixels of two images are fine enough to compare the positions of points."""
     return grid.spacing_m <= WIDEST_PIXEL * min(first.cell_m, second.cell_m)
 
 
 def shows_points_of(first: ComparedImage, second: ComparedImage, grid: SceneGrid) -> bool:
-    """Test whether a second image has bright pixels at more bright points of a first than chance explains.
+    """Return True if a second image has bright pixels at significantly many bright points of a first.
 
     Notes
     -----
@@ -218,20 +225,21 @@ def shows_points_of(first: ComparedImage, second: ComparedImage, grid: SceneGrid
     """
     reach, count = max(1, round(first.cell_m / grid.spacing_m)), len(first.points)
     shown = sum(has_point(second.raster, round(one.row), round(one.column), reach=reach) for one in first.points)
-    return shown > 0 and float(scipy.special.bdtrc(shown - 1, count, _SPECKLE_SHOWS)) < _BY_CHANCE
+    return shown > 0 and float(scipy.special.bdtrc(shown - 1, count, _SPECKLE_PROBABILITY)) < _SIGNIFICANCE
 
 
-def agreement_report(found: Agreement | None) -> dict[str, float | str] | None:
-    """Return an agreement as JSON values."""
-    if found is None:
+def agreement_report(measured: Agreement | None) -> dict[str, float | str] | None:
+    """Return an agreement as JSON values; None if the images were not compared."""
+    if measured is None:
         return None
     return {
-        name: value if isinstance(value, str | bool) else float(f"{value:.4g}") for name, value in asdict(found).items()
+        name: value if isinstance(value, str | bool) else float(f"{value:.4g}")
+        for name, value in asdict(measured).items()
     }
 
 
 def report_of(campaign: Campaign, flight: str, image: str) -> dict[str, Any]:
-    """Return image.json of a pair or of 'fused'; raise CampaignError if it is not there as step export left it."""
+    """Return image.json of a pair or of 'fused'; raise CampaignError if it is missing or has changed since export."""
     path = campaign.result(flight, image, "image.json")
     return open_listed(path, path.with_name("export.manifest.json"))
 
@@ -242,15 +250,15 @@ def assessment_of(campaign: Campaign, flight: str) -> dict[str, Any]:
     Raises
     ------
     CampaignError
-        If it is not there as the step left it.
+        If the file is missing, or has changed since the step wrote it.
     """
     path = campaign.result(flight, "assessment.json")
     document = open_document(path)
-    with undamaged(path, expected="what step assess writes", remedy=remake(path)):
+    with undamaged(path, expected="the fields that step assess writes", remedy=remake(path)):
         read = {name: document[name] for name in ("reference", "hypotheses", "code_sha256")}
         fusion, pairs = document["fusion"], document["pairs"]
         phases = {pair: float(phase_rad) for pair, phase_rad in fusion["phases_rad"].items()}
-        excluded = {name: {**fusion[name]} for name in ("left_out", "unmeasured")}
+        excluded = {name: {**fusion[name]} for name in ("excluded", "unmeasured")}
         read["fusion"] = {**fusion, **excluded, "phases_rad": phases}
         read["pairs"] = {pair: {**agreed, "flags": {**agreed["flags"]}} for pair, agreed in pairs.items()}
     return {**document, **read}

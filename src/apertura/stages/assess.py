@@ -1,4 +1,4 @@
-"""Rule `assess`: agreement of a flight's images, which of them to add, and hypotheses for bad ones."""
+"""Rule `assess`: agreement of a flight's images, choice of the coherent sum, and causes of defocused images."""
 
 from collections.abc import Collection, Mapping, Sequence
 from itertools import combinations, permutations
@@ -29,18 +29,18 @@ _LOOKS_WRONG = frozenset(
 )
 """Flags that a wrong geometry raises; hypotheses are tried where one is raised."""
 
-_TIED = "as many pairs say the opposite, and their images do not show which is wrong"
+_TIED = "as many pairs contradict this, and the images do not show which pairs are wrong"
 
-_SPREAD = ", by amounts that differ from point to point by more than a resolution cell"
+_SPREAD = ", by amounts that differ between points by more than a resolution cell"
 
 _EXPLAINED_SIGMAS = 3.0
-"""Standard deviations of the phase that errors of the logs make between pairs, beyond which it has another cause."""
+"""Limit of a phase difference between pairs that log errors explain, in its standard deviations."""
 
 _REGAINED_SIGMAS = 3.0
-"""Standard deviations of a loss from none, beyond which a cause named for another image is told of this one too."""
+"""Smallest peak loss, in its standard deviations, to which a cause identified for another image is applied."""
 
 _VISIBLE_SNR_DB = 20.0
-"""A bright point this far above the noise should show in every image of the scene."""
+"""SNR from which a bright point is expected in every image of the scene, dB."""
 
 
 def assess(campaign: Campaign, flight: str) -> Path:
@@ -50,35 +50,38 @@ def assess(campaign: Campaign, flight: str) -> Path:
     images = {pair: open_stage(campaign.stage("image", flight, pair), "image") for pair in pairs}
     quality = {pair: image.attrs["quality"] for pair, image in images.items()}
     windows = list(grid.tiles(campaign.settings.processing.tile_px))
-    shown = {pair: ComparedImage.of(image, grid, windows) for pair, image in images.items()}
-    between = {(one, two): agreement_of(shown[one], shown[two], grid, windows) for one, two in combinations(pairs, 2)}
+    compared = {pair: ComparedImage.of(image, grid, windows) for pair, image in images.items()}
+    between = {
+        (one, two): agreement_of(compared[one], compared[two], grid, windows) for one, two in combinations(pairs, 2)
+    }
     hidden = {
         (one, two)
         for one, two in permutations(pairs, 2)
-        if between.get((one, two), between.get((two, one))) is None and _hides(shown[one], shown[two], grid)
+        if between.get((one, two), between.get((two, one))) is None and _hides(compared[one], compared[two], grid)
     }
-    rank = {pair: _rank(one["focus"]) for pair, one in quality.items()}
+    rank = {pair: _rank(measures["focus"]) for pair, measures in quality.items()}
     track = open_refined(campaign, flight)
     refined = track.correction is not None
-    coarse = _too_coarse(shown, grid)
+    coarse = _too_coarse(compared, grid)
     as_formed = choose_fusion(rank, between, hidden=hidden, coarse=coarse, align=False)
-    # A path that is constant for a pair is invisible to the refinement of tracks: its phase is removed here.
+    # Track refinement does not observe a constant path offset of a pair; its phase is removed here.
     align = refined or campaign.settings.processing.fusion.align_phase
     fusion = choose_fusion(rank, between, hidden=hidden, coarse=coarse, align=True) if align else as_formed
     explained_rad = track.stage.attrs["report"].get("pair_phase_std_rad", {}) if refined else None
     flags = _flags(pairs, as_formed, hidden, explained_rad=explained_rad)
-    for pair, name, line in wrong_codes({pair: one.get("code", {}) for pair, one in quality.items()}):
+    for pair, name, line in wrong_codes({pair: measures.get("code", {}) for pair, measures in quality.items()}):
         flags[pair][name] = line
     reference = fusion.reference
-    named = _hypotheses(campaign, flight, images, flags, reference)
+    causes = _hypotheses(campaign, flight, images, flags, reference)
     against = {pair: agreement_between(between, reference, pair) for pair in pairs if pair != reference}
     report = {
         "flight": flight,
         "reference": reference,
-        "hypotheses": named,
+        "hypotheses": causes,
         "pairs": {pair: {"agreement": agreement_report(against.get(pair)), "flags": flags[pair]} for pair in pairs},
         "between": [
-            {"first": one, "second": two, **(agreement_report(found) or {})} for (one, two), found in between.items()
+            {"first": one, "second": two, **(agreement_report(measured) or {})}
+            for (one, two), measured in between.items()
         ],
         "fusion": fusion.report,
         "code_sha256": chained_sha256(
@@ -90,16 +93,16 @@ def assess(campaign: Campaign, flight: str) -> Path:
     return path
 
 
-def _too_coarse(shown: Mapping[str, ComparedImage], grid: SceneGrid) -> str:
-    """Return why no two images can be compared where pixels are wider than their cells; empty where they can."""
-    if any(comparable(one, two, grid) for one, two in combinations(shown.values(), 2)):
+def _too_coarse(compared: Mapping[str, ComparedImage], grid: SceneGrid) -> str:
+    """Return the reason if pixels are too coarse to compare any two images; empty if they are fine enough."""
+    if any(comparable(one, two, grid) for one, two in combinations(compared.values(), 2)):
         return ""
-    cell_m = min((image.cell_m for image in shown.values()), default=np.inf)
-    return f"pixels of {grid.spacing_m:g} m do not resolve cells of {cell_m:.3g} m: make scene.spacing_m finer"
+    cell_m = min((image.cell_m for image in compared.values()), default=np.inf)
+    return f"pixels of {grid.spacing_m:g} m do not sample resolution cells of {cell_m:.3g} m: reduce scene.spacing_m"
 
 
 def _hides(first: ComparedImage, second: ComparedImage, grid: SceneGrid) -> bool:
-    """Return whether a second image lacks the bright points of a first that stand far enough above its noise."""
+    """Return True if a second image lacks the bright points of a first although their SNR is high."""
     return (
         any(point["snr_db"] > _VISIBLE_SNR_DB for point in first.focus["points"])
         and comparable(first, second, grid)
@@ -116,19 +119,20 @@ def _flags(
 ) -> dict[str, Flags]:
     """Return pair → flags of disagreement.
 
-    Where most pairs agree, the others carry them; where as many say the opposite, as of two pairs that differ, their
-    images do not show which is wrong, and both sides do. The phase of refined tracks is corrected before pairs are
-    added, and raised only where errors of the logs do not explain it: by `explained_rad`, pair → standard deviation
-    against the first pair; None: tracks are those of the logs.
+    The flags are raised on the pairs outside the largest set that agrees. If an equally large set contradicts that
+    set, as with two pairs that differ, the images do not show which is wrong, and the pairs of both are flagged.
+    With refined tracks, the phase is corrected before pairs are added, and flagged only if log errors do not explain
+    it. `explained_rad`: pair → standard deviation of the phase difference to the first pair that log errors explain;
+    None with tracks that were not refined.
     """
     flags = {pair: Flags() for pair in pairs}
     for pair in pairs:
-        blind = [one for one in chosen.agreeing if (one, pair) in hidden]
+        blind = [member for member in chosen.agreeing if (member, pair) in hidden]
         raised = _disagreement(chosen, pair, blind)
         if not raised:
             continue
-        # Two pairs of which one shows nothing of the other: the other may as well show what is not there.
-        tied = {one for tie in chosen.ties for one in tie if pair in tie} or (len(chosen.agreeing) == 1 and blind)
+        # If one of two pairs lacks the points of the other, the points themselves may be wrong.
+        tied = {member for tie in chosen.ties for member in tie if pair in tie} or (len(chosen.agreeing) == 1 and blind)
         opposite = f"; {_TIED}" if tied else ""
         for side in (pair, *(chosen.agreeing if tied else ())):
             if explained_rad is not None and _explained(chosen, pair, explained_rad):
@@ -139,14 +143,14 @@ def _flags(
 
 
 def _explained(chosen: CoherentSum, pair: str, std_rad: Mapping[str, float]) -> bool:
-    """Return whether errors of the logs may turn a pair against the reference by the phase measured."""
-    one = chosen.apart.get(pair)
-    if one is None or not std_rad:  # one phase per pulse and pair takes any constant
+    """Return True if log errors explain the measured phase difference of a pair from the reference."""
+    measured = chosen.apart.get(pair)
+    if measured is None or not std_rad:  # a correction with one phase per pulse and pair includes any constant
         return True
-    if one.incoherent:
+    if measured.incoherent:
         return False
-    std = np.sqrt(sum(std_rad.get(of, 0.0) ** 2 for of in (pair, chosen.reference)) + one.phase_std_rad**2)
-    return abs(float(one.phase_rad)) <= _EXPLAINED_SIGMAS * float(std)
+    std = np.sqrt(sum(std_rad.get(of, 0.0) ** 2 for of in (pair, chosen.reference)) + measured.phase_std_rad**2)
+    return abs(float(measured.phase_rad)) <= _EXPLAINED_SIGMAS * float(std)
 
 
 def _hypotheses(
@@ -156,7 +160,7 @@ def _hypotheses(
     flags: dict[str, Flags],
     reference: str,
 ) -> list[dict[str, Any]]:
-    """Try hypotheses where flags indicate a wrong geometry; append the best to these flags."""
+    """Test hypotheses if flags indicate a wrong geometry; append the best hypothesis to these flags."""
     suspicious = {pair: _LOOKS_WRONG & {*images[pair].attrs["flags"], *raised} for pair, raised in flags.items()}
     if not any(suspicious.values()) or not isinstance(campaign.settings.waveform, SampledWaveform):
         return []
@@ -167,90 +171,98 @@ def _hypotheses(
         for pair, image in images.items()
         if image.attrs["quality"]["focus"]["verdict"] == "focused" and "pair_unconfirmed" not in flags[pair]
     }
-    named = hypotheses(campaign, flight, brightest=brightest, cell_m=quality["focus"]["cell_m"], focused=sharp)
-    told = "; no single cause explains it"
-    if named:
-        told = f"; {named[0]['gain_db']:.1f} of {named[0]['lost_db']:.1f} dB come back if {named[0]['what']}"
+    causes = hypotheses(campaign, flight, brightest=brightest, cell_m=quality["focus"]["cell_m"], focused=sharp)
+    cause = "; no single cause explains it"
+    if causes:
+        cause = f"; {causes[0]['gain_db']:.1f} of {causes[0]['lost_db']:.1f} dB are explained if {causes[0]['what']}"
     for pair, names in suspicious.items():
         for name in names:
             line = flags[pair].get(name) or images[pair].attrs["flags"][name]
-            flags[pair][name] = line + told
+            flags[pair][name] = line + cause
         focus = images[pair].attrs["quality"]["focus"]
-        if named and not names and _regained(focus, named[0]["pair_gain_db"][pair]):
-            flags[pair]["loss_unexpected"] = f"{focus['why']}{told}"
-    return named
+        if causes and not names and _regained(focus, causes[0]["pair_gain_db"][pair]):
+            flags[pair]["loss_unexpected"] = f"{focus['reason']}{cause}"
+    return causes
 
 
 def _regained(focus: Mapping[str, Any], gain_db: float) -> bool:
-    """Return whether a cause named for other images of the flight brings back what this one lost, beyond chance."""
+    """Return True if a cause identified in other images of the flight recovers a significant loss of this image."""
     lost_db = -float(focus.get("loss_db", 0.0))
     beyond = max(UNEXPECTED_DB, _REGAINED_SIGMAS * float(focus.get("std_db", 0.0)))
     return lost_db > beyond and gain_db > max(beyond, LEAST_SHARE * lost_db)
 
 
 def _rank(focus: Mapping[str, Any]) -> tuple[int, float]:
-    """Return the rank of a pair's focus, the best first."""
-    uncertain = "cannot tell" if "loss_db" in focus else "not measured"
-    verdict = uncertain if focus["verdict"] == "cannot tell" else focus["verdict"]
-    return ["focused", "cannot tell", "defocused", "not measured"].index(verdict), -focus.get("loss_db", 0.0)
+    """Return the sort key of a pair's focus; the best focus has the lowest key."""
+    uncertain = "inconclusive" if "loss_db" in focus else "not measured"
+    verdict = uncertain if focus["verdict"] == "inconclusive" else focus["verdict"]
+    return ["focused", "inconclusive", "defocused", "not measured"].index(verdict), -focus.get("loss_db", 0.0)
 
 
 def _disagreement(chosen: CoherentSum, pair: str, blind: Sequence[str]) -> dict[str, str]:
-    """Return the flags of a pair that is not of the set that agrees; `blind`: members none of whose points it shows."""
-    agreeing, one = " and ".join(chosen.agreeing), chosen.apart.get(pair)
-    if one is None:
-        line = f"{pair} shows none of the bright points of {' and '.join(blind)} beyond those expected by chance"
-        return {"pair_unconfirmed": f"{line}: its echo is too weak, or it is wrong"} if blind else {}
-    where = one.evidence
-    if one.shifted:
+    """Return the flags of a pair outside the set that agrees.
+
+    `blind`: members of the set none of whose bright points the pair shows.
+    """
+    agreeing, measured = " and ".join(chosen.agreeing), chosen.apart.get(pair)
+    if measured is None:
+        line = f"{pair} does not show the bright points of {' and '.join(blind)} more often than speckle explains"
+        return {"pair_unconfirmed": f"{line}: its echo is too weak, or its geometry is wrong"} if blind else {}
+    where = measured.evidence
+    if measured.shifted:
         return {
             "pairs_displaced": (
-                f"{where} of {pair} lie {100 * one.shift_m:.1f} ± {100 * one.shift_std_along_m:.1f} cm from where "
-                f"{agreeing} {'has' if len(chosen.agreeing) == 1 else 'have'} them, "
-                f"{100 * one.shift_east_m:+.1f} cm east and {100 * one.shift_north_m:+.1f} cm north"
-                f"{_SPREAD * one.spread}: positions, lever arms, path offsets or heights are wrong"
+                f"{where} of {pair} displaced by {100 * measured.shift_m:.1f} ± "
+                f"{100 * measured.shift_std_along_m:.1f} cm relative to {agreeing}, "
+                f"{100 * measured.shift_east_m:+.1f} cm east and {100 * measured.shift_north_m:+.1f} cm north"
+                f"{_SPREAD * measured.spread}: positions, lever arms, path offsets or heights are wrong"
             ),
-            **({_PHASE: _phase_line(one, where, pair, chosen.reference)} if one.out_of_phase else {}),
+            **({_PHASE: _phase_line(measured, where, pair, chosen.reference)} if measured.out_of_phase else {}),
         }
-    return {_PHASE: _phase_line(one, where, pair, chosen.reference)}
+    return {_PHASE: _phase_line(measured, where, pair, chosen.reference)}
 
 
-def _phase_line(one: Agreement, where: str, pair: str, reference: str) -> str:
-    found = f"{pair} is {one.phase_rad:+.2f} ± {one.phase_std_rad:.2f} rad from {reference} at {where}"
-    if one.incoherent:
+def _phase_line(measured: Agreement, where: str, pair: str, reference: str) -> str:
+    line = (
+        f"phase of {pair} differs by {measured.phase_rad:+.2f} ± {measured.phase_std_rad:.2f} rad from {reference} "
+        f"at {where}"
+    )
+    if measured.incoherent:
         return (
-            f"{found}, coherence {one.coherence:.2f}: no common phase; positions of one are wrong from point to point"
+            f"{line}, coherence {measured.coherence:.2f}: no common phase; the position errors of one pair differ "
+            "between points"
         )
-    return f"{found}: path offsets or positions are wrong by a fraction of the wavelength"
+    return f"{line}: path offsets or positions are wrong by a fraction of the wavelength"
 
 
 def wrong_codes(codes: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, str, str]]:
-    """Return pair, flag and line for each pair whose transmitter sent, or whose receiver recorded, another code.
+    """Return pair, flag and line for each pair whose sidelink does not contain the configured code.
 
-    Where some receivers find the code and others find another, the transmitter sent it, and these recorded another
-    transmitter; where none finds it, all pairs of the transmitter are wrong.
+    If some receivers detect the configured code, the transmitter sent it, and the others recorded another
+    transmitter. If none detects it, the transmitter sent another code, and all its pairs are flagged.
 
     Parameters
     ----------
     codes
-        Pair → `CodeEvidence` as it stands in image.json.
+        Pair → `CodeEvidence` as in image.json.
 
     Examples
     --------
-    >>> found, other = {"carried": True, "evidence": "locked"}, {"carried": False, "evidence": "another code"}
+    >>> locked, other = {"carried": True, "evidence": "locked"}, {"carried": False, "evidence": "another code"}
     >>> wrong_codes({"a-a": {}, "a-b": other})
-    [('a-a', 'wrong_code', 'another code; seen by a-b'), ('a-b', 'wrong_code', 'another code; seen by a-b')]
-    >>> wrong_codes({"a-a": {}, "a-b": other, "a-c": found})
-    [('a-b', 'wrong_code', 'another code; a-c found the code that was stated')]
+    [('a-a', 'wrong_code', 'another code; measured in a-b'), ('a-b', 'wrong_code', 'another code; measured in a-b')]
+    >>> wrong_codes({"a-a": {}, "a-b": other, "a-c": locked})
+    [('a-b', 'wrong_code', 'another code; the configured code was detected in a-c')]
     """
-    carried = {pair: one.get("carried") for pair, one in codes.items()}
+    carried = {pair: evidence.get("carried") for pair, evidence in codes.items()}
     flags = []
     for pair in codes:
-        of_one = [other for other in codes if other.split("-")[0] == pair.split("-")[0]]
-        seen_by = next((other for other in of_one if carried[other] is False), None)
-        if seen_by and not any(carried[other] for other in of_one):
-            flags.append((pair, "wrong_code", f"{codes[seen_by]['evidence']}; seen by {seen_by}"))
+        same_tx = [other for other in codes if other.split("-")[0] == pair.split("-")[0]]
+        without_code = next((other for other in same_tx if carried[other] is False), None)
+        if without_code and not any(carried[other] for other in same_tx):
+            flags.append((pair, "wrong_code", f"{codes[without_code]['evidence']}; measured in {without_code}"))
         elif carried[pair] is False:
-            found = ", ".join(other for other in of_one if carried[other])
-            flags.append((pair, "wrong_code", f"{codes[pair]['evidence']}; {found} found the code that was stated"))
+            detected = ", ".join(other for other in same_tx if carried[other])
+            line = f"{codes[pair]['evidence']}; the configured code was detected in {detected}"
+            flags.append((pair, "wrong_code", line))
     return flags

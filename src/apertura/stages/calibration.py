@@ -1,4 +1,4 @@
-"""Rule `calibrate`: path offsets of a flight's pairs, from a reflector at a known place."""
+"""Rule `calibrate`: path offsets of a flight's pairs, from a reflector at a known position."""
 
 from pathlib import Path
 from typing import Any
@@ -23,12 +23,12 @@ from apertura.workflow.lineage import result_of
 
 
 def calibrate(campaign: Campaign, flight: str) -> Path:
-    """Write results/<flight>/calibration.json: offset, deviation and coherence of every pair.
+    """Write results/<flight>/calibration.json: path offset, standard deviation and coherence of every pair.
 
     Raises
     ------
     CampaignError
-        If config/config.yaml has no calibration section, or no reflector stands out.
+        If config/config.yaml has no calibration section, or no reflector is detected.
     """
     requested = campaign.settings.calibration
     if requested is None:
@@ -36,7 +36,7 @@ def calibrate(campaign: Campaign, flight: str) -> Path:
             "no section calibration",
             where="config/config.yaml",
             expected="calibration.flight and calibration.reflector_m for a flight of kind calibration",
-            remedy="State the place of the reflector.",
+            remedy="State the position of the reflector.",
         )
     lineage = result_of(campaign, "calibration", flight).begin(campaign.root)
     report: dict[str, Any] = {"flight": flight, "reflector_m": list(requested.reflector_m), "pairs": {}}
@@ -54,20 +54,20 @@ def calibrate(campaign: Campaign, flight: str) -> Path:
 
 
 def calibrated(campaign: Campaign, flight: str, pair: str) -> dict[str, Any] | None:
-    """Return the calibrated offset of a pair for an imaging flight; None: the config's offsets are used."""
+    """Return the calibrated path offset of a pair for an imaging flight; None if the configured offsets apply."""
     requested = campaign.settings.calibration
     if requested is None or campaign.flight(flight).kind == "calibration":
         return None
     path = campaign.result(requested.flight, "calibration.json")
     document = open_document(path)
-    with undamaged(path, expected="what step calibrate writes", remedy=remake(path)):
+    with undamaged(path, expected="the fields that step calibrate writes", remedy=remake(path)):
         offsets = {name: _validated(offset) for name, offset in document["pairs"].items()}
     if pair not in offsets:
         raise CampaignError(
             f"no offset of pair {pair}",
             where=path,
-            expected=f"the pairs of flight {flight}; {requested.flight} calibrated {sorted(offsets)}",
-            remedy="Fly the calibration with the same transmitter and nodes, or take out config: calibration.",
+            expected=f"all pairs of flight {flight}; flight {requested.flight} calibrated {sorted(offsets)}",
+            remedy="Fly the calibration with the same transmitter and nodes, or remove section calibration.",
         )
     return {"flight": requested.flight, **offsets[pair]}
 
@@ -106,5 +106,5 @@ def _pair(campaign: Campaign, opened: PairEcho, requested: CalibrationSettings, 
 
 
 def calibration_spec(offset: dict[str, Any] | None) -> str:
-    """Return the calibration used as one line for provenance."""
+    """Return the applied calibration as one line for provenance."""
     return canonical_json({name: offset[name] for name in ("flight", "offset_m", "std_m")} if offset else None)

@@ -1,4 +1,4 @@
-"""Rule `coverage`: coverage of all flights and pairs of a campaign, as a picture and for a GIS."""
+"""Rule `coverage`: coverage of all flights and pairs of a campaign, as a PNG map and as GeoJSON."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -23,8 +23,8 @@ from apertura.stages.scene import OpenScene, settled_scene
 from apertura.stages.tags import tags_of
 from apertura.workflow.lineage import result_of
 
-_DOTS = 480  # of the longer side of the scene
-_VERTICES = 400  # of a track
+_DOTS = 480  # averaged pixels along the longer side of the scene
+_VERTICES = 400  # vertices of a track
 
 
 def coverage(campaign: Campaign) -> Sequence[Path]:
@@ -40,44 +40,44 @@ def coverage(campaign: Campaign) -> Sequence[Path]:
     title = f"{campaign.settings.campaign} · coverage"
     local = scene.grid.crs == LOCAL
     write_coverage(picture, covered, transform, crs_name=crs_name(scene.grid), title=title, tags=tags, local=local)
-    found = feature_collection(covered, transform, place_of(scene), height_m=scene.level.height_m)
+    collection = feature_collection(covered, transform, place_of(scene), height_m=scene.level.height_m)
     with replacement(features) as temporary:
-        temporary.write_text(canonical_json(found) + "\n", encoding="utf-8")
+        temporary.write_text(canonical_json(collection) + "\n", encoding="utf-8")
     record_files(campaign.root / lineage.result.manifest, written, lineage)
     return written
 
 
 def _covered(campaign: Campaign, flight: str, pair: str, grid: SceneGrid) -> Covered:
     aperture = aperture_of(open_stage(campaign.stage("echo", flight, pair), "echo"))
-    some = np.unique(np.linspace(0, len(aperture) - 1, _VERTICES).round().astype(int))
-    legs = dict(zip(("transmitter", "receiver"), aperture[some].legs, strict=True))
+    vertices = np.unique(np.linspace(0, len(aperture) - 1, _VERTICES).round().astype(int))
+    positions_m = dict(zip(("transmitter", "receiver"), aperture[vertices].legs, strict=True))
     if is_monostatic(pair):
-        del legs["receiver"]  # the same node: one track
-    tracks_m = {antenna: map_from_frame(grid.crs, leg) for antenna, leg in legs.items()}
+        del positions_m["receiver"]  # the same node: one track
+    tracks_m = {antenna: map_from_frame(grid.crs, track) for antenna, track in positions_m.items()}
     return Covered(flight, pair, tracks_m, few_looks(campaign, flight, pair))
 
 
 def few_looks(campaign: Campaign, flight: str, pair: str) -> NDArray[np.float32]:
-    """Return the looks of a pair, averaged to few places; from the overviews of its file.
+    """Return the looks of a pair, averaged to a coarse grid, from the overviews of its file.
 
     Raises
     ------
     CampaignError
-        If the file is not as step `layers` wrote it.
+        If the file has changed since step `layers` wrote it.
     """
     with opened_layer(campaign, flight, pair, "looks.tif") as raster:
         return averaged(raster, _DOTS)
 
 
 def transform_of(grid: SceneGrid, looks: NDArray[np.float32]) -> Affine:
-    """Return the transform of the places of `few_looks` on the map."""
+    """Return the affine transform from pixels of `few_looks` to map coordinates."""
     step, _, west, _, _, north = grid.transform
     down, right = (size * step / dots for size, dots in zip(grid.shape, looks.shape, strict=True))
     return Affine(right, 0, west, 0, -down, north)
 
 
 def place_of(scene: OpenScene) -> Any:
-    """Return the transformation of map coordinates to longitude, latitude, height; None in a local frame."""
+    """Return a function from map coordinates to longitude, latitude and height; None in a local frame."""
     if scene.grid.crs == LOCAL:
         return None
 
@@ -89,8 +89,8 @@ def place_of(scene: OpenScene) -> Any:
 
 
 def crs_name(grid: SceneGrid) -> str:
-    """Return the name of a grid's CRS as pictures show it."""
+    """Return the name of a grid's CRS for the labels of plots."""
     from pyproj import CRS
 
-    known = CRS.from_user_input(grid.crs_wkt)
-    return known.name + (" (local axes, no place on Earth)" if known.is_engineering else "")
+    crs = CRS.from_user_input(grid.crs_wkt)
+    return crs.name + (" (local axes, not georeferenced)" if crs.is_engineering else "")

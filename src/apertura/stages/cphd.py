@@ -24,7 +24,7 @@ from apertura.stages.transfer import PairEcho
 from apertura.workflow.lineage import result_of
 
 _NULL_ISLAND = (0.0, 0.0, 0.0)
-"""Origin assumed for a frame without a place on Earth: latitude, longitude (deg) and height (m)."""
+"""Origin assumed for a local frame that is not georeferenced: latitude, longitude (deg) and height (m)."""
 
 
 def cphd(campaign: Campaign, flight: str, pair: str) -> Path:
@@ -32,12 +32,12 @@ def cphd(campaign: Campaign, flight: str, pair: str) -> Path:
     lineage = result_of(campaign, "cphd", flight, pair).begin(campaign.root)
     echo, scene = PairEcho.opened(campaign, flight, pair).stage, settled_scene(campaign)
     flags = open_stage(campaign.stage("profile", flight, pair), "profile").attrs["flags"]
-    echo = echo.assign_attrs(flags=flags)  # those of its samples, too
+    echo = echo.assign_attrs(flags=flags)  # the flags of the samples are raised by stage `profile`
     collection = _collection(campaign, flight, echo, scene, tags_of(Provenance.of(lineage.modules, [echo]), lineage))
     path = campaign.result(flight, pair, PHASE_HISTORY)
     if collection.swath_s[1] <= 0:
         raise CampaignError(
-            "the middle of the scene lies beyond the cyclic prefix of some pulses",
+            "echoes of the scene centre exceed the cyclic prefix in some pulses",
             where=f"flight {flight}, pair {pair}",
             expected="a reference point whose echoes were recorded",
             remedy="Correct scene.bounds_m.",
@@ -50,9 +50,10 @@ def cphd(campaign: Campaign, flight: str, pair: str) -> Path:
 def _collection(
     campaign: Campaign, flight: str, echo: xr.Dataset, scene: OpenScene, tags: Mapping[str, str]
 ) -> CphdCollection:
-    """Return the file's metadata of the echo; a local frame is put at latitude and longitude 0.
+    """Return the CPHD metadata of an echo; a local frame is placed at latitude and longitude 0.
 
-    There east, north and up are axes of ECEF, and metres keep their value: only the height is rounded, by 1 nm.
+    At that point east, north and up are axes of ECEF. Coordinates keep their values; only the height is rounded, to
+    1 nm.
     """
     frame_origin, frame_axes = np.zeros(3), np.eye(3)
     origin = scene.middle_m
@@ -87,13 +88,13 @@ def _collection(
 
 
 def _east_north_up(point_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the axes at a place, ECEF, as the rows of (3, 3) float64."""
+    """Return the east, north and up axes at a point in ECEF, as the rows of (3, 3) float64."""
     north, east, down = ned_axes(point_m).T
     return np.stack([east, north, -down])
 
 
 def _rereferenced(echo: xr.Dataset, collection: CphdCollection) -> Iterator[NDArray[np.complex64]]:
-    """Yield the samples referred to the delay of the reference point instead of that of the stage."""
+    """Yield blocks of samples referred to the delay of the reference point instead of the stage's reference delay."""
     extra_delay_s = collection.reference_delay_s - echo.reference_delay.values
     frequency: Any = echo.frequency.values
     with progress("pulses", len(extra_delay_s)) as done:

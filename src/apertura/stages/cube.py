@@ -1,4 +1,4 @@
-"""Rule `cube`: every image of the campaign on one grid, each flight's pairs added up, and phases between images."""
+"""Rule `cube`: every image of the campaign on one grid, sums over each flight's pairs, and interferometric phases."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
@@ -35,20 +35,20 @@ _TEXTS = np.dtypes.StringDType()
 
 
 Sums = Mapping[str, Mapping[str, Any]]
-"""Flight that has pairs to add up → its coherent sum, as step `assess` chose it."""
+"""Flight with several pairs → its coherent sum, as step `assess` chose it."""
 
 
 def labels(images: Images, assessed: Mapping[str, Mapping[str, Any]], sums: Sums, pairs: Sequence[str]) -> xr.Dataset:
-    """Return coordinates flight, pair, time and what pairs and flights are compared with; values of every image.
+    """Return the coordinates flight, pair, time, reference pair and reference flight, and the values of every image.
 
     Parameters
     ----------
     images
-        Those that were formed.
+        Images that were formed.
     assessed
-        Flight → what step `assess` wrote of it.
+        Flight → its assessment by step `assess`.
     sums
-        Of the flights that have any.
+        Coherent sums, of the flights with several pairs.
     pairs
         Every pair of the campaign.
     """
@@ -57,14 +57,14 @@ def labels(images: Images, assessed: Mapping[str, Mapping[str, Any]], sums: Sums
         name: np.full(shape, "", _TEXTS) if dtype == "T" else np.full(shape, np.nan)
         for name, (_, dtype, _, _) in QUOTED.items()
     }
-    for place, (flight, one) in enumerate(assessed.items()):
+    for row, (flight, assessment) in enumerate(assessed.items()):
         for pair in pairs:
             if (flight, pair) in images:
-                measures = _quoted_values(images[flight, pair], one["pairs"][pair])
+                measures = _quoted_values(images[flight, pair], assessment["pairs"][pair])
                 measures["phase_removed"] = sums[flight]["phases_rad"].get(pair) if flight in sums else None
                 for name, value in measures.items():
                     if value is not None:
-                        values[name][place, pairs.index(pair)] = value
+                        values[name][row, pairs.index(pair)] = value
     return xr.Dataset(
         {name: (QUOTED[name][0], array) for name, array in values.items()},
         coords={
@@ -75,19 +75,19 @@ def labels(images: Images, assessed: Mapping[str, Mapping[str, Any]], sums: Sums
                 np.array([_middle_time(images, flight) for flight in assessed]),
                 {"standard_name": "time"},
             ),
-            "reference_pair": ("flight", np.array([one["reference"] for one in assessed.values()], _TEXTS)),
+            "reference_pair": ("flight", np.array([flight["reference"] for flight in assessed.values()], _TEXTS)),
             "reference_flight": ("pair", np.array([*reference_flights(images, pairs).values()], _TEXTS)),
         },
     )
 
 
 def reference_flights(images: Images, pairs: Sequence[str]) -> dict[str, str]:
-    """Return pair → the first flight that flew it."""
+    """Return pair → the first flight with an image of it."""
     return {pair: next(flight for flight, other in images if other == pair) for pair in pairs}
 
 
 def _middle_time(images: Images, flight: str) -> Any:
-    """Return the middle of the pulses of all pairs of a flight, UTC."""
+    """Return the mid-time of the pulses of all pairs of a flight, UTC."""
     views = [image.attrs["quality"]["view"] for (name, _), image in images.items() if name == flight]
     ends = np.array([view[end] for view in views for end in ("first_utc", "last_utc")], "datetime64[ns]")
     return ends.min() + (ends.max() - ends.min()) // 2
@@ -96,7 +96,7 @@ def _middle_time(images: Images, flight: str) -> Any:
 def _quoted_values(image: xr.Dataset, assessed: Mapping[str, Any]) -> dict[str, float | str | None]:
     """Return the quality of an image and its assessment: name of a row of `QUOTED` → value or None."""
     quality = image.attrs["quality"]
-    view, focus, pulses = quality["view"], quality["focus"], quality.get("pulses", {})  # a phase history has none
+    view, focus, pulses = quality["view"], quality["focus"], quality.get("pulses", {})  # none from a phase history
     flags = {*image.attrs["flags"], *assessed["flags"]}
     return {
         "heading": view["heading_deg"],
@@ -123,7 +123,7 @@ def _quoted_values(image: xr.Dataset, assessed: Mapping[str, Any]) -> dict[str, 
 # ---- Coherence and phase between the images of a cube ---------------------------------------------------------------
 
 _TILES_AT_ONCE = 4
-"""Along a side: tiles are read with a margin, and what they share is read once."""
+"""Tiles per side of a block that is read at once, so that tiles share the margin of their windows."""
 
 Compared = Mapping[str, Mapping[tuple[str, str], tuple[str, str]]]
 """'pair' or 'flight' → image, by flight and pair → the image it is compared with."""
@@ -135,26 +135,26 @@ def compared(images: Images, references: Mapping[str, str], first_flights: Mappi
     Parameters
     ----------
     images
-        Those that were formed.
+        Images that were formed.
     references
         Flight → its reference pair.
     first_flights
-        Pair → the flight that others are compared with.
+        Pair → its reference flight.
     """
-    to = {
+    partners = {
         "pair": {(flight, pair): (flight, references[flight]) for flight, pair in images},
         "flight": {(flight, pair): (first_flights[pair], pair) for flight, pair in images},
     }
-    return {kind: {one: other for one, other in rows.items() if one != other} for kind, rows in to.items()}
+    return {kind: {one: other for one, other in rows.items() if one != other} for kind, rows in partners.items()}
 
 
 def window_of(images: Images, spacing_m: float) -> int:
-    """Return the side (pixels) of the window that coherence is measured in: every image has 16 looks in it."""
+    """Return the side of the coherence window, pixels: it contains at least 16 looks of every image."""
     return max(window_px(_spectrum(image), spacing_m) for image in images.values())
 
 
 def shared_band(one: xr.Dataset, other: xr.Dataset) -> float:
-    """Return the coherence of unchanged ground, docs/theory/interferometry.md, eq. 1a."""
+    """Return the coherence of unchanged terrain, docs/theory/interferometry.md, eq. 1a."""
     carriers = tuple(np.array(image.attrs["quality"]["view"]["carrier_cycles_m"]) for image in (one, other))
     return common_band((carriers[0], carriers[1]), (_spectrum(one), _spectrum(other)))
 
@@ -168,34 +168,36 @@ def write_phase(
     window: int,
     workers: Executor,
 ) -> tuple[float, float]:
-    """Write coherence and phase of two images tile by tile; return looks, and the coherence of chance.
+    """Write coherence and phase of two images tile by tile; return looks, and the coherence bias of unrelated images.
 
     Parameters
     ----------
     images
-        An image and the one it is compared with.
+        An image and its reference image.
     arrays
-        Of coherence and phase, (y, x) float32; a tile that one of the images does not hold is not written.
+        Arrays of coherence and phase, (y, x) float32; tiles that one of the images lacks are not written.
     grid
-        Of all.
+        Grid of the images and arrays.
     side, window
-        Of a tile, and of the window, pixels.
+        Sides of a tile and of the coherence window, pixels.
     workers
-        Who measure tiles; how many do changes nothing in what is written.
+        Threads that measure tiles; their number does not affect the result.
 
     Returns
     -------
     tuple
-        NaN of images without a tile in common.
+        Both values; NaN for images without a common tile.
     """
-    shares: list[float] = []
+    inverse_looks: list[float] = []
     for block in grid.tiles(_TILES_AT_ONCE * side):
-        wide = _widened(block, window // 2, grid.shape)
-        first, second = (np.asarray(image[wide]) for image in images)
+        with_margin = _widened(block, window // 2, grid.shape)
+        first, second = (np.asarray(image[with_margin]) for image in images)
 
-        def measured(tile: Window, wide: Window = wide, first: Any = first, second: Any = second) -> float | None:
+        def measured(
+            tile: Window, with_margin: Window = with_margin, first: Any = first, second: Any = second
+        ) -> float | None:
             around = _widened(tile, window // 2, grid.shape)
-            part, middle = _against(around, wide), _against(tile, around)
+            part, middle = _relative_to(around, with_margin), _relative_to(tile, around)
             if not (np.isfinite(first[part]) & np.isfinite(second[part])).any():
                 return None
             magnitude, phase, looks = coherence(first[part], second[part], window=window)
@@ -205,9 +207,10 @@ def write_phase(
                 array[tile] = values[middle]
             return 1 / looks
 
-        shares += [share for share in workers.map(measured, _subwindows(grid, block, side)) if share is not None]
-    looks = 1 / float(np.mean(shares)) if shares else float("nan")
-    return looks, chance(looks) if shares else looks
+        tiles = workers.map(measured, _subwindows(grid, block, side))
+        inverse_looks += [value for value in tiles if value is not None]
+    looks = 1 / float(np.mean(inverse_looks)) if inverse_looks else float("nan")
+    return looks, chance(looks) if inverse_looks else looks
 
 
 def _spectrum(image: xr.Dataset) -> Any:
@@ -227,8 +230,8 @@ def _widened(window: Window, by: int, shape: tuple[int, int]) -> Window:
     return rows, columns
 
 
-def _against(window: Window, whole: Window) -> Window:
-    """Return a window counted from where another begins."""
+def _relative_to(window: Window, whole: Window) -> Window:
+    """Return a window with indices relative to the first pixel of another."""
     rows, columns = (slice(part.start - of.start, part.stop - of.start) for part, of in zip(window, whole, strict=True))
     return rows, columns
 
@@ -241,8 +244,8 @@ _PHASE = "coherence", "phase"
 def cube(campaign: Campaign, *, threads: int = 1) -> Path:
     """Write results/cube.zarr: images (flight, pair, y, x), sums of each flight, coherence and phase between images.
 
-    Sums are there where a flight has two pairs, and NaN of flights of one.
-    Tile by tile; a tile that no pulse of a pair illuminates is not stored and reads as NaN, as in its image.
+    The cube has sums if a flight has two or more pairs; they are NaN for flights with a single pair. Tiles that no
+    pulse of a pair illuminates are not stored and read as NaN, as in the image.
     """
     flights, lineage = campaign.image_flights, result_of(campaign, "cube").begin(campaign.root)
     images = {
@@ -254,11 +257,11 @@ def cube(campaign: Campaign, *, threads: int = 1) -> Path:
     sums = {flight.name: assessed[flight.name]["fusion"] for flight in flights if FUSED in flight.images}
     grid, side = settled_scene(campaign).grid, campaign.settings.processing.tile_px
     folder, windows = campaign.stage("cube"), list(grid.tiles(side))
-    with undamaged(folder, expected="images as this version forms them", remedy="Run the workflow again."):
-        described = _empty_cube(campaign.settings.campaign, images, assessed, sums, grid, windows)
+    with undamaged(folder, expected="images formed by this version", remedy="Run the workflow again."):
+        template = _empty_cube(campaign.settings.campaign, images, assessed, sums, grid, windows)
     with writing(folder) as wip, ThreadPoolExecutor(threads) as workers:
         empty = stamped(
-            described,
+            template,
             "cube",
             modules=lineage.modules,
             parents={"/".join(name): image for name, image in images.items()},
@@ -278,7 +281,7 @@ def cube(campaign: Campaign, *, threads: int = 1) -> Path:
             sum_db = image_statistics(arrays.plane("coherent", flight), windows).noise_floor_db
             arrays.plane("coherent_noise_floor", flight)[()] = sum_db
             arrays.plane("clutter_reduction", flight)[()] = clutter_reduction_db(single_db, sum_db)
-        references = {flight: one["reference"] for flight, one in assessed.items()}
+        references = {flight: assessment["reference"] for flight, assessment in assessed.items()}
         _compare(images, references, arrays, grid, side=side, workers=workers)
         finish(wip, folder, lineage=lineage)
     return folder
@@ -286,36 +289,36 @@ def cube(campaign: Campaign, *, threads: int = 1) -> Path:
 
 @dataclass(frozen=True)
 class _Plane:
-    """The plane of an array of one flight, or of one pair of it."""
+    """Plane of an array for one flight, or for one pair of a flight."""
 
     array: Any
-    place: tuple[int, ...]
+    indices: tuple[int, ...]
 
     @property
     def shape(self) -> tuple[int, ...]:
         """Shape of the plane."""
-        shape: tuple[int, ...] = self.array.shape[len(self.place) :]
+        shape: tuple[int, ...] = self.array.shape[len(self.indices) :]
         return shape
 
     def __getitem__(self, window: Window) -> Any:
-        return self.array[(*self.place, *window)]
+        return self.array[(*self.indices, *window)]
 
     def __setitem__(self, window: Window | tuple[()], values: Any) -> None:
-        self.array[(*self.place, *window)] = values
+        self.array[(*self.indices, *window)] = values
 
 
 @dataclass(frozen=True)
 class _CubeArrays:
-    """The arrays of the cube, by name, flight and pair."""
+    """Arrays of the cube, by name, flight and pair."""
 
     arrays: Mapping[str, Any]
     flights: Sequence[str]
     pairs: Sequence[str]
 
     def plane(self, name: str, flight: str, pair: str | None = None) -> _Plane:
-        """Return a plane of an array, to be read and written by windows."""
-        place = (self.flights.index(flight), *([] if pair is None else [self.pairs.index(pair)]))
-        return _Plane(self.arrays[name], place)
+        """Return a plane of an array, which is read and written by windows."""
+        indices = (self.flights.index(flight), *([] if pair is None else [self.pairs.index(pair)]))
+        return _Plane(self.arrays[name], indices)
 
 
 def _write_images(
@@ -326,24 +329,24 @@ def _write_images(
     windows: list[Window],
     workers: Executor,
 ) -> None:
-    """Copy the images of a flight and write their sums, tile by tile, each read once; `fusion`: None without sums."""
+    """Copy the images of a flight and write their sums, tile by tile; `fusion` is None if the flight has no sums."""
     present = {pair: image for (name, pair), image in images.items() if name == flight}
     copies = [arrays.plane("image", flight, pair) for pair in present]
     phases_rad = {} if fusion is None else fusion["phases_rad"]
     peaks = np.array([image.attrs["quality"]["brightest"]["amplitude"] for image in present.values()])
     added = np.array([pair in phases_rad for pair in present])
-    turned = np.array([phases_rad[pair] for pair in present if pair in phases_rad])
-    named = () if fusion is None else ("coherent", "noncoherent", "magnitude")
-    sums = {name: arrays.plane(name, flight) for name in named}
+    removed_rad = np.array([phases_rad[pair] for pair in present if pair in phases_rad])
+    sum_names = () if fusion is None else ("coherent", "noncoherent", "magnitude")
+    sums = {name: arrays.plane(name, flight) for name in sum_names}
 
     def write(window: Window) -> None:
         stack = np.stack([image.image[window].values for image in present.values()])
-        there = ~np.isnan(stack).all(axis=(1, 2))
-        for copy, block in zip(compress(copies, there), stack[there], strict=True):
+        illuminated = ~np.isnan(stack).all(axis=(1, 2))
+        for copy, block in zip(compress(copies, illuminated), stack[illuminated], strict=True):
             copy[window] = block
-        if sums and there[added].any():
-            sums["coherent"][window] = coherent_sum(stack[added], peaks[added], turned)
-        if sums and there.any():
+        if sums and illuminated[added].any():
+            sums["coherent"][window] = coherent_sum(stack[added], peaks[added], removed_rad)
+        if sums and illuminated.any():
             sums["noncoherent"][window] = noncoherent_sum(stack, peaks)
             sums["magnitude"][window] = magnitude_sum(stack, peaks)
 
@@ -363,34 +366,34 @@ def _compare(
     """Write coherence and phase of each image with its flight's reference pair and its pair's first flight."""
     window = window_of(images, grid.spacing_m)
     for kind, rows in compared(images, references, reference_flights(images, arrays.pairs)).items():
-        for other in dict.fromkeys(rows.values()):
-            against = held(images[other].image)
-            for one in (image for image, its in rows.items() if its == other):
-                planes = [arrays.plane(f"{kind}_{name}", *one) for name in _PHASE]
-                both, to = (held(images[one].image), against), (planes[0], planes[1])
-                measures = write_phase(both, to, grid, side=side, window=window, workers=workers)
-                shared = shared_band(images[one], images[other])
-                for name, value in zip(("looks", "chance", "common_band"), (*measures, shared), strict=True):
-                    arrays.plane(f"{kind}_{name}", *one)[()] = value
+        for reference in dict.fromkeys(rows.values()):
+            reference_raster = held(images[reference].image)
+            for name in (image for image, partner in rows.items() if partner == reference):
+                planes = [arrays.plane(f"{kind}_{measure}", *name) for measure in _PHASE]
+                rasters, outputs = (held(images[name].image), reference_raster), (planes[0], planes[1])
+                measures = write_phase(rasters, outputs, grid, side=side, window=window, workers=workers)
+                shared = shared_band(images[name], images[reference])
+                for measure, value in zip(("looks", "chance", "common_band"), (*measures, shared), strict=True):
+                    arrays.plane(f"{kind}_{measure}", *name)[()] = value
 
 
 def _between_flights(
     references: Mapping[str, xr.Dataset], grid: SceneGrid, windows: Sequence[Window]
 ) -> dict[str, Any]:
-    """Return the shift of each flight's reference image against the first flight's, and its flags."""
+    """Return the displacement of each flight's reference image relative to the first flight's, and its flags."""
     first, *others = references
-    shown = {name: ComparedImage.of(image, grid, windows) for name, image in references.items()} if others else {}
+    images = {name: ComparedImage.of(image, grid, windows) for name, image in references.items()} if others else {}
     between: dict[str, Any] = {}
     flags: dict[str, Flags] = {}
     for name in others:
-        found = agreement_of(shown[first], shown[name], grid, windows)
-        between[name] = agreement_report(found)
-        if found is not None and found.shifted:
+        agreement = agreement_of(images[first], images[name], grid, windows)
+        between[name] = agreement_report(agreement)
+        if agreement is not None and agreement.shifted:
             line = (
-                f"{found.points} {found.by} of flight {name} lie {100 * found.shift_m:.1f} ± "
-                f"{100 * found.shift_std_along_m:.1f} cm from where flight {first} has them, "
-                f"{100 * found.shift_east_m:+.1f} cm east and "
-                f"{100 * found.shift_north_m:+.1f} cm north: a base station, datum or time system differs"
+                f"{agreement.evidence} of flight {name} displaced by {100 * agreement.shift_m:.1f} ± "
+                f"{100 * agreement.shift_std_along_m:.1f} cm relative to flight {first}, "
+                f"{100 * agreement.shift_east_m:+.1f} cm east and "
+                f"{100 * agreement.shift_north_m:+.1f} cm north: a base station, datum or time system differs"
             )
             flags[name] = Flags({"flights_displaced": line})
     return {"agreement": {"reference": first, "flights": between}, "flags": flags}
@@ -404,20 +407,23 @@ def _empty_cube(
     grid: SceneGrid,
     windows: Sequence[Window],
 ) -> xr.Dataset:
-    """Return the cube of a campaign of this name without the values of its rasters and of measures on them."""
+    """Return the cube with its coordinates and labels; rasters and measures computed from them are NaN.
+
+    `campaign` is the campaign's name.
+    """
     pairs = sorted({pair for _, pair in images})
-    named = labels(images, assessed, sums, pairs)
-    sizes = {**named.sizes, "y": grid.shape[0], "x": grid.shape[1]}
+    empty = labels(images, assessed, sums, pairs)
+    sizes = {**empty.sizes, "y": grid.shape[0], "x": grid.shape[1]}
     for name, (dims, dtype, _, _) in {**RASTERS, **MEASURED}.items():
         if name in SUMMED and not sums:
             continue
-        nothing = np.full((), complex(np.nan, np.nan) if dtype == "complex64" else np.nan, dtype)
-        named[name] = dims, np.broadcast_to(nothing, tuple(sizes[dim] for dim in dims))
-    references = {flight: images[flight, one["reference"]] for flight, one in assessed.items()}
-    return named.assign_coords(grid.coordinates).assign_attrs(
+        nan = np.full((), complex(np.nan, np.nan) if dtype == "complex64" else np.nan, dtype)
+        empty[name] = dims, np.broadcast_to(nan, tuple(sizes[dim] for dim in dims))
+    references = {flight: images[flight, assessment["reference"]] for flight, assessment in assessed.items()}
+    return empty.assign_coords(grid.coordinates).assign_attrs(
         Conventions="CF-1.11",
         title=f"SAR images of campaign {campaign}",
-        history="rule cube of apertura: runspec, inputs and code_sha256 say of what and how",
+        history="written by rule cube of apertura; runspec, inputs and code_sha256 state settings, data and code",
         flights=[*assessed],
         pairs=pairs,
         fusion=sums,

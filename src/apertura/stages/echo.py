@@ -1,7 +1,7 @@
-"""Rule `echo`: what is measured of a pair's recordings and tracks: pulses, phase centres, clock and sidelink.
+"""Rule `echo`: pulse association, phase centres, clock and sidelink of a pair, from recordings and tracks.
 
-The calibrated transfer functions follow from it and the recordings. They are in it of a recorder that stores transfer
-functions itself; else rule `transfer` keeps them where `processing.keep` says so.
+The calibrated transfer functions follow from this stage and the recordings. The stage contains them if the recorder
+stores transfer functions itself; otherwise rule `transfer` stores them if `processing.keep` lists echo.
 """
 
 from dataclasses import replace
@@ -65,11 +65,11 @@ def echo(campaign: Campaign, flight: str, pair: str) -> Path:
         inputs = merged(inputs, calibration["inputs"])
     relevant = {**lineage.result.settings, "calibration": calibration_spec(calibration)}
     folder = campaign.stage("echo", flight, pair)
-    how: dict[str, Any] = {"modules": lineage.modules, "parents": parents, "settings": relevant, "inputs": inputs}
+    origin: dict[str, Any] = {"modules": lineage.modules, "parents": parents, "settings": relevant, "inputs": inputs}
     if isinstance(waveform, SampledWaveform):
-        save_stage(stamped(formed.dataset, "echo", **how), folder, lineage=lineage)
+        save_stage(stamped(formed.dataset, "echo", **origin), folder, lineage=lineage)
     else:
-        save_transfer(formed, stamped(formed.hollow, "echo", **how), folder, lineage)
+        save_transfer(formed, stamped(formed.hollow, "echo", **origin), folder, lineage)
     return folder
 
 
@@ -83,9 +83,9 @@ def pair_echo(
     *,
     hovers: bool = False,
 ) -> PairEcho:
-    """Return the echo of a pair from its nodes' recordings; path offsets are the calibration's, or the config's.
+    """Return the echo of a pair from its nodes' recordings, with calibrated path offsets or else configured ones.
 
-    Pulses of a hover are left out unless `hovers`, as `apertura.stages.positions.place` does.
+    Pulses of a hover are excluded unless `hovers` is True, as in `apertura.stages.positions.place`.
     """
     pulses = common_pulses(tx, rx, prf_hz=sent.waveform.prf_hz)
     repeats = rx.raw.repeats.values[pulses.rx_index]
@@ -98,14 +98,14 @@ def pair_echo(
     stated = rx.settings.path_offset_m
     stated_m = stated.radar if tx.name == rx.name else stated.radar - stated.sidelink
     offset_m = calibration["offset_m"] if calibration else stated_m
-    beyond_m = offset_m - sidelink_m  # electrical path of an echo beyond tx → scene → rx
+    extra_path_m = offset_m - sidelink_m  # electrical path of an echo in addition to tx → scene → rx
     aperture = Aperture(tx.antenna("radar_tx", at), rx.antenna("radar_rx", at))
-    flown = air.over(aperture)
-    delay_s = beyond_m / SPEED_OF_LIGHT_M_S
-    # body axes of the nodes whose attitude counts
-    turning = {"tx_axes": tx.turns("radar_tx") and tx, "rx_axes": rx.turns("radar_rx") and rx}
+    air_on_track = air.over(aperture)
+    extra_delay_s = extra_path_m / SPEED_OF_LIGHT_M_S
+    # Body axes are stored for nodes whose attitude affects the echo.
+    rotating = {"tx_axes": tx.turns("radar_tx") and tx, "rx_axes": rx.turns("radar_rx") and rx}
     geometry: dict[str, tuple[tuple[str, ...], NDArray[np.float64]]] = {
-        name: (("pulse", "axis", "body"), node.body_axes(at)) for name, node in turning.items() if node
+        name: (("pulse", "axis", "body"), node.body_axes(at)) for name, node in rotating.items() if node
     }
     if tx.name != rx.name:  # b of docs/theory/autofocus.md, eq. 2: the sidelink's length was added to the echo
         sidelink_m = tx.antenna("sidelink", at) - rx.antenna("sidelink", at)
@@ -114,17 +114,17 @@ def pair_echo(
         {
             "time": ("pulse", at),
             "capture": ("pulse", pulses.rx_index[paired][measured.kept]),
-            "path_removed": ("pulse", beyond_m),
+            "path_removed": ("pulse", extra_path_m),
             "tx_position": (("pulse", "axis"), aperture.tx_m),
             "rx_position": (("pulse", "axis"), aperture.rx_m),
             "frequency": ("subcarrier", rx.numerology.frequency_hz),
-            "reference_delay": ("pulse", np.zeros(len(beyond_m))),
-            "path_limit": ("pulse", flown.wave_speed_m_s * (sent.waveform.longest_delay_s - delay_s)),
+            "reference_delay": ("pulse", np.zeros(len(extra_path_m))),
+            "path_limit": ("pulse", air_on_track.wave_speed_m_s * (sent.waveform.longest_delay_s - extra_delay_s)),
             **_sidelink(measured),
             **geometry,
         },
         attrs=_attributes((tx, rx), pulses, positions, measured, repeats, at=at, calibration=calibration)
-        | {"stated_offset_m": offset_m, **stated_air(flown)},
+        | {"stated_offset_m": offset_m, **stated_air(air_on_track)},
     )
     saturation = Saturation()
     return PairEcho(dataset, forming_from(rx, sent, saturation, divided=tx.name != rx.name), saturation)
@@ -140,7 +140,7 @@ def _attributes(
     at: Times,
     calibration: dict[str, Any] | None,
 ) -> dict[str, Any]:
-    """Return the attributes of an echo whose pulses were sent `at`: flags, counts of pulses left out, reports."""
+    """Return the attributes of an echo: flags, counts of excluded pulses, reports; `at`: transmit times."""
     tx, rx = nodes
     missing = missing_flags(nanoseconds(at))
     attrs = {
@@ -176,9 +176,10 @@ def _transfer(
     processing: Processing,
     air: SceneAir,
 ) -> tuple[Transfer, NDArray[np.float64]]:
-    """Return the transfer functions of captures, sent `at` the transmitter's tags, and electrical lengths of sidelinks.
+    """Return the transfer functions of captures, and the electrical length of the sidelink per pulse, in metres.
 
-    In metres; 0 without. Both ends are taken from the logs at the transmitter's tag (docs/theory.md, "Geometry").
+    The length is 0 for a monostatic pair. `at`: time tags of the transmitter, at which both logs are evaluated
+    (docs/theory.md, "Geometry").
     """
     tx, rx = nodes
     if tx.name == rx.name:
@@ -200,25 +201,25 @@ def _transfer(
 
 
 def _sidelink(measured: Transfer) -> dict[str, tuple[str, Any]]:
-    """Return the measurements of the sidelink in each pulse; empty for a monostatic pair."""
+    """Return the sidelink measurements per pulse; empty for a monostatic pair."""
     correction, kept = measured.correction, measured.kept
     if correction is None:
         return {}
-    known = {
+    quantities = {
         "sidelink_delay": measured.sidelink_delay_m,
         "sidelink_snr": measured.sidelink_snr_db,
         "sidelink_phase": measured.sidelink_phase_rad,
         "sidelink_amplitude": np.where(correction.path.locked, correction.path.amplitude, np.nan)[kept],
         "clock_offset": correction.clock_hz if correction.clock_hz is None else correction.clock_hz[kept],
     }
-    return {name: ("pulse", values) for name, values in known.items() if values is not None}
+    return {name: ("pulse", values) for name, values in quantities.items() if values is not None}
 
 
 def _with_waveform(measured: Transfer, sent: Transmitted) -> Transfer:
-    """Add flags and report of the transmitted waveform to the transfer functions, and of truncated captures."""
+    """Add flags and report of the transmitted waveform, and flags of truncated captures, to the transfer functions."""
     flags, waveform = dict(sent.flags), sent.waveform
     if measured.report.get("sidelink", {}).get("method") in DIVIDING:
-        flags.pop("waveform_sidelobes", None)  # the pulse cancels: it is in both channels
+        flags.pop("waveform_sidelobes", None)  # both channels contain the pulse, and the division removes it
     if isinstance(waveform, PulseWaveform) and measured.sidelink_delay_m is not None:
         window = {name: getattr(waveform, name) for name in ("lead_s", "pulse_s", "listen_s")}
         cell_s = 1 / (sent.numerology.numbers.size * sent.numerology.spacing_hz)
@@ -229,18 +230,18 @@ def _with_waveform(measured: Transfer, sent: Transmitted) -> Transfer:
 
 
 def _repeat_flags(rx: Acquisition, pulses: Association, repeats: NDArray[np.bool_]) -> Flags:
-    """Raise a flag where captures of the receiver repeat earlier ones bit for bit; they are left out."""
+    """Return a flag if captures of the receiver repeat earlier ones bit for bit; they are excluded."""
     if not repeats.any():
         return Flags()
     first = int(pulses.rx_index[int(repeats.argmax())])
-    line = f"{int(repeats.sum())} of {len(repeats)} captures of {rx.name}, the first is number {first}"
+    line = f"{int(repeats.sum())} of {len(repeats)} captures of {rx.name}, first at capture {first}"
     return Flags({"captures_repeated": line})
 
 
 def _pulse_counts(
     sent: int, pulses: Association, repeats: NDArray[np.bool_], positions: PulsePositions, measured: Transfer
 ) -> dict[str, Any]:
-    """Count the pulses sent that are used and those that are not, by reason."""
+    """Count the transmitted pulses that are used, and those that are dropped by reason."""
     used = int(measured.kept.sum())
     reasons = {
         "unpaired": pulses.tx_dropped,
@@ -249,4 +250,8 @@ def _pulse_counts(
         **positions.reasons,
         "sidelink_lost": int((~measured.kept).sum()),
     }
-    return {"used": used, "dropped": sent - used, "reasons": {why: count for why, count in reasons.items() if count}}
+    return {
+        "used": used,
+        "dropped": sent - used,
+        "reasons": {reason: count for reason, count in reasons.items() if count},
+    }

@@ -32,7 +32,7 @@ from apertura.core.quality.point_targets import CUT_REACH_M, cuts_report, find_p
 from apertura.core.scene.grid import SceneGrid
 from apertura.formats.export import product, remove_outdated, write_exports
 from apertura.formats.export.radiometry import CROSS_SECTIONS, ECHO, of_sums
-from apertura.stages.agreement import ComparedImage, assessment_of, bright_places
+from apertura.stages.agreement import ComparedImage, assessment_of, bright_points_within
 from apertura.stages.multilook import LazyLayer, coarse, mean_power_report, multilook_of
 from apertura.stages.scene import settled_scene
 from apertura.stages.tags import acquisition_tags, quality_tags, tags_of
@@ -85,11 +85,12 @@ def _calibrated(campaign: Campaign, flight: str, pair: str, report: Mapping[str,
     stated = None if std_db is None else f"{std_db:.2g} dB"
     lines = [BudgetLine("amplitude", stated, NO_EFFECT, "an error of power or gain")]
     if calibration["pointing_std_db"]:
-        lines.insert(0, BudgetLine("pointing", f"{calibration['pointing_std_db']:.2g} dB by attitude", NO_EFFECT))
+        pointing = f"{calibration['pointing_std_db']:.2g} dB from the attitude"
+        lines.insert(0, BudgetLine("pointing", pointing, NO_EFFECT))
     flags = Flags.merged(report["flags"], calibration["flags"])
     return {
         "cross_sections": calibration,
-        "budget": [*report["budget"], *(one.report for one in lines)],
+        "budget": [*report["budget"], *(line.report for line in lines)],
         "flags": flags,
     }
 
@@ -110,20 +111,21 @@ def export_fused(campaign: Campaign, flight: str) -> list[Path]:
     measured, isolated = _in_phase(images, assessed, sums["noncoherent"], grid, windows)
     at_points = measured if isolated else None
     added = assessed["fusion"]["phases_rad"]
-    of_pairs = {
+    pair_flags = {
         pair: Flags.merged(image.attrs["flags"], assessed["pairs"][pair]["flags"]) for pair, image in images.items()
     }
-    of_sum = Flags.merged(
+    sum_flags = Flags.merged(
         _flags_of_choice(assessed["fusion"]), _incoherent(at_points), cube.attrs["flags"].get(flight, {})
     )
-    against = {*of_sum, *(flag for pair in added for flag in of_pairs[pair])}  # of pairs left out, none
+    # Flags of pairs outside the coherent sum do not affect its focus.
+    relevant = {*sum_flags, *(flag for pair in added for flag in pair_flags[pair])}
     worst = _worst(images, assessed["fusion"])
     focuses = [images[pair].attrs["quality"]["focus"] for pair in added]
-    places = {name: max(one.get(name, 0.0) for one in focuses) for name in ("cell_m", "expected_shift_m")}
+    geolocation = {name: max(focus.get(name, 0.0) for focus in focuses) for name in ("cell_m", "expected_shift_m")}
     report = {
         **worst,
         "focus": focus_with_flags(
-            _focus(images, at_points, [*added]) | places, against, error_db=worst["numerical_error_db"]
+            _focus(images, at_points, [*added]) | geolocation, relevant, error_db=worst["numerical_error_db"]
         ),
         **_measures(grid, windows, sums, images, assessed),
         "fusion": assessed["fusion"],
@@ -136,7 +138,7 @@ def export_fused(campaign: Campaign, flight: str) -> list[Path]:
             "isolated": isolated,
         },
         "agreement": cube.attrs["agreement"]["flights"].get(flight),
-        "flags": Flags.merged(_flags_of_pairs(of_pairs), of_sum),
+        "flags": Flags.merged(_flags_of_pairs(pair_flags), sum_flags),
     }
     name = f"{campaign.settings.campaign} · flight {flight}"
     titles = {
@@ -144,7 +146,7 @@ def export_fused(campaign: Campaign, flight: str) -> list[Path]:
         "noncoherent": f"non-coherent sum of {' + '.join(pairs)}",
         "magnitude": f"sum of magnitudes of {' + '.join(pairs)}",
     }
-    # the cube depends on every flight, its files of one flight on that flight's pairs alone
+    # The cube depends on every flight, but the products of a flight depend on its own pairs alone.
     origin = Provenance.of(lineage.modules, images, settings={"fusion": assessed["fusion"]})
     code_sha256 = chained_sha256(lineage.result.code_sha256, [cube.attrs["code_sha256"]])
     tags = tags_of(replace(origin, code_sha256=code_sha256), lineage) | quality_tags(report)
@@ -154,7 +156,7 @@ def export_fused(campaign: Campaign, flight: str) -> list[Path]:
         folder,
         {**sums, "magnitude": cube.magnitude[index]},
         radiometry=report["radiometry"],
-        titles={source: f"{name} · {words}" for source, words in titles.items()},
+        titles={source: f"{name} · {title}" for source, title in titles.items()},
         tags=tags,
         **_georeference(grid),
     )
@@ -182,20 +184,20 @@ def _averaged_sum(
     means: Mapping[str, Any],
     noise: Callable[[Window], Floats] | None,
 ) -> tuple[LazyLayer, dict[str, Any]]:
-    """Return the mean power of a sum on a coarser grid, less its noise, and what it means."""
+    """Return the mean power of a sum on a coarser grid, minus the noise, and its radiometric report."""
     cells = multilook_of(lambda window: np.asarray(raster[window], np.complex64), grid, multilook)
 
-    def less(window: Window) -> Floats:
+    def without_noise(window: Window) -> Floats:
         return cells.mean(window) - (0.0 if noise is None else noise(window))
 
     report = mean_power_report(cells, means, noise="in it" if noise is None else "subtracted")
-    return coarse(grid, cells, threads=1, of=less), report
+    return coarse(grid, cells, threads=1, of=without_noise), report
 
 
 def _noise_of_sum(
     campaign: Campaign, flight: str, source: str, divisors: Mapping[str, float]
 ) -> Callable[[Window], Floats] | None:
-    """Return the mean power of the noise in squares of pixels of a sum; None where it is not taken off or not known.
+    """Return the mean noise power in multilook cells of a sum; None if it is not subtracted or not known.
 
     Source: docs/theory/speckle.md, eq. 6.
     """
@@ -203,22 +205,22 @@ def _noise_of_sum(
     paths = [campaign.result(flight, pair, kept) for pair in divisors]
     if multilook is None or not multilook.subtract_noise or not all(path.is_file() for path in paths):
         return None
-    # Noise of pairs is independent: powers add up, over n² where amplitudes are averaged and over n where powers are.
+    # Noise is independent between pairs: powers add up, over n² in a mean of amplitudes and over n in one of powers.
     count = len(divisors) ** (2 if source == "coherent" else 1)
 
     def noise(window: Window) -> Floats:
         total = np.zeros([part.stop - part.start for part in window])
         for path, divisor in zip(paths, divisors.values(), strict=True):
-            with opened_raster(path, expected="what step layers wrote", remedy="Run the workflow again.") as one:
-                part = one.read(1, window=rasterio.windows.Window.from_slices(*window)).astype(np.float64)
-            total += np.nan_to_num(part) / divisor**2 / count
+            with opened_raster(path, expected="a raster of step layers", remedy="Run the workflow again.") as layer:
+                power = layer.read(1, window=rasterio.windows.Window.from_slices(*window)).astype(np.float64)
+            total += np.nan_to_num(power) / divisor**2 / count
         return total
 
     return noise
 
 
 def _finish(folder: Path, written: list[Path], report: Mapping[str, Any], lineage: Lineage) -> list[Path]:
-    """Write image.json beside the products, then the manifest of all."""
+    """Write image.json next to the products, then the manifest of all files."""
     files = [*written, folder / "image.json"]
     write_json(files[-1], report)
     record_files(folder / "export.manifest.json", files, lineage)
@@ -236,22 +238,23 @@ def _measures(
     images: Mapping[str, xr.Dataset],
     assessed: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """Return the image statistics of the sums, cuts through the brightest target, and what is gained over one pair."""
+    """Return image statistics of the sums, cuts through the brightest target, and the gain over the best pair."""
     statistics = {source: image_statistics(layer, windows) for source, layer in sums.items()}
     peaks = {pair: image.attrs["quality"]["brightest"]["amplitude"] for pair, image in images.items()}
     radiometry, top = of_sums(peaks, assessed["fusion"]["phases_rad"]), statistics["coherent"]
     peak = find_peak(sums["coherent"], top.row, top.column)
     x, y = map(float, grid.map_at(peak.row, peak.column))
-    peaks = {source: one.peak for source, one in statistics.items()} | {"coherent": float(abs(peak.value))}
+    peaks = {source: measured.peak for source, measured in statistics.items()} | {"coherent": float(abs(peak.value))}
     levels = {
-        source: radiometry[source].measured(peaks[source], one.noise_floor_db) for source, one in statistics.items()
+        source: radiometry[source].measured(peaks[source], measured.noise_floor_db)
+        for source, measured in statistics.items()
     }
     along = images[assessed["reference"]].attrs["quality"]["brightest"]["cross_range_direction"]
     floors = {pair: images[pair].attrs["quality"]["noise_floor_db"] for pair in assessed["fusion"]["phases_rad"]}
     best = min(floors, key=lambda pair: floors[pair])
     return {
-        "radiometry": {source: one.report for source, one in {**radiometry, **levels}.items()},
-        "entropy": {source: round(one.entropy, 6) for source, one in statistics.items()},
+        "radiometry": {source: scale.report for source, scale in {**radiometry, **levels}.items()},
+        "entropy": {source: round(measured.entropy, 6) for source, measured in statistics.items()},
         "noise_floor_db": top.noise_floor_db,
         "gain": {
             "best_pair": best,
@@ -277,116 +280,122 @@ def _measures(
 def _in_phase(
     images: Mapping[str, xr.Dataset],
     assessed: Mapping[str, Any],
-    places: BlockRaster,
+    noncoherent: BlockRaster,
     grid: SceneGrid,
     windows: Sequence[Window],
 ) -> tuple[InPhase | None, bool]:
-    """Measure the phase agreement of the summed images at bright places of the noncoherent sum; None of one image.
+    """Measure the phase agreement of the summed images at bright points of the noncoherent sum.
 
-    And whether these are isolated points that all of them show. Without any, the brightest places are taken: of many
-    scatterers in a cell each image has its own sum, and the phases need not agree.
+    None for a single image. The second value is True if the points are isolated and shown by all images. If there
+    are none, the brightest pixels are used; in cells with several scatterers, phases of images need not agree.
     """
     added = assessed["fusion"]["phases_rad"]
-    shown = {pair: ComparedImage.of(images[pair], grid, windows) for pair in added}
-    cell_m = max(image.cell_m for image in shown.values())
-    spectrum = np.mean([image.spectrum for image in shown.values()], axis=0)
+    compared = {pair: ComparedImage.of(images[pair], grid, windows) for pair in added}
+    cell_m = max(image.cell_m for image in compared.values())
+    spectrum = np.mean([image.spectrum for image in compared.values()], axis=0)
     points = [
         point
-        for point in bright_places(places, grid, windows, spectrum, cell_m=cell_m)
-        if all(image.shows(point) for image in shown.values())
+        for point in bright_points_within(noncoherent, grid, windows, spectrum, cell_m=cell_m)
+        if all(image.shows(point) for image in compared.values())
     ]
     isolated = bool(points)
-    points = points or bright_places(places, grid, windows, spectrum, cell_m=cell_m, isolated=False)
+    points = points or bright_points_within(noncoherent, grid, windows, spectrum, cell_m=cell_m, isolated=False)
     divisors = {
-        pair: images[pair].attrs["quality"]["brightest"]["amplitude"] * np.exp(1j * turn)
-        for pair, turn in added.items()
+        pair: images[pair].attrs["quality"]["brightest"]["amplitude"] * np.exp(1j * phase_rad)
+        for pair, phase_rad in added.items()
     }
-    amplitudes = [[shown[pair].at(one.row, one.column) / by for pair, by in divisors.items()] for one in points]
+    amplitudes = [
+        [compared[pair].at(point.row, point.column) / divisor for pair, divisor in divisors.items()] for point in points
+    ]
     if len(added) == 1 or not points:
         return None, isolated
-    return in_phase(np.array(amplitudes), np.array([one.background for one in points])), isolated
+    return in_phase(np.array(amplitudes), np.array([point.background for point in points])), isolated
 
 
 def _focus(images: Mapping[str, xr.Dataset], measured: InPhase | None, added: Sequence[str]) -> dict[str, Any]:
-    """Return the verdict of the coherent sum: what its images lost, and what it lost by their phases."""
-    of_pairs = {pair: images[pair].attrs["quality"]["focus"] for pair in added}
+    """Return the focus of the coherent sum, from the peak loss of its images and the loss by phase differences."""
+    pair_focus = {pair: images[pair].attrs["quality"]["focus"] for pair in added}
     if len(added) == 1:
-        one = of_pairs[added[0]]
-        return {name: one[name] for name in ("verdict", "loss_db", "std_db") if name in one} | {
-            "why": f"{added[0]} alone: {one['why']}"
+        focus = pair_focus[added[0]]
+        return {name: focus[name] for name in ("verdict", "loss_db", "std_db") if name in focus} | {
+            "reason": f"{added[0]} alone: {focus['reason']}"
         }
-    focuses = [one for one in of_pairs.values() if "loss_db" in one]
+    focuses = [focus for focus in pair_focus.values() if "loss_db" in focus]
     if measured is None or not focuses:
-        missing = "no isolated bright point is common to the pairs added" if measured is None else "no pair was judged"
-        return {"verdict": "cannot tell", "why": missing}
-    # Images are added at equal peaks; in focus each peak would be higher by what it lost.
-    of_images = -20 * float(np.log10(np.mean([10 ** (-one["loss_db"] / 20) for one in focuses])))
-    loss_db = of_images + measured.loss_db
-    std_db = float(np.hypot(np.mean([one["std_db"] for one in focuses]), measured.loss_std_db))
+        missing = (
+            "no isolated bright point is common to the summed pairs"
+            if measured is None
+            else "the focus of no pair was measured"
+        )
+        return {"verdict": "inconclusive", "reason": missing}
+    # Images are normalised to equal peaks before they are added; in focus, each peak is higher by its loss.
+    image_loss_db = -20 * float(np.log10(np.mean([10 ** (-focus["loss_db"] / 20) for focus in focuses])))
+    loss_db = image_loss_db + measured.loss_db
+    std_db = float(np.hypot(np.mean([focus["std_db"] for focus in focuses]), measured.loss_std_db))
     return {
         "verdict": verdict_of_loss(loss_db, std_db),
         "loss_db": round(loss_db, 3),
         "std_db": round(std_db, 3),
-        "why": (
-            f"{number_of(measured.places, 'bright point')} of the sum lost {abs(loss_db):.2f} ± {std_db:.2f} dB of "
-            f"their peak, {abs(measured.loss_db):.2f} dB of it because the pairs differ in phase"
+        "reason": (
+            f"peak loss of the coherent sum, {number_of(measured.places, 'bright point')}: {abs(loss_db):.2f} ± "
+            f"{std_db:.2f} dB ({abs(measured.loss_db):.2f} dB from phase differences between pairs)"
         ),
     }
 
 
 def _incoherent(measured: InPhase | None) -> dict[str, str]:
-    """Return the flag of a sum whose images are not in phase where it shows bright points."""
+    """Return the flag of a sum whose images are not in phase at bright points."""
     if measured is None or measured.loss_db >= DEFOCUSED_DB - 2 * measured.loss_std_db:
         return {}
     line = (
-        f"at {number_of(measured.places, 'bright point')} the pairs keep {measured.coherence:.2f} ± "
-        f"{measured.std:.2f} of their power in phase, {measured.chance:.2f} by chance: the peaks of the sum lost "
-        f"{abs(measured.loss_db):.1f} dB"
+        f"{measured.coherence:.2f} ± {measured.std:.2f} of the pairs' power is in phase at "
+        f"{number_of(measured.places, 'bright point')} ({measured.chance:.2f} expected for random phases): peak loss "
+        f"of the sum {abs(measured.loss_db):.1f} dB"
     )
     return {"sum_incoherent": line}
 
 
-def _flags_of_pairs(of_pairs: Mapping[str, Mapping[str, str]]) -> Flags:
-    """Merge the flags of all pairs, each line with its pairs unless all carry it."""
+def _flags_of_pairs(pair_flags: Mapping[str, Mapping[str, str]]) -> Flags:
+    """Merge the flags of all pairs; a line that only some pairs have is prefixed with their names."""
     raised: dict[tuple[str, str], list[str]] = {}
-    for pair, flags in of_pairs.items():
+    for pair, flags in pair_flags.items():
         for flag in flags.items():
             raised.setdefault(flag, []).append(pair)
     return Flags.merged(
         *(
-            {name: line if len(pairs) == len(of_pairs) else f"{' and '.join(pairs)}: {line}"}
+            {name: line if len(pairs) == len(pair_flags) else f"{' and '.join(pairs)}: {line}"}
             for (name, line), pairs in raised.items()
         )
     )
 
 
 def _flags_of_choice(fusion: Mapping[str, Any]) -> Flags:
-    """List the flags of the choice of pairs of a coherent sum: pairs left out, and phases not measured."""
-    alone = "; ".join(f"{pair} is not in the coherent sum: {why}" for pair, why in fusion["left_out"].items())
+    """Return the flags of the choice of a coherent sum: excluded pairs, and pairs added with an unmeasured phase."""
+    excluded = "; ".join(f"{pair} is not in the coherent sum: {reason}" for pair, reason in fusion["excluded"].items())
     if ties := " or ".join(" and ".join(tie) for tie in fusion["ties"]):
-        alone += f"; a tie: {ties} would make as large a sum, and the better focused one was taken"
-    chosen = {"pair_excluded": alone} if alone else {}
+        excluded += f"; tie: {ties} form an equally large set that agrees, and the better focused set was used"
+    flags = {"pair_excluded": excluded} if excluded else {}
     if unmeasured := fusion["unmeasured"]:
         known, unknown = len(fusion["phases_rad"]) - len(unmeasured), len(unmeasured)
-        lost = [-20 * np.log10(abs(known + turn * unknown) / (known + unknown) + 1e-3) for turn in (1j, -1)]
-        chosen["phase_unobservable"] = (
-            "; ".join(f"{pair} is added with phase 0: {why}" for pair, why in unmeasured.items())
-            + f"; wrong by a quarter of a turn the peak would be {lost[0]:.0f} dB lower, by half a turn "
-            + (f"{lost[1]:.0f} dB" if known != unknown else "gone, and each target shown twice beside its place")
+        loss_db = [-20 * np.log10(abs(known + phasor * unknown) / (known + unknown) + 1e-3) for phasor in (1j, -1)]
+        half_cycle = f"{loss_db[1]:.0f} dB" if known != unknown else "total, with each target split in two"
+        flags["phase_unobservable"] = (
+            "; ".join(f"{pair} is added with phase 0: {reason}" for pair, reason in unmeasured.items())
+            + f"; peak loss for a phase error of a quarter cycle: {loss_db[0]:.0f} dB, of half a cycle: {half_cycle}"
         )
-    return Flags(chosen)
+    return Flags(flags)
 
 
 def _worst(images: Mapping[str, xr.Dataset], fusion: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the worst errors and models of the images, as those of their sum, and the budget of each."""
+    """Return the largest errors of the images, as those of their sum, and the error budget of each image."""
     qualities = [image.attrs["quality"] for image in images.values()]
     worst = max(qualities, key=lambda quality: quality["numerical_error_db"])
-    left_out = "".join(f"; without {pair}: {why}" for pair, why in fusion["left_out"].items())
+    without = "".join(f"; without {pair}: {reason}" for pair, reason in fusion["excluded"].items())
     return {
         "budgets": {pair: image.attrs["quality"]["budget"] for pair, image in images.items()},
         "models": {
-            "fusion": f"mean of the peak-normalised images, with and without phase{left_out}",
-            "numerical_error": "that of the worst pair",
+            "fusion": f"mean of the peak-normalised images, with and without phase{without}",
+            "numerical_error": "largest numerical error of the pairs",
         },
         "numerical_error_db": worst["numerical_error_db"],
         "numerical_error_confidence": round(1 - sum(1 - one["numerical_error_confidence"] for one in qualities), 4),

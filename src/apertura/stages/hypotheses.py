@@ -1,4 +1,4 @@
-"""Hypotheses of what is wrong with a flight, each tried on a bright place, and the one that explains what was lost.
+"""Hypotheses on errors of a flight, tested on a bright point, and choice of the one that explains the peak loss.
 
 Source: docs/theory/focus.md, "Hypotheses".
 """
@@ -37,17 +37,20 @@ from apertura.stages.transfer import PairEcho
 from apertura.stages.transmitted import Transmitted, transmitted
 
 MOST_PULSES = 512
-"""Pulses of a pair on which hypotheses are tried, evenly spread."""
+"""Largest number of pulses per pair on which hypotheses are tested, evenly spaced."""
 
-CHANCES = 48
-"""Wrong tracks drawn at random; a third each is offset, inclined and bent."""
+RANDOM_TRACKS = 48
+"""Number of wrong tracks drawn at random; a third each has an offset, a slope and a sinusoidal error."""
 
-_CHANCE_M, _CHANCE_PERIODS = (0.03, 2.0), (0.25, 1.5)  # sizes, as those of hypotheses; over the aperture
+_RANDOM_SIZE_M, _RANDOM_PERIODS = (0.03, 2.0), (0.25, 1.5)  # ranges of track errors, and of periods per aperture
 _AXES = ("forward", "right", "down")
 _POINTS = ("radar_tx", "radar_rx", "sidelink")
 
-_ALIKE_RAD = 0.5
-"""RMS phase over the aperture, beside a constant and a shift of the point, below which paths differ by an offset."""
+_OFFSET_RESIDUAL_RAD = 0.5
+"""Largest residual RMS phase over the aperture of a path change that counts as an offset, radians.
+
+The residual excludes a constant and a displacement of the point.
+"""
 
 _SIDE_PX = 128
 _PIXELS_PER_CELL = 2.5
@@ -55,18 +58,18 @@ _PIXELS_PER_CELL = 2.5
 
 @dataclass(frozen=True, eq=False)
 class PairGeometry:
-    """The echo of a pair with what its geometry was made from.
+    """Phase history of a pair for a subset of its pulses, with their time tags and sidelink lengths.
 
     Attributes
     ----------
     pair
-        Its name.
+        Name of the pair.
     history
-        Of some of its pulses.
+        Phase history of the subset.
     time
-        (pulse,) datetime64[ns], their tags.
+        (pulse,) datetime64[ns], time tags.
     sidelink_m
-        (pulse,) float64, length of the sidelink that was put into the echo, metres; 0 without.
+        (pulse,) float64, sidelink length that was added to the echo, metres; 0 for a monostatic pair.
     """
 
     pair: str
@@ -77,22 +80,22 @@ class PairGeometry:
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """One possible error of the campaign.
+    """Possible error of the campaign.
 
     Attributes
     ----------
     what
-        Line for the reader: 'the times of the log of uav1 are 18.00 s late: GPST taken for UTC?'.
+        Sentence for reports: 'the times of the log of uav1 are 18.00 s late: GPST taken for UTC?'.
     kind
-        Short name of its kind.
+        Short name of the kind of error.
     histories
-        Echoes of the flight's pairs if it is true.
+        Phase histories of the flight's pairs under the hypothesis.
     height_m
-        Rise of the ground, metres.
+        Change of the terrain height, metres.
     gain_db
-        Of the joint peak power at the bright place, where the hypothesis was tried.
+        Gain of the joint peak power at the bright point; NaN before the test.
     is_offset
-        Whether it changes the path of each pair by a constant alone, beside moving the point.
+        True if it changes the path of each pair by a constant only, apart from a displacement of the point.
     """
 
     what: str
@@ -103,7 +106,7 @@ class Hypothesis:
     is_offset: bool = False
 
 
-# ---- Hypotheses tried on a bright place -----------------------------------------------------------------------------
+# ---- Test of hypotheses on a bright point ----------------------------------------------------------------------------
 
 
 def hypotheses(
@@ -114,81 +117,90 @@ def hypotheses(
     cell_m: float,
     focused: Collection[str] = (),
 ) -> list[dict[str, Any]]:
-    """Return the hypothesis that explains most of what the images of a flight lost, alone; none where several could.
+    """Return the hypothesis that alone explains most of the peak loss of a flight; empty if several explain it.
 
     Parameters
     ----------
     campaign, flight
-        Which.
+        Campaign, and name of the flight.
     brightest
-        Easting and northing of a bright place in the scene's CRS, metres.
+        Easting and northing of a bright point in the scene's CRS, metres.
     cell_m
         Resolution cell.
     focused
-        Pairs whose own image is sharp: they have lost nothing but their agreement.
+        Pairs whose own image is focused: they have no peak loss of their own.
 
     Returns
     -------
     list
-        what, kind, gain_db and lost_db: gain of the peak power at the bright place, and what there is to gain; and
-        pair_gain_db, of each pair's own peak.
+        At most one dict: what, kind, gain_db and lost_db (gain of the joint peak power at the bright point, and its
+        loss), and pair_gain_db (gain of each pair's own peak).
     """
     waveform = campaign.settings.waveform
-    if not isinstance(waveform, SampledWaveform):  # positions travel with a phase history: there are no logs to doubt
+    if not isinstance(waveform, SampledWaveform):  # a phase history contains its positions: there are no logs to test
         return []
     sent = transmitted(campaign, waveform)
     logged = {node: open_acquisition(campaign, flight, node, sent) for node in campaign.flight(flight).nodes}
     window, track = campaign.settings.processing.window, open_refined(campaign, flight)
-    found = [
-        evidence_of(logged, pair, PairEcho.opened(campaign, flight, pair).stage, window)
+    geometries = [
+        subset_geometry(logged, pair, PairEcho.cleaned(campaign, flight, pair).stage, window)
         for pair in campaign.flight(flight).pairs
     ]
     nodes = {name: track.node(node) for name, node in logged.items()}
     if track.correction is not None:
-        found = flown(nodes, found)
+        geometries = with_logs(nodes, geometries)
     scene = open_scene(campaign)
-    here, height_m = _around(scene, brightest, cell_m), scene.level.height_m
-    now = joint_peak_power([one.history for one in found], here, height_m)
-    lost_db = decibels(_possible(found, here, height_m, focused) / now)
+    grid, height_m = _grid_around(scene, brightest, cell_m), scene.level.height_m
+    measured_power = joint_peak_power([geometry.history for geometry in geometries], grid, height_m)
+    lost_db = decibels(_focused_power(geometries, grid, height_m, focused) / measured_power)
 
-    def tried(possible: Iterator[Hypothesis]) -> Iterator[Hypothesis]:
-        for one in possible:
-            place = _moved(scene, brightest, found, one)
+    def tested(candidates: Iterator[Hypothesis]) -> Iterator[Hypothesis]:
+        for candidate in candidates:
+            point = _displaced(scene, brightest, geometries, candidate)
+            point_grid, point_height_m = _grid_around(scene, point, cell_m), height_m + candidate.height_m
             try:
-                peak = joint_peak_power(one.histories, _around(scene, place, cell_m), height_m + one.height_m)
-            except ValueError:  # the places are too far apart for one pulse: rejected
+                power = joint_peak_power(candidate.histories, point_grid, point_height_m)
+            except ValueError:  # the grid is deeper than the unambiguous range
                 continue
-            is_offset = _is_offset(scene, (brightest, place), found, one)
-            yield replace(one, gain_db=decibels(peak / now), is_offset=is_offset)
+            is_offset = _is_offset(scene, (brightest, point), geometries, candidate)
+            yield replace(candidate, gain_db=decibels(power / measured_power), is_offset=is_offset)
 
     trials = [
-        *tried(_other_geometries(nodes, found)),
-        *tried(_other_echoes(campaign, flight, nodes, found, sent=sent)),
+        *tested(_other_geometries(nodes, geometries)),
+        *tested(_other_echoes(campaign, flight, nodes, geometries, sent=sent)),
     ]
-    named = explanation(trials, [*tried(_by_chance(nodes, found, np.random.default_rng(0)))], lost_db)
-    if named:
-        best = max(trials, key=lambda one: one.gain_db)
-        there, there_m = _around(scene, _moved(scene, brightest, found, best), cell_m), height_m + best.height_m
-        named[0]["pair_gain_db"] = {
-            one.pair: round(
-                decibels(joint_peak_power([after], there, there_m) / joint_peak_power([one.history], here, height_m)), 2
+    drawn = [*tested(_random_tracks(nodes, geometries, np.random.default_rng(0)))]
+    reports = explanation(trials, drawn, lost_db)
+    if reports:
+        best = max(trials, key=lambda trial: trial.gain_db)
+        best_grid = _grid_around(scene, _displaced(scene, brightest, geometries, best), cell_m)
+        best_height_m = height_m + best.height_m
+        reports[0]["pair_gain_db"] = {
+            geometry.pair: round(
+                decibels(
+                    joint_peak_power([after], best_grid, best_height_m)
+                    / joint_peak_power([geometry.history], grid, height_m)
+                ),
+                2,
             )
-            for one, after in zip(found, best.histories, strict=True)
+            for geometry, after in zip(geometries, best.histories, strict=True)
         }
-    return named
+    return reports
 
 
-def _possible(found: Sequence[PairGeometry], grid: SceneGrid, height_m: float, focused: Collection[str]) -> float:
-    """Return the joint peak power if every pair were sharp at one place and in phase.
+def _focused_power(
+    geometries: Sequence[PairGeometry], grid: SceneGrid, height_m: float, focused: Collection[str]
+) -> float:
+    """Return the joint peak power if every pair were focused at one point and in phase.
 
-    A pair that is sharp by itself has its own peak, another one the strongest echo in its pulses.
+    A focused pair contributes its own peak, another pair the strongest echo of its pulses.
     """
     amplitudes = np.array(
         [
-            np.sqrt(joint_peak_power([one.history], grid, height_m))
-            if one.pair in focused
-            else strongest_echo(one.history, grid, height_m)
-            for one in found
+            np.sqrt(joint_peak_power([geometry.history], grid, height_m))
+            if geometry.pair in focused
+            else strongest_echo(geometry.history, grid, height_m)
+            for geometry in geometries
         ]
     )
     return float((amplitudes**2).mean() + amplitudes.mean() ** 2) / 2
@@ -196,100 +208,104 @@ def _possible(found: Sequence[PairGeometry], grid: SceneGrid, height_m: float, f
 
 def _is_offset(
     scene: OpenScene,
-    places: tuple[tuple[float, float], tuple[float, float]],
-    found: Sequence[PairGeometry],
+    points: tuple[tuple[float, float], tuple[float, float]],
+    geometries: Sequence[PairGeometry],
     hypothesis: Hypothesis,
 ) -> bool:
-    """Return whether a hypothesis changes paths by a constant for each pair, beside moving the bright place.
+    """Return True if a hypothesis changes the path of each pair by a constant, apart from displacing the point.
 
-    Source: docs/theory/focus.md, eq. 2.
+    `points`: the bright point before and after. Source: docs/theory/focus.md, eq. 2.
     """
-    here_m, there_m = (_ground(scene, place) for place in places)
-    there_m = there_m + hypothesis.height_m * np.cross(*scene.axes[:2])
-    for before, after in zip((one.history for one in found), hypothesis.histories, strict=True):
+    before_m, after_m = (_on_level(scene, point) for point in points)
+    after_m = after_m + hypothesis.height_m * np.cross(*scene.axes[:2])
+    for before, after in zip((geometry.history for geometry in geometries), hypothesis.histories, strict=True):
         if len(before) != len(after):
             return False
-        longer_m = (after.aperture.path(there_m[None]) - before.aperture.path(here_m[None]))[:, 0]
-        longer_m -= before.wave_speed_m_s * (after.reference_delay_s - before.reference_delay_s)
-        moves = np.column_stack([np.ones(len(longer_m)), before.aperture.path_gradient(here_m) @ scene.axes[:2].T])
-        rest_m = longer_m - moves @ np.linalg.lstsq(moves, longer_m, rcond=None)[0]
-        if 2 * np.pi * centre_frequency(before.frequency_hz) / before.wave_speed_m_s * float(rest_m.std()) > _ALIKE_RAD:
+        extra_m = (after.aperture.path(after_m[None]) - before.aperture.path(before_m[None]))[:, 0]
+        extra_m -= before.wave_speed_m_s * (after.reference_delay_s - before.reference_delay_s)
+        # Least-squares fit of a constant and a horizontal displacement to the change of path.
+        gradient = before.aperture.path_gradient(before_m) @ scene.axes[:2].T
+        design = np.column_stack([np.ones(len(extra_m)), gradient])
+        residual_m = extra_m - design @ np.linalg.lstsq(design, extra_m, rcond=None)[0]
+        wavenumber = 2 * np.pi * centre_frequency(before.frequency_hz) / before.wave_speed_m_s
+        if wavenumber * float(residual_m.std()) > _OFFSET_RESIDUAL_RAD:
             return False
     return True
 
 
-def _ground(scene: OpenScene, place: tuple[float, float]) -> NDArray[np.float64]:
-    row, column = scene.grid.pixel_of([place[0]], [place[1]])
+def _on_level(scene: OpenScene, point: tuple[float, float]) -> NDArray[np.float64]:
+    row, column = scene.grid.pixel_of([point[0]], [point[1]])
     return np.asarray(scene.level.positions_at(scene.grid, row, column)[0])
 
 
-def _around(scene: OpenScene, place: tuple[float, float], cell_m: float) -> SceneGrid:
-    """Return a grid about a place, coarser than the scene's."""
-    spacing_m, (x, y) = cell_m / _PIXELS_PER_CELL, place
+def _grid_around(scene: OpenScene, point: tuple[float, float], cell_m: float) -> SceneGrid:
+    """Return a grid centred on a point, with its own spacing."""
+    spacing_m, (x, y) = cell_m / _PIXELS_PER_CELL, point
     half = _SIDE_PX / 2 * spacing_m
     return SceneGrid(scene.grid.crs, x - half, y + half, spacing_m, (_SIDE_PX, _SIDE_PX), name=scene.grid.name)
 
 
-def _moved(
-    scene: OpenScene, place: tuple[float, float], found: Sequence[PairGeometry], hypothesis: Hypothesis
+def _displaced(
+    scene: OpenScene, point: tuple[float, float], geometries: Sequence[PairGeometry], hypothesis: Hypothesis
 ) -> tuple[float, float]:
-    """Return where a bright place is expected: shifted as antennas are on average, and by the height of the ground."""
+    """Return the expected position of a bright point: displaced with the mean antenna, and by the terrain height."""
     shifts = []
-    for one, history in zip(found, hypothesis.histories, strict=True):
-        for before, after in zip(one.history.aperture.legs, history.aperture.legs, strict=True):
+    for geometry, history in zip(geometries, hypothesis.histories, strict=True):
+        for before, after in zip(geometry.history.aperture.legs, history.aperture.legs, strict=True):
             ends = scene.grid.pixel_below(np.stack([before.mean(axis=0), after.mean(axis=0)]))
             shifts.append(ends[1, :2] - ends[0, :2])
     down, right = scene.grid.spacing_m * np.mean(shifts, axis=0)
-    east_m, north_m = _moved_by_height(scene, place, found, hypothesis.height_m)
-    return place[0] + float(right) + east_m, place[1] - float(down) + north_m
+    east_m, north_m = _displacement_by_height(scene, point, geometries, hypothesis.height_m)
+    return point[0] + float(right) + east_m, point[1] - float(down) + north_m
 
 
-def _moved_by_height(
-    scene: OpenScene, place: tuple[float, float], found: Sequence[PairGeometry], height_m: float
+def _displacement_by_height(
+    scene: OpenScene, point: tuple[float, float], geometries: Sequence[PairGeometry], height_m: float
 ) -> tuple[float, float]:
-    """Return by how much a point of unchanged paths moves, metres east and north, on ground higher by `height_m`.
+    """Return the displacement of a point with unchanged paths if the terrain is `height_m` higher, m east and north.
 
     With g the mean gradient of the path, g·dx = 0: dx = −g_up height g_level/|g_level|² along the level.
     """
-    here_m = _ground(scene, place)
-    gradient = np.mean([one.history.aperture.path_gradient(here_m).mean(axis=0) for one in found], axis=0).reshape(3)
+    point_m = _on_level(scene, point)
+    gradients = [geometry.history.aperture.path_gradient(point_m).mean(axis=0) for geometry in geometries]
+    gradient = np.mean(gradients, axis=0).reshape(3)
     east, north, up = scene.axes @ gradient
     level = max(float(east**2 + north**2), 1e-6)
     return -up * height_m * east / level, -up * height_m * north / level
 
 
-# ---- Echoes of a flight as they would be if a hypothesis were true ---------------------------------------------------
+# ---- Echoes of a flight under a hypothesis ---------------------------------------------------------------------------
 
 
-def evidence_of(nodes: Mapping[str, Acquisition], pair: str, echo: xr.Dataset, window: str) -> PairGeometry:
-    """Return some pulses of the echo of a pair, weighted by a window, with their geometry."""
+def subset_geometry(nodes: Mapping[str, Acquisition], pair: str, echo: xr.Dataset, window: str) -> PairGeometry:
+    """Return evenly spaced pulses of a pair's echo, weighted by a window, with their geometry."""
     tx, rx = (nodes[name] for name in pair.split("-"))
-    some = echo.isel(pulse=aperture_of(echo).sample(MOST_PULSES))
-    time = some.time.values
-    return PairGeometry(pair, phase_history_of(some, window), time, _sidelink_m(tx, rx, time, time))
+    subset = echo.isel(pulse=aperture_of(echo).sample(MOST_PULSES))
+    time = subset.time.values
+    return PairGeometry(pair, phase_history_of(subset, window), time, _sidelink_m(tx, rx, time, time))
 
 
-def flown(
-    nodes: Mapping[str, Acquisition], found: Sequence[PairGeometry], late_s: Mapping[str, float] | None = None
+def with_logs(
+    nodes: Mapping[str, Acquisition], geometries: Sequence[PairGeometry], late_s: Mapping[str, float] | None = None
 ) -> list[PairGeometry]:
-    """Return the same echoes with antennas and sidelink lengths by other logs of their nodes, or by logs that are late.
+    """Return the echoes with antenna positions and sidelink lengths from other logs, or from logs that are late.
 
     Raises
     ------
     CampaignError
-        Where a log does not reach.
+        If a log does not cover all pulses.
     """
-    moved = []
-    for one in found:
-        tx, rx = (nodes[name] for name in one.pair.split("-"))
+    changed = []
+    for geometry in geometries:
+        tx, rx = (nodes[name] for name in geometry.pair.split("-"))
         tx_at, rx_at = (
-            one.time + np.timedelta64(round((late_s or {}).get(node.name, 0.0) * 1e9), "ns") for node in (tx, rx)
+            geometry.time + np.timedelta64(round((late_s or {}).get(node.name, 0.0) * 1e9), "ns") for node in (tx, rx)
         )
         aperture = Aperture(tx.antenna("radar_tx", tx_at), rx.antenna("radar_rx", rx_at))
         sidelink_m = _sidelink_m(tx, rx, tx_at, rx_at)
-        history = one.history.moved(aperture, sidelink_m - one.sidelink_m)
-        moved.append(replace(one, history=history, sidelink_m=sidelink_m))
-    return moved
+        history = geometry.history.moved(aperture, sidelink_m - geometry.sidelink_m)
+        changed.append(replace(geometry, history=history, sidelink_m=sidelink_m))
+    return changed
 
 
 def _sidelink_m(tx: Acquisition, rx: Acquisition, tx_at: Times, rx_at: Times) -> NDArray[np.float64]:
@@ -298,34 +314,34 @@ def _sidelink_m(tx: Acquisition, rx: Acquisition, tx_at: Times, rx_at: Times) ->
     return np.asarray(np.linalg.norm(tx.antenna("sidelink", tx_at) - rx.antenna("sidelink", rx_at), axis=1))
 
 
-def _other_geometries(nodes: Mapping[str, Acquisition], found: Sequence[PairGeometry]) -> Iterator[Hypothesis]:
-    """Yield hypotheses on logs, arms, heights and paths, the likeliest first; not those that logs do not cover."""
+def _other_geometries(nodes: Mapping[str, Acquisition], geometries: Sequence[PairGeometry]) -> Iterator[Hypothesis]:
+    """Yield hypotheses on logs, lever arms, heights and paths, the likeliest first, as far as the logs cover them."""
     for what, kind, changed, late_s in _other_logs(nodes):
         with suppress(CampaignError):
-            moved = flown({**nodes, **changed}, found, late_s)
-            yield Hypothesis(what, kind, tuple(one.history for one in moved))
-    logged = tuple(one.history for one in found)
+            moved = with_logs({**nodes, **changed}, geometries, late_s)
+            yield Hypothesis(what, kind, tuple(geometry.history for geometry in moved))
+    logged = tuple(geometry.history for geometry in geometries)
     for height_m in causes.HEIGHT.errors:
         yield Hypothesis(causes.HEIGHT.line(height_m, digits=1), causes.HEIGHT.kind, logged, height_m)
-    for place, one in enumerate(found):
-        tx, rx = one.pair.split("-")
+    for index, geometry in enumerate(geometries):
+        tx, rx = geometry.pair.split("-")
         paths = [
-            (path_m, causes.RANGE.kind, causes.RANGE.line(path_m, pair=one.pair)) for path_m in causes.RANGE.errors
+            (path_m, causes.RANGE.kind, causes.RANGE.line(path_m, pair=geometry.pair)) for path_m in causes.RANGE.errors
         ]
         for count in causes.PREFIX.errors if tx == rx else ():
             path_m = count * SPEED_OF_LIGHT_M_S / nodes[tx].numerology.sample_rate_hz
-            begin = "the prefix" if nodes[tx].numerology.prefix_samples else "where waveform.lead_s says"
-            what = causes.PREFIX.line(count, pair=one.pair, path_m=f"{path_m:+.2f}", begin=begin)
+            begin = "the prefix" if nodes[tx].numerology.prefix_samples else "the start that waveform.lead_s implies"
+            what = causes.PREFIX.line(count, pair=geometry.pair, path_m=f"{path_m:+.2f}", begin=begin)
             paths.append((path_m, causes.PREFIX.kind, what))
         for path_m, kind, what in paths:
-            longer = one.history.moved(one.history.aperture, np.asarray(-path_m))
-            yield Hypothesis(what, kind, (*logged[:place], longer, *logged[place + 1 :]))
+            longer = geometry.history.moved(geometry.history.aperture, np.asarray(-path_m))
+            yield Hypothesis(what, kind, (*logged[:index], longer, *logged[index + 1 :]))
 
 
 def _other_logs(
     nodes: Mapping[str, Acquisition],
 ) -> Iterator[tuple[str, str, Mapping[str, Acquisition], Mapping[str, float]]]:
-    """Yield lines and kinds of wrong logs and arms, with the nodes as they would be, and how late their logs."""
+    """Yield sentences and kinds of wrong logs and lever arms, with the changed nodes and the delay of their logs."""
     groups = [*([name] for name in nodes), *([list(nodes)] if len(nodes) > 1 else [])]
     for late_s in causes.TIME.errors:
         for group in groups:
@@ -336,24 +352,24 @@ def _other_logs(
         for axis, word in enumerate(_AXES):
             if any(arm[axis] for arm in arms.values()):
                 flip = np.where(np.arange(3) == axis, -1.0, 1.0)
-                turned = node.settings.lever_arms_m.model_copy(
+                flipped = node.settings.lever_arms_m.model_copy(
                     update={key: tuple(arm * flip) for key, arm in arms.items()}
                 )
-                settings = node.settings.model_copy(update={"lever_arms_m": turned})
+                settings = node.settings.model_copy(update={"lever_arms_m": flipped})
                 what = causes.ARM_SIGN.line(axis=word, node=name)
                 yield what, causes.ARM_SIGN.kind, {name: replace(node, settings=settings)}, {}
     for first, second in combinations(nodes, 2):
         pair = nodes[first], nodes[second]
-        swapped = {first: _placed(*pair), second: _placed(*pair[::-1])}
+        swapped = {first: _on_track_of(*pair), second: _on_track_of(*pair[::-1])}
         yield causes.TRACKS.line(first=first, second=second), causes.TRACKS.kind, swapped, {}
 
 
-def _placed(node: Acquisition, other: Acquisition) -> Acquisition:
-    """Return a node at the positions of another, with its own attitude."""
+def _on_track_of(node: Acquisition, other: Acquisition) -> Acquisition:
+    """Return a node with the positions of another and its own attitude."""
     at = node.log_seconds(other.track.time.values)
     own = node.log_seconds(node.track.time.values)
-    turned = np.unwrap(node.track.attitude.values, axis=0)
-    attitude = np.stack([np.interp(at, own, angle) for angle in turned.T], axis=-1)
+    unwrapped = np.unwrap(node.track.attitude.values, axis=0)
+    attitude = np.stack([np.interp(at, own, angle) for angle in unwrapped.T], axis=-1)
     return replace(node, track=other.track.assign(attitude=(("epoch", "axis"), attitude)))
 
 
@@ -361,27 +377,28 @@ def _other_echoes(
     campaign: Campaign,
     flight: str,
     nodes: Mapping[str, Acquisition],
-    found: Sequence[PairGeometry],
+    geometries: Sequence[PairGeometry],
     *,
     sent: Transmitted,
 ) -> Iterator[Hypothesis]:
-    """Yield hypotheses that need other echoes: channels swapped, the carrier at the other end of the band."""
-    calibration = {one.pair: calibrated(campaign, flight, one.pair) for one in found}
+    """Yield hypotheses that require other echoes: swapped channels, or another reference of the carrier frequency."""
+    pairs = [geometry.pair for geometry in geometries]
+    calibration = {pair: calibrated(campaign, flight, pair) for pair in pairs}
 
-    def formed(one: PairGeometry, nodes: Mapping[str, Acquisition], sent: Transmitted) -> PhaseHistory:
-        tx, rx = (nodes[name] for name in one.pair.split("-"))
+    def formed(pair: str, nodes: Mapping[str, Acquisition], sent: Transmitted) -> PhaseHistory:
+        tx, rx = (nodes[name] for name in pair.split("-"))
         air = scene_air(campaign, tx.track.position.values)
         processing = campaign.settings.processing
-        echo = pair_echo(tx, rx, sent, processing, calibration[one.pair], air)
-        return evidence_of(nodes, one.pair, echo.stage, processing.window).history
+        echo = pair_echo(tx, rx, sent, processing, calibration[pair], air)
+        return subset_geometry(nodes, pair, echo.stage, processing.window).history
 
     waveform = sent.waveform
     if isinstance(waveform, OfdmWaveform):
         other = "band_centre" if waveform.carrier_is == "band_start" else "band_start"
         changed = transmitted(campaign, waveform.model_copy(update={"carrier_is": other}))
-        placed = {name: replace(node, numerology=changed.numerology) for name, node in nodes.items()}
+        retuned = {name: replace(node, numerology=changed.numerology) for name, node in nodes.items()}
         with suppress(CampaignError):
-            histories = tuple(formed(one, placed, changed) for one in found)
+            histories = tuple(formed(pair, retuned, changed) for pair in pairs)
             yield Hypothesis(causes.CARRIER.line(other=other), causes.CARRIER.kind, histories)
     for name, node in nodes.items():
         names = node.raw.attrs["channels"]
@@ -389,78 +406,84 @@ def _other_echoes(
         with suppress(CampaignError):
             if len(names) == 2:
                 histories = tuple(
-                    formed(one, swapped, sent) if one.pair.endswith(f"-{name}") else one.history for one in found
+                    formed(geometry.pair, swapped, sent) if geometry.pair.endswith(f"-{name}") else geometry.history
+                    for geometry in geometries
                 )
                 yield Hypothesis(causes.CHANNELS.line(node=name), causes.CHANNELS.kind, histories)
 
 
-def _by_chance(
-    nodes: Mapping[str, Acquisition], found: Sequence[PairGeometry], generator: np.random.Generator
+def _random_tracks(
+    nodes: Mapping[str, Acquisition], geometries: Sequence[PairGeometry], generator: np.random.Generator
 ) -> Iterator[Hypothesis]:
-    """Yield smooth wrong tracks of one or two unknowns that are drawn: what explains no better than they do is chance.
+    """Yield smooth wrong tracks drawn at random, against which the gain of a hypothesis is compared.
 
-    Drawn are node, direction, size, and whether the track is offset, inclined or bent.
+    Node, direction and size of the error are drawn; it is an offset, a slope or sinusoidal.
     """
-    for number in range(CHANCES):
-        size_m = float(np.exp(generator.uniform(*np.log(_CHANCE_M))))
+    for number in range(RANDOM_TRACKS):
+        size_m = float(np.exp(generator.uniform(*np.log(_RANDOM_SIZE_M))))
         direction = generator.standard_normal(3)
         error_m = size_m * direction / np.linalg.norm(direction)
         name = list(nodes)[generator.integers(len(nodes))]
-        periods, phase = generator.uniform(*_CHANCE_PERIODS), generator.uniform(0, 2 * np.pi)
+        periods, phase = generator.uniform(*_RANDOM_PERIODS), generator.uniform(0, 2 * np.pi)
         histories = []
-        for one in found:
-            along, logged = np.linspace(0, 1, len(one.time)), one.history.aperture
+        for geometry in geometries:
+            along, logged = np.linspace(0, 1, len(geometry.time)), geometry.history.aperture
             shape = (np.ones_like(along), 2 * along - 1, np.sin(2 * np.pi * periods * along + phase))[number % 3]
             wrong = TrackCorrection(along, {name: shape[:, None] * error_m})
-            longer_m = wrong.longer_m(one.pair, along, logged.tx_m - logged.rx_m if one.sidelink_m.any() else None)
-            histories.append(one.history.moved(wrong.aperture(logged, one.pair, along), longer_m))
-        yield Hypothesis(f"the log of {name} errs by {size_m:.2f} m", "chance", tuple(histories))
+            sidelink = logged.tx_m - logged.rx_m if geometry.sidelink_m.any() else None
+            extra_m = wrong.longer_m(geometry.pair, along, sidelink)
+            histories.append(geometry.history.moved(wrong.aperture(logged, geometry.pair, along), extra_m))
+        yield Hypothesis(f"the log of {name} has an error of {size_m:.2f} m", "chance", tuple(histories))
 
 
-# ---- Which hypothesis explains what was lost -------------------------------------------------------------------------
+# ---- Choice of the hypothesis that explains the loss -----------------------------------------------------------------
 
 LEAST_SHARE = 0.7
-"""Of the dB lost that a hypothesis must bring back to be named: most of it."""
+"""Smallest share of the loss in dB that a hypothesis must recover to be reported."""
 
 LEAST_AGAINST_NEXT = 2.0
-"""Its gain over that of the best other cause, and of the best wrong track drawn at random, dB over dB."""
+"""Smallest ratio, in dB over dB, of its gain to that of the best other cause and of the best random track."""
 
 CLEAR_DB = 10.0
-"""dB by which a gain exceeds another beyond doubt, however large both are."""
+"""Difference in dB from which a gain exceeds another with certainty, even if the ratio is below the limit."""
 
 
 def explanation(trials: Sequence[Hypothesis], drawn: Sequence[Hypothesis], lost_db: float) -> list[dict[str, Any]]:
-    """Return the report of the hypothesis that alone explains most of a loss, or that an offset does; else nothing.
+    """Return the report of the hypothesis that alone explains most of a loss, or of an offset; else an empty list.
 
     Parameters
     ----------
     trials, drawn
-        Hypotheses, and wrong tracks drawn at random, with what they gain.
+        Tested hypotheses, and random wrong tracks, with their gains.
     lost_db
-        What there is to gain.
+        Peak loss.
 
     Examples
     --------
     >>> late, arm, other = (Hypothesis("", kind, (), gain_db=db) for kind, db in (("time", 6), ("arm", 2), ("arm", 4)))
-    >>> [one["kind"] for one in explanation([late, arm], [], 7.0)], explanation([late, other], [], 7.0)
+    >>> [report["kind"] for report in explanation([late, arm], [], 7.0)], explanation([late, other], [], 7.0)
     (['time'], [])
     """
 
-    def cause(one: Hypothesis) -> str:  # a path longer by samples of the prefix or by an offset is the same
-        return causes.RANGE.kind if one.kind == causes.PREFIX.kind else one.kind
+    def cause(trial: Hypothesis) -> str:  # an offset by samples of the prefix is a path offset as well
+        return causes.RANGE.kind if trial.kind == causes.PREFIX.kind else trial.kind
 
-    best = max(trials, key=lambda one: one.gain_db, default=None)
+    best = max(trials, key=lambda trial: trial.gain_db, default=None)
     if best is None or best.gain_db < max(causes.LEAST_GAIN_DB, LEAST_SHARE * lost_db):
         return []
-    others = [*(one for one in trials if cause(one) != cause(best)), *drawn]
-    rivals = [one for one in others if one.gain_db > max(best.gain_db / LEAST_AGAINST_NEXT, best.gain_db - CLEAR_DB)]
-    if any(not (one.is_offset and best.is_offset) for one in rivals):
+    others = [*(trial for trial in trials if cause(trial) != cause(best)), *drawn]
+    rival_gain_db = max(best.gain_db / LEAST_AGAINST_NEXT, best.gain_db - CLEAR_DB)
+    rivals = [trial for trial in others if trial.gain_db > rival_gain_db]
+    if any(not (trial.is_offset and best.is_offset) for trial in rivals):
         return []
     what = best.what
-    if rivals:  # a constant of each pair does it, whatever made it: a path, an arm, a log, a phase
-        what = f"pairs are off by a constant: of a path, an arm, a phase, a log's place or time, such as: {what}"
-        heights = [one for one in rivals if one.kind == causes.HEIGHT.kind]
-        if heights:  # along a straight track a height does nearly the same
-            what += f"; or {max(heights, key=lambda one: one.gain_db).what}"
+    if rivals:  # several causes of a constant path offset per pair explain the loss equally well
+        what = (
+            "the path of each pair has a constant offset, from a path offset, lever arm, phase, or position or time of "
+            f"a log, such as: {what}"
+        )
+        heights = [trial for trial in rivals if trial.kind == causes.HEIGHT.kind]
+        if heights:  # along a straight track a height error has nearly the same effect
+            what += f"; or {max(heights, key=lambda trial: trial.gain_db).what}"
     report = {"what": what, "kind": "offset" if rivals else best.kind}
     return [report | {"gain_db": round(best.gain_db, 2), "lost_db": round(max(lost_db, best.gain_db), 2)}]

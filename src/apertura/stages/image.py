@@ -1,4 +1,4 @@
-"""Rules `image` and `tiles`: a focused image of one pair with its measured error, by one job or by many."""
+"""Rules `image` and `tiles`: image formation of one pair with its measured error, in one job or several."""
 
 from dataclasses import dataclass, replace
 from functools import partial
@@ -42,13 +42,24 @@ from apertura.workflow.lineage import result_of
 _MISSING = np.complex64(complex(np.nan, np.nan))
 """Value of a tile that no pulse illuminates; it is not stored."""
 
-_QUOTED = ("pulses", "positions", "time_tags", "sidelink", "clock", "code", "calibration", "atmosphere")
+_QUOTED = (
+    "pulses",
+    "background",
+    "interference",
+    "positions",
+    "time_tags",
+    "sidelink",
+    "clock",
+    "code",
+    "calibration",
+    "atmosphere",
+)
 
 
 def image(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Path:
     """Write results/<flight>/<pair>/image.zarr.
 
-    Tiles that are there already are kept: from a run that was killed, or from the jobs of rule `tiles`.
+    Existing tiles are kept, from a run that was killed or from the jobs of rule `tiles`.
     """
     lineage = result_of(campaign, "image", flight, pair).begin(campaign.root)
     work = _open(campaign, flight, pair, threads=threads)
@@ -81,30 +92,30 @@ def image(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> Pa
         }
         judged = judgement(work.formation, target, [*budget, arithmetic_line(quality["numerical_error_db"])])
         quality |= {"focus": judged.focus, "budget": judged.budget}
-        of_stages = work.empty.attrs["flags"], work.track.stage.attrs["flags"]
-        quality["flags"] = Flags.merged(*of_stages, plan.flags, quality["flags"], judged.flags)
+        stage_flags = work.empty.attrs["flags"], work.track.stage.attrs["flags"]
+        quality["flags"] = Flags.merged(*stage_flags, plan.flags, quality["flags"], judged.flags)
         finish(wip, folder, lineage=lineage, quality=quality, flags=quality["flags"])
-    # Also those of another number of jobs, of a run that was killed: the workflow only knows of the present ones.
+    # Removes all receipts, including those of an earlier run with another number of jobs.
     _receipts(folder).remove()
     return folder
 
 
 def tiles(campaign: Campaign, flight: str, pair: str, share: str, *, threads: int = 1) -> Path:
-    """Form one job's share of a pair's tiles for `image` to finish; write results/<flight>/<pair>/tiles/<share>.json.
+    """Form one job's share of the tiles of an image; write results/<flight>/<pair>/tiles/<share>.json.
 
     Parameters
     ----------
     campaign, flight, pair
-        Which image.
+        Campaign, flight and pair of the image.
     share
-        '2-of-8': every eighth tile, from the second on.
+        Share of the tiles, such as '2-of-8': every eighth tile, from the second on.
     threads
-        Tiles in work at once.
+        Number of tiles processed in parallel.
 
     Raises
     ------
     ValueError
-        If `share` is no such share.
+        If `share` is not valid.
     """
     number, jobs = (int(part) for part in share.split("-of-"))
     if not 1 <= number <= jobs:
@@ -122,13 +133,13 @@ def tiles(campaign: Campaign, flight: str, pair: str, share: str, *, threads: in
 
 
 def _receipts(folder: ConfinedPath) -> ConfinedPath:
-    """Receipts of finished shares of an image, until the image is complete."""
+    """Return the folder of the receipts of finished shares, which exists until the image is complete."""
     return folder.with_name("tiles")
 
 
 @dataclass(frozen=True, eq=False)
 class _Work:
-    """Common inputs of both rules: folder of the stage, reports that it quotes, formation."""
+    """Common inputs of both rules: stage folder, upstream stages, image formation."""
 
     folder: ConfinedPath
     echo: xr.Dataset
@@ -142,7 +153,7 @@ class _Work:
 
     @property
     def report(self) -> dict[str, Any]:
-        """Pulses and tiles used, for image.json."""
+        """Integration and tile counts, for image.json."""
         integration, formation = self.formation.plan.integration, self.formation
         empty = 1 - len(formation.windows) / len(formation.tiles)
         tiles = {"tiles": {"formed": len(formation.windows), "empty_share": round(empty, 6)}}
@@ -153,25 +164,26 @@ class _Work:
         )
 
     def compute(self, windows: list[Window], target: Any) -> None:
-        """Compute some tiles as planned."""
+        """Compute the tiles of some windows as planned."""
         line = self.formation.plan.setting.line
-        print(f"{len(windows)} of {number_of(len(self.formation.windows), 'tile')} to form with {line}", flush=True)
+        count = number_of(len(self.formation.windows), "tile")
+        print(f"forming {len(windows)} of {count} with {line}", flush=True)
         if windows:
             image = self.formation.image
             compute_tiles(image, windows, target, threads=self.threads, scheduler=self.scheduler)
         if variants := self.formation.variant_counts:
             shares = ", ".join(f"{100 * count / variants.total():.3g} % {name}" for name, count in variants.items())
-            print(f"of pixels × pulses went {shares}", flush=True)
+            print(f"path variants, share of pixels × pulses: {shares}", flush=True)
 
 
 def _open(campaign: Campaign, flight: str, pair: str, *, threads: int) -> _Work:
-    echo = PairEcho.opened(campaign, flight, pair).stage
+    echo = PairEcho.cleaned(campaign, flight, pair).stage
     profile = open_stage(campaign.stage("profile", flight, pair), "profile")
     scene, logged = open_scene(campaign), open_pair(campaign, flight, pair, echo=echo)
     track = open_refined(campaign, flight)
     opened, profiles = track.pair(logged), track.profiles(logged, profiles_of(profile, lazy=True))
     if opened.history is None:
-        raise TypeError("an open echo stage holds a phase history")
+        raise TypeError("the open echo stage has no phase history")
     plan = plan_pair(campaign, opened, scene, threads=threads)
     plan = replace(plan, decisions=(*plan.decisions, *track.decisions))
     compression_db = profile.attrs["compression_error_db"]
@@ -179,7 +191,7 @@ def _open(campaign: Campaign, flight: str, pair: str, *, threads: int) -> _Work:
         opened.history, profiles, scene.grid, plan, campaign.settings.processing.tile_px, compression_db
     )
     result = result_of(campaign, "image", flight, pair)
-    # Blocks of pulses are of the machine, not of the work: jobs with less memory share it all the same.
+    # The number of pulse blocks depends on memory, not on the result: jobs with different memory share one image.
     choices = {name: value for name, value in plan.choices.items() if name != "pulse_blocks"}
     empty = stamped(
         xr.Dataset(

@@ -21,14 +21,14 @@ from apertura.workflow.lineage import result_of
 
 
 def checked_recording(campaign: Campaign, flight: str, node: str) -> Recording:
-    """Return a node's recording; raise CampaignError where its samples are not those that the recorder hashed."""
+    """Open a node's recording; raise CampaignError if its samples do not match the recorder's hash."""
     recording = open_recording(campaign.recording_files(flight, node))
     recording.check_hash(lambda path: digest_of(campaign.root, campaign.relative(path), algorithm="sha512"))
     return recording
 
 
 def preamble_files(recording: Recording, campaign: Campaign) -> tuple[Path, ...]:
-    """Return the file of chips that the recorder's metadata name, which must lie in the campaign; none of triggers."""
+    """Return the preamble file named by the recorder's metadata, within the campaign; empty for triggered captures."""
     if recording.framing is None:
         return ()
     name = recording.framing["preamble"]
@@ -41,8 +41,8 @@ def captures_of(recording: Recording, campaign: Campaign, *, node: str) -> xr.Da
     Raises
     ------
     CampaignError
-        If a capture holds only zeros, the file ends before the last, or no preamble is found in samples that run
-        through.
+        If a capture contains only zeros, the file ends before the last capture, or a continuous recording contains
+        no preamble.
     """
     if recording.framing is None:
         dataset = recording.cut(recording.captures, node=node)
@@ -58,14 +58,14 @@ def framing_of(recording: Recording, campaign: Campaign) -> PulseFraming:
     Raises
     ------
     CampaignError
-        If the preamble is none, or the waveform begins before its captures can.
+        If the preamble file is invalid, or waveform.lead_s is set.
     """
     waveform = campaign.settings.waveform
     if isinstance(waveform, PulseWaveform) and waveform.lead_s:
         raise CampaignError(
-            f"waveform.lead_s is {waveform.lead_s:g}, and {recording.files[0].name} never stopped",
+            f"waveform.lead_s is {waveform.lead_s:g}, and {recording.files[0].name} is a continuous recording",
             where=CONFIG,
-            expected="0: its captures are cut where the pulse begins",
+            expected="0: captures of a continuous recording begin with the pulse",
             remedy="Set waveform.lead_s to 0.",
         )
     return read_framing(
@@ -77,10 +77,10 @@ def framing_of(recording: Recording, campaign: Campaign) -> PulseFraming:
 
 
 def _triggered(recording: Recording, campaign: Campaign, *, node: str) -> xr.Dataset:
-    """Return the `raw` stage of a continuous recording, as a triggered recorder would have written it."""
-    waveform, described = campaign.settings.waveform, recording.framing or {}
+    """Return the `raw` stage of a continuous recording, cut into captures at its preambles."""
+    waveform, metadata = campaign.settings.waveform, recording.framing or {}
     if not isinstance(waveform, SampledWaveform):
-        raise TypeError("a recording of samples needs a waveform that was recorded as samples")
+        raise TypeError("a sample recording requires a sampled waveform")
     framing = framing_of(recording, campaign)
     rate = campaign.settings.processing.false_alarms_per_s
     channel = "sidelink" if "sidelink" in recording.channels else "radar"
@@ -90,10 +90,10 @@ def _triggered(recording: Recording, campaign: Campaign, *, node: str) -> xr.Dat
     captures = trigger_captures(samples, framing, symbol_samples=length, false_alarms_per_s=rate, sample_bits=bits)
     if not captures.start.size:
         raise CampaignError(
-            f"no preamble in {len(samples)} samples at a threshold for {rate} false alarms per second",
+            f"no preamble detected in {len(samples)} samples, at a threshold of {rate} false alarms per second",
             where=recording.files[-1],
-            expected=f"preambles of {described['preamble']} in channel {channel}",
-            remedy="Check the preamble file and apertura:framing, or record with more signal.",
+            expected=f"the preamble of {metadata['preamble']} in channel {channel}",
+            remedy="Check the preamble file and apertura:framing, or record with a higher SNR.",
         )
     dataset = recording.cut(recording.captures_at(captures.start, length, captures.frame), node=node)
     return dataset.assign_attrs(trigger=captures.report)
@@ -105,12 +105,12 @@ def ingest(campaign: Campaign, flight: str, node: str) -> tuple[Path, Path]:
     Raises
     ------
     CampaignError
-        If a file is missing, damaged, or not what its format promises.
+        If a file is missing or damaged, or does not conform to its format.
     """
     logged = result_of(campaign, "track", flight, node).begin(campaign.root)
     log = read_log(campaign, flight, node)
-    how: dict[str, Any] = {"settings": logged.result.settings, "inputs": logged.sources.digests}
-    track = stamped(log, "track", modules=logged.modules, **how)
+    origin: dict[str, Any] = {"settings": logged.result.settings, "inputs": logged.sources.digests}
+    track = stamped(log, "track", modules=logged.modules, **origin)
     recording = checked_recording(campaign, flight, node)
     recorded = result_of(campaign, "raw", flight, node).begin(
         campaign.root, others=[*map(campaign.relative, preamble_files(recording, campaign))]

@@ -40,21 +40,21 @@ from apertura.stages.transfer import PairEcho
 from apertura.workflow.lineage import result_of
 from apertura.workflow.rules import INTERFEROMETRY
 
-_SAME = 1e-6  # share by which two bands may differ
+_BAND_TOLERANCE = 1e-6  # relative difference of two bands' limits that is tolerated
 
 
 @dataclass(frozen=True, eq=False)
 class TwoImages:
-    """Two images, and what both assume of the ground.
+    """Two images of an interferogram, and the terrain that both assume.
 
     Attributes
     ----------
     names
         flight/pair of each.
     images
-        Their stages.
+        Stages of both images.
     ground
-        Of each pixel of the grid.
+        Assumed terrain, per pixel of the grid.
     """
 
     names: tuple[str, str]
@@ -68,24 +68,26 @@ def open_two(campaign: Campaign, name: str, scene: OpenScene) -> TwoImages:
     Parameters
     ----------
     campaign, scene
-        Settings, grid and ground.
+        Campaign, and its scene with grid and terrain.
     name
         A key of `interferometry.pairs`.
 
     Raises
     ------
     CampaignError
-        If there is no such key, or the two images are of other frequencies.
+        If the key does not exist, or the images have different frequency bands.
     """
     requested = campaign.settings.interferometry
     if name not in requested.pairs:
-        expected = f"one of {', '.join(requested.pairs) or 'none: no two images are named'}"
-        raise CampaignError(f"no interferogram {name!r}", f"{CONFIG}: interferometry.pairs", expected, "Name it there.")
+        names = ", ".join(requested.pairs)
+        expected = f"one of {names}" if names else "a configured interferogram; none is configured"
+        where = f"{CONFIG}: interferometry.pairs"
+        raise CampaignError(f"no interferogram {name!r}", where, expected, "Add it to interferometry.pairs.")
     images = requested.images(name)
     bands, legs, looks, antennas = [], [], [], list[FlownAntenna]()
     began: np.datetime64 | None = None
     for sign, (flight, pair) in zip((1, -1), images, strict=True):
-        echo = PairEcho.opened(campaign, flight, pair).stage
+        echo = PairEcho.cleaned(campaign, flight, pair).stage
         profile = open_stage(campaign.stage("profile", flight, pair), "profile")
         opened = open_pair(campaign, flight, pair, echo=echo)
         bands.append((float(opened.frequency_hz.min()), float(opened.frequency_hz.max())))
@@ -93,10 +95,11 @@ def open_two(campaign: Campaign, name: str, scene: OpenScene) -> TwoImages:
         legs.append(legs_of(looks[-1]))
         began = began or opened.began
         antennas += _antennas(campaign, opened, looks[-1], sign=sign, began=began)
-    if not np.allclose(bands[0], bands[1], rtol=_SAME, atol=0):
-        found = " and ".join(f"{low / 1e6:.6g} to {high / 1e6:.6g} MHz" for low, high in bands)
+    if not np.allclose(bands[0], bands[1], rtol=_BAND_TOLERANCE, atol=0):
+        measured = " and ".join(f"{low / 1e6:.6g} to {high / 1e6:.6g} MHz" for low, high in bands)
         where = f"{CONFIG}: interferometry.pairs.{name}"
-        raise CampaignError(f"images of {found}", where, "two images of one band", "Name two of one band.")
+        expected = "two images of the same frequency band"
+        raise CampaignError(f"bands of {measured}", where, expected, "Name two images of the same band.")
     first, second = ("/".join(image) for image in images)
     stages = [open_stage(campaign.stage("image", *image), "image") for image in images]
     sensed = sensed_heights(scene, looks[0], legs, bands[0])
@@ -104,7 +107,8 @@ def open_two(campaign: Campaign, name: str, scene: OpenScene) -> TwoImages:
     height_m = np.broadcast_to(np.asarray(scene.terrain.heights(scene.grid), np.float64), scene.grid.shape)
     shift_px = np.stack([-sensed.shift[..., 1], sensed.shift[..., 0]], axis=-1) / scene.grid.spacing_m
     points = [point.model_dump() for point in campaign.settings.scene.reference_points]
-    known = [one for point in points if (one := _known_height(point, scene, sensed, height_m, shift_px)) is not None]
+    heights = (_known_height(point, scene, sensed, height_m, shift_px) for point in points)
+    known = [height for height in heights if height is not None]
     ground = AssumedGround(height_m, visible, sensed, shift_px, known)
     if antennas:
         wavenumber = np.pi * sum(bands[0]) / opened.wave_speed_m_s
@@ -116,18 +120,18 @@ def open_two(campaign: Campaign, name: str, scene: OpenScene) -> TwoImages:
 def _antennas(
     campaign: Campaign, opened: OpenPair, looks: Looks, *, sign: int, began: np.datetime64
 ) -> list[FlownAntenna]:
-    """Return the antennas of an image whose position errors are known: stated, or left by the refinement."""
+    """Return the antennas of an image with known position accuracy, configured or estimated by the refinement."""
     pulses = looks.pulses.reshape(-1, looks.pulses.shape[-1])
     at_s, refined = clock_s(opened, began), open_refined(campaign, opened.flight)
     time = opened.began + (opened.time_s * 1e9).astype("timedelta64[ns]")
     names = dict.fromkeys(opened.name.split("-"))
-    known = dict(zip(names, opened.positions, strict=True))
+    accuracies = dict(zip(names, opened.positions, strict=True))
     antennas = []
     for node, leg in zip(opened.name.split("-"), looks.aperture.legs, strict=True):
-        positions = known[node].assumed
-        left_m = refined.left_m(node, time)
-        if np.isfinite(left_m).any():
-            std_m = np.full(3, np.sqrt(np.nanmean(left_m**2)))
+        positions = accuracies[node].assumed
+        residual_m = refined.left_m(node, time)
+        if np.isfinite(residual_m).any():
+            std_m = np.full(3, np.sqrt(np.nanmean(residual_m**2)))
         elif positions.std_m is not None:
             std_m = np.array(positions.std_m)
         else:
@@ -139,24 +143,25 @@ def _antennas(
 
 
 def _nodes(scene: OpenScene, looks: Looks) -> NDArray[np.float64]:
-    """Return the places of the nodes of a lattice, (node, 3)."""
+    """Return the positions of the lattice nodes, (node, 3)."""
     rows, columns = np.meshgrid(*looks.lattice.nodes, indexing="ij")
     return scene.terrain.positions_at(scene.grid, rows, columns).reshape(-1, 3)
 
 
 def _track_std(phase: TrackPhase, lattice: Lattice, known: Sequence[KnownHeight]) -> NDArray[np.float64]:
-    """Return the deviation of the phase of every pixel by errors of the tracks, of heights that count from points."""
+    """Return the standard deviation of every pixel's phase from track errors, for heights relative to known points."""
     columns = lattice.shape[1]
     nearest = [
-        int(np.abs(lattice.nodes[0] - one.row).argmin()) * columns + int(np.abs(lattice.nodes[1] - one.column).argmin())
-        for one in known
+        int(np.abs(lattice.nodes[0] - point.row).argmin()) * columns
+        + int(np.abs(lattice.nodes[1] - point.column).argmin())
+        for point in known
     ]
     whole: Window = (slice(0, int(lattice.nodes[0][-1]) + 1), slice(0, int(lattice.nodes[1][-1]) + 1))
     return lattice.between(phase.std(nearest).reshape(lattice.shape), whole)
 
 
 def legs_of(looks: Looks) -> Legs:
-    """Return phase centres of some pulses of each node of the lattice, (node, pulse, 3)."""
+    """Return the phase centres at the sampled pulses of each lattice node, (node, pulse, 3)."""
     pulses = looks.pulses.reshape(-1, looks.pulses.shape[-1])
     tx, rx = (leg[pulses] for leg in looks.aperture.legs)
     return tx, rx
@@ -169,19 +174,19 @@ def sensed_heights(
     band_hz: tuple[float, float],
     window: NDArray[np.float64] | None = None,
 ) -> Sensitivity:
-    """Return the sensitivity to height at every pixel: computed at nodes of the lattice, bilinear between them.
+    """Return the sensitivity to height at every pixel: computed at the lattice nodes, bilinear between them.
 
     Parameters
     ----------
     scene, looks
-        Grid and ground; whose lattice.
+        Scene with grid and terrain; looks with the lattice.
     legs
-        Of both images at the nodes of that lattice, as `legs_of`.
+        Phase centres of both images at the lattice nodes, as returned by `legs_of`.
     band_hz, window
-        Lowest and highest frequency; weights between them, by which the overlap counts, flat by default.
+        Lowest and highest frequency, and the spectral weights between them (default: flat) for the spectral overlap.
     """
-    lattice, grid, places = looks.lattice, scene.grid, _nodes(scene, looks)
-    at_nodes = sensitivity(places, scene.axes, legs[0], legs[1], band_hz=band_hz, window=window)
+    lattice, grid, nodes_m = looks.lattice, scene.grid, _nodes(scene, looks)
+    at_nodes = sensitivity(nodes_m, scene.axes, legs[0], legs[1], band_hz=band_hz, window=window)
     whole: Window = (slice(0, grid.shape[0]), slice(0, grid.shape[1]))
 
     def between(name: str) -> NDArray[np.float64]:
@@ -205,34 +210,34 @@ def _known_height(
     height_m: NDArray[np.float64],
     shift_px: NDArray[np.float64],
 ) -> KnownHeight | None:
-    """Return the pixel that shows a point, and the phase that its height makes there; None beside the grid."""
+    """Return the pixel at which a point is imaged, and the phase of its height there; None outside the grid."""
     x_m, y_m, z_m = point["position_m"]
-    place = np.array(scene.grid.pixel_of(x_m, y_m))
-    pixel = np.round(place).astype(int)
-    for _ in range(5):  # it shows where its own height moves it
+    map_pixel = np.array(scene.grid.pixel_of(x_m, y_m))
+    pixel = np.round(map_pixel).astype(int)
+    for _ in range(5):  # iterate the displacement by the point's height above the assumed terrain
         if not ((pixel >= 0) & (pixel < scene.grid.shape)).all():
             return None
         row, column = pixel
         rise = z_m - height_m[row, column]
-        pixel = np.round(place - shift_px[row, column] * rise).astype(int)
+        pixel = np.round(map_pixel - shift_px[row, column] * rise).astype(int)
     phase = sensed.slope[row, column] * rise + sensed.bend[row, column] * rise**2
     return KnownHeight(point["name"], int(row), int(column), float(phase))
 
 
 def interferogram(campaign: Campaign, name: str) -> list[Path]:
-    """Write results/interferometry/<name>: GeoTIFFs, a picture and interferogram.json; return their paths.
+    """Write results/interferometry/<name>: GeoTIFFs, a plot and interferogram.json; return their paths.
 
     Parameters
     ----------
     campaign
-        Settings and flights.
+        Campaign with settings and flights.
     name
         A key of `interferometry.pairs`.
 
     Raises
     ------
     CampaignError
-        If there is no such key, or the two images are of other frequencies.
+        If the key does not exist, or the images have different frequency bands.
     """
     scene = open_scene(campaign)
     two = open_two(campaign, name, scene)
@@ -240,20 +245,20 @@ def interferogram(campaign: Campaign, name: str) -> list[Path]:
     tiles = scene.grid.tiles(campaign.settings.processing.tile_px)
     first, second = (stage.image for stage in two.images)
     window = campaign.settings.interferometry.window_px
-    found = form_interferogram(first, second, two.ground, tiles, window=window)
+    formed = form_interferogram(first, second, two.ground, tiles, window=window)
     origin = Provenance.of(
         lineage.modules,
         dict(zip(two.names, two.images, strict=True)),
         settings=lineage.result.settings,
     )
-    report = _report(found, two)
+    report = _report(formed, two)
     folder = campaign.result(INTERFEROMETRY, name)
     title = f"{campaign.settings.campaign} · {two.names[0]} against {two.names[1]}"
     written = write_exports(
         "interferogram",
         folder,
-        {**found.panels, "panels": found.panels},
-        titles={source: f"{title} · {source}" for source in found.panels} | {"panels": title},
+        {**formed.panels, "panels": formed.panels},
+        titles={source: f"{title} · {source}" for source in formed.panels} | {"panels": title},
         tags=tags_of(origin, lineage) | _tags(report),
         transform=Affine(*scene.grid.transform),
         crs=scene.grid.crs_wkt,
@@ -264,52 +269,54 @@ def interferogram(campaign: Campaign, name: str) -> list[Path]:
     return written
 
 
-def _report(found: Interferogram, two: TwoImages) -> dict[str, Any]:
+def _report(formed: Interferogram, two: TwoImages) -> dict[str, Any]:
     """Return the values of interferogram.json."""
     flagged = {name: stage.attrs["flags"] for name, stage in zip(two.names, two.images, strict=True)}
-    stds = found.panels["height_std"]
-    there = stds[np.isfinite(stds)]
-    std_m = round(float(np.median(there)), 4) if there.size else None
-    measured = {key: round(one, 4) if isinstance(one, float) else one for key, one in asdict(found.measured).items()}
+    stds = formed.panels["height_std"]
+    finite = stds[np.isfinite(stds)]
+    std_m = round(float(np.median(finite)), 4) if finite.size else None
+    measured = {
+        key: round(value, 4) if isinstance(value, float) else value for key, value in asdict(formed.measured).items()
+    }
     return {
         "images": list(two.names),
         "flags_of_images": {name: flags for name, flags in flagged.items() if flags},
-        "looks": round(found.looks, 3) if isfinite(found.looks) else None,
+        "looks": round(formed.looks, 3) if isfinite(formed.looks) else None,
         "measured": measured,
-        "level": None if found.level is None else {**asdict(found.level), "says": _level_line(found.level)},
+        "level": None if formed.level is None else {**asdict(formed.level), "says": _level_line(formed.level)},
         "height_std_m": std_m,
-        "says": _summary(found, std_m),
-        "flags": interferogram_flags(found.measured),
+        "says": _summary(formed, std_m),
+        "flags": interferogram_flags(formed.measured),
     }
 
 
-def _summary(found: Interferogram, std_m: float | None) -> str:
-    """Return the outcome in one line."""
-    coherence = f"coherence {found.measured.coherence:.2f}, {found.measured.chance:.2f} by chance"
-    if found.level is None or std_m is None:
+def _summary(formed: Interferogram, std_m: float | None) -> str:
+    """Return a one-line summary: coherence, height accuracy, height of ambiguity and reference."""
+    coherence = f"coherence {formed.measured.coherence:.2f} ({formed.measured.chance:.2f} for unrelated images)"
+    if formed.level is None or std_m is None:
         return f"{coherence}; no heights"
     return (
-        f"{coherence}; heights to {std_m:.2g} m, {found.measured.ambiguity_m:.3g} m for a turn of the phase; "
-        f"{_level_line(found.level)}"
+        f"{coherence}; height accuracy {std_m:.2g} m, height of ambiguity {formed.measured.ambiguity_m:.3g} m; "
+        f"{_level_line(formed.level)}"
     )
 
 
 def _level_line(level: Level) -> str:
-    """Return the reference of the heights in one line."""
+    """Return the height reference of an interferogram in one line."""
     if not level.points:
-        return "heights count from the terrain: the median phase is taken for none"
-    spread = "" if level.spread_rad is None else f", which agree to {level.spread_rad:.2f} rad"
-    known = "" if level.std_rad is None else f", known to {level.std_rad:.2f} rad"
-    return f"heights count from {' and '.join(level.points)}{spread}{known}"
+        return "heights relative to the terrain: the median phase is set to zero"
+    spread = "" if level.spread_rad is None else f", which agree within {level.spread_rad:.2f} rad"
+    accuracy = "" if level.std_rad is None else f", accuracy {level.std_rad:.2f} rad"
+    return f"heights relative to {' and '.join(level.points)}{spread}{accuracy}"
 
 
 def _tags(report: dict[str, Any]) -> dict[str, str]:
     measured = report["measured"]
-    needed = measured["by"] or "no: snaphu is not installed"
+    method = measured["by"] or "no: snaphu is not installed"
     return {
         "APERTURA_FLAGS": canonical_json(report["flags"]),
         "APERTURA_LEVEL": report["level"]["says"] if report["level"] else "no heights",
         "APERTURA_LOOKS": "none" if report["looks"] is None else f"{report['looks']:.2f}",
         "APERTURA_CHANCE": f"{measured['chance']:.3f}",
-        "APERTURA_UNWRAPPED": needed if measured["jumps"] else "not needed: no jumps",
+        "APERTURA_UNWRAPPED": method if measured["jumps"] else "not needed: no jumps",
     }

@@ -44,23 +44,23 @@ from apertura.workflow.lineage import result_of
 
 
 def layers(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> list[Path]:
-    """Write incidence, bistatic angle, mask, looks and noise of one pair, σ⁰ where its radio is stated, and mean power.
+    """Write incidence, bistatic angle, mask, looks and noise of a pair, and σ⁰ and mean power if configured.
 
-    Returns their paths. What the radio makes of bright points and of noise is in radiometry.json.
+    Returns their paths. Cross-sections of bright points and the noise figure are written to radiometry.json.
     """
     lineage = result_of(campaign, "layers", flight, pair).begin(campaign.root)
-    echo = PairEcho.opened(campaign, flight, pair).stage
+    echo = PairEcho.cleaned(campaign, flight, pair).stage
     profile = open_stage(campaign.stage("profile", flight, pair), "profile")
     scene, profiles = open_scene(campaign), profiles_of(profile, lazy=True)
     opened = open_pair(campaign, flight, pair, echo=echo)
     beams, calibrated = weighing(campaign, opened, scene), calibrated_pair(campaign, opened, scene, threads=threads)
     looks = Looks.of(scene.grid, scene.terrain, profiles.aperture, beams, threads=threads)
-    places_m = noise_places(scene.grid, scene.terrain)
-    measured_noise = noise_power(profiles, places_m, time_s=opened.time_s, beams=beams)
+    points_m = noise_places(scene.grid, scene.terrain)
+    measured_noise = noise_power(profiles, points_m, time_s=opened.time_s, beams=beams)
     noise = measured_noise.power
     coefficients, multilook = campaign.settings.processing.radiometry, campaign.settings.processing.multilook
-    measured = campaign.calibrated or multilook is not None
-    image = open_stage(campaign.stage("image", flight, pair), "image") if measured else None
+    needs_image = campaign.calibrated or multilook is not None
+    image = open_stage(campaign.stage("image", flight, pair), "image") if needs_image else None
     origin = Provenance.of(
         lineage.modules,
         [echo, profile, *([] if image is None else [image]), *scene.parents],
@@ -95,7 +95,7 @@ def layers(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> l
             known = calibrated is not None
             powers = {name: GroundPower(scene, image, calibrated, mask, name, known) for name in coefficients}
             means = {name: means_of(name) for name in coefficients}
-            images = ((name, one.amplitude) for name, one in powers.items())
+            images = ((name, power.amplitude) for name, power in powers.items())
             write("radiometry", {name: LazyLayer(scene.grid, np.complex64, of, threads) for name, of in images}, means)
             written.append(folder / CROSS_SECTIONS)
             report = _report(scene, image, calibrated, measured_noise) if calibrated else _no_constant(campaign, pair)
@@ -117,17 +117,17 @@ def layers(campaign: Campaign, flight: str, pair: str, *, threads: int = 1) -> l
 
 @dataclass(frozen=True, eq=False)
 class GroundPower:
-    """Power of an image, as its ground scatters it where the pair is calibrated.
+    """Power of an image: backscattering coefficient of a calibrated pair, else the echo power.
 
     Attributes
     ----------
     scene, image
-        Grid and ground, and the stage.
+        Scene with grid and terrain, and the image stage.
     calibrated, mask, quantity
-        Of a calibrated pair: what its power is divided by, and the file in which other values than 0 are places whose
-        power is not that of their ground alone. None: power as it is.
+        For a calibrated pair: its calibration, the mask file and the coefficient. Pixels with a mask other than 0 are
+        excluded, because their power is not that of their own terrain alone. None: echo power.
     is_known
-        Whether the power is known; False: of a pair without a constant in a campaign that is calibrated.
+        False for a pair without a calibration constant in a calibrated campaign: its power is NaN.
     """
 
     scene: OpenScene
@@ -138,7 +138,7 @@ class GroundPower:
     is_known: bool = True
 
     def per_one(self, window: Window) -> NDArray[np.float64]:
-        """Return the mean power of a window, (row, column), of ground that is 1; NaN where it is not determined."""
+        """Return the echo power per unit of the coefficient in a window, (row, column); NaN where it is unknown."""
         if self.calibrated is None:
             return np.full([part.stop - part.start for part in window], 1.0 if self.is_known else np.nan)
         scene, flat = self.scene, isinstance(self.scene.terrain, FlatGround)
@@ -146,11 +146,11 @@ class GroundPower:
         power = self.calibrated.calibration.power(window, self.quantity, normal)
         if flat or self.mask is None:
             return power
-        with opened_raster(self.mask, expected="what this step has written", remedy="Run it again.") as raster:
+        with opened_raster(self.mask, expected="the mask that this step writes", remedy="Run it again.") as raster:
             return np.where(raster.read(1, window=rasterio.windows.Window.from_slices(*window)) == 0, power, np.nan)
 
     def amplitude(self, window: Window) -> NDArray[np.complex64]:
-        """Return the complex pixels of a window whose power it is, (row, column)."""
+        """Return the complex pixels of a window scaled to this power, (row, column)."""
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.asarray(self.image.image[window].values / np.sqrt(self.per_one(window)), np.complex64)
 
@@ -164,7 +164,10 @@ def _multilooked(
     *,
     threads: int,
 ) -> tuple[LazyLayer, dict[str, Any]]:
-    """Return mean power on a coarser grid, float32, and what it means; `pulse_noise` is noise per Σw² of a pixel."""
+    """Return the mean power on a coarser grid, and its radiometric report.
+
+    `pulse_noise`: noise power of a pixel per sum of its squared pulse weights, Σw².
+    """
 
     def noise(window: Window) -> Floats:
         return pulse_noise * looks.weight_squares(window) / power.per_one(window)
@@ -178,7 +181,7 @@ def _multilooked(
 def _noise_of_echoes(
     scene: OpenScene, image: xr.Dataset, looks: Looks, pulse_noise: float, multilook: Multilooking, *, threads: int
 ) -> tuple[dict[str, LazyLayer], dict[str, dict[str, Any]]]:
-    """Return mean power of the noise in the pixels of power.tif, on the coarser grid, for the sums of pairs."""
+    """Return the mean noise power in the pixels of power.tif, on the coarser grid, for the sums of pairs."""
     side = side_of(scene.grid, multilook)
     cells = Multilook(
         GroundPower(scene, image).amplitude,
@@ -189,13 +192,13 @@ def _noise_of_echoes(
         *3 * [float("nan")],
     )
     raster = coarse(scene.grid, cells, threads=threads, of=cells.mean_noise)
-    means = {"amplitude": "root of the power of noise", "power": f"mean power of noise of {side} x {side} pixels"}
+    means = {"amplitude": "square root of the noise power", "power": f"mean noise power of {side} x {side} pixels"}
     return {"multilook_noise": raster}, {"multilook_noise": ECHO.report | means}
 
 
 def _report(scene: OpenScene, image: xr.Dataset, calibrated: CalibratedPair, noise: PulseNoise) -> dict[str, Any]:
     """Return the link budget and noise of an image, for radiometry.json."""
-    found = points_of(image.image, image.attrs["quality"], scene, list(scene.grid.tiles(BLOCK_PX)))
+    points = points_of(image.image, image.attrs["quality"], scene, list(scene.grid.tiles(BLOCK_PX)))
     constant = calibrated.calibration.constant
     noise_report, noise_flags = calibrated.noise_report(noise, bound="azimuth_undersampled" in image.attrs["flags"])
     return {
@@ -206,20 +209,20 @@ def _report(scene: OpenScene, image: xr.Dataset, calibrated: CalibratedPair, noi
         "flags": Flags.merged(calibrated.flags, noise_flags),
         "link": calibrated.link and asdict(calibrated.link),
         "noise": {"pulse": noise.power if np.isfinite(noise.power) else None, **noise_report},
-        "points": calibrated.points(found, scene, noise.power),
+        "points": calibrated.points(points, scene, noise.power),
         "points_listed": POINTS_LISTED,
     }
 
 
 def _no_constant(campaign: Campaign, pair: str) -> dict[str, Any]:
-    """Return radiometry.json of a pair without a constant in a campaign that is calibrated."""
-    line = f"{campaign.calibration_file and campaign.calibration_file.name} has no constant of {pair}"
+    """Return the radiometry.json of a pair without a calibration constant in a calibrated campaign."""
+    line = f"{campaign.calibration_file and campaign.calibration_file.name} has no constant for {pair}"
     return {
         "calibrated_by": None,
         "constant_db": None,
         "std_db": None,
         "pointing_std_db": 0.0,
-        "flags": Flags({"pair_uncalibrated": f"{line}: its backscattering coefficients hold no value"}),
+        "flags": Flags({"pair_uncalibrated": f"{line}: its backscattering coefficients are NaN"}),
         "link": None,
         "noise": {"pulse": None, "noise_figure_db": None, "noise_figure_measured_db": None, "std_db": None},
         "points": [],
@@ -235,13 +238,13 @@ def layer_rasters(
     Parameters
     ----------
     scene, looks
-        Grid and ground; pulses that make each pixel.
+        Scene with grid and terrain; pulses that contribute to each pixel.
     noise
-        Of one pulse in its range profile, power; NaN where it is unknown.
+        Noise power of one pulse in its range profile; NaN where it is unknown.
     calibrated
-        Of the pair; None: its noise is relative.
+        Calibration of the pair; None: the noise is relative.
     threads
-        Tiles computed at once.
+        Number of tiles processed in parallel.
     """
     grid, terrain = scene.grid, scene.terrain
     level, noise_db = isinstance(terrain, FlatGround), np.float32(10 * np.log10(noise or np.nan))
@@ -274,26 +277,26 @@ def _inside(looks: Looks, window: Window, values: NDArray[Any]) -> NDArray[Any]:
 
 
 def _mask(scene: OpenScene, looks: Looks) -> Callable[[Window], NDArray[np.uint8]]:
-    """Return the mask of a window, each pixel by the pulses that form the nearest node of the lattice."""
+    """Return the function that computes the mask of a window, with the pulses of the nearest lattice node per pixel."""
 
     def outside(window: Window) -> NDArray[np.uint8]:
         return np.where(looks.illuminated(window), 0, OUTSIDE).astype(np.uint8)
 
     if isinstance(scene.terrain, FlatGround):
         return outside
-    from apertura.core.scene.visibility import Relief, visibility  # slow to import: it brings a compiler
+    from apertura.core.scene.visibility import Relief, visibility  # slow to import: it loads numba
 
     relief = Relief.of(scene.grid, scene.terrain, scene.level.height_m)
 
     def mask(window: Window) -> NDArray[np.uint8]:
-        illuminated, marked = looks.illuminated(window), outside(window)
+        illuminated, values = looks.illuminated(window), outside(window)
         if not illuminated.any():
-            return marked
+            return values
         for node, part in looks.lattice.nearest(window):
-            here = tuple(slice(at.start - by.start, at.stop - by.start) for at, by in zip(part, window, strict=True))
-            if illuminated[here].any():
+            inner = tuple(slice(at.start - by.start, at.stop - by.start) for at, by in zip(part, window, strict=True))
+            if illuminated[inner].any():
                 tx, rx = (relief.above(leg) for leg in looks.aperture[looks.pulses[node].astype(np.int64)].legs)
-                marked[here] = np.where(illuminated[here], visibility(relief, tx, rx, part), OUTSIDE)
-        return marked
+                values[inner] = np.where(illuminated[inner], visibility(relief, tx, rx, part), OUTSIDE)
+        return values
 
     return mask

@@ -1,4 +1,4 @@
-"""Mean power of squares of pixels, on a coarser grid: of the layers of a pair, and of the sums of a flight."""
+"""Multilooking: mean power on a coarser grid, of the images of a pair and of the sums of a flight."""
 
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -16,25 +16,25 @@ from apertura.core.scene.grid import SceneGrid
 from apertura.core.scene.looks import BLOCK_PX
 from apertura.formats.export.radiometry import of_multilooked
 
-_FEWEST_CELLS = 64  # along a tile of mean power: those around it that the filter reads, too, are few
+_FEWEST_CELLS = 64  # multilook cells along a tile, so that the margin which the filter reads is small in comparison
 
 
 @dataclass(frozen=True)
 class LazyLayer:
-    """A raster whose blocks are computed on reading, tile by tile, in threads.
+    """Raster whose blocks are computed on reading, tile by tile, in threads.
 
     Attributes
     ----------
     grid
-        Its pixels.
+        Grid of the raster.
     dtype
-        Of the values.
+        Data type of the values.
     of
-        Window of the grid → values (row, column).
+        Function from a window of the grid to its values (row, column).
     threads
-        Tiles computed at once.
+        Number of tiles computed in parallel.
     tile_px
-        Side of a tile.
+        Side of a tile, pixels.
     """
 
     grid: SceneGrid
@@ -63,7 +63,7 @@ class LazyLayer:
 
 
 def side_of(grid: SceneGrid, multilook: Multilooking) -> int:
-    """Return the side of the squares that power is averaged over, pixels."""
+    """Return the side of a multilook cell, pixels."""
     return max(1, round(multilook.spacing_m / grid.spacing_m))
 
 
@@ -74,7 +74,7 @@ def multilook_of(
     *,
     noise: Callable[[Window], Floats] | None = None,
 ) -> Multilook:
-    """Return the mean power of an image by the settings, with `noise` subtracted where it is given."""
+    """Return the multilooked power of an image as configured; the mean power `noise` is subtracted unless None."""
     filtered = multilook.speckle_filter == "lee"
     return Multilook.of(image, grid.shape, side_of(grid, multilook), noise=noise, filtered=filtered)
 
@@ -82,13 +82,13 @@ def multilook_of(
 def coarse(
     grid: SceneGrid, cells: Multilook, *, threads: int, of: Callable[[Window], Floats] | None = None
 ) -> LazyLayer:
-    """Return the raster of squares of pixels: their mean power, or a function of a window of squares."""
+    """Return the raster of multilook cells: their mean power, or the values of a function of a window of cells."""
     coarser = replace(grid, spacing_m=cells.side * grid.spacing_m, shape=cells.shape)
     return LazyLayer(coarser, np.float32, of or cells.mean, threads, max(_FEWEST_CELLS, BLOCK_PX // cells.side))
 
 
 def mean_power_report(cells: Multilook, means: Mapping[str, Any], *, noise: str) -> dict[str, Any]:
-    """Return the meaning of mean power, of pixels that mean `means`."""
+    """Return the radiometric report of a multilooked raster; `means`: report of its pixels."""
     return of_multilooked(
         means,
         side_px=cells.side,

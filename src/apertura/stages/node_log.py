@@ -1,4 +1,4 @@
-"""Positions of a node: its flight log, its sound epochs, and its antennas at any time."""
+"""Flight log of a node: its valid epochs, and positions of its antennas at any time."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -24,35 +24,35 @@ if TYPE_CHECKING:
 
 
 def read_log(campaign: Campaign, flight: str, node: str) -> "xr.Dataset":
-    """Return the `track` stage of a node's flight log."""
+    """Read the flight log of a node as a `track` stage."""
     options = campaign.settings.nodes[node].log.options
     return read_track(campaign.track_file(flight, node), node=node, options=options)
 
 
 def read_history(campaign: Campaign, flight: str, node: str, *, pair: str) -> "xr.Dataset":
-    """Return the phase history recorded by a node of a pair, by its format and the config."""
-    described = campaign.settings.waveform.model_dump()
+    """Read the phase history recorded by a node of a pair, in the configured format."""
+    waveform = campaign.settings.waveform.model_dump()
     files = campaign.history_files(flight, node)
-    history = read_phase_history(described["format"], files, pair=pair, described=described)
-    if described["kind"] == "phase_history" and described["iq"] == "conjugate":
+    history = read_phase_history(waveform["format"], files, pair=pair, described=waveform)
+    if waveform["kind"] == "phase_history" and waveform["iq"] == "conjugate":
         return history.assign(transfer=history.transfer.conj())
     return history
 
 
 @dataclass(frozen=True)
 class NodeLog:
-    """A node's log in one flight, with the node's settings.
+    """Log of a node in one flight, with the node's settings.
 
     Attributes
     ----------
     name, settings
-        Of the node.
+        Name and settings of the node.
     track
-        Its stage.
+        Stage `track`.
     log
-        Its file, for messages.
+        Log file, for messages.
     shortest_wave_m
-        Wavelength of the highest frequency, metres: errors between epochs are compared with it.
+        Wavelength of the highest frequency, metres: scale of the tolerated error between epochs.
     """
 
     name: str
@@ -63,7 +63,7 @@ class NodeLog:
 
     @cached_property
     def checked(self) -> CheckedTrack:
-        """Epochs of the log that may be used: errors up to λ/16 between epochs are tolerated."""
+        """Check result of the log's epochs; errors up to λ/16 between epochs are tolerated."""
         poor = np.zeros(self.track.sizes["epoch"], bool)
         if "fix" in self.track:
             poor = poorer_fix(self.track.fix.values, self.settings.worst_fix)
@@ -77,22 +77,22 @@ class NodeLog:
 
     @cached_property
     def yaw_fault(self) -> YawFault | None:
-        """Contradiction of its attitude and course, where the attitude is the log's and turns antennas."""
-        turns = self.settings.attitude == "log" and (self.settings.antennas.any() or self.settings.lever_arms_m.any())
-        return yaw_fault_of(self.track.isel(epoch=self.checked.kept)) if turns else None
+        """Contradiction between the logged attitude and the course; None if the logged attitude is not used."""
+        is_used = self.settings.attitude == "log" and (self.settings.antennas.any() or self.settings.lever_arms_m.any())
+        return yaw_fault_of(self.track.isel(epoch=self.checked.kept)) if is_used else None
 
     def log_seconds(self, at: Times) -> NDArray[np.float64]:
-        """Return times as seconds since the log's first epoch, float64."""
+        """Return times in seconds since the log's first epoch, float64."""
         return seconds_since(at, self.track.time.values[0])
 
     def log_time(self, time_s: float) -> str:
-        """Return the UTC time of day, to 10 ms, of seconds since the log's first epoch."""
+        """Return the UTC time of day of a time in seconds since the log's first epoch, rounded to 10 ms."""
         time = self.track.time.values[0] + np.timedelta64(round(time_s * 1e9), "ns")
         return f"{np.datetime_as_string(time, 'ms')[11:-1]}Z"
 
     @property
     def interval_s(self) -> float:
-        """Median time between epochs of the log, seconds."""
+        """Median interval between epochs of the log, seconds."""
         return float(np.median(np.diff(self.log_seconds(self.track.time.values))))
 
     @property
@@ -103,39 +103,39 @@ class NodeLog:
 
     @cached_property
     def smoothing_residual_m(self) -> float | None:
-        """RMS change of the valid epochs by smoothing, in one axis, metres; None without smoothing."""
+        """RMS change per axis of the valid epochs by smoothing, metres; None without smoothing."""
         if self.settings.log.smoothing_m is None:
             return None
-        times, position, _ = self._sound
+        times, position, _ = self._valid_epochs
         smooth = position_spline(self.log_seconds(times), position, smoothing_m=self.settings.log.smoothing_m)
         return float(np.sqrt(np.mean((smooth(self.log_seconds(times)) - position) ** 2)))
 
     def antenna(self, name: Literal["radar_tx", "radar_rx", "sidelink"], at: Times) -> NDArray[np.float64]:
-        """Return positions of an antenna by the sound epochs of the log, (time, 3) float64 metres in its frame."""
+        """Return antenna positions from the valid epochs of the log, (time, 3) float64 metres in the log's frame."""
         return phase_centres(
-            *self._sound, at=at, lever_arm_m=getattr(self.settings.lever_arms_m, name), **self._from_log
+            *self._valid_epochs, at=at, lever_arm_m=getattr(self.settings.lever_arms_m, name), **self._from_log
         )
 
     @property
     def has_attitude(self) -> bool:
-        """True if body axes are known: from the log at all its sound epochs, or from the course."""
-        _, _, logged = self._sound
+        """True if body axes are known: from the log at all its valid epochs, or from the course."""
+        _, _, logged = self._valid_epochs
         return self.settings.attitude == "course" or (
             self.settings.attitude == "log" and bool(np.isfinite(logged).all())
         )
 
     def turns(self, name: Literal["radar_tx", "radar_rx"]) -> bool:
-        """Test whether attitude counts where this antenna is used: it has a beam, or the node has a lever arm."""
+        """Return True if attitude affects this antenna: it has a beam, or the node has a lever arm."""
         return getattr(self.settings.antennas, name) is not None or self.settings.lever_arms_m.any()
 
     def body_axes(self, at: Times) -> NDArray[np.float64]:
-        """Return forward, right, down of the body in the log's frame at given times, (time, axis, body) float64."""
-        return attitude_axes(*self._sound, at=at, **self._from_log)
+        """Return the body axes forward, right and down in the log's frame, (time, axis, body) float64."""
+        return attitude_axes(*self._valid_epochs, at=at, **self._from_log)
 
     @cached_property
-    def _sound(self) -> tuple[Times, NDArray[np.float64], NDArray[np.float64]]:
-        sound = self.track.isel(epoch=self.checked.kept)
-        return sound.time.values, sound.position.values, sound.attitude.values
+    def _valid_epochs(self) -> tuple[Times, NDArray[np.float64], NDArray[np.float64]]:
+        track = self.track.isel(epoch=self.checked.kept)
+        return track.time.values, track.position.values, track.attitude.values
 
     @property
     def _from_log(self) -> dict[str, Any]:
@@ -154,19 +154,21 @@ def raw_log(campaign: Campaign, flight: str, node: str, wave_m: float) -> NodeLo
 
 
 def yaw_fault_of(track: xr.Dataset) -> YawFault | None:
-    """Return the contradiction of attitude and course of a track."""
+    """Return the contradiction between attitude and course of a track; None if they agree."""
     position = track.position.values
     ned = LOCAL_NED if track.attrs["frame"] == LOCAL else ned_axes(position)
     return check_yaw(position, track.attitude.values, ned)
 
 
 def shortest_wave(frequency_hz: NDArray[np.float64]) -> float:
-    """Return the wavelength of the highest of ascending frequencies (Hz), metres."""
+    """Return the wavelength of the last of ascending frequencies (Hz), metres."""
     return SPEED_OF_LIGHT_M_S / float(frequency_hz[-1])
 
 
 def poorer_fix(fix: NDArray[np.int8], worst: Literal["auto", "fix", "float", "any"]) -> NDArray[np.bool_]:
-    """Return (epoch,) bool: solutions poorer than `worst`; none where nothing is logged, nor by auto without RTK.
+    """Return (epoch,) bool, True for solutions poorer than `worst`.
+
+    Epochs without a logged solution are False, and all epochs for 'auto' if the log has no RTK solution.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""A pair, opened once: pulses, beams and echo, or before that is formed its geometry from the flight logs."""
+"""Geometry, beams and phase history of a pair, from its echo, or from the flight logs before the echo is formed."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -31,24 +31,24 @@ from apertura.stages.scene import Flown, OpenScene
 from apertura.stages.transfer import PairEcho, recorded_echo
 from apertura.stages.transmitted import transmitted
 
-# ---- Antennas of a pair: from the config to the beams that weigh pulses ---------------------------------------------
+# ---- Antennas of a pair: from the config to the beams that weight pulses ---------------------------------------------
 
-_STAGED = {"radar_tx": "tx_axes", "radar_rx": "rx_axes"}
+_AXES_VARIABLES = {"radar_tx": "tx_axes", "radar_rx": "rx_axes"}
 _POINTS = 33
 
 
 def body_axes(echo: xr.Dataset) -> dict[str, NDArray[np.float64]]:
-    """Return the bodies' attitude in an echo stage: radar_tx, radar_rx → (pulse, axis, body)."""
-    return {point: echo[name].values for point, name in _STAGED.items() if name in echo}
+    """Return the body axes of an echo stage: radar_tx, radar_rx → (pulse, axis, body)."""
+    return {point: echo[name].values for point, name in _AXES_VARIABLES.items() if name in echo}
 
 
 def beams_of(campaign: Campaign, pair: str, axes: Mapping[str, NDArray[np.float64]]) -> Beams | None:
-    """Return the beams of a pair; None where its antennas are isotropic.
+    """Return the beams of a pair; None if its antennas are isotropic.
 
     Parameters
     ----------
     campaign, pair
-        Which.
+        Campaign, and name of the pair.
     axes
         radar_tx, radar_rx → (pulse, axis, body), forward, right and down of the body in the frame of the pixels.
     """
@@ -57,19 +57,19 @@ def beams_of(campaign: Campaign, pair: str, axes: Mapping[str, NDArray[np.float6
         return None
     patterns = campaign.pattern_files(pair)
     files = {point: patterns.get(f"nodes.{node}.antennas.{point}.pattern") for point, (node, _) in stated.items()}
-    found = {point: _beam(antenna, files[point], axes[point]) for point, (_, antenna) in stated.items()}
-    return Beams(found.get("radar_tx"), found.get("radar_rx"))
+    beams = {point: _beam(antenna, files[point], axes[point]) for point, (_, antenna) in stated.items()}
+    return Beams(beams.get("radar_tx"), beams.get("radar_rx"))
 
 
 def pattern_digests(campaign: Campaign, pair: str) -> dict[str, str]:
-    """Return key of the config → sha256 of each sampled pattern of a pair's antennas, for provenance."""
+    """Return config key → SHA-256 of each sampled pattern of a pair's antennas, for provenance."""
     return {key: sha256_file(path) for key, path in campaign.pattern_files(pair).items()}
 
 
 def _beam(antenna: Antenna, pattern: Path | None, axes: NDArray[np.float64]) -> Beam:
     if antenna.beamwidth_deg is None:
         if pattern is None:
-            raise TypeError("an antenna has a beamwidth or a pattern")
+            raise TypeError("antenna without beamwidth and pattern")
         sampled = read_beam_pattern(pattern)
         cuts = tuple(sampled_cut(angle, gain, cutoff_db=antenna.cutoff_db) for angle, gain, _ in sampled)
         phases = [
@@ -86,7 +86,7 @@ def _beam(antenna: Antenna, pattern: Path | None, axes: NDArray[np.float64]) -> 
 
 
 def antennas_report(campaign: Campaign, pair: str, illumination: Illumination | None) -> dict[str, Any]:
-    """Return the antennas of a pair for image.json: as stated, and how many pulses illuminate the scene."""
+    """Return the antennas of a pair for image.json: configured values, and numbers of pulses that illuminate points."""
     stated = {point: {"node": node, **beam.model_dump()} for point, (node, beam) in campaign.antennas(pair).items()}
     if illumination is None or not stated:
         return {}
@@ -105,13 +105,13 @@ def scene_illumination(
     Parameters
     ----------
     campaign, pair
-        Which.
+        Campaign, and name of the pair.
     beams
-        Of the pair.
+        Beams of the pair.
     scene
-        The campaign's.
+        Scene of the campaign.
     aperture
-        Of the pair.
+        Aperture of the pair.
 
     Raises
     ------
@@ -123,53 +123,53 @@ def scene_illumination(
     points = scene.grid.sample_points(_POINTS, scene.level.height_m)
     illumination = illuminate(beams, aperture, points.reshape(-1, 3))
     if illumination.unilluminated == 1:
-        _refuse(campaign, pair, beams, points[points.shape[0] // 2, points.shape[1] // 2], aperture)
+        _raise_unilluminated(campaign, pair, beams, points[points.shape[0] // 2, points.shape[1] // 2], aperture)
     return illumination
 
 
-def _refuse(
+def _raise_unilluminated(
     campaign: Campaign,
     pair: str,
     beams: Beams,
     middle_m: NDArray[np.float64],
     aperture: Aperture,
 ) -> None:
-    """Raise with how far off each boresight the middle of the scene lies, at the pulse where that is least."""
+    """Raise an error with the smallest angle between each boresight and the scene centre over all pulses."""
     stated = campaign.antennas(pair)
     keys, lines = [f"nodes.{node}.antennas.{point}" for point, (node, _) in stated.items()], []
     legs = {"radar_tx": (beams.transmit, aperture.tx_m), "radar_rx": (beams.receive, aperture.rx_m)}
     for point, (node, _) in stated.items():
-        beam, place = legs[point]
+        beam, antenna_m = legs[point]
         if beam is None:
             continue
-        azimuth, elevation = beam.angles(place, middle_m[None])[..., 0]
+        azimuth, elevation = beam.angles(antenna_m, middle_m[None])[..., 0]
         off = np.degrees(np.arccos(np.cos(azimuth) * np.cos(elevation)))
         best = int(off.argmin())
         side, up, *ends = np.degrees([azimuth[best], elevation[best], beam.azimuth_rad[-1], beam.elevation_rad[-1]])
         lines.append(
-            f"{off[best]:.0f}° from the boresight of {node}'s {point} at best: azimuth {side:+.0f}°, elevation "
-            f"{up:+.0f}°, while its pattern ends at {ends[0]:.0f}° and {ends[1]:.0f}°"
+            f"at least {off[best]:.0f}° from the boresight of {node}'s {point} (azimuth {side:+.0f}°, elevation "
+            f"{up:+.0f}°; the pattern ends at {ends[0]:.0f}° and {ends[1]:.0f}°)"
         )
     raise CampaignError(
-        f"zero pulses in the beam: the middle of the scene lies {'; and '.join(lines)}",
+        f"no pulse illuminates the scene: its centre is {' and '.join(lines)}",
         where=f"config/config.yaml: {', '.join(keys)}",
-        expected="a scene that both antennas illuminate in some pulse",
+        expected="a scene that both antennas illuminate during at least one pulse",
         remedy="Check boresight_deg (azimuth clockwise from forward: right is +90; elevation: down is negative), the "
         "log's yaw (clockwise from north) and scene.bounds_m.",
     )
 
 
-# ---- A pair, opened from its echo, or before that from the flight logs ----------------------------------------------
+# ---- Pair, opened from its echo, or from the flight logs before that is formed ---------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
 class OpenPair:
-    """A pair with its geometry, band, errors and, once echoes are there, its phase history.
+    """Pair with its geometry, band, position errors and, once its echo is formed, its phase history.
 
     Attributes
     ----------
     flight, name
-        Which: the name is transmitter-receiver.
+        Flight, and name of the pair as transmitter-receiver.
     aperture
         Phase centres.
     frequency_hz, weight
@@ -177,28 +177,28 @@ class OpenPair:
     path_limits_m
         (pulse,) float64, longest total path inside the cyclic prefix.
     time_s
-        (pulse,) float64, seconds from the first.
+        (pulse,) float64, seconds from the first pulse.
     began
-        The first pulse, UTC.
+        Time of the first pulse, UTC.
     positions
-        What is known of the node's positions, or of the transmitter's and the receiver's.
+        Position accuracy of the node, or of transmitter and receiver.
     history
-        The echo itself; None before it is formed.
+        Phase history; None before the echo is formed.
     beams
-        Of the antennas; None where they are isotropic.
+        Antenna beams; None if the antennas are isotropic.
     axes
-        As of `beams_of`, of antennas whose attitude counts.
+        Body axes as in `beams_of`, of antennas that attitude affects.
     sidelink_m
-        (pulse, 3) float64, metres, from the receiver's sidelink point to the transmitter's; None where the echo was not
-        given back a sidelink's length, and before it is formed.
+        (pulse, 3) float64, metres, from the receiver's sidelink antenna to the transmitter's; None if no sidelink
+        length was added to the echo, and before the echo is formed.
     left
-        What is left of errors of position after the tracks were refined; None where they are those of the logs.
+        Residual effect of position errors after track refinement; None if the tracks are those of the logs.
     report
         Attributes of stage echo; empty before it is formed.
     wave_speed_m_s
-        Speed of the wave along the paths.
+        Wave speed along the paths.
     air
-        What is known of it, as stage echo states it.
+        Report on the atmosphere along the paths, as in stage echo.
     """
 
     flight: str
@@ -221,7 +221,7 @@ class OpenPair:
 
     @property
     def monostatic(self) -> bool:
-        """True if one node sends and receives."""
+        """True if one node transmits and receives."""
         tx, rx = self.name.split("-")
         return tx == rx
 
@@ -232,20 +232,20 @@ class OpenPair:
 
     @property
     def flown(self) -> Flown:
-        """The geometry and band from which `auto` settles the grid."""
+        """Geometry and band from which `auto` derives the grid."""
         return Flown(self.aperture, self.frequency_hz, self.path_limit_m)
 
 
 def open_pair(
     campaign: Campaign, flight: str, pair: str, *, echo: xr.Dataset | None = None, recorded: Times | None = None
 ) -> OpenPair:
-    """Return an open pair from `echo`, its stage as far as it is formed, or from the logs.
+    """Open a pair from its stage `echo` if it is formed, else from the flight logs.
 
-    From the logs in any case where the tags of pulses that both nodes `recorded` are given.
+    If `recorded` is given, the time tags of pulses that both nodes recorded, the logs are used in any case.
     """
     waveform = campaign.settings.waveform
     if echo is None and recorded is None and campaign.is_current(campaign.stage("echo", flight, pair)):
-        echo = PairEcho.opened(campaign, flight, pair).stage
+        echo = PairEcho.cleaned(campaign, flight, pair).stage
     if echo is None:
         if isinstance(waveform, SampledWaveform):
             return _expected(campaign, flight, pair, waveform, recorded)
@@ -277,7 +277,7 @@ def open_pair(
 def _expected(
     campaign: Campaign, flight: str, pair: str, waveform: SampledWaveform, recorded: Times | None
 ) -> OpenPair:
-    """Return the pair expected from the logs: the pulses that all logs place, but those of hovers."""
+    """Return the pair expected from the logs: the pulses with positions in both logs, without those of hovers."""
     frequency = transmitted(campaign, waveform).numerology.frequency_hz
     tx, rx = (raw_log(campaign, flight, node, shortest_wave(frequency)) for node in pair.split("-"))
     first = max(log.track.time.values[0] for log in (tx, rx))
@@ -303,34 +303,34 @@ def expected_pair(
     frequency_hz: NDArray[np.float64],
     delay_s: float,
 ) -> OpenPair:
-    """Return a pair before its echo is formed, or flown.
+    """Return a pair from logs or planned tracks, before its echo is formed.
 
     Parameters
     ----------
     campaign, flight
-        Settings, and which flight.
+        Campaign, and name of the flight.
     nodes
-        Where transmitter and receiver were, or are meant to be.
+        Logs or planned tracks of transmitter and receiver.
     times
         (pulse,) datetime64[ns], UTC, within both logs.
     frequency_hz
         (subcarrier,) float64, ascending.
     delay_s
-        Longest delay whose echo is recorded whole.
+        Longest delay of an echo that is recorded completely.
     """
     tx, rx = nodes
-    turning = {"radar_tx": tx.turns("radar_tx") and tx, "radar_rx": rx.turns("radar_rx") and rx}
-    axes = {antenna: log.body_axes(times) for antenna, log in turning.items() if log}
+    rotating = {"radar_tx": tx.turns("radar_tx") and tx, "radar_rx": rx.turns("radar_rx") and rx}
+    axes = {antenna: log.body_axes(times) for antenna, log in rotating.items() if log}
     offset = rx.settings.path_offset_m
-    beyond_m = np.full(len(times), offset.radar)
+    extra_path_m = np.full(len(times), offset.radar)
     if tx.name != rx.name:
         length_m = np.linalg.norm(tx.antenna("sidelink", times) - rx.antenna("sidelink", times), axis=1)
-        beyond_m -= offset.sidelink + length_m
+        extra_path_m -= offset.sidelink + length_m
     weight = window_weights(campaign.settings.processing.window, len(frequency_hz))
     aperture = Aperture(tx.antenna("radar_tx", times), rx.antenna("radar_rx", times))
-    flown = scene_air(campaign, aperture.tx_m).over(aperture)
-    limits_m = flown.wave_speed_m_s * delay_s - beyond_m
-    known = {log.name: _positions(position_error(log.track, log.settings, times)) for log in (tx, rx)}
+    air_on_track = scene_air(campaign, aperture.tx_m).over(aperture)
+    limits_m = air_on_track.wave_speed_m_s * delay_s - extra_path_m
+    positions = {log.name: _positions(position_error(log.track, log.settings, times)) for log in (tx, rx)}
     pair = f"{tx.name}-{rx.name}"
     return OpenPair(
         flight,
@@ -341,22 +341,22 @@ def expected_pair(
         limits_m,
         time_s=seconds_since(times, times[0]),
         began=times[0],
-        positions=tuple(known.values()),
+        positions=tuple(positions.values()),
         beams=beams_of(campaign, pair, axes),
         axes=axes,
-        wave_speed_m_s=flown.wave_speed_m_s,
-        air=flown.report,
+        wave_speed_m_s=air_on_track.wave_speed_m_s,
+        air=air_on_track.report,
     )
 
 
 def _positions(stated: Mapping[str, Any]) -> NodePositions:
-    """Return the position errors of a node stated in an echo stage, whose deviations are north, east, up."""
+    """Return the position accuracy of a node from an echo stage, whose standard deviations are north, east, up."""
     std = stated.get("std_m")
     axes = None if std is None else (float(std[1]), float(std[0]), float(std[2]))
     return NodePositions(
         axes,
         float(stated.get("correlation_s", 1.0)),
-        str(stated.get("stated_by", "nobody")),
+        str(stated.get("stated_by", "none")),
         float(stated.get("drift_m", 0.0)),
         stated.get("receiver"),
     )

@@ -1,4 +1,4 @@
-"""Plan of each pair's image, and its error budget: from its echo, or from the flight logs."""
+"""Plan and error budget of each pair's image, from its echo or from the flight logs."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -44,21 +44,21 @@ from apertura.stages.scene import OpenScene
 # ---- Error budget of a pair, from config, logs and echo -------------------------------------------------------------
 
 _MS, _CM, _PPM = 1e-3, 1e-2, 1e-6
-_SHOWN_CELLS = 0.01  # of a range cell: a shift below it is lost in any peak of 20 dB (docs/theory/focus.md, eq. 6)
+_OBSERVABLE_CELLS = 0.01
+"""Smallest observable displacement in range cells, of a point of 20 dB SNR (docs/theory/focus.md, eq. 6)."""
 
 
 def budget_of(
     campaign: Campaign, pair: OpenPair, scene: OpenScene, *, place_m: NDArray[np.float64] | None = None
 ) -> list[BudgetLine]:
-    """Return the expected degradation of an image of a pair, except arithmetic: one line per cause.
+    """Return the expected degradation of a pair's image, one line per cause, without the arithmetic error.
 
     Parameters
     ----------
     campaign, pair, scene
-        Settings, pair and ground; before the echo is formed, by the config and the logs.
+        Campaign, pair and scene; before the echo is formed, config and logs determine the budget.
     place_m
-        (3,) float64, metres in the frame of the pixels: the point that the effects are those on; the middle of the
-        scene by default.
+        (3,) float64, metres in the frame of the pixels: point at which effects are computed (default: scene centre).
 
     Notes
     -----
@@ -66,13 +66,13 @@ def budget_of(
     """
     paths = paths_to(pair, scene, scene.middle_m if place_m is None else place_m)
     monostatic, sidelink = pair.monostatic, pair.report.get("sidelink", {})
-    flown = [*_positions(campaign, pair, paths), *_attitude(campaign, pair, paths)]
+    track_lines = [*_positions(campaign, pair, paths), *_attitude(campaign, pair, paths)]
     pulses = pair.report.get("pulses", {})
     used, dropped = pulses.get("used"), pulses.get("dropped", 0)
     stated = None if used is None else f"{dropped} of {used + dropped} pulses missing"
     lines = [
-        *flown,
-        height_line(paths, campaign.settings.scene.height_std_m, expected_db=expected(flown).loss_db),
+        *track_lines,
+        height_line(paths, campaign.settings.scene.height_std_m, expected_db=expected(track_lines).loss_db),
         offset_line(
             paths,
             "time tags",
@@ -92,6 +92,10 @@ def budget_of(
         BudgetLine("missing pulses", stated, NO_EFFECT),
         _antenna(pair, paths),
     ]
+    background = pair.report.get("background", {})
+    if background.get("removed", "none") != "none":
+        effect = Effect(background["middle_loss_db"], 0.0, 0.0)
+        lines.append(BudgetLine("background removal", background["removed"], effect))
     if not monostatic:
         total = paths.aperture.path(paths.point_m)
         lines.append(offset_line(paths, "clock", _PPM * total, _scaled(pair.report, "clock", "std_ppm", 1), unit="ppm"))
@@ -108,18 +112,19 @@ def budget_of(
             ]
     if isinstance(campaign.settings.waveform, SampledWaveform):
         effect = paths.of_offset(campaign.settings.waveform.middle_s * paths.rate_m_s)
-        lines.append(BudgetLine("stop and go", f"{np.abs(paths.rate_m_s).max():.2g} m/s of path at most", effect))
+        rate = f"path rate at most {np.abs(paths.rate_m_s).max():.2g} m/s"
+        lines.append(BudgetLine("stop and go", rate, effect))
     return [*lines, *_between_epochs(paths, pair)]
 
 
 def positions_loss_db(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> float:
-    """Return the expected focus loss of an image of a pair by stated position errors, dB, 0 or less."""
+    """Return the expected peak loss of a pair's image from stated position errors, dB, 0 or less."""
     lines = _positions(campaign, pair, paths_to(pair, scene, scene.middle_m))
     return summed(line.effect for line in lines if line.stated is not None).loss_db
 
 
 def paths_to(pair: OpenPair, scene: OpenScene, place_m: NDArray[np.float64]) -> PointPaths:
-    """Return the paths of a pair to a place of the scene, (3,) float64 metres in the frame of the pixels."""
+    """Return the paths of a pair to a point of the scene, (3,) float64 metres in the frame of the pixels."""
     return PointPaths.of(
         pair.aperture,
         pair.time_s,
@@ -131,31 +136,31 @@ def paths_to(pair: OpenPair, scene: OpenScene, place_m: NDArray[np.float64]) -> 
 
 def _positions(campaign: Campaign, pair: OpenPair, paths: PointPaths) -> list[BudgetLine]:
     if pair.left is not None:
-        return [BudgetLine("positions", "error remaining after refinement", pair.left)]
+        return [BudgetLine("positions", "residual error after track refinement", pair.left)]
     return position_lines(paths, pair.positions, sidelink=_by_sidelink(campaign, pair))
 
 
 def _by_sidelink(campaign: Campaign, pair: OpenPair) -> bool:
-    """Test whether echoes are divided by a sidelink whose length comes from the logs."""
+    """Return True if echoes are divided by a sidelink, whose length comes from the logs."""
     return not pair.monostatic and isinstance(campaign.settings.waveform, SampledWaveform)
 
 
 def _attitude(campaign: Campaign, pair: OpenPair, paths: PointPaths) -> list[BudgetLine]:
-    """Return the effect of attitude and lever-arm errors; empty where refined tracks have moved the antennas."""
+    """Return the effect of attitude and lever-arm errors; empty for refined tracks, which are those of the antennas."""
     if pair.left is not None or not pair.axes:
         return []
-    some = pair.aperture.sample(MOST_PULSES)
+    sampled = pair.aperture.sample(MOST_PULSES)
     legs = dict(zip(pair.name.split("-"), ("radar_tx", "radar_rx"), strict=True))
-    nodes = [_attitude_of(campaign.settings.nodes[name], pair.axes.get(point), some) for name, point in legs.items()]
+    nodes = [_attitude_of(campaign.settings.nodes[name], pair.axes.get(point), sampled) for name, point in legs.items()]
     return attitude_lines(paths, nodes, sidelink=_by_sidelink(campaign, pair))
 
 
-def _attitude_of(node: Node, axes: NDArray[np.float64] | None, some: slice) -> NodeAttitude | None:
+def _attitude_of(node: Node, axes: NDArray[np.float64] | None, sampled: slice) -> NodeAttitude | None:
     arms = node.lever_arms_m
     if axes is None or not arms.any():
         return None
     return NodeAttitude(
-        axes[some],
+        axes[sampled],
         (arms.radar_tx, arms.radar_rx, arms.sidelink),
         node.attitude,
         node.attitude_error_deg,
@@ -165,7 +170,7 @@ def _attitude_of(node: Node, axes: NDArray[np.float64] | None, some: slice) -> N
 
 
 def _between_epochs(paths: PointPaths, pair: OpenPair) -> list[BudgetLine]:
-    """Return the error of the spline between epochs of the logs: noise of one epoch's correlation time."""
+    """Return the interpolation error between epochs of the logs, as noise with the correlation time of one epoch."""
     stated = pair.report.get("positions", {})
     errors = [stated.get(leg, {}).get("interpolation_m") for leg in ("tx", "rx")[: len(pair.positions)]]
     if any(error is None for error in errors):
@@ -177,38 +182,50 @@ def _between_epochs(paths: PointPaths, pair: OpenPair) -> list[BudgetLine]:
 
 
 def _air(campaign: Campaign, pair: OpenPair, paths: PointPaths) -> BudgetLine:
-    """Return the effect of uncertain refractivity: displacement common to all pairs, phase by path difference.
+    """Return the effect of uncertain refractivity: displacement common to all pairs, phase from the path difference.
 
-    Against the transmitter's own image a pair's phase is off by what its path differs, the sidelink's length included
-    (docs/theory/atmosphere.md, eq. 6).
+    The phase of a pair relative to the transmitter's own image has an error proportional to the difference of their
+    paths, which includes the sidelink length (docs/theory/atmosphere.md, eq. 6).
     """
-    per_n, words = 1e-6 * float(pair.air["std_n"]), f"{pair.air['source']}: N = {pair.air['refractivity_n']:.1f}"
+    per_n = 1e-6 * float(pair.air["std_n"])
+    line = f"{pair.air['source']}: N = {pair.air['refractivity_n']:.1f} ± {pair.air['std_n']:.1f}"
     tx_m, rx_m = (np.linalg.norm(leg - paths.point_m, axis=1) for leg in paths.aperture.legs)
-    known_m, further_m = np.zeros(len(tx_m)), rx_m - tx_m
+    sidelink_m, difference_m = np.zeros(len(tx_m)), rx_m - tx_m
     if _by_sidelink(campaign, pair):
-        known_m = np.linalg.norm(paths.aperture.tx_m - paths.aperture.rx_m, axis=1)
-    effect = paths.of_offset(per_n * (tx_m + rx_m - known_m), common=True)
-    phase_rad = 2 * np.pi / paths.wavelength_m * per_n * float(np.abs(further_m - known_m).mean())
+        sidelink_m = np.linalg.norm(paths.aperture.tx_m - paths.aperture.rx_m, axis=1)
+    effect = paths.of_offset(per_n * (tx_m + rx_m - sidelink_m), common=True)
+    phase_rad = 2 * np.pi / paths.wavelength_m * per_n * float(np.abs(difference_m - sidelink_m).mean())
     effect = replace(effect, phase_rad=0.0 if pair.monostatic else phase_rad)
-    words = f"{words} ± {pair.air['std_n']:.1f}"
     assumed = campaign.settings.scene.atmosphere == "auto"
-    return BudgetLine("atmosphere", None if assumed else words, effect, assumed=words if assumed else None)
+    return BudgetLine("atmosphere", None if assumed else line, effect, assumed=line if assumed else None)
 
 
 def air_decision(pair: OpenPair) -> Decision:
-    """Return the air assumed on the paths of a pair, and its effect against vacuum: one constant for all pairs."""
+    """Return the refractivity assumed on the paths of a pair, and its effect relative to vacuum."""
     air = pair.air
     cell_m = pair.wave_speed_m_s / float(np.ptp(pair.frequency_hz)) / 2
-    moved_m, left_m, other = float(air["vacuum_shift_m"]), float(air["constant_refractivity_error_m"]), "vacuum"
+    displaced_m, residual_m = float(air["vacuum_shift_m"]), float(air["constant_refractivity_error_m"])
+    reference = "vacuum"
     if not air["refractivity_n"]:
-        moved_m, other = 1e-6 * USUAL_N * float(air["range_m"]), f"air of N = {USUAL_N:.0f}"
-    shows = "" if moved_m > _SHOWN_CELLS * cell_m else ", which does not show"
-    why = (
-        f"{air['source']}; mean along the paths from {air['antennas_m']:.0f} m; {other} would move the image by "
-        f"{100 * moved_m:.2g} cm of slant range, {moved_m / cell_m:.2g} of a cell{shows}; one value for all pulses "
-        f"leaves {100 * left_m:.1g} cm of path"
+        displaced_m, reference = 1e-6 * USUAL_N * float(air["range_m"]), f"N = {USUAL_N:.0f}"
+    observable = "" if displaced_m > _OBSERVABLE_CELLS * cell_m else ", not observable"
+    reason = (
+        f"{air['source']}; mean along the paths from {air['antennas_m']:.0f} m height; displacement of the image "
+        f"relative to {reference} {100 * displaced_m:.2g} cm in slant range, {displaced_m / cell_m:.2g} cells"
+        f"{observable}; residual of one value for all pulses {100 * residual_m:.1g} cm of path"
     )
-    return Decision("atmosphere", f"N = {air['refractivity_n']:.1f}", why)
+    return Decision("atmosphere", f"N = {air['refractivity_n']:.1f}", reason)
+
+
+def background_decision(pair: OpenPair) -> Decision:
+    """Return the decision on the background: from stage `profile`, or what decides it once there is one."""
+    report = pair.report.get("background")
+    if report is None:
+        return Decision("background", "auto", "decided when range profiles are formed")
+    if "removed" in report:
+        return Decision("background", report["removed"], report["reason"])
+    reason = "configured" if report["requested"] == "none" else "auto: the recording has no echo at constant delay"
+    return Decision("background", "none", reason)
 
 
 def _scaled(report: Mapping[str, Any], section: str, name: str, unit: float) -> float | None:
@@ -217,10 +234,10 @@ def _scaled(report: Mapping[str, Any], section: str, name: str, unit: float) -> 
 
 
 def _stated_tags_ms(campaign: Campaign, pair: OpenPair) -> float | None:
-    """Return the deviation of the pulses' tags, milliseconds; None where the config has only its default."""
+    """Return the standard deviation of the pulses' time tags, milliseconds; None if it is not configured."""
     tx, rx = pair.name.split("-")
     sampled = isinstance(campaign.settings.waveform, SampledWaveform)
-    name = tx if sampled else rx  # who tagged the pulses
+    name = tx if sampled else rx  # the node that tags the pulses
     if name not in campaign.settings.nodes:
         return None
     node = campaign.node(pair.flight, name)
@@ -228,17 +245,17 @@ def _stated_tags_ms(campaign: Campaign, pair: OpenPair) -> float | None:
 
 
 def _antenna(pair: OpenPair, paths: PointPaths) -> BudgetLine:
-    """Return the line of the antennas: beams weigh the pulses; what phase their patterns have is not taken out."""
+    """Return the budget line of the antennas, whose beams weight the pulses; phases of patterns are not corrected."""
     if pair.beams is None:
-        return BudgetLine("antenna", None, NO_EFFECT, "a beam without a phase of its own")
-    some, point = pair.beams[pair.aperture.sample(MOST_PULSES)], paths.point_m[None]
-    phase = some.phase(paths.aperture, point)
+        return BudgetLine("antenna", None, NO_EFFECT, "a beam pattern without phase")
+    beams, point = pair.beams[pair.aperture.sample(MOST_PULSES)], paths.point_m[None]
+    phase = beams.phase(paths.aperture, point)
     if phase is None:
-        return BudgetLine("antenna", "weighed by the beams stated", NO_EFFECT)
-    return antenna_line(paths, phase[:, 0], some.weight(paths.aperture, point)[:, 0])
+        return BudgetLine("antenna", "pulses weighted by the configured beams", NO_EFFECT)
+    return antenna_line(paths, phase[:, 0], beams.weight(paths.aperture, point)[:, 0])
 
 
-# ---- Plan of each pair, from its echo or before that from the flight logs -------------------------------------------
+# ---- Plan of each pair, from its echo, or from the flight logs before that is formed ---------------------------------
 
 
 def plan_pair(campaign: Campaign, pair: OpenPair, scene: OpenScene, *, threads: int = 1) -> Plan:
@@ -247,16 +264,16 @@ def plan_pair(campaign: Campaign, pair: OpenPair, scene: OpenScene, *, threads: 
     Parameters
     ----------
     campaign
-        With its settings.
+        Campaign with its settings.
     pair, scene
-        The open pair, and the campaign's grid and ground.
+        Open pair, and the scene with grid and terrain.
     threads
-        Tiles formed at once: for seconds and bytes; nothing is chosen by it.
+        Number of tiles processed in parallel, for the predicted run time and memory; no choice depends on it.
 
     Raises
     ------
     CampaignError
-        If the job cannot fit in memory or on the disk, or its geometry is impossible.
+        If the job does not fit in memory or on the disk, or its geometry is impossible.
     """
     where = f"flight {pair.flight}, pair {pair.name}"
     flags = check_antennas(scene.grid, scene.terrain, pair.aperture, where=where)
@@ -264,31 +281,31 @@ def plan_pair(campaign: Campaign, pair: OpenPair, scene: OpenScene, *, threads: 
     plan = plan_job(campaign, job_of(campaign, pair, scene, threads=threads), accuracy_db=float(accuracy.value))
     plan = replace(
         plan,
-        decisions=(*plan.decisions, accuracy, air_decision(pair)),
+        decisions=(*plan.decisions, accuracy, air_decision(pair), background_decision(pair)),
         flags=Flags.merged(flags, scene.flags, plan.flags),
     )
-    written = campaign.is_current(campaign.stage("image", pair.flight, pair.name))
-    free_disk = None if written else campaign.root.free_bytes()
+    is_written = campaign.is_current(campaign.stage("image", pair.flight, pair.name))
+    free_disk = None if is_written else campaign.root.free_bytes()
     check_fits(plan, free_disk=free_disk, where=f"{pair.flight}/{pair.name}")
     return plan
 
 
 def plan_job(campaign: Campaign, job: Job, *, accuracy_db: float) -> Plan:
-    """Plan a job at an accuracy and with the overrides of a campaign."""
+    """Plan a job for an accuracy and the overrides of a campaign."""
     overrides = campaign.settings.processing.planned
     return make_plan(job, accuracy_db=accuracy_db, overrides=overrides, where=f"{CONFIG}: processing")
 
 
 def accuracy_of(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> Decision:
-    """Return the numerical error to request, and why."""
+    """Return the requested numerical error, and the reason for it."""
     requested = campaign.settings.processing.accuracy_db
     if requested != "auto":
-        return Decision("accuracy_db", requested, "asked for")
+        return Decision("accuracy_db", requested, "configured")
     return decide_accuracy(budget_of(campaign, pair, scene))
 
 
 def job_of(campaign: Campaign, pair: OpenPair, scene: OpenScene, *, threads: int = 1) -> Job:
-    """Return the planner's job of an open pair, or of some of its pulses."""
+    """Return the planner's job for an open pair, or for a subset of its pulses."""
     ground = GroundModels.of(scene.terrain, scene.level, scene.grid)
     job = imaging_job(
         pair.aperture,
@@ -311,9 +328,9 @@ def job_of(campaign: Campaign, pair: OpenPair, scene: OpenScene, *, threads: int
 
 
 def weighing(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> Beams | None:
-    """Return the weights of a pair's pulses over the scene by antennas and sector; None where all count alike.
+    """Return the weights of a pair's pulses over the scene, by antennas and angular sector; None if all are equal.
 
-    As in `job_of`, but without the echo: the ranges that profiles must cover follow from it.
+    The weights are those of `job_of`, without the echo: they determine the ranges that profiles must cover.
     """
     return Beams.within(integration_of(campaign, pair, scene).sector, pair.beams)
 
@@ -324,7 +341,7 @@ def ranges_of(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> RangeWind
     Raises
     ------
     CampaignError
-        If an antenna is in the ground, or echoes of the scene were not recorded, or repeat themselves.
+        If an antenna is below the terrain, or echoes of the scene were not recorded or are ambiguous in range.
     """
     where = f"flight {pair.flight}, pair {pair.name}"
     check_antennas(scene.grid, scene.terrain, pair.aperture, where=where)
@@ -336,13 +353,15 @@ def ranges_of(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> RangeWind
         beams=weighing(campaign, pair, scene),
         wave_speed_m_s=pair.wave_speed_m_s,
     )
-    _check_held(window.farthest_m, pair.path_limits_m, campaign, where=where)
+    _check_recorded(window.farthest_m, pair.path_limits_m, campaign, where=where)
     _check_unambiguous(window)
     return window
 
 
-def _check_held(farthest: NDArray[np.float64], limit: NDArray[np.float64], campaign: Campaign, *, where: str) -> None:
-    """Raise CampaignError where echoes of the scene arrive after the captures end."""
+def _check_recorded(
+    farthest: NDArray[np.float64], limit: NDArray[np.float64], campaign: Campaign, *, where: str
+) -> None:
+    """Check that echoes of the scene arrive before the captures end; raise CampaignError if not."""
     waveform = campaign.settings.waveform
     key, limit_name = "path_limit", "the recorded delays"
     if isinstance(waveform, SampledWaveform):
@@ -350,12 +369,12 @@ def _check_held(farthest: NDArray[np.float64], limit: NDArray[np.float64], campa
     beyond = np.flatnonzero(farthest > limit)
     if beyond.size:
         pulse = int((farthest - limit).argmax())
-        height = f" First of all: {HEIGHT_DEFAULT}." if campaign.settings.scene.height_is_default else ""
+        height = f" A likely cause: {HEIGHT_DEFAULT}." if campaign.settings.scene.height_is_default else ""
         raise CampaignError(
-            f"at {number_of(beyond.size, 'pulse')} echoes of the scene arrive after {limit_name}, worst at pulse "
-            f"{pulse}: total path {farthest[pulse]:.1f} m",
+            f"echoes of the scene arrive after {limit_name} at {number_of(beyond.size, 'pulse')}; longest total path "
+            f"{farthest[pulse]:.1f} m at pulse {pulse}",
             where=where,
-            expected=f"at most {limit[pulse]:.1f} m (c·{key} less the path offsets)",
+            expected=f"at most {limit[pulse]:.1f} m (c·{key} minus the path offsets)",
             remedy=f"Make scene.bounds_m smaller, or check path_offset_m and {key}.{height}",
         )
 
@@ -374,7 +393,7 @@ def _check_unambiguous(window: RangeWindow) -> None:
 
 
 def integration_of(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> Integration:
-    """Return over how much of a flight the pixels of a pair are integrated."""
+    """Return the integration interval of a pair's pixels: the whole aperture or an angular sector."""
     centre_hz, requested = centre_frequency(pair.frequency_hz), campaign.settings.processing.integrated
     return decide_integration(
         pair.aperture, centre_hz, scene.grid, scene.level, antennas=pair.beams, requested=requested
@@ -382,31 +401,31 @@ def integration_of(campaign: Campaign, pair: OpenPair, scene: OpenScene) -> Inte
 
 
 def check_fits(plan: Plan, *, free_disk: int | None, where: str, memory: int | None = None) -> None:
-    """Raise CampaignError, with the numbers, unless the plan fits this machine.
+    """Check that a plan fits the memory and disk of this machine; raise CampaignError if not.
 
     Parameters
     ----------
     plan
-        Of one pair.
+        Plan of a pair.
     free_disk
-        Bytes; None: not checked.
+        Free disk space, bytes; None: not checked.
     where
-        Flight and pair.
+        Flight and pair, for messages.
     memory
-        Bytes, by default those of this machine or of the control group that the process runs in.
+        Available memory, bytes (default: of this machine, or of the control group of the process).
     """
     memory = memory or memory_limit()
     if plan.memory_bytes > memory:
         raise CampaignError(
-            f"imaging needs {decimal(plan.memory_bytes)} of memory",
+            f"image formation requires {decimal(plan.memory_bytes)} of memory",
             where=where,
-            expected=f"at most the {decimal(memory)} that this machine, or the job's share of it, has",
-            remedy="Make scene.bounds_m smaller, use fewer threads, or ask for more memory.",
+            expected=f"at most {decimal(memory)}, the memory of this machine or of the job",
+            remedy="Make scene.bounds_m smaller, use fewer threads, or give the job more memory.",
         )
     if free_disk is not None and plan.disk_bytes > free_disk:
         raise CampaignError(
-            f"the results need {decimal(plan.disk_bytes)} on disk",
+            f"the results require {decimal(plan.disk_bytes)} on disk",
             where=where,
-            expected=f"at most the {decimal(free_disk)} that are free",
-            remedy="Free some space, make scene.bounds_m smaller or scene.spacing_m larger.",
+            expected=f"at most {decimal(free_disk)}, the free disk space",
+            remedy="Free disk space, make scene.bounds_m smaller or scene.spacing_m larger.",
         )

@@ -1,4 +1,4 @@
-"""Imaged pulses of a pair, their positions, and the air on their paths."""
+"""Imaged pulses of a pair, their positions, and the refractivity along their paths."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -26,12 +26,14 @@ from apertura.stages.scene import ConfiguredGround
 
 
 def inside_segments(campaign: Campaign, flight: str, pair: str, times: NDArray[np.datetime64]) -> NDArray[np.bool_]:
-    """Return (pulse,) bool: which pulses, by the transmitter's time tags (pulse,), image a pair.
+    """Return (pulse,) bool, True for pulses within the configured segments of a pair.
+
+    `times`: (pulse,) time tags of the transmitter.
 
     Raises
     ------
     CampaignError
-        If none does.
+        If no pulse is within a segment.
     """
     segments = campaign.segments_of(flight, pair)
     inside = np.full(len(times), not segments)
@@ -39,16 +41,16 @@ def inside_segments(campaign: Campaign, flight: str, pair: str, times: NDArray[n
         inside |= (times >= np.datetime64(start)) & (times <= np.datetime64(end))
     if len(times) and not inside.any():
         raise CampaignError(
-            f"no pulse of flight {flight}, pair {pair} inside {' or '.join('…'.join(line) for line in segments)}",
+            f"no pulse of flight {flight}, pair {pair} within {' or '.join('…'.join(line) for line in segments)}",
             where=campaign.root / SEGMENTS,
-            expected=f"times between {times.min()} and {times.max()}, UTC",
-            remedy="Correct start and end, or take the lines out to image with the whole track.",
+            expected=f"segments between {times.min()} and {times.max()}, UTC",
+            remedy="Correct start and end, or remove the lines to use the whole track.",
         )
     return inside
 
 
 def keep_segments(campaign: Campaign, flight: str, pair: str, echo: xr.Dataset) -> xr.Dataset:
-    """Return an echo without the pulses outside the segments of its pair, and with their number in `pulses`."""
+    """Return an echo without the pulses outside the segments of its pair; attribute `pulses` contains their number."""
     if not campaign.segments_of(flight, pair):
         return echo
     inside = inside_segments(campaign, flight, pair, echo.time.values)
@@ -56,15 +58,15 @@ def keep_segments(campaign: Campaign, flight: str, pair: str, echo: xr.Dataset) 
     return echo.isel(pulse=inside).assign_attrs(pulses=counts)
 
 
-# ---- Pulses of valid positions, and the errors of these -------------------------------------------------------------
+# ---- Pulses with valid positions, and position accuracy --------------------------------------------------------------
 
-_LINES = {
-    "fix_quality_low": "the log's solution is poorer than {poorest_fix}",
-    "track_gap": "no epochs",
-    "track_outlier": "outliers or steps of the log",
-    "track_frozen": "epochs that repeat the position before them",
+_LOG_FAULTS = {
+    "fix_quality_low": "position solution poorer than {poorest_fix}",
+    "track_gap": "gap in the log",
+    "track_outlier": "outliers or steps in the log",
+    "track_frozen": "epochs that repeat the previous position",
 }
-"""Flag → what is wrong with the log there."""
+"""Flag → fault of the log."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,14 +76,14 @@ class PulsePositions:
     Attributes
     ----------
     good
-        (pulse,) bool, pulses that both nodes have a position for.
+        (pulse,) bool, True for pulses with a position of both nodes.
     reasons
-        Cause → number of pulses left out by it, each counted once.
+        Cause → number of pulses excluded by it; each pulse is counted once.
     flags
-        Edge crossed → what was measured, in one line.
+        Flags with the measured values.
     report
         tx, rx → node, std_m, correlation_s, stated_by, interpolation_m; smoothing_residual_m, source and remarks of the
-        log where there are any.
+        log if there are any.
     """
 
     good: NDArray[np.bool_]
@@ -91,42 +93,42 @@ class PulsePositions:
 
 
 def place(tx: NodeLog, rx: NodeLog, at: Times, *, hovers: bool = False) -> PulsePositions:
-    """Place a pair at the transmitter's tags `at`, and select the pulses for which both logs give positions.
+    """Select the pulses of a pair, at the transmitter's time tags `at`, for which both logs have valid positions.
 
-    Pulses of a hover are left out unless `hovers`: segments of the pair say what images it.
+    Pulses of a hover are excluded unless `hovers` is True, as it is for pairs with configured segments.
 
     Raises
     ------
     CampaignError
-        If none is left.
+        If no pulse remains.
     """
     good, reasons, flags = np.ones(len(at), bool), dict[str, int](), Flags()
-    for node in {one.name: one for one in (tx, rx)}.values():
-        barred = node.checked.excluded(node.log_seconds(at))
-        flags = Flags.merged(flags, _flags(node, at, barred))
-        for cause, out in barred.items():
-            reasons[cause] = reasons.get(cause, 0) + int((out & good).sum())
-            good &= ~out
+    for node in {log.name: log for log in (tx, rx)}.values():
+        excluded = node.checked.excluded(node.log_seconds(at))
+        flags = Flags.merged(flags, _flags(node, at, excluded))
+        for cause, pulses in excluded.items():
+            reasons[cause] = reasons.get(cause, 0) + int((pulses & good).sum())
+            good &= ~pulses
     if not good.any():
         raise CampaignError(
-            f"no pulse has a position: {'; '.join(flags.values())}",
+            f"no pulse has a valid position: {'; '.join(flags.values())}",
             where=" and ".join(dict.fromkeys((tx.log, rx.log))),
-            expected="logs whose epochs are sound while there are pulses",
-            remedy="Correct the log, or allow poorer solutions by nodes.<node>.worst_fix.",
+            expected="logs with valid epochs during the recording",
+            remedy="Correct the log, or accept poorer solutions with nodes.<node>.worst_fix.",
         )
-    standing = np.zeros(len(at), bool)
+    stationary = np.zeros(len(at), bool)
     if not hovers:
         legs = tx.antenna("radar_tx", at[good]), rx.antenna("radar_rx", at[good])
-        standing[good] = hovering(tx.log_seconds(at[good]), legs)
-    if standing.any():
-        reasons["hover"] = int(standing.sum())
+        stationary[good] = hovering(tx.log_seconds(at[good]), legs)
+    if stationary.any():
+        reasons["hover"] = int(stationary.sum())
         time_s = tx.log_seconds(at)
-        first, last = max(stretches(standing), key=lambda edge: time_s[edge[1] - 1] - time_s[edge[0]])
+        first, last = max(stretches(stationary), key=lambda edge: time_s[edge[1] - 1] - time_s[edge[0]])
         flags["hover"] = (
-            f"{int(standing.sum())} of {len(at)} pulses left out: the antennas stood, longest "
+            f"{int(stationary.sum())} of {len(at)} pulses excluded: platform stationary, at most "
             f"{time_s[last - 1] - time_s[first]:.0f} s from {tx.log_time(float(time_s[first]))}"
         )
-        good &= ~standing
+        good &= ~stationary
     report = {
         leg: position_error(node.track, node.settings, at[good])
         | {"node": node.name, "interpolation_m": node.checked.interpolation_m}
@@ -137,7 +139,7 @@ def place(tx: NodeLog, rx: NodeLog, at: Times, *, hovers: bool = False) -> Pulse
 
 
 def _log_report(node: NodeLog) -> dict[str, Any]:
-    """Return the report on reading and smoothing of a log; empty without remarks."""
+    """Return smoothing residual, source and remarks of a log, as far as there are any."""
     values = {"smoothing_residual_m": node.smoothing_residual_m} | {
         name: node.track.attrs.get(name) for name in ("source", "remarks")
     }
@@ -145,14 +147,15 @@ def _log_report(node: NodeLog) -> dict[str, Any]:
 
 
 def position_error(track: xr.Dataset, settings: Node, at: Times) -> dict[str, Any]:
-    """Return the known position error of a node at some pulses.
+    """Return the configured or logged position accuracy of a node at given pulses.
 
     Returns
     -------
     dict
-        std_m: [north, east, up], metres, of the config, else the median over the pulses of what the log states, else
-        None; stated_by: log, config or nobody; correlation_s: how long an error lasts, seconds; drift_m: of
-        a slow error; receiver: the kind of solution that most of these epochs have, a key of `RECEIVER_STD_M`.
+        std_m: standard deviation [north, east, up], metres, from the config, else the median over the pulses from the
+        log, else None; stated_by: log, config or none; correlation_s: correlation time of the error,
+        seconds; drift_m: slow error over the flight; receiver: most frequent kind of solution, a key of
+        `RECEIVER_STD_M`.
     """
     epochs = np.searchsorted(track.time.values, at).clip(0, track.sizes["epoch"] - 1)
     receiver = {"receiver": _kind_of_solution(track.fix.values[epochs]) if "fix" in track else "unknown"}
@@ -165,7 +168,7 @@ def position_error(track: xr.Dataset, settings: Node, at: Times) -> dict[str, An
 
 
 def _kind_of_solution(fix: NDArray[np.int8]) -> str:
-    """Return the commonest kind of solution among RTKLIB's numbers.
+    """Return the most frequent kind of solution among RTKLIB's solution numbers.
 
     Examples
     --------
@@ -177,10 +180,10 @@ def _kind_of_solution(fix: NDArray[np.int8]) -> str:
 
 
 def stated_error(settings: Node) -> dict[str, Any]:
-    """Return the error of a node's positions stated in the config, as `position_error`."""
+    """Return the configured position accuracy of a node, in the form of `position_error`."""
     stated = settings.position_std_m
     std_m = None if stated is None else np.broadcast_to(stated, 3).tolist()
-    stated_by = "nobody" if stated is None else "config"
+    stated_by = "none" if stated is None else "config"
     return {
         "std_m": std_m,
         "correlation_s": settings.position_correlation_s,
@@ -189,36 +192,36 @@ def stated_error(settings: Node) -> dict[str, Any]:
     }
 
 
-def _flags(node: NodeLog, at: Times, barred: dict[str, NDArray[np.bool_]]) -> dict[str, str]:
+def _flags(node: NodeLog, at: Times, excluded: dict[str, NDArray[np.bool_]]) -> dict[str, str]:
     """Return the faults of a node's log that affect its pulses: flag → one line."""
     checked, lines = node.checked, {}
     begin, end = node.log_seconds(at[[0, -1]]) + np.array([-1.0, 1.0]) * 2 * node.interval_s
-    for name, what in _LINES.items():
-        out = int(barred[name].sum()) if name in barred else 0
-        faults = [fault for fault in checked.faults.get(name, ()) if begin <= fault[0] <= end]
-        if not (out or faults):
+    for name, fault in _LOG_FAULTS.items():
+        count = int(excluded[name].sum()) if name in excluded else 0
+        faults = [(time_s, size_m) for time_s, size_m in checked.faults.get(name, ()) if begin <= time_s <= end]
+        if not (count or faults):
             continue
         worst = ""
         if faults:
             time_s, size_m = faults[0]
             size = f"{size_m:.3f} m " if size_m else ""
-            worst = f"; {len(faults)} found, worst {size}at {node.log_time(time_s)}"
-        longest = _longest_hole(node, checked, name) if out else ""
-        reason = what.format(poorest_fix=node.settings.poorest_fix)
-        lines[name] = f"{node.name}: {out} of {len(at)} pulses left out: {reason}{longest}{worst}"
+            worst = f"; {len(faults)} in the log, largest {size}at {node.log_time(time_s)}"
+        longest = _longest_hole(node, checked, name) if count else ""
+        reason = fault.format(poorest_fix=node.settings.poorest_fix)
+        lines[name] = f"{node.name}: {count} of {len(at)} pulses excluded: {reason}{longest}{worst}"
     if node.track.attrs["dropped"]:
-        counted = ", ".join(f"{count} {why}" for why, count in node.track.attrs["dropped"].items())
-        lines["track_epochs_dropped"] = f"{node.name}: epochs of the log left out: {counted}"
+        counted = ", ".join(f"{count} {reason}" for reason, count in node.track.attrs["dropped"].items())
+        lines["track_epochs_dropped"] = f"{node.name}: epochs of the log excluded: {counted}"
     if node.track.attrs.get("damage"):
         lines["track_log_damaged"] = f"{node.name}: {node.track.attrs['damage']}"
     if "track_times" in checked.faults:
         lines["track_times"] = (
-            f"{node.name}: times of the log are written so coarsely that positions err by "
-            f"{checked.faults['track_times'][0][1]:.2f} m along the flight"
+            f"{node.name}: rounded times of the log cause position errors of "
+            f"{checked.faults['track_times'][0][1]:.2f} m along the track"
         )
     if "track_positions" in checked.faults:
         lines["track_positions"] = (
-            f"{node.name}: positions of the log are written so coarsely that they err by "
+            f"{node.name}: rounded coordinates of the log cause position errors of "
             f"{checked.faults['track_positions'][0][1]:.3f} m"
         )
     if node.yaw_fault is not None:
@@ -229,42 +232,45 @@ def _flags(node: NodeLog, at: Times, barred: dict[str, NDArray[np.bool_]]) -> di
 def _longest_hole(node: NodeLog, checked: CheckedTrack, cause: str) -> str:
     holes = [hole for hole in checked.holes if hole.cause == cause and np.isfinite(hole.end_s - hole.start_s)]
     if not holes:
-        return " at an end of the log"
-    hole = max(holes, key=lambda one: one.end_s - one.start_s)
-    error = f", where a spline may err by {hole.size_m:.2f} m" if np.isfinite(hole.size_m) else ""
+        return " at the start or end of the log"
+    hole = max(holes, key=lambda gap: gap.end_s - gap.start_s)
+    error = f", interpolation error up to {hole.size_m:.2f} m" if np.isfinite(hole.size_m) else ""
     return f", longest {hole.end_s - hole.start_s:.2f} s at {node.log_time(hole.start_s)}{error}"
 
 
 GROUND_STEP_M = 10.0
-"""Rounding of the ground's height for air: 0.4 N units, so that a height of focus does not form echoes anew."""
+"""Rounding of the terrain height for the refractivity, metres: 0.4 N units.
 
-_SIDE = 16  # of a grid on which the mean height of a DEM is taken
+A small change of the configured height then does not require echoes to be formed again.
+"""
+
+_SIDE = 16  # pixels per side of the grid on which the mean height of a DEM is computed
 
 
 def scene_air(campaign: Campaign, position_m: NDArray[np.float64]) -> SceneAir:
-    """Return the air of a campaign.
+    """Return the atmosphere over the scene of a campaign.
 
     Parameters
     ----------
     campaign
-        With `scene.atmosphere`.
+        Campaign with `scene.atmosphere`.
     position_m
-        (epoch, 3) float64, metres: where an antenna flew, which says where the scene is that the config leaves open.
+        (epoch, 3) float64, metres: antenna positions, from which an automatic CRS and scene centre follow.
 
     Notes
     -----
-    Source: docs/theory/atmosphere.md. The ground is flat at the height of the config, or at the mean of the DEM,
-    rounded to `GROUND_STEP_M`.
+    Source: docs/theory/atmosphere.md. The terrain height is the configured one or the mean of the DEM, rounded to
+    `GROUND_STEP_M`.
     """
     stated = campaign.settings.scene
     crs = utm_crs(np.median(position_m, axis=0)) if stated.crs == "auto" else stated.crs
-    place = np.median(map_from_frame(crs, position_m)[:, :2], axis=0)
+    centre = np.median(map_from_frame(crs, position_m)[:, :2], axis=0)
     if stated.bounds_m != "auto":
         xmin, ymin, xmax, ymax = stated.bounds_m
-        place = np.array([xmin + xmax, ymin + ymax]) / 2
+        centre = np.array([xmin + xmax, ymin + ymax]) / 2
     air = stated.atmosphere
-    ground_m = 0.0 if air == "vacuum" else _ground_m(campaign, crs, (float(place[0]), float(place[1])))
-    middle = frame_from_map(crs, place[0], place[1], stated.height_m if air == "vacuum" else ground_m)
+    ground_m = 0.0 if air == "vacuum" else _ground_m(campaign, crs, (float(centre[0]), float(centre[1])))
+    middle = frame_from_map(crs, centre[0], centre[1], stated.height_m if air == "vacuum" else ground_m)
     if air == "vacuum":
         atmosphere = Atmosphere.vacuum()
     elif air == "auto":
@@ -276,37 +282,38 @@ def scene_air(campaign: Campaign, position_m: NDArray[np.float64]) -> SceneAir:
     return SceneAir(atmosphere, middle, LOCAL if crs == LOCAL else "ecef")
 
 
-def _ground_m(campaign: Campaign, crs: str, place: tuple[float, float]) -> float:
+def _ground_m(campaign: Campaign, crs: str, centre: tuple[float, float]) -> float:
     stated = campaign.settings.scene
     ground = ConfiguredGround.of(stated, campaign.height_files(), crs=crs)
     if ground.dem is None or stated.bounds_m == "auto":
-        return GROUND_STEP_M * round(ground.height_at(*place) / GROUND_STEP_M)
+        return GROUND_STEP_M * round(ground.height_at(*centre) / GROUND_STEP_M)
     xmin, ymin, xmax, ymax = stated.bounds_m
     heights = ground.dem.heights(SceneGrid(crs, xmin, ymax, max(xmax - xmin, ymax - ymin) / _SIDE, (_SIDE, _SIDE)))
-    known = heights[np.isfinite(heights)]
-    height_m = float(known.mean()) if known.size else ground.height_at(*place)
+    finite = heights[np.isfinite(heights)]
+    height_m = float(finite.mean()) if finite.size else ground.height_at(*centre)
     return GROUND_STEP_M * round(height_m / GROUND_STEP_M)
 
 
 def stated_air(air: FlightAir) -> dict[str, Any]:
-    """Return the attributes by which a stage states the air that it is of."""
+    """Return the attributes of a stage that state wave speed and atmosphere."""
     return {"wave_speed_m_s": air.wave_speed_m_s, "atmosphere": air.report}
 
 
 def in_air(campaign: Campaign, history: xr.Dataset) -> xr.Dataset:
-    """Return a recorder's phase history with the air that its paths are of, by the config's `waveform.air`.
+    """Return a recorder's phase history with the atmosphere along its paths, according to `waveform.air`.
 
-    Where samples are referred to a point, its delay is that of its distance in the air: none of the samples changes.
+    If samples are referred to a point, the reference delay becomes that of its distance in the atmosphere; samples are
+    unchanged.
     """
-    waveform, given = campaign.settings.waveform, history.attrs.get("reference", "delay")
+    waveform, reference = campaign.settings.waveform, history.attrs.get("reference", "delay")
     requested: str = waveform.air if isinstance(waveform, PhaseHistoryWaveform) else "auto"
     if requested == "auto":
-        requested = "point" if given == "point" else "measured"
+        requested = "point" if reference == "point" else "measured"
     air = scene_air(campaign, history.tx_position.values)
     if requested == "corrected":
-        corrected = replace(Atmosphere.stated(0.0, ground_m=0.0), source="none: taken out of the files, as stated")
-        air = replace(air, atmosphere=corrected)
-    flown = air.over(aperture_of(history))
+        source = "vacuum: the files are already corrected (waveform.air)"
+        air = replace(air, atmosphere=replace(Atmosphere.stated(0.0, ground_m=0.0), source=source))
+    air_on_track = air.over(aperture_of(history))
     if requested == "point":
-        history = history.assign(reference_delay=history.reference_delay * (1 + 1e-6 * flown.refractivity_n))
-    return history.assign_attrs(stated_air(flown))
+        history = history.assign(reference_delay=history.reference_delay * (1 + 1e-6 * air_on_track.refractivity_n))
+    return history.assign_attrs(stated_air(air_on_track))

@@ -1,4 +1,4 @@
-"""Radiometry of a pair: from its radio as stated, or its constant as measured, to the calibration of its image."""
+"""Radiometric calibration of a pair's image, from the configured radio or from a measured calibration constant."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -26,16 +26,17 @@ from apertura.core.imaging.reflectors import DRIFT_SIGMAS
 from apertura.core.quality.bright_points import DEEPEST_DB, SPECKLE, BrightPoint
 from apertura.core.quality.budget import ATTITUDE_STD_DEG
 from apertura.core.quality.measures import BlockRaster
-from apertura.stages.agreement import bright_places
+from apertura.stages.agreement import bright_points_within
 from apertura.stages.pair import OpenPair
 from apertura.stages.planning import integration_of
 from apertura.stages.scene import OpenScene
 from apertura.stages.transmitted import transmitted
 
 FILE = "calibration.json"
-"""Name of the file, in the campaign folder."""
+"""Name of the file of calibration constants, in the campaign folder."""
 
-_SAME = 1e-3  # relative: of frequencies and powers that are stated alike, which moves a constant by 0.01 dB at most
+_TOLERANCE = 1e-3
+"""Relative difference of frequencies and powers that is tolerated; it changes a constant by at most 0.01 dB."""
 
 _REMEDY = "Measure with `apertura reflectors`, or set processing.radiometric_calibration to null."
 
@@ -49,16 +50,17 @@ class _Part(BaseModel):
 
 
 class AntennaShape(_Part):
-    """Pattern of an antenna, to whose peak a constant is referred."""
+    """Pattern of an antenna; calibration constants are referred to its peak."""
 
     beamwidth_deg: tuple[float, float] | None
     pattern_sha256: str | None
 
 
 class Radar(_Part):
-    """Conditions of a constant beside the radio: it holds under the same ones alone.
+    """Signal and antennas with which a calibration constant was measured; it is valid for the same ones only.
 
-    `sent_power` is the mean power of the signal in the units that echoes are divided by; None of phase histories.
+    `sent_power` is the mean power of the transmitted signal in the units by which echoes are divided; None for phase
+    histories.
     """
 
     centre_hz: Annotated[float, Field(gt=0)]
@@ -70,7 +72,7 @@ class Radar(_Part):
 
     @classmethod
     def of(cls, campaign: Campaign, opened: OpenPair) -> "Radar":
-        """Return the conditions of the constant of an open pair."""
+        """Return signal and antennas of an open pair."""
         waveform, frequency = campaign.settings.waveform, opened.frequency_hz
         sent = transmitted(campaign, waveform).mean_power if isinstance(waveform, SampledWaveform) else None
         files = campaign.pattern_files(opened.name)
@@ -90,29 +92,29 @@ class Radar(_Part):
         )
 
     def differs(self, other: "Radar") -> str | None:
-        """Return in what another radar is another, in words; None where they are the same.
+        """Return the first difference from another radar as text; None if there is none.
 
         Examples
         --------
-        >>> one = Radar(centre_hz=1.3e9, bandwidth_hz=2e8, subcarriers=256, sent_power=1.0, antennas={})
-        >>> one.differs(one), one.differs(one.model_copy(update={"centre_hz": 1.4e9}))
+        >>> radar = Radar(centre_hz=1.3e9, bandwidth_hz=2e8, subcarriers=256, sent_power=1.0, antennas={})
+        >>> radar.differs(radar), radar.differs(radar.model_copy(update={"centre_hz": 1.4e9}))
         (None, 'centre_hz is 1.4e+09 and was 1.3e+09')
         """
         for name in type(self).model_fields:
             was, now = getattr(self, name), getattr(other, name)
             if name == "polarisation" and None in (was, now):
-                continue  # no other set-up is stated
+                continue  # the polarisation of one of them is not configured
             numbers = isinstance(was, float) and isinstance(now, float)
-            if not (abs(was - now) <= _SAME * abs(was) if numbers else was == now):
-                words = [f"{one:g}" if isinstance(one, float) else str(one) for one in (now, was)]
-                return f"{name} is {words[0]} and was {words[1]}"
+            if not (abs(was - now) <= _TOLERANCE * abs(was) if numbers else was == now):
+                new, old = (f"{value:g}" if isinstance(value, float) else str(value) for value in (now, was))
+                return f"{name} is {new} and was {old}"
         return None
 
 
 class PairConstant(_Part):
-    """Constant of a pair, and its phase against `reference` of the file, rad; None where they share no image.
+    """Calibration constant of a pair, and its phase relative to the file's `reference` pair, rad; None if not measured.
 
-    `profile_noise` is the noise of a pulse per Σw² of the window: of another gain of the receiver it is another.
+    `profile_noise` is the noise power of a pulse per Σw² of the window; it changes with the receiver gain.
     """
 
     radar: Radar
@@ -133,7 +135,7 @@ class PairConstant(_Part):
 
 
 class Constants(_Part):
-    """calibration.json."""
+    """Content of calibration.json."""
 
     schema_version: Literal[1] = 1
     software: str
@@ -146,33 +148,33 @@ class Constants(_Part):
 
     @property
     def measured(self) -> str:
-        """When and where from, in words."""
+        """Source of the constants: campaign and dates, as text."""
         days = sorted({began[:10] for began in self.flights.values()})
         return f"reflectors of campaign {self.campaign}, {', '.join(days)}"
 
 
 def read_constants(path: Path) -> Constants:
-    """Return a file of constants.
+    """Read a file of calibration constants.
 
     Raises
     ------
     CampaignError
-        If it is not there, or is no such file.
+        If the file is missing or invalid.
     """
-    expected, remedy = "what `apertura reflectors` writes", "Copy it from the campaign that measured it."
+    expected, remedy = "a file of `apertura reflectors`", "Copy it from the campaign that measured it."
     return validated(Constants, read_json(path, expected=expected, remedy=remedy), where=path, expected=expected)
 
 
 def constant_of(campaign: Campaign, opened: OpenPair) -> tuple[PairConstant, str] | None:
-    """Return the measured constant of an open pair and where it comes from.
+    """Return the measured calibration constant of an open pair, and its source.
 
-    None where the config names no file, or where that holds constants of other pairs of the campaign alone: a
-    reflector that serves monostatic pairs calibrates no bistatic one.
+    None if the config names no file, or if the file has constants of other pairs of the campaign only: a reflector
+    for monostatic pairs does not calibrate a bistatic pair.
 
     Raises
     ------
     CampaignError
-        If the file holds no pair of the campaign, or was measured with another radar.
+        If the file contains no pair of the campaign, or was measured with another radar.
     """
     path = campaign.calibration_file
     if path is None:
@@ -181,71 +183,71 @@ def constant_of(campaign: Campaign, opened: OpenPair) -> tuple[PairConstant, str
     check_pairs(constants, campaign, path)
     if opened.name not in constants.pairs:
         return None
-    found = constants.pairs[opened.name]
-    other = found.radar.differs(Radar.of(campaign, opened))
-    if other is not None:
+    constant = constants.pairs[opened.name]
+    difference = constant.radar.differs(Radar.of(campaign, opened))
+    if difference is not None:
         raise CampaignError(
-            f"measured with another radar than {opened.name} now: {other}",
+            f"the constant of {opened.name} was measured with another radar: {difference}",
             where=path,
-            expected="constants of the same band, signal and antennas",
+            expected="constants measured with the same band, signal and antennas",
             remedy=_REMEDY,
         )
-    return found, constants.measured
+    return constant, constants.measured
 
 
 def check_pairs(constants: Constants, campaign: Campaign, path: Path) -> None:
-    """Raise CampaignError where a file of constants holds none of a campaign's pairs."""
+    """Check that a file of constants contains a pair of the campaign; raise CampaignError if not."""
     pairs = list(dict.fromkeys(pair for flight in campaign.image_flights for pair in flight.pairs))
     if constants.pairs.keys().isdisjoint(pairs):
-        found = f"no constant of {', '.join(pairs)}, but of {', '.join(constants.pairs)}"
-        raise CampaignError(found, path, "a constant of one of the pairs that are imaged", _REMEDY)
+        line = f"constants of {', '.join(constants.pairs)} only, none of {', '.join(pairs)}"
+        raise CampaignError(line, path, "a constant of at least one imaged pair", _REMEDY)
 
 
 LEAST_CONTRAST = 10.0
-"""Power of a peak against noise and clutter around it, below which it is as likely one of theirs: no cross-section."""
+"""Smallest ratio of peak power to noise and clutter for a cross-section; weaker peaks may be noise or clutter."""
 
-_UNSTATED_STD_DB, _FIGURE_STD_DB = 1.0, 0.5  # of a radio without amplitude_std_db; of a noise figure
-_SIDELINK_STD_DB = 0.3  # of the noise that a sidelink adds, by its mean SNR
-_MOST_POINTS = 50  # whose cross-section is stated, the brightest
+_UNSTATED_STD_DB, _FIGURE_STD_DB = 1.0, 0.5  # standard deviations: radio without amplitude_std_db; noise figure
+_SIDELINK_STD_DB = 0.3  # standard deviation of the predicted sidelink noise
+_MOST_POINTS = 50  # the brightest points, whose cross-sections are reported
 
 POINTS_LISTED = {
     "most": _MOST_POINTS,
     "below_brightest_db": DEEPEST_DB,
     "above_surroundings_db": round(-decibels(SPECKLE), 1),
 }
-"""Limits of the list of points in radiometry.json: a weaker target has no cross-section there."""
+"""Limits of the list of points in radiometry.json; weaker targets are not listed."""
 
 
 @dataclass(frozen=True, eq=False)
 class CalibratedPair:
-    """A pair whose radio is stated, or whose constant was measured.
+    """Pair with a configured radio or a measured calibration constant.
 
     Attributes
     ----------
     calibrated_by
-        Where its constant comes from, in words.
+        Source of the constant, as text.
     link
-        Its radio; None where it is not stated.
+        Configured radio; None if it is not configured.
     std_db
-        Standard deviation of its constant; None where it is unknown.
+        Standard deviation of the constant; None if it is unknown.
     flags
-        Of its constant.
+        Flags of the constant.
     calibration
-        Of its image.
+        Calibration of the image.
     beams
-        Weights of its pulses.
+        Weights of the pulses.
     radio_std_db
-        Standard deviation of the radio as stated; None where it is unknown.
+        Standard deviation of the configured radio; None if it is unknown.
     thermal_noise
-        Power that thermal noise would have in a profile by a receiver of 0 dB; None where no radio is stated.
+        Thermal noise power in a profile for a noise figure of 0 dB; None without a configured radio.
     noise_before
-        Noise of a pulse in the flights that measured the constant; None where it is stated, or not measured.
+        Noise power of a pulse in the flights that measured the constant; None if it was not measured.
     sidelink_noise
-        Power that the noise of the sidelink has in a profile; 0 without one.
+        Noise power that the sidelink adds to a profile; 0 without a sidelink.
     noise_figure_db
-        Stated; None: unknown.
+        Configured noise figure; None if it is not configured.
     pointing_std_db
-        What errors of attitude do to a point in the middle of the scene, by the beams.
+        Standard deviation of the power at the scene centre from attitude errors and the beams.
     """
 
     calibrated_by: str
@@ -261,62 +263,62 @@ class CalibratedPair:
     noise_figure_db: float | None
     pointing_std_db: float
 
-    def points(self, found: list[BrightPoint], scene: OpenScene, pulse_noise: float) -> list[dict[str, Any]]:
+    def points(self, bright: list[BrightPoint], scene: OpenScene, pulse_noise: float) -> list[dict[str, Any]]:
         """Return the radar cross-sections of bright points, for radiometry.json.
 
         Parameters
         ----------
-        found
-            Of the image, brightest first.
+        bright
+            Bright points of the image, brightest first.
         scene
-            Of the image.
+            Scene of the image.
         pulse_noise
-            Noise of a pulse, measured.
+            Measured noise power of a pulse.
         """
-        found = found[:_MOST_POINTS]
-        rows, columns = (np.array([getattr(one, name) for one in found]) for name in ("row", "column"))
-        if not found:
+        bright = bright[:_MOST_POINTS]
+        rows, columns = (np.array([getattr(point, name) for point in bright]) for name in ("row", "column"))
+        if not bright:
             return []
-        places = scene.grid.map_at(rows, columns)
+        positions = scene.grid.map_at(rows, columns)
         values = self.cross_sections(
             scene.terrain.positions_at(scene.grid, rows, columns),
-            np.array([one.amplitude for one in found]),
-            np.array([one.background for one in found]),
+            np.array([point.amplitude for point in bright]),
+            np.array([point.background for point in bright]),
             pulse_noise,
         )
         return [
             {"x_m": round(float(x), 4), "y_m": round(float(y), 4), **value}
-            for (x, y), value in zip(places, values, strict=True)
+            for (x, y), value in zip(positions, values, strict=True)
         ]
 
     def cross_sections(
         self,
-        places_m: NDArray[np.float64],
+        points_m: NDArray[np.float64],
         amplitude: NDArray[np.float64],
         background: NDArray[np.float64],
         pulse_noise: float,
     ) -> list[dict[str, Any]]:
-        """Return radar cross-sections with their standard deviation from peaks of an image.
+        """Return radar cross-sections of peaks of an image, with their standard deviations.
 
         Parameters
         ----------
-        places_m
+        points_m
             (point, 3) float64, in the frame of the aperture.
         amplitude, background
-            (point,) float64: of the peak; power around it relative to its own.
+            (point,) float64: amplitude of the peak; power of its surroundings relative to the peak's.
         pulse_noise
-            Noise of a pulse, measured.
+            Measured noise power of a pulse.
 
         Returns
         -------
         list of dict
-            rcs_m2, rcs_dbsm, std_db and scatter_db of each; None where a peak is no point of its own.
+            rcs_m2, rcs_dbsm, std_db and scatter_db of each; None if a peak does not exceed its surroundings enough.
 
         Notes
         -----
         Source: docs/theory/radiometry.md, eq. 4.
         """
-        per_m2, share = self.calibration.at(places_m)
+        per_m2, share = self.calibration.at(points_m)
         power, noise = amplitude**2, share * (pulse_noise if np.isfinite(pulse_noise) else 0.0)
         sigma = np.maximum(power - noise, 0.0) / np.where(per_m2 > 0, per_m2, np.nan)
         inverse = np.maximum(noise / power, background)
@@ -326,69 +328,81 @@ class CalibratedPair:
             sigma_db = 10 * np.log10(sigma)
         return [
             {
-                "rcs_m2": float(f"{one:.4g}"),
-                "rcs_dbsm": round(float(one_db), 2),
+                "rcs_m2": float(f"{rcs_m2:.4g}"),
+                "rcs_dbsm": round(float(rcs_db), 2),
                 "std_db": round(float(std), 2),
                 "scatter_db": round(float(scatter), 2),
             }
-            if np.isfinite(one_db) and LEAST_CONTRAST * doubt <= 1
+            if np.isfinite(rcs_db) and LEAST_CONTRAST * background_share <= 1
             else {"rcs_m2": None, "rcs_dbsm": None, "std_db": None, "scatter_db": None}
-            for one, one_db, std, scatter, doubt in zip(sigma, sigma_db, std_db, scatter_db, inverse, strict=True)
+            for rcs_m2, rcs_db, std, scatter, background_share in zip(
+                sigma, sigma_db, std_db, scatter_db, inverse, strict=True
+            )
         ]
 
     def noise_report(self, pulse_noise: PulseNoise, *, bound: bool) -> tuple[dict[str, Any], Flags]:
-        """Return the noise measured against what the receiver alone would have, and the flag where they disagree.
+        """Return the measured noise figure, and a flag if it disagrees with the configured or earlier noise.
 
         Parameters
         ----------
         pulse_noise
-            Measured; NaN where it was not.
+            Measured noise; NaN if it was not measured.
         bound
-            Whether it is an upper bound, since echoes alias into it.
+            True if it is an upper bound because echoes alias into it.
 
         Notes
         -----
         Source: docs/theory/radiometry.md, eqs. 8, 8a and 8b.
         """
-        own = pulse_noise.power - self.sidelink_noise
+        receiver_noise = pulse_noise.power - self.sidelink_noise
         report = {"noise_figure_db": self.noise_figure_db, "noise_figure_measured_db": None, "std_db": None}
         report |= {"sidelink": self.sidelink_noise or None}
         differences = list[tuple[str, float, float]]()
-        if self.thermal_noise and own > 0:  # NaN is not
-            figure_db = decibels(own / self.thermal_noise)
-            of_own_db = np.hypot(pulse_noise.std_db * pulse_noise.power, _SIDELINK_STD_DB * self.sidelink_noise) / own
-            report |= {"noise_figure_measured_db": round(figure_db, 2), "std_db": round(float(of_own_db), 2)}
+        if self.thermal_noise and receiver_noise > 0:  # False for NaN
+            figure_db = decibels(receiver_noise / self.thermal_noise)
+            measured_std_db = (
+                np.hypot(pulse_noise.std_db * pulse_noise.power, _SIDELINK_STD_DB * self.sidelink_noise)
+                / receiver_noise
+            )
+            report |= {"noise_figure_measured_db": round(figure_db, 2), "std_db": round(float(measured_std_db), 2)}
             radio_db = _UNSTATED_STD_DB if self.radio_std_db is None else self.radio_std_db
-            std_db = float(np.hypot(of_own_db, np.hypot(radio_db, _FIGURE_STD_DB)))
+            std_db = float(np.hypot(measured_std_db, np.hypot(radio_db, _FIGURE_STD_DB)))
             if self.noise_figure_db is not None:
-                differences.append(("the noise figure stated", figure_db - self.noise_figure_db, std_db))
+                differences.append(("the configured noise figure", figure_db - self.noise_figure_db, std_db))
             elif figure_db < 0:  # no receiver has a noise figure below 0 dB
-                differences.append(("a receiver of 0 dB", figure_db, std_db))
+                differences.append(("a noise figure of 0 dB", figure_db, std_db))
         if self.noise_before and pulse_noise.power > 0 and not self.sidelink_noise:
             std_db = float(np.hypot(2**0.5 * pulse_noise.std_db, _FIGURE_STD_DB))
             since_db = decibels(pulse_noise.power / self.noise_before)
-            differences.append(("that over the reflectors, of another gain?", since_db, std_db))
+            differences.append(("the noise of the reflector flights (other receiver gain?)", since_db, std_db))
         lines = [
-            f"the noise measured is {by_db:+.1f} dB of {than}, ± {std_db:.1f} dB"
-            for than, by_db, std_db in differences
+            f"measured noise is {by_db:+.1f} ± {std_db:.1f} dB relative to {reference}"
+            for reference, by_db, std_db in differences
             if abs(by_db) > DRIFT_SIGMAS * std_db and not (by_db > 0 and bound)
         ]
         return report, Flags({"noise_disagrees": "; ".join(lines)} if lines else {})
 
 
 def stated_link(campaign: Campaign, pair: str) -> tuple[Link, float | None, float | None] | None:
-    """Return the radio of a pair, the error of what is stated, None unknown, and the noise figure, dB; None: no radio.
+    """Return the configured radio of a pair, its standard deviation (None: unknown) and its noise figure, dB.
 
-    Where constants were measured a radio may be stated in parts, which is none.
+    None if the radio is not configured completely, as is permitted with measured constants.
     """
     power, transmit, receive, receiver = radio_of(campaign.settings.nodes, pair).values()
     if not isinstance(receiver, Receiver) or None in (power, transmit, receive):
         return None
     nodes: list[Node] = [campaign.settings.nodes[name] for name in dict.fromkeys(pair.split("-"))]
-    known = [node.amplitude_std_db for node in nodes]
-    std_db = None if None in known else float(np.sqrt(sum((one or 0.0) ** 2 for one in known)))
-    sent, outward, back = (float(str(value)) for value in (power, transmit, receive))
-    link = Link(sent, outward, back, receiver.gain_db, receiver.at_full_scale_dbm, receiver.full_scale_counts)
+    stds_db = [node.amplitude_std_db for node in nodes]
+    std_db = None if None in stds_db else float(np.sqrt(sum((one or 0.0) ** 2 for one in stds_db)))
+    power_dbm, transmit_dbi, receive_dbi = (float(str(value)) for value in (power, transmit, receive))
+    link = Link(
+        power_dbm,
+        transmit_dbi,
+        receive_dbi,
+        receiver.gain_db,
+        receiver.at_full_scale_dbm,
+        receiver.full_scale_counts,
+    )
     return link, std_db, receiver.noise_figure_db
 
 
@@ -400,29 +414,29 @@ def calibrated_pair(
     weights: tuple[Beams | None, int] | None = None,
     threads: int = 1,
 ) -> CalibratedPair | None:
-    """Return the calibration of an open pair's image; None where neither radio nor constant is known.
+    """Return the calibration of an open pair's image; None if neither radio nor constant is known.
 
     Parameters
     ----------
     campaign, opened, scene
-        Settings, the pair by its echo, and the campaign's grid and ground.
+        Campaign, pair opened from its echo, and scene with grid and terrain.
     weights
-        As of `image_weights`, which by default says them.
+        Weights of the pulses and divisor of the image (default: `image_weights`).
     threads
-        Blocks of the lattice in work at once.
+        Number of lattice blocks processed in parallel.
     """
     waveform, frequency = campaign.settings.waveform, opened.frequency_hz
     measured, stated = constant_of(campaign, opened), stated_link(campaign, opened.name)
     sent = transmitted(campaign, waveform) if stated and isinstance(waveform, SampledWaveform) else None
     link, radio_db, figure_db = stated if stated and sent else (None, None, None)
-    std_db, constant, by, flags = radio_db, 0.0, "the radio that the config states", Flags()
+    std_db, constant, source, flags = radio_db, 0.0, "the configured radio", Flags()
     if link and sent:
         wavelength_m = SPEED_OF_LIGHT_M_S / centre_frequency(frequency)
         constant = link.constant(wavelength_m=wavelength_m, sent_power=sent.mean_power)
     if measured:
-        found, by = measured
-        flags = Flags.merged(found.flags, _disagreement(found, constant, std_db) if link else {})
-        constant, std_db = found.constant, found.std_db
+        of_pair, source = measured
+        flags = Flags.merged(of_pair.flags, _disagreement(of_pair, constant, std_db) if link else {})
+        constant, std_db = of_pair.constant, of_pair.std_db
     elif not link:
         return None
     beams, count = weights or image_weights(campaign, opened, scene)
@@ -453,21 +467,21 @@ def calibrated_pair(
             method=sidelink["method"],
             snr_db=sidelink["snr_db"],
         )
-    pointing_db = pointing_std_db(beams, opened.aperture, scene.middle_m, _turns(campaign, opened, scene))
+    pointing_db = pointing_std_db(beams, opened.aperture, scene.middle_m, _attitude_errors(campaign, opened, scene))
     return CalibratedPair(
-        by, link, std_db, flags, calibration, beams, radio_db, thermal, before, added, figure_db, pointing_db
+        source, link, std_db, flags, calibration, beams, radio_db, thermal, before, added, figure_db, pointing_db
     )
 
 
 def image_weights(campaign: Campaign, opened: OpenPair, scene: OpenScene) -> tuple[Beams | None, int]:
-    """Return the weights of a pair's pulses in its image, and the number that the image was divided by."""
+    """Return the weights of a pair's pulses in its image, and the divisor of the image."""
     integration = integration_of(campaign, opened, scene)
     count = integration.count if integration.sector else None
     return Beams.within(integration.sector, opened.beams), count or len(opened.aperture)
 
 
-def _turns(campaign: Campaign, opened: OpenPair, scene: OpenScene) -> list[Turn]:
-    """Return the errors of attitude of a pair's nodes about east, north and up, as stated or of their source."""
+def _attitude_errors(campaign: Campaign, opened: OpenPair, scene: OpenScene) -> list[Turn]:
+    """Return the attitude errors of a pair's nodes about east, north and up, configured or typical of the source."""
     legs, turns = opened.name.split("-"), list[Turn]()
     for name in dict.fromkeys(legs):
         node = campaign.settings.nodes[name]
@@ -480,22 +494,22 @@ def _turns(campaign: Campaign, opened: OpenPair, scene: OpenScene) -> list[Turn]
     return turns
 
 
-def _disagreement(found: PairConstant, stated: float, std_db: float | None) -> dict[str, str]:
-    """Return the flag of a constant that was measured and is not what the config's radio says."""
-    difference_db = decibels(stated) - found.constant_db
-    both_db = float(np.hypot(found.std_db, std_db or 0.0))
+def _disagreement(measured: PairConstant, configured: float, std_db: float | None) -> dict[str, str]:
+    """Return the flag of a measured constant that disagrees with the configured radio."""
+    difference_db = decibels(configured) - measured.constant_db
+    both_db = float(np.hypot(measured.std_db, std_db or 0.0))
     if std_db is None or abs(difference_db) <= DRIFT_SIGMAS * both_db:
         return {}
     return {
-        "constant_disagrees": f"the radio that the config states makes it {difference_db:+.2f} dB of what "
-        f"reflectors said, {abs(difference_db) / both_db:.1f} standard deviations of both"
+        "constant_disagrees": f"constant from the configured radio {difference_db:+.2f} dB relative to the constant "
+        f"measured at reflectors, {abs(difference_db) / both_db:.1f} standard deviations of the difference"
     }
 
 
 def points_of(
     image: BlockRaster, quality: dict[str, Any], scene: OpenScene, windows: list[Window]
 ) -> list[BrightPoint]:
-    """Return the bright points of a finished image, brightest first; `quality` is that of its stage."""
+    """Return the bright points of a finished image, brightest first; `quality`: attribute of its stage."""
     focus = quality["focus"]
     spectrum = np.array(focus["spectrum_cycles2_m2"])
-    return bright_places(image, scene.grid, windows, spectrum, cell_m=focus["cell_m"])
+    return bright_points_within(image, scene.grid, windows, spectrum, cell_m=focus["cell_m"])

@@ -1,4 +1,4 @@
-"""Rule `refine`: errors of a flight's tracks as its images show them, all pairs together, or why they are left."""
+"""Rule `refine`: joint estimation of a flight's track errors from the images of all its pairs (autofocus)."""
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -39,29 +39,29 @@ from apertura.stages.scene import OpenScene, open_scene
 from apertura.stages.tags import stamped
 from apertura.workflow.lineage import result_of
 
-# ---- Decision whether and how the tracks of a flight are refined ----------------------------------------------------
+# ---- Decision on the refinement of a flight's tracks, and on its method ----------------------------------------------
 
 ASSUMED_STD_M = 0.02
-"""Metres in each axis, assumed for positions of unstated error when a refinement is requested: a fair RTK solution."""
+"""Assumed position accuracy per axis if none is stated and a refinement is requested, metres: RTK fix."""
 
 LEAST_STD_M = 1e-3
-"""Metres, lower bound of a stated deviation: a prior of zero would fix the track."""
+"""Lower bound of a stated position accuracy, metres: a prior of zero would fix the track."""
 
 ONE_PHASE = "minimum_entropy"
-"""Method of auto where one phase suffices: accepted at least as often as phase_gradient, at its cost."""
+"""Method of `auto` if one phase per pulse suffices; accepted as often as phase_gradient or more, at equal cost."""
 
 
 def autofocus_of(campaign: Campaign, pairs: Sequence[OpenPair], scene: OpenScene) -> tuple[Decision, ...]:
-    """Decide on refinement of the tracks of a flight, of which these are all pairs, and on its method."""
+    """Decide on the refinement of a flight's tracks and on its method; `pairs` are all pairs of the flight."""
     requested = campaign.settings.processing
-    silent = [node for node, known in positions_of(pairs).items() if known.std_m is None]
+    unstated = [node for node, accuracy in positions_of(pairs).items() if accuracy.std_m is None]
     loss_db = {pair.name: positions_loss_db(campaign, pair, scene) for pair in pairs}
-    decision = decide_autofocus(requested.autofocus, loss_db, silent)
+    decision = decide_autofocus(requested.autofocus, loss_db, unstated)
     if decision.value == "off":
         return (decision,)
     variances = {pair.name: _variance(pair, scene, errors_of(pairs)) for pair in pairs}
-    known = bool(campaign.settings.scene.reference_points)
-    return decision, decide_method(requested.autofocus_method, variances, known_points=known)
+    has_points = bool(campaign.settings.scene.reference_points)
+    return decision, decide_method(requested.autofocus_method, variances, known_points=has_points)
 
 
 def decide_method(requested: str, variances: Mapping[str, SpaceVariance], *, known_points: bool) -> Decision:
@@ -72,9 +72,9 @@ def decide_method(requested: str, variances: Mapping[str, SpaceVariance], *, kno
     requested
         auto, tracks, or a row of `apertura.methods.autofocus.one_phase.METHODS`.
     variances
-        Pair → what one phase per pulse leaves of it.
+        Pair → residual error with one phase per pulse.
     known_points
-        Whether the scene has reference points: only the method tracks can use them.
+        True if the scene has reference points, which only the method `tracks` uses.
 
     Examples
     --------
@@ -84,47 +84,47 @@ def decide_method(requested: str, variances: Mapping[str, SpaceVariance], *, kno
     'tracks'
     """
     if requested != "auto":
-        return Decision("autofocus_method", requested, "asked for")
+        return Decision("autofocus_method", requested, "configured")
     if known_points:
-        return Decision("autofocus_method", "tracks", "auto: only tracks can be tied to scene.reference_points")
-    pair, worst = min(variances.items(), key=lambda one: one[1].loss_db)
+        return Decision("autofocus_method", "tracks", "auto: only method tracks uses scene.reference_points")
+    pair, worst = min(variances.items(), key=lambda item: item[1].loss_db)
     value = ONE_PHASE if worst.method == "one_phase" else "tracks"
     return Decision("autofocus_method", value, f"auto: in {pair} {worst.reason}")
 
 
 def positions_of(pairs: Sequence[OpenPair]) -> Mapping[str, NodePositions]:
-    """Return node → what is known of the errors of its log; it is the same in each pair."""
+    """Return node → position accuracy of its log, which is the same in each pair."""
     return {
-        node: known
+        node: accuracy
         for pair in pairs
-        for node, known in zip(dict.fromkeys(pair.name.split("-")), pair.positions, strict=True)
+        for node, accuracy in zip(dict.fromkeys(pair.name.split("-")), pair.positions, strict=True)
     }
 
 
 def errors_of(pairs: Sequence[OpenPair]) -> Mapping[str, TrackErrors]:
-    """Return node → the errors that its log is taken to have."""
+    """Return node → stated or assumed error statistics of its log."""
     return {
-        node: TrackErrors(_stated_std_m(known), known.correlation_s, known.drift_m)
-        for node, known in positions_of(pairs).items()
+        node: TrackErrors(_std_m(accuracy), accuracy.correlation_s, accuracy.drift_m)
+        for node, accuracy in positions_of(pairs).items()
     }
 
 
 def _variance(pair: OpenPair, scene: OpenScene, errors: Mapping[str, TrackErrors]) -> SpaceVariance:
-    """Return the residual of one phase per pulse at the corners of the scene."""
+    """Return the residual error with one phase per pulse at the corners of the scene."""
     last_row, last_column = (size - 1 for size in scene.grid.shape)
     rows, columns = np.array([0, 0, last_row, last_row]), np.array([0, last_column, 0, last_column])
     corners_m = scene.terrain.positions_at(scene.grid, rows, columns)
-    of_nodes = [errors[node] for node in dict.fromkeys(pair.name.split("-"))]
-    return space_variance(paths_to(pair, scene, scene.middle_m), corners_m, of_nodes)
+    node_errors = [errors[node] for node in dict.fromkeys(pair.name.split("-"))]
+    return space_variance(paths_to(pair, scene, scene.middle_m), corners_m, node_errors)
 
 
-def _stated_std_m(known: NodePositions) -> tuple[float, float, float]:
-    """Return the errors of a node's log, east, north, up."""
-    east, north, up = (max(one, LEAST_STD_M) for one in known.std_m or (ASSUMED_STD_M,) * 3)
+def _std_m(accuracy: NodePositions) -> tuple[float, float, float]:
+    """Return the stated or assumed standard deviations of a node's log, east, north, up."""
+    east, north, up = (max(std_m, LEAST_STD_M) for std_m in accuracy.std_m or (ASSUMED_STD_M,) * 3)
     return east, north, up
 
 
-# ---- Refined tracks, from which images take their phase centres -----------------------------------------------------
+# ---- Refined tracks, which give images their phase centres -----------------------------------------------------------
 
 _QUOTED = ("gain_fitted_db", "gain_held_out_db", "gain_std_db")
 
@@ -136,11 +136,12 @@ class RefinedTrack:
     Attributes
     ----------
     stage
-        `refined_track`, from which images inherit.
+        Stage `refined_track`, a parent of the images.
     correction
-        Of the flight's nodes and pairs, seconds from `began`; None where images are formed from the logs as they are.
+        Correction of the flight's nodes and pairs, with times in seconds since `began`; None if images are formed from
+        the unchanged logs.
     began
-        Zero of the correction's clock, UTC.
+        Zero of the correction's time scale, UTC.
     """
 
     stage: xr.Dataset
@@ -149,7 +150,7 @@ class RefinedTrack:
 
     @classmethod
     def of(cls, stage: xr.Dataset) -> "RefinedTrack":
-        """Return the outcome stored in a stage."""
+        """Read the outcome from a stage."""
         time, nodes = stage.time.values, stage.attrs["nodes"]
         if not stage.attrs["accepted"] or not len(time):
             return cls(stage, None, np.datetime64(0, "ns"))
@@ -160,34 +161,38 @@ class RefinedTrack:
     @property
     def decisions(self) -> tuple[Decision, ...]:
         """Decisions on refinement and its method, with reason and outcome."""
-        became = {"autofocus": f"; {self.stage.attrs['why']}"}
-        made = self.stage.attrs["decisions"].items()
-        return tuple(Decision(name, one["value"], one["reason"] + became.get(name, "")) for name, one in made)
+        outcome = {"autofocus": f"; {self.stage.attrs['reason']}"}
+        return tuple(
+            Decision(name, decision["value"], decision["reason"] + outcome.get(name, ""))
+            for name, decision in self.stage.attrs["decisions"].items()
+        )
 
     def report(self, pair: str) -> dict[str, Any]:
         """Return the refinement of a pair's tracks for image.json."""
         attrs = self.stage.attrs
-        made = {name: f"{one['value']}: {one['reason']}" for name, one in attrs["decisions"].items()}
+        decisions = {
+            name: f"{decision['value']}: {decision['reason']}" for name, decision in attrs["decisions"].items()
+        }
         return {
-            "decision": made["autofocus"],
-            **({"method": made["autofocus_method"]} if "autofocus_method" in made else {}),
+            "decision": decisions["autofocus"],
+            **({"method": decisions["autofocus_method"]} if "autofocus_method" in decisions else {}),
             "accepted": attrs["accepted"],
-            "why": attrs["why"],
+            "reason": attrs["reason"],
             **{name: attrs["report"][name] for name in _QUOTED if name in attrs["report"]},
             **({} if self.correction is None else _sizes_cm(self.correction, pair)),
         }
 
     def pair(self, logged: OpenPair) -> OpenPair:
-        """Return an open pair as images are formed from it; its errors are those that the refinement leaves."""
+        """Return an open pair with corrected phase centres and the residual errors of the refinement."""
         if self.correction is None:
             return logged
         aperture, extra_path_m = self._moved(self.correction, logged)
         history = None if logged.history is None else logged.history.moved(aperture, extra_path_m)
-        left = self.stage.attrs["left"]
-        return replace(logged, aperture=aperture, history=history, left=Effect(**left) if left else None)
+        residual = self.stage.attrs["left"]
+        return replace(logged, aperture=aperture, history=history, left=Effect(**residual) if residual else None)
 
     def profiles(self, logged: OpenPair, profiles: Profiles) -> Profiles:
-        """Return the range profiles of a pair as images are formed from them."""
+        """Return the range profiles of a pair with corrected phase centres and paths."""
         return profiles if self.correction is None else profiles.moved(*self._moved(self.correction, logged))
 
     def node(self, logged: Acquisition) -> Acquisition:
@@ -198,34 +203,34 @@ class RefinedTrack:
         return replace(logged, track=logged.track.assign(position=logged.track.position + moved_m))
 
     def moved_m(self, node: str, at: Times) -> NDArray[np.float64]:
-        """Return the correction of the logged points of a node at some times, (time, 3) float64 metres in the frame.
+        """Return the correction of a node's logged positions at given times, (time, 3) float64 metres in the frame.
 
-        Before the first pulse and after the last it stays what it was there.
+        Before the first and after the last pulse, it is constant.
         """
         if self.correction is None:
             return np.zeros((len(at), 3))
         return self.correction.at(node, seconds_since(at, self.began))
 
     def left_m(self, node: str, at: Times) -> NDArray[np.float64]:
-        """Return the standard deviation of what the refinement leaves of a node's error, along the axes of the frame.
+        """Return the standard deviation of a node's residual position error, along the axes of the frame.
 
         Returns
         -------
         ndarray
-            (time, 3) float64, metres; NaN where the images say nothing of the node: before the first pulse, after the
-            last, and everywhere if no track was moved.
+            (time, 3) float64, metres; NaN where the images do not observe the node: before the first pulse, after the
+            last, and everywhere if no track was corrected.
         """
-        left_m, nodes = np.full((len(at), 3), np.nan), self.stage.attrs["nodes"]
+        residual_m, nodes = np.full((len(at), 3), np.nan), self.stage.attrs["nodes"]
         if self.correction is None or self.correction.extra_path_m or node not in nodes:
-            return left_m
+            return residual_m
         knots_s, at_s = self.correction.time_s, seconds_since(at, self.began)
         inside = (at_s >= knots_s[0]) & (at_s <= knots_s[-1])
         std_m = self.stage["std"].values[nodes.index(node)]
-        left_m[inside] = np.stack([np.interp(at_s[inside], knots_s, axis) for axis in std_m.T], axis=-1)
-        return left_m
+        residual_m[inside] = np.stack([np.interp(at_s[inside], knots_s, axis) for axis in std_m.T], axis=-1)
+        return residual_m
 
     def _moved(self, correction: TrackCorrection, logged: OpenPair) -> tuple[Aperture, NDArray[np.float64]]:
-        """Return the phase centres of a pair, and by how much paths of its echoes are longer than with the logs."""
+        """Return the corrected phase centres of a pair, and the extra path of its echoes relative to the logs."""
         time_s = clock_s(logged, self.began)
         aperture = correction.aperture(logged.aperture, logged.name, time_s)
         return aperture, correction.longer_m(logged.name, time_s, logged.sidelink_m)
@@ -239,9 +244,9 @@ def open_refined(campaign: Campaign, flight: str) -> RefinedTrack:
 def expected_track(
     campaign: Campaign, pairs: Sequence[OpenPair], scene: OpenScene
 ) -> tuple[list[OpenPair], tuple[Decision, ...]]:
-    """Return the pairs of a flight as they are or will be imaged; whether and how their tracks are refined, and why.
+    """Return the pairs of a flight with refined tracks if they exist, and the decisions on the refinement.
 
-    Before step `refine` ran, the pairs are those of the logs, whatever was decided.
+    Before step `refine`, the pairs are those of the logs, whatever the decision.
     """
     if campaign.is_current(campaign.stage("refined_track", pairs[0].flight)):
         track = open_refined(campaign, pairs[0].flight)
@@ -250,12 +255,12 @@ def expected_track(
 
 
 def clock_s(pair: OpenPair, began: np.datetime64) -> NDArray[np.float64]:
-    """Return the times of a pair's pulses, (pulse,) float64 seconds from an instant."""
+    """Return the times of a pair's pulses, (pulse,) float64 seconds since `began`."""
     return pair.time_s + float((pair.began - began) / np.timedelta64(1, "s"))
 
 
 def _sizes_cm(correction: TrackCorrection, pair: str) -> dict[str, Any]:
-    """Return the rms size of the correction of a pair: of its nodes, or of its path."""
+    """Return the RMS correction of a pair: of its nodes, or of its path."""
     if pair in correction.extra_path_m:
         return {"extra_path_rms_cm": _rms_cm(correction.extra_path_m[pair][:, None])}
     nodes = dict.fromkeys(pair.split("-"))
@@ -266,7 +271,7 @@ def _rms_cm(moved_m: NDArray[np.float64]) -> float:
     return round(100 * float(np.sqrt((moved_m**2).sum(axis=-1).mean())), 2)
 
 
-# ---- Inputs of a refinement of tracks from an open flight: profiles of each pair, errors of the logs ---------------
+# ---- Inputs of the refinement: profiles of each pair, errors of the logs ---------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -276,15 +281,15 @@ class RefinementInputs:
     Attributes
     ----------
     records
-        One for each pair, by the flight's clock.
+        Record of each pair, on the flight's time scale.
     errors
         Node → error statistics of its log.
     points
-        Points of the scene whose places are known.
+        Reference points of the scene, with known positions.
     began
-        Zero of the clock, UTC.
+        Zero of the time scale, UTC.
     causes
-        Constants of the config that may be wrong.
+        Configured constants that may be wrong.
     """
 
     records: tuple[PairRecord, ...]
@@ -300,11 +305,11 @@ def refinement_inputs(campaign: Campaign, pairs: Mapping[OpenPair, Profiles], sc
     Parameters
     ----------
     campaign
-        With its settings.
+        Campaign with its settings.
     pairs
-        Every pair of the flight, as the logs have it, and its range profiles.
+        Every pair of the flight, from the logs, and its range profiles.
     scene
-        The campaign's.
+        Scene of the campaign.
     """
     began = min(pair.began for pair in pairs)
     records = [
@@ -319,27 +324,27 @@ def refinement_inputs(campaign: Campaign, pairs: Mapping[OpenPair, Profiles], sc
 def _causes(
     campaign: Campaign, flight: str, records: Sequence[PairRecord], began: np.datetime64, up: Floats
 ) -> Iterator[Cause]:
-    """Yield possible causes: height of the ground; times of logs; lever arms of nodes whose attitude is known."""
-    flown = {
-        node: (one.time_s, leg)
-        for one in records
-        for node, leg in zip(one.nodes, one.profiles.aperture.legs, strict=True)
+    """Yield possible causes: terrain height; times of logs; lever arms of nodes with known attitude."""
+    tracks = {
+        node: (record.time_s, leg)
+        for record in records
+        for node, leg in zip(record.nodes, record.profiles.aperture.legs, strict=True)
     }
-    yield other_height(list(flown), records[0].time_s, up)
-    logged = [node for node in flown if campaign.logged(flight, node)]
+    yield other_height(list(tracks), records[0].time_s, up)
+    logged = [node for node in tracks if campaign.logged(flight, node)]
     for node in logged:
-        yield late_logs([node], flown)
-        time_s, _ = flown[node]
+        yield late_logs([node], tracks)
+        time_s, _ = tracks[node]
         wave_m = 2 * np.pi / records[0].profiles.wavenumber_rad_m
         log = raw_log(campaign, flight, node, wave_m)
         if log.has_attitude:
             yield other_arm(node, time_s, log.body_axes(began + (1e9 * time_s).astype("timedelta64[ns]")))
     if len(logged) > 1:
-        yield late_logs(logged, flown)
+        yield late_logs(logged, tracks)
 
 
 def reference_points(campaign: Campaign) -> tuple[ReferencePoint, ...]:
-    """Return the reference points of the config, in the frame of the phase centres."""
+    """Return the configured reference points, in the frame of the phase centres."""
     requested, points = campaign.settings.scene, []
     for point in requested.reference_points:
         x, y, z = frame_from_map(requested.crs, *point.position_m).tolist()
@@ -347,11 +352,11 @@ def reference_points(campaign: Campaign) -> tuple[ReferencePoint, ...]:
     return tuple(points)
 
 
-# ---- Rule `refine`: corrections of a flight's tracks by the images of all its pairs, or why there are none ---------
+# ---- Rule `refine`: corrections of a flight's tracks from the images of all its pairs --------------------------------
 
 
 def refine(campaign: Campaign, flight: str) -> Path:
-    """Write results/<flight>/refined_track.zarr; without corrections it states the reason and has no knots."""
+    """Write results/<flight>/refined_track.zarr; without a correction, it contains the reason and no knots."""
     lineage = result_of(campaign, "refined_track", flight).begin(campaign.root)
     names, scene = campaign.flight(flight).pairs, open_scene(campaign)
     requested = campaign.settings.processing.autofocus
@@ -360,57 +365,60 @@ def refine(campaign: Campaign, flight: str) -> Path:
     if decisions[0].value == "on":
         stages = {pair: open_stage(campaign.stage("profile", flight, pair), "profile") for pair in names}
         profiles = {pair: profiles_of(stages[pair.name], lazy=True) for pair in pairs}
-        given = refinement_inputs(campaign, profiles, scene)
-        found = _estimated(given, scene, str(decisions[1].value))
-        stage = refined_stage(found, decisions, given, scene)
+        inputs = refinement_inputs(campaign, profiles, scene)
+        refinement = _estimated(inputs, scene, str(decisions[1].value))
+        stage = refined_stage(refinement, decisions, inputs, scene)
     else:
-        nothing = {node: np.zeros((0, 3)) for pair in names for node in pair.split("-")}
-        why = "images are formed from the logs as they are"
-        found = Refinement(TrackCorrection(np.zeros(0), nothing), nothing, accepted=False, why=why)
-        stages, stage = {}, refined_stage(found, decisions, None, scene)
-    print("; ".join([*(f"{one.name} {one.value}: {one.reason}" for one in decisions), found.why]), flush=True)
+        empty = {node: np.zeros((0, 3)) for pair in names for node in pair.split("-")}
+        reason = "images are formed from the unchanged logs"
+        refinement = Refinement(TrackCorrection(np.zeros(0), empty), empty, accepted=False, reason=reason)
+        stages, stage = {}, refined_stage(refinement, decisions, None, scene)
+    lines = [f"{decision.name} {decision.value}: {decision.reason}" for decision in decisions]
+    print("; ".join([*lines, refinement.reason]), flush=True)
     patterns = [pattern_digests(campaign, pair) for pair in names]
     inherits: dict[str, Any] = {"parents": stages, "inputs": merged(scene.inputs, *patterns)}
-    settings = {**lineage.result.settings, "refined": found.accepted}
-    # Images that are formed from the logs depend on their own echoes alone, not on those read here.
-    how: dict[str, Any] = {"modules": lineage.modules, "settings": settings, **(inherits if found.accepted else {})}
-    save_stage(stamped(stage, "refined_track", **how), folder, lineage=lineage)
+    accepted = refinement.accepted
+    settings = {**lineage.result.settings, "refined": accepted}
+    # Without a correction, images depend on their own echoes alone, not on the profiles read by this step.
+    origin: dict[str, Any] = {"modules": lineage.modules, "settings": settings, **(inherits if accepted else {})}
+    save_stage(stamped(stage, "refined_track", **origin), folder, lineage=lineage)
     return folder
 
 
-def _estimated(given: RefinementInputs, scene: OpenScene, method: str) -> Refinement:
-    """Return the refinement of tracks, or of one phase per pulse where there are places enough to validate it."""
-    records, errors = given.records, given.errors
-    found = None if method == "tracks" else Candidates.of(records, scene.grid, scene.terrain, errors)
-    if found is None or len(found.patches) < FOLDS:
-        points, causes = given.points, given.causes
+def _estimated(inputs: RefinementInputs, scene: OpenScene, method: str) -> Refinement:
+    """Return the refinement of tracks, or of one phase per pulse if there are enough patches to validate it."""
+    records, errors = inputs.records, inputs.errors
+    candidates = None if method == "tracks" else Candidates.of(records, scene.grid, scene.terrain, errors)
+    if candidates is None or len(candidates.patches) < FOLDS:
+        points, causes = inputs.points, inputs.causes
         return refine_tracks(records, scene.grid, scene.terrain, errors, reference_points=points, causes=causes)
-    return refine_one_phase(records, found, errors, method=method)
+    return refine_one_phase(records, candidates, errors, method=method)
 
 
 def refined_stage(
-    found: Refinement, decisions: Sequence[Decision], given: RefinementInputs | None, scene: OpenScene
+    refinement: Refinement, decisions: Sequence[Decision], inputs: RefinementInputs | None, scene: OpenScene
 ) -> xr.Dataset:
-    """Return stage `refined_track`, to be stamped.
+    """Return stage `refined_track` without provenance.
 
     Parameters
     ----------
-    found, decisions
-        The refinement; whether it was tried, how, and why.
-    given
-        Its inputs; None where it was not tried.
+    refinement, decisions
+        Refinement; decisions on it and on its method.
+    inputs
+        Inputs of the refinement; None if it was not tried.
     scene
-        The campaign's.
+        Scene of the campaign.
     """
-    knots_s, nodes = found.correction.time_s, list(found.correction.moved_m)
-    extra_path_m = found.correction.extra_path_m
-    began = np.datetime64(0, "ns") if given is None else given.began.astype("datetime64[ns]")
-    logged = _logged_positions(() if given is None else given.records, knots_s)
-    moved_m, std_m = (np.stack([values[node] for node in nodes]) for values in (found.correction.moved_m, found.std_m))
+    correction = refinement.correction
+    knots_s, nodes = correction.time_s, list(correction.moved_m)
+    extra_path_m = correction.extra_path_m
+    began = np.datetime64(0, "ns") if inputs is None else inputs.began.astype("datetime64[ns]")
+    logged = _logged_positions(() if inputs is None else inputs.records, knots_s)
+    moved_m, std_m = (np.stack([values[node] for node in nodes]) for values in (correction.moved_m, refinement.std_m))
     position_m = np.stack([logged.get(node, np.zeros((0, 3))) for node in nodes])
     by_node = ("node", "knot", "axis")
-    named = {"loss_db": "left_db", "shift_m": "gauge_shift_m", "phase_rad": "left_rad"}
-    known = {*named.values()} <= found.report.keys()
+    report_names = {"loss_db": "left_db", "shift_m": "gauge_shift_m", "phase_rad": "left_rad"}
+    has_residual = {*report_names.values()} <= refinement.report.keys()
     return xr.Dataset(
         {
             "time": ("knot", began + np.rint(1e9 * knots_s).astype("timedelta64[ns]")),
@@ -421,15 +429,17 @@ def refined_stage(
         },
         attrs={
             "frame": scene.grid.frame,
-            "flags": Flags(found.flags),
+            "flags": Flags(refinement.flags),
             "nodes": nodes,
             "pairs": list(extra_path_m),
-            "decisions": {one.name: {"value": one.value, "reason": one.reason} for one in decisions},
-            "accepted": found.accepted,
-            "why": found.why,
-            "report": dict(found.report),
-            # the effect of the remaining errors by the fields of `Effect`, where it is known
-            "left": {effect: found.report[name] for effect, name in named.items() if known},
+            "decisions": {
+                decision.name: {"value": decision.value, "reason": decision.reason} for decision in decisions
+            },
+            "accepted": refinement.accepted,
+            "reason": refinement.reason,
+            "report": dict(refinement.report),
+            # effect of the residual errors, by the fields of `Effect`, if it is known
+            "left": {effect: refinement.report[name] for effect, name in report_names.items() if has_residual},
         },
     )
 
@@ -437,9 +447,10 @@ def refined_stage(
 def _logged_positions(
     records: Collection[PairRecord], knots_s: NDArray[np.float64]
 ) -> Mapping[str, NDArray[np.float64]]:
-    """Return node → (knot, 3), its radar phase centre as the log has it, in the first pair that it takes part in."""
-    places: dict[str, NDArray[np.float64]] = {}
-    for one in records:
-        for node, leg in zip(one.nodes, one.profiles.aperture.legs, strict=True):
-            places.setdefault(node, np.stack([np.interp(knots_s, one.time_s, axis) for axis in leg.T], axis=-1))
-    return places
+    """Return node → (knot, 3), radar phase centre from the log, in the first pair of the node."""
+    positions: dict[str, NDArray[np.float64]] = {}
+    for record in records:
+        for node, leg in zip(record.nodes, record.profiles.aperture.legs, strict=True):
+            at_knots = [np.interp(knots_s, record.time_s, axis) for axis in leg.T]
+            positions.setdefault(node, np.stack(at_knots, axis=-1))
+    return positions

@@ -1,4 +1,4 @@
-"""Rule `ro_crate`: the whole run as an RO-Crate, results/ro-crate-metadata.json; last of all."""
+"""Rule `ro_crate`: description of the whole run as an RO-Crate, results/ro-crate-metadata.json; the last step."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -19,7 +19,7 @@ from apertura.workflow.rules import RESULTS, RULES
 
 
 def ro_crate(campaign: Campaign) -> Sequence[Path]:
-    """Write results/ro-crate-metadata.json, and the workflow beside it; return their paths."""
+    """Write results/ro-crate-metadata.json, and a copy of the workflow next to it; return their paths."""
     lineage = result_of(campaign, "ro_crate").begin(campaign.root)
     folder = shipped() / "workflow"
     paths = [folder / "Snakefile", *sorted((folder / "rules").glob("*.smk"))]
@@ -28,12 +28,12 @@ def ro_crate(campaign: Campaign) -> Sequence[Path]:
     manifest.unlink(missing_ok=True)
     for name, text in workflow.items():
         write_text(campaign.result(name), text)
-    made = list(_results(campaign))
-    read = {name: sha256 for one in reversed(made) for name, sha256 in one.recorded["sources"].items()}
-    known = {**read, **lineage.sources.digests}
-    # recordings as they were when they were read, and the config as it is
-    inputs = sorted(name for name in known if not name.startswith("results/"))
-    catalog, expected = campaign.result("stac", CATALOG), "the catalog that step stac writes"
+    results = list(_results(campaign))
+    read = {name: sha256 for one in reversed(results) for name, sha256 in one.recorded["sources"].items()}
+    # Hashes of recordings are those at the time they were read, hashes of the config are current.
+    hashes = {**read, **lineage.sources.digests}
+    inputs = sorted(name for name in hashes if not name.startswith("results/"))
+    catalog, expected = campaign.result("stac", CATALOG), "the catalogue that step stac writes"
     remedy = remake(campaign.result("stac"))
     document = read_json(catalog, expected=expected, remedy=remedy)
     with undamaged(catalog, expected=expected, remedy=remedy):
@@ -43,8 +43,8 @@ def ro_crate(campaign: Campaign) -> Sequence[Path]:
         recorded_until,
         software(),
         lock_sha256(),
-        list(_jobs(campaign, made, known)),
-        [Listed(name, known[name], _size(campaign.root.named(name, where=campaign.root))) for name in inputs],
+        list(_jobs(campaign, results, hashes)),
+        [Listed(name, hashes[name], _size(campaign.root.named(name, where=campaign.root))) for name in inputs],
         [Listed(name, sha256_text(text), len(text.encode())) for name, text in workflow.items()],
         author=campaign.settings.metadata.author,
         licence=campaign.settings.metadata.licence,
@@ -56,8 +56,8 @@ def ro_crate(campaign: Campaign) -> Sequence[Path]:
     return written
 
 
-class _Made(NamedTuple):
-    """A result and its manifest."""
+class _FinishedResult(NamedTuple):
+    """Result of the campaign with its manifest."""
 
     name: str
     where: tuple[str, ...]
@@ -65,7 +65,7 @@ class _Made(NamedTuple):
     recorded: Mapping[str, Any]
 
 
-def _results(campaign: Campaign) -> Iterator[_Made]:
+def _results(campaign: Campaign) -> Iterator[_FinishedResult]:
     """Yield every result that the crate describes."""
     for name, where, result in places_of(campaign):
         if name != "ro_crate" and not on_demand(campaign, result.manifest):
@@ -73,26 +73,27 @@ def _results(campaign: Campaign) -> Iterator[_Made]:
             recorded, expected = read_manifest(path), "a manifest that states the sources of a result"
             with undamaged(path, expected=expected, remedy=remake_from(path)):
                 hashes = {key: str(recorded[key]) for key in ("code", "settings")}
-                yield _Made(name, where, result, {**recorded, **hashes, "sources": dict(recorded["sources"])})
+                sources = dict(recorded["sources"])
+                yield _FinishedResult(name, where, result, {**recorded, **hashes, "sources": sources})
 
 
-def _jobs(campaign: Campaign, made: Sequence[_Made], known: Mapping[str, str]) -> Iterator[CrateJob]:
-    """Yield every job behind some results; one job makes several.
+def _jobs(campaign: Campaign, results: Sequence[_FinishedResult], hashes: Mapping[str, str]) -> Iterator[CrateJob]:
+    """Yield every job that wrote some of the results; a job may write several.
 
     Parameters
     ----------
     campaign
-        Its folder has the files.
-    made
-        The results.
-    known
-        File of the campaign → sha256, of inputs as the first result found them, of results as they are.
+        Campaign with the files.
+    results
+        Finished results.
+    hashes
+        File of the campaign → SHA-256, of inputs when they were first read, of results as they are now.
     """
-    jobs = dict[tuple[str, tuple[str, ...]], list[_Made]]()
-    for one in made:
+    jobs = dict[tuple[str, tuple[str, ...]], list[_FinishedResult]]()
+    for one in results:
         jobs.setdefault((RESULTS[one.name].name, one.where), []).append(one)
     for (rule, where), parts in jobs.items():
-        doubts = [doubt for one in parts for doubt in _differences(one.recorded, one.result, known)]
+        doubts = [doubt for one in parts for doubt in _differences(one.recorded, one.result, hashes)]
         yield CrateJob(
             rule,
             where,
@@ -100,28 +101,28 @@ def _jobs(campaign: Campaign, made: Sequence[_Made], known: Mapping[str, str]) -
             parts[0].recorded["code"],
             {name: value for one in parts for name, value in one.result.settings.items()},
             list(dict.fromkeys(source for one in parts for source in one.recorded["sources"])),
-            [file for one in parts for file in _files(campaign, one, known)],
+            [file for one in parts for file in _files(campaign, one, hashes)],
             list(dict.fromkeys(doubts)),
         )
 
 
-def _differences(recorded: Mapping[str, Any], result: Result, known: Mapping[str, str]) -> Iterator[str]:
-    """Yield the reasons why a result would be made otherwise today."""
+def _differences(recorded: Mapping[str, Any], result: Result, hashes: Mapping[str, str]) -> Iterator[str]:
+    """Yield the differences of a result's code, settings and sources from the current ones."""
     if recorded["code"] != result.code_sha256:
-        yield f"made by other code than is installed now, which is {result.code_sha256}"
+        yield f"written by code other than the installed one, whose sha256 is {result.code_sha256}"
     if recorded["settings"] != result.settings_sha256:
-        yield f"made under other settings than these, of sha256 {recorded['settings']}"
+        yield f"written with other settings, of sha256 {recorded['settings']}"
     for name, sha256 in recorded["sources"].items():
-        if known.get(name) != sha256:
-            yield f"made from {name} of sha256 {sha256}, which has changed since"
+        if hashes.get(name) != sha256:
+            yield f"written from {name} of sha256 {sha256}, which has changed since"
 
 
-def _files(campaign: Campaign, one: _Made, known: Mapping[str, str]) -> list[Listed]:
-    """Return the files of a result and its manifest."""
+def _files(campaign: Campaign, one: _FinishedResult, hashes: Mapping[str, str]) -> list[Listed]:
+    """Return the files of a result, including its manifest."""
     manifest = one.result.manifest.removeprefix("results/")
     folder, where = manifest.rpartition("/")[0], campaign.root / one.result.manifest
     files = {f"{folder}/{name}" if folder else name: sha256 for name, sha256 in sorted(one.recorded["files"].items())}
-    files[manifest] = known[one.result.manifest]
+    files[manifest] = hashes[one.result.manifest]
     return [Listed(name, sha256, _size(campaign.results.named(name, where=where))) for name, sha256 in files.items()]
 
 

@@ -1,4 +1,4 @@
-"""Rules `scene` and `terrain`: the campaign's one grid, every `auto` settled once, and the height of each pixel."""
+"""Rules `scene` and `terrain`: the grid of the campaign with all `auto` settings resolved, and its terrain heights."""
 
 import operator
 from collections.abc import Callable, Mapping, Sequence
@@ -38,25 +38,25 @@ from apertura.core.scene.terrain import FlatGround, GridHeights, Terrain
 from apertura.stages.tags import stamped
 from apertura.workflow.lineage import result_of
 
-# ---- Ground of the config: flat at a height, or a DEM ---------------------------------------------------------------
+# ---- Configured terrain: flat at a height, or a DEM ------------------------------------------------------------------
 
 _BLOCKS = 32
 
 
 @dataclass(frozen=True)
 class ConfiguredGround:
-    """Ground stated in the config: flat at a height, or a DEM; and the files that it needs.
+    """Configured terrain, flat at a height or a DEM, with the files that it needs.
 
     Attributes
     ----------
     flat_m
-        Height of flat ground above `height_datum`, metres.
+        Height of flat terrain above `height_datum`, metres.
     dem
-        The DEM; None: flat ground.
+        DEM; None: flat terrain.
     geoid
-        Grid of the geoid that `flat_m` counts from; None: the ellipsoid.
+        Geoid grid to which `flat_m` refers; None: `flat_m` is ellipsoidal.
     crs
-        Of the scene.
+        CRS of the scene.
     """
 
     flat_m: float
@@ -66,31 +66,31 @@ class ConfiguredGround:
 
     @classmethod
     def of(cls, requested: Scene, files: Mapping[str, Path], *, crs: str) -> "ConfiguredGround":
-        """Open what section `scene` names; `files` are those of `Campaign.height_files`."""
-        named = files.get("geoid")
+        """Open the terrain of section `scene`; `files` are those of `Campaign.height_files`."""
+        geoid_path = files.get("geoid")
         if requested.dem and requested.dem_datum:
-            dem = open_dem(files["dem"], crs, datum=requested.dem_datum, geoid=named)
+            dem = open_dem(files["dem"], crs, datum=requested.dem_datum, geoid=geoid_path)
             return cls(requested.height_m, dem, None, crs)
-        geoid = None if requested.height_datum == "ellipsoid" else geoid_file(requested.height_datum, named)
+        geoid = None if requested.height_datum == "ellipsoid" else geoid_file(requested.height_datum, geoid_path)
         return cls(requested.height_m, None, geoid, crs)
 
     @property
     def inputs(self) -> dict[str, str]:
-        """Role → sha256 of the DEM and of the grid of the geoid, as far as there are any."""
+        """Role → SHA-256 of the DEM and of the geoid grid, as far as they are used."""
         files = {"dem": self.dem.path if self.dem else None, "geoid": self.dem.geoid if self.dem else self.geoid}
         return {role: sha256_file(path) for role, path in files.items() if path}
 
     def height_at(self, x_m: float, y_m: float) -> float:
-        """Return the ellipsoidal height (m) of the ground at a place in the scene's CRS; raise where it has none."""
+        """Return the ellipsoidal terrain height (m) at a point in the scene's CRS; raise CampaignError if unknown."""
         if self.dem:
             height_m = float(self.dem.heights(SceneGrid(self.crs, x_m - 0.5, y_m + 0.5, 1.0, (1, 1)))[0, 0])
             if np.isfinite(height_m):
                 return height_m
             raise CampaignError(
-                f"no height at ({x_m:.1f}, {y_m:.1f}) under the track, where scene.bounds_m: auto starts from",
+                f"no height at ({x_m:.1f}, {y_m:.1f}) below the track, which scene.bounds_m: auto requires",
                 where=self.dem.path,
-                expected="a DEM that reaches there and has no void there",
-                remedy="Get the missing part, fill the void, or state scene.bounds_m.",
+                expected="a DEM that covers this point without a void",
+                remedy="Extend the DEM, fill the void, or state scene.bounds_m.",
             )
         if self.geoid is None:
             return self.flat_m
@@ -98,30 +98,30 @@ class ConfiguredGround:
         return self.flat_m + float(undulation(self.geoid, longitude, latitude))
 
     def level(self, grid: SceneGrid) -> FlatGround:
-        """Return flat ground for a whole grid: at the height stated, or at the mean of the DEM (to the millimetre).
+        """Return flat terrain for a whole grid: at the configured height, or at the mean of the DEM (rounded to 1 mm).
 
         Raises
         ------
         CampaignError
-            If the DEM does not reach over the grid.
+            If the DEM does not cover the grid.
         """
         xmin, ymin, xmax, ymax = grid.bounds_m
         if self.dem is None:
             return FlatGround(self.height_at((xmin + xmax) / 2, (ymin + ymax) / 2))
         self.dem.check_cover(grid)
         heights = self.dem.heights(grid.coarse(_BLOCKS))
-        known = np.isfinite(heights)
-        return FlatGround(round(float(heights[known].mean()), 3) if known.any() else 0.0)
+        finite = np.isfinite(heights)
+        return FlatGround(round(float(heights[finite].mean()), 3) if finite.any() else 0.0)
 
     @property
     def reason(self) -> dict[str, str]:
-        """Why flat ground lies where `level` puts it; nothing where the config states it."""
+        """Origin of the height of `level`; empty if the config states it as an ellipsoidal height."""
         if self.dem:
             return {"height_m": "mean of the DEM over the scene"}
-        return {"height_m": "height_m and the undulation at the scene's middle"} if self.geoid else {}
+        return {"height_m": "height_m plus the geoid undulation at the scene centre"} if self.geoid else {}
 
 
-# ---- Grid and ground of a campaign, from its results or its config --------------------------------------------------
+# ---- Grid and terrain of a campaign, from its results or its config --------------------------------------------------
 
 _FARTHEST_M = 1e9
 
@@ -130,12 +130,12 @@ Bounds = tuple[float, float, float, float]
 
 @dataclass(frozen=True)
 class Flown:
-    """Geometry and band from which `auto` settles the grid.
+    """Geometry and band of a flight, from which `auto` derives the grid.
 
     Attributes
     ----------
     aperture
-        In ECEF or the local frame.
+        Aperture in ECEF or the local frame.
     frequency_hz
         (subcarrier,) float64.
     path_limit_m
@@ -148,29 +148,29 @@ class Flown:
 
     @classmethod
     def together(cls, pairs: Sequence["Flown"]) -> "Flown":
-        """Join the geometry of all pairs of a flight: a campaign has one grid, whichever pair is imaged."""
+        """Join the geometry of all pairs of a flight; the grid of a campaign does not depend on the imaged pair."""
         tx_m, rx_m = (np.concatenate([flown.aperture.legs[leg] for flown in pairs]) for leg in (0, 1))
         return cls(Aperture(tx_m, rx_m), pairs[0].frequency_hz, min(flown.path_limit_m for flown in pairs))
 
 
 @dataclass(frozen=True)
 class OpenScene:
-    """A campaign's grid and ground.
+    """Grid and terrain of a campaign.
 
     Attributes
     ----------
     grid
-        Of every raster.
+        Grid of every raster.
     level
-        Flat ground: where it is stated, or at the mean of the DEM.
+        Flat terrain at the configured height, or at the mean of the DEM.
     terrain
-        The ground itself: `level`, or the DEM's heights.
+        Terrain: `level`, or the heights of the DEM.
     parents
-        The stage `terrain`, or nothing: what is made on it inherits its provenance.
+        Stage `terrain` if there is a DEM, for the provenance of results that depend on it.
     inputs
-        Role → sha256 of the files that the heights come from.
+        Role → SHA-256 of the files of heights.
     chosen
-        Key of the config's `scene` → why it was settled so.
+        Key of section `scene` → reason for its automatic value.
     """
 
     grid: SceneGrid
@@ -187,12 +187,12 @@ class OpenScene:
 
     @cached_property
     def middle_m(self) -> NDArray[np.float64]:
-        """The ground in the middle, (3,) float64 metres in the frame of the pixels."""
+        """Scene centre on the terrain, (3,) float64 metres in the frame of the pixels."""
         return self.grid.positions_at(*self._middle)
 
     @cached_property
     def axes(self) -> NDArray[np.float64]:
-        """Unit vectors along easting, northing and height there, the rows of (3, 3) float64."""
+        """Unit vectors along easting, northing and height at the scene centre, the rows of (3, 3) float64."""
         row, column, height_m = self._middle
         steps = [
             self.grid.positions_at(row, column + 1, height_m) - self.middle_m,
@@ -208,12 +208,12 @@ class OpenScene:
 
     @property
     def report(self) -> dict[str, Any]:
-        """Terrain for image.json; empty for flat ground."""
+        """Report on the terrain for image.json; empty for flat terrain."""
         return {"terrain": self.parents[0].attrs["terrain"]} if self.parents else {}
 
     @property
     def flags(self) -> dict[str, str]:
-        """Flags of the terrain for images: name → what was measured, in one line."""
+        """Flags of the terrain for images."""
         step = self.report.get("terrain", {}).get("steepest_step")
         if step is None:
             return {}
@@ -224,41 +224,41 @@ class OpenScene:
 
 
 def settled_scene(campaign: Campaign) -> OpenScene:
-    """Return the scene of results/scene.json on level ground; `open_scene` also opens the ground itself.
+    """Return the scene of results/scene.json with flat terrain; `open_scene` also opens the terrain heights.
 
     Raises
     ------
     CampaignError
-        If the grid is not settled yet, or its file is damaged.
+        If scene.json does not exist yet, or is damaged.
     """
     path = campaign.result("scene.json")
     document = open_document(path)
-    with undamaged(path, expected="the grid that the workflow settles", remedy=remake(path)):
+    with undamaged(path, expected="the grid that step scene writes", remedy=remake(path)):
         grid, level = document["grid"], FlatGround(_number(document["height_m"]))
-        places = {name: _number(grid[name]) for name in ("west_m", "north_m", "spacing_m")}
+        metres = {name: _number(grid[name]) for name in ("west_m", "north_m", "spacing_m")}
         shape, first = ((operator.index(grid[name][0]), operator.index(grid[name][1])) for name in ("shape", "first"))
         crs, name = plain_crs(_text(grid["crs"])), _text(grid["name"])
         try:
-            whole = SceneGrid(crs, **places, shape=shape, first=first, name=name)
-        except CampaignError as none:
-            raise ValueError(none.found) from none
+            whole = SceneGrid(crs, **metres, shape=shape, first=first, name=name)
+        except CampaignError as error:
+            raise ValueError(error.found) from error
         return OpenScene(whole, level, level, (), dict(document["inputs"]), dict(document["chosen"]))
 
 
 def _text(value: object) -> str:
     if not isinstance(value, str):
-        raise TypeError(f"{quoted(value)} is no text")
+        raise TypeError(f"{quoted(value)} is not text")
     return value
 
 
 def _number(value: object) -> float:
     if not isinstance(value, int | float) or not abs(value) < _FARTHEST_M:
-        raise TypeError(f"{quoted(value)} is no number of metres")
+        raise TypeError(f"{quoted(value)} is not a length in metres")
     return float(value)
 
 
 def open_scene(campaign: Campaign) -> OpenScene:
-    """Return the settled scene with its ground: the stage `terrain`, read by windows, where there is a DEM."""
+    """Return the scene of results/scene.json with its terrain; heights of a DEM are read by windows."""
     scene = settled_scene(campaign)
     if campaign.settings.scene.dem is None:
         return scene
@@ -269,13 +269,13 @@ def open_scene(campaign: Campaign) -> OpenScene:
 
 
 def expected_scene(campaign: Campaign, flown: Callable[[], Flown]) -> OpenScene:
-    """Return the scene as `open_scene`, or before that as planned; voids of a DEM are rejected here too.
+    """Return the scene as `open_scene` does, or the planned scene before that; voids of a DEM raise CampaignError.
 
-    `flown` gives the apertures of the first image flight; needed only where something is `auto`.
+    `flown` returns the apertures of the first image flight; it is called only for `auto` settings.
     """
     requested = campaign.settings.scene
-    settles = "auto" in {requested.crs, requested.bounds_m, requested.spacing_m}
-    if settles and campaign.is_current(campaign.result("scene.json")):
+    is_automatic = "auto" in {requested.crs, requested.bounds_m, requested.spacing_m}
+    if is_automatic and campaign.is_current(campaign.result("scene.json")):
         scene = settled_scene(campaign)
     else:
         grid, ground, chosen = settled(campaign, flown)
@@ -290,14 +290,14 @@ def expected_scene(campaign: Campaign, flown: Callable[[], Flown]) -> OpenScene:
 
 
 def settled(campaign: Campaign, flown: Callable[[], Flown]) -> tuple[SceneGrid, ConfiguredGround, dict[str, str]]:
-    """Return the requested grid, every `auto` decided from a flight; its ground; and the reasons.
+    """Return the configured grid with `auto` settings derived from a flight, its terrain, and the reasons.
 
     Parameters
     ----------
     campaign
-        With its settings.
+        Campaign with its settings.
     flown
-        Gives the apertures of the first image flight; needed only where something is `auto`.
+        Returns the apertures of the first image flight; called only for `auto` settings.
     """
     requested, chosen = campaign.settings.scene, {}
     crs, bounds, spacing = requested.crs, requested.bounds_m, requested.spacing_m
@@ -308,9 +308,9 @@ def settled(campaign: Campaign, flown: Callable[[], Flown]) -> tuple[SceneGrid, 
     if bounds == "auto":
         first = flown()
         east, north = map_from_frame(crs, _middle(first))[:2]
-        height_m = ground.height_at(float(east), float(north))  # under the track
+        height_m = ground.height_at(float(east), float(north))  # below the track
         bounds = auto_bounds(first.aperture, crs=crs, height_m=height_m, path_limit_m=first.path_limit_m)
-        chosen["bounds_m"] = "ground that the first image flight illuminates well (docs/theory.md, eq. 8)"
+        chosen["bounds_m"] = "area that the first image flight illuminates well (docs/theory.md, eq. 8)"
     if spacing == "auto":
         finest = _spacing(flown(), ground, bounds, height_m)
         chosen["spacing_m"] = "a third of the finest resolution cell (docs/theory.md, eq. 8)"
@@ -319,8 +319,9 @@ def settled(campaign: Campaign, flown: Callable[[], Flown]) -> tuple[SceneGrid, 
         if spacing > finest:
             megapixels = (bounds[2] - bounds[0]) * (bounds[3] - bounds[1]) / finest**2 / 1e6
             chosen["spacing_m"] = (
-                f"coarser than a third of the finest resolution cell, {finest:g} m, which on automatic bounds makes "
-                f"{megapixels:.3g} Mpx, more than the {most / 1e6:.3g} Mpx that this pass fills: state scene.bounds_m"
+                f"coarser than {finest:g} m, a third of the finest resolution cell: with automatic bounds that spacing "
+                f"requires {megapixels:.3g} Mpx, more than the limit of {most / 1e6:.3g} Mpx for this flight; for a "
+                "finer spacing, state scene.bounds_m"
             )
     if "auto" in {requested.bounds_m, requested.spacing_m}:
         xmin, ymin, xmax, ymax = bounds
@@ -331,7 +332,7 @@ def settled(campaign: Campaign, flown: Callable[[], Flown]) -> tuple[SceneGrid, 
 
 
 def _spacing(flown: Flown, ground: ConfiguredGround, bounds: Bounds, height_m: float | None) -> float:
-    """Return automatic spacing; on stated bounds the ground's level is taken on pixels made just for that."""
+    """Return the automatic pixel spacing; with configured bounds, the mean height is computed on a coarse grid."""
     if height_m is None:
         xmin, ymin, xmax, ymax = bounds
         side_m = min(xmax - xmin, ymax - ymin) / COVER_NODES
@@ -344,11 +345,11 @@ def _middle(flown: Flown) -> NDArray[np.float64]:
     return np.asarray(np.median(np.concatenate(flown.aperture.legs), axis=0))
 
 
-# ---- Rule `scene`: the campaign's one grid, every `auto` decided once -----------------------------------------------
+# ---- Rule `scene`: the grid of the campaign, with all `auto` settings resolved ---------------------------------------
 
 
 def scene(campaign: Campaign) -> Path:
-    """Write results/scene.json: the grid requested in config/config.yaml, the height of its ground, and reasons."""
+    """Write results/scene.json: the configured grid, its mean terrain height, and the reasons of automatic values."""
     lineage = result_of(campaign, "scene").begin(campaign.root)
     grid, ground, chosen = settled(campaign, cache(lambda: _first_flight(campaign)))
     path, height_m = campaign.result("scene.json"), ground.level(grid).height_m
@@ -381,7 +382,7 @@ def terrain(campaign: Campaign) -> Path:
     Raises
     ------
     CampaignError
-        If the config names no DEM, or the DEM does not reach over the scene or has voids in it.
+        If the config names no DEM, or the DEM does not cover the scene or has voids within it.
     """
     scene, folder = settled_scene(campaign), campaign.stage("terrain")
     grid, ground = scene.grid, ConfiguredGround.of(campaign.settings.scene, campaign.height_files(), crs=scene.grid.crs)
@@ -390,14 +391,15 @@ def terrain(campaign: Campaign) -> Path:
             "no DEM",
             where="config/config.yaml: scene.dem",
             expected="a GeoTIFF of heights",
-            remedy="Flat ground needs no terrain; name a DEM and its dem_datum, or leave this step out.",
+            remedy="State a DEM and its dem_datum; flat terrain does not need this step.",
         )
     lineage = result_of(campaign, "terrain").begin(campaign.root)
     ground.dem.check_cover(grid)
     windows = list(grid.tiles(campaign.settings.processing.tile_px))
     with writing(folder) as wip:
         missing = resume(wip, _empty_terrain(scene, ground, lineage), "height", windows)
-        print(f"{len(missing)} of {number_of(len(windows), 'tile')} to read from {ground.dem.path.name}", flush=True)
+        count = number_of(len(windows), "tile")
+        print(f"reading {len(missing)} of {count} from {ground.dem.path.name}", flush=True)
         heights = open_array(wip, "height")
         for window in missing:
             heights[window] = ground.dem.heights(grid[window])
@@ -417,7 +419,7 @@ def terrain(campaign: Campaign) -> Path:
 
 
 def _empty_terrain(scene: OpenScene, ground: ConfiguredGround, lineage: Lineage) -> xr.Dataset:
-    """Return the stamped stage without its heights."""
+    """Return stage `terrain` with provenance and without heights."""
     return stamped(
         xr.Dataset(
             {"height": (("y", "x"), np.broadcast_to(np.float64(0), scene.grid.shape))},

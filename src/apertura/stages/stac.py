@@ -1,4 +1,4 @@
-"""Rule `stac`: every image of a campaign in a static STAC catalog."""
+"""Rule `stac`: static STAC catalogue of all images of a campaign."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -34,17 +34,17 @@ from apertura.stages.scene import OpenScene, settled_scene
 from apertura.workflow.lineage import result_of
 
 _SUMS = {"coherent": "SLC", "noncoherent": "MLI"}
-"""Sum of a flight's pairs → type of product; what begins with the name of the other is not its file."""
+"""Sum of a flight's pairs → type of product; file names of a sum begin with its name."""
 
 
 def stac(campaign: Campaign) -> list[Path]:
-    """Write results/stac/; return the path of catalog.json, where it begins."""
+    """Write results/stac/; return the path of its root, catalog.json."""
     lineage = result_of(campaign, "stac").begin(campaign.root)
     manifest, folder = campaign.root / lineage.result.manifest, campaign.result("stac")
-    described = _Described(campaign, settled_scene(campaign))
-    stated = campaign.settings.metadata
-    by_whom = {"licence": stated.licence, "author": stated.author, "doi": stated.doi}
-    files = catalog_files(campaign.settings.campaign, described.images(), **by_whom)
+    images = _ImageDescriptions(campaign, settled_scene(campaign)).images()
+    metadata = campaign.settings.metadata
+    attribution = {"licence": metadata.licence, "author": metadata.author, "doi": metadata.doi}
+    files = catalog_files(campaign.settings.campaign, images, **attribution)
     manifest.unlink(missing_ok=True)
     for name, document in files.items():
         write_json(campaign.result("stac", name), document)
@@ -53,21 +53,21 @@ def stac(campaign: Campaign) -> list[Path]:
 
 
 @dataclass(frozen=True)
-class _Described:
-    """A campaign whose images are described."""
+class _ImageDescriptions:
+    """Descriptions of the images of a campaign."""
 
     campaign: Campaign
     scene: OpenScene
 
     def images(self) -> list[Image]:
-        """Return the catalog's images by flight: every pair, then every sum."""
+        """Return the images of the catalogue by flight: every pair, then every sum."""
         images = []
         for flight in self.campaign.image_flights:
             looks = {pair: few_looks(self.campaign, flight.name, pair) for pair in flight.pairs}
             pairs = [self._pair(flight.name, pair, looks[pair]) for pair in flight.pairs]
-            together = np.sum(list(looks.values()), axis=0)
+            all_looks = np.sum(list(looks.values()), axis=0)
             sums = _SUMS if FUSED in flight.images else ()
-            images += pairs + [self._sum(flight.name, name, pairs, together) for name in sums]
+            images += pairs + [self._sum(flight.name, name, pairs, all_looks) for name in sums]
         return images
 
     def _pair(self, flight: str, pair: str, looks: NDArray[np.float32]) -> Image:
@@ -112,13 +112,13 @@ class _Described:
         )
 
     def _listed(self, flight: str, name: str, result: str) -> dict[Path, str]:
-        """Return the files of a result with their hashes, as its manifest has them."""
+        """Return the files of a result with the hashes in its manifest."""
         manifest = self.campaign.root / self.campaign.manifest(result, flight, name)
         hashes: Mapping[str, str] = read_manifest(manifest)["files"]
         return {manifest.parent.named(file, where=manifest): digest for file, digest in hashes.items()}
 
     def _assets(self, files: Mapping[Path, str]) -> tuple[dict[str, Any], dict[str, str]]:
-        """Return the assets of some files by their keys, and file → sha256 of what their rasters were made from."""
+        """Return the assets of files by their keys, and file → SHA-256 of the inputs of the rasters."""
         assets, inputs = {}, dict[str, str]()
         for path, digest in files.items():
             if not path.is_file():
@@ -139,12 +139,12 @@ class _Described:
         code = read_manifest(manifest).get("code", "unknown")
         with undamaged(path, expected="the report of an image", remedy=remedy):
             verdict, facts = str(report["focus"]["verdict"]), dict[str, Any]()
-            if verdict == "focused":  # widths at -3 dB of the brightest point
+            if verdict == "focused":  # -3 dB widths of the brightest point
                 brightest = report.get("brightest") or {}
                 for axis, width in (("range", "ground_range_width_m"), ("azimuth", "cross_range_width_m")):
                     if brightest.get(width) is not None:
                         facts[f"sar:resolution_{axis}"] = float(brightest[width])
-            if "view" in report:  # direction in which the pair looks at the middle of the scene
+            if "view" in report:  # look direction of the pair at the scene centre
                 view = report["view"]
                 directions = {"sar:observation_direction": view["side"], "view:azimuth": view["look_deg"]}
                 facts |= {name: value for name, value in directions.items() if value not in {"both", None}}
@@ -177,8 +177,9 @@ class _Described:
 
     def _footprint(self, looks: NDArray[np.float32]) -> dict[str, Any] | None:
         covered, transform = Covered("", "", {}, looks), transform_of(self.scene.grid, looks)
-        found = feature_collection([covered], transform, place_of(self.scene), height_m=self.scene.level.height_m)
-        geometry: dict[str, Any] | None = found["features"][0]["geometry"]
+        height_m = self.scene.level.height_m
+        collection = feature_collection([covered], transform, place_of(self.scene), height_m=height_m)
+        geometry: dict[str, Any] | None = collection["features"][0]["geometry"]
         return geometry if geometry and geometry["coordinates"] else None
 
     def _acquisition(self, flight: str, pair: str) -> AcquisitionTime:

@@ -1,4 +1,4 @@
-"""Attributes of stages and tags of GeoTIFFs: settings, inputs, code, those of the stages before, time and quality."""
+"""Provenance attributes of stages, and GeoTIFF tags: settings, inputs and code of upstream stages, time, quality."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -32,16 +32,16 @@ def stamped(
     settings: Mapping[str, Any] | None = None,
     inputs: Mapping[str, str] | None = None,
 ) -> xr.Dataset:
-    """Return `dataset` checked and stamped with its own and its parents' provenance.
+    """Return a checked dataset with its own and its parents' provenance as attributes.
 
     Parameters
     ----------
     dataset
-        What the step computed.
+        Dataset computed by the step.
     stage
         A key of `apertura.common.contracts.STAGES`.
     modules
-        ``__name__`` of the step's module and of modules named by rows of tables; the code hash covers their imports.
+        ``__name__`` of the step's module and of modules named in tables; the code hash covers their imports.
     parents, settings, inputs
         As `apertura.common.provenance.Provenance.of`.
     """
@@ -55,9 +55,9 @@ def tags_of(origin: Provenance, lineage: Lineage) -> dict[str, str]:
     Parameters
     ----------
     origin
-        Settings, inputs and code, its own and those of the stages before it.
+        Settings, inputs and code of the file and of all upstream stages.
     lineage
-        Of the result, with the sha256 of each of its sources.
+        Lineage of the result, with the SHA-256 of each of its sources.
     """
     return replace(origin, software=joined(origin.software, software())).tags() | {
         "APERTURA_SOURCES": canonical_json(lineage.sources.digests),
@@ -74,22 +74,22 @@ def stamp(
     code_sha256: str,
     software: Mapping[str, str] | None = None,
 ) -> xr.Dataset:
-    """Check `dataset` and write units and provenance into its attributes.
+    """Check a dataset and write units and provenance into its attributes.
 
     Parameters
     ----------
     dataset
-        What the stage computed.
+        Dataset computed by the stage.
     stage
         A key of `STAGES`.
     runspec
-        Settings that this stage and those before it used.
+        Settings used by this stage and all upstream stages.
     inputs
-        Role → sha256 of each thing read.
+        Role → SHA-256 of each input.
     code_sha256
-        Chain of the code hashes of this stage and those before it.
+        Chained code hashes of this stage and all upstream stages.
     software
-        Package → version, of this stage and those before it.
+        Package → version, of this stage and all upstream stages.
 
     Returns
     -------
@@ -103,12 +103,12 @@ def stamp(
     """
     stamped = check(dataset, stage).copy()
     contract = STAGES[stage]
-    for name, promise in {**contract.variables, **contract.optional}.items():
+    for name, variable in {**contract.variables, **contract.optional}.items():
         if name not in dataset.variables:
             continue
-        if promise.unit:
-            stamped[name].attrs["units"] = promise.unit
-        stamped[name].attrs["long_name"] = promise.meaning
+        if variable.unit:
+            stamped[name].attrs["units"] = variable.unit
+        stamped[name].attrs["long_name"] = variable.meaning
         if name in STANDARD_NAMES:
             stamped[name].attrs["standard_name"] = STANDARD_NAMES[name]
     stamped.attrs |= {
@@ -122,42 +122,43 @@ def stamp(
     return stamped
 
 
-_FIRST_CLOCK = np.datetime64("1980-01-06")  # a recording without a clock counts from 1970
+_FIRST_CLOCK = np.datetime64("1980-01-06")  # times of a recording without a clock count from 1970
 
 
 def acquisition_tags(campaign: Campaign, views: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
-    """Return time, frequency, side and author of an image as tags; of a sum, those of its pairs together."""
+    """Return time, frequency, look side and author of an image as tags; for a sum, of all its pairs together."""
     each = list(views.values())
-    first, last = min(one["first_utc"] for one in each), max(one["last_utc"] for one in each)
-    centres = {one["centre_hz"] for one in each}
-    low, high = (f(one["centre_hz"] + sign * one["band_hz"] / 2 for one in each) for f, sign in ((min, -1), (max, 1)))
+    first, last = min(view["first_utc"] for view in each), max(view["last_utc"] for view in each)
+    centres = {view["centre_hz"] for view in each}
+    low = min(view["centre_hz"] - view["band_hz"] / 2 for view in each)
+    high = max(view["centre_hz"] + view["band_hz"] / 2 for view in each)
     centre_hz = centres.pop() if len(centres) == 1 else (low + high) / 2
-    sides = {one["side"] for one in each}
+    sides = {view["side"] for view in each}
     side = sides.pop() if len(sides) == 1 else "both"
-    seen = any(one["side_observable"] for one in each)
+    is_observable = any(view["side_observable"] for view in each)
     labels = {label for pair in views if (label := polarisation_of(campaign.settings.nodes, pair))}
-    incidence = [one["incidence_deg"] for one in each]
-    stated, clock = campaign.settings.metadata, np.datetime64(first) >= _FIRST_CLOCK
-    found = {
-        "APERTURA_ACQUISITION_START": f"{first[:26]}Z" if clock else None,
-        "APERTURA_ACQUISITION_END": f"{last[:26]}Z" if clock else None,
+    incidence = [view["incidence_deg"] for view in each]
+    metadata, has_clock = campaign.settings.metadata, np.datetime64(first) >= _FIRST_CLOCK
+    tags = {
+        "APERTURA_ACQUISITION_START": f"{first[:26]}Z" if has_clock else None,
+        "APERTURA_ACQUISITION_END": f"{last[:26]}Z" if has_clock else None,
         "APERTURA_CENTRE_FREQUENCY_HZ": f"{centre_hz:.12g}",
         "APERTURA_BANDWIDTH_HZ": f"{high - low:.12g}",
         "APERTURA_WAVELENGTH_M": f"{SPEED_OF_LIGHT_M_S / centre_hz:.6g}",
-        "APERTURA_LOOK_SIDE": side if side == "both" or seen else f"{side}, assumed",
+        "APERTURA_LOOK_SIDE": side if side == "both" or is_observable else f"{side}, assumed",
         "APERTURA_INCIDENCE_DEG": f"{np.mean(incidence):.2f}",
         "APERTURA_POLARISATION": ", ".join(sorted(labels)) or None,
-        "APERTURA_PLATFORM": stated.platform,
-        "APERTURA_DOI": stated.doi,
-        "TIFFTAG_DATETIME": f"{first[:19].replace('-', ':').replace('T', ' ')}" if clock else None,
-        "TIFFTAG_ARTIST": stated.author,
-        "TIFFTAG_COPYRIGHT": stated.licence,
+        "APERTURA_PLATFORM": metadata.platform,
+        "APERTURA_DOI": metadata.doi,
+        "TIFFTAG_DATETIME": f"{first[:19].replace('-', ':').replace('T', ' ')}" if has_clock else None,
+        "TIFFTAG_ARTIST": metadata.author,
+        "TIFFTAG_COPYRIGHT": metadata.licence,
     }
-    return {name: value for name, value in found.items() if value is not None}
+    return {name: value for name, value in tags.items() if value is not None}
 
 
 def quality_tags(report: Mapping[str, Any]) -> dict[str, str]:
-    """Return engine, error bound, flags, models and budget of an image as tags."""
+    """Return instruction set, error bound, flags, models and error budget of an image as tags."""
     reports = {
         name: report[name] for name in ("budget", "budgets", "focus", "fusion", "recomputed") if report.get(name)
     }

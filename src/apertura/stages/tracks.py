@@ -1,4 +1,4 @@
-"""Rule `tracks`: the logs of a flight as refined, for other programs, with what was moved and how sure that is."""
+"""Rule `tracks`: export of a flight's refined tracks, with their corrections and accuracy."""
 
 from pathlib import Path
 
@@ -20,17 +20,18 @@ from apertura.workflow.rule_inputs import is_sampled
 
 
 def tracks(campaign: Campaign, flight: str) -> list[Path]:
-    """Write results/<flight>/tracks: of each node .csv and, on Earth, .pos, and tracks.png; return their paths.
+    """Write results/<flight>/tracks: per node a .csv and, unless the frame is local, a .pos, and tracks.png.
 
-    Positions that travel with the samples of a phase history are written as phase centres, an epoch per pulse.
-    Where the refinement was not accepted, moved no track or was not tried, the files hold the logs as they are.
+    Returns their paths. Positions stored with the samples of a phase history are written as phase centres, one epoch
+    per pulse. If the refinement was not tried, not accepted, or did not correct a track, the files contain the
+    unchanged logs.
     """
     lineage = result_of(campaign, "tracks", flight).begin(campaign.root)
-    found = open_refined(campaign, flight)
-    positions = {node: _positions(campaign, flight, node) for node in found.stage.attrs["nodes"]}
-    outcome, folder = outcome_of(found), (campaign.root / lineage.result.manifest).parent
+    refined = open_refined(campaign, flight)
+    positions = {node: _positions(campaign, flight, node) for node in refined.stage.attrs["nodes"]}
+    outcome, folder = outcome_of(refined), (campaign.root / lineage.result.manifest).parent
     folder.mkdir(parents=True, exist_ok=True)
-    logs = [refined_log(found, node, track, campaign.node(flight, node)) for node, track in positions.items()]
+    logs = [refined_log(refined, node, track, campaign.node(flight, node)) for node, track in positions.items()]
     written = []
     for log in logs:
         table, solution = (folder / f"{log.node}.{suffix}" for suffix in ("csv", "pos"))
@@ -41,9 +42,9 @@ def tracks(campaign: Campaign, flight: str) -> list[Path]:
             written.append(solution)
     picture = folder / "tracks.png"
     if is_sampled(campaign):
-        provenance = Provenance.of(lineage.modules, [found.stage, *positions.values()])
+        provenance = Provenance.of(lineage.modules, [refined.stage, *positions.values()])
     else:
-        provenance = Provenance.of(lineage.modules, [found.stage], inputs=lineage.sources.digests)
+        provenance = Provenance.of(lineage.modules, [refined.stage], inputs=lineage.sources.digests)
     tags = tags_of(provenance, lineage)
     title = f"{campaign.settings.campaign} · tracks of flight {flight}"
     write_picture(picture, logs, title=title, outcome=outcome, tags=tags)
@@ -52,7 +53,7 @@ def tracks(campaign: Campaign, flight: str) -> list[Path]:
 
 
 def _positions(campaign: Campaign, flight: str, node: str) -> xr.Dataset:
-    """Return the positions of a node as stage `track` holds them: as logged, else of its antenna at the pulses."""
+    """Return the positions of a node in the form of stage `track`: logged, else of its antenna at the pulses."""
     if is_sampled(campaign):
         track: xr.Dataset = open_stage(campaign.stage("track", flight, node), "track")
         return track
@@ -60,48 +61,48 @@ def _positions(campaign: Campaign, flight: str, node: str) -> xr.Dataset:
         return read_log(campaign, flight, node)
     pair = next(pair for pair in campaign.flight(flight).pairs if node in pair.split("-"))
     echo, leg = open_stage(campaign.stage("echo", flight, pair), "echo"), "tx" if pair.startswith(f"{node}-") else "rx"
-    place_m = echo[f"{leg}_position"].values
-    return xr.Dataset(  # its times may be of no calendar, as where a recorder states none
+    position_m = echo[f"{leg}_position"].values
+    return xr.Dataset(  # times are not UTC if the recorder has no clock
         {
             "time": ("epoch", echo.time.values),
-            "position": (("epoch", "axis"), place_m),
-            "attitude": (("epoch", "axis"), np.full(place_m.shape, np.nan)),
+            "position": (("epoch", "axis"), position_m),
+            "attitude": (("epoch", "axis"), np.full(position_m.shape, np.nan)),
         },
         attrs={"node": node, "frame": echo.attrs["frame"]},
     )
 
 
-def outcome_of(found: RefinedTrack) -> str:
-    """Return the outcome of refinement for the tracks of a flight, with the reason, in a line."""
-    decided = found.decisions[0]
-    why = f"autofocus {decided.value}: {decided.reason}"
-    if found.correction is None:
-        return f"as logged: {why}"
-    if found.correction.extra_path_m:
-        return f"as logged: one path offset per pulse and pair was refined, which moves no node; {why}"
-    return f"refined: {why}"
+def outcome_of(refined: RefinedTrack) -> str:
+    """Return the outcome of the refinement for the tracks of a flight, with the reason, in one line."""
+    decision = refined.decisions[0]
+    reason = f"autofocus {decision.value}: {decision.reason}"
+    if refined.correction is None:
+        return f"as logged: {reason}"
+    if refined.correction.extra_path_m:
+        return f"as logged: the refinement estimated one path offset per pulse and pair, and no node position; {reason}"
+    return f"refined: {reason}"
 
 
-def refined_log(found: RefinedTrack, node: str, track: xr.Dataset, settings: Node) -> RefinedLog:
+def refined_log(refined: RefinedTrack, node: str, track: xr.Dataset, settings: Node) -> RefinedLog:
     """Return a node's log with its corrections.
 
     Parameters
     ----------
-    found
+    refined
         Outcome of step `refine`.
     node, track, settings
-        Of the node: its name, its stage `track` and what the config says of it.
+        Name, stage `track` and settings of the node.
     """
     at = track.time.values
-    return RefinedLog(node, track, found.moved_m(node, at), found.left_m(node, at), _stated_m(track, settings))
+    return RefinedLog(node, track, refined.moved_m(node, at), refined.left_m(node, at), _stated_m(track, settings))
 
 
 def _stated_m(track: xr.Dataset, settings: Node) -> Floats:
-    """Return stated errors of a log's epochs, (epoch, 3) metres east, north, up: the log's own, else the config's."""
+    """Return the accuracy of a log's epochs, (epoch, 3) metres east, north, up, from the log, else the config."""
     config_m = np.nan if settings.position_std_m is None else settings.position_std_m
     stated_m = np.array(np.broadcast_to(config_m, track.position.shape), np.float64)
     if "position_std" in track:
-        own_m = track.position_std.values
-        is_stated = (own_m > 0).all(axis=1)  # 0 states nothing, as when an error is budgeted
-        stated_m[is_stated] = own_m[is_stated]
+        logged_m = track.position_std.values
+        is_stated = (logged_m > 0).all(axis=1)  # 0 means that the log states no accuracy, as in the error budget
+        stated_m[is_stated] = logged_m[is_stated]
     return stated_m[:, [1, 0, 2]]

@@ -1,4 +1,4 @@
-"""Transfer functions of a pair: formed from the recording when they are read, recorded, or kept by rule `transfer`."""
+"""Transfer functions of a pair: formed from the recording on reading, recorded, or stored by rule `transfer`."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 from xarray.backends import BackendArray
 from xarray.core import indexing
 
@@ -15,12 +16,13 @@ from apertura.campaign.config import CONFIG, SampledWaveform
 from apertura.campaign.digests import Lineage
 from apertura.campaign.folder import Campaign
 from apertura.campaign.store import finish, open_stage, write_blocks, writing
-from apertura.common.arrays import Complexes
+from apertura.common.arrays import Complexes, Floats
 from apertura.common.constants import SPEED_OF_LIGHT_M_S
 from apertura.common.errors import CampaignError
 from apertura.common.flags import Flags
-from apertura.common.units import nanoseconds
+from apertura.common.units import nanoseconds, seconds_since
 from apertura.core.echo.association import missing_flags
+from apertura.core.echo.background import Background
 from apertura.core.echo.captures import Pulses, Saturation, blocks_of
 from apertura.core.echo.dechirp import sweep_motion_flags
 from apertura.core.echo.demodulate import remove_path
@@ -44,26 +46,32 @@ from apertura.stages.transmitted import Transmitted, transmitted
 from apertura.workflow.lineage import reads_kept, result_of
 
 Form = Callable[[Pulses, Correction | None], Complexes]
-"""Captures, ascending, and their correction → transfer functions, (pulse, subcarrier) complex64."""
+"""Ascending capture indices and their correction → transfer functions, (pulse, subcarrier) complex64."""
 
 
 @dataclass(frozen=True, eq=False)
 class PairEcho:
-    """The echo of a pair, whose transfer functions are formed as often as they are needed, block by block.
+    """Echo of a pair, whose transfer functions are formed on reading, block by block.
 
     Attributes
     ----------
     dataset
-        The stage; without `transfer`, `capture` (pulse,) says what each pulse is formed of.
+        Stage `echo`; if it has no `transfer`, `capture` (pulse,) is the capture index of each pulse.
     source
-        Of captures, or of pulses of a recorder that stores transfer functions.
+        Function that forms transfer functions from captures, or reads those that a recorder stored.
     saturation
-        Of the samples read so far.
+        Saturation of the samples read so far.
+    removed
+        Background that `stage` is without.
+    gain
+        (subcarrier,) float32, factors of `stage`: 0 where interference is excluded.
     """
 
     dataset: xr.Dataset
     source: Form
     saturation: Saturation = field(default_factory=Saturation)
+    removed: Background | None = None
+    gain: NDArray[np.float32] | None = None
 
     @classmethod
     def recorded(cls, echo: xr.Dataset) -> "PairEcho":
@@ -77,15 +85,15 @@ class PairEcho:
 
     @classmethod
     def opened(cls, campaign: Campaign, flight: str, pair: str) -> "PairEcho":
-        """Return that of a finished stage `echo`; the recording is opened when a transfer function is asked for.
+        """Open a finished stage `echo`; its recording is opened when transfer functions are read.
 
-        Where the recording is not there its transfer functions are those that stage `transfer` keeps, to the bit.
+        If the recording is missing, the bit-identical transfer functions of stage `transfer` are used.
 
         Raises
         ------
         CampaignError
-            If the stage is damaged or missing; when a transfer function is asked for, if the recording is, and nothing
-            was kept of it.
+            If the stage is damaged or missing; on reading transfer functions, if the recording is damaged or missing
+            and stage `transfer` was not kept.
         """
         stage, saturation = open_stage(campaign.stage("echo", flight, pair), "echo"), Saturation()
         if "transfer" not in stage and reads_kept(campaign, flight, pair):
@@ -96,7 +104,7 @@ class PairEcho:
         def source() -> Form:
             waveform = campaign.settings.waveform
             if not isinstance(waveform, SampledWaveform):
-                raise TypeError("the echo of a recorder of transfer functions holds them")
+                raise TypeError("the echo has no transfer functions although its recorder stores them")
             sent = transmitted(campaign, waveform)
             receiver = open_acquisition(campaign, flight, pair.split("-")[1], sent)
             return forming_from(receiver, sent, saturation, divided="sidelink_amplitude" in stage)
@@ -106,8 +114,21 @@ class PairEcho:
 
         return cls(stage, form, saturation)
 
+    @classmethod
+    def cleaned(cls, campaign: Campaign, flight: str, pair: str) -> "PairEcho":
+        """Return a finished echo without what a finished stage `profile` removes: background and interference."""
+        echo, folder = cls.opened(campaign, flight, pair), campaign.stage("profile", flight, pair)
+        if not campaign.is_current(folder):
+            return echo
+        profile, removed = open_stage(folder, "profile"), None
+        if "background" in profile:
+            removed = Background(profile.background.values, profile.background_time.values)
+        gain = profile.subcarrier_gain.values if "subcarrier_gain" in profile else None
+        reports = {name: profile.attrs[name] for name in ("background", "interference")}
+        return replace(echo, dataset=echo.dataset.assign_attrs(reports), removed=removed, gain=gain)
+
     def within(self, campaign: Campaign, flight: str, pair: str) -> "PairEcho":
-        """Return the echo inside the segments of its pair."""
+        """Return the echo without the pulses outside the segments of its pair."""
         return replace(self, dataset=keep_segments(campaign, flight, pair, self.dataset))
 
     @property
@@ -122,20 +143,20 @@ class PairEcho:
 
     @property
     def stage(self) -> xr.Dataset:
-        """The stage, its `transfer` read or formed on access."""
-        if "transfer" in self.dataset:
+        """Stage `echo`, whose `transfer` is read or formed on access, without removed background and interference."""
+        if "transfer" in self.dataset and self.removed is None and self.gain is None:
             return self.dataset
         return self.dataset.assign(transfer=xr.Variable(_HISTORY, indexing.LazilyIndexedArray(_Transfer(self))))
 
     @property
     def hollow(self) -> xr.Dataset:
-        """The stage without what captures say, with zeros that take no memory for `transfer`."""
+        """Stage `echo` without `capture`, with a `transfer` of zeros that uses no memory."""
         zeros = np.broadcast_to(np.complex64(0), self.shape)
         return self.dataset.drop_vars("capture").assign(transfer=(_HISTORY, zeros))
 
     @cached_property
     def form(self) -> Callable[[Pulses], Complexes]:
-        """Numbers of a few pulses, ascending → their transfer functions, (pulse, subcarrier) complex64."""
+        """Ascending pulse indices → transfer functions, (pulse, subcarrier) complex64."""
         captures, correction = self.dataset.capture.values, _correction(self.dataset)
         frequency = self.dataset.frequency.values
         path_m = self.dataset.path_removed.values if "path_removed" in self.dataset else None
@@ -148,12 +169,44 @@ class PairEcho:
 
         return form
 
+    @property
+    def time_s(self) -> Floats:
+        """(pulse,) float64, seconds from the first pulse."""
+        time = self.dataset.time.values
+        return seconds_since(time, time[0])
+
+    @property
+    def extra_s(self) -> Floats:
+        """(pulse,) float64, delay of an echo in the recorder beyond geometry."""
+        if "path_removed" not in self.dataset:
+            return np.zeros(len(self.dataset.time))
+        return np.asarray(self.dataset.path_removed.values / SPEED_OF_LIGHT_M_S)
+
+    @property
+    def delay_s(self) -> Floats:
+        """(pulse,) float64, delay that is removed from the recorder's transfer functions."""
+        return np.asarray(self.extra_s + self.dataset.reference_delay.values)
+
+    def read(self, pulses: Pulses) -> Complexes:
+        """Return the transfer functions of a few pulses, ascending, without removed background and interference."""
+        transfer = self.dataset.transfer[pulses].values if "transfer" in self.dataset else self.form(pulses)
+        if self.gain is not None:
+            transfer = transfer * self.gain
+        if self.removed is None:
+            return np.asarray(transfer)
+        frequency_hz = self.dataset.frequency.values
+        return np.asarray(transfer - self.removed.at(self.time_s[pulses], frequency_hz, self.delay_s[pulses]))
+
+    def recorded_at(self, pulses: Pulses) -> Complexes:
+        """Return the transfer functions of a few pulses, ascending, in delays of the recorder."""
+        return remove_path(self.read(pulses), self.dataset.frequency.values, delay_s=-self.delay_s[pulses])
+
     def blocks(self) -> Iterator[Complexes]:
-        """Yield `transfer` from its beginning, some pulses at a time."""
+        """Yield `transfer` from the first pulse on, in blocks of pulses."""
         return map(self.form, blocks_of(np.arange(len(self.dataset.time))))
 
     def at(self, pulses: slice) -> xr.Dataset:
-        """Return the stage at some pulses, formed."""
+        """Return the stage for a slice of pulses, with its transfer functions in memory."""
         return self.stage.isel(pulse=pulses).load()
 
 
@@ -161,7 +214,7 @@ _HISTORY = ("pulse", "subcarrier")
 
 
 class _Transfer(BackendArray):
-    """Transfer functions as an array that is formed where it is read."""
+    """Array of transfer functions that are formed on reading."""
 
     def __init__(self, echo: PairEcho) -> None:
         self._echo, self.shape, self.dtype = echo, echo.shape, np.dtype(np.complex64)
@@ -172,23 +225,23 @@ class _Transfer(BackendArray):
 
     def _formed(self, key: tuple[Any, Any]) -> Complexes:
         pulses = np.arange(self.shape[0])[key[0]]
-        some, back = np.unique(pulses, return_inverse=True)
-        blocks = [self._echo.form(block) for block in blocks_of(some)]
+        unique, inverse = np.unique(pulses, return_inverse=True)
+        blocks = [self._echo.read(block) for block in blocks_of(unique)]
         transfer = np.concatenate(blocks) if blocks else np.empty((0, self.shape[1]), np.complex64)
-        if len(some) != pulses.size or (np.diff(np.atleast_1d(pulses)) < 0).any():
-            transfer = transfer[back]
+        if len(unique) != pulses.size or (np.diff(np.atleast_1d(pulses)) < 0).any():
+            transfer = transfer[inverse]
         return np.asarray((transfer if pulses.ndim else transfer[0])[..., key[1]])
 
 
 def forming_from(rx: Acquisition, sent: Transmitted, saturation: Saturation, *, divided: bool) -> Form:
-    """Return the former of transfer functions of a recording, divided by the sidelink or by the code."""
+    """Return a function that forms transfer functions from a recording, by division by the sidelink or by the code."""
     read = rx.reader(["radar", "sidelink"] if divided else ["radar"], np.arange(len(rx.raw.start)))
     demodulator = Demodulator(sent.inverse, rx.numerology, sent.waveform.capture_samples)
     return forming(read, demodulator, saturation)
 
 
 def _correction(stage: xr.Dataset) -> Correction | None:
-    """Return the correction of the pulses of a stage; None of a monostatic pair."""
+    """Return the sidelink correction of a stage's pulses; None for a monostatic pair."""
     if "sidelink_amplitude" not in stage:
         return None
     frequency, amplitude = stage.frequency.values, stage.sidelink_amplitude.values
@@ -197,8 +250,8 @@ def _correction(stage: xr.Dataset) -> Correction | None:
     noise = amplitude**2 / 10 ** (stage.sidelink_snr.values / 10)
     locked = np.isfinite(amplitude)
     delay, phase = stage.sidelink_delay.values / cell_m, stage.sidelink_phase.values
-    known = [np.where(locked, values, 0.0) for values in (delay, phase, amplitude, noise)]
-    path = LineOfSight(known[0], known[1], known[2], known[3], locked)
+    delay, phase, amplitude, noise = (np.where(locked, values, 0.0) for values in (delay, phase, amplitude, noise))
+    path = LineOfSight(delay, phase, amplitude, noise, locked)
     clock_hz = stage.clock_offset.values if "clock_offset" in stage else None
     return Correction(stage.attrs["sidelink"]["method"], path, clock_hz, stage.attrs["clock"].get("sfo_ppm", 0.0))
 
@@ -207,67 +260,66 @@ def _correction(stage: xr.Dataset) -> Correction | None:
 
 
 def recorded_echo(campaign: Campaign, flight: str, pair: str) -> xr.Dataset:
-    """Return the echo of a pair as a recorder wrote it, at the times of its log's clock.
+    """Return the echo of a pair as a recorder stored it, with times on the clock of the flight log.
 
     Raises
     ------
     CampaignError
-        If positions travel neither with the samples nor in a flight log, or do in both; or if the scene is in another
-        frame than theirs.
+        If positions are neither stored with the samples nor in a flight log, or in both; or if their frame is not that
+        of the scene.
     """
     tx, rx = pair.split("-")
     history = read_history(campaign, flight, rx, pair=pair)
     history = history.assign(time=("pulse", campaign.clock(flight, rx).utc(history.time.values)))
-    logged, placed = campaign.logged(flight, tx), "tx_position" in history
-    if logged == placed:
-        found = "positions both with the samples and in a flight log" if logged else "samples without positions"
-        expected = "positions of one source: phase history with positions, or a flight log raw/<flight>/<node>.track.*"
-        where, remedy = (
-            campaign.history_files(flight, rx)[0],
-            "Take one away." if logged else "Copy the flight log there.",
+    logged, has_positions = campaign.logged(flight, tx), "tx_position" in history
+    if logged == has_positions:
+        raise CampaignError(
+            "positions both with the samples and in a flight log" if logged else "samples without positions",
+            where=campaign.history_files(flight, rx)[0],
+            expected="positions from one source: with the samples, or in a flight log raw/<flight>/<node>.track.*",
+            remedy="Remove one of them." if logged else "Copy the flight log there.",
         )
-        raise CampaignError(found, where, expected, remedy)
     if logged:
-        return in_air(campaign, _placed_by_logs(campaign, flight, (tx, rx), history))
+        return in_air(campaign, _with_log_positions(campaign, flight, (tx, rx), history))
     crs = campaign.settings.scene.crs
     local = history.attrs["frame"] == LOCAL
     if local != (crs == LOCAL):
         raise CampaignError(
-            f"{crs} for phase history with positions {'in metres of a frame of its own' if local else 'on Earth'}",
+            f"{crs} for a phase history with positions in {'a local frame' if local else 'ECEF'}",
             where=f"{CONFIG}: scene.crs",
             expected=LOCAL if local else "an EPSG code, or auto",
             remedy="Correct scene.crs.",
         )
     history = in_air(campaign, history)
     nodes = campaign.settings.nodes
-    known = {leg: stated_error(nodes[node]) | {"node": node} for leg, node in (("tx", tx), ("rx", rx))}
-    return history.assign_attrs(positions=known)
+    accuracies = {leg: stated_error(nodes[node]) | {"node": node} for leg, node in (("tx", tx), ("rx", rx))}
+    return history.assign_attrs(positions=accuracies)
 
 
-def _placed_by_logs(campaign: Campaign, flight: str, nodes: tuple[str, str], history: xr.Dataset) -> xr.Dataset:
-    """Return phase history at the antennas' places, without the pulses that have none.
+def _with_log_positions(campaign: Campaign, flight: str, nodes: tuple[str, str], history: xr.Dataset) -> xr.Dataset:
+    """Return a phase history with antenna positions from the logs, without the pulses that have no position.
 
-    The path of the receiving node beyond geometry (docs/theory.md, eq. 3) comes off the delay that samples are referred
-    to: no sample changes.
+    The path offset of the receiving node (docs/theory.md, eq. 3) is subtracted from the reference delay of the samples;
+    samples are unchanged.
     """
     wave_m = shortest_wave(history.frequency.values)
     logs = {node: raw_log(campaign, flight, node, wave_m) for node in nodes}
     tx, rx = (logs[node] for node in nodes)
     segmented = bool(campaign.segments_of(flight, "-".join(nodes)))
-    placed = place(tx, rx, history.time.values, hovers=segmented)
-    history = history.isel(pulse=placed.good)
+    positions = place(tx, rx, history.time.values, hovers=segmented)
+    history = history.isel(pulse=positions.good)
     at = history.time.values
     offset_s = rx.settings.path_offset_m.radar / SPEED_OF_LIGHT_M_S
-    turning = {"tx_axes": tx.turns("radar_tx") and tx, "rx_axes": rx.turns("radar_rx") and rx}
+    rotating = {"tx_axes": tx.turns("radar_tx") and tx, "rx_axes": rx.turns("radar_rx") and rx}
     axes: dict[str, Any] = {
-        name: (("pulse", "axis", "body"), log.body_axes(at)) for name, log in turning.items() if log
+        name: (("pulse", "axis", "body"), log.body_axes(at)) for name, log in rotating.items() if log
     }
-    left_out = {**history.attrs.get("dropped", {}), **placed.reasons}
-    counts: dict[str, Any] = {"used": len(at), "dropped": sum(left_out.values()), "reasons": left_out}
+    reasons = {**history.attrs.get("dropped", {}), **positions.reasons}
+    counts: dict[str, Any] = {"used": len(at), "dropped": sum(reasons.values()), "reasons": reasons}
     antennas = tx.antenna("radar_tx", at), rx.antenna("radar_rx", at)
     lasting_s = history.attrs.get("sweep_used_s", 0.0)
     missing = missing_flags(nanoseconds(at))
-    moved = sweep_motion_flags(at, antennas, lasting_s=lasting_s, frequency_hz=history.frequency.values)
+    motion = sweep_motion_flags(at, antennas, lasting_s=lasting_s, frequency_hz=history.frequency.values)
     return history.assign(
         reference_delay=history.reference_delay - offset_s,
         path_limit=history.path_limit - offset_s * SPEED_OF_LIGHT_M_S,
@@ -276,8 +328,8 @@ def _placed_by_logs(campaign: Campaign, flight: str, nodes: tuple[str, str], his
         **axes,
     ).assign_attrs(
         frame=tx.track.attrs["frame"],
-        flags=Flags.merged(history.attrs["flags"], placed.flags, moved, missing),
-        positions=placed.report,
+        flags=Flags.merged(history.attrs["flags"], positions.flags, motion, missing),
+        positions=positions.report,
         pulses=counts,
         stated_offset_m=rx.settings.path_offset_m.radar,
         time_tags={"std_s": rx.settings.time_tag_std_s},
@@ -285,7 +337,7 @@ def _placed_by_logs(campaign: Campaign, flight: str, nodes: tuple[str, str], his
 
 
 def transfer(campaign: Campaign, flight: str, pair: str) -> Path:
-    """Write results/<flight>/<pair>/transfer.zarr, pulse by pulse those of echo.zarr."""
+    """Write results/<flight>/<pair>/transfer.zarr: the transfer functions of the pulses in echo.zarr."""
     lineage = result_of(campaign, "transfer", flight, pair).begin(campaign.root)
     formed, folder = PairEcho.opened(campaign, flight, pair), campaign.stage("transfer", flight, pair)
     kept = formed.hollow[["time", "frequency", "transfer"]]

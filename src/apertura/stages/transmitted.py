@@ -1,4 +1,4 @@
-"""Transmitted signal: code symbols or the samples of a pulse, and the preamble of each symbol."""
+"""Transmitted signal of a campaign: code symbols or samples of a pulse, and the preamble of each symbol."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -21,16 +21,16 @@ from apertura.formats.recordings.sample_file import SampleFile
 
 
 def check_mixing(samples: SampleFile, numerology: Numerology, *, where: object) -> None:
-    """Raise CampaignError if real samples are mixed so that a subcarrier and mirror image meet, or prefixes are short.
+    """Check the mixing of real samples: no mirror image within the band, sufficient prefix; else raise CampaignError.
 
     Parameters
     ----------
     samples
-        Of a recording; complex ones are never wrong.
+        Sample file of a recording; complex samples always pass.
     numerology
-        Of the symbol.
+        Numerology of the symbol.
     where
-        The recording, for the message.
+        Recording, for the message.
     """
     mixing = samples.layout.mixing
     if mixing is None:
@@ -41,45 +41,45 @@ def check_mixing(samples: SampleFile, numerology: Numerology, *, where: object) 
         raise CampaignError(
             problem,
             where=where,
-            expected="apertura:if_hz and waveform such that the whole band lies inside one Nyquist zone",
-            remedy="Correct apertura:if_hz (where baseband zero lies, before aliasing) or the waveform.",
+            expected="apertura:if_hz and waveform with the whole band within one Nyquist zone",
+            remedy="Correct apertura:if_hz (frequency of baseband zero before aliasing) or the waveform.",
         )
 
 
-# ---- The transmitted signal: code symbols or samples of a pulse -----------------------------------------------------
+# ---- Transmitted signal: code symbols or samples of a pulse ----------------------------------------------------------
 
 MOST_SYMBOLS = 1 << 24
-"""Code symbols of a waveform."""
+"""Largest number of code symbols of a waveform."""
 
 MOST_PULSE_SAMPLES = 1 << 22
 """Largest number of samples of a pulse, and of a capture."""
 
 MOST_CHIPS = 1 << 20
-"""Chips of a preamble."""
+"""Largest number of chips of a preamble."""
 
 MOST_LEAD_SAMPLES = 1 << 26
-"""Samples before a symbol."""
+"""Largest number of samples of preamble, counter and guard before a symbol."""
 
-_FEWEST_BINS = 16  # of a band
-_LEAST_INSIDE = 0.01  # of the pulse's energy, in the band
+_FEWEST_BINS = 16  # frequency bins of a band
+_LEAST_INSIDE = 0.01  # smallest share of the pulse's energy within the band
 
 
 @dataclass(frozen=True, eq=False)
 class Transmitted:
-    """The transmitted signal as echo processing needs it, for any kind of waveform.
+    """Transmitted signal for echo processing, of any kind of waveform.
 
     Attributes
     ----------
     waveform
-        As the config states it.
+        Configured waveform.
     numerology
-        Grid of the frequencies that echoes are measured at.
+        Grid of the frequencies at which echoes are measured.
     inverse
         (subcarrier,) complex64, inverse filter of the transmitted signal.
     mean_power
-        E|s|² while it is sent, in the units that echoes are divided by: of a symbol, of a pulse whose peak is 1.
+        E|s|² during transmission, in the units by which echoes are divided: of a symbol, or of a pulse with peak 1.
     report, flags
-        Decisions on it, and flags.
+        Report and flags of the inverse filter.
     """
 
     waveform: SampledWaveform
@@ -93,26 +93,26 @@ class Transmitted:
 def transmitted(campaign: Campaign, waveform: SampledWaveform) -> Transmitted:
     """Return the transmitted signal, from a waveform and the campaign's file of codes or samples.
 
-    Of a flight plan without that file: codes of one power, or a linear chirp over the band.
+    A flight plan without that file assumes codes of equal power, or a linear chirp over the band.
 
     Raises
     ------
     CampaignError
         If the file is missing or contradicts the waveform.
     """
+    assumes = campaign.planned and not campaign.sent_file.is_file()
     if isinstance(waveform, OfdmWaveform):
-        count, unsaid = waveform.subcarriers, campaign.planned and not campaign.sent_file.is_file()
-        codes = np.ones(count, np.complex64) if unsaid else read_codes(campaign.sent_file, count)
+        count = waveform.subcarriers
+        codes = np.ones(count, np.complex64) if assumes else read_codes(campaign.sent_file, count)
         return Transmitted(waveform, symbol_numerology(waveform), 1 / codes, float((np.abs(codes) ** 2).sum()))
     if isinstance(waveform, PulseWaveform):
-        unsaid = campaign.planned and not campaign.sent_file.is_file()
-        pulse = _chirp(waveform) if unsaid else read_pulse(campaign.sent_file, waveform)
-        return _pulse_sent(pulse, waveform, where=campaign.sent_file)
-    raise TypeError(f"no way to take out what a {type(waveform).__name__} sends")
+        pulse = _chirp(waveform) if assumes else read_pulse(campaign.sent_file, waveform)
+        return _transmitted_pulse(pulse, waveform, where=campaign.sent_file)
+    raise TypeError(f"no inverse filter for a {type(waveform).__name__}")
 
 
 def symbol_numerology(waveform: OfdmWaveform) -> Numerology:
-    """Return the numerology of an OFDM symbol as receivers sample it."""
+    """Return the numerology of an OFDM symbol at the receiver's sample rate."""
     return Numerology(
         waveform.carrier_hz,
         waveform.sample_rate_hz,
@@ -123,15 +123,15 @@ def symbol_numerology(waveform: OfdmWaveform) -> Numerology:
 
 
 def _chirp(waveform: PulseWaveform) -> NDArray[np.complex128]:
-    """Return a linear chirp over the band of a waveform, or over 0.8 of all that its samples carry."""
+    """Return a linear chirp over the band of a waveform, or over 0.8 of the sample rate."""
     half = 0.4 * waveform.sample_rate_hz
     low, high = waveform.band_hz or (-half, half)
     time = np.arange(round(waveform.pulse_s * waveform.sample_rate_hz)) / waveform.sample_rate_hz
     return np.asarray(np.exp(2j * np.pi * (low * time + (high - low) / waveform.pulse_s * time**2 / 2)))
 
 
-def _pulse_sent(pulse: NDArray[np.complex128], waveform: PulseWaveform, *, where: Path) -> Transmitted:
-    """Return a pulse that is sent once: a DFT of the whole capture, and its filter (docs/theory/waveforms.md)."""
+def _transmitted_pulse(pulse: NDArray[np.complex128], waveform: PulseWaveform, *, where: Path) -> Transmitted:
+    """Return a single transmitted pulse: DFT over the whole capture, and its filter (docs/theory/waveforms.md)."""
     length = waveform.capture_samples
     lead = waveform.lead_s * waveform.sample_rate_hz
     spectrum = pulse_spectrum(pulse, lead=lead, length=length)
@@ -146,10 +146,12 @@ def _pulse_sent(pulse: NDArray[np.complex128], waveform: PulseWaveform, *, where
     inside = float(power[numbers % length].sum() / power.sum())
     if numbers.size < _FEWEST_BINS or inside < _LEAST_INSIDE:
         raise CampaignError(
-            f"{max(numbers.size, 0)} bins of {waveform.sample_rate_hz / length:g} Hz hold {inside:.2g} of its energy",
+            f"the band contains {inside:.2g} of the pulse's energy in {max(numbers.size, 0)} bins of "
+            f"{waveform.sample_rate_hz / length:g} Hz",
             where=where,
-            expected=f"at least {_FEWEST_BINS} bins and {_LEAST_INSIDE} of the energy, as {CONFIG}: waveform.band_hz",
-            remedy="Correct band_hz (baseband: what the carrier is subtracted from), or the file.",
+            expected=f"at least {_LEAST_INSIDE} of the energy in at least {_FEWEST_BINS} bins of {CONFIG}: "
+            "waveform.band_hz",
+            remedy="Correct band_hz (baseband frequencies, relative to the carrier), or the file.",
         )
     chosen = pulse_filter(spectrum[numbers % length], requested=waveform.filter)
     longest = length - round((waveform.lead_s + waveform.pulse_s) * waveform.sample_rate_hz)
@@ -161,15 +163,17 @@ def _pulse_sent(pulse: NDArray[np.complex128], waveform: PulseWaveform, *, where
 
 
 def read_pulse(path: Path, waveform: PulseWaveform) -> NDArray[np.complex128]:
-    """Return a transmitted pulse, (sample,) complex128.
+    """Read a transmitted pulse, (sample,) complex128.
 
     Raises
     ------
     CampaignError
-        If the file is missing, is not as long as waveform.pulse_s, silent, or not finite.
+        If the file is missing, its length is not waveform.pulse_s, or its samples are all zero or not finite.
     """
     count = round(waveform.pulse_s * waveform.sample_rate_hz)
-    expected = f"({count},) complex or ({count}, 2) integers, as {CONFIG}: waveform.pulse_s times sample_rate_hz"
+    expected = (
+        f"({count},) complex or ({count}, 2) integers, for {CONFIG}: waveform.pulse_s times waveform.sample_rate_hz"
+    )
     remedy = "Use the samples that were transmitted, or correct the waveform."
     if not path.is_file():
         raise CampaignError("no such file", where=path, expected=expected, remedy="Copy it there.")
@@ -178,42 +182,42 @@ def read_pulse(path: Path, waveform: PulseWaveform) -> NDArray[np.complex128]:
         raise CampaignError(
             f"captures of {waveform.capture_samples} samples",
             where=f"{CONFIG}: waveform",
-            expected=f"no more than {MOST_PULSE_SAMPLES} in lead_s, pulse_s and listen_s",
+            expected=f"at most {MOST_PULSE_SAMPLES} in lead_s, pulse_s and listen_s",
             remedy="Shorten listen_s to the longest delay of the scene.",
         )
     pairs = stored.dtype.kind == "i" and stored.shape == (count, 2)
     if not (pairs or (stored.dtype.kind == "c" and stored.shape == (count,))):
         raise CampaignError(f"{stored.dtype} of shape {stored.shape}", where=path, expected=expected, remedy=remedy)
-    with np.errstate(over="ignore", invalid="ignore"):  # becomes infinite or is none, and is refused as such
+    with np.errstate(over="ignore", invalid="ignore"):  # infinite and NaN values are rejected below
         pulse = stored[:, 0] + 1j * stored[:, 1].astype(np.float64) if pairs else stored.astype(np.complex128)
         level = np.abs(pulse)
-    lost = int((~np.isfinite(level)).sum())
-    if lost or not level.max() > 0:
-        found = f"{lost} samples that are no number" if lost else "silence: every sample is zero"
-        raise CampaignError(found, where=path, expected=expected, remedy=remedy)
+    invalid = int((~np.isfinite(level)).sum())
+    if invalid or not level.max() > 0:
+        problem = f"{invalid} samples are not finite" if invalid else "all samples are zero"
+        raise CampaignError(problem, where=path, expected=expected, remedy=remedy)
     return np.asarray(pulse / level.max(), np.complex128)
 
 
 def read_codes(path: Path, subcarriers: int) -> NDArray[np.complex64]:
-    """Return the transmitted code symbols, (subcarrier,) complex64.
+    """Read the transmitted code symbols, (subcarrier,) complex64.
 
     Raises
     ------
     CampaignError
-        If the file is missing, of another length, or a symbol is zero or not finite.
+        If the file is missing or has another length, or a symbol is zero or not finite.
     """
-    expected = f"({subcarriers},) complex64 without zeros, as config/config.yaml: waveform.subcarriers"
+    expected = f"({subcarriers},) complex64 without zeros, for config/config.yaml: waveform.subcarriers"
     remedy = "Use the codes that were transmitted, or correct the waveform."
     if not path.is_file():
         raise CampaignError("no such file", where=path, expected=expected, remedy="Copy it there.")
     stored = read_npy(path, kinds="c", most=MOST_SYMBOLS, expected=expected, remedy=remedy)
-    with np.errstate(over="ignore", invalid="ignore"):  # becomes infinite or is none, and is refused as such
+    with np.errstate(over="ignore", invalid="ignore"):  # infinite and NaN values are rejected below
         codes = stored.astype(np.complex64)
         zeros = int((codes == 0).sum())
     usable = codes.shape == (subcarriers,) and np.isfinite(codes).all() and np.abs(codes).min() > 0
     if not usable:
         raise CampaignError(
-            f"{stored.dtype} of shape {codes.shape}, {zeros} of them zero, "
+            f"{stored.dtype} of shape {codes.shape}, of which {zeros} are zero and "
             f"{int((~np.isfinite(codes)).sum())} not finite",
             where=path,
             expected=expected,
@@ -223,23 +227,23 @@ def read_codes(path: Path, subcarriers: int) -> NDArray[np.complex64]:
 
 
 def read_framing(path: Path, described: Mapping[str, Any], *, sample_rate_hz: float, where: Path) -> PulseFraming:
-    """Return the preamble of each symbol.
+    """Read the preamble of each symbol.
 
     Parameters
     ----------
     path
         .npy file of the preamble's chips, ±1.
     described
-        The recorder's apertura:framing.
+        apertura:framing of the recorder's metadata.
     sample_rate_hz
         Complex samples per second.
     where
-        The file that describes it, for messages.
+        Metadata file, for messages.
 
     Raises
     ------
     CampaignError
-        If the preamble is missing, is not chips of ±1, or takes longer than any pulse.
+        If the file is missing, its values are not ±1, or the preamble is longer than `MOST_LEAD_SAMPLES`.
     """
     if not path.is_file():
         raise CampaignError(
@@ -248,11 +252,13 @@ def read_framing(path: Path, described: Mapping[str, Any], *, sample_rate_hz: fl
             expected=f"the preamble that {where.name}: apertura:framing names",
             remedy="Copy it there.",
         )
-    expected = f"one dimension of chips +1 and -1, no more than {MOST_CHIPS}"
-    chips = read_npy(path, kinds="if", most=MOST_CHIPS, expected=expected, remedy="Save the preamble that was sent.")
+    expected = f"a one-dimensional array of at most {MOST_CHIPS} chips, +1 or -1"
+    remedy = "Save the preamble that was transmitted."
+    chips = read_npy(path, kinds="if", most=MOST_CHIPS, expected=expected, remedy=remedy)
     if chips.ndim != 1 or not chips.size or not np.isin(chips, (-1, 1)).all():
-        found = f"{chips.dtype} of shape {chips.shape}, {int((~np.isin(chips, (-1, 1))).sum())} neither 1 nor -1"
-        raise CampaignError(found, where=path, expected=expected, remedy="Save the preamble that was sent.")
+        invalid = int((~np.isin(chips, (-1, 1))).sum())
+        problem = f"{chips.dtype} of shape {chips.shape}, of which {invalid} are neither 1 nor -1"
+        raise CampaignError(problem, where=path, expected=expected, remedy=remedy)
     keys = ("chip_samples", "centre_hz", "counter_bits", "bit_chips", "guard_samples")
     framing = PulseFraming(
         chips.astype(np.int64), sample_rate_hz=sample_rate_hz, **{key: described[key] for key in keys}
@@ -261,7 +267,7 @@ def read_framing(path: Path, described: Mapping[str, Any], *, sample_rate_hz: fl
         raise CampaignError(
             f"{framing.lead_samples} samples of preamble, counter and guard before each symbol",
             where=where,
-            expected=f"no more than {MOST_LEAD_SAMPLES}",
+            expected=f"at most {MOST_LEAD_SAMPLES}",
             remedy="Correct apertura:framing.",
         )
     return framing

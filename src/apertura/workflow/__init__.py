@@ -1,6 +1,6 @@
-"""The graph of the workflow: its rules, what each result is made from, what is out of date, what a job takes.
+"""Graph of the workflow: its rules, the dependencies of results, checks for outdated results, resources of jobs.
 
-`rules` has one row per rule; `lineage` gives sources, settings and code of a result; `stale` compares them with what
-results record; `resources` estimates memory and time; `jobs` gives `workflow/*.smk` inputs, resources and parameters.
-Imports `apertura.campaign` and the layers below; runs nothing.
+`rules` has one row per rule; `lineage` determines sources, settings and code of a result; `stale` compares them with
+the manifests of results; `resources` estimates memory and time; `jobs` provides inputs, resources and parameters for
+`workflow/*.smk`. Imports `apertura.campaign` and the layers below; runs nothing.
 """

@@ -1,7 +1,7 @@
-"""Inputs, resources and parameters of the rules in `workflow/`, by the campaign's flights and settings.
+"""Inputs, resources and parameters of the rules in `workflow/`, from the campaign's flights and settings.
 
-Names of files stand in the rules as they are. `apertura.workflow.rules` has the same graph for lineage and staleness;
-a test holds the two together.
+The rules contain their file names literally. `apertura.workflow.rules` has the same graph for lineage and for the
+check of outdated results; a test compares the two.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -13,7 +13,7 @@ from apertura.campaign.folder import Campaign
 from apertura.formats.export import added_exports
 from apertura.workflow.lineage import manifests_below, result_of
 from apertura.workflow.resources import Resources
-from apertura.workflow.rule_inputs import JobPlace, Scope
+from apertura.workflow.rule_inputs import JobScope, Scope
 from apertura.workflow.rules import RESULTS, RULES, Rule
 
 FilesOfJob = Callable[[Any], list[str]]
@@ -22,7 +22,7 @@ FilesOfJob = Callable[[Any], list[str]]
 
 @dataclass(frozen=True)
 class Job:
-    """Resources and parameters of the jobs of a rule, as Snakemake takes them: functions of a job's wildcards."""
+    """Resources and parameters of a rule's jobs for Snakemake, as functions of a job's wildcards."""
 
     threads: Callable[..., int]
     resources: Mapping[str, Callable[..., int]]
@@ -31,7 +31,7 @@ class Job:
 
 @dataclass(frozen=True)
 class Jobs:
-    """The jobs of a campaign's rules."""
+    """Jobs of a campaign's rules."""
 
     campaign: Campaign
 
@@ -40,41 +40,41 @@ class Jobs:
         return Resources(self.campaign)
 
     def __getitem__(self, rule: str) -> Job:
-        """Return resources of the jobs of a rule; its parameters are the settings and code that matter to them."""
+        """Return resources and parameters of a rule's jobs; parameters are the settings and code that affect them."""
         resources, row = self._resources[rule], RULES[rule]
-        rows = [made for made in RESULTS.values() if made.name == rule] or [RESULTS[row.result]]
+        rows = [other for other in RESULTS.values() if other.name == rule] or [RESULTS[row.result]]
 
         def results(wildcards: Any) -> list[Any]:
             where = [getattr(wildcards, word) for word in row.of.wildcards]
-            return [result_of(self.campaign, made.result, *where) for made in rows]
+            return [result_of(self.campaign, row_of.result, *where) for row_of in rows]
 
         params = {
-            "settings": lambda wildcards: {k: v for one in results(wildcards) for k, v in one.settings.items()},
-            "code": lambda wildcards: [one.code_sha256 for one in results(wildcards)],
+            "settings": lambda wildcards: {k: v for result in results(wildcards) for k, v in result.settings.items()},
+            "code": lambda wildcards: [result.code_sha256 for result in results(wildcards)],
         }
         return Job(resources.threads, {"mem_mb": resources.mem_mb, "runtime": resources.runtime}, params)
 
     def each(self, manifest: str, of: Scope | None = None) -> FilesOfJob:
-        """Return the input function of a manifest with wildcards: one for each node, pair or flight of the job.
+        """Return the input function of a manifest with wildcards: one manifest per node, pair or flight of the job.
 
-        Those that the campaign does not have are left out, such as the terrain of a campaign without a DEM.
+        Results that the campaign does not have are omitted, such as the terrain of a campaign without a DEM.
         """
         row = next(row for row in RESULTS.values() if f"results/{row.manifest}.manifest.json" == manifest)
-        return lambda wildcards: manifests_below(self._place(wildcards, of), row)
+        return lambda wildcards: manifests_below(self._scope(wildcards, of), row)
 
-    def files(self, source: Callable[[JobPlace], Iterable[str]], of: Scope | None = None) -> FilesOfJob:
-        """Return the input function of files that `apertura.workflow.rule_inputs` names."""
+    def files(self, source: Callable[[JobScope], Iterable[str]], of: Scope | None = None) -> FilesOfJob:
+        """Return the input function of the files of a function in `apertura.workflow.rule_inputs`."""
         root = self.campaign.root
-        return lambda wildcards: [str((root / name).location) for name in source(self._place(wildcards, of))]
+        return lambda wildcards: [str((root / name).location) for name in source(self._scope(wildcards, of))]
 
-    def _place(self, wildcards: Any, of: Scope | None) -> JobPlace:
-        """Return the arguments of a job: of the kind stated, or by the names of its wildcards."""
+    def _scope(self, wildcards: Any, of: Scope | None) -> JobScope:
+        """Return the scope of a job: of the given kind, or of the kind that its wildcards imply."""
         named = {name for name in ("flight", "node", "pair", "two") if hasattr(wildcards, name)}
         of = of or next(of for of in Scope if set(of.wildcards) == named)
-        return JobPlace(self.campaign, of, tuple(getattr(wildcards, word) for word in of.wildcards))
+        return JobScope(self.campaign, of, tuple(getattr(wildcards, word) for word in of.wildcards))
 
 
 def added_files(rule: str) -> list[str]:
-    """Return the files of a rule that other packages add by entry points of group ``apertura.exports``."""
+    """Return the files that other packages add to a rule by entry points of group ``apertura.exports``."""
     row: Rule = RULES[rule]
     return [f"results/{row.folder}/{one.file}" for one in added_exports(row.exports)]

@@ -1,7 +1,8 @@
-"""What every result is made from: files, other results, settings, code. Rules, steps and checks ask here.
+"""Lineage of every result: source files, other results, settings and code, for rules, steps and checks.
 
-A result is what one rule writes. Its manifest, written last, names its files and what they were made from; another
-file, setting or code makes it stale, whatever the times of files say. All of it follows from `apertura.workflow.rules`.
+A result is the output of one rule. Its manifest is written last; it lists the files and states their lineage. A changed
+source, setting or code makes the result out of date, independent of file times. The lineage follows from
+`apertura.workflow.rules`.
 """
 
 from collections.abc import Iterable, Iterator
@@ -19,11 +20,11 @@ from apertura.common.provenance import code_sha256
 from apertura.core.backprojection.engines import ENGINES
 from apertura.formats.export import EXPORTS, export_modules, exports_in
 from apertura.formats.names import FINDERS, PHASE_HISTORIES, RECORDERS, TRACKS, log_format
-from apertura.workflow.rule_inputs import JobPlace, Scope, SettingSpec, SourceSpec, is_sampled, received
+from apertura.workflow.rule_inputs import JobScope, Scope, SettingSpec, SourceSpec, is_sampled, received
 from apertura.workflow.rules import EVERY, RESULTS, Rule
 
 _READS = "apertura.formats.reading"
-"""Calls the readers of rows: a result whose step imports it may read what was recorded."""
+"""Module that calls the readers of recordings and logs; a step that imports it depends on their code."""
 
 _FOCUSES = frozenset(
     {
@@ -32,13 +33,13 @@ _FOCUSES = frozenset(
         "apertura.methods.alignment.on_ground",
     }
 )
-"""Call engines: a result whose step imports one of them may stand on pixels that any engine has formed."""
+"""Modules that call engines; a step that imports one of them depends on the code of all engines."""
 
 _KEPT = {"transfer": "echo"}
-"""Result made on demand → word of `processing.keep` by which every run makes it."""
+"""Result that is written on demand → value of `processing.keep` with which every run writes it."""
 
 _INPUTS = ("config", "raw")
-"""Folders of a campaign that are inputs with all that is in them."""
+"""Folders of a campaign that are inputs with all their files."""
 
 
 def result_of(campaign: Campaign, result: str, *where: str) -> Result:
@@ -47,55 +48,55 @@ def result_of(campaign: Campaign, result: str, *where: str) -> Result:
     Parameters
     ----------
     campaign
-        Settings and flights.
+        Campaign with settings and flights.
     result
         A key of `apertura.workflow.rules.RESULTS`.
     *where
-        What it is of: values of the wildcards of its row.
+        Values of the wildcards of its row, such as flight and pair.
 
     Raises
     ------
     CampaignError
-        If the campaign has none there, as sums of one pair.
+        If the campaign does not have the result, such as sums of a flight with one pair.
     """
     rule = RESULTS[result]
-    place = JobPlace(campaign, rule.of, where)
-    if not rule.needed(place):
+    scope = JobScope(campaign, rule.of, where)
+    if not rule.needed(scope):
         raise CampaignError(
             f"no {result} of {' '.join(where) or 'this campaign'}",
             where=campaign.root,
-            expected="a result that its flights and its config have",
-            remedy="`apertura list` shows them.",
+            expected="a result that follows from the campaign's flights and config",
+            remedy="`apertura list` lists them.",
         )
-    sources = tuple(dict.fromkeys(source for one in rule.sources for source in _read(place, one)))
-    settings = {name: value for one in rule.settings for name, value in _stated(place, one).items()}
+    sources = tuple(dict.fromkeys(source for one in rule.sources for source in _read(scope, one)))
+    settings = {name: value for one in rule.settings for name, value in _stated(scope, one).items()}
     return Result(_manifest(rule, where), sources, settings, modules_of(campaign, result, *where))
 
 
 def results_of(campaign: Campaign) -> Iterator[tuple[str, Result]]:
-    """Yield every result of a campaign with its name, each after those it is made from."""
-    for result, _, made in places_of(campaign):
-        yield result, made
+    """Yield every result of a campaign with its name, each after the results that it depends on."""
+    for name, _, result in places_of(campaign):
+        yield name, result
 
 
 def places_of(campaign: Campaign) -> Iterator[tuple[str, tuple[str, ...], Result]]:
-    """Yield every result as `results_of` does, with what it is of, as `result_of` takes it."""
+    """Yield name, wildcard values and result for every result, in the order of `results_of`."""
     for rule, where in _jobs(campaign):
         yield rule.result, where, result_of(campaign, rule.result, *where)
 
 
 def on_demand(campaign: Campaign, manifest: str) -> bool:
-    """Return whether a manifest is that of a result made when it is asked for, and not by every run."""
+    """Return True if a manifest belongs to a result that is written on demand, and not by every run."""
     rule = RESULTS.get(manifest.rpartition("/")[2].removesuffix(".manifest.json"))
     return rule is not None and _on_demand(campaign, rule)
 
 
 def reads_kept(campaign: Campaign, flight: str, pair: str) -> bool:
-    """Return whether a pair's transfer functions are read from stage `transfer`, and not formed from the recording.
+    """Return True if a pair's transfer functions are read from stage `transfer`, not formed from the recording.
 
-    They are where the recording is gone, and the stage is of the echo that is there.
+    This is the case if the recording is missing and the stage belongs to the present echo.
     """
-    from apertura.campaign.store import read_manifest, sha256_present  # loads arrays: a run, too, waits for them
+    from apertura.campaign.store import read_manifest, sha256_present  # loads zarr, which delays the start of a run
 
     manifest, echo = (campaign.root / campaign.manifest(stage, flight, pair) for stage in ("transfer", "echo"))
     if campaign.promised_files(flight, pair.split("-")[1])[-1].is_file() or not manifest.is_file():
@@ -104,39 +105,39 @@ def reads_kept(campaign: Campaign, flight: str, pair: str) -> bool:
 
 
 def files_read(campaign: Campaign, result: str, *where: str) -> Iterator[str]:
-    """Yield the sources of a result, and the recordings that its step forms transfer functions from."""
+    """Yield the sources of a result, and the recordings from which its step forms transfer functions."""
     rule = RESULTS[result]
     yield from result_of(campaign, result, *where).sources
     if rule.forms and is_sampled(campaign):
-        for pair in JobPlace(campaign, rule.of, where).pairs:
+        for pair in JobScope(campaign, rule.of, where).pairs:
             if not reads_kept(campaign, *pair):
-                yield from received(JobPlace(campaign, Scope.PAIR, pair))
+                yield from received(JobScope(campaign, Scope.PAIR, pair))
 
 
 def places(campaign: Campaign, rule: Rule) -> list[tuple[str, ...]]:
-    """Return what each job of a rule runs on, values of its wildcards; flights in the order of `KINDS`."""
+    """Return the wildcard values of each job of a rule; flights in the order of `KINDS`."""
     return [where for kind in KINDS for where in _places(campaign, rule, kind)]
 
 
 def products_of(rule: Rule) -> list[str]:
-    """Return the files beside the manifest of a rule that people open."""
+    """Return the products of a rule for users: the files next to its manifest."""
     return [*rule.products, *(row.file for row in (exports_in(rule.exports) if rule.exports else ()))]
 
 
 def _jobs(campaign: Campaign) -> Iterator[tuple[Rule, tuple[str, ...]]]:
-    """Yield rule and place of every result: calibration flights first, which correct the echoes of others."""
+    """Yield rule and wildcard values of every result; calibration flights come first, because others depend on them."""
     for kind in KINDS:
         for rule in RESULTS.values():
             yield from ((rule, where) for where in _places(campaign, rule, kind))
 
 
 def _places(campaign: Campaign, rule: Rule, kind: str) -> list[tuple[str, ...]]:
-    """Return the places of a rule that belong to flights of a kind; those of the campaign belong to its images."""
+    """Return the wildcard values of a rule's jobs for flights of a kind; campaign-wide jobs belong to image flights."""
     return _needed(rule, campaign, _candidates(campaign, rule, kind)) if kind in rule.kinds else []
 
 
 def _needed(rule: Rule, campaign: Campaign, places: Iterable[tuple[str, ...]]) -> list[tuple[str, ...]]:
-    return [where for where in places if rule.needed(JobPlace(campaign, rule.of, where))]
+    return [where for where in places if rule.needed(JobScope(campaign, rule.of, where))]
 
 
 def _candidates(campaign: Campaign, rule: Rule, kind: str) -> list[tuple[str, ...]]:
@@ -148,7 +149,7 @@ def _candidates(campaign: Campaign, rule: Rule, kind: str) -> list[tuple[str, ..
     if rule.of is Scope.FLIGHT:
         return [(flight.name,) for flight in flights]
     pairs = rule.of is Scope.PAIR
-    return [(flight.name, one) for flight in flights for one in (flight.pairs if pairs else flight.participants)]
+    return [(flight.name, name) for flight in flights for name in (flight.pairs if pairs else flight.participants)]
 
 
 def _manifest(rule: Rule, where: Iterable[str]) -> str:
@@ -156,24 +157,24 @@ def _manifest(rule: Rule, where: Iterable[str]) -> str:
     return f"results/{name}.manifest.json"
 
 
-def manifests_below(place: JobPlace, rule: Rule) -> list[str]:
-    """Return the manifests of a rule's results that belong to what a job runs on, and that the campaign has."""
-    return [_manifest(rule, where) for where in _needed(rule, place.campaign, place.below(rule.of))]
+def manifests_below(scope: JobScope, rule: Rule) -> list[str]:
+    """Return the manifests of a rule's results within the scope of a job, as far as the campaign has them."""
+    return [_manifest(rule, where) for where in _needed(rule, scope.campaign, scope.below(rule.of))]
 
 
-def every_result(place: JobPlace) -> list[str]:
-    """Return the manifests of all results but those made on demand, and of those that describe all."""
-    every = _jobs(place.campaign)
-    return [_manifest(rule, where) for rule, where in every if not _describes_all(place.campaign, rule)]
+def every_result(scope: JobScope) -> list[str]:
+    """Return the manifests of all results except those written on demand and those that describe all results."""
+    every = _jobs(scope.campaign)
+    return [_manifest(rule, where) for rule, where in every if not _describes_all(scope.campaign, rule)]
 
 
-def _read(place: JobPlace, source: SourceSpec) -> Iterable[str]:
-    """Return what a source of a row names at a place."""
+def _read(scope: JobScope, source: SourceSpec) -> Iterable[str]:
+    """Return the files and manifests of a row's source for a job."""
     if callable(source):
-        return source(place)
+        return source(scope)
     if source == EVERY:
-        return every_result(place)
-    return manifests_below(place, RESULTS[source])
+        return every_result(scope)
+    return manifests_below(scope, RESULTS[source])
 
 
 def _on_demand(campaign: Campaign, rule: Rule) -> bool:
@@ -184,20 +185,20 @@ def _describes_all(campaign: Campaign, rule: Rule) -> bool:
     return _on_demand(campaign, rule) or EVERY in rule.sources
 
 
-def _stated(place: JobPlace, setting: SettingSpec) -> dict[str, Any]:
-    """Return what a setting of a row says at a place, by the last word of its key."""
+def _stated(scope: JobScope, setting: SettingSpec) -> dict[str, Any]:
+    """Return the values of a row's setting for a job, by the last part of the key."""
     if callable(setting):
-        return dict(setting(place))
-    value: Any = place.campaign.values
+        return dict(setting(scope))
+    value: Any = scope.campaign.values
     for word in setting.split("."):
         value = value[word]
     return {setting.rpartition(".")[2]: value}
 
 
 def modules_of(campaign: Campaign, result: str, *where: str) -> tuple[str, ...]:
-    """Return the modules whose import closure is the code that makes a result, as dotted names.
+    """Return the modules whose import closure is the code of a result, as dotted names.
 
-    Of readers those count that the files in raw/ name: another format's reader makes nothing again.
+    Only the readers for the formats of the files in raw/ are included.
 
     Parameters
     ----------
@@ -228,7 +229,7 @@ def _closure(modules: tuple[str, ...]) -> frozenset[str]:
 
 
 def _readers(campaign: Campaign, rule: Rule, where: tuple[str, ...]) -> Iterator[str]:
-    """Yield the modules that read what the nodes of a place have recorded, and their logs."""
+    """Yield the modules that read the recordings and logs of a job's nodes."""
     stated = dict(zip(rule.of.wildcards, where, strict=True))
     flights = [campaign.flight(stated["flight"])] if "flight" in stated else campaign.flights
     named = {node for word in ("node", "pair") for node in stated.get(word, "").split("-")}
@@ -245,38 +246,38 @@ def _readers(campaign: Campaign, rule: Rule, where: tuple[str, ...]) -> Iterator
 
 
 def _log_reader(campaign: Campaign, flight: str, node: str) -> str:
-    """Return the module that reads a log; of one that is not there, by its suffix, the module that has read it."""
+    """Return the module that reads a log; for a missing log, the module of that suffix with which it was read."""
     path, options = campaign.track_file(flight, node), campaign.settings.nodes[node].log.options
     manifest = campaign.root / campaign.manifest("track", flight, node)
     readers = [module_of(row.reader) for row in TRACKS.values() if path.suffix.lower() in row.suffixes]
     if path.is_file() or options.format in TRACKS or not readers or not manifest.is_file():
         return module_of(TRACKS[log_format(path, options)].reader)
-    from apertura.campaign.store import read_manifest  # loads arrays
+    from apertura.campaign.store import read_manifest  # loads zarr
 
     code = read_manifest(manifest)["code"]
-    return next((one for one in readers if code_sha256(RESULTS["track"].module, one) == code), readers[0])
+    return next((reader for reader in readers if code_sha256(RESULTS["track"].module, reader) == code), readers[0])
 
 
 def with_inputs(campaign: Campaign, target: Path, *, link: bool) -> Path:
-    """Fill a folder with what a campaign's results are made from; return it.
+    """Copy the inputs of a campaign's results to a folder; return the folder.
 
-    What stays is copied: who edits it later must not edit the recordings of the campaign.
+    Without `link`, recordings are copied, so that later edits of the copy do not change the campaign.
 
     Parameters
     ----------
     campaign
-        Of whose folder plain files are taken: those of config/ and raw/, and others that its configuration names.
+        Campaign with the files: those of config/ and raw/, and others that its config names.
     target
-        The folder, made where it is missing.
+        Folder, which is created if it is missing.
     link
-        Give recordings as hard links where that is possible.
+        Create hard links to recordings where possible.
     """
     sources = {source for _, result in results_of(campaign) for source in result.sources}
     named = [campaign.root / source for source in sources if source.partition("/")[0] not in {"results", *_INPUTS}]
-    inputs = ["config", *([] if campaign.settings.raw_root else ["raw"])]  # the config names raw_root there, too
+    inputs = ["config", *([] if campaign.settings.raw_root else ["raw"])]  # raw_root is absolute, valid in the copy
     for path in sorted({*named, *(path for folder in inputs for path in (campaign.root / folder).rglob("*"))}):
         if path.is_file(follow_symlinks=False):
-            here = path.relative_to(campaign.root)
-            (target / here).parent.mkdir(parents=True, exist_ok=True)
-            path.copy_to(target / here, link=link and here.parts[0] == "raw")
+            relative = path.relative_to(campaign.root)
+            (target / relative).parent.mkdir(parents=True, exist_ok=True)
+            path.copy_to(target / relative, link=link and relative.parts[0] == "raw")
     return target

@@ -1,7 +1,7 @@
-"""Resources of a job of each rule, by sizes of files and the config: of a cluster, and time on this machine.
+"""Cluster resources and run time of the jobs of each rule, estimated from file sizes and the config.
 
-Nothing here opens a recording: it runs for each job of a thousand flights while the workflow is put together.
-Estimates are from above; a job that was killed for want of memory or time asks for twice as much.
+No recording is opened, because Snakemake calls this for each job of up to a thousand flights when it builds the
+workflow. The resources are upper bounds; a job killed at its memory or time limit requests twice as much.
 """
 
 import math
@@ -18,12 +18,12 @@ from apertura.common.documents import DAMAGED, read_json
 from apertura.common.errors import CampaignError
 from apertura.workflow.rules import RULES, Cost, Demand
 
-_CAPTURE_BYTES = 64  # of a recording's metadata at least
-_UNKNOWN_PIXELS = 4096**2  # of a grid that is settled by the first flight
-_USUAL_MPX = 0.25  # of such a grid, as most are
-_AT_ONCE_PIXELS = 4096**2  # more are read and written by blocks
-_AT_ONCE_BYTES = 1_000_000_000  # of range profiles; more are formed by blocks of pulses
-_OVERSAMPLING = 2  # of range profiles
+_CAPTURE_BYTES = 64  # smallest size of a capture's metadata
+_UNKNOWN_PIXELS = 4096**2  # assumed for a grid that is derived from the first flight, for resources
+_USUAL_MPX = 0.25  # assumed for such a grid, for the run time
+_AT_ONCE_PIXELS = 4096**2  # pixels in memory at once; larger rasters are processed in blocks
+_AT_ONCE_BYTES = 1_000_000_000  # range profiles in memory at once; larger ones are processed in blocks of pulses
+_OVERSAMPLING = 2  # oversampling of range profiles
 
 
 @dataclass(frozen=True)
@@ -33,17 +33,17 @@ class Work:
     Attributes
     ----------
     recorded_bytes
-        Of the recordings of its nodes.
+        Size of its nodes' recordings.
     pulses
-        Of one pair, at most.
+        Largest number of pulses of a pair.
     profile_bytes
-        Of one pair's range profiles.
+        Size of a pair's range profiles.
     pixels
-        Of the grid.
+        Pixels of the grid.
     tiles
-        Of one image, or of a job's share of them.
+        Tiles of an image, or of the job's share of an image.
     images
-        Pairs that it looks at.
+        Number of images.
     """
 
     recorded_bytes: int
@@ -54,21 +54,21 @@ class Work:
     images: int = 1
 
 
-_BESIDE_MB = 300  # Snakemake, twice: a batch system counts them as the job's
-_LEAST_MINUTES = 10  # the start on a busy node, and a file system that is slow to answer
-_SLOWER = 3  # than the machine that the constants are from
+_SNAKEMAKE_MB = 300  # two Snakemake processes, which a batch system counts as part of the job
+_LEAST_MINUTES = 10  # for the start on a busy node, and slow file systems
+_SLOWER = 3  # assumed factor to the run times on the machine where the constants were measured
 
 
 @dataclass(frozen=True)
 class Resources:
-    """Resources of the jobs of a campaign's rules; rules quote its methods, and Snakemake calls them.
+    """Resources of the jobs of a campaign's rules.
 
     Attributes
     ----------
     campaign
-        Settings and flights.
+        Campaign with settings and flights.
     planned
-        Flight and node → bytes and pulses of recordings that are not there yet; None: they lie in raw/.
+        Flight and node → bytes and pulses of planned recordings; None: recordings are in raw/.
 
     Examples
     --------
@@ -94,44 +94,44 @@ class Resources:
         Parameters
         ----------
         rule
-            The rule's name; any other counts as one that is soon done.
+            Name of the rule; for an unknown name, the default cost is returned.
         *where
-            Words of its job, first the values of its wildcards; what the campaign does not have counts for nothing.
+            Arguments of the job, first the values of its wildcards; names that the campaign does not have are ignored.
         """
         row = RULES.get(rule)
         cost = row.cost if row else Cost()
         wildcards = row.of.wildcards if row else ()
-        counts = cost.mb_s or cost.mb_mpx_s
-        recorded_mb = self._recorded_mb(dict(zip(wildcards, where, strict=False))) if counts else 0.0
+        needs_size = cost.mb_s or cost.mb_mpx_s
+        recorded_mb = self._recorded_mb(dict(zip(wildcards, where, strict=False))) if needs_size else 0.0
         rows, columns = self._shape or (0, 0)
         mpx = rows * columns / 1e6 if self._shape else _USUAL_MPX
         return cost.begin_s + cost.mb_s * recorded_mb + cost.mpx_s * mpx + cost.mb_mpx_s * recorded_mb * mpx
 
     def _recorded_mb(self, stated: dict[str, str]) -> float:
-        """Return the recorded megabytes of the nodes of a job; 0 for names that are not in the campaign."""
+        """Return the size of the recordings of a job's nodes, MB; 0 for names that the campaign does not have."""
         flight, pair, node = (stated.get(word) for word in ("flight", "pair", "node"))
         named = [name for name in (node, *(pair or "").split("-")) if name]
         known = flight in {each.name for each in self.campaign.flights} and {*named} <= {*self.campaign.settings.nodes}
-        with suppress(CampaignError, OSError):  # not there yet
+        with suppress(CampaignError, OSError):  # recording missing
             return self.work(flight, pair, node).recorded_bytes / 1e6 if known else 0.0
         return 0.0
 
     def work(self, flight: str | None, pair: str | None, node: str | None, jobs: int = 1) -> Work:
-        """Return the work of a job: of a node's recording, a pair, a flight, or all of them.
+        """Return the work of a job on a node's recording, a pair, a flight or the campaign.
 
         Parameters
         ----------
         flight, pair, node
-            Wildcards of the job; None where it has none.
+            Wildcards of the job; None for wildcards that it does not have.
         jobs
-            That share the tiles of an image.
+            Number of jobs that share the tiles of an image.
         """
         campaign = self.campaign
         flights = [campaign.flight(flight)] if flight else list(campaign.image_flights or campaign.flights)
         first = flights[0]
-        images = 1 if pair or node else sum(len(one.pairs) for one in flights)
+        images = 1 if pair or node else sum(len(each.pairs) for each in flights)
         nodes = [node] if node else dict.fromkeys(pair.split("-") if pair else first.participants)
-        if not isinstance(campaign.settings.waveform, SampledWaveform):  # all that is recorded lies with the receivers
+        if not isinstance(campaign.settings.waveform, SampledWaveform):  # only receivers record phase histories
             nodes = [node for node in nodes if node in first.nodes]
         recorded = [self._recorded(first.name, name) for name in nodes]
         pulses = max((pulses for _, pulses in recorded), default=0)
@@ -152,7 +152,7 @@ class Resources:
         return cache(self._bytes_and_pulses)
 
     def _bytes_and_pulses(self, flight: str, node: str) -> tuple[int, int]:
-        """Return the bytes of a recording and how many pulses it has at most."""
+        """Return the size of a recording in bytes, and the largest possible number of its pulses."""
         if self.planned is not None:
             return self.planned[flight, node]
         waveform = self.campaign.settings.waveform
@@ -164,13 +164,11 @@ class Resources:
         if not paths[-1].is_file():
             return sum(files), self._captures(flight, node)
         samples = files[-1] / 4
-        ran_through = samples / waveform.sample_rate_hz * waveform.prf_hz  # one capture, of all pulses
-        return sum(files), math.ceil(
-            min(samples / waveform.needed_samples, max(files[0] / _CAPTURE_BYTES, ran_through))
-        )
+        continuous = samples / waveform.sample_rate_hz * waveform.prf_hz  # pulses of a continuous recording
+        return sum(files), math.ceil(min(samples / waveform.needed_samples, max(files[0] / _CAPTURE_BYTES, continuous)))
 
     def _captures(self, flight: str, node: str) -> int:
-        """Count the captures in stage `raw` of a recording that is not there; 0 where it is not known."""
+        """Return the number of captures in stage `raw` of a missing recording; 0 if it is unknown."""
         with suppress(CampaignError, LookupError, TypeError, ValueError):
             path = self.campaign.stage("raw", flight, node) / "start" / "zarr.json"
             return int(read_json(path, expected="an array of stage raw", remedy=DAMAGED)["shape"][0])
@@ -178,11 +176,11 @@ class Resources:
 
     @cached_property
     def _shape(self) -> tuple[int, int] | None:
-        """Rows and columns: as settled, or as the config says; None where they are not known yet."""
+        """Rows and columns from scene.json or the config; None if they are not known yet."""
         scene = self.campaign.settings.scene
-        with suppress(CampaignError, LookupError, TypeError, ValueError):  # not there, or damaged
-            settled = read_json(self.campaign.result("scene.json"), expected="a settled scene", remedy=DAMAGED)
-            rows, columns = map(int, settled["grid"]["shape"])
+        with suppress(CampaignError, LookupError, TypeError, ValueError):  # scene.json missing or damaged
+            document = read_json(self.campaign.result("scene.json"), expected="the campaign's grid", remedy=DAMAGED)
+            rows, columns = map(int, document["grid"]["shape"])
             return rows, columns
         if scene.bounds_m == "auto" or scene.spacing_m == "auto":
             return None
@@ -191,7 +189,7 @@ class Resources:
 
     @cached_property
     def _range_samples(self) -> int:
-        """Largest number of samples of a range profile: of the whole period, or of the scene's depth."""
+        """Largest number of samples of a range profile: of the unambiguous range, or of the scene's depth."""
         waveform, scene = self.campaign.settings.waveform, self.campaign.settings.scene
         if not isinstance(waveform, SampledWaveform):
             return 1000
@@ -206,26 +204,26 @@ class Resources:
 
 @dataclass(frozen=True)
 class RuleResources:
-    """Resources of the jobs of one rule, as Snakemake calls them: by the wildcards of a job."""
+    """Resources of the jobs of a rule, as functions of a job's wildcards for Snakemake."""
 
     demand: Demand
     of: Resources
 
     def threads(self, wildcards: Any) -> int:
-        """Return the threads of a job: not more than it has tiles, where it forms them."""
+        """Return the number of threads of a job, at most its number of tiles."""
         return max(1, min(self.demand.threads, self._work(wildcards).tiles))
 
     def mem_mb(self, wildcards: Any, attempt: int) -> int:
-        """Return the memory of a job, MB of 1e6 bytes; twice as much at each further attempt."""
+        """Return the memory of a job, MB of 1e6 bytes; it doubles with each attempt."""
         work, demand = self._work(wildcards), self.demand
         grows = demand.pulse_bytes * work.pulses
         grows += demand.pixel_bytes * min(work.pixels, _AT_ONCE_PIXELS)
         grows += demand.image_bytes * work.images + demand.tile_bytes * work.tiles
         grows += demand.profile_share * min(work.profile_bytes, _AT_ONCE_BYTES)
-        return math.ceil(_BESIDE_MB + demand.base_mb + grows / 1e6) << attempt - 1
+        return math.ceil(_SNAKEMAKE_MB + demand.base_mb + grows / 1e6) << attempt - 1
 
     def runtime(self, wildcards: Any, attempt: int) -> int:
-        """Return the time limit of a job, minutes; twice as much at each further attempt."""
+        """Return the time limit of a job, minutes; it doubles with each attempt."""
         work, demand = self._work(wildcards), self.demand
         seconds = demand.recorded_s * work.recorded_bytes / 1e9 + demand.pixel_s * work.images * work.pixels / 1e6
         seconds += demand.sum_s * work.images * work.pixels * work.pulses / 1e9

@@ -1,7 +1,7 @@
-"""The rules of the workflow, one row each: what a rule makes, of what, by which module, at what cost.
+"""Rules of the workflow, one row each: result, sources, settings, function, resources and cost.
 
-Lineage, resources, the time left and `apertura step` follow from the rows; a test compares them with the rules in
-`workflow/`. Rows refer to functions by `Lazy`, since the command line reads them, too.
+Lineage, resources, the remaining time and `apertura step` follow from the rows; a test compares them with the rules in
+`workflow/`. Rows refer to functions by `Lazy`, because the command line imports the rows as well.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -13,29 +13,29 @@ from apertura.workflow import rule_inputs as inputs
 from apertura.workflow.rule_inputs import Scope
 
 INTERFEROMETRY = "interferometry"
-"""Folder of the results: pairs of images compared in phase."""
+"""Results folder of interferograms."""
 
 STUDY = "study"
-"""Folder of the results: measurements that are made on demand."""
+"""Results folder of benchmark measurements, which are made on demand."""
 
 EVERY = "*"
-"""Source of a result that describes all results that are not made on demand."""
+"""Source of a result that describes all results except those written on demand."""
 
 
 @dataclass(frozen=True)
 class Demand:
-    """What a job takes of a cluster: a constant, and what grows with its work, from measured runs.
+    """Cluster resources of a job: a constant, and terms proportional to its work, from measured runs.
 
     Attributes
     ----------
     base_mb
-        Resident memory whatever the work; what was measured on small work, and half as much again.
+        Resident memory independent of the work: 1.5 times the memory measured for little work.
     pulse_bytes, pixel_bytes, tile_bytes, image_bytes
         Memory per pulse, per pixel in memory at once, per tile to be formed, and per image that is described.
     profile_share
         Memory per byte of range profiles in memory at once.
     threads
-        As many as it can use.
+        Largest useful number of threads.
     recorded_s
         Seconds per GB recorded.
     pixel_s
@@ -58,18 +58,18 @@ class Demand:
 
 @dataclass(frozen=True)
 class Cost:
-    """How long a job is expected to take on two cores of 2025, begun by a fork: a run tells it by its own steps.
+    """Expected run time of a job on two CPU cores of 2025, started by a fork; a run scales it by its measured times.
 
     Attributes
     ----------
     begin_s
-        Seconds whatever the work.
+        Seconds independent of the work.
     mb_s, mpx_s, mb_mpx_s
-        Seconds per MB recorded, per million pixels, and per both.
+        Seconds per MB recorded, per million pixels, and per product of both.
     all_cores
-        Whether a job takes all cores.
+        True if a job uses all cores.
     last
-        Whether no other rule waits for it, or hardly.
+        True if no other rule, or hardly any, depends on it.
     """
 
     begin_s: float = 0.4
@@ -81,68 +81,68 @@ class Cost:
 
     @property
     def of_imaging(self) -> bool:
-        """Whether a job sums pulses over pixels: what that takes the plan decides, by orders of magnitude."""
+        """True if a job sums pulses over pixels; its run time depends on the plan by orders of magnitude."""
         return bool(self.mb_mpx_s)
 
     @property
     def of_rasters(self) -> bool:
-        """Whether a job reads and writes rasters and does little else: such jobs are alike."""
+        """True if a job mainly reads and writes rasters; run times of such jobs deviate alike from expected ones."""
         return bool(self.mpx_s) and not self.mb_s and not self.mb_mpx_s
 
 
 @dataclass(frozen=True)
 class Rule:
-    """One rule of the workflow.
+    """Rule of the workflow.
 
     Attributes
     ----------
     name
-        As the workflow calls it.
+        Name in the workflow.
     of
-        What each of its jobs runs on.
+        Scope of its jobs.
     help
-        What it does, in a sentence; `apertura step` shows it.
+        Description in one sentence, shown by `apertura step`.
     step
-        Function that does it, of a campaign and the values of the wildcards; it returns what it wrote.
+        Function of a campaign and the values of the wildcards that writes the result; it returns the written paths.
     sources
-        What it reads: names of results, of the same place or of all places that belong to it, and functions of a place
-        that return further manifests and files, relative to the campaign folder.
+        Names of results, within the scope of the job, and functions of the scope that return further manifests and
+        files, relative to the campaign folder.
     settings
-        What of the config matters to it: dotted keys, and functions of a place that return further values by name.
+        Settings that affect the result: dotted keys, and functions of the scope that return further values by name.
     demand
-        What a job takes of a cluster; None where Snakemake itself does the work.
+        Cluster resources of a job; None if Snakemake itself does the work.
     cost
-        How long a job is expected to take.
+        Expected run time of a job.
     result
-        Name of what it makes; empty: as the rule.
+        Name of the result; empty: the name of the rule.
     products
-        Files beside the manifest that people open.
+        Files next to the manifest for users.
     documents
-        Files beside the manifest that other rules read.
+        Files next to the manifest for other rules.
     exports
         Kind of the rows of `apertura.formats.export` that it writes.
     styles
-        Whether it writes the styles of all rows.
+        True if it writes the styles of all rows.
     manifest
-        Path below the results, without ``.manifest.json``; empty: by the place and the name of the result.
+        Path below the results, without ``.manifest.json``; empty: from the scope and the name of the result.
     kinds
-        Kinds of flights that it is made of.
+        Kinds of flights to which it applies.
     needed
-        Whether a place has it at all.
+        Function that returns True if the result exists in a scope.
     on_demand
-        Whether it is made when it is asked for, and not with the images.
+        True if it is written on request only, and not by every run.
     shares
-        Whether it only does a share of the work behind `result`, which another rule completes.
+        True if it computes a share of `result`, which another rule completes.
     forms
-        Whether its step reads transfer functions of its pairs, which are formed from the recordings of receivers.
+        True if its step reads transfer functions of its pairs, which are formed from the recordings of receivers.
     reads
-        Which readers of what was recorded count as its code, where its step reads: of recordings, of logs.
+        Readers whose code affects the result if its step reads recorded files: of recordings, of logs.
     command
-        As `apertura step` calls it; empty: as the rule.
+        Name of its `apertura step` command; empty: the name of the rule.
     arguments, options
-        Of that command; no arguments: the wildcards.
+        Arguments and options of that command; no arguments: the wildcards.
     last_words
-        Words that follow the wildcards, where the command serves several rules.
+        Arguments after the wildcards, for a command that serves several rules.
     """
 
     name: str
@@ -160,7 +160,7 @@ class Rule:
     styles: bool = False
     manifest: str = ""
     kinds: tuple[str, ...] = ("image",)
-    needed: Callable[[inputs.JobPlace], bool] = lambda _: True
+    needed: Callable[[inputs.JobScope], bool] = lambda _: True
     on_demand: bool = False
     shares: bool = False
     forms: bool = False
@@ -171,15 +171,15 @@ class Rule:
     last_words: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        """Fill in what follows from the name and the place."""
+        """Set the default values that follow from the name and the scope."""
         folder = "/".join(f"{{{word}}}" for word in self.of.wildcards)
-        follows = {
+        defaults = {
             "result": self.name,
             "manifest": f"{folder}/{self.result or self.name}".removeprefix("/"),
             "command": self.name.replace("_", "-"),
             "arguments": self.of.wildcards,
         }
-        for field, value in follows.items():
+        for field, value in defaults.items():
             if not getattr(self, field):
                 object.__setattr__(self, field, value)
 
@@ -190,25 +190,25 @@ class Rule:
 
     @property
     def folder(self) -> str:
-        """Folder of what it makes, below the results, with wildcards in braces."""
+        """Folder of the result below the results folder, with wildcards in braces."""
         return self.manifest.rpartition("/")[0]
 
     @property
     def log(self) -> str:
-        """Where its log and its benchmark lie below their folders, without suffix.
+        """Path of its log and benchmark files below their folders, without suffix.
 
         Examples
         --------
         >>> RULES["echo"].log, RULES["calibrate"].log, RULES["cube"].log
         ('{flight}/{pair}.echo', '{flight}/calibrate', 'cube')
         """
-        above, _, place = self.folder.rpartition("/")
+        above, _, last = self.folder.rpartition("/")
         if not self.of.wildcards:
             return self.name
-        return f"{above}/{place}.{self.name}" if above else f"{place}/{self.name}"
+        return f"{above}/{last}.{self.name}" if above else f"{last}/{self.name}"
 
     def command_line(self, where: Iterable[str]) -> str:
-        """Return the command that a person can paste.
+        """Return the shell command of a job.
 
         Parameters
         ----------
@@ -223,7 +223,7 @@ class Rule:
         return " ".join(["apertura step", self.command, *where, *self.last_words])
 
 
-def _workflow(_: inputs.JobPlace) -> Mapping[str, Any]:
+def _workflow(_: inputs.JobScope) -> Mapping[str, Any]:
     from apertura.common.paths import shipped
     from apertura.common.provenance import canonical_json, sha256_text, sha256_tree
 
@@ -282,7 +282,7 @@ _ROWS = (
     Rule(
         "bench",
         Scope.FLIGHT,
-        "Measure channels, clocks and links of a radar that stands still, bench.json, bench.html and bench.png.",
+        "Measure channels, clocks and links of a stationary radar, bench.json, bench.html and bench.png.",
         _TOOLS.bench.report.bench,
         sources=(inputs.recorded_on_the_bench,),
         settings=("campaign", "waveform", "bench", "processing.sidelink", inputs.stated_paths, inputs.sample_orders),
@@ -312,7 +312,7 @@ _ROWS = (
     Rule(
         "transfer",
         Scope.PAIR,
-        "Keep the transfer functions of a pair, transfer.zarr, for when the recording is no longer there.",
+        "Store the transfer functions of a pair, transfer.zarr, for use without the recording.",
         _STAGES.transfer.transfer,
         sources=("echo", inputs.received),
         reads=("recordings",),
@@ -353,7 +353,7 @@ _ROWS = (
         _STAGES.scene.terrain,
         sources=("scene", inputs.heights),
         settings=("scene.dem", "scene.dem_datum", "scene.geoid"),
-        needed=lambda place: bool(place.campaign.settings.scene.dem),
+        needed=lambda scope: bool(scope.campaign.settings.scene.dem),
         demand=Demand(500, pixel_bytes=50, pixel_s=10),
     ),
     Rule(
@@ -362,7 +362,13 @@ _ROWS = (
         "Compress a pair in range over the scene, profile.zarr.",
         _STAGES.profile.profile,
         sources=("echo", *_GROUND, inputs.patterns),
-        settings=("processing.window", "processing.integration", inputs.antennas),
+        settings=(
+            "processing.window",
+            "processing.background",
+            "processing.interference",
+            "processing.integration",
+            inputs.antennas,
+        ),
         forms=True,
         demand=Demand(500, pulse_bytes=500, recorded_s=120),
         cost=Cost(0.3, mb_s=0.001),
@@ -370,7 +376,7 @@ _ROWS = (
     Rule(
         "refine",
         Scope.FLIGHT,
-        "Estimate errors of a flight's tracks from its images, where that pays, refined_track.zarr.",
+        "Estimate errors of a flight's tracks from its images if autofocus is on, refined_track.zarr.",
         _STAGES.refine.refine,
         result="refined_track",
         sources=(inputs.autofocused, *_GROUND),
@@ -381,7 +387,7 @@ _ROWS = (
     Rule(
         "tracks",
         Scope.FLIGHT,
-        "Write the logs of a flight as refined, tracks/<node>.pos and .csv, and what was moved, tracks.png.",
+        "Write the refined tracks of a flight, tracks/<node>.pos and .csv, and plot the corrections, tracks.png.",
         _STAGES.tracks.tracks,
         sources=("refined_track", "track", inputs.unstaged_positions),
         settings=("campaign", inputs.stated_errors, inputs.unstaged_log_settings),
@@ -394,7 +400,7 @@ _ROWS = (
     replace(
         _IMAGE,
         name="tiles",
-        help="Form one job's share of a pair's tiles, '2-of-8'; step image finishes them.",
+        help="Form one job's share of an image's tiles, such as '2-of-8'; step image completes the image.",
         step=_STAGES.image.tiles,
         result="image",
         command="tiles",
@@ -406,7 +412,7 @@ _ROWS = (
     Rule(
         "layers",
         Scope.PAIR,
-        "Write incidence, bistatic angle, mask, looks and noise of a pair as GeoTIFFs, and sigma0 where it is known.",
+        "Write incidence, bistatic angle, mask, looks and noise of a pair as GeoTIFFs, and sigma0 if calibrated.",
         _STAGES.layers.layers,
         sources=(*_FORMED, inputs.measured_image),
         settings=("campaign", "processing.integration", inputs.antennas, inputs.radio, inputs.multilook),
@@ -419,7 +425,7 @@ _ROWS = (
     Rule(
         "assess",
         Scope.FLIGHT,
-        "Compare the images of a flight with each other, and choose what is added up, assessment.json.",
+        "Compare the images of a flight and choose the pairs of the coherent sum, assessment.json.",
         _STAGES.assess.assess,
         result="assessment",
         sources=("echo", "image", "refined_track", *_GROUND),
@@ -444,7 +450,7 @@ _ROWS = (
     Rule(
         "cphd",
         Scope.PAIR,
-        "Write the calibrated transfer functions of a pair for other processors, phase_history.cphd.",
+        "Write the calibrated transfer functions of a pair as CPHD, phase_history.cphd.",
         _STAGES.cphd.cphd,
         sources=("echo", "profile", "scene"),
         settings=("campaign",),
@@ -458,7 +464,7 @@ _ROWS = (
     Rule(
         "coverage",
         Scope.CAMPAIGN,
-        "Draw what every flight and pair covers, coverage.png and coverage.geojson.",
+        "Draw the coverage of every flight and pair, coverage.png and coverage.geojson.",
         _STAGES.coverage.coverage,
         sources=("echo", "layers", "scene"),
         settings=("campaign",),
@@ -468,7 +474,7 @@ _ROWS = (
     Rule(
         "cube",
         Scope.CAMPAIGN,
-        "Stack and add up every image, cube.zarr.",
+        "Stack all images and compute sums and interferometric phases, cube.zarr.",
         _STAGES.cube.cube,
         sources=("image", "assessment", "scene"),
         settings=("campaign", "processing.tile_px"),
@@ -479,7 +485,7 @@ _ROWS = (
     Rule(
         "export_fused",
         Scope.FLIGHT,
-        "Write GeoTIFFs and the quicklook of what the pairs of a flight add up to.",
+        "Write GeoTIFFs and the quicklook of the sums of a flight's pairs.",
         _STAGES.export.export,
         result="fused",
         sources=("image", "assessment", "cube", "scene", inputs.noise_of_sums),
@@ -497,7 +503,7 @@ _ROWS = (
     Rule(
         "interferogram",
         Scope.TWO,
-        "Compare two images in phase: coherence, unwrapped phase and heights, by a name of interferometry.pairs.",
+        "Compute coherence, unwrapped phase and heights from two images, by a name of interferometry.pairs.",
         _STAGES.interferogram.interferogram,
         sources=(*_FORMED, "image", "layers"),
         settings=(
@@ -517,7 +523,7 @@ _ROWS = (
     Rule(
         "mosaic",
         Scope.CAMPAIGN,
-        "Write a mosaic of each product of all flights, mosaic/<pair>/<product>.vrt.",
+        "Write a mosaic of each product over all flights, mosaic/<pair>/<product>.vrt.",
         _STAGES.mosaic.mosaic,
         sources=("layers", "export", "fused"),
         settings=("campaign", inputs.coefficients),
@@ -529,7 +535,7 @@ _ROWS = (
     Rule(
         "stac",
         Scope.CAMPAIGN,
-        "Describe every image in a static STAC catalog, stac/catalog.json.",
+        "Describe every image in a static STAC catalogue, stac/catalog.json.",
         _STAGES.stac.stac,
         sources=("echo", "layers", "export", "fused", "scene"),
         settings=("campaign", "metadata", inputs.polarisations),
@@ -539,7 +545,7 @@ _ROWS = (
     Rule(
         "pictures",
         Scope.PAIR,
-        "Draw what the report shows of a pair: geometry, pulses, phase, cuts, range profiles, budget.",
+        "Draw the figures of a pair for the report: geometry, pulses, phase, cuts, range profiles, budget.",
         _VIEWS.report.pictures.pictures,
         sources=("echo", "profile", "image", "layers", inputs.transmitter_raw, "refined_track", *_GROUND),
         settings=("campaign",),
@@ -550,7 +556,7 @@ _ROWS = (
     Rule(
         "pictures_fused",
         Scope.FLIGHT,
-        "Draw what the report shows of the sums of a flight's pairs: beside the pairs, and cuts.",
+        "Draw the figures of a flight's sums for the report: comparison with the pairs, and cuts.",
         _VIEWS.report.pictures.pictures_fused,
         sources=("export", "image", "cube", "fused", "scene"),
         settings=("campaign",),
@@ -564,7 +570,7 @@ _ROWS = (
     Rule(
         "page",
         Scope.FLIGHT,
-        "Write what the report says of a flight, report.html, which prints.",
+        "Write the report page of a flight, report.html.",
         _VIEWS.report.step.page,
         sources=("pictures", "pictures_fused", "export", "fused", "scene"),
         settings=(inputs.everything,),
@@ -575,7 +581,7 @@ _ROWS = (
     Rule(
         "report",
         Scope.CAMPAIGN,
-        "Write the first page of Snakemake's report, which `apertura report` asks for.",
+        "Write the first page of Snakemake's report, for `apertura report`.",
         _VIEWS.report.step.landing,
         sources=("page", "coverage"),
         settings=(inputs.everything,),
@@ -584,7 +590,7 @@ _ROWS = (
     Rule(
         "map",
         Scope.CAMPAIGN,
-        "Write what `apertura map` shows of every image in a browser, map/map.json.",
+        "Write the data of `apertura map`, map/map.json.",
         _VIEWS.webmap.document.webmap,
         sources=("layers", "export", "fused", "coverage", "scene", inputs.truth),
         settings=("campaign", "calibration", "scene.reference_points"),
@@ -596,7 +602,7 @@ _ROWS = (
     Rule(
         "speed_accuracy",
         Scope.CHARTED,
-        "Time and measure every engine and setting on a pair, for at most so many seconds.",
+        "Measure run time and accuracy of every engine and setting on a pair, within a time limit in seconds.",
         _TOOLS.chart.speed_accuracy.speed_accuracy,
         sources=(*_FORMED, "refined_track"),
         settings=(inputs.charted_pair, *_IMAGE_SETTINGS),
@@ -612,7 +618,7 @@ _ROWS = (
     Rule(
         "whole_chart",
         Scope.CAMPAIGN,
-        "Time and measure the way from raw samples to GeoTIFFs under several settings, whole.csv and .png.",
+        "Measure run time and accuracy from raw samples to GeoTIFFs with several settings, whole.csv and .png.",
         _TOOLS.chart.whole.whole_chart,
         result="whole",
         sources=(inputs.everything_recorded, inputs.heights),
@@ -636,7 +642,7 @@ _ROWS = (
 )
 
 RULES: Mapping[str, Rule] = dict(reversed({row.name: row for row in reversed(_ROWS) if row.demand}.items()))
-"""Rule of the workflow → its row; of a rule that makes several results the row of the first."""
+"""Rule of the workflow → its row; for a rule with several results, the row of the first result."""
 
 RESULTS: Mapping[str, Rule] = {row.result: row for row in _ROWS if not row.shares}
-"""Result → the row of the rule that makes it, each after those that it is made from."""
+"""Result → row of its rule, each after the results on which it depends."""

@@ -1,4 +1,7 @@
-"""Results that another file, another setting or other code has overtaken, whatever the times of files say."""
+"""Detection of results that are out of date, because a source, a setting or the code changed; file times do not count.
+
+The comparison uses the hashes in the manifests of results.
+"""
 
 import re
 import sys
@@ -21,31 +24,31 @@ _ONLY_LOOKS = (
     r"-[a-zA-Z]*[nlSD][a-zA-Z]*|--(dry-?run|lint|list.*|lt|lc|lp|summary|detailed-summary|dag|d3dag|rulegraph|filegraph|"
     r"report.*|unlock|cleanup.*|containerize|export-cwl|archive|compilation|print-compilation|delete-.*|help|version)"
 )
-"""Options with which snakemake reads a workflow and runs none of it."""
+"""Options with which snakemake reads a workflow without running it."""
 
 _RAW = "raw/"
-_SOURCE = {"missing": "is gone", "altered": "has changed", "added": "is new to it"}
+_SOURCE = {"missing": "is missing", "altered": "has changed", "added": "is a new source"}
 
 
 def stale_results(campaign: Campaign, *, paranoid: bool = False) -> dict[str, str]:
-    """Return manifest → why its result has to be made again, of those that are there, each after those it depends on.
+    """Return manifest → reason for each existing result that is out of date, in the order of dependencies.
 
-    The reason is empty where it only depends on one that is made again. A file of raw/ that is not there overtakes
-    nothing: it may lie elsewhere, see `absent_files`.
+    The reason is empty if a result only depends on another one that is out of date. A missing file of raw/ is no
+    reason, because recordings may be stored elsewhere, see `absent_files`.
 
     Parameters
     ----------
     campaign
-        Settings and flights.
+        Campaign with settings and flights.
     paranoid
-        Read every file, also where its state is that of a hash taken before.
+        Compute the hash of every file, even if its size and times are those of a stored hash.
     """
     stale: dict[str, str] = {}
     for name, result in results_of(campaign):
         path = campaign.root.named(result.manifest, where=campaign.root)
         if not path.is_file():
             if any((path.parent / file).is_file() for file in products_of(RESULTS[name])):
-                stale[result.manifest] = "its manifest is gone, which said what its files were made from"
+                stale[result.manifest] = "its manifest, which states its lineage, is missing"
             continue
         try:
             reasons = list(_reasons(campaign.root, result, read_manifest(path), paranoid=paranoid))
@@ -57,59 +60,59 @@ def stale_results(campaign: Campaign, *, paranoid: bool = False) -> dict[str, st
 
 
 def without_outdated(campaign: Campaign) -> Campaign:
-    """Return a campaign whose plans are taken from its config and files: results that are out of date are not read."""
+    """Return the campaign with its outdated results marked, so that plans follow from config and files instead."""
     return replace(campaign, outdated=frozenset(stale_results(campaign)))
 
 
 def outdated_lines(campaign: Campaign) -> Iterator[str]:
-    """Yield a line on the results that `without_outdated` has taken out of account."""
+    """Yield a line on the results that `without_outdated` has marked."""
     if campaign.outdated:
         count = number_of(len(campaign.outdated), "result")
-        yield f"{count} out of date ({min(campaign.outdated)}): planned from the config; `apertura run` updates them"
+        yield f"{count} out of date ({min(campaign.outdated)}): plan from the config; `apertura run` updates them"
 
 
 def absent_files(campaign: Campaign) -> list[str]:
-    """Return the files of raw/ that results which are there were made from, and that are not there themselves."""
-    made = (result for _, result in results_of(campaign) if (campaign.root / result.manifest).is_file())
-    sources = dict.fromkeys(name for result in made for name in result.sources if name.startswith(_RAW))
+    """Return the missing files of raw/ that are sources of existing results."""
+    existing = (result for _, result in results_of(campaign) if (campaign.root / result.manifest).is_file())
+    sources = dict.fromkeys(name for result in existing for name in result.sources if name.startswith(_RAW))
     return [name for name in sources if not (campaign.root / name).is_file()]
 
 
 def wanted_files(campaign: Campaign, stale: Collection[str]) -> dict[str, str]:
-    """Return file of raw/ that is not there and that a run would read → manifest of the first result it is read for.
+    """Return missing file of raw/ that a run needs → manifest of the first result that needs it.
 
-    `stale` holds the manifests of `stale_results`.
+    `stale`: manifests of `stale_results`.
     """
-    wanted = dict[str, str]()
+    missing = dict[str, str]()
     for name, where, result in places_of(campaign):
-        made = (campaign.root / result.manifest).is_file() and result.manifest not in stale
-        if not made and not on_demand(campaign, result.manifest):
+        is_current = (campaign.root / result.manifest).is_file() and result.manifest not in stale
+        if not is_current and not on_demand(campaign, result.manifest):
             for source in files_read(campaign, name, *where):
                 if source.startswith(_RAW) and not (campaign.root / source).is_file():
-                    wanted.setdefault(source, result.manifest)
-    return wanted
+                    missing.setdefault(source, result.manifest)
+    return missing
 
 
 def absent_lines(campaign: Campaign) -> Iterator[str]:
-    """Yield a line where raw/ lies elsewhere, and one where files of it are missing and not compared with results."""
+    """Yield a line if raw/ is stored elsewhere, and a line if files of raw/ are missing and thus not compared."""
     if campaign.settings.raw_root:
         yield f"recordings are read from {shown(campaign.settings.raw_root, 400)} (raw_root in the config)"
     if absent := absent_files(campaign):
         more = f" and {len(absent) - 1} more" if len(absent) > 1 else ""
-        yield f"not there, so results are not compared with it: {shown(absent[0])}{more}"
+        yield f"missing recordings, not compared with results: {shown(absent[0])}{more}"
 
 
 def any_is_missing(campaign: Campaign) -> bool:
-    """Test whether a result is missing that is not made on demand."""
-    made = (result.manifest for _, result in results_of(campaign) if not on_demand(campaign, result.manifest))
-    return not all((campaign.root / manifest).is_file() for manifest in made)
+    """Return True if a result that every run writes is missing."""
+    expected = (result.manifest for _, result in results_of(campaign) if not on_demand(campaign, result.manifest))
+    return not all((campaign.root / manifest).is_file() for manifest in expected)
 
 
 def settle_times(campaign: Campaign, stale: Collection[str]) -> None:
-    """Give results that are not stale times that say so: not before what they were made from, and not after now.
+    """Set the file times of current results: not older than their sources, and not later than now.
 
-    Snakemake makes again what is older than its input, also where a copy has lost the times, and refuses an input from
-    the future, as a clock that was set back leaves it.
+    Snakemake recomputes results that are older than their input, even if a copy lost the file times, and rejects
+    inputs from the future, which a clock that was set back leaves.
     """
     results, now_ns = [result for _, result in results_of(campaign)], time.time_ns()
     inputs = {source for result in results for source in result.sources if not source.startswith("results/")}
@@ -120,7 +123,8 @@ def settle_times(campaign: Campaign, stale: Collection[str]) -> None:
         if result.manifest not in stale and path.is_file():
             files = [path.parent / file for file in read_manifest(path)["files"] if ".zarr/" not in file]
             date([path, *files], earliest_ns=newest_ns, latest_ns=now_ns)
-    benchmarks = (campaign.root / "results" / "benchmarks").rglob("*.tsv")  # Snakemake's oldest output may be one
+    # Benchmark files are outputs of the rules, too: the oldest output decides in Snakemake.
+    benchmarks = (campaign.root / "results" / "benchmarks").rglob("*.tsv")
     date(benchmarks, earliest_ns=newest_ns, latest_ns=now_ns)
 
 
@@ -129,23 +133,24 @@ def _newest_ns(root: ConfinedPath, names: Iterable[str]) -> int:
 
 
 def make_again(campaign: Campaign, stale: Mapping[str, str], *, remove: bool) -> None:
-    """Print the results that will be made again, and `remove` their manifests: without one a result is unfinished."""
+    """Print the results that will be recomputed, and `remove` their manifests, so that they count as unfinished."""
     for line in stale_lines(stale):
         print(line, file=sys.stderr, flush=True)
-    for manifest in reversed(list(stale)) if remove else ():  # dependent results first: a kill leaves no gap below
+    # Dependent results first, so that a kill leaves no finished result that depends on an unfinished one.
+    for manifest in reversed(list(stale)) if remove else ():
         for kept in _set_aside(campaign.root, manifest):
-            print(f"what was edited by hand is kept as {kept}", file=sys.stderr, flush=True)
+            print(f"a manually edited file is kept as {kept}", file=sys.stderr, flush=True)
         (campaign.root / manifest).unlink(missing_ok=True)
     if stale and not remove:
-        print("a dry run of snakemake alone does not count them: `apertura run CAMPAIGN -n` does", file=sys.stderr)
+        print("a dry run of snakemake alone does not include them; `apertura run CAMPAIGN -n` does", file=sys.stderr)
 
 
 def _set_aside(root: ConfinedPath, manifest: str) -> Iterator[str]:
-    """Put files of a result that were edited since out of the workflow's way; yield their new names."""
+    """Rename manually edited files of a result, so that the workflow does not overwrite them; yield their new names."""
     path = root / manifest
     try:
         files = read_manifest(path)["files"]
-    except CampaignError:  # their former hashes are unknown
+    except CampaignError:  # without a manifest, edits cannot be detected
         return
     for name, digest in files.items():
         file = path.parent.named(name, where=path)
@@ -158,26 +163,26 @@ def _set_aside(root: ConfinedPath, manifest: str) -> Iterator[str]:
 
 
 def stale_lines(stale: Mapping[str, str]) -> Iterator[str]:
-    """Yield a line for each reason and the results it holds for, and one for those that only depend on them.
+    """Yield a line for each reason with the results that are out of date, and one for dependent results.
 
     Examples
     --------
     >>> list(stale_lines({"a.json": "its code has changed", "b.json": "its code has changed", "c.json": ""}))
-    ['a.json and 1 more: stale, its code has changed', '1 result stands on that: stale, too']
+    ['a.json and 1 more: out of date, its code has changed', '1 dependent result out of date as well']
     """
-    holds_for: dict[str, list[str]] = {}
-    for manifest, why in stale.items():
-        holds_for.setdefault(why, []).append(manifest)
-    standing = len(holds_for.pop("", ()))
-    for why, manifests in holds_for.items():
+    by_reason: dict[str, list[str]] = {}
+    for manifest, reason in stale.items():
+        by_reason.setdefault(reason, []).append(manifest)
+    dependent = len(by_reason.pop("", ()))
+    for reason, manifests in by_reason.items():
         more = f" and {len(manifests) - 1} more" if len(manifests) > 1 else ""
-        yield f"{manifests[0]}{more}: stale, {why}"
-    if standing:
-        yield f"{standing} results stand on that: stale, too" if standing > 1 else "1 result stands on that: stale, too"
+        yield f"{manifests[0]}{more}: out of date, {reason}"
+    if dependent:
+        yield f"{number_of(dependent, 'dependent result')} out of date as well"
 
 
 def forms_results(arguments: Sequence[str]) -> bool:
-    """Test whether a command line of snakemake runs jobs; inside the workflow nothing else states it.
+    """Return True if a command line of snakemake runs jobs; the workflow has no other way to detect a dry run.
 
     Examples
     --------
@@ -188,7 +193,7 @@ def forms_results(arguments: Sequence[str]) -> bool:
 
 
 def damaged_results(campaign: Campaign) -> dict[str, str]:
-    """Return manifest → what of a result is not as it was written, of those that are there; every byte is read."""
+    """Return manifest → files that have changed since they were written, for all existing results; reads every byte."""
     damaged = {}
     for _, result in results_of(campaign):
         path = campaign.root.named(result.manifest, where=campaign.root)
@@ -199,19 +204,18 @@ def damaged_results(campaign: Campaign) -> dict[str, str]:
                 damaged[result.manifest] = "its manifest is damaged"
                 continue
             if files:
-                damaged[result.manifest] = f"{files[0]} is not as it was written" + (
-                    f", nor are {len(files) - 1} others" if len(files) > 1 else ""
-                )
+                others = f", and {len(files) - 1} more" if len(files) > 1 else ""
+                damaged[result.manifest] = f"changed since it was written: {files[0]}{others}"
     return damaged
 
 
 def _reasons(root: ConfinedPath, result: Result, recorded: Mapping[str, Any], *, paranoid: bool) -> Iterator[str]:
     if not states_origin(recorded):
-        yield "it does not say what it was made from"
+        yield "its manifest does not state its lineage"
         return
     folder = (root / result.manifest).parent
 
-    def file(name: str) -> str:  # arrays are looked into where they are opened
+    def file(name: str) -> str:  # chunks of arrays are verified when they are read
         path = folder.named(name, where=root / result.manifest)
         if not path.is_file():
             return ""
@@ -223,9 +227,9 @@ def _reasons(root: ConfinedPath, result: Result, recorded: Mapping[str, Any], *,
 
     for difference in compare(recorded["files"], file):
         if difference.state == "missing":
-            yield f"{difference.name} is gone"
+            yield f"{difference.name} is missing"
             break
-        yield f"{difference.name} is not as it was written"
+        yield f"{difference.name} has changed since it was written"
     for difference in compare_origin(recorded, result, source):
         if difference.part == "source":
             elsewhere = difference.state == "missing" and difference.name.startswith(_RAW)

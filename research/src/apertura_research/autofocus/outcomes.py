@@ -157,7 +157,7 @@ class AutofocusRow:
     estimate_loss_db: float
     verdict: str
     flags: str
-    why: str
+    reason: str
 
 
 def cases_of(scene: str) -> list[tuple[float, int]]:  # noqa: ARG001
@@ -201,7 +201,7 @@ def outcome_of(one: AutofocusCase, result: Refinement) -> AutofocusRow:
         estimate_loss_db=round(after, 4),
         verdict=verdict_of(result),
         flags=" ".join(result.flags),
-        why=result.why,
+        reason=result.reason,
     )
 
 

@@ -141,7 +141,7 @@ def _between(images: dict[str, PairImage]) -> dict[str, str]:
     """Return the flags that step assess raises for a pair of images."""
     two = [images[pair] for pair in PAIRS]
     windows = list(GRID.tiles(_TILE_PX))
-    first, second = (ComparedImage.found(one.image, one.focus, one.carriers, GRID, windows) for one in two)
+    first, second = (ComparedImage.from_raster(one.image, one.focus, one.carriers, GRID, windows) for one in two)
     agreement = agreement_of(first, second, GRID, windows)
     if agreement is None:
         has_bright_point = any(point["snr_db"] > 20.0 for point in two[0].focus["points"])

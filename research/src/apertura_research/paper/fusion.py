@@ -143,7 +143,7 @@ def _clutter(images: Images) -> list[Claim]:
             relative=False,
             style=".2f",
             note=f"clutter {level_db['mono']:.1f} dB in mono, {level_db['bistatic']:.1f} dB in bistatic, "
-            f"{level_db[kind]:.1f} dB in the sum; {why}",
+            f"{level_db[kind]:.1f} dB in the sum; {reason}",
         )
         for kind, expected, why in (
             ("coherent", 3.0, "targets add in amplitude, clutter of two look angles adds in power: 3 dB"),

@@ -1,6 +1,6 @@
-"""The campaign folder's config: one model generates the defaults, the JSON schema and the validation.
+"""Config of a campaign folder: one model generates the defaults, the JSON schema and the validation.
 
-Layers from `campaign` up use these objects; those below get plain arrays and numbers.
+Layers from `campaign` up use these objects; lower layers receive arrays and numbers.
 """
 
 from apertura.campaign.config.config import CONFIG, Settings, located, read_settings, validated

@@ -1,4 +1,4 @@
-"""The config as one value: config/config.yaml validated as `Settings`; all errors are one message."""
+"""Validation of config/config.yaml as `Settings`; one message lists all errors."""
 
 from pathlib import Path
 from typing import Self
@@ -23,9 +23,9 @@ CONFIG = Path("config/config.yaml")
 
 
 class Metadata(Section):
-    """Statements about the campaign that no file of it holds."""
+    """Metadata of the campaign that its files do not contain."""
 
-    author: Title | None = Field(None, description="who recorded the campaign; null: not stated")
+    author: Title | None = Field(None, description="author of the recordings; null: not stated")
     licence: Licence | None = Field(
         None, description="licence of the products, an SPDX identifier such as CC-BY-4.0; null: not stated"
     )
@@ -34,42 +34,43 @@ class Metadata(Section):
 
 
 class Settings(Section):
-    """config/config.yaml."""
+    """Content of config/config.yaml."""
 
     campaign: Title = Field(description="name of the campaign", examples=["my_campaign"])
-    waveform: Waveform = Field(description="what was transmitted")
+    waveform: Waveform = Field(description="transmitted waveform")
     raw_root: RawRoot | None = Field(
         None,
-        description="absolute path of a folder that is read in place of raw/, as on another disk; null: raw/ itself",
+        description="absolute path of a folder that replaces raw/, such as on another disk; null: raw/",
     )
-    nodes: dict[Name, Node] = Field(min_length=1, description="one section per UAV, named as in flights.tsv")
-    scene: Scene = Field(default_factory=Scene, description="the grid of every raster of the campaign")
-    processing: Processing = Field(default_factory=Processing, description="how to compute")
+    nodes: dict[Name, Node] = Field(min_length=1, description="one section per node, named as in flights.tsv")
+    scene: Scene = Field(default_factory=Scene, description="output grid of the campaign")
+    processing: Processing = Field(default_factory=Processing, description="processing settings")
     calibration: CalibrationSettings | None = Field(
-        None, description="path offsets from a calibration flight: flight, reflector_m, search_m; null: as stated above"
+        None,
+        description="path offsets from a calibration flight: flight, reflector_m, search_m; null: "
+        "nodes.<name>.path_offset_m",
     )
-    bench: BenchSettings = Field(
-        default_factory=BenchSettings, description="what is known of a set-up on the bench, before a flight"
-    )
+    bench: BenchSettings = Field(default_factory=BenchSettings, description="set-up of bench recordings")
     interferometry: Interferometry = Field(
-        default_factory=Interferometry, description="images compared in phase, two by two, for coherence and heights"
+        default_factory=Interferometry, description="pairs of images for interferometry: coherence and heights"
     )
     metadata: Metadata = Field(
         default_factory=Metadata, description="author, licence, platform and DOI for GeoTIFF tags, STAC and RO-Crate"
     )
 
     @model_validator(mode="after")
-    def _calibration_needs_a_place(self) -> Self:
+    def _calibration_needs_a_crs(self) -> Self:
         if self.calibration is not None and self.scene.crs == "auto":
-            raise ValueError("calibration.reflector_m is in scene.crs, which is auto: give the CRS")
+            raise ValueError("calibration.reflector_m refers to scene.crs, which is auto: state the CRS")
         return self
 
     @model_validator(mode="after")
-    def _orders_are_of_samples(self) -> Self:
-        named = [name for name, node in self.nodes.items() if node.iq is not None]
-        if named and not isinstance(self.waveform, SampledWaveform):
+    def _node_iq_needs_samples(self) -> Self:
+        nodes = [name for name, node in self.nodes.items() if node.iq is not None]
+        if nodes and not isinstance(self.waveform, SampledWaveform):
             raise ValueError(
-                f"nodes.{named[0]}.iq is of recorded samples (kinds ofdm and pulse): set it to null, and waveform.iq"
+                f"nodes.{nodes[0]}.iq applies to recorded samples only (kinds ofdm and samples): set it to null and "
+                "use waveform.iq"
             )
         return self
 
@@ -78,29 +79,29 @@ class Settings(Section):
         return self.nodes[node].iq or self.waveform.iq
 
     @model_validator(mode="after")
-    def _beams_need_a_log(self) -> Self:
-        named = [name for name, node in self.nodes.items() if node.antennas.any()]
-        if named and isinstance(self.waveform, PhaseHistoryWaveform):
+    def _beams_need_attitude(self) -> Self:
+        nodes = [name for name, node in self.nodes.items() if node.antennas.any()]
+        if nodes and isinstance(self.waveform, PhaseHistoryWaveform):
             raise ValueError(
-                f"nodes.{named[0]}.antennas has a beam, but phase history carries no attitude: set it to null"
+                f"nodes.{nodes[0]}.antennas has a beam, but phase histories contain no attitude: set it to null"
             )
         return self
 
 
 def read_settings(path: Path) -> Settings:
-    """Return the settings in a config file.
+    """Read the settings of a config file.
 
     Raises
     ------
     CampaignError
-        If it is not there, is not YAML, or `validated` refuses it.
+        If the file is missing, is not YAML, or is not valid.
     """
-    remedy = "`apertura init` writes a commented one."
+    remedy = "`apertura init` writes a commented config."
     return validated(read_yaml(path, expected="a campaign folder", remedy=remedy), where=path)
 
 
 def located(message: str) -> str:
-    """Return a message with the config's path before it, where it begins with a key of it.
+    """Return a message with the path of the config as a prefix if it begins with a config key.
 
     Examples
     --------
@@ -114,12 +115,12 @@ def located(message: str) -> str:
 
 
 def validated(document: object, *, where: object) -> Settings:
-    """Return `document` as Settings; one message names every wrong key and the nearest valid one.
+    """Return `document` as Settings; one message names every invalid key and the nearest valid one.
 
     Raises
     ------
     CampaignError
-        With file, key, what was found and what was expected.
+        If the document is not valid.
 
     Examples
     --------
@@ -128,5 +129,5 @@ def validated(document: object, *, where: object) -> Settings:
     ...
     apertura.common.errors.CampaignError: config.yaml: campaing: unknown key (did you mean 'campaign'?); ...
     """
-    expected = f"the keys and values of {CONFIG} as `apertura init` writes it"
+    expected = f"keys and values as in the {CONFIG} of `apertura init`"
     return documents.validated(Settings, document, where=where, expected=expected)

@@ -23,16 +23,16 @@ if TYPE_CHECKING:
 FLIGHTS = Path("config/flights.tsv")
 _COLUMNS = ["flight", "kind", "transmitter", "nodes"]
 KINDS = ("bench", "calibration", "image")
-"""Kinds of flights: a stationary radar; a flight past a reflector, which corrects the echoes of others; images."""
+"""Kinds of flights: stationary radar; flight past a reflector, whose calibration other flights use; images."""
 _NAME: TypeAdapter[str] = TypeAdapter(Name)
 
 FUSED = "fused"
-"""Name of the sums of a flight's pairs, among its images and as a folder."""
+"""Name of the sums of a flight's pairs, as image and folder name."""
 
 
 @dataclass(frozen=True)
 class Flight:
-    """One line of flights.tsv."""
+    """Line of flights.tsv."""
 
     name: str
     kind: str
@@ -41,7 +41,7 @@ class Flight:
 
     @property
     def participants(self) -> tuple[str, ...]:
-        """The transmitter and then the receivers, each once.
+        """Transmitter and receivers, each once.
 
         Examples
         --------
@@ -52,7 +52,7 @@ class Flight:
 
     @property
     def recorded(self) -> tuple[str, ...]:
-        """Nodes with a recording: all that take part, on a bench the receivers.
+        """Nodes with a recording: all participants, or the receivers of a bench measurement.
 
         Examples
         --------
@@ -63,12 +63,12 @@ class Flight:
 
     @property
     def pairs(self) -> tuple[str, ...]:
-        """Transmitter-receiver names, as folders are named."""
+        """Names of the pairs, transmitter-receiver, which are also folder names."""
         return tuple(f"{self.transmitter}-{node}" for node in self.nodes)
 
     @property
     def images(self) -> tuple[str, ...]:
-        """Names of its images: its pairs, and their sums where there are two pairs to add.
+        """Names of its images: its pairs, and their sums if there are several pairs.
 
         Examples
         --------
@@ -79,39 +79,39 @@ class Flight:
 
 
 def is_monostatic(pair: str) -> bool:
-    """Test whether one node sends and receives in a pair."""
+    """Return True if one node of a pair transmits and receives."""
     transmitter, receiver = pair.split("-")
     return transmitter == receiver
 
 
 def read_flights(path: Path, *, nodes: Collection[str]) -> Iterator[Flight]:
-    """Yield the flights of a flights.tsv.
+    """Yield the flights of flights.tsv.
 
     Parameters
     ----------
     path
-        Tab-separated, columns flight, kind, transmitter, nodes.
+        Tab-separated table with columns flight, kind, transmitter, nodes.
     nodes
-        Names that the config knows.
+        Names of the configured nodes.
 
     Raises
     ------
     CampaignError
-        Naming file and line.
+        If a line is invalid; the message states file and line.
     """
-    seen: set[str] = set()
+    names: set[str] = set()
     for where, cells in table_rows(path, _COLUMNS, remedy="Write one line per flight."):
         flight = _flight(cells, nodes, where=where)
-        if flight.name in seen:
+        if flight.name in names:
             raise CampaignError(
-                f"flight {flight.name} a second time",
+                f"second line of flight {flight.name}",
                 where=where,
-                expected="each flight once",
+                expected="one line per flight",
                 remedy="Join the lines or rename one flight.",
             )
-        seen.add(flight.name)
+        names.add(flight.name)
         yield flight
-    if not seen:
+    if not names:
         raise CampaignError("no flights", where=path, expected="at least one line", remedy="Add a flight.")
 
 
@@ -123,12 +123,12 @@ def _flight(cells: dict[str, str], known: Collection[str], *, where: str) -> Fli
     except ValidationError as error:
         problem = error.errors()[0]["msg"].removeprefix("Value error, ")
     if cells["kind"] not in KINDS:
-        problem = f"kind {quoted(cells['kind'])} is none of {', '.join(KINDS)}"
+        problem = f"unknown kind {quoted(cells['kind'])}, not one of {', '.join(KINDS)}"
     unknown = [name for name in (cells["transmitter"], *nodes) if name not in known]
     if unknown:
         problem = f"node {quoted(unknown[0])} is not in {CONFIG}: nodes"
     if not nodes or len(set(nodes)) != len(nodes):
-        problem = f"nodes {quoted(cells['nodes'])} are none or doubled"
+        problem = f"nodes {quoted(cells['nodes'])} are empty or contain duplicates"
     if problem:
         raise CampaignError(
             problem,
@@ -139,7 +139,7 @@ def _flight(cells: dict[str, str], known: Collection[str], *, where: str) -> Fli
     return Flight(cells["flight"], cells["kind"], cells["transmitter"], nodes)
 
 
-# ---- config/segments.tsv: part of the track that images a pair ------------------------------------------------------
+# ---- config/segments.tsv: track segments that image a pair -----------------------------------------------------------
 
 SEGMENTS = Path("config/segments.tsv")
 _FIRST_YEAR, _LAST_YEAR = 1980, 2199
@@ -148,7 +148,7 @@ _SEGMENT_COLUMNS = ["flight", "pair", "start", "end"]
 
 @dataclass(frozen=True)
 class Segment:
-    """One line of segments.tsv: pulses from start to end, both included, image the pair.
+    """Line of segments.tsv: the pair is imaged with the pulses from start to end, both included.
 
     Attributes
     ----------
@@ -163,19 +163,19 @@ class Segment:
 
 
 def read_segments(path: Path, *, flights: Sequence[Flight]) -> Iterator[Segment]:
-    """Yield the lines of a segments.tsv; none where there is no such file.
+    """Yield the lines of segments.tsv; nothing if the file is missing.
 
     Parameters
     ----------
     path
-        Tab-separated, columns flight, pair, start, end; several lines of a pair are all used.
+        Tab-separated table with columns flight, pair, start, end; a pair may have several lines.
     flights
-        Those of flights.tsv.
+        Flights of flights.tsv.
 
     Raises
     ------
     CampaignError
-        Naming file and line.
+        If a line is invalid; the message states file and line.
     """
     if not path.is_file():
         return
@@ -190,7 +190,7 @@ def read_segments(path: Path, *, flights: Sequence[Flight]) -> Iterator[Segment]
         start, end = (_utc(cells[name]) for name in ("start", "end"))
         for name, time in (("start", start), ("end", end)):
             if not problem and time is None:
-                problem = f"{name} {quoted(cells[name])} is no time"
+                problem = f"{name} {quoted(cells[name])} is not a valid time"
         if not problem and start is not None and end is not None and start >= end:
             problem, expected = f"start {cells['start']} is not before end {cells['end']}", "a start before its end"
         if problem or start is None or end is None:
@@ -199,7 +199,7 @@ def read_segments(path: Path, *, flights: Sequence[Flight]) -> Iterator[Segment]
 
 
 def _utc(text: str) -> datetime | None:
-    """Return a time in UTC; one without time zone is UTC already. None if the text is no time."""
+    """Parse a time as UTC, which is also assumed without a time zone; None if it is not valid."""
     try:
         time = datetime.fromisoformat(text)
         time = time.astimezone(UTC).replace(tzinfo=None) if time.tzinfo else time
@@ -208,24 +208,24 @@ def _utc(text: str) -> datetime | None:
     return time if _FIRST_YEAR <= time.year <= _LAST_YEAR else None
 
 
-# ---- config/clocks.tsv: offset and drift of recorders against logs --------------------------------------------------
+# ---- config/clocks.tsv: offset and drift of recorders relative to logs -----------------------------------------------
 
 CLOCKS = Path("config/clocks.tsv")
 CLOCK_COLUMNS = ["flight", "node", "offset_s", "drift_ppm", "std_s"]
 _FARTHEST_S, _LARGEST_PPM = Decimal(5_000_000_000), Decimal(1000)
-_EXPECTED = "flight, node, seconds to add to the recorder's time, ppm by which it runs slow, standard deviation in s"
+_EXPECTED = "flight, node, offset to add to the recorder's time in s, drift in ppm, standard deviation in s"
 
 
 @dataclass(frozen=True)
 class ClockRow:
-    """The clock of a node's recorder in one flight, against that of the node's log.
+    """Clock of a node's recorder in one flight, relative to the node's log.
 
     Attributes
     ----------
     offset_ns
-        To be added to the recorder's times, at its first pulse.
+        Offset that is added to the recorder's times, at its first pulse.
     drift_ppm
-        By which more is to be added for every second since.
+        Increase of the offset per elapsed time since the first pulse.
     std_s
         Standard deviation of the offset; None: unknown.
     """
@@ -237,12 +237,12 @@ class ClockRow:
     std_s: float | None = None
 
     def utc(self, times: "NDArray[np.datetime64]") -> "NDArray[np.datetime64]":
-        """Return times of a recorder converted to the log's clock.
+        """Convert times of a recorder to the log's clock.
 
         Parameters
         ----------
         times
-            (pulse,) datetime64[ns], ascending, the first of the recording first.
+            (pulse,) datetime64[ns], ascending, from the first pulse of the recording.
 
         Examples
         --------
@@ -260,19 +260,19 @@ class ClockRow:
 
 
 def read_clocks(path: Path, *, flights: Sequence[Flight]) -> Iterator[ClockRow]:
-    """Yield the lines of a clocks.tsv; none where there is no such file.
+    """Yield the lines of clocks.tsv; nothing if the file is missing.
 
     Parameters
     ----------
     path
-        Tab-separated, columns flight, node, offset_s, drift_ppm, std_s, which the last two may leave empty.
+        Tab-separated table with columns flight, node, offset_s, drift_ppm, std_s; the last two may be empty.
     flights
-        Those of flights.tsv.
+        Flights of flights.tsv.
 
     Raises
     ------
     CampaignError
-        Naming file and line.
+        If a line is invalid; the message states file and line.
     """
     if not path.is_file():
         return
@@ -286,7 +286,7 @@ def read_clocks(path: Path, *, flights: Sequence[Flight]) -> Iterator[ClockRow]:
         elif node not in nodes[flight]:
             problem = f"flight {flight} has no node {quoted(node)}"
         elif (flight, node) in stated:
-            problem = f"flight {flight}, node {node} a second time"
+            problem = f"second line of flight {flight}, node {node}"
         if problem:
             raise CampaignError(problem, where=where, expected=_EXPECTED, remedy="Correct the line.")
         stated.add((flight, node))
@@ -298,7 +298,7 @@ def read_clocks(path: Path, *, flights: Sequence[Flight]) -> Iterator[ClockRow]:
 
 
 def _number(cells: dict[str, str], name: str, where: str, *, most: Decimal) -> Decimal | None:
-    """Return a cell as it is written, to all of its digits; None where it is empty."""
+    """Return the exact decimal number of a cell; None if it is empty."""
     if not cells[name]:
         return None
     try:
@@ -310,6 +310,6 @@ def _number(cells: dict[str, str], name: str, where: str, *, most: Decimal) -> D
     raise CampaignError(
         f"{name} {quoted(cells[name])}",
         where=where,
-        expected=f"a number between -{most} and {most}, or nothing",
+        expected=f"a number between -{most} and {most}, or an empty cell",
         remedy="Correct the line; `apertura align` writes it.",
     )

@@ -1,4 +1,4 @@
-"""Base classes of sections and tables of the config, and names of flights and nodes."""
+"""Base class of config sections, types of names and texts, and reading of config tables."""
 
 import csv
 import io
@@ -12,18 +12,18 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 from apertura.common.documents import read_text
 from apertura.common.errors import CampaignError, quoted
 
-# ---- Base of every section; names that become names of folders ------------------------------------------------------
+# ---- Base class of sections; names that become folder names ----------------------------------------------------------
 
 RESERVED_NAMES = frozenset(
     {
         *("fused", "layers", "stac", "map", "mosaic", "interferometry", "study", "logs", "benchmarks", "tiles"),
-        *("tracks", "workflow", "look"),
+        *("tracks", "workflow", "preview"),
     }
 )
-"""Names of the results folder that no flight or node may take."""
+"""Names of files and folders in the results folder, which flights and nodes must not use."""
 
 _RESERVED_ENDS = (".json", ".geojson", ".zarr", ".wip", ".lock", ".tif", ".png", ".html", ".vrt", ".qml")
-"""Endings of files of the results folder: scene.json, cube.manifest.json, cube.zarr …"""
+"""Suffixes of files in the results folder: scene.json, cube.manifest.json, cube.zarr …"""
 
 WAVEFORM_KINDS = (
     "ofdm, samples (a pulse given by its samples), fmcw (beat signals of sweeps) or phase_history "
@@ -40,7 +40,7 @@ Metres3 = tuple[float, float, float]
 
 
 class Section(BaseModel):
-    """A part of the config; unknown keys are errors."""
+    """Section of the config; unknown keys are errors."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -51,14 +51,16 @@ def _plain_name(name: str) -> str:
     if len(name) > _LONGEST:
         raise ValueError(f"name of {len(name)} characters: at most {_LONGEST} may be used")
     if name.lower() in RESERVED_NAMES or name.lower().endswith(_RESERVED_ENDS):
-        raise ValueError(f"name {name!r} is taken by the results folder; choose another")
+        raise ValueError(f"name {name!r} is reserved for files in the results folder; choose another")
     return name
 
 
 def _title(text: str) -> str:
-    odd = next((one for one in text if not one.isprintable() or one in '"<>&\\'), None)
-    if odd is not None:
-        raise ValueError(f"{quoted(text)}: {quoted(odd)} may not be used: it becomes part of WKT, HTML and file tags")
+    invalid = next((char for char in text if not char.isprintable() or char in '"<>&\\'), None)
+    if invalid is not None:
+        raise ValueError(
+            f"{quoted(text)}: {quoted(invalid)} may not be used, because WKT, HTML and file tags contain the text"
+        )
     if not 1 <= len(text.strip()) <= _LONGEST_TITLE:
         raise ValueError(f"{len(text.strip())} characters: 1 to {_LONGEST_TITLE} may be used")
     return text
@@ -66,12 +68,12 @@ def _title(text: str) -> str:
 
 def _absolute(path: str) -> str:
     if not path.startswith("/") or not path.isprintable() or ".." in path.split("/"):
-        raise ValueError(f"{quoted(path)}: only the absolute path of a folder may be used, without '..'")
+        raise ValueError(f"{quoted(path)}: must be the absolute path of a folder without '..'")
     return path
 
 
 def plain_crs(crs: str) -> str:
-    """Return a CRS that is 'auto', 'local' or authority and code; raise ValueError for any other text.
+    """Check that a CRS is 'auto', 'local' or authority and code, and return it; raise ValueError for any other text.
 
     Examples
     --------
@@ -80,8 +82,8 @@ def plain_crs(crs: str) -> str:
     """
     if not re.fullmatch(rf"auto|local|{_CODE}(\+({_AUTHORITY}:)?[0-9]+)?", crs):
         raise ValueError(
-            f"{quoted(crs)}: only authority and code such as EPSG:32632, auto or local may be used, no text of PROJ, "
-            "which may name files and code elsewhere"
+            f"{quoted(crs)}: must be authority and code such as EPSG:32632, auto or local; PROJ strings and WKT are "
+            "not accepted, because they may refer to files"
         )
     return crs
 
@@ -90,43 +92,43 @@ Name = Annotated[str, AfterValidator(_plain_name)]
 """Name of a flight or a node."""
 
 CrsName = Annotated[str, AfterValidator(plain_crs)]
-"""A coordinate reference system by authority and code, two of them joined by ``+``, 'auto' or 'local'."""
+"""Coordinate reference system by authority and code, two of them joined by ``+``, 'auto' or 'local'."""
 
 RawRoot = Annotated[str, AfterValidator(_absolute)]
-"""The path of a folder outside the campaign."""
+"""Path of a folder outside the campaign."""
 
 Licence = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9.+-]{0,63}$")]
-"""An SPDX identifier."""
+"""SPDX identifier."""
 
 Doi = Annotated[str, Field(pattern=r"^10\.[0-9]{4,9}/[A-Za-z0-9._;()/:-]{1,100}$")]
-"""A digital object identifier, without https://doi.org/."""
+"""Digital object identifier, without https://doi.org/."""
 
 Title = Annotated[str, AfterValidator(_title)]
-"""Text for people: one line without characters that WKT, HTML or a terminal interpret."""
+"""One line of text without characters that WKT, HTML or a terminal interpret."""
 
 
-# ---- Tab-separated tables of the config: a heading, then one line per row ------------------------------------------
+# ---- Tab-separated tables of the config: a header line, then one line per row ----------------------------------------
 
 LARGEST_TABLE = 1_000_000
-"""Bytes of a table of the config."""
+"""Largest size of a config table, bytes."""
 
 
 def table_rows(path: Path, columns: Sequence[str], *, remedy: str) -> Iterator[tuple[str, dict[str, str]]]:
-    """Yield the position of each row, for messages, and its stripped cells by column.
+    """Yield file and line of each row, for messages, and its stripped cells by column.
 
     Parameters
     ----------
     path
-        Of the table; lines that begin with # and lines of blanks and tabs are no rows.
+        Path of the table; lines that begin with # and blank lines are ignored.
     columns
-        The heading.
+        Column names of the header line.
     remedy
-        What to do if there is no such file.
+        Remedy for a missing file.
 
     Raises
     ------
     CampaignError
-        If the file is not there, is not UTF-8, or has other columns.
+        If the file is missing, is not UTF-8, or has other columns.
     """
     listed = f"a tab-separated table {list(columns)}"
     text = read_text(path, expected=listed, remedy=remedy, largest=LARGEST_TABLE)
@@ -140,10 +142,10 @@ def table_rows(path: Path, columns: Sequence[str], *, remedy: str) -> Iterator[t
             if heading is None:
                 heading = cells
                 if cells != list(columns):
-                    raise CampaignError(f"columns {quoted(cells, 300)}", path, listed, "Correct the heading.")
+                    raise CampaignError(f"columns {quoted(cells, 300)}", path, listed, "Correct the header line.")
             elif len(cells) > len(columns):
-                found = f"{len(cells)} cells, the last {quoted(cells[-1])}"
-                raise CampaignError(found, f"{path}: line {rows.line_num}", listed, "Correct the line.")
+                problem = f"{len(cells)} cells, the last {quoted(cells[-1])}"
+                raise CampaignError(problem, f"{path}: line {rows.line_num}", listed, "Correct the line.")
             else:
                 yield f"{path}: line {rows.line_num}", dict(zip(columns, cells + [""] * len(columns), strict=False))
     except csv.Error as error:

@@ -1,4 +1,4 @@
-"""The commented config every campaign starts from, and its JSON schema, both generated from `Settings`."""
+"""Commented config template and JSON schema, both generated from `Settings`."""
 
 import json
 import types
@@ -17,13 +17,13 @@ from apertura.common.errors import CampaignError, quoted
 from apertura.core.backprojection.engines import ENGINES, load_engine
 
 WAVEFORMS: dict[str, type[BaseModel]] = {
-    get_args(one.model_fields["kind"].annotation)[0]: one for one in get_args(get_args(Waveform)[0])
+    get_args(section.model_fields["kind"].annotation)[0]: section for section in get_args(get_args(Waveform)[0])
 }
-"""waveform.kind and the section that it stands for."""
+"""waveform.kind → class of its section."""
 
 _FLIGHTS = "flight\tkind\ttransmitter\tnodes\nf01\timage\tuav1\t{nodes}\n"
 _NODES = {"fmcw": ("uav1",), "phase_history": ("uav1",)}
-"""Kind of waveform → nodes of the example, where one radar sends and receives by itself; else two."""
+"""Kind of waveform with a single node in the example; other kinds have two nodes."""
 
 
 def config_template(kind: str = "ofdm") -> str:
@@ -32,12 +32,12 @@ def config_template(kind: str = "ofdm") -> str:
     Parameters
     ----------
     kind
-        Of waveform: a key of `WAVEFORMS`.
+        Kind of waveform, a key of `WAVEFORMS`.
 
     Raises
     ------
     CampaignError
-        If there is no such kind.
+        If the kind does not exist.
 
     Examples
     --------
@@ -46,7 +46,10 @@ def config_template(kind: str = "ofdm") -> str:
     """
     if kind not in WAVEFORMS:
         raise CampaignError(
-            f"kind {quoted(kind)}", where="apertura init", expected=", ".join(WAVEFORMS), remedy="Choose one of them."
+            f"kind {quoted(kind)}",
+            where="apertura init",
+            expected=f"one of {', '.join(WAVEFORMS)}",
+            remedy="Choose one of them.",
         )
     examples = {"waveform": WAVEFORMS[kind], "nodes": dict.fromkeys(_nodes(kind), Node)}
     header = "# Generated from the settings model by `apertura init`; see config/README.md.\n\n"
@@ -54,7 +57,7 @@ def config_template(kind: str = "ofdm") -> str:
 
 
 def flights_template(kind: str = "ofdm") -> str:
-    """Return config/flights.tsv with one flight, for a kind of waveform."""
+    """Return config/flights.tsv with one example flight, for a kind of waveform."""
     return _FLIGHTS.format(nodes=",".join(_nodes(kind)))
 
 
@@ -106,7 +109,7 @@ def _value(field: FieldInfo) -> Any:
 
 
 def _choices(field: FieldInfo) -> str:
-    """Return the words or the range that a field takes, in brackets, unless its description names them."""
+    """Return the allowed values or the range of a field in parentheses, unless its description lists them."""
     kinds = (
         get_args(field.annotation) if get_origin(field.annotation) in (Union, types.UnionType) else (field.annotation,)
     )
@@ -117,8 +120,8 @@ def _choices(field: FieldInfo) -> str:
     limits = [
         limit
         for kind in kinds
-        for about in getattr(kind, "__metadata__", ())
-        for limit in getattr(about, "metadata", ())
+        for metadata in getattr(kind, "__metadata__", ())
+        for limit in getattr(metadata, "metadata", ())
     ]
     ends = [getattr(limit, end) for end in ("gt", "ge", "lt", "le") for limit in limits if hasattr(limit, end)]
     above = any(hasattr(limit, "gt") for limit in limits)

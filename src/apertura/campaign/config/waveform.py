@@ -1,4 +1,4 @@
-"""Section `waveform`: what was transmitted, as samples or as transfer functions."""
+"""Section `waveform`: the transmitted signal and the kind of recording, samples or transfer functions."""
 
 from abc import abstractmethod
 from typing import Annotated, ClassVar, Literal, Self
@@ -12,10 +12,10 @@ from apertura.formats.names import PHASE_HISTORIES
 
 
 class SampledWaveform(Section):
-    """One pulse per trigger, recorded as samples: the common interface from captures to transfer functions.
+    """Waveform with one pulse per trigger, recorded as samples: interface from captures to transfer functions.
 
-    Each kind states in `file_key` the key that names the file of the transmitted signal, in `delay_key` and
-    `limit_name` the key and the name of the interval in which an echo must arrive.
+    `file_key` is the key with the file of the transmitted signal; `delay_key` and `limit_name` are key and name of the
+    interval in which echoes must arrive.
     """
 
     file_key: ClassVar[str]
@@ -23,7 +23,7 @@ class SampledWaveform(Section):
     limit_name: ClassVar[str]
 
     kind: str = Field(description=WAVEFORM_KINDS)
-    carrier_hz: float = Field(gt=0, description="RF carrier: what lies at baseband zero, Hz", examples=[1.2e9])
+    carrier_hz: float = Field(gt=0, description="RF carrier, the frequency at baseband zero, Hz", examples=[1.2e9])
     sample_rate_hz: float = Field(gt=0, description="complex sample rate f_s, Hz", examples=[1.024e9])
     prf_hz: float = Field(gt=0, description="pulse repetition frequency, Hz", examples=[100.0])
     iq: Literal["complex", "swapped", "conjugate"] = Field(
@@ -35,48 +35,49 @@ class SampledWaveform(Section):
     @property
     @abstractmethod
     def longest_delay_s(self) -> float:
-        """Delay up to which a whole echo is recorded, seconds."""
+        """Longest delay of an echo that is recorded completely, seconds."""
 
     @property
     @abstractmethod
     def middle_s(self) -> float:
-        """Time of the middle of the measured part of the pulse, seconds after its beginning."""
+        """Mid-time of the measured part of the pulse, seconds after its start."""
 
     @property
     @abstractmethod
     def capture_s(self) -> float:
-        """Duration of a capture, seconds; nothing beyond is used."""
+        """Duration of a capture, seconds; later samples are not used."""
 
     @property
     @abstractmethod
     def needed_samples(self) -> int:
-        """Samples that a capture must hold."""
+        """Smallest number of samples of a capture."""
 
     @property
     @abstractmethod
     def most_subcarriers(self) -> int:
-        """Frequencies that an echo is measured at, at most."""
+        """Largest number of frequencies at which an echo is measured."""
 
     @property
     @abstractmethod
     def widest_band_hz(self) -> float:
-        """Bandwidth, at most."""
+        """Largest bandwidth, Hz."""
 
     @property
     def capture_samples(self) -> int:
-        """Samples of a whole capture."""
+        """Number of samples of a capture."""
         return round(self.capture_s * self.sample_rate_hz)
 
 
 class OfdmWaveform(SampledWaveform):
-    """One OFDM symbol per pulse."""
+    """Waveform with one OFDM symbol per pulse."""
 
     file_key, delay_key, limit_name = "codes", "cyclic_prefix_s", "the cyclic prefix"
 
     kind: Literal["ofdm"] = Field(description=WAVEFORM_KINDS)
     codes: str = Field("raw/codes.npy", description="transmitted code symbols, complex64 (subcarriers,)")
     carrier_is: Literal["band_start", "band_centre"] = Field(
-        "band_start", description="which subcarrier the carrier is: n = 0…N-1 (band_start) or -N/2…N/2-1 (band_centre)"
+        "band_start",
+        description="subcarrier numbers relative to the carrier: n = 0…N-1 (band_start) or -N/2…N/2-1 (band_centre)",
     )
     subcarriers: int = Field(gt=1, description="number of subcarriers N", examples=[4096])
     subcarrier_spacing_hz: float = Field(gt=0, description="subcarrier spacing Δf, Hz", examples=[100e3])
@@ -85,17 +86,17 @@ class OfdmWaveform(SampledWaveform):
 
     @property
     def longest_delay_s(self) -> float:
-        """The cyclic prefix."""
+        """Duration of the cyclic prefix."""
         return self.cyclic_prefix_s
 
     @property
     def middle_s(self) -> float:
-        """The middle of the symbol."""
+        """Mid-time of the symbol."""
         return self.cyclic_prefix_s + self.symbol_s / 2
 
     @property
     def capture_s(self) -> float:
-        """Prefix and symbol."""
+        """Duration of prefix and symbol."""
         return self.cyclic_prefix_s + self.symbol_s
 
     @property
@@ -110,7 +111,7 @@ class OfdmWaveform(SampledWaveform):
 
     @property
     def needed_samples(self) -> int:
-        """Prefix and one period 1/Δf."""
+        """Samples of the prefix and one period 1/Δf."""
         return self.prefix_samples + self.dft_samples
 
     @property
@@ -127,9 +128,7 @@ class OfdmWaveform(SampledWaveform):
     def _dft_fits(self) -> Self:
         length = self.sample_rate_hz / self.subcarrier_spacing_hz
         if abs(length - round(length)) > 1e-6 * length:
-            raise ValueError(
-                f"sample_rate_hz/subcarrier_spacing_hz = {length:.6f} must be an integer: it is the DFT length"
-            )
+            raise ValueError(f"sample_rate_hz/subcarrier_spacing_hz = {length:.6f} must be an integer, the DFT length")
         if self.subcarriers > round(length):
             raise ValueError(f"subcarriers={self.subcarriers} exceed the DFT length {round(length)}")
         if self.symbol_s < (1 - 1e-9) / self.subcarrier_spacing_hz:
@@ -141,7 +140,7 @@ class OfdmWaveform(SampledWaveform):
 
 
 class PulseWaveform(SampledWaveform):
-    """A pulse given by its samples and sent once per trigger: a chirp, a code, whatever a loop-back captured."""
+    """Waveform given by its samples and transmitted once per trigger: a chirp, a code, or a loop-back recording."""
 
     file_key, delay_key, limit_name = "pulse", "listen_s", "the listening time"
 
@@ -149,46 +148,50 @@ class PulseWaveform(SampledWaveform):
     pulse: str = Field(
         "raw/pulse.npy", description="the pulse at sample_rate_hz: .npy of (sample,) complex, or (sample, 2) integers"
     )
-    pulse_s: float = Field(gt=0, description="how long the pulse lasts: all of the file, s", examples=[1e-6])
-    lead_s: float = Field(0.0, ge=0, description="how long before the pulse a capture begins, s")
-    listen_s: float = Field(gt=0, description="longest delay whose echo a capture holds to its end, s", examples=[2e-6])
+    pulse_s: float = Field(gt=0, description="pulse duration: that of the whole file, s", examples=[1e-6])
+    lead_s: float = Field(0.0, ge=0, description="time from the start of a capture to the pulse, s")
+    listen_s: float = Field(
+        gt=0, description="longest delay of an echo that a capture contains completely, s", examples=[2e-6]
+    )
     band_hz: tuple[float, float] | None = Field(
-        None, description="baseband frequencies that images are made of, Hz; null: where the pulse has its energy"
+        None,
+        description="baseband frequencies used for imaging, [lowest, highest], Hz; null: where the pulse has its "
+        "energy",
     )
     filter: Literal["auto", "inverse", "matched"] = Field(
         "auto",
-        description="inverse leaves the window's sidelobes, matched the least noise; "
-        "auto: inverse, unless the spectrum is flat or has too many gaps",
+        description="range filter: inverse (sidelobes of the window alone) or matched (least noise); auto: inverse, "
+        "unless the spectrum is flat or has too many gaps",
     )
 
     @property
     def longest_delay_s(self) -> float:
-        """As stated."""
+        """Configured listening time."""
         return self.listen_s
 
     @property
     def middle_s(self) -> float:
-        """The middle of the pulse."""
+        """Mid-time of the pulse."""
         return self.pulse_s / 2
 
     @property
     def capture_s(self) -> float:
-        """Lead time, pulse, and longest delay."""
+        """Sum of lead time, pulse duration and listening time."""
         return self.lead_s + self.pulse_s + self.listen_s
 
     @property
     def needed_samples(self) -> int:
-        """Number of samples of a whole capture: its end holds the end of the last echo."""
+        """Samples of a whole capture, which ends with the end of the last echo."""
         return self.capture_samples
 
     @property
     def most_subcarriers(self) -> int:
-        """Number of subcarriers of the band."""
+        """Largest number of DFT frequencies within the band."""
         return min(self.capture_samples, int(self.widest_band_hz / self.sample_rate_hz * self.capture_samples) + 1)
 
     @property
     def widest_band_hz(self) -> float:
-        """Stated bandwidth, or all that the samples carry."""
+        """Configured bandwidth, else the sample rate."""
         return self.sample_rate_hz if self.band_hz is None else self.band_hz[1] - self.band_hz[0]
 
     @model_validator(mode="after")
@@ -198,7 +201,8 @@ class PulseWaveform(SampledWaveform):
             half = self.sample_rate_hz / 2
             if not -half <= low < high <= half:
                 raise ValueError(
-                    f"band_hz={[low, high]} must rise within ±sample_rate_hz/2 = ±{half:g} Hz: beyond, it aliases"
+                    f"band_hz={[low, high]} must be ascending and within ±sample_rate_hz/2 = ±{half:g} Hz; higher "
+                    "frequencies are aliased"
                 )
         if self.capture_s * self.prf_hz > 1:
             raise ValueError(
@@ -221,7 +225,7 @@ def _formats(kind: str) -> list[str]:
 
 def _known(name: str, kind: str) -> str:
     if name not in _formats(kind):
-        raise ValueError(f"no such format; choose {', '.join(_formats(kind))}")
+        raise ValueError(f"unknown format; choose {', '.join(_formats(kind))}")
     return name
 
 
@@ -237,16 +241,18 @@ class PhaseHistoryWaveform(Section):
 
     air: Literal["auto", "measured", "point", "corrected"] = Field(
         "auto",
-        description="air in the delays of the files: measured, delays as they were; point, samples are referred to a "
-        "point whose distance the file states, so that only what lies beyond it is delayed by air; corrected, whoever "
-        "made them took it out; auto: point for afrl_mat and cphd, else measured",
+        description="atmospheric delay in the files: measured (delays as recorded), point (samples are referred to "
+        "a point at a stated distance; only the excess path is delayed), corrected (removed before); "
+        "auto: point for afrl_mat and cphd, otherwise measured",
     )
-    channel: str | None = Field(None, description="of a CPHD file with several channels the one to image")
+    channel: str | None = Field(None, description="channel to image, for CPHD files with several channels")
     corrections: Literal["none", "stored"] = Field(
-        "none", description="of afrl_mat files that hold corrections of their passes (data.af): stored applies them"
+        "none", description="phase corrections contained in afrl_mat files (data.af): none, or stored to apply them"
     )
     iq: Literal["complex", "conjugate"] = Field(
-        "complex", description="complex: samples as recorded; conjugate: their conjugates, where phases count upwards"
+        "complex",
+        description="complex: samples as recorded; conjugate: their complex conjugates, for files with the opposite "
+        "sign of phase",
     )
 
     @field_validator("format")
@@ -257,25 +263,29 @@ class PhaseHistoryWaveform(Section):
     @model_validator(mode="after")
     def _keys_are_of_their_format(self) -> Self:
         if self.channel is not None and self.format != "cphd":
-            raise ValueError(f"channel={self.channel!r} is of format cphd, and not of {self.format}")
+            raise ValueError(f"channel={self.channel!r} applies to format cphd, not to {self.format}")
         if self.corrections != "none" and self.format != "afrl_mat":
-            raise ValueError(f"corrections={self.corrections!r} is of format afrl_mat, and not of {self.format}")
+            raise ValueError(f"corrections={self.corrections!r} applies to format afrl_mat, not to {self.format}")
         return self
 
 
 class Trigger(Section):
-    """Beginnings of the sweeps in a .wav file."""
+    """Detection of sweep starts in a .wav file."""
 
     sync_channel: int = Field(1, ge=1, le=64, description="channel of the sync pulses, counted from 1")
     beat_channel: int = Field(2, ge=1, le=64, description="channel of the beat signal, counted from 1")
-    edge: Literal["rising", "falling"] = Field("rising", description="of the sync pulses, where a sweep begins")
+    edge: Literal["rising", "falling"] = Field("rising", description="edge of the sync pulses at which a sweep starts")
     threshold: float = Field(
-        0.3, gt=0, lt=1, description="how far beyond the middle of its levels sync must go, of half their distance"
+        0.3,
+        gt=0,
+        lt=1,
+        description="trigger level of the sync signal above the mean of its two levels, as a fraction of half their "
+        "difference",
     )
 
 
 class FmcwWaveform(Section):
-    """Linear sweeps, mixed with their echoes when received: the beat signal was recorded."""
+    """FMCW waveform: linear sweeps, whose beat signals with their echoes were recorded."""
 
     kind: Literal["fmcw"] = Field(description=WAVEFORM_KINDS)
     format: str = Field(
@@ -287,24 +297,26 @@ class FmcwWaveform(Section):
         gt=0, description="RF frequency at the first sample of a sweep, or at its trigger, Hz", examples=[2.2e9]
     )
     bandwidth_hz: float = Field(
-        description="what frequency rises by in sweep_s, Hz; negative: sweeps that fall", examples=[400e6]
+        description="frequency change during sweep_s, Hz; negative for falling sweeps", examples=[400e6]
     )
-    sweep_s: float = Field(gt=0, description="how long a sweep is linear, s", examples=[20e-6])
-    sample_rate_hz: float = Field(gt=0, description="of the beat signal, Hz", examples=[25e6])
+    sweep_s: float = Field(gt=0, description="duration of the linear sweep, s", examples=[20e-6])
+    sample_rate_hz: float = Field(gt=0, description="sample rate of the beat signal, Hz", examples=[25e6])
     iq: Literal["real", "complex", "conjugate"] = Field(
         "real",
-        description="real: one mixer; complex: I+jQ of echo times conjugate sweep, whose beats are negative in a "
-        "sweep that rises; conjugate: the other way about",
+        description="real: a single mixer; complex: I+jQ of the echo times the conjugate sweep, with negative beat "
+        "frequencies for rising sweeps; conjugate: the opposite sign",
     )
-    settle_s: float = Field(0.0, ge=0, description="left out at the beginning of every sweep, s")
+    settle_s: float = Field(0.0, ge=0, description="settling time excluded at the start of every sweep, s")
     reference_path_m: float = Field(0.0, ge=0, description="path of the sweep to the mixer inside the radar, m")
-    prf_hz: float | None = Field(None, ge=1e-3, description="sweeps per second, Hz; null: files hold times or triggers")
+    prf_hz: float | None = Field(
+        None, ge=1e-3, description="sweep repetition frequency, Hz; null: the files contain times or triggers"
+    )
     start_utc: str | None = Field(
         None,
-        description="when files without times began, ISO 8601 in UTC by the recorder; null: 1970, config/clocks.tsv "
-        "says the rest",
+        description="start of recordings without times, by the recorder's clock, ISO 8601 in UTC; null: 1970, "
+        "corrected by config/clocks.tsv",
     )
-    trigger: Trigger = Field(default_factory=Trigger, description="where sweeps begin in a .wav file")
+    trigger: Trigger = Field(default_factory=Trigger, description="sweep trigger in a .wav file")
 
     @field_validator("format")
     @classmethod
@@ -315,12 +327,12 @@ class FmcwWaveform(Section):
     def _sweeps_hold_samples(self) -> Self:
         if not self.bandwidth_hz or self.start_hz + self.bandwidth_hz <= 0:
             raise ValueError(
-                f"bandwidth_hz={self.bandwidth_hz:g} from start_hz={self.start_hz:g} is no band above 0 Hz"
+                f"bandwidth_hz={self.bandwidth_hz:g} with start_hz={self.start_hz:g} is not a band above 0 Hz"
             )
         if not 8 <= (self.sweep_s - self.settle_s) * self.sample_rate_hz <= _MOST_SAMPLES:
             raise ValueError(
                 f"(sweep_s - settle_s)*sample_rate_hz = {(self.sweep_s - self.settle_s) * self.sample_rate_hz:g} "
-                f"samples per sweep: must be 8 to {_MOST_SAMPLES}"
+                f"samples per sweep; must be 8 to {_MOST_SAMPLES}"
             )
         if self.reference_path_m > _LONGEST_REFERENCE_M:
             raise ValueError(f"reference_path_m={self.reference_path_m:g}: at most {_LONGEST_REFERENCE_M:g}")
@@ -329,6 +341,6 @@ class FmcwWaveform(Section):
         return self
 
 
-# ---- Section `waveform`: what was transmitted ----------------------------------------------------------------------
+# ---- Section `waveform` ----------------------------------------------------------------------------------------------
 
 Waveform = Annotated[OfdmWaveform | PulseWaveform | PhaseHistoryWaveform | FmcwWaveform, Field(discriminator="kind")]

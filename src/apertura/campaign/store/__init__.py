@@ -1,8 +1,8 @@
-"""Stages on disk: zarr folders that are complete or absent, each beside a manifest of hashes.
+"""Stages on disk: zarr folders that are complete or absent, each with a manifest of hashes.
 
-A stage is written as ``<stage>.zarr.wip`` under a kernel lock, finished by a rename, and described by
-``<stage>.manifest.json``, which is written last: where the manifest stands, the folder is complete. Documents and
-products have manifests of the same kind. Each names its files with their hashes and what they were made from.
+A stage is written as ``<stage>.zarr.wip`` under a kernel lock and finished by a rename. ``<stage>.manifest.json`` is
+written last: if the manifest exists, the folder is complete. Documents and products have manifests of the same form,
+which list their files with hashes and state their lineage.
 """
 
 from apertura.campaign.store.manifest import (

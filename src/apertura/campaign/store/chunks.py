@@ -1,4 +1,4 @@
-"""Chunks on disk: brought to the disk before they are renamed, checked by their sum when they are read."""
+"""Chunks on disk: synchronised to disk before they are renamed, verified by their checksum when they are read."""
 
 import asyncio
 import hashlib
@@ -26,31 +26,31 @@ if TYPE_CHECKING:
     import xarray as xr
 
 
-# What a user has set for zarr (ZARR_…, ~/.config/zarr) changes no byte of ours: one order of arrays and of sums.
+# Override the user's zarr settings (ZARR_…, ~/.config/zarr), so that the written bytes do not depend on them.
 zarr.config.update(zarr.config.defaults[0], priority="new")
-zarr.config.set({"array.write_empty_chunks": True})  # no chunk means not computed yet: zeros are written too
+zarr.config.set({"array.write_empty_chunks": True})  # a missing chunk means not computed, so zeros are written as well
 
 CODECS = (ZstdCodec(), Crc32cCodec())
-"""Codecs of a chunk; the checksum comes last, so that it covers the bytes on the disk."""
+"""Codecs of a chunk; the checksum is last, so that it covers the bytes on disk."""
 
 _SUM_BYTES = 4
 _METADATA = "zarr.json"
 
 
 class StageStore(LocalStore):
-    """A folder of a stage, as zarr reads and writes it.
+    """Zarr store of a stage folder that verifies chunks.
 
-    A file is complete or absent, also after a power failure; a chunk that is not what was written is never handed out:
-    by its own sum, and of a finished stage by its hash in the manifest, where that is given, when it is first read.
+    A file is complete or absent, even after a power failure. Every chunk is verified by its checksum on reading, and
+    chunks of a finished stage also by their hash in the manifest, if it is given, when they are first read.
 
     Parameters
     ----------
     folder, read_only
-        As `zarr.storage.LocalStore` takes them.
+        As in `zarr.storage.LocalStore`.
     sha256
         File of the folder → hash.
     finished_later
-        Leave it to `finish` to bring all files to the disk at once: what is there after a kill is begun anew.
+        Leave the synchronisation of all files to `finish`; after a kill, the stage is recomputed from the start.
     """
 
     root: ConfinedPath
@@ -70,13 +70,13 @@ class StageStore(LocalStore):
     async def get(
         self, key: str, prototype: BufferPrototype | None = None, byte_range: ByteRequest | None = None
     ) -> Buffer | None:
-        """Return a file of the folder; `CampaignError` if it is a chunk and not what was written."""
+        """Return the content of a file; raise CampaignError if it is a damaged chunk."""
         return self._checked(key, await super().get(key, prototype, byte_range), byte_range)
 
     def get_sync(
         self, key: str, *, prototype: BufferPrototype | None = None, byte_range: ByteRequest | None = None
     ) -> Buffer | None:
-        """As `get`."""
+        """Return the content of a file, as `get` does."""
         return self._checked(key, super().get_sync(key, prototype=prototype, byte_range=byte_range), byte_range)
 
     async def set(self, key: str, value: Buffer) -> None:
@@ -84,7 +84,7 @@ class StageStore(LocalStore):
         await asyncio.to_thread(self.set_sync, key, value)
 
     def set_sync(self, key: str, value: Buffer) -> None:
-        """As `set`."""
+        """Write a file of the folder, as `set` does."""
         self._check_writable()
         path = self.root / key
         if self._finished_later:
@@ -94,7 +94,7 @@ class StageStore(LocalStore):
             write_beside(path, value.to_bytes())
 
     async def set_if_not_exists(self, key: str, value: Buffer) -> None:
-        """Write a file that is not there; a file of a stage has one writer."""
+        """Write a file unless it exists; each file of a stage has one writer."""
         if not await self.exists(key):
             await self.set(key, value)
 
@@ -104,16 +104,16 @@ class StageStore(LocalStore):
         await asyncio.to_thread((self.root / key).remove)
 
     async def delete_dir(self, prefix: str) -> None:
-        """As `delete`."""
+        """Remove a folder with its contents."""
         await self.delete(prefix)
 
     def _checked(self, key: str, value: Buffer | None, byte_range: ByteRequest | None) -> Buffer | None:
         name = key.rpartition("/")[2]
-        if name.startswith(".z"):  # of version 2, which is not ours, and whose filters may be a pickle
+        if name.startswith(".z"):  # metadata of zarr version 2, not used here; its filters may contain a pickle
             return None
         if name == _METADATA and value is not None and other_codec(_json(value)) is not None:
             raise damaged(self.root, key)
-        if value is None and key in self._unchecked:  # zarr would take a chunk that is gone for one that is empty
+        if value is None and key in self._unchecked:  # zarr reads a missing chunk as an empty one
             raise damaged(self.root, key)
         if value is None or byte_range is not None or name == _METADATA:
             return value
@@ -134,22 +134,22 @@ def _json(value: Buffer) -> object:
 
 
 def array_of(folder: Path, name: str, mode: str) -> Any:
-    """Return an array of a stage, a `zarr.Array`."""
+    """Open an array of a stage as a `zarr.Array`."""
     return zarr.open_array(StageStore(folder, read_only=mode == "r"), path=name, mode=mode)
 
 
 def update_attributes(folder: Path, attributes: Mapping[str, Any]) -> None:
-    """Write attributes of a stage in work."""
+    """Write attributes of an unfinished stage."""
     zarr.open_group(StageStore(folder), mode="r+").attrs.update(attributes)
 
 
 def damaged(folder: Path, key: str) -> CampaignError:
-    """Return the error that a chunk of a stage, finished or in work, is not what was written."""
+    """Return the error for a damaged chunk of a finished or unfinished stage."""
     finished = folder.suffix == ".zarr"
     return CampaignError(
-        "damaged since it was written",
+        "the file is damaged",
         where=folder / key,
-        expected="bytes that agree with their sum",
+        expected="content that matches its checksum",
         remedy=remake(folder) if finished else "Run the workflow again.",
     )
 
@@ -160,9 +160,9 @@ def encoding_of(dataset: "xr.Dataset", chunks: Mapping[str, int]) -> dict[Hashab
     Parameters
     ----------
     dataset
-        The stage.
+        Stage.
     chunks
-        Dimension → chunk length; a dimension not named is one chunk.
+        Dimension → chunk length; other dimensions have one chunk.
     """
     encoding: dict[Hashable, dict[str, Any]] = {}
     for name, array in dataset.variables.items():
@@ -181,23 +181,23 @@ def encoding_of(dataset: "xr.Dataset", chunks: Mapping[str, int]) -> dict[Hashab
 def skeleton(
     stage: "xr.Dataset", chunks: Mapping[str, tuple[int, ...]], *, packed: bool = True, consolidated: bool = False
 ) -> dict[str, bytes]:
-    """Return the files of a stage before anything is computed: its metadata and coordinates, path → bytes.
+    """Return metadata and coordinates of a stage before its arrays are computed: path → bytes.
 
     Parameters
     ----------
     stage
-        The stamped stage; of the arrays in `chunks` only dims, dtype, fill value and attributes count, so they may be
-        broadcast.
+        Stage with provenance. Only dims, dtype, fill value and attributes of the arrays in `chunks` are used, so they
+        may be broadcast.
     chunks
         Array that is written chunk by chunk → shape of its chunks.
     packed
-        Whether those are compressed; noise is not made smaller by it.
+        True if those arrays are compressed, which has no effect on noise.
     consolidated
-        Whether the stage's own metadata repeat those of its arrays, for readers that open many of them.
+        True if the metadata of the stage repeat those of its arrays, for readers that open several of them.
     """
     files: dict[str, Buffer] = {}
-    rest, store = stage.drop_vars(list(chunks)), MemoryStore(files)
-    rest.to_zarr(store, mode="w", consolidated=False, zarr_format=3, encoding=encoding_of(rest, {}))
+    whole, store = stage.drop_vars(list(chunks)), MemoryStore(files)
+    whole.to_zarr(store, mode="w", consolidated=False, zarr_format=3, encoding=encoding_of(whole, {}))
     group = zarr.open_group(store, mode="r+")
     for name, shape in chunks.items():
         array = stage[name]
@@ -207,12 +207,12 @@ def skeleton(
             chunks=shape,
             dtype=array.dtype,
             compressors=CODECS if packed else CODECS[-1:],
-            fill_value=array.values.flat[0],  # of a chunk that is never written
+            fill_value=array.values.flat[0],  # value of chunks that are never written
             dimension_names=[str(dim) for dim in array.dims],
             attributes=array.attrs | ({"grid_mapping": "spatial_ref"} if {"y", "x"} <= set(array.dims) else {}),
         )
     if consolidated:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", ZarrUserWarning)  # of version 3 it is not in the standard yet
+            warnings.simplefilter("ignore", ZarrUserWarning)  # not in the zarr version 3 standard yet
             zarr.consolidate_metadata(store)
     return {path: content.to_bytes() for path, content in files.items()}

@@ -1,4 +1,4 @@
-"""The manifest of a result: hashes of its files and what it was made from; written last, compared when it is opened."""
+"""Manifest of a result: hashes of its files and its lineage; written last, and verified when the result is opened."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ from typing import Any, Literal, Protocol
 from apertura.common.atomic import write_json
 from apertura.common.confined import ConfinedPath
 from apertura.common.documents import read_json, undamaged
-from apertura.common.errors import CampaignError
+from apertura.common.errors import CampaignError, number_of
 from apertura.common.provenance import sha256_file
 
 
@@ -24,7 +24,7 @@ def manifest_of(result: Path) -> Path:
 
 
 def remake(result: Path) -> str:
-    """Return the remedy for a result that is not as it was written.
+    """Return the remedy for a result that has changed since it was written.
 
     Examples
     --------
@@ -35,70 +35,70 @@ def remake(result: Path) -> str:
 
 
 def remake_from(manifest: Path) -> str:
-    """Return the remedy for a result whose files contradict their manifest, or have none that is whole."""
+    """Return the remedy for a result whose files contradict their manifest, or whose manifest is damaged."""
     return f"Delete {manifest} and run the workflow again."
 
 
 class ResultOrigin(Protocol):
-    """Origin of a result that is being made, `apertura.campaign.digests.Lineage`."""
+    """Lineage of a result that is being computed, `apertura.campaign.digests.Lineage`."""
 
     def record(self) -> dict[str, Any]:
-        """Return sources (file → sha256), settings and code for the manifest, once more compared with what is there."""
+        """Return sources (file → SHA-256), settings and code for the manifest; check that the files are unchanged."""
 
 
 def write_manifest(manifest: Path, files: Mapping[str, str], lineage: ResultOrigin | None = None) -> None:
-    """Write the manifest of a result that is complete.
+    """Write the manifest of a complete result.
 
     Parameters
     ----------
     manifest
         ``….manifest.json``.
     files
-        File relative to the manifest's folder → sha256.
+        File relative to the manifest's folder → SHA-256.
     lineage
-        Its origin; None: not stated.
+        Lineage of the result; None: not stated.
     """
     write_json(manifest, {"files": files, **(lineage.record() if lineage else {})})
 
 
 def record_files(manifest: Path, files: Sequence[Path], lineage: ResultOrigin | None = None) -> None:
-    """Write the manifest of some files beside or below it."""
+    """Hash files in or below the manifest's folder, and write their manifest."""
     write_manifest(
         manifest, {path.relative_to(manifest.parent).as_posix(): sha256_file(path) for path in sorted(files)}, lineage
     )
 
 
 def read_manifest(manifest: Path) -> dict[str, Any]:
-    """Return a manifest.
+    """Read a manifest.
 
     Raises
     ------
     CampaignError
-        If it is no manifest.
+        If the file is not a valid manifest.
     """
-    expected, remedy = "a manifest as the workflow wrote it", remake_from(manifest)
+    expected, remedy = "a manifest of the workflow", remake_from(manifest)
     document = read_json(manifest, expected=expected, remedy=remedy)
     with undamaged(manifest, expected=expected, remedy=remedy):
         for hashes in (document["files"], document.get("sources", {})):
             if not all(isinstance(text, str) for pair in hashes.items() for text in pair):
-                raise TypeError("a hash that is no text")
+                raise TypeError("a hash that is not text")
     return document
 
 
 @dataclass(frozen=True)
 class Difference:
-    """One thing that is not as a manifest records it.
+    """Difference from a manifest.
 
     Attributes
     ----------
     part
-        Of the record: a file of the result, a source, the settings or the code.
+        Part of the manifest: a file of the result, a source, the settings or the code.
     name
-        Of the file or source, as recorded; empty of settings and code.
+        Recorded name of the file or source; empty for settings and code.
     state
-        missing: recorded, and not there; altered: with another hash; added: there, and not recorded.
+        missing: recorded, but absent; altered: with another hash; added: present, but not recorded.
     recorded, present
-        sha256, hex; empty of what is added, and where a file is missing.
+        SHA-256, hex; empty for added and missing files, respectively.
     """
 
     part: Literal["file", "source", "settings", "code"]
@@ -109,7 +109,7 @@ class Difference:
 
 
 class CurrentInputs(Protocol):
-    """Origin that a result would have now, `apertura.campaign.digests.Result`."""
+    """Current lineage of a result, `apertura.campaign.digests.Result`."""
 
     @property
     def sources(self) -> Sequence[str]:
@@ -117,11 +117,11 @@ class CurrentInputs(Protocol):
 
     @property
     def settings_sha256(self) -> str:
-        """Hash of its settings."""
+        """Hash of the settings."""
 
     @property
     def code_sha256(self) -> str:
-        """Hash of its code."""
+        """Hash of the code."""
 
 
 def compare(
@@ -131,24 +131,24 @@ def compare(
     added: Iterable[str] = (),
     part: Literal["file", "source"] = "file",
 ) -> Iterator[Difference]:
-    """Compare files with recorded hashes; yield what differs, in order of the names.
+    """Compare files with recorded hashes; yield the differences in the order of names.
 
     Parameters
     ----------
     recorded
-        Name → sha256, hex.
+        Name → SHA-256, hex.
     present
-        Returns the sha256 of a file as it is now; empty where it is not there.
+        Function that returns the current SHA-256 of a file; empty if it is missing.
     added
-        Names that are there now, or that count now.
+        Names of current files or sources.
     part
-        Which part of the record it is.
+        Part of the manifest.
 
     Examples
     --------
     >>> now = {"a": "4c", "b": "0f", "d": "1a"}
-    >>> found = compare({"a": "4c", "b": "9e", "c": "77"}, lambda name: now.get(name, ""), added=now)
-    >>> [(one.name, one.state) for one in found]
+    >>> differences = compare({"a": "4c", "b": "9e", "c": "77"}, lambda name: now.get(name, ""), added=now)
+    >>> [(difference.name, difference.state) for difference in differences]
     [('b', 'altered'), ('c', 'missing'), ('d', 'added')]
     """
     for name in sorted({*recorded, *added}):
@@ -161,16 +161,16 @@ def compare(
 def compare_origin(
     document: Mapping[str, Any], expected: CurrentInputs, present: Callable[[str], str]
 ) -> Iterator[Difference]:
-    """Compare what a manifest says of where its result comes from with what is there now: sources, settings and code.
+    """Compare the lineage in a manifest with the current one: sources, settings and code.
 
     Parameters
     ----------
     document
-        The manifest, with ``sources``, ``settings`` and ``code``.
+        Manifest with ``sources``, ``settings`` and ``code``.
     expected
-        What the result would be made from now.
+        Current lineage of the result.
     present
-        As `compare`, of sources.
+        Function that returns the current SHA-256 of a source; empty if it is missing.
     """
     yield from compare(document["sources"], present, added=expected.sources, part="source")
     if document["settings"] != expected.settings_sha256:
@@ -180,17 +180,17 @@ def compare_origin(
 
 
 def states_origin(document: Mapping[str, Any]) -> bool:
-    """Test whether a manifest states the origin of its result; those before 0.1.0 did not."""
+    """Return True if a manifest states the lineage of its result; manifests before 0.1.0 do not."""
     return {"sources", "settings", "code"} <= document.keys()
 
 
 def sha256_present(path: Path) -> str:
-    """Return the sha256 of a file, every byte read; empty where there is none."""
+    """Return the SHA-256 of a file, reading every byte; empty if the file is missing."""
     return sha256_file(path) if path.is_file() else ""
 
 
 def damaged_files(manifest: Path) -> list[str]:
-    """Return the files of a result that are not as they were written, or not there; every byte is read."""
+    """Return the files of a result that have changed since they were written or are missing; reads every byte."""
 
     def present(name: str) -> str:
         return sha256_present(ConfinedPath.of(manifest).parent.named(name, where=manifest))
@@ -204,29 +204,29 @@ def check_document(path: Path) -> None:
     Raises
     ------
     CampaignError
-        If it is missing, or is not what the manifest describes.
+        If it is missing, or differs from its manifest.
     """
     _check(manifest_of(path), _files_of(path), {path.name: sha256_file(path)})
 
 
 def check_stage(folder: Path) -> dict[str, str]:
-    """Check which files a finished stage has, and what its metadata hold, against its manifest; return their hashes.
+    """Check file names and metadata of a finished stage against its manifest; return the recorded hashes.
 
     Returns
     -------
     dict
-        File of the folder → sha256, against which chunks are checked as they are read: a stage is not read whole to
-        look at a part of it.
+        File of the folder → SHA-256, for the verification of chunks when they are read; opening a stage does not read
+        its chunks.
 
     Raises
     ------
     CampaignError
-        If it is missing, or is not what the manifest describes.
+        If it is missing, or differs from its manifest.
     """
     recorded, inside = _files_of(folder), f"{folder.name}/"
     names = [path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()]
     present = {
-        # zarr version 3 keeps values in files below a folder `c`
+        # zarr version 3 stores chunks below a folder `c`
         f"{inside}{name}": recorded.get(f"{inside}{name}", "")
         if "c" in name.split("/")[1:]
         else sha256_file(folder / name)
@@ -241,7 +241,7 @@ def _files_of(result: Path) -> dict[str, str]:
     manifest = manifest_of(result)
     if not manifest.is_file() or not result.exists():
         raise CampaignError(
-            "not there, or not finished",
+            "the result is missing or unfinished",
             where=result,
             expected="a finished result with its manifest",
             remedy=f"{f'Delete {manifest} and run' if manifest.is_file() else 'Run'} the workflow (`apertura run`).",
@@ -250,67 +250,69 @@ def _files_of(result: Path) -> dict[str, str]:
 
 
 def _check(manifest: Path, recorded: Mapping[str, str], present: Mapping[str, str]) -> None:
-    """Raise CampaignError unless the files present are those recorded."""
+    """Check that the present files are those recorded; raise CampaignError if not."""
     differing = list(compare(recorded, lambda name: present.get(name, ""), added=present))
     if differing:
+        count = f"{number_of(len(differing), 'file')} {'differs' if len(differing) == 1 else 'differ'}"
         raise CampaignError(
-            f"{len(differing)} files are not as they were written, first {differing[0].name}",
+            f"{count} from the manifest, first {differing[0].name}",
             where=manifest.parent,
-            expected=f"what {manifest.name} describes",
+            expected=f"the files listed in {manifest.name}",
             remedy=remake_from(manifest),
         )
 
 
 def check_listed(path: Path, manifest: Path, *, present: Callable[[Path], str] = sha256_present) -> str:
-    """Check one of a result's files against their manifest; return its sha256.
+    """Check a file of a result against the manifest; return its SHA-256.
 
     Parameters
     ----------
     path
-        The file, in the manifest's folder or below.
+        File in the manifest's folder or below.
     manifest
-        That lists it.
+        Manifest that lists the file.
     present
-        Returns the sha256 of the file as it is now; empty where it is not there.
+        Function that returns the current SHA-256 of the file; empty if it is missing.
 
     Raises
     ------
     CampaignError
-        If it is not as it was written, or the manifest does not list it.
+        If the file has changed since it was written, or the manifest does not list it.
     """
     recorded = str(read_manifest(manifest)["files"].get(path.relative_to(manifest.parent).as_posix(), ""))
-    if not recorded or present(path) != recorded:
-        remedy = remake_from(manifest)
-        raise CampaignError("not as it was written", path, f"what {manifest.name} describes", remedy)
+    now = present(path)
+    if not recorded or now != recorded:
+        problem = "the file has changed since it was written" if now else "no such file"
+        raise CampaignError(problem, path, f"the file listed in {manifest.name}", remake_from(manifest))
     return recorded
 
 
 def save_document(path: Path, document: Mapping[str, Any], lineage: ResultOrigin | None = None) -> None:
-    """Write a result that is one JSON document, and its manifest."""
+    """Write a result that consists of one JSON document, and its manifest."""
     manifest_of(path).unlink(missing_ok=True)
     write_json(path, document)
     record_files(manifest_of(path), [path], lineage)
 
 
 def open_document(path: Path) -> dict[str, Any]:
-    """Return a result that is one JSON document, after checking it against its manifest.
+    """Read a result that consists of one JSON document, after checking it against its manifest.
 
     Raises
     ------
     CampaignError
-        If it is missing, or is not what the manifest describes.
+        If it is missing, or differs from its manifest.
     """
     check_document(path)
     return read_json(path, expected="a result of the workflow", remedy=remake(path))
 
 
 def open_listed(path: Path, manifest: Path) -> dict[str, Any]:
-    """Return a JSON document that is one of a result's files, after checking it against their manifest.
+    """Read a JSON document that is a file of a result, after checking it against the manifest.
 
     Raises
     ------
     CampaignError
-        If it or the manifest is missing, or it is not as it was written.
+        If it or the manifest is missing, or it has changed since it was written.
     """
     document = read_json(path, expected="a finished campaign", remedy="Run the workflow first.")
     check_listed(path, manifest)

@@ -1,4 +1,4 @@
-"""Stages written, read and resumed: their blocks, the lock on work in progress, the rename that finishes one."""
+"""Writing, reading and resuming of stages: blocks of arrays, the lock on work in progress, the finishing rename."""
 
 import errno
 import fcntl
@@ -33,20 +33,20 @@ if TYPE_CHECKING:
 
 @contextmanager
 def writing(folder: Path) -> Iterator[ConfinedPath]:
-    """Hold the right to write `folder` and yield where work in progress goes.
+    """Lock `folder` for writing and yield the folder of work in progress.
 
-    A kernel lock that dies with its process keeps a second writer out: a step that outlived its snakemake finishes its
-    work, and the new one waits for it. A finished folder whose files are as `finish` left them becomes work in progress
+    A kernel lock, which is released when its process ends, excludes a second writer: a new step waits for one that is
+    still running after its snakemake was killed. A finished folder with unchanged files becomes work in progress
     again, so that nothing is computed twice.
 
     Yields
     ------
     apertura.common.confined.ConfinedPath
-        ``<folder>.wip``; kept if the body fails, so that finished chunks are picked up again.
+        ``<folder>.wip``; kept if the body fails, so that finished chunks are used again.
     """
     folder = confined_target(folder)
     with _opened(folder) as (wip, lock):
-        _take(lock, folder, wip)
+        _acquire(lock, folder, wip)
         yield wip
 
 
@@ -54,26 +54,26 @@ def writing(folder: Path) -> Iterator[ConfinedPath]:
 def sharing(
     folder: Path, stage: "xr.Dataset", name: str, windows: Sequence[Window]
 ) -> Iterator[tuple[ConfinedPath, list[Window]]]:
-    """Join the jobs that write chunks of one stage at once, each its own; who finishes the stage waits for them.
+    """Lock a stage for several jobs that write different chunks at the same time; its finishing step waits for them.
 
     Parameters
     ----------
     folder, stage, name, windows
-        As `writing` and `resume` take them.
+        As in `writing` and `resume`.
 
     Yields
     ------
     tuple
-        ``<folder>.wip``, and the windows that it does not hold yet: none if meanwhile others finished it, or began
-        other work there.
+        ``<folder>.wip``, and the windows that it lacks: empty if another job meanwhile finished the stage, or started
+        it with other settings.
     """
     folder = confined_target(folder)
     with _opened(folder) as (wip, lock):
         fcntl.flock(lock, fcntl.LOCK_SH)
         if not (is_work_on(wip, stage) and is_intact(wip, skeleton_of(stage, name, windows))):
-            _take(lock, folder, wip)
+            _acquire(lock, folder, wip)
             resume(wip, stage, name, windows)
-            fcntl.flock(lock, fcntl.LOCK_SH)  # not atomic: another writer may come between
+            fcntl.flock(lock, fcntl.LOCK_SH)  # not atomic: another writer may have obtained the lock in between
         yield wip, missing(wip, name, windows) if is_work_on(wip, stage) else []
 
 
@@ -84,19 +84,19 @@ def _opened(folder: ConfinedPath) -> Iterator[tuple[ConfinedPath, IO[str]]]:
         yield folder.with_name(f"{folder.name}.wip"), lock
 
 
-def _take(lock: IO[str], folder: ConfinedPath, wip: ConfinedPath) -> None:
-    """Wait for every other writer; turn a finished folder that is undamaged into work in progress."""
+def _acquire(lock: IO[str], folder: ConfinedPath, wip: ConfinedPath) -> None:
+    """Wait for all other writers; turn a finished, undamaged folder into work in progress."""
     fcntl.flock(lock, fcntl.LOCK_EX)
     manifest_of(folder).unlink(missing_ok=True)
     if folder.is_dir() and not wip.exists():
         lock.seek(0)
-        linked = any(path.is_symlink() for path in folder.rglob("*"))  # none of ours: not even hashed
+        linked = any(path.is_symlink() for path in folder.rglob("*"))  # stages contain no links; do not follow them
         if not linked and lock.read() == canonical_json(sha256_tree(folder)):
             folder.rename(wip)
 
 
 def _lock_of(folder: ConfinedPath) -> ConfinedPath:
-    """Return the lock file of a stage, which keeps the hashes of its files: snakemake removes manifests."""
+    """Return the lock file of a stage, which also contains the hashes of its files, as snakemake removes manifests."""
     return folder.with_name(f".{folder.name}.lock")
 
 
@@ -106,18 +106,18 @@ def finish(wip: Path, folder: Path, *, lineage: ResultOrigin | None = None, **at
     Parameters
     ----------
     wip, folder
-        As `writing` yields and takes them.
+        Work in progress, from `writing`, and the folder of the stage.
     lineage
-        Its sources, settings and code, for `write_manifest`.
+        Lineage of the stage, for `write_manifest`.
     **attributes
-        Attributes of the stage that are known only now, such as what was measured on it.
+        Attributes of the stage that are known only at the end, such as measurements on it.
     """
     wip, folder = ConfinedPath.of(wip), ConfinedPath.of(folder)
     if attributes:
         from apertura.campaign.store.chunks import update_attributes
 
         update_attributes(wip, attributes)
-    for partial in wip.rglob("*.partial"):  # of a killed writer
+    for partial in wip.rglob("*.partial"):  # left by a killed writer
         partial.unlink()
     files = sha256_tree(wip)
     with naming(_lock_of(folder)), _lock_of(folder).open("w", encoding="utf-8") as lock:
@@ -129,7 +129,7 @@ def finish(wip: Path, folder: Path, *, lineage: ResultOrigin | None = None, **at
     write_manifest(manifest_of(folder), {f"{folder.name}/{name}": digest for name, digest in files.items()}, lineage)
 
 
-# ---- Resuming work in progress: checks and repair of its chunks -----------------------------------------------------
+# ---- Resumption of work in progress: checks and repair of its chunks -------------------------------------------------
 
 _LOG = logging.getLogger(__name__)
 _REWRITTEN = "rewritten_chunks"
@@ -137,24 +137,24 @@ _PROVENANCE = ("runspec", "inputs", "code_sha256")
 
 
 def resume(wip: Path, stage: "xr.Dataset", name: str, windows: Sequence[Window]) -> list[Window]:
-    """Return the windows of array `name` that `wip` does not hold yet; create `wip` if it is absent or other work.
+    """Return the windows of array `name` that `wip` lacks; create `wip` if it is absent or has another provenance.
 
-    Nothing in `wip` is trusted: damaged chunks are computed again, with a notice.
+    All files of `wip` are verified; damaged chunks are recomputed, with a warning.
 
     Parameters
     ----------
     wip
         Work in progress, from `writing`.
     stage
-        The stamped stage; of array `name` only shape, dtype and fill value count, so it may be a broadcast zero.
+        Stage with provenance. Only shape, dtype and fill value of array `name` are used, so it may be a broadcast zero.
     name
-        The array that is written tile by tile.
+        Array that is written tile by tile.
     windows
-        Every tile, square but at the edges; the first one's shape is the chunk's.
+        All tiles, square except at the edges; the shape of the first is the chunk shape.
 
     Notes
     -----
-    Work in progress is other work when its settings, inputs or code differ.
+    Work in progress with other settings, inputs or code is discarded.
     """
     wip, files = ConfinedPath.of(wip), skeleton_of(stage, name, windows)
     if is_work_on(wip, stage):
@@ -168,14 +168,14 @@ def resume(wip: Path, stage: "xr.Dataset", name: str, windows: Sequence[Window])
 
 
 def mark_rewritten(wip: Path, name: str, windows: Sequence[Window], rewritten: Sequence[Window]) -> None:
-    """Note which windows are about to be written otherwise than at first: `resume` begins them anew.
+    """Record the windows that are rewritten with other settings than at first: `resume` recomputes them.
 
-    Work that goes on after a kill, and a finished stage that becomes work again, thus ends in the same bytes.
+    A run that resumes after a kill, or from a finished stage, thus produces the same bytes.
     """
     from apertura.campaign.store.chunks import update_attributes
 
-    known = set(_attributes(wip).get(_REWRITTEN, []))
-    keys = known | {f"{name}/{_key(window, windows)}" for window in rewritten}
+    earlier = set(_attributes(wip).get(_REWRITTEN, []))
+    keys = earlier | {f"{name}/{_key(window, windows)}" for window in rewritten}
     update_attributes(wip, {_REWRITTEN: sorted(keys)})
 
 
@@ -185,21 +185,21 @@ def _attributes(wip: Path) -> dict[str, Any]:
 
 
 def is_work_on(wip: Path, stage: "xr.Dataset") -> bool:
-    """Test whether `wip` was begun with the settings, inputs and code of the stamped `stage`."""
+    """Return True if `wip` has the settings, inputs and code of `stage`."""
     try:
-        begun = _attributes(wip)
-        return {key: begun[key] for key in _PROVENANCE} == {key: stage.attrs[key] for key in _PROVENANCE}
+        attributes = _attributes(wip)
+        return {key: attributes[key] for key in _PROVENANCE} == {key: stage.attrs[key] for key in _PROVENANCE}
     except (FileNotFoundError, NotADirectoryError):
         return False
     except (ValueError, TypeError, KeyError, RecursionError, IsADirectoryError) as error:
-        _notice(wip / "zarr.json", error, "all of it is begun anew")
+        _warn_damaged(wip / "zarr.json", error, "recomputing from the start")
         return False
 
 
 def missing(wip: Path, name: str, windows: Sequence[Window]) -> list[Window]:
-    """Return the windows of array `name` whose chunks `wip` does not hold as they were written.
+    """Return the windows of array `name` whose chunks are missing or damaged in `wip`.
 
-    A damaged chunk is removed, with a notice.
+    Damaged chunks are removed, with a warning.
     """
     wip = ConfinedPath.of(wip)
     array = open_array(wip, name, "r")
@@ -214,29 +214,29 @@ def _is_whole(path: ConfinedPath, array: Any, window: Window) -> bool:
         array[window]
     except MemoryError:
         raise
-    except Exception as error:  # a codec may raise anything
+    except Exception as error:  # a codec may raise any exception
         if isinstance(error, OSError) and error.errno != errno.EIO:
             raise
-        _notice(path, error, "it is formed again")
+        _warn_damaged(path, error, "recomputing it")
         remove(path)
         return False
     return True
 
 
-def _notice(path: Path, error: BaseException, what: str) -> None:
-    """Log on stderr, if no handler is set up, that part of work in progress is computed again."""
-    _LOG.warning("%s is damaged (%s): %s", path, f"{error}".split(";")[0] or type(error).__name__, what)
+def _warn_damaged(path: Path, error: BaseException, consequence: str) -> None:
+    """Log a warning on a damaged file of work in progress; it appears on stderr if no handler is configured."""
+    _LOG.warning("%s is damaged (%s): %s", path, f"{error}".split(";")[0] or type(error).__name__, consequence)
 
 
 def skeleton_of(stage: "xr.Dataset", name: str, windows: Sequence[Window]) -> dict[str, bytes]:
-    """Return the files of a stage whose array `name` is written by `windows`, before any is."""
+    """Return metadata and coordinates of a stage whose array `name` is written by `windows`: path → bytes."""
     from apertura.campaign.store.chunks import skeleton
 
     return skeleton(stage, {name: _chunk(windows)})
 
 
 def _begin(wip: ConfinedPath, files: Mapping[str, bytes]) -> None:
-    """Write metadata and coordinates; that of the stage, by which it is known, last. Resuming checks all of it."""
+    """Write metadata and coordinates of a stage; zarr.json, which identifies the stage, is last."""
     remove(wip)
     for name, content in files.items():
         if name != "zarr.json":
@@ -247,27 +247,27 @@ def _begin(wip: ConfinedPath, files: Mapping[str, bytes]) -> None:
 
 
 def is_intact(wip: ConfinedPath, files: Mapping[str, bytes]) -> bool:
-    """Test whether metadata and coordinates of work in progress are as it was begun, but for what was measured."""
+    """Return True if metadata and coordinates of work in progress are unchanged, apart from attributes of the stage."""
     paths = ((wip / name, content) for name, content in files.items() if name != "zarr.json")
     return all(path.is_file(follow_symlinks=False) and path.read_bytes() == content for path, content in paths)
 
 
 def _repair(wip: ConfinedPath, files: Mapping[str, bytes], chunks: Collection[str]) -> None:
-    """Bring metadata and coordinates of work in progress back to how it was begun; remove what does not belong."""
+    """Restore metadata and coordinates of work in progress; remove files that do not belong to it."""
     for path in [path for path in wip.rglob("*") if not path.is_dir(follow_symlinks=False)]:
         if (name := path.relative_to(wip).as_posix()) not in files and name not in chunks:
             path.unlink()
     for name, content in files.items():
         path = wip / name
         if not path.is_file(follow_symlinks=False) or path.read_bytes() != content:
-            if name != "zarr.json":  # of a finished stage it also says what was measured
-                _notice(path, ValueError("not as it was written"), "it is written again")
+            if name != "zarr.json":  # zarr.json of a finished stage also contains measured attributes
+                _warn_damaged(path, ValueError("it has changed since it was written"), "restoring it")
             remove(path)
             write_beside(path, content)
 
 
 def _key(window: Window, windows: Sequence[Window]) -> str:
-    """Return the chunk indices of a window in its array."""
+    """Return the chunk key of a window."""
     return "/".join(["c", *(str(part.start // size) for part, size in zip(window, _chunk(windows), strict=True))])
 
 
@@ -283,21 +283,21 @@ def create(
     packed: bool = True,
     consolidated: bool = False,
 ) -> None:
-    """Create `wip`: metadata and coordinates of a stage, and arrays without values, to be written chunk by chunk.
+    """Create `wip`: metadata and coordinates of a stage, and empty arrays that are written chunk by chunk.
 
     Parameters
     ----------
     wip
-        Work in progress, from `writing`; what is there is removed.
+        Work in progress, from `writing`; existing files are removed.
     stage
-        The stamped stage; of the arrays in `chunks` only dims, dtype, fill value and attributes count, so they may be
-        broadcast.
+        Stage with provenance. Only dims, dtype, fill value and attributes of the arrays in `chunks` are used, so they
+        may be broadcast.
     chunks
-        Array name → shape of its chunks. One process at a time may write a chunk.
+        Array name → shape of its chunks. Each chunk must be written by one process at a time.
     packed
-        Whether chunks are compressed.
+        True if chunks are compressed.
     consolidated
-        As `apertura.campaign.store.chunks.skeleton` takes it.
+        As in `apertura.campaign.store.chunks.skeleton`.
     """
     from apertura.campaign.store.chunks import skeleton
 
@@ -305,7 +305,7 @@ def create(
 
 
 def open_array(folder: Path, name: str, mode: str = "r+") -> Any:
-    """Return an array of a stage, a `zarr.Array` to be read by blocks, and written while it is work in progress."""
+    """Open an array of a stage as a `zarr.Array`; arrays of work in progress may be written."""
     from apertura.campaign.store.chunks import array_of
 
     return array_of(folder, name, mode)
@@ -323,13 +323,13 @@ def save_stage(
     Parameters
     ----------
     dataset
-        A stamped stage.
+        Stage with provenance.
     folder
         ``…/<stage>.zarr``.
     chunks
-        Dimension → chunk length; a dimension not named is one chunk.
+        Dimension → chunk length; other dimensions have one chunk.
     lineage
-        Its sources, settings and code, for `apertura.campaign.store.manifest.write_manifest`.
+        Lineage of the stage, for `apertura.campaign.store.manifest.write_manifest`.
     """
     from apertura.campaign.store.chunks import StageStore, encoding_of
 
@@ -345,13 +345,13 @@ def save_stage(
 def open_stage(folder: Path, stage: str) -> "xr.Dataset":
     """Open a finished stage lazily, after checking its metadata and coordinates against the manifest and the contract.
 
-    Chunks are checked against the manifest as they are read.
+    Chunks are checked against the manifest when they are read.
 
     Raises
     ------
     CampaignError
-        If the folder is missing, contradicts its manifest, or is whole and no such stage: another version's; on
-        reading, if a chunk is damaged.
+        If the folder is missing, differs from its manifest, or was written by another version that does not satisfy
+        the contract; on reading, if a chunk is damaged.
     """
     import xarray as xr
 
@@ -364,8 +364,8 @@ def open_stage(folder: Path, stage: str) -> "xr.Dataset":
         raise CampaignError(
             f"written by another version of apertura: {error}",
             where=folder,
-            expected=f"stage {stage} as this version writes it",
-            remedy="Run the workflow again: it makes what another version made anew.",
+            expected=f"stage {stage} of this version",
+            remedy="Run the workflow again: it recomputes results of other versions.",
         ) from error
 
 
@@ -376,19 +376,20 @@ _FEWEST_ROWS = 16
 
 
 def write_blocks(wip: Path, stage: "xr.Dataset", name: str, blocks: Iterable[NDArray[Any]]) -> None:
-    """Write a stage whose array `name` comes in blocks; earlier content of `wip` is discarded.
+    """Write a stage whose array `name` is supplied in blocks; earlier content of `wip` is discarded.
 
     Parameters
     ----------
     wip
         Work in progress, from `writing`.
     stage
-        The stamped stage; of array `name` only dims, shape, dtype and attributes count, so it may be a broadcast zero.
+        Stage with provenance. Only dims, shape, dtype and attributes of array `name` are used, so it may be a broadcast
+        zero.
     name
-        The array.
+        Name of the array.
     blocks
-        It, some rows at a time, in order. On the disk it lies in chunks of some 8 MB, however blocks are cut, not
-        compressed: echoes are mostly noise. A chunk of nothing but zeros is left out.
+        Consecutive blocks of rows of the array. Chunks on disk have about 8 MB, independent of the blocks. They are not
+        compressed, because echoes are mostly noise. Chunks of zeros are not written.
 
     Raises
     ------
@@ -401,11 +402,11 @@ def write_blocks(wip: Path, stage: "xr.Dataset", name: str, blocks: Iterable[NDA
     array, buffer, written = open_array(wip, name), np.empty((chunk, *rest), stage[name].dtype), 0
     filled = 0
     for block in _counted(blocks, stage[name]):
-        taken = 0
-        while taken < len(block):
-            count = min(chunk - filled, len(block) - taken)
-            buffer[filled : filled + count] = block[taken : taken + count]
-            filled, taken = filled + count, taken + count
+        copied = 0
+        while copied < len(block):
+            count = min(chunk - filled, len(block) - copied)
+            buffer[filled : filled + count] = block[copied : copied + count]
+            filled, copied = filled + count, copied + count
             if filled == chunk or written + filled == rows:
                 if buffer[:filled].any():
                     array[written : written + filled] = buffer[:filled]
@@ -415,7 +416,7 @@ def write_blocks(wip: Path, stage: "xr.Dataset", name: str, blocks: Iterable[NDA
 
 
 def _counted(blocks: Iterable[NDArray[Any]], array: "xr.DataArray") -> Iterator[NDArray[Any]]:
-    """Yield blocks, and report how many rows are done."""
+    """Yield blocks, and report the number of rows written."""
     with progress(f"{array.dims[0]}s", len(array)) as done:
         for block in blocks:
             yield block
@@ -423,10 +424,10 @@ def _counted(blocks: Iterable[NDArray[Any]], array: "xr.DataArray") -> Iterator[
 
 
 def blocks_of_rows(stage: "xr.Dataset", name: str) -> Iterator[slice]:
-    """Yield rows of an array of a stage, as many at a time as one of its chunks holds, or would hold."""
+    """Yield slices of the rows of a stage's array, with the chunk length of the array on disk."""
     array, rows = stage[name], len(stage[name])
-    would = rows_of_chunk(array.dtype.itemsize * int(np.prod(array.shape[1:], dtype=int)))
-    size = int(array.encoding.get("chunks", (would,))[0]) or would
+    default = rows_of_chunk(array.dtype.itemsize * int(np.prod(array.shape[1:], dtype=int)))
+    size = int(array.encoding.get("chunks", (default,))[0]) or default
     for first in range(0, rows, size):
         yield slice(first, min(first + size, rows))
 

@@ -94,7 +94,7 @@ def flight(seconds: float, half_width_m: float):
     )
     scene = replace(whole.scene, half_width_m=half_width_m)
     return replace(
-        whole, nodes=nodes, targets=targets, flights=(replace(flown, tracks=tracks),), scene=scene, campaign="look"
+        whole, nodes=nodes, targets=targets, flights=(replace(flown, tracks=tracks),), scene=scene, campaign="preview"
     )
 
 
