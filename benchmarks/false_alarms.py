@@ -66,7 +66,7 @@ def _rows(number: int, drawn: Drawn, outcome: Outcome, root: Path) -> Iterator[R
     if outcome.error:
         yield inputs | results
     # The flag phase_unobservable is true for an image without a point.
-    has_no_points = any(verdict_of(report) == "cannot tell" for report in outcome.reports.values())
+    has_no_points = any(verdict_of(report) == "inconclusive" for report in outcome.reports.values())
     true_flags = {*drawn.true_flags, *(["phase_unobservable"] if has_no_points else [])}
     for image, report in outcome.reports.items():
         flags = report["flags"]

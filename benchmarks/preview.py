@@ -1,10 +1,10 @@
 """Live imaging during a flight: delay relative to the recording, CPU load, and equality of the results.
 
-``python benchmarks/look.py WORK --seconds 60`` simulates a flight at 500 Hz into WORK/flown unless it exists (one
+``python benchmarks/preview.py WORK --seconds 60`` simulates a flight at 500 Hz into WORK/flown unless it exists (one
 transmitter, one receiver, 5 m/s; 27 kB per pulse), then copies its recordings and logs in real time into WORK/replayed,
-with writes that end at arbitrary bytes, while ``apertura look --follow`` runs on this folder; then it runs the workflow
-on a copy without look, and compares the results of both runs file by file. ``--campaign DIR`` replays another campaign,
-at ``--rate`` times its original rate.
+with writes that end at arbitrary bytes, while ``apertura preview --follow`` runs on this folder; then it runs the
+workflow on a copy without preview, and compares the results of both runs file by file. ``--campaign DIR`` replays
+another campaign, at ``--rate`` times its original rate.
 """
 
 import argparse
@@ -29,7 +29,7 @@ from apertura.simulation import preset, simulate
 
 PRF_HZ = 500
 _STEP_S = 0.1  # between two writes
-_OWN = ("look", "logs", "benchmarks", ".hashes", ".run")
+_OWN = ("preview", "logs", "benchmarks", ".hashes", ".run")
 """Folders of the results that depend on the run, such as times and machine."""
 
 
@@ -51,7 +51,7 @@ def main() -> None:
     replayed = options.work / "replayed"
     shutil.rmtree(replayed, ignore_errors=True)
     begin(flown, replayed)
-    arguments = ["look", str(replayed), "--follow", "--every", str(options.every), "--cores", str(options.cores)]
+    arguments = ["preview", str(replayed), "--follow", "--every", str(options.every), "--cores", str(options.cores)]
     looking = subprocess.Popen(
         [*APERTURA, *arguments, *(["--no-run"] if options.no_run else [])], stdout=subprocess.PIPE, text=True
     )

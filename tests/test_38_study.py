@@ -350,8 +350,7 @@ def test_a_row_says_whose_value_it_is_compared_with_and_hides_no_difference():
     known = compare("x", 1.0, "1", paper="2.0", within=0.1, reason="swapped", note="n")
     assert (known.verdict, known.note) == (EXPLAINED, "differs by -50.0 %; swapped; n")
     assert (
-        compare("x", 2.0, "1", paper="2.0", within=0.1, reason="swapped").note
-        == "differs by +0.0 %, tolerance ±10 %"
+        compare("x", 2.0, "1", paper="2.0", within=0.1, reason="swapped").note == "differs by +0.0 %, tolerance ±10 %"
     )
     # Only values that round to the printed digits agree.
     assert [compare("x", value, "1", paper="2.0").verdict for value in (2.049, 2.06)] == [AGREES, DISAGREES]

@@ -47,12 +47,12 @@ def by_speckle(one: AutofocusCase) -> Refinement:
 
 def uncorrected(_: AutofocusCase) -> Refinement:
     """Return no correction: the logged tracks."""
-    return Refinement(UNCORRECTED, {}, accepted=False, why="uncorrected")
+    return Refinement(UNCORRECTED, {}, accepted=False, reason="uncorrected")
 
 
 def true_tracks(one: AutofocusCase) -> Refinement:
     """Return the correction to the true tracks."""
-    return Refinement(one.truth, {}, accepted=True, why="true tracks")
+    return Refinement(one.truth, {}, accepted=True, reason="true tracks")
 
 
 ATTEMPTS: Mapping[str, Callable[[AutofocusCase], Refinement]] = {
@@ -98,7 +98,7 @@ def row(
     }
     image_s = image_seconds(one.records[0])
     cost = {"cpu_s": round(seconds, 2), "image_s": round(image_s, 4), "images": round(seconds / image_s, 1)}
-    texts = {"flags": " ".join(result.flags), "why": result.why, "report": json.dumps(dict(result.report))}
+    texts = {"flags": " ".join(result.flags), "reason": result.reason, "report": json.dumps(dict(result.report))}
     return {**dict(zip(NAMED, key, strict=True)), **measures, "accepted": result.accepted, **cost, **texts}
 
 

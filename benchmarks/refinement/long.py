@@ -74,7 +74,7 @@ def measured(work: Path, minutes: float) -> str:
     before_mb, start_s = _peak_mb(), process_time()
     result = refine(records, GRID, GROUND, errors, causes=causes)
     cost = f"{process_time() - start_s:6.1f} CPU s, peak {_peak_mb():5.0f} MB ({before_mb:.0f} MB before)"
-    return f"{minutes:4g} min: {cost}; {'accepted' if result.accepted else 'rejected'}: {result.why}"
+    return f"{minutes:4g} min: {cost}; {'accepted' if result.accepted else 'rejected'}: {result.reason}"
 
 
 def _peak_mb() -> float:

@@ -172,7 +172,7 @@ def _title(one: AutofocusCase, result: Refinement) -> str:
         f"{KINDS[row.scene]}, σ = {row.sigma_cm:g} cm: peak loss at the probes {row.loss_db:.2f} dB with the logged "
         f"tracks, {row.product_loss_db:.2f} dB with the tracks used by the product"
     )
-    verdict = f"{row.verdict}: {row.why}; {flags}"
+    verdict = f"{row.verdict}: {row.reason}; {flags}"
     return f"{fill(head, _TITLE_CHARACTERS)}\n{fill(verdict, _TITLE_CHARACTERS)}"
 
 

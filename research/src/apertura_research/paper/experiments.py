@@ -183,14 +183,14 @@ def _corrected(name: str, experiment: Experiment) -> list[Claim]:
         snr = {pair: _snr(own, noise[pair]) for pair, own in terms.items()}
         pulses, factor = len(terms["bistatic"]), factors["bistatic"]
         needed_db = _db(snr_of_coherence_factor(float(printed), pulses))
-        why = (
+        reason = (
             f"the factor depends only on the SNR, which the paper does not print: {needed_db:.1f} dB per compressed "
             f"pulse were chosen; bistatic, 1σ = {(1 - factor) / np.sqrt(pulses):.2g}; mono {factors['mono']:.5f}"
         )
         title = f"coherence factor after correction, {name}, {target}"
         tolerance = half_digit(printed) + 3 * (1 - factor) / np.sqrt(pulses)
         rows.append(fitted_to(compare(title, factor, "1", paper=printed, within=tolerance, relative=False, style=".5f",
-                                      note=why)))  # fmt: skip
+                                      note=reason)))  # fmt: skip
         lack = {pair: (1 - factors[pair]) / (1 - coherence_of_snr(snr[pair], pulses)) for pair in terms}
         title = f"lack of coherence 1 − Γ over its value from noise alone, {name}, {target}"
         note = (

@@ -99,7 +99,7 @@ def _phase(experiment: Experiment) -> Claim:
 
 
 def _widths(images: Images) -> list[Claim]:
-    why = (
+    reason = (
         f"two track segments of {SEGMENT_M:g} m with a gap of {GAP_M:g} m, at midpoints, not fitted: the paper does "
         "not state which segments it used"
     )
@@ -107,7 +107,7 @@ def _widths(images: Images) -> list[Claim]:
     for axis, direction, printed in (("cross-range", EAST, "11"), ("ground-range", NORTH, "49")):
         width_cm = 100 * images.cut("coherent", direction).width_m
         name = f"UAV experiment: {axis} width, coherent sum"
-        rows.append(compare(name, width_cm, "cm", paper=printed, within=WITHIN, style=".3g", reason=why))
+        rows.append(compare(name, width_cm, "cm", paper=printed, within=WITHIN, style=".3g", reason=reason))
     single_m, noncoherent_m = (
         [images.cut(name, direction).width_m for direction in (EAST, NORTH)] for name in ("mono", "noncoherent")
     )
@@ -145,7 +145,7 @@ def _clutter(images: Images) -> list[Claim]:
             note=f"clutter {level_db['mono']:.1f} dB in mono, {level_db['bistatic']:.1f} dB in bistatic, "
             f"{level_db[kind]:.1f} dB in the sum; {reason}",
         )
-        for kind, expected, why in (
+        for kind, expected, reason in (
             ("coherent", 3.0, "targets add in amplitude, clutter of two look angles adds in power: 3 dB"),
             ("noncoherent", MAGNITUDES_DB, "magnitudes add: the clutter only becomes smoother"),
         )

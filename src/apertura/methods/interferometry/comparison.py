@@ -108,8 +108,8 @@ def interferogram_flags(measured: InterferogramCounts) -> Flags:
     ambiguous = []
     if counts.apart:
         ambiguous.append(
-            f"{counts.apart} of {counts.unwrapped} unwrapped pixels lie in other components, with unknown multiples of 2π: "
-            "excluded"
+            f"{counts.apart} of {counts.unwrapped} unwrapped pixels lie in other components, "
+            "with unknown multiples of 2π: excluded"
         )
     if counts.jumps and not counts.by:
         ambiguous.append(
