@@ -28,7 +28,7 @@ def test_pulses_are_presummed_only_if_the_aperture_is_oversampled(step_m, summed
         assert plan(**job).predicted_seconds <= min(seconds) / 0.9
 
 
-def test_a_presum_beyond_the_doppler_band_of_a_wide_scene_is_refused():
+def test_presum_beyond_the_doppler_bandwidth_is_refused():
     with pytest.raises(CampaignError, match="presum factor 32"):
         plan(overrides={"presum": 32}, aperture=monostatic(straight_track(length_m=30)))
 
